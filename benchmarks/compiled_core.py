@@ -1,22 +1,62 @@
 """Equality of the compiled core and its sources, bit for bit, on a million drawn inputs of each function.
 
     python -m tools.compile_core                               # first: it takes about a minute
-    python benchmarks/compiled_core.py [--inputs 1000000] [--seed 1]
+    python benchmarks/compiled_core.py [--inputs 1000000] [--seed 1] [--only NAME]
 
 Among the inputs are the edges (zeros of both signs, infinities, NaN, subnormals) and any pattern of 64 bits; what a
-function raises is compared as well, and one NaN is as good as another. Exit code 0 if nothing differs.
+function raises is compared as well, and one NaN is as good as another. Each core runs in processes of its own, which
+give a digest of each block of answers. Exit code 0 if nothing differs.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
+import hashlib
+import math
 import os
+import random
+import struct
 import sys
 import time
+from collections.abc import Callable, Iterator
+from functools import cache
+from itertools import islice
 from multiprocessing import get_context
+from textwrap import shorten
+from typing import Any, NamedTuple
 
-CHECK = "emb_runtime.cli.core_check"
+from emb_runtime.can import e2e, receiver
+from emb_runtime.can.messages import load_layout
+from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.config.shield_config import shield_config
+from emb_runtime.control import result, start_conditions
+from emb_runtime.learning import assumptions, bounded
+from emb_runtime.learning import known as estimate_set
+from emb_runtime.learning.law import law_for
+from emb_runtime.policy import scalar_operations
+from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState, SensorSample
+from emb_runtime.safety import (
+    command_limits,
+    drive_monitor,
+    sensor_monitor,
+    sensor_thresholds,
+    shield,
+    shield_design,
+    state_machine,
+)
+from emb_runtime.safety.guard import Guard
+from emb_runtime.system import compiled_core
+
+BLOCK = 1000  # Answers to a digest
+EDGES = (0.0, -0.0, 1.0, -6.0, 6.0, 5e-324, -2.2e-308, 1e6, 1e308, math.inf, -math.inf, math.nan)
+
+
+class Task(NamedTuple):
+    """Answers of the core that a process runs."""
+
+    name: str  # Of the comparison
+    inputs: int
+    seed: int  # Of the drawing
 
 
 def main() -> int:
@@ -24,26 +64,341 @@ def main() -> int:
     p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     p.add_argument("--inputs", type=int, default=1_000_000, metavar="N", help="of each (default: %(default)d)")
     p.add_argument("--seed", type=int, default=1, metavar="N", help="of the drawing (default: %(default)d)")
+    p.add_argument("--only", choices=COMPARISONS, metavar="NAME", help="one comparison (default: all)")
     args = p.parse_args()
-    os.environ["EMB_CORE"] = "compiled"  # before anything of ours is imported, here and in the children
-    check = importlib.import_module(CHECK)
-    differing = 0
-    with get_context("spawn").Pool() as pool:
-        arguments = [(name, args.inputs, args.seed) for name in check.COMPARISONS]
-        for name, found, duration in pool.imap(_compared, arguments):
-            print(
-                f"{name:24}{args.inputs:10} inputs in {duration:6.1f} s: {found or 'the same, bit for bit'}", flush=True
-            )
-            differing += bool(found)
+    pools = []
+    for choice in ("compiled", "python"):
+        os.environ["EMB_CORE"] = choice  # of the processes that are started now
+        pools.append(get_context("spawn").Pool(max(1, (os.cpu_count() or 2) // 2)))
+    compiled, plain = pools
+    with compiled, plain:
+        if (found := compiled.apply(core), plain.apply(core)) != (True, False):
+            raise SystemExit(f"expected the compiled core and its sources, got {found}")
+        differing = 0
+        for name in [args.only] if args.only else COMPARISONS:
+            began, task = time.monotonic(), Task(name, args.inputs, args.seed)
+            one, other = [pool.apply_async(digests, task) for pool in pools]
+            difference = first_difference(task, one.get(), other.get(), compiled.apply, plain.apply)
+            told = difference or "the same, bit for bit"
+            print(f"{name:24}{args.inputs:10} inputs in {time.monotonic() - began:6.1f} s: {told}", flush=True)
+            differing += bool(difference)
     return 1 if differing else 0
 
 
-def _compared(argument: tuple[str, int, int]) -> tuple[str, str, float]:
-    name, count, seed = argument
-    check = importlib.import_module(CHECK)
-    begin = time.monotonic()
-    found: str = check.compared(check.COMPARISONS[name], *check.cores(), count, seed)
-    return name, found, time.monotonic() - begin
+def core() -> bool:
+    """Returns True if this process runs the compiled core."""
+    return compiled_core.running().compiled
+
+
+def first_difference(
+    task: Task, one: list[bytes], other: list[bytes], compiled: Callable[..., Any], plain: Callable[..., Any]
+) -> str:
+    """First answer that differs between two lists of digests; empty if none does."""
+    for block, pair in enumerate(zip(one, other, strict=True)):
+        if pair[0] != pair[1]:
+            answers = (ask(block_of, (*task, block)) for ask in (compiled, plain))
+            for number, (a, b) in enumerate(zip(*answers, strict=True)):
+                if a != b:
+                    said = [shorten(text, 80, placeholder=" …") for text in (a, b)]
+                    return f"input {BLOCK * block + number}: compiled {said[0]}, Python {said[1]}"
+    return ""
+
+
+def digests(name: str, count: int, seed: int) -> list[bytes]:
+    """Digest of each block of answers."""
+    answers = islice(COMPARISONS[name](random.Random(seed)), count)
+    found = []
+    while block := [repr(bits(answer)) for answer in islice(answers, BLOCK)]:
+        found.append(hashlib.sha256("\n".join(block).encode()).digest())
+    return found
+
+
+def block_of(name: str, count: int, seed: int, block: int) -> list[str]:
+    """The answers of one block."""
+    answers = islice(COMPARISONS[name](random.Random(seed)), count)
+    return [repr(bits(answer)) for answer in islice(answers, BLOCK * block, BLOCK * (block + 1))]
+
+
+def bits(answer: Any) -> Any:
+    """An answer in such a form that equal means bit for bit; an enumeration's member is its number.
+
+    One NaN is as good as another: IEEE 754 leaves its sign and payload open, and on aarch64 a compiled product of a
+    negated number has another sign than Python's.
+    """
+    if isinstance(answer, float):
+        return "NaN" if math.isnan(answer) else struct.pack("<d", answer)
+    if isinstance(answer, int) and not isinstance(answer, bool):
+        return int(answer)
+    if isinstance(answer, (tuple, list)):
+        return tuple(map(bits, answer))
+    return type(answer).__name__, answer
+
+
+def _tried(function: Callable[..., Any], *arguments: Any) -> Any:
+    try:
+        return function(*arguments)
+    except Exception as err:
+        return type(err).__name__, str(err), str(getattr(err, "detail", ""))
+
+
+def _number(dice: random.Random, scale: float) -> float:
+    kind = dice.random()
+    if kind < 0.9:
+        return dice.uniform(-scale, scale)
+    if kind < 0.97:
+        return dice.choice(EDGES)
+    number: float = struct.unpack("<d", dice.randbytes(8))[0]
+    return number
+
+
+@cache
+def _bench() -> Bench:
+    return load_bench()
+
+
+def _laws() -> list[Any]:
+    law = shield_design.make_law(_bench())
+    return [
+        law,
+        law._replace(age_high=2),
+        law._replace(age_low=1, age_high=1, lag=2e-4, kept=math.exp(-5.0)),
+        law._replace(coasting=True, damping_velocity=math.inf),
+    ]
+
+
+def _drawn_past(dice: random.Random) -> tuple[float, ...]:
+    return tuple(_number(dice, 6.0) for _ in range(5))
+
+
+def _shield(dice: random.Random) -> Iterator[Any]:
+    laws = _laws()
+    yield laws
+    while True:
+        law, past = dice.choice(laws), _drawn_past(dice)
+        angle, velocity, wanted = _number(dice, 110.0), _number(dice, 510.0), _number(dice, 7.0)
+        step = dice.randrange(-1, law.steps + 2)
+        yield (
+            _tried(shield.shield, law, angle, velocity, wanted, past, step),
+            _tried(shield.window, law, angle, velocity, past),
+            _tried(shield.damped_current, velocity, law.current, law.damping_velocity),
+        )
+
+
+def _successor(dice: random.Random) -> Iterator[Any]:
+    laws = _laws()
+    while True:
+        box = (_number(dice, 110.0), _number(dice, 110.0), _number(dice, 510.0), _number(dice, 510.0))
+        yield _tried(shield.successor, dice.choice(laws), *box, _number(dice, 6.0))
+
+
+def _decide(dice: random.Random) -> Iterator[Any]:
+    laws, limits = _laws(), command_limits
+    while True:
+        reach = limits.Reach(abs(_number(dice, 6.0)), abs(_number(dice, 12.0)))
+        asked = _tried(limits.checked, _number(dice, 7.0), 6.0)
+        wanted = asked if isinstance(asked, float) else 0.0
+        state, past = (_number(dice, 110.0), _number(dice, 510.0)), _drawn_past(dice)
+        last, step = _number(dice, 6.0), dice.randrange(0, 501)
+        yield asked, _tried(limits.decide, dice.choice(laws), reach, *state, wanted, past, last, step)
+
+
+def _e2e(dice: random.Random) -> Iterator[Any]:
+    check = e2e.CounterCheck(5)
+    while True:
+        data, start, counter = dice.randbytes(dice.randrange(1, 9)), dice.randrange(256), dice.randrange(-1, 16)
+        payload = e2e.protect(start, data[1:]) if dice.random() < 0.5 else data
+        yield (
+            *(e2e.crc8_j1850(data), e2e.profile1_start(dice.randrange(65536)), payload, e2e.check(start, payload)),
+            *(e2e.next_counter(counter), _tried(check.step, counter), check.last, check.errors),
+        )
+
+
+def _codec(dice: random.Random) -> Iterator[Any]:
+    layout = load_layout()
+    decoders = (layout.decode_command, layout.decode_angle, layout.decode_velocity, layout.decode_status)
+    while True:
+        for message, decode in zip(layout.messages.values(), decoders, strict=True):
+            wanted = [_drawn_value(dice, signal) for signal in message.signals[1:]]
+            packed = _tried(message.pack, *wanted)
+            frame = packed if isinstance(packed, Frame) else _drawn_frame(dice, message)
+            yield packed, _tried(decode, frame), _tried(message.decode, frame), message.unpack(frame.data.ljust(8))
+
+
+def _drawn_value(dice: random.Random, signal: Any) -> Any:
+    """A value in a signal's range, mostly: an int where it is whole."""
+    if dice.random() < 0.03:
+        return _number(dice, 2.0 * abs(signal.maximum) + 1.0)
+    raw = dice.randint(signal.raw_minimum, signal.raw_maximum)
+    return raw * signal.factor + signal.offset
+
+
+def _drawn_frame(dice: random.Random, message: Any) -> Frame:
+    body = dice.randbytes(message.length - 1 if dice.random() < 0.9 else dice.randrange(1, 8))
+    data = e2e.protect(message.crc_start, body) if dice.random() < 0.8 else bytes(1) + body
+    return Frame(message.identifier, data, error=dice.random() < 0.05, extended=dice.random() < 0.05)
+
+
+def _reception(dice: random.Random) -> Iterator[Any]:
+    """A stream of pairs, with gaps, jumps, repeats, and frames that are none."""
+    bench, layout = _bench(), load_layout()
+    told: list[str] = []
+    take = receiver.Reception(layout, bench, lambda _frame, why: told.append(why))
+    counter, time_ns, angle, velocity = 0, 10**9, 0.0, 0.0
+    messages = list(layout.messages.values())
+    while True:
+        counter, time_ns = (
+            (counter + dice.choice((0, 1, 1, 1, 1, 1, 1, 2))) % 15,
+            time_ns + dice.randrange(0, 3_000_000),
+        )
+        velocity = max(min(velocity + dice.uniform(-9.0, 9.0), 400.0), -400.0)
+        angle = dice.uniform(0.0, 80.0) if dice.random() < 0.05 else max(min(angle + 1e-3 * velocity, 90.0), -9.0)
+        frames = (
+            layout.encode_angle(counter, angle, time_ns),
+            layout.encode_velocity(counter, velocity, dice.uniform(-6.0, 6.0), dice.choice(tuple(NodeState)), counter),
+            _drawn_frame(dice, dice.choice(messages)),
+        )
+        for frame in frames[: 2 + (dice.random() < 0.1)]:
+            sample = take.take(frame._replace(time_ns=time_ns, own=dice.random() < 0.01, dropped=counter // 14))
+            yield (
+                *(sample, take.permitted(time_ns + dice.randrange(-(10**7), 10**8)), take.rejected, take.dropped),
+                *(take.too_many_rejected, take.foreign_command, list(told), take.status, str(take.rejections())),
+            )
+            told.clear()
+        if take.foreign_command or take.too_many_rejected:
+            take = receiver.Reception(layout, bench, lambda _frame, why: told.append(why))
+
+
+def _drive(dice: random.Random) -> Iterator[Any]:
+    while True:
+        check = drive_monitor.DriveCheck(0.5, 6.0)
+        for _ in range(50):
+            counter, current = dice.randrange(15), _number(dice, 6.0)
+            check.sent(counter, current)
+            obeyed = counter if dice.random() < 0.8 else dice.randrange(16)
+            applied = current + dice.uniform(-0.6, 0.6) if dice.random() < 0.8 else _number(dice, 6.0)
+            yield _tried(check.judge, obeyed, applied), check.errors
+
+
+def _sensors(dice: random.Random) -> Iterator[Any]:
+    monitor, laws = sensor_monitor, _laws()[:2]
+    limits = sensor_thresholds.sensor_thresholds(_bench(), laws[0])
+    while True:
+        law, memory = dice.choice(laws), [0.0] * monitor.MEMORY
+        angle, velocity = dice.uniform(-5.0, 80.0), dice.uniform(-300.0, 300.0)
+        monitor.begin(memory, angle, velocity)
+        for _ in range(40):
+            elapsed, current = dice.choice((1e-3, 1e-3, 1e-3, 2e-3)), _number(dice, 6.0)
+            velocity += dice.uniform(-6.0, 6.0)
+            angle += elapsed * velocity
+            measured = (_number(dice, 100.0), velocity) if dice.random() < 0.02 else (angle, velocity)
+            obeyed, reported = dice.random() < 0.9, current + dice.uniform(-0.5, 0.5)
+            verdict = _tried(monitor.judge, law, limits, memory, elapsed, *measured, obeyed, current, reported)
+            yield verdict, list(memory), monitor.largest_current(law, limits, memory, 6.0)
+
+
+def _learning(dice: random.Random) -> Iterator[Any]:
+    """Answers to a brake that moves about as it should, with both models, and the law then."""
+    bench, setting = _bench(), shield_config(_bench())
+    plain = assumptions.make_assumptions(bench)
+    while True:
+        assumed = plain._replace(flow=dice.random() < 0.5, model_error=dice.choice((0.0, 50.0)))
+        state = bounded.start(assumed)
+        angle, velocity, current = dice.uniform(-1.0, 40.0), dice.uniform(-200.0, 200.0), 0.0
+        for _ in range(30):
+            measured = (angle + dice.gauss(0.0, 1e-3), velocity + dice.gauss(0.0, 1.0))
+            if dice.random() < 0.05:
+                answer = _tried(bounded.lose, assumed, state)
+            else:
+                heard = (_number(dice, 100.0), velocity) if dice.random() < 0.01 else measured
+                answer = _tried(bounded.hear, assumed, state, *heard, current)
+            known = estimate_set.known(state)
+            yield answer, list(state), known, _tried(law_for, setting, bench.brake, known)
+            current = dice.uniform(-6.0, 6.0)
+            push = plain.motor * current - plain.spring * max(angle, 0.0) - plain.viscous * velocity
+            angle += 1e-3 * velocity
+            velocity += 1e-3 * (push - math.copysign(plain.coulomb, velocity))
+
+
+def _guard(dice: random.Random) -> Iterator[Any]:
+    bench, layout = _bench(), load_layout()
+    while True:
+        sent: list[Frame] = []
+        guard = Guard(layout, bench, sent.append, None, dice.choice((1.0, 6.0)))
+        now_ns, current = 10**9, 0.0
+        for _ in range(100):
+            now_ns += dice.randrange(0, 2_000_000)
+            current = max(min(current + dice.uniform(-4.0, 4.0), 6.0), -6.0) if dice.random() < 0.98 else 0.0
+            enable, answers = dice.random() < 0.97, dice.randrange(15)
+            counter = guard.next_counter if dice.random() < 0.95 else dice.randrange(15)
+            command = CurrentCommand(counter, answers, current if enable or dice.random() < 0.1 else 0.0, enable)
+            state = RunState.ACTIVE if dice.random() < 0.95 else dice.choice(tuple(RunState))
+            frame, sampled_ns = layout.encode_command(command), now_ns - dice.randrange(0, 2_100_000)
+            yield _tried(guard.send, frame, state, sampled_ns, now_ns), list(sent), guard.passed, guard.rejected
+            sent.clear()
+
+
+def _states(dice: random.Random) -> Iterator[Any]:
+    machine = state_machine
+    times = machine.timeouts(_bench())
+    events = (*machine.Event, *machine.Fault)
+    while True:
+        run, now_ns = machine.Run(), 10**9
+        for _ in range(12):
+            now_ns += dice.randrange(0, 5_000_000)
+            event = dice.choice(events if dice.random() < 0.1 else tuple(machine.Event))
+            after = _tried(machine.step, times, run, event, now_ns)
+            run = after if isinstance(after, machine.Run) else run
+            yield tuple(map(str, after)), machine.missed(times, run, now_ns), machine.may_send(run.state)
+
+
+def _bounds(dice: random.Random) -> Iterator[Any]:
+    bounds, counters = start_conditions.Bounds(_bench()), result.RunCounters()
+    while True:
+        angle, velocity, applied = _number(dice, 110.0), _number(dice, 510.0), _number(dice, 6.0)
+        sample = SensorSample(dice.randrange(15), angle, velocity, 0, 0, applied, 15, NodeState.ACTIVE)
+        counters.count_pair(sample, dice.randrange(3))
+        counters.count_answer(dice.randrange(32), applied)
+        yield (
+            *(bounds.is_home(sample), bounds.outside(sample), counters.pairs, counters.missed, counters.left),
+            *(counters.clipped, counters.limited, counters.angle_min, counters.angle_max, counters.top_speed),
+        )
+
+
+def _scalars(dice: random.Random) -> Iterator[Any]:
+    """Every operation, each of numbers and of results of others."""
+    of = scalar_operations
+    unary = of.Absolute, of.Sign, of.SquareRoot, of.Exponential, of.Logarithm, of.HyperbolicTangent
+    comparing = of.Greater, of.GreaterOrEqual, of.Equal
+    binary = of.Add, of.Subtract, of.Multiply, of.Divide, of.Maximum, of.Minimum, *comparing
+    seen = [of.Number() for _ in range(4)]
+    results: list[scalar_operations.Operation] = [kind(a) for kind in unary for a in seen[:2]]
+    results += [kind(*pair) for kind in binary for pair in (seen[:2], seen[2:], results[:2])]
+    results += [kind(seen[0], *results[:2]) for kind in (of.Where, of.AddProduct, of.SubtractProduct)]
+    results += [of.AddProducts(*seen, *results[-3:])]
+    while True:
+        for number in seen:
+            number.value = _number(dice, dice.choice((1.0, 30.0, 1e3)))
+        for operation in results:
+            operation.run()
+        yield [operation.value for operation in results]
+
+
+COMPARISONS: dict[str, Callable[[random.Random], Iterator[Any]]] = {
+    "shield": _shield,
+    "successor": _successor,
+    "command limits": _decide,
+    "end-to-end protection": _e2e,
+    "codec": _codec,
+    "reception": _reception,
+    "drive monitor": _drive,
+    "guard": _guard,
+    "sensor monitor": _sensors,
+    "learning": _learning,
+    "state machine": _states,
+    "bounds and counters": _bounds,
+    "scalar operations": _scalars,
+}
+"""Answers without end to inputs drawn from the dice, by what they compare."""
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import shutil
 import sys
 import sysconfig
@@ -98,20 +97,14 @@ def compile_core(folder: Path) -> None:
             name = ".".join(built.relative_to(Path(temporary, "lib")).parts).removesuffix(suffix)
             files[name] = f"{name}{suffix}"
             shutil.copyfile(built, folder / files[name])
-        _write_manifest(folder, names, files)
+        _write_manifest(folder, files)
 
 
-def _write_manifest(folder: Path, names: list[str], files: dict[str, str]) -> None:
+def _write_manifest(folder: Path, files: dict[str, str]) -> None:
     sys.path.insert(0, str(ROOT / "runtime"))
-    from emb_runtime.system.compiled_core import MANIFEST, fingerprint
+    from emb_runtime.system.compiled_core import MANIFEST, identity
 
-    manifest = {
-        "interpreter": sys.implementation.cache_tag,
-        "machine": platform.machine(),
-        "sources": {name: fingerprint(Path(*name.split(".")).with_suffix(".py")) for name in names},
-        "files": files,
-        "digests": {name: fingerprint(folder / file) for name, file in files.items()},
-    }
+    manifest = {"identity": identity(name for name in files if "." in name), "files": files}
     (folder / MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
 
 

@@ -22,12 +22,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import cache
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import IO, Any, ParamSpec, TypeVar, cast
 
+import emb_runtime
 from emb_runtime.errors import UsageError
-from emb_runtime.system import compiled_core
 
 PACKAGES = ("emb_runtime", "emb_bench", "emb_train", "emb_export")
 UNUSED_LIFE = 30 * 86400.0  # s; every edit of a function leaves its old directory behind
@@ -93,9 +94,20 @@ def _with_compiled_callees(fn: FunctionType) -> FunctionType:
 def _source_of(value: Any) -> Any:
     """A function of the runtime's compiled core as its source has it; everything else as it is."""
     if isinstance(value, BuiltinFunctionType) and str(value.__module__).startswith("emb_runtime."):
-        (module,) = compiled_core.sources(value.__module__)
-        return getattr(module, value.__name__)
+        return getattr(source_module(value.__module__), value.__name__)
     return value
+
+
+@cache
+def source_module(name: str) -> ModuleType:
+    """A module of the runtime from its source, whatever core this process runs; what it imports is of that core."""
+    path = Path(emb_runtime.__file__).parent.joinpath(*name.split(".")[1:]).with_suffix(".py")
+    spec = spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def _jit(fn: FunctionType, directory: str | None, parallel: bool) -> Any:

@@ -9,4 +9,4 @@ os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 if os.environ.get("EMB_CORE") == "compiled":  # in every process, for tests and measurements
     from emb_runtime.system import compiled_core
 
-    compiled_core.take_unchecked()
+    compiled_core.take_or_end()

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import emb_train.structured.learning as learning_module
 import tests.properties.learning_search as search_module
-from emb_runtime.system import compiled_core
+from emb_bench.compiled import source_module
 
 
 class Mutant(NamedTuple):
@@ -78,7 +78,7 @@ MUTANTS: dict[str, Mutant] = {
 
 def broken(mutant: Mutant, episodes: Callable[..., None]) -> Any:
     """The episodes of the search with a learner that is changed."""
-    (original,) = compiled_core.sources("emb_runtime.learning.bounded")
+    original = source_module("emb_runtime.learning.bounded")
     source = Path(str(original.__file__)).read_text(encoding="utf-8")
     assert mutant.old in source, mutant.old
     changed = ModuleType(f"{original.__name__}_changed")

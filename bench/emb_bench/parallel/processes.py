@@ -12,16 +12,16 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import connection, resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, TypeVar
 
 from emb_bench.parallel.threads import ONE_THREAD
 from emb_runtime.errors import EmbError
-from emb_runtime.system import signals
 
 # Compiled code is not safe after a fork, and some of it has threads of its own.
 _SPAWN = multiprocessing.get_context("spawn")
@@ -93,7 +93,7 @@ class _Worker:
         self._process = _SPAWN.Process(target=_work, args=(theirs, work), daemon=True)
         if sys.platform != "win32":
             resource_tracker.ensure_running()  # started along with the first process, it would end the waiting
-        with signals.waiting((signal.SIGINT,)), _environment(ONE_THREAD):  # a Ctrl-C is for the command
+        with _deferred(signal.SIGINT), _environment(ONE_THREAD):  # a Ctrl-C is for the command
             self._process.start()
         theirs.close()
 
@@ -137,6 +137,23 @@ def _work(pipe: Connection, work: Callable[[Any], Any]) -> None:
             except EmbError as err:
                 error = err
             pipe.send((result, error))
+
+
+@contextmanager
+def _deferred(number: signal.Signals) -> Iterator[None]:
+    """A signal is handled after this, and never reaches a process that is started inside.
+
+    To block it is not enough: another thread would take it, and Python then calls the handler in the main thread.
+    """
+    came: list[int] = []
+    with ExitStack() as undo:
+        undo.callback(lambda: [*map(signal.raise_signal, came)])
+        if threading.current_thread() is threading.main_thread():  # Python calls handlers nowhere else
+            undo.callback(signal.signal, number, signal.signal(number, lambda which, _frame: came.append(which)))
+        if hasattr(signal, "pthread_sigmask"):  # not on Windows
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, [number])
+            undo.callback(signal.pthread_sigmask, signal.SIG_SETMASK, before)
+        yield
 
 
 @contextmanager

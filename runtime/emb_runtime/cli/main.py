@@ -6,8 +6,6 @@ import itertools
 import signal
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,24 +19,19 @@ from emb_runtime.cli.repeat import campaign, experiment
 from emb_runtime.cli.session import Bus, Console
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.drives.transport import MappedTransport
-from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, BenchFileError, EmbError, UsageError
+from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError, UsageError
 from emb_runtime.run_type import LISTEN_ONLY_LOG
-from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system import signals
 from emb_runtime.system.terminal import as_json, complain, forget_typed, mention, show, typed_line
 
 LISTEN_NS = 50_000_000  # Time between two looks at the keyboard [ns]
 
-ASK_AGAIN = 0.01  # Time after which a request that was lost in a callback of the interpreter interrupts once more [s]
-
-_ALARM = hasattr(signal, "setitimer")  # not on Windows
-
 
 class StopRequest:
-    """Set by Ctrl-C and its kin, asked by the loop. Taken first of all, so that none of them is ever a traceback."""
+    """Set by Ctrl-C, SIGTERM and SIGHUP from now on, asked by the loop."""
 
     def __init__(self) -> None:
-        self._requested = self._at_once = False
+        self._requested = False
         for number in signals.ENDING:
             if signal.getsignal(number) is not signal.SIG_IGN:  # nohup asked for that one to be ignored
                 signal.signal(number, self._request)
@@ -47,42 +40,8 @@ class StopRequest:
         """Returns True if an end is wanted."""
         return self._requested
 
-    @contextmanager
-    def at_once(self) -> Iterator[None]:
-        """While nothing is open, an end comes at once, wherever the program is.
-
-        Raises:
-            RefusedError: one was wanted.
-        """
-        report, sys.unraisablehook = sys.unraisablehook, self._ask_again
-        alarm = signal.signal(signal.SIGALRM, self._request) if _ALARM else None
-        self._at_once = True
-        try:
-            yield
-        except KeyboardInterrupt:
-            pass
-        finally:
-            self._at_once = False
-            if _ALARM:
-                signal.setitimer(signal.ITIMER_REAL, 0.0)
-                signal.signal(signal.SIGALRM, alarm)
-            sys.unraisablehook = report
-        if self._requested:
-            raise RefusedError(
-                "stopped by the operator before anything was opened", EXIT_SAFETY_STOP, (), Fault.INTERRUPTED
-            )
-
-    def _ask_again(self, unraisable: sys.UnraisableHookArgs) -> None:
-        """Interrupt once more: Python drops what is raised in a callback of its own, and only reports it."""
-        if isinstance(unraisable.exc_value, KeyboardInterrupt) and _ALARM:
-            signal.setitimer(signal.ITIMER_REAL, ASK_AGAIN)
-        else:
-            sys.__unraisablehook__(unraisable)
-
     def _request(self, _signal: int, _frame: object) -> None:
         self._requested = True
-        if self._at_once:
-            raise KeyboardInterrupt
 
 
 class Operator:
@@ -138,14 +97,13 @@ class Operator:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point of ``emb-run``."""
-    stop = StopRequest()
+    """Entry point of ``emb-run``: a signal ends it at once until a run begins, and with stop frames from then on."""
     try:
-        with stop.at_once():
-            args = parser().parse_args(argv)
-            if args.write_bench is not None:
-                return _write_bench(args.write_bench)
-            plan = None if args.commission is not None else prepare(args)
+        args = parser().parse_args(argv)
+        if args.write_bench is not None:
+            return _write_bench(args.write_bench)
+        plan = None if args.commission is not None else prepare(args)
+        stop = StopRequest()
         if plan is None:
             steps = itertools.count()  # the first one only listens
             return commission(args, lambda plan: Operator(plan, stop, briefly=next(steps) > 1).console(), stop)

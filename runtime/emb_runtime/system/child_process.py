@@ -12,8 +12,6 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from emb_runtime.system import signals
-
 HAS_CHILD_PROCESSES = sys.platform == "linux"  # True where there are processes of our own
 END_TIMEOUT = 1.0  # Time for the process to end when nothing is asked of it any more; then it is killed [s]
 
@@ -44,20 +42,14 @@ class Child:
         with os.fdopen(fd, "wb") as memory:
             memory.write(json.dumps(document).encode())
             memory.flush()
-            try:
-                with signals.waiting(signals.ENDING):  # they are for the runtime
-                    # -P: modules of the working directory are not ours. A group of its own: Ctrl-C is for the runtime.
-                    self._process = subprocess.Popen(
-                        [sys.executable, "-P", "-m", module, *map(str, fds), str(fd)],
-                        stdin=subprocess.PIPE,
-                        stdout=subprocess.PIPE,
-                        pass_fds=(*fds, *inherited, fd),
-                        process_group=0,
-                    )
-            except BaseException:
-                if hasattr(self, "_process"):
-                    self.kill()
-                raise
+            # -P: modules of the working directory are not ours. A group of its own: Ctrl-C is for the runtime.
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", module, *map(str, fds), str(fd)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                pass_fds=(*fds, *inherited, fd),
+                process_group=0,
+            )
 
     @property
     def pid(self) -> int:

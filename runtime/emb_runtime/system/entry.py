@@ -1,72 +1,55 @@
-"""The commands' first step: a Ctrl-C is no traceback, while the imports take their time or when nobody has taken it."""
+"""The commands' first step: a Ctrl-C is no traceback, neither in the imports nor when nobody has taken it."""
 
 from __future__ import annotations
 
-import atexit
-import contextlib
 import gc
 import importlib
 import io
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
-from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_SAFETY_STOP, UsageError
+from emb_runtime.errors import EXIT_INTERRUPTED
 
 
 def start(
     module: str,
     message: str,
     interrupted: int = EXIT_INTERRUPTED,
-    taken: Sequence[int] = (),
     prepare: Callable[[], object] | None = None,
+    takes_signals: bool = False,
 ) -> int:
-    """Run the ``main`` of a module.
+    """Run the ``main`` of a module; a Ctrl-C in its imports just ends the process: nothing is open yet.
 
     Args:
         module: where it is; imported here.
-        message: what to say of a Ctrl-C that nobody has taken, unless the exception says it.
+        message: what to say of a Ctrl-C in ``main`` that nobody has taken, unless the exception says it.
         interrupted: exit code for it.
-        taken: signals that the ``main`` takes in its first step. They end the program like a Ctrl-C until then.
         prepare: called before the import.
+        takes_signals: ``main`` does; until then a Ctrl-C ends the process as in the imports.
 
     Returns:
         The exit code.
     """
     _prepare_streams()
-
-    def leave(_number: int, _frame: object) -> None:  # at once: nothing is open yet, and the imports may take seconds
-        with contextlib.suppress(OSError):
-            os.write(2, f"{message}\n".encode() if message else b"")
-        os._exit(interrupted)
-
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *taken)}
+    handler = signal.getsignal(signal.SIGINT)
     try:
-        for number, handler in before.items():
-            if handler in (signal.default_int_handler, signal.SIG_DFL):  # an exception may leave an import as another
-                signal.signal(number, leave)
-        back = [number for number in before if number not in taken]
-        try:
-            if prepare is not None:
-                prepare()
-            loaded = importlib.import_module(module)
-        except BaseException:
-            back = list(before)
-            raise
-        finally:
-            for number in back:
-                signal.signal(number, before[number])
-        return int(loaded.main())
+        if handler is signal.default_int_handler:  # else somebody wants it ignored
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+        if prepare is not None:
+            prepare()
+        main: Callable[[], int] = importlib.import_module(module).main
+        if not takes_signals:
+            signal.signal(signal.SIGINT, handler)
+        return main()
     except KeyboardInterrupt as err:
         message = str(err) or message
     finally:
         _flush()
         gc.freeze()  # or Python searches all that was imported for garbage before it ends: a fifth of a short command
     if message:
-        from emb_runtime.system.terminal import (
-            mention,  # whatever is imported before the handler is set can be interrupted
-        )
+        from emb_runtime.system.terminal import mention  # nothing is imported before the handler is set
 
         mention(message)
     return interrupted
@@ -95,21 +78,12 @@ def _flush() -> None:
 
 
 def emb_run() -> int:
-    """``emb-run``: before anything is opened, an interruption is the same stop as later."""
-    message = "emb-run: stopped by the operator while it started; nothing was opened"
-    taken = (signal.SIGINT, signal.SIGTERM)
-    for number in taken:  # when all is done, Python puts the default actions back before it ends
-        atexit.register(signal.signal, number, signal.SIG_IGN)
+    """``emb-run``: until it opens anything, Ctrl-C just ends it."""
+    from emb_runtime.errors import UsageError
+    from emb_runtime.system import compiled_core
+    from emb_runtime.system.terminal import complain
+
     try:
-        return start("emb_runtime.cli.main", message, EXIT_SAFETY_STOP, taken, choose_core)
+        return start("emb_runtime.cli.main", "", prepare=compiled_core.choose, takes_signals=True)
     except UsageError as err:
-        from emb_runtime.system.terminal import complain
-
         return complain("emb-run", err)
-
-
-def choose_core() -> None:
-    """Take the compiled core, where there is one that does what its sources do."""
-    from emb_runtime.system import compiled_core  # after the handlers are set, as all that takes its time
-
-    compiled_core.choose(lambda: str(importlib.import_module("emb_runtime.cli.core_check").difference()))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,8 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, shipped
 from emb_runtime.errors import EXIT_LOG
 from emb_runtime.log.recorder import Recorder, RecorderResult
 from emb_runtime.policy.contract import MIN_VECTORS, Quantity, Vector
-from emb_runtime.system import entry
 from tests.actors import alone, constant_actor
-from tests.runtime.operating import Edited, EmbRun, Sim, assert_one_line
+from tests.runtime.operating import Edited, EmbRun, Sim
 
 pytestmark = pytest.mark.usefixtures("handlers")
 
@@ -227,39 +227,6 @@ def test_a_full_disk_behind_standard_output_is_one_line(tmp_path: Path, actor: P
     assert "standard output" in done.stderr
 
 
-def test_ctrl_c_while_the_imports_take_their_time_is_a_line_and_no_traceback(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupted(_module: str) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(importlib, "import_module", interrupted)
-    assert entry.emb_run() == 3
-    assert_one_line(capsys.readouterr(), "stopped by the operator while it started")
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_inside_an_import_ends_it_at_once_and_the_handlers_are_put_back(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], number: signal.Signals
-) -> None:
-    def pressed(_module: str) -> None:
-        signal.raise_signal(number)  # an exception here would leave a C extension as an ImportError
-        pytest.fail("it went on")
-
-    def left(code: int) -> None:
-        raise SystemExit(code)
-
-    before = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
-    signal.signal(number, before)  # a library that an earlier test used may have taken it
-    monkeypatch.setattr(importlib, "import_module", pressed)
-    monkeypatch.setattr(os, "_exit", left)
-    with pytest.raises(SystemExit) as ended:
-        entry.emb_run()
-    assert ended.value.code == 3
-    assert signal.getsignal(number) is before
-    assert_one_line(capfd.readouterr(), "stopped by the operator while it started")
-
-
 def test_the_shipped_bench_is_written_for_editing_and_not_over_a_file(emb_run: EmbRun, tmp_path: Path) -> None:
     path = tmp_path / "my.toml"
     emb_run.text("--write-bench", str(path))
@@ -314,17 +281,69 @@ def test_no_node_is_a_bus_error_with_the_table_and_a_document(emb_run: EmbRun, e
     assert not list(tmp_path.glob("*.mcap"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_in_the_middle_ends_the_run_with_stop_frames_and_a_whole_log(
-    emb_run: EmbRun, sim: Sim, number: signal.Signals
+def press(number: signal.Signals, _node: object) -> None:
+    signal.raise_signal(number)
+
+
+def test_a_signal_in_the_middle_ends_the_run_with_stop_frames_and_a_whole_log(emb_run: EmbRun, sim: Sim) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        sim.when(lambda node: node.obeyed == 100, partial(press, number))
+        summary = emb_run.document(code=3)
+        assert summary["result"] == "INTERRUPTED"
+        log = emb_run.log()
+        assert log.complete
+        assert log.end["exit_reason"] == "INTERRUPTED"
+        assert list(log.signals("EMB_Command")["Enable"][-4:]) == [1, 0, 0, 0]
+        Path(summary["log"]).unlink()
+
+
+PRESSED = """
+import importlib, os, sys
+from emb_runtime.system import child_process, entry
+place, number = sys.argv.pop(1), int(sys.argv.pop(1))
+def press(): os.kill(os.getpid(), number)
+find, answer = importlib.import_module, child_process.Child.answer
+def imported(name):
+    if place == "import" and name == "emb_runtime.cli.main":
+        press()
+    return find(name)
+def answered(child, timeout):
+    if place == child._name:
+        press()
+    return answer(child, timeout)
+importlib.import_module, child_process.Child.answer = imported, answered
+sys.exit(entry.emb_run())
+"""
+"""``emb-run`` that gets a signal in an import, while a policy is tried, or while the recorder starts."""
+
+
+def test_a_signal_before_the_run_just_ends_it_and_one_from_then_on_is_a_safety_stop(
+    tmp_path: Path, actor: Path
 ) -> None:
-    sim.when(lambda node: node.obeyed == 100, lambda _node: signal.raise_signal(number))
-    summary = emb_run.document(code=3)
-    assert summary["result"] == "INTERRUPTED"
-    log = emb_run.log()
-    assert log.complete
-    assert log.end["exit_reason"] == "INTERRUPTED"
-    assert list(log.signals("EMB_Command")["Enable"][-4:]) == [1, 0, 0, 0]
+    for place in ("import", "trial", "recorder"):
+        for number in (signal.SIGINT, signal.SIGTERM):
+            log = tmp_path / f"{place}-{int(number)}.mcap"
+            command = [sys.executable, "-c", PRESSED, place, str(int(number)), "--policy", str(actor), "--json"]
+            process = subprocess.Popen(
+                [*command, "--log", str(log)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+            )
+            out, err = process.communicate(timeout=60)
+            assert b"Traceback" not in err, err
+            if place == "recorder":
+                assert (process.returncode, json.loads(out)["result"]) == (3, "INTERRUPTED")
+                assert read_log(log).complete
+            else:
+                assert (process.returncode, out, err, log.exists()) == (-number, b"", b"", False)
+            wait_for(lambda leader=process.pid: not members(leader))
+
+
+def members(leader: int) -> list[int]:
+    """The processes of a session."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            found += [int(entry.name)] if os.getsid(int(entry.name)) == leader else []
+    return found
 
 
 def wait_for(condition: object, seconds: float = 60.0) -> None:

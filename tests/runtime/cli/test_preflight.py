@@ -94,14 +94,6 @@ def test_a_compiled_core_that_is_not_taken_is_a_warning_with_its_reason(findings
     assert line.found == f"Python; {refused.warning}"
 
 
-def test_a_compiled_core_that_nobody_compared_is_a_warning(findings: Findings) -> None:
-    unchecked = Core(compiled=True, text="compiled (mypyc, x86-64), not compared", warning="as EMB_CORE asks")
-    line = lines_of(replace(findings, core=unchecked))["core"]
-    assert (line.verdict, line.found) == (
-        Verdict.WARNING, "compiled (mypyc, x86-64), not compared; as EMB_CORE asks",
-    )  # fmt: skip
-
-
 def test_a_bench_that_is_as_it_should_be_is_ok_in_every_line(findings: Findings) -> None:
     lines = check(findings)
     assert [line.verdict for line in lines] == [Verdict.OK] * len(CHECKS)

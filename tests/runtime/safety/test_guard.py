@@ -353,7 +353,6 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
         ("can/python_can.py", "self._bus.send"),
         ("safety/guard.py", "self._send"),
         ("cli/session.py", "bus.transport.send"),  # handed to the guard, and kept by nobody else
-        ("cli/core_check.py", "guard.send"),  # a guard of its own, in front of a list
         ("control/loop.py", "self.guard.send"),
         ("control/loop.py", "self._send"),  # the loop's own method, which hands the frame to the guard
         ("safety/watchdog_process.py", "transport.send"),  # the watchdog process, which has stop frames only
