@@ -107,7 +107,8 @@ def svg(draw: Callable[[Any], None], rows: int, columns: int, size: tuple[float,
         figure.align_ylabels(axes[:, 0])
         file = io.BytesIO()
         # Figure.savefig would draw everything once more, for the layout alone.
-        FigureCanvasSVG(figure).print_svg(file, metadata={"Date": None, "Creator": None})
+        canvas: Any = FigureCanvasSVG(figure)
+        canvas.print_svg(file, metadata={"Date": None, "Creator": None})
     return file.getvalue()
 
 

@@ -183,7 +183,7 @@ def test_the_motion_that_no_one_brake_explains_is_told(told: Any, outcome: Outco
 
 
 @pytest.mark.parametrize("changes", [{}, {"unexplained": 3.6, "allowed": math.inf}])
-def test_a_motion_that_was_not_judged_says_so(told: Any, outcome: Outcome, changes: dict[str, float]) -> None:
+def test_a_motion_that_was_not_judged_says_so(told: Any, outcome: Outcome, changes: dict[str, Any]) -> None:
     document = told(**changes)
     assert (document["unexplained"], document["unexplained_allowed"]) == (None, None)
     assert "  motion     not judged" in text(document)

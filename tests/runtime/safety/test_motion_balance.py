@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from random import Random
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -93,7 +93,7 @@ class Reference:
             self.at.append(k)
         self.x, self.y = np.array(lines).reshape(-1, 8), np.array(changes)
 
-    def coefficients(self, count: int) -> np.ndarray:
+    def coefficients(self, count: int) -> Any:
         nominal = np.array([1.0] * 4 + [0.0] * 4)[:count]
         weight = math.sqrt(2.0) * self.bench.noise.velocity
         x = np.vstack([self.x[:, :count], weight * np.eye(count)])
@@ -102,7 +102,7 @@ class Reference:
     def range(self, count: int, entries: list[int]) -> float:
         left = self.y - self.x[:, :count] @ self.coefficients(count)
         sums = [0.0, *(sum(r for at, r in zip(self.at, left, strict=True) if at <= entry) for entry in entries)]
-        return max(sums) - min(sums)
+        return float(max(sums) - min(sums))
 
     def unexplained(self, entries: list[int]) -> float:
         return max(self.range(8, entries), self.range(7, entries) - 0.03 * self.bench.limits.velocity)
@@ -167,7 +167,8 @@ def test_a_long_run_keeps_a_coarser_table(samples: int, since: int) -> None:
     """Also where what was dropped is the extreme."""
     rows = played(BENCH, 5, samples, gain=1.2, since=since)
     memory, entries = taken(BENCH, rows)
-    spacing, at, kept = 20, 0, []
+    spacing, at = 20, 0
+    kept: list[int] = []
     while (at := at + spacing) <= samples:
         if len(kept) == 32:
             kept, spacing = kept[1::2], 2 * spacing
@@ -206,7 +207,7 @@ def test_the_edges_of_a_period_that_counts() -> None:
         ({"current_lag": 0.0005}, False),
     ],
 )
-def test_what_the_bench_declares_decides_whether_it_is_judged(changes: dict[str, object], judged: bool) -> None:
+def test_what_the_bench_declares_decides_whether_it_is_judged(changes: dict[str, Any], judged: bool) -> None:
     bench = replace(BENCH, shield=replace(BENCH.shield, **changes))
     assert math.isfinite(balance_model(bench).allowed) == judged
 

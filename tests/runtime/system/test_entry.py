@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -27,12 +28,15 @@ def main():
 """
 
 
-def started(folder: Path, text: str, encoding: str, **streams: int) -> subprocess.CompletedProcess[bytes]:
+def started(folder: Path, text: str, encoding: str, **streams: Any) -> subprocess.CompletedProcess[bytes]:
     (folder / "command.py").write_text(text, encoding="utf-8")
     code = "import sys; from emb_runtime.system.entry import start; sys.exit(start('command', 'interrupted'))"
     paths = os.pathsep.join([str(folder), *filter(None, sys.path)])
     environment = os.environ | {"PYTHONIOENCODING": encoding, "PYTHONPATH": paths}
-    return subprocess.run([sys.executable, "-c", code], env=environment, timeout=120, check=False, **streams)
+    ran: subprocess.CompletedProcess[bytes] = subprocess.run(
+        [sys.executable, "-c", code], env=environment, timeout=120, check=False, **streams
+    )
+    return ran
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252", "ascii:strict", "utf-8"])

@@ -58,7 +58,7 @@ def test_a_shield_that_learns_is_refused_where_its_model_is_not_the_brake_s() ->
     for bench, plant, randomised in cases:
         for shielded in (True, False):
             conditions = Conditions(shielded=shielded, randomised=randomised)
-            arguments = (bench, bench.range_set("pm50"), PARAMETER_NAMES, [], plant, conditions)
+            arguments: Any = (bench, bench.range_set("pm50"), PARAMETER_NAMES, [], plant, conditions)
             with pytest.raises(UsageError):
                 Trials(*arguments, shield="bounded")
             Trials(*arguments)

@@ -259,4 +259,4 @@ class EmbExcitationVectorEnv(
         return brakes
 
 
-register(id=ENV_ID, entry_point=EmbExcitationEnv, vector_entry_point=EmbExcitationVectorEnv)
+register(id=ENV_ID, entry_point=f"{__name__}:EmbExcitationEnv", vector_entry_point=f"{__name__}:EmbExcitationVectorEnv")
