@@ -68,7 +68,7 @@ def trailer(
     entries |= {name: str(value) for name, value in asdict(outcome.counters).items()}
     entries |= {"home": str(outcome.home), "node_at_rest": str(outcome.node_at_rest)}
     entries |= {"goal_reached": str(outcome.goal_reached)}
-    entries |= {name: repr(value) for name, value in motion(outcome).items() if value is not None}
+    entries |= {name: f"{value:.1f}" for name, value in motion(outcome).items() if value is not None}
     if outcome.learnt is not None:
         entries["learnt"] = json.dumps(ranges_of(outcome.learnt))
     if outcome.node_stop_reason is not None:
