@@ -97,7 +97,8 @@ class Reference:
         nominal = np.array([1.0] * 4 + [0.0] * 4)[:count]
         weight = math.sqrt(2.0) * self.bench.noise.velocity
         x = np.vstack([self.x[:, :count], weight * np.eye(count)])
-        return np.linalg.lstsq(x, np.concatenate([self.y, weight * nominal]), rcond=None)[0]
+        found: np.ndarray = np.linalg.lstsq(x, np.concatenate([self.y, weight * nominal]), rcond=None)[0]
+        return found
 
     def range(self, count: int, entries: list[int]) -> float:
         left = self.y - self.x[:, :count] @ self.coefficients(count)
