@@ -196,7 +196,7 @@ def estimate(
         prior: name of ranges that were known beforehand.
         bounds: lowest and highest value to search, by name [SI].
         model: name of the plant; without, the one that was simulated, else ``exact``.
-        method: ``oem``, ``pem``, ``rls`` or ``ensemble``.
+        method: ``oem``, ``pem`` or ``rls``.
         starts: local searches.
         seed: of the searches and the bootstrap.
         profile: add the likelihood profile of every parameter.

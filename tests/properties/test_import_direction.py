@@ -107,13 +107,13 @@ def test_the_bench_computer_s_commands_load_no_heavy_package(module: str, more: 
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
     loaded = {name.partition(".")[0] for name in out.split()}
     heavy = {"torch", "scipy", "numba", "matplotlib", "gymnasium", "onnx", "onnxscript", "rich", "jinja2"}
-    assert not loaded & (heavy | {"emcee", "pyarrow", "pandas", "ray", "asammdf"})
+    assert not loaded & (heavy | {"pyarrow", "pandas", "ray", "asammdf"})
 
 
 def test_an_estimate_loads_no_package_that_takes_longer_than_itself() -> None:
     code = "import sys, emb_bench.analysis.study, emb_bench.report.estimate; print(*sorted(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    slow = {"scipy.stats", "matplotlib", "pyarrow", "pandas", "cantools", "emcee", "polars", "ray", "torch"}
+    slow = {"scipy.stats", "matplotlib", "pyarrow", "pandas", "cantools", "polars", "ray", "torch"}
     assert not slow & set(done.stdout.split())
 
 

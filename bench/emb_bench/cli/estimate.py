@@ -29,11 +29,10 @@ PRIOR = (
 )
 METHODS_EXPLAINED = """\
 methods:
-  oem       output error: the brake whose simulated angle and velocity lie nearest to the measured ones
-  pem       prediction error: a Kalman filter follows the brake, for brakes that are disturbed by more than the model
-  rls       recursive least squares: simple and biased, as a baseline
-  ensemble  output error, and draws from the posterior, for what is not Gaussian
-  windows   output error over windows, each with a start of its own: for machines without a spring and disturbed ones
+  oem      output error: the brake whose simulated angle and velocity lie nearest to the measured ones
+  pem      prediction error: a Kalman filter follows the brake, for brakes that are disturbed by more than the model
+  rls      recursive least squares: simple and biased, as a baseline
+  windows  output error over windows, each with a start of its own: for machines without a spring and disturbed ones
 """
 NUISANCES_EXPLAINED = "\nunknowns for --nuisance, besides the parameters:\n" + "".join(
     f"  {name:17} {said}\n" for name, said in SAID_OF.items()

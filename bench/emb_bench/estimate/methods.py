@@ -15,13 +15,13 @@ from emb_runtime.config.plants import Plant
 from emb_runtime.config.units import CURRENT
 from emb_runtime.errors import UsageError
 
-ALONG = ("oem", "pem", "ensemble")  # Methods that estimate systematic errors along
+ALONG = ("oem", "pem")  # Methods that estimate systematic errors along
 NOT_ALONG = (
     "the bench's systematic errors ([systematic]) are not estimated along by this method, and its intervals do not "
     "allow for them; --method oem does so"
 )
 """Caveat of the other methods."""
-GAPS = ("oem", "pem", "rls", "ensemble")
+GAPS = ("oem", "pem", "rls")
 """Methods that take what acted in periods whose report was lost as unknown, or leave these periods out."""
 
 
@@ -96,10 +96,6 @@ def _run(name: str, problem: Problem, starts: int, seed: int) -> Estimate:
             from emb_bench.estimate import least_squares
 
             return least_squares.estimate(problem)
-        case "ensemble":
-            from emb_bench.estimate import ensemble
-
-            return ensemble.estimate(problem, starts=starts, seed=seed)
         case "windows":
             from emb_bench.estimate import windows
 
@@ -110,8 +106,7 @@ def _run(name: str, problem: Problem, starts: int, seed: int) -> Estimate:
 def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
     """Estimates again from some of the records, by the same method.
 
-    Output error begins where the estimate is, and stands for the ensemble too, whose draws lie around it. The model
-    validation is not repeated: it is that of the first estimate.
+    Output error begins where the estimate is. The model validation is not repeated: it is that of the first estimate.
 
     Args:
         e: the estimate.
@@ -120,7 +115,7 @@ def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
     from emb_bench.estimate.output_error import finished, search, settled
 
     records = tuple(e.records[i] for i in chosen)
-    if e.method not in ("oem", "ensemble"):
+    if e.method != "oem":
         return run_method(e.method, e.bench, e.plant, records, e.asked, starts=1)
     problem = Problem(e.bench, e.plant, e.asked, records)
     known = dict(zip(e.unknowns, e.values.tolist(), strict=True))

@@ -68,7 +68,6 @@ METHODS: Mapping[str, str] = {
     "pem": "prediction error",
     "rls": "recursive least squares",
     "windows": "output error over windows",
-    "ensemble": "ensemble of posterior draws",
 }
 """Estimation methods by their names."""
 TERMS = {
@@ -423,8 +422,6 @@ class Estimate:
     """Standard deviation of the velocity's random walk, as the prediction error method estimates it [rad/s per √s]."""
     load_noise: float = 0.0
     """Standard deviation of the load's random walk, as a current, as it estimates that [A per √s]."""
-    draws: Floats | None = field(default=None, repr=False)
-    """Of the unknowns from the posterior, SI units, shape (m, unknowns); none where the method draws none."""
     caveats: tuple[str, ...] = ()  # Limitations of this method on these records
 
     @property
@@ -443,12 +440,11 @@ class Estimate:
         return deviations
 
     def deviations(self) -> Floats:
-        """Standard deviations to be used: of the draws or the Cramér-Rao bound; at least ``robust`` for a wrong model.
+        """Standard deviations to be used: the Cramér-Rao bound; at least ``robust`` for a wrong model.
 
         They allow for the one suspect that may have moved an unknown most without being noticed (:meth:`open`).
         """
-        own = self.cramer_rao() if self.draws is None else self.draws.std(axis=0, ddof=1) / self._scale
-        wide: Floats = np.hypot(own, self.open())
+        wide: Floats = np.hypot(self.cramer_rao(), self.open())
         return wide if self.validation.fits else np.maximum(wide, self.robust())
 
     def open(self) -> Floats:
@@ -461,22 +457,10 @@ class Estimate:
         found = [suspect for suspect in self.validation.suspects if suspect.moves and suspect.moves[i] > 0.0]
         return max(found, key=lambda suspect: suspect.moves[i], default=None)
 
-    @property
-    def _scale(self) -> Floats:
-        """Factors from deviations to SI units."""
-        return np.array([abs(v) if u.relative else 1.0 for u, v in zip(self.unknowns, self.values, strict=True)])
-
     def intervals(self) -> Floats:
-        """95 % intervals in SI units, shape (unknowns, 2): quantiles of the draws if there are any, else Gaussian.
-
-        Where the model does not fit, they are as much wider than the method's own as ``deviations`` are.
-        """
-        if self.draws is not None:
-            wider = self.deviations() * self._scale / np.maximum(self.draws.std(axis=0, ddof=1), 1e-300)
-            quantiles = np.quantile(self.draws, [0.025, 0.975], axis=0).T
-            widened: Floats = self.values[:, None] + wider[:, None] * (quantiles - self.values[:, None])
-            return widened
-        half = NORMAL_95 * self.deviations() * self._scale
+        """Gaussian 95 % intervals in SI units, shape (unknowns, 2)."""
+        scale = np.array([abs(v) if u.relative else 1.0 for u, v in zip(self.unknowns, self.values, strict=True)])
+        half = NORMAL_95 * self.deviations() * scale
         return np.stack([self.values - half, self.values + half], axis=1)
 
     def correlation(self) -> Floats:

@@ -78,9 +78,6 @@ def ellipses(e: Estimate, truth: BrakeParameters | None) -> bytes:
                 x, y = chosen[column], chosen[row + 1]
                 pair = np.array([x, y])
                 border = ellipse(correlation[np.ix_(pair, pair)] * np.outer(spread[pair], spread[pair]))
-                if e.draws is not None:
-                    drawn = (e.draws[:: max(1, len(e.draws) // 400)][:, pair] - e.values[pair]) * scale[pair]
-                    axis.plot(drawn[:, 0], drawn[:, 1], ".", color=COLOURS[4], markersize=1.5)
                 axis.fill(border[:, 0], border[:, 1], facecolor="#0072B222", edgecolor=COLOURS[0], linewidth=1.1)
                 axis.plot(0.0, 0.0, "o", color=COLOURS[0], markersize=3.5)
                 if truth is not None and all(hasattr(truth, e.unknowns[i].name) for i in pair):

@@ -181,7 +181,7 @@ def three(tmp_path: Path, path: Path, simulate: Simulate) -> list[Path]:
     return [path, *others]
 
 
-@pytest.mark.parametrize("method", ["oem", "pem", "rls"])  # the ensemble takes long
+@pytest.mark.parametrize("method", ["oem", "pem", "rls"])
 def test_every_method_answers_and_says_its_name(path: Path, method: str, replay: Replay) -> None:
     got = replay.document(path, "--method", method, "--starts", "1", "--params", "k_m,f_v")
     assert (got["method_name"], got["method"]) == (method, METHODS[method])

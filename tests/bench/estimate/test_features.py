@@ -92,9 +92,3 @@ def test_play_does_not_go_with_hysteresis(bench: Bench, plant: str, names: tuple
     data = record(bench, bench.plant("exact"), np.ones(50))
     with pytest.raises(UsageError, match=f"plant '{plant}': play does not go with hysteresis"):
         fit(bench, plant, [data], EstimationProblem(("k_m",), names))
-
-
-def test_draws_of_the_posterior_have_no_features(bench: Bench) -> None:
-    data = record(bench, bench.plant("exact"), np.ones(50))
-    with pytest.raises(UsageError, match="use --method oem"):
-        fit(bench, "exact", [data], EstimationProblem(("k_m",), ("hysteresis",)), method="ensemble")

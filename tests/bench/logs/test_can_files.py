@@ -230,7 +230,7 @@ def test_a_file_that_cannot_grow_is_said_at_the_next_frame_and_at_the_end(tmp_pa
 def test_the_base_install_is_enough_and_the_parsers_do_not_load_python_can(path: Path) -> None:
     code = """
 import sys
-for extra in ("scipy", "numba", "matplotlib", "pyarrow", "asammdf", "pandas", "torch", "emcee", "ray"):
+for extra in ("scipy", "numba", "matplotlib", "pyarrow", "asammdf", "pandas", "torch", "ray"):
     sys.modules[extra] = None
 import emb_bench.cli.replay
 emb_bench.cli.replay.parser()
