@@ -198,7 +198,7 @@ echo running >"$state/status"
     [
         ("echo Kernel panic: no init; exit 0", (), ("died before the command ran", "Kernel panic: no init")),
         (RUNNING, (), ("died while the command ran",)),
-        (f"{RUNNING}; sleep 60", ("--slow", "2"), ("did not say 'time runs slowly'",)),
+        (f"{RUNNING}sleep 60", ("--slow", "2"), ("did not say 'time runs slowly'",)),
         (None, (), ("sudo apt-get install user-mode-linux",)),
     ],
     ids=["dies before", "dies under it", "does not slow down", "is not there"],
