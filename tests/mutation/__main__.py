@@ -128,7 +128,8 @@ def digest(module: str) -> str:
     """
     files = [*Path(__file__).parent.glob("*.py"), EQUIVALENT, *(ROOT / name for name in tests_of(module))]
     files += [*(path_of(name) for name in TESTS), ROOT / "tests/conftest.py", ROOT / "tests/independent.py"]
-    files += [ROOT / RUNTIME / "conftest.py", ROOT / "tests/drives.py", *(ROOT / "examples/drives").iterdir()]
+    files += [ROOT / RUNTIME / "conftest.py", ROOT / "tests/drives.py"]
+    files += [path for path in (ROOT / "examples/drives").iterdir() if path.is_file()]
     files += [path_of("config.bench"), path_of("config.bench").with_suffix(".toml")]
     return hashlib.sha256("".join(map(_without_words, sorted(files))).encode()).hexdigest()
 
