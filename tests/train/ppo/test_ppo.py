@@ -238,7 +238,7 @@ def test_a_perceptron_s_outputs_and_gradients_are_those_of_autograd(hidden: tupl
 
 def test_other_layers_are_refused() -> None:
     layers = torch.nn.Sequential(torch.nn.Linear(1, 1), torch.nn.ReLU(), torch.nn.Linear(1, 1))
-    with pytest.raises(UsageError, match="linear layers with tanh"):
+    with pytest.raises(UsageError):
         PerceptronTrainer(layers, layers, 1, 1e-3, 0.5)
 
 

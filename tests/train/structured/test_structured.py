@@ -383,7 +383,7 @@ def test_two_references_meet_the_same_brakes_and_noise() -> None:
 
 def test_an_estimator_that_takes_the_inertia_as_known_refuses_ranges_in_which_it_varies() -> None:
     wide = dataclasses.replace(PM50, high=PM50.high._replace(J=2.0 * BENCH.brake.J))
-    with pytest.raises(UsageError, match="takes J as known"):
+    with pytest.raises(UsageError):
         make_model(BENCH, wide, "euler")
 
 
