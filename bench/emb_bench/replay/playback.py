@@ -18,8 +18,9 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from emb_bench.replay.trace import RUNS_ON, Item, Trace
+from emb_bench.replay.trace import LATCHED, RUNS_ON, Item, Trace
 from emb_runtime.can.e2e import COUNTER_MODULUS
+from emb_runtime.can.messages import Layout
 from emb_runtime.can.transport import STEP_SLACK_NS, TransmitQueueFullError
 from emb_runtime.control.interfaces import Actor
 from emb_runtime.errors import BusError
@@ -31,11 +32,10 @@ _IN_CONTROL = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
 
 _RAISED = frozenset({Fault.BUS_LOST.name, Fault.INTERNAL.name, "LISTENING_FAILED"})
 """Events of a failed wait for a frame."""
-_REFUSED = frozenset({Fault.BUS_LOST.name, "STOP_FRAME_NOT_SENT"})  # Events of a frame that the bus did not take
 _IN_VAIN = frozenset(
     {
         *("SENSOR_LATE", "STOP_FRAME_NOT_SENT", RunState.OVER.name),
-        *(Fault.SENSOR_LOST.name, Fault.NO_NODE.name, Fault.NODE_NOT_READY.name),
+        *(Fault.SENSOR_LOST.name, Fault.NO_NODE.name, Fault.NODE_NOT_READY.name, Fault.NOT_AT_REST.name),
     }
 )
 """Events that follow a wait in which no frame came."""
@@ -51,7 +51,7 @@ class Difference(NamedTuple):
 
 
 class PlaybackOverError(BaseException):
-    """Leaves the loop: the trace has nothing more, or the loop has left the trace. Nothing in the loop catches it."""
+    """Ends the loop: the trace has nothing more, or the loop has left it. What its stop then does counts for nothing."""
 
 
 class _Sent(NamedTuple):
@@ -64,10 +64,12 @@ class Playback:
 
     Args:
         trace: the records of the run.
+        layout: of its bus.
         actor: decides.
     """
 
-    def __init__(self, trace: Trace, actor: Actor) -> None:
+    def __init__(self, trace: Trace, layout: Layout, actor: Actor) -> None:
+        self._layout = layout
         self._items = trace.items
         self._pauses = dict(trace.pauses)
         self._last_ns = trace.last_ns
@@ -80,6 +82,7 @@ class Playback:
         self._reading = "wake_time_ns"  # of the cycle record: the event that the loop dates next
         self._arrived_ns = trace.listening_ns
         self._stops_tried = 0
+        self._is_over = False
         self._tripped = False
         self._sent: list[_Sent] = []
         self._echoed = 0
@@ -174,14 +177,24 @@ class Playback:
         Raises:
             BusError: the bus did not take it.
         """
-        self._stops_tried += self._state is RunState.STOPPING
-        item = None if self.at_end else self._items[self._at]
-        if isinstance(item, EventRecord) and item.code in _REFUSED:
+        if self._is_over:
+            return
+        stops = not self._layout.decode_command(frame).enable
+        self._stops_tried += stops
+        # The first stop frame leaves before its fault is recorded.
+        item = self._behind_the_fault() if stops else None if self.at_end else self._items[self._at]
+        if isinstance(item, EventRecord) and item.code == ("STOP_FRAME_NOT_SENT" if stops else Fault.BUS_LOST.name):
             raise _bus_error(item)
         if self._comes(Fault.SEND_QUEUE_FULL):
             raise TransmitQueueFullError(_detail(self._items[self._at]))
         self._sent.append(_Sent(frame, self._step))
         self._reading = "send_time_ns"
+
+    def _behind_the_fault(self) -> Item | None:
+        """The next record that is not the fault which ended the run, nor the state after it."""
+        skipped = {RunState.STOPPING.name, *LATCHED}
+        rest = self._items[self._at :]
+        return next((item for item in rest if not (isinstance(item, EventRecord) and item.code in skipped)), None)
 
     def stop_requested(self) -> bool:
         """Returns True if the operator had requested the end."""
@@ -265,7 +278,7 @@ class Playback:
     ) -> None:
         recorded = of_step.get(step)
         if recorded is None and self.at_end:
-            raise PlaybackOverError  # the log was cut just there
+            raise self._over()  # the log was cut just there
         if recorded is None or len(recorded) != len(came) or not all(map(_same, recorded, came)):
             self._differ_at(step, what, repr(recorded), repr(came))
 
@@ -288,13 +301,17 @@ class Playback:
     # --- comparing --------------------------------------------------------------------------------------------------
 
     def _next(self) -> Item:
-        if self.at_end:
-            raise PlaybackOverError
+        if self.at_end or self._is_over:
+            raise self._over()
         return self._items[self._at]
 
     def _left(self, came: str) -> PlaybackOverError:
         """The loop has left the trace: nothing after this can be compared."""
         self._differ("what came next", _words(self._items[self._at]), came)
+        return self._over()
+
+    def _over(self) -> PlaybackOverError:
+        self._is_over = True
         return PlaybackOverError()
 
     def _compare_echo(self, echo: Frame) -> None:

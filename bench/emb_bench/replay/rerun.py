@@ -201,7 +201,7 @@ def _play(
 ) -> tuple[Playback, Outcome | None]:
     """One run of the loop; without an outcome if it was left on the way."""
     bench, layout, limit, homing = log.bench, log.layout, _limit(log), run_type(log) is RunType.HOMING
-    playback = Playback(trace, actor)
+    playback = Playback(trace, layout, actor)
     loop = Loop(
         bench=bench,
         layout=layout,

@@ -23,6 +23,7 @@ from emb_runtime.safety.state_machine import FAULTS
 Item = Frame | CycleRecord | EventRecord
 
 SOFT = frozenset(fault.name for fault, info in FAULTS.items() if not info.latched)  # Events of faults that pass
+LATCHED = frozenset(fault.name for fault, info in FAULTS.items() if info.latched)  # Events of faults that end a run
 RUNS_ON = frozenset({RunState.ACTIVE.name, RunState.HOMING.name, "FRAME_REJECTED", REACHED, *SOFT})
 """Events that a cycle may follow which began before them."""
 

@@ -127,8 +127,10 @@ class Loop:
         self._estimate: tuple[float, ...] = ()  # the actor's latest
         self._condition_met = False
         self._met_ns = 0  # from the first sample to that at which it was met, device time
-        self._at_rest = False  # the node has said idle after the stop frames
+        self._at_rest = False  # the newest sample since the first stop frame says idle
         self._leaving: BaseException | None = None  # the first error that is no Exception
+        self._failures: list[tuple[str, BaseException]] = []  # steps of the stop that failed, not yet recorded
+        self._records_failures = False  # the fault that ended the run is recorded
 
     @property
     def state(self) -> RunState:
@@ -500,6 +502,8 @@ class Loop:
             if cause is not None and fault is Fault.INTERNAL:
                 self._attempt("TRACEBACK_FAILED", lambda: self._record_traceback(cause, fault_ns))
             self._record_fault(before, fault, detail, fault_ns)
+        self._records_failures = True
+        self._record_failures()
         for sent in range(1, frames + 1):
             # Each in a period of its own: what stood in the way of one may be gone for the next.
             self._listen(self._now_ns + self._period_ns)
@@ -532,11 +536,18 @@ class Loop:
         return f"the node's last state is {self._last.node_state.name}" if self._last else ""
 
     def _attempt(self, failure: str, call: Callable[[], object]) -> None:
-        """Do a step of the stop. Its failure keeps nothing back; it is recorded as an event."""
+        """Do a step of the stop. Its failure keeps nothing back; it is recorded as an event, after the fault's."""
         try:
             call()
         except BaseException as err:
             self._keep(err)
+            self._failures.append((failure, err))
+        if self._records_failures:
+            self._record_failures()
+
+    def _record_failures(self) -> None:
+        failures, self._failures = self._failures, []
+        for failure, err in failures:
             try:
                 self.journal.push_event(self._now_ns, failure, _one_line(err))
             except BaseException as again:
@@ -574,7 +585,6 @@ class Loop:
 
     def _listen(self, deadline_ns: int, until_idle: bool = False) -> None:
         """Record what comes until a deadline, or until the node has said idle and its status why it stopped."""
-        self._at_rest = False
         self._attempt("LISTENING_FAILED", lambda: self._take_until(deadline_ns, until_idle))
 
     def _take_until(self, deadline_ns: int, until_idle: bool) -> None:
