@@ -11,7 +11,6 @@ from typing import Any
 
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.cli import listen_only, summary
-from emb_runtime.cli.commissioning import commission
 from emb_runtime.cli.live import shown
 from emb_runtime.cli.options import Ask, Plan, Stage, log_folder, log_path, parser, prepare
 from emb_runtime.cli.preflight import CheckResult, RefusedError, Verdict, table
@@ -105,6 +104,8 @@ def main(argv: list[str] | None = None) -> int:
         plan = None if args.commission is not None else prepare(args)
         stop = StopRequest()
         if plan is None:
+            from emb_runtime.cli.commissioning import commission  # takes its time, and no other way needs it
+
             steps = itertools.count()  # the first one only listens
             return commission(args, lambda plan: Operator(plan, stop, briefly=next(steps) > 1).console(), stop)
         console = Operator(plan, stop).console()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import signal
@@ -20,6 +21,7 @@ def leave_ending_to_parent() -> None:
 
 def read_document(fd: int) -> dict[str, Any]:
     """Read what the parent has written for this process, from the memory that it has passed as a file descriptor."""
+    gc.freeze()  # or Python searches all that was imported for garbage before it ends
     with os.fdopen(fd, "rb") as memory:
         memory.seek(0)
         document: dict[str, Any] = json.loads(memory.read())

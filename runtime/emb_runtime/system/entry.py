@@ -39,7 +39,9 @@ def start(
             signal.signal(signal.SIGINT, signal.SIG_DFL)
         if prepare is not None:
             prepare()
+        gc.disable()  # imports leave no garbage to search for
         main: Callable[[], int] = importlib.import_module(module).main
+        gc.enable()
         if not takes_signals:
             signal.signal(signal.SIGINT, handler)
         return main()
