@@ -17,7 +17,7 @@ from emb_runtime.system.terminal import mention, show
 HELP = "shows runs while they go on, in Foxglove or Lichtblick, or in lines"
 DESCRIPTION = """\
 Follow the logs that appear in a folder, as they are written: for viewers, over the Foxglove WebSocket protocol (open
-the address as a connection, and the layout that emb-replay layout writes), or in lines of text. It only reads files:
+the address as a connection, and the layout of the documentation), or in lines of text. It only reads files:
 the runs do not know of it. Ctrl-C ends it. emb-run --live does the same for one run.
 """
 

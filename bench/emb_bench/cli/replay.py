@@ -80,7 +80,6 @@ COMMANDS: Mapping[str, Command] = {
     ),
     "export": Command("emb_bench.export.export", OF_A_LOG),
     "import": Command("emb_bench.cli.import_recording", ANY),
-    "layout": Command("emb_bench.export.layout", ANY),
     "live": Command(
         "emb_bench.cli.live",
         {0: "ended by Ctrl-C, or the one log is over", 2: ANY[2], 6: "the one log is not a log, or is damaged"},

@@ -1,4 +1,4 @@
-"""``emb-replay export``: a log in the formats of other tools."""
+"""``emb-replay export``: a topic of a log as a table, or a picture of the run."""
 
 from __future__ import annotations
 
@@ -6,26 +6,23 @@ import argparse
 from pathlib import Path
 
 from emb_bench.export.picture import ENDINGS, draw_run
-from emb_bench.export.tables import write_csv, write_mf4, write_parquet
-from emb_bench.logs.log import RunLog, read_log
+from emb_bench.export.tables import write_csv, write_parquet
+from emb_bench.logs.log import read_log
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.system.terminal import as_json, show
 
-FRAMES = ("blf", "asc", "log")  # Formats of the frames on the bus
-TABLES = ("csv", "parquet")  # Formats of one topic as a table
-FORMATS = (*FRAMES, *TABLES, "mf4", "plot")
+TABLES = {"csv": write_csv, "parquet": write_parquet}  # Formats of one topic as a table
+FORMATS = (*TABLES, "plot")
 CYCLE = "/cycle"
 
-HELP = "the log as BLF, ASC, candump, CSV, Parquet, MDF 4 or a picture"
+HELP = "a topic of the log as CSV or Parquet, or a picture of the run"
 DESCRIPTION = """\
-Write a log in the format of another tool.
+Write a part of a log for another tool.
 
-  blf asc log  every frame on the bus (Vector BLF and ASC, candump), received and sent
-  csv parquet  one topic as a table, units in the head: the control cycles, or --topic
-  mf4          every topic as a channel group (ASAM MDF 4.10), and the CAN frames as a bus log; time in seconds
+  csv parquet  one topic as a table, with units: the control cycles, or --topic
   plot         a picture of the run, PNG, SVG or PDF by the ending of FILE
 
-FILE ends as its format is called.
+FILE ends as its format is called. The frames on the bus go to BLF, ASC and others by can_logconvert LOG FILE.
 """
 
 
@@ -50,27 +47,10 @@ def run(args: argparse.Namespace) -> int:
     endings = ENDINGS if args.to == "plot" else (f".{args.to}",)
     if args.out.suffix.lower() not in endings:
         raise UsageError(f"{args.out}: expected a file that ends in {', '.join(endings)} with --to {args.to}")
-    if args.to in FRAMES:
-        from emb_bench.export.frames import write_frames  # python-can takes its time to import
-
-        written, missing = write_frames(args.log, args.to, args.out)
-    else:
-        log = read_log(args.log)
-        written, missing = _write(log, args), log.missing
+    log = read_log(args.log)
+    written = draw_run(log, args.out) if args.to == "plot" else TABLES[args.to](log, args.topic or CYCLE, args.out)
     if args.json:
-        show(as_json({"log": str(args.log), "file": str(args.out), "holds": written, "missing": missing}))
+        show(as_json({"log": str(args.log), "file": str(args.out), "holds": written, "missing": log.missing}))
     else:
-        show("\n".join([f"WARNING: {missing}"] * bool(missing) + [f"{args.out}: {written}"]))
+        show("\n".join([f"WARNING: {log.missing}"] * bool(log.missing) + [f"{args.out}: {written}"]))
     return EXIT_DONE
-
-
-def _write(log: RunLog, args: argparse.Namespace) -> str:
-    match args.to:
-        case "csv":
-            return write_csv(log, args.topic or CYCLE, args.out)
-        case "parquet":
-            return write_parquet(log, args.topic or CYCLE, args.out)
-        case "mf4":
-            return write_mf4(log, args.out)
-        case _:
-            return draw_run(log, args.out)

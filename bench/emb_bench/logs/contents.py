@@ -15,7 +15,7 @@ from mcap import records as mcap
 from numpy.typing import NDArray
 
 from emb_bench.logs.chunks import DAMAGE, HEADER, PAD, Chunk, Integers, require, unpack_chunk
-from emb_bench.logs.mcap_reader import LIBRARY, Record, RecordReader, message_of, name_missing
+from emb_bench.logs.mcap_reader import Record, RecordReader, message_of, name_missing
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.system.input_file import open_regular
 
@@ -140,7 +140,7 @@ def read_contents(path: Path) -> Contents:
     try:
         with open_regular(path) as file:
             contents.size = file.seek(0, io.SEEK_END)
-            reader = RecordReader(path, file, contents.size, (LIBRARY,))
+            reader = RecordReader(path, file, contents.size)
             contents.missing = reader.missing
             for begin, end, record in reader.records():
                 contents.add(begin, end, record)

@@ -35,7 +35,6 @@ from emb_runtime.errors import LogError
 
 MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = "emb-excite/"  # Begin of the library's name in the header of a log
-CAN_LIBRARY = "emb-excite-can/"  # Begin of that name in a file that python-can wrote: frames of a bus, but no run
 OUR_SCHEMAS = "emb."  # Begin of the names of our schemas, by which a log is known that another program has copied
 PEEKED = 1000  # Records at the begin of a file of another program in which one of our schemas is looked for
 MOST_CARRIED = 32 << 20  # Size of all attachments and metadata together [bytes]; a policy has 4 MiB at most
@@ -57,15 +56,13 @@ class RecordReader:
         path: name of the file, for messages.
         file: the file.
         size: bytes of it that count; what is appended meanwhile does not.
-        libraries: accepted beginnings of the library's name in its header.
+        library: accepted beginning of the library's name in its header.
 
     Raises:
         LogError: the file is empty, or not a log of ours.
     """
 
-    def __init__(
-        self, path: Path, file: BinaryIO, size: int, libraries: tuple[str, ...] = (LIBRARY, CAN_LIBRARY)
-    ) -> None:
+    def __init__(self, path: Path, file: BinaryIO, size: int, library: str = LIBRARY) -> None:
         self._path, self._file, self._size = path, file, size
         self._carried = 0  # bytes of attachments and metadata
         self._described: dict[tuple[bool, int], mcap.Schema | mcap.Channel] = {}
@@ -89,15 +86,13 @@ class RecordReader:
         except DAMAGE:
             self.header = mcap.Header("", "")
         self._begin = len(MAGIC) + RECORD.size + len(first[1])
-        if first[0] != Opcode.HEADER or not (self.header.library.startswith(libraries) or self._is_copy()):
+        if first[0] != Opcode.HEADER or not (self.header.library.startswith(library) or self._is_copy()):
             raise LogError(f"{path}: an MCAP file, but not a log of emb-run")
         self._add(*first)
 
     def _is_copy(self) -> bool:
         """Returns True for a log of ours that another program has written again: its messages have our schemas."""
-        if self.header.library.startswith((LIBRARY, CAN_LIBRARY)):
-            return False  # of a kind that is not accepted here
-        reader = RecordReader(self._path, self._file, self._size, ("",))
+        reader = RecordReader(self._path, self._file, self._size, "")
         for n, record in enumerate(reader.one_by_one()):
             if isinstance(record, mcap.Schema) and record.name.startswith(OUR_SCHEMAS):
                 return True

@@ -46,7 +46,7 @@ def shown(plan: Plan) -> Iterator[None]:
         if "ready" not in answer:
             raise UsageError(f"--live: {answer.get('error', 'its process gave no answer')}")
         if answer["ready"]:
-            mention(f"live at {answer['ready']}; emb-replay layout writes a layout for it")
+            mention(f"live at {answer['ready']}")
         yield
     finally:
         child.end()

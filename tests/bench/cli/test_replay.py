@@ -426,7 +426,6 @@ def test_the_true_parameters_are_not_made_up(tmp_path: Path, run: SimRun, replay
         ("rerun", [0, 1, 2, 5, 6, 130], "something came out otherwise"),
         ("repair", [0, 2, 6, 130], "not one message in it can be saved"),
         ("export", [0, 2, 6, 130], "the log is not a log"),
-        ("layout", [0, 2, 130], "wrong argument"),
     ],
 )
 def test_the_help_of_a_command_has_its_own_exit_codes(

@@ -12,11 +12,7 @@ import pytest
 from google.protobuf import descriptor_pb2
 from mcap.reader import make_reader
 
-from emb_bench.cli.replay import main
-from emb_bench.export.layout import layout_text
 from emb_runtime.cli.main import main as emb_run
-
-from tests.bench.conftest import Replay  # isort: skip
 
 PATH = re.compile(r"(/[\w/]+)(?:\.(\w+))?")
 
@@ -44,7 +40,7 @@ def schemas(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, di
 
 @pytest.fixture(scope="module")
 def layout() -> dict[str, Any]:
-    document: dict[str, Any] = json.loads(layout_text())
+    document: dict[str, Any] = json.loads(Path("docs/reference/viewer-layout.json").read_text(encoding="utf-8"))
     return document
 
 
@@ -145,11 +141,3 @@ def test_the_scripts_read_what_a_fresh_log_has_and_fill_what_they_declare(
     for topic, fields in script_fields(layout).items():
         assert topic in shown
         assert all(re.search(rf"^\s+{field}: ", code, re.MULTILINE) for field in fields)
-
-
-def test_the_command_writes_the_layout_and_overwrites_nothing(tmp_path: Path, replay: Replay) -> None:
-    out = tmp_path / "layout.json"
-    assert main(["layout", "-o", str(out)]) == 0
-    assert out.read_text(encoding="utf-8") == layout_text()
-    assert "nothing is overwritten" in replay.refused("layout", "-o", out)
-    assert replay.document("layout", "-o", tmp_path / "2.json") == {"file": str(tmp_path / "2.json")}

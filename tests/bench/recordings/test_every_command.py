@@ -24,12 +24,10 @@ WORKS: dict[str, tuple[str, ...]] = {
     "export --to plot": ("export", "RUN", "--to", "plot", "-o", "OUT.png"),
     "repair": ("repair", "RUN", "-o", "OUT.mcap"),
     "live --lines": ("live", "RUN", "--lines"),
-    "layout": ("layout", "-o", "OUT.json"),
 }  # fmt: skip
 LACKS: dict[str, tuple[tuple[str, ...], str]] = {
     "timing": (("timing", "RUN"), "no loop whose timing"),
     "rerun": (("rerun", "RUN"), "no policy.onnx"),
-    "export --to log": (("export", "RUN", "--to", "log", "-o", "OUT.log"), "no frame"),
     "estimate --method rls": (("estimate", "RUN", "--method", "rls"), "another method does"),
     "estimate --model all": (("estimate", "RUN", "--model", "all"), "expected --method oem"),
     "estimate --grow": (("estimate", "RUN", "--grow"), "expected --method oem"),
