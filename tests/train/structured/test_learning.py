@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -58,9 +59,9 @@ def test_a_shield_that_learns_is_refused_where_its_model_is_not_the_brake_s() ->
     for bench, plant, randomised in cases:
         for shielded in (True, False):
             conditions = Conditions(shielded=shielded, randomised=randomised)
-            arguments: tuple[Any, ...] = (bench, bench.range_set("pm50"), PARAMETER_NAMES, [], plant, conditions)
+            begin = partial(Trials, bench, bench.range_set("pm50"), PARAMETER_NAMES, [], plant, conditions)
             with pytest.raises(UsageError):
-                Trials(*arguments, shield="bounded")  # type: ignore[misc]  # a tuple of any length
-            Trials(*arguments)
+                begin(shield="bounded")
+            begin()
     for plant in ("euler", "exact", "stribeck", "jitter"):
         replace(FOUR, plant=plant, shield="bounded").trials(BENCH, [])
