@@ -31,14 +31,7 @@ RANDOM_OBSERVATIONS = 2000
 
 
 def graph_of(module: nn.Module, examples: tuple[Tensor, ...], inputs: list[str], outputs: list[str]) -> onnx.ModelProto:
-    """The graph of a module.
-
-    Args:
-        module: whatever torch can trace.
-        examples: of its arguments; their shapes are those of the graph.
-        inputs: names of its arguments.
-        outputs: names of what it returns.
-    """
+    """The graph of a module."""
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # its chatter is nothing that a user can act on
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter's, about itself
@@ -104,11 +97,6 @@ def random_observations(bench: Bench) -> Floats:
 
 def require_parity(actor: DeployedActor, policy: Policy, observations: Floats) -> float:
     """Compare the network with the file, through the runtime's own policy.
-
-    Args:
-        actor: the trained network.
-        policy: the exported file, loaded.
-        observations: shape [M, 3].
 
     Returns:
         The largest difference as a part of the current limit.

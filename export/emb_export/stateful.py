@@ -68,12 +68,6 @@ def export_stateful(
 ) -> tuple[bytes, float]:
     """The file's bytes and how far it is from the module, as a part of the current limit.
 
-    Args:
-        actor: a module of torch, too.
-        bench: what it is for.
-        ranges: the brakes that it is for.
-        provenance: how it came to be.
-
     Raises:
         UsageError: it estimates something that is no parameter of a brake.
         PolicyRefusedError: the file would be refused by the runtime, or differs from the module.
