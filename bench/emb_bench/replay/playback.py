@@ -51,7 +51,7 @@ class Difference(NamedTuple):
 
 
 class PlaybackOverError(BaseException):
-    """Ends the loop: the trace has nothing more, or the loop has left it. What its stop then does counts for nothing."""
+    """Ends the loop: the trace has nothing more, or the loop has left it. What its stop then does does not count."""
 
 
 class _Sent(NamedTuple):
