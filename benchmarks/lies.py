@@ -78,7 +78,7 @@ def played(lie: Lie, policy: Policy, goal: str, seed: int = 1) -> tuple[str, int
 
 
 def size_of(lie: Lie) -> str:
-    """What of it is not honest, in words."""
+    """Part of it that is not honest, in words."""
     told = {name: value for name, value in vars(lie).items() if repr(value) != repr(getattr(HONEST, name))}
     return ", ".join(f"{name} {value:g}" for name, value in told.items() if name != "blind") or "-"
 

@@ -91,7 +91,7 @@ NAMES = ("name", "label", "plant")
 
 
 class Tolerance(NamedTuple):
-    """How far a number may lie from the frozen one."""
+    """Largest distance of a number from the frozen one."""
 
     relative: float
     """Of the largest number in the same list."""
@@ -123,7 +123,7 @@ PAIRED = 0.005
 
 
 class Done(NamedTuple):
-    """What a command said."""
+    """Answer of a command."""
 
     code: int
     out: str
@@ -131,7 +131,7 @@ class Done(NamedTuple):
 
 
 class Spent(NamedTuple):
-    """What a command took."""
+    """Time and memory of a command."""
 
     wall: float
     """[s]."""
@@ -398,7 +398,7 @@ OF_A_RUN = (
 
 
 def run_summary(said: dict[str, Any]) -> dict[str, Any]:
-    """What is compared of a run's document."""
+    """Part of a run's document that is compared."""
     document = said["says"]
     if isinstance(document, dict):
         said["says"] = {key: document[key] for key in OF_A_RUN.split() if key in renamed(document)}

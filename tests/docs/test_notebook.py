@@ -33,7 +33,8 @@ def test_its_outputs_are_stored_for_a_reader_without_python() -> None:
 
 def test_the_example_for_a_log_runs(tmp_path: Path) -> None:
     page = (NOTEBOOK.parents[1] / "docs" / "howto" / "read-a-log.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    example, other = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    example += other
     api.simulate(tmp_path / "run.mcap", duration=0.05)
     done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert done.stdout.startswith("DONE True")

@@ -32,6 +32,6 @@ def test_emb_run_ends_cleanly_at_any_moment_and_leaves_nothing(
     """Some of the moments of ``benchmarks/interrupt.py``, which measures how long it takes, too."""
     moment = part + random.Random(f"{part} {number}").uniform(0.0, 0.3)
     ended = interrupted(tmp_path, moment, number)
-    assert ended.code in (0, 3)
+    assert ended.code in (0, 3, -ended.number)  # by the signal itself while nothing was open
     assert "Traceback" not in ended.said
     assert ended.left == ()

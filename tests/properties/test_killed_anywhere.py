@@ -33,7 +33,7 @@ POLICIES = {
 
 
 class Killed(BaseException):
-    """Stands for kill -9: nothing catches it."""
+    """Stands for kill -9: whoever catches it can neither send nor receive any more."""
 
 
 @settings(max_examples=60, deadline=None)
@@ -54,10 +54,20 @@ def test_a_runtime_killed_at_any_moment_leaves_the_brake_inside_its_limits(
     transport, clock = open_sim(options, BENCH)
     node = transport.node
 
+    dead = False
+
     def send(frame: Frame) -> None:
-        transport.send(frame)
-        if node.obeyed > last_step:
+        nonlocal dead
+        if not dead:
+            transport.send(frame)
+        dead = dead or node.obeyed > last_step
+        if dead:
             raise Killed
+
+    def receive(deadline_ns: int) -> Frame | None:
+        if dead:
+            raise Killed
+        return transport.receive(deadline_ns)
 
     loop = Loop(
         bench=BENCH,
@@ -67,7 +77,7 @@ def test_a_runtime_killed_at_any_moment_leaves_the_brake_inside_its_limits(
         current_limit=6.0,
         steps=500,
         guard=Guard(LAYOUT, BENCH, send),
-        receive=transport.receive,
+        receive=receive,
         clock=clock,
         journal=MemoryJournal(),
         stop_requested=lambda: False,

@@ -186,7 +186,7 @@ def _probes(contract: Contract, bench: Bench) -> list[list[Vector]]:
 
 
 def played(evaluation: Evaluation, sequences: Sequence[Sequence[Vector]]) -> list[Vector]:
-    """What an evaluation gives for the observations of sequences, each from the initial state."""
+    """Outputs of an evaluation for the observations of sequences, each from the initial state."""
     given = []
     for sequence in sequences:
         evaluation.begin()

@@ -50,7 +50,7 @@ def admit_policy(source: str | Path | bytes, bench: Bench, evaluated_by: str = "
 
 
 def _try(data: bytes, bench: Bench, evaluated_by: str) -> str:
-    """What evaluates a policy, by the process that tried it."""
+    """Name of what evaluates a policy, by the process that tried it."""
     document = {
         "policy": base64.b64encode(data).decode(),
         "bench": base64.b64encode(pickle.dumps(bench)).decode(),

@@ -115,7 +115,7 @@ def test_ray_gives_the_same_bytes_and_the_same_words(folder: Path, tmp_path: Pat
 
 def test_what_takes_longer_than_the_limit_has_failed(folder: Path, tmp_path: Path) -> None:
     done = subprocess.run(
-        emb_replay("campaign", str(folder / "1.mcap"), "-o", str(tmp_path / "r"), "--time-limit", "0.001"),
+        emb_replay("campaign", str(folder / "1.mcap"), "-o", str(tmp_path / "r.parquet"), "--time-limit", "0.001"),
         capture_output=True,
         text=True,
         timeout=WAIT,
