@@ -116,7 +116,7 @@ PLAYS = (
         (_signal("recorder", "SIGKILL", LATE), _signal("run", "SIGKILL")), may_lose=HALF_A_SECOND,
     ),
     Play(
-        "recorder_killed", "kill -9 of the recorder", ("done",), (6,), (_signal("recorder", "SIGKILL", LATE),),
+        "recorder_killed", "kill -9 of the recorder", ("LOG_INCOMPLETE",), (6,), (_signal("recorder", "SIGKILL", LATE),),
         stops=False, may_lose=HALF_A_SECOND,
     ),
     Play(
@@ -207,7 +207,7 @@ PLAYS = (
         "bus_off", "the controller goes bus-off", ("BUS_LOST",), (4,), ({"do": "bus_off", "off": True, "after": WHEN},),
     ),
     Play(
-        "disk_full", "the disk fills up in mid-run", ("done",), (6,),
+        "disk_full", "the disk fills up in mid-run", ("LOG_INCOMPLETE",), (6,),
         ({"do": "fill", "where": "/run/small", "after": WHEN},),
         before=({"do": "small_disk", "where": "/run/small", "size": 16 << 20},), log="/run/small/disk_full.mcap",
         stops=False,

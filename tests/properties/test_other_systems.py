@@ -20,6 +20,7 @@ from tests.runtime.drives.mapped import late_bench
 
 ROOT = Path(__file__).parents[2]
 SYSTEMS = ["darwin", "win32"]
+pytestmark = pytest.mark.slow  # those systems themselves are played at night, too
 
 
 def run(system: str, *command: object) -> subprocess.CompletedProcess[str]:
