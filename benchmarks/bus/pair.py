@@ -10,7 +10,7 @@ from __future__ import annotations
 import multiprocessing
 import socket
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -18,7 +18,6 @@ from emb_bench.cli.node import run_node
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.plant_spec import gaussian_noise
 from emb_runtime.can.messages import load_layout
-from emb_runtime.can.recvmmsg import Datagram, DatagramReader, stamp_and_count
 from emb_runtime.can.transport import SocketCan, TransmitQueueFullError
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
@@ -41,15 +40,10 @@ class _LocalSocket(socket.socket):
     def bind(self, address: Any) -> None:
         """It is connected already."""
 
-
-def _marked_as_echoes(sock: socket.socket) -> Callable[[], list[Datagram]]:
-    stamp_and_count(sock)
-    read = DatagramReader(sock.fileno(), _FRAME.size, 16).read
-
-    def confirmed() -> list[Datagram]:
-        return [d._replace(flags=socket.MSG_CONFIRM) if d.data[_PAD_AT] == _MARK else d for d in read()]
-
-    return confirmed
+    def recvmsg(self, *arguments: int) -> Any:  # type: ignore[override]
+        """A frame; a marked one is an echo."""
+        data, control, flags, sender = super().recvmsg(*arguments)
+        return data, control, socket.MSG_CONFIRM if data[_PAD_AT] == _MARK else flags, sender
 
 
 def local_bus(end: socket.socket, clock: Clock) -> SocketCan:
@@ -61,7 +55,6 @@ def local_bus(end: socket.socket, clock: Clock) -> SocketCan:
         "pair",
         clock,
         open_socket=lambda: _LocalSocket(fileno=end.detach()),
-        open_reader=_marked_as_echoes,
     )
 
 

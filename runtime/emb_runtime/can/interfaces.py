@@ -9,7 +9,6 @@ from emb_runtime.can.python_can import PythonCan
 from emb_runtime.can.transport import SocketCan, Transport
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
-from emb_runtime.system.alarm import Alarm
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES
 from emb_runtime.system.clock import Clock, MonotonicClock
 
@@ -43,7 +42,7 @@ def open_transport(iface: str, bench: Bench, identifiers: tuple[int, ...] | None
     if separator and head != "socketcan":
         return PythonCan(head, tail, bench.can.bitrate, clock), clock
     # python-can's own SocketCAN backend cannot tell our echo from a frame of another process on this host.
-    return SocketCan(tail or head, clock, identifiers, make_alarm=Alarm.here), clock
+    return SocketCan(tail or head, clock, identifiers), clock
 
 
 def require_linux(iface: str) -> None:

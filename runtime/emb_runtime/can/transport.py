@@ -11,28 +11,29 @@ import os
 import select
 import socket
 import struct
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from typing import Final, Protocol
+from collections.abc import Callable, Mapping
+from typing import Final, NamedTuple, Protocol
 
-from emb_runtime.can.recvmmsg import Datagram, DatagramReader, stamp_and_count
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
-from emb_runtime.system.alarm import Alarm
 from emb_runtime.system.clock import Clock
 
 # Values of <linux/can.h>, <linux/can/raw.h> and <asm-generic/socket.h> that Python does not name.
 _CAN_FRAME: Final = struct.Struct("=IB3x8s")
 _CAN_RAW_ERR_FILTER: Final = 2
 _SO_RCVBUFFORCE: Final = 33
+_SO_TIMESTAMPNS: Final = 35  # The option that asks for a control message is also its type
+_SO_RXQ_OVFL: Final = 40
+_STAMP: Final = struct.Struct("@ll")
+_COUNT: Final = struct.Struct("@I")
+_LONGEST_FRAME: Final = 72  # bytes of a CAN FD frame, so that one is not taken for a classical frame
+_CONTROL_BYTES: Final = 64  # room for both control messages
 
 _RECEIVE_BUFFER: Final = 4 << 20  # bytes; a classic frame takes about 770, so this is over a second of the bench
-_AT_ONCE: Final = 16  # frames read in one system call; a pair, an echo and a status are four
 _SELECT_LIMIT: Final = 1024  # FD_SETSIZE
 _SFF_MASK: Final = 0x7FF  # the hot path's, as plain numbers
 _MSG_CONFIRM: Final = 0x800
 _MSG_DONTWAIT: Final = 0x40
-_SHORTEST: Final = struct.pack("@ll", 0, 1)  # a time-out of one tick of the kernel, as a struct timeval
 STEP_SLACK_NS: Final = 1_000_000  # A wall clock that stepped by less than a sample time is not noticed [ns]
 
 
@@ -95,22 +96,17 @@ def _wait_readable(descriptor: int, timeout_s: float) -> bool:
     return bool(select.select([descriptor], [], [], timeout_s)[0])
 
 
-def _no_alarm() -> None:
-    return None
+class Datagram(NamedTuple):
+    """One frame as the kernel gives it."""
 
-
-def _stamped_frames(sock: socket.socket) -> Callable[..., Sequence[Datagram]]:
-    stamp_and_count(sock)
-    return DatagramReader(sock.fileno(), _CAN_FRAME.size, _AT_ONCE).read
+    data: bytes
+    wall_ns: int  # Arrival, Unix time [ns]
+    dropped: int | None  # Frames dropped on this socket so far; None if none was just before this one
+    flags: int
 
 
 class SocketCan:
-    """A raw SocketCAN socket: classical frames, kernel time stamps, drop count, error frames, own echo.
-
-    One system call reads all frames that wait; they are then given one by one. With an alarm, the call that waits for
-    a frame has read it when it returns; without, the wait ends with another call. (SO_RCVTIMEO alone would save them
-    both, but counts in ticks of the kernel, several milliseconds: it is there for a signal that came too early.)
-    """
+    """A raw SocketCAN socket: classical frames, kernel time stamps, drop count, error frames, own echo."""
 
     truth = None
 
@@ -122,8 +118,6 @@ class SocketCan:
         *,
         open_socket: Callable[[], socket.socket] = _raw_socket,
         wait_readable: Callable[[int, float], bool] = _wait_readable,
-        open_reader: Callable[[socket.socket], Callable[..., Sequence[Datagram]]] = _stamped_frames,
-        make_alarm: Callable[[], Alarm | None] = _no_alarm,
     ) -> None:
         """Open and bind the socket.
 
@@ -133,8 +127,6 @@ class SocketCan:
             identifiers: the only 11-bit identifiers the kernel should pass on; None for all frames, empty for none.
             open_socket: makes the unbound socket.
             wait_readable: waits for a descriptor, at most so many seconds.
-            open_reader: prepares a socket for reading all that waits on it, stamped and counted; ``wait=True`` blocks.
-            make_alarm: makes what ends a read that blocks, for the thread that receives; None if there is none.
 
         Raises:
             BusError: this kernel has no CAN, or the interface does not exist or is down.
@@ -143,8 +135,6 @@ class SocketCan:
         self._clock = clock
         self._wait_readable = wait_readable
         self._dropped = 0
-        self._waiting: deque[Datagram] = deque()
-        self._emptied = False  # the last read left nothing behind
         self._lost, self._lost_ns = "", 0
         try:
             self._socket = open_socket()
@@ -156,15 +146,10 @@ class SocketCan:
             ) from err
         try:
             self._set_up(interface, identifiers)
-            self._read_waiting = open_reader(self._socket)
         except BaseException:
             self._socket.close()
             raise
         self._wall_offset_ns = clock.wall_offset_ns()
-        self._alarm = make_alarm()
-        if self._alarm is not None:
-            self._socket.setblocking(True)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _SHORTEST)
 
     def _set_up(self, interface: str, identifiers: tuple[int, ...] | None) -> None:
         sock = self._socket
@@ -181,6 +166,8 @@ class SocketCan:
             "identifiers": "all" if identifiers is None else ", ".join(f"{i:#05x}" for i in identifiers) or "none",
         }
         """See :attr:`Transport.obtained`."""
+        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
         sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 1)
         sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, 0 if identifiers == () else socket.CAN_ERR_MASK)
         if identifiers is not None:
@@ -228,49 +215,48 @@ class SocketCan:
         The kernel says once that the interface is down and then stays silent: until a frame comes again, not one that
         had waited, that silence is an error too.
         """
-        if not (self._waiting or self._read()):
-            # Only looking costs no clock read: where that is a system call, it is a good part of a cycle.
-            empty_ns = self._wait(deadline_ns) if deadline_ns > 0 else None
-            if empty_ns is None:
+        datagram = self._read()
+        if datagram is None:
+            datagram = self._wait(deadline_ns) if deadline_ns > 0 else None
+            if datagram is None:
                 if self._lost:
                     raise BusError(self._lost)
                 return None
-            self._keep_offset(empty_ns, deadline_ns)
-        frame = self._frame(self._waiting.popleft())
+        frame = self._frame(datagram)
         if self._lost and frame.time_ns > self._lost_ns:
             self._lost = ""
         return frame
 
     def close(self) -> None:
         """See :meth:`Transport.close`."""
-        if self._alarm is not None:
-            self._alarm.close()
         self._socket.close()
 
-    def gave_newest(self) -> bool:
-        """Returns True if nothing had come after the frame given last when it was read."""
-        return self._emptied and not self._waiting
-
-    def _wait(self, deadline_ns: int) -> int | None:
-        """Wait for a frame until a deadline; when nothing had come yet [ns], or None if nothing came."""
+    def _wait(self, deadline_ns: int) -> Datagram | None:
+        """Wait for a frame until a deadline [ns]."""
         while (now_ns := self._clock.now_ns()) < deadline_ns:
-            if self._alarm is not None:
-                self._alarm.set(deadline_ns)
-            elif not self._wait_readable(self._descriptor, (deadline_ns - now_ns) * 1e-9):
+            if not self._wait_readable(self._descriptor, (deadline_ns - now_ns) * 1e-9):
                 return None
-            if self._read(wait=self._alarm is not None):
-                return now_ns
+            if (datagram := self._read()) is not None:
+                self._keep_offset(datagram, now_ns, deadline_ns)
+                return datagram
         return None
 
-    def _read(self, *, wait: bool = False) -> bool:
-        """Read all that waits, or wait for one that does; returns True if anything came."""
+    def _read(self) -> Datagram | None:
+        """The next frame that waits, if one does."""
         try:
-            found = self._read_waiting(wait=True) if wait else self._read_waiting()
-            self._waiting.extend(found)
-            self._emptied = len(found) < _AT_ONCE
+            data, control, flags, _ = self._socket.recvmsg(_LONGEST_FRAME, _CONTROL_BYTES, _MSG_DONTWAIT)
+        except BlockingIOError:
+            return None
         except OSError as err:
             raise self._lose(err.errno) from err
-        return bool(self._waiting)
+        wall_ns, dropped = 0, None
+        for _level, kind, value in control:
+            if kind == _SO_TIMESTAMPNS:
+                seconds, nanoseconds = _STAMP.unpack(value)
+                wall_ns = seconds * 1_000_000_000 + nanoseconds
+            elif kind == _SO_RXQ_OVFL:
+                (dropped,) = _COUNT.unpack(value)
+        return Datagram(data, wall_ns, dropped, flags)
 
     def _frame(self, datagram: Datagram) -> Frame:
         raw, wall_ns, dropped, flags = datagram
@@ -296,12 +282,12 @@ class SocketCan:
             dropped=self._dropped,
         )
 
-    def _keep_offset(self, empty_ns: int, deadline_ns: int) -> None:
+    def _keep_offset(self, datagram: Datagram, empty_ns: int, deadline_ns: int) -> None:
         """Measure the wall clock's offset anew if it has stepped since, judged by a frame that came while we waited.
 
         The queue was empty just before, so the frame cannot be older than that, nor younger than the deadline.
         """
-        time_ns = self._waiting[0].wall_ns - self._wall_offset_ns
+        time_ns = datagram.wall_ns - self._wall_offset_ns
         if not empty_ns - STEP_SLACK_NS <= time_ns <= deadline_ns + STEP_SLACK_NS:
             self._wall_offset_ns = self._clock.wall_offset_ns()
 

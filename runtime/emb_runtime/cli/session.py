@@ -15,7 +15,7 @@ from pathlib import Path
 from textwrap import shorten
 
 from emb_runtime.can.messages import Layout
-from emb_runtime.can.transport import SocketCan, Transport, is_private
+from emb_runtime.can.transport import Transport, is_private
 from emb_runtime.cli.bus_monitor import BusMonitor, BusStatistics, is_alarming, listen
 from emb_runtime.cli.options import Plan, Stage
 from emb_runtime.cli.preflight import CheckResult, Findings, check, interrupted, refuse
@@ -38,7 +38,7 @@ from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.watchdog import WatchdogHandle
 from emb_runtime.system import compiled_core, realtime
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES
-from emb_runtime.system.clock import Clock, is_dear
+from emb_runtime.system.clock import Clock
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,6 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
                 guard=Guard(plan.layout, plan.bench, bus.transport.send, pulse, plan.limit),
                 receive=paced_receive(bus, recorder),
                 clock=bus.clock,
-                gave_newest=newest_of(bus),
                 journal=recorder,
                 stop_requested=console.stop_requested,
                 pulse=pulse,
@@ -325,9 +324,3 @@ def paced_receive(bus: Bus, recorder: Recorder) -> Callable[[int], Frame | None]
         return receive(deadline_ns)
 
     return wait_and_receive
-
-
-def newest_of(bus: Bus) -> Callable[[], bool] | None:
-    """The receiver's word that a frame is the newest, where a clock reading is dear; None elsewhere, or without one."""
-    transport = bus.transport
-    return transport.gave_newest if isinstance(transport, SocketCan) and is_dear(bus.clock) else None

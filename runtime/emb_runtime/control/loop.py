@@ -7,8 +7,7 @@ answers the newest sample or is not sent: nothing repeats a command.
 
 The clock is read once per event, in :meth:`Loop._read_clock`, and the cycle record keeps each reading that decides
 anything: a sample or a timeout is in hand (``wake_time_ns``), the command is decided, the command is sent. What a frame
-says is dated by the frame's own stamp, and a missed period by its deadline. Where a reading is a good part of a cycle
-(User-Mode Linux), a sample that is the newest is in hand when it arrives.
+says is dated by the frame's own stamp, and a missed period by its deadline.
 """
 
 from __future__ import annotations
@@ -83,9 +82,6 @@ class Loop:
     """The sensor monitor judges, and limits the first move; not in a rerun of a log of a version without it."""
     constant_first_move: bool = False
     """The limit of the first move is constant, as in a log of a version that did not reckon with friction."""
-    gave_newest: Callable[[], bool] | None = None
-    """Returns True if nothing had come after the received frame when it was read: given where reading the clock is too
-    dear for a sample that is known to be the newest."""
     overheard: Sequence[Frame] = ()  # Frames from just before the run that must not be missed
 
     def __post_init__(self) -> None:
@@ -322,10 +318,7 @@ class Loop:
 
     def _wake(self) -> int:
         """Read the clock for a sample or a timeout in hand, and exchange signs of life with the watchdog."""
-        return self._show_life(self._read_clock())
-
-    def _show_life(self, now_ns: int) -> int:
-        self._now_ns = now_ns
+        now_ns = self._read_clock()
         self.pulse.beat(now_ns)
         if not self.pulse.watched(now_ns):
             raise StopError(Fault.WATCHDOG_LOST)
@@ -333,9 +326,6 @@ class Loop:
 
     def _newest(self, sample: SensorSample) -> SensorSample:
         """Replace a sample by what has come meanwhile: the node obeys an answer to its newest sample only."""
-        if self.gave_newest is not None and self.gave_newest():
-            self._wake_ns = self._show_life(sample.receive_time_ns)
-            return sample
         self._wake_ns = self._wake()
         if self._wake_ns - sample.receive_time_ns < self._period_ns // 2:
             return sample  # the next one is not due yet

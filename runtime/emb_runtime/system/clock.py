@@ -5,8 +5,7 @@ from __future__ import annotations
 import ctypes
 import sys
 import time
-from itertools import pairwise
-from typing import Final, Protocol
+from typing import Protocol
 
 _TIMER_ABSTIME = 1
 _clock_nanosleep = ctypes.CDLL(None).clock_nanosleep if sys.platform == "linux" else None
@@ -62,15 +61,6 @@ class MonotonicClock:
             else:
                 _clock_nanosleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(wake), None)
         return now_ns
-
-
-DEAR_NS: Final = 2_000
-"""Duration of a reading that is a system call, where those are dear [ns]; elsewhere it takes a fiftieth."""
-
-
-def is_dear(clock: Clock) -> bool:
-    """Returns True if reading a clock takes a good part of a cycle, as in User-Mode Linux."""
-    return min(after - before for before, after in pairwise(clock.now_ns() for _ in range(9))) > DEAR_NS
 
 
 class SteppedClock:

@@ -160,12 +160,6 @@ def test_on_a_hostile_bus_whatever_happened_happens_again(again: Again, name: st
         assert_reproduced(again(run), run)
 
 
-def test_a_run_with_a_dear_clock_comes_out_again(recorded: Callable[..., Driven], again: Again) -> None:
-    run = recorded(gave_newest=lambda: True)
-    assert run.outcome.fault is None
-    assert_reproduced(again(run), run)
-
-
 def test_the_hostile_bus_is_hostile_enough() -> None:
     runs = [run for name in MISBEHAVIOUR for run in hostile_runs(name)]
     faults = {run.outcome.fault for run in runs}

@@ -4,6 +4,7 @@ import errno
 import itertools
 import os
 import socket
+import struct
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -16,13 +17,10 @@ from can.interfaces.virtual import VirtualBus
 
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.python_can import PythonCan
-from emb_runtime.can.recvmmsg import Datagram
-from emb_runtime.can.transport import SocketCan, TransmitQueueFullError, Transport
-from emb_runtime.cli.session import Bus, newest_of
+from emb_runtime.can.transport import Datagram, SocketCan, TransmitQueueFullError, Transport
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import BusError, UsageError
 from emb_runtime.records import Frame
-from emb_runtime.system.alarm import Alarm
 from emb_runtime.system.clock import Clock, MonotonicClock, SteppedClock
 
 WALL_NS = 1_700_000_000_000_000_000
@@ -88,23 +86,18 @@ class FakeSocket:
         self.sent.append(data)
         return len(data)
 
-    def read(self, *, wait: bool = False) -> list[Datagram]:
-        """All that waits, up to the first error: as recvmmsg does it. With ``wait``, what the script brings first."""
-        assert self.blocking or not wait
+    def recvmsg(self, size: int, _control: int, flags: int) -> tuple[bytes, list[tuple[int, int, bytes]], int, None]:
+        assert flags == socket.MSG_DONTWAIT
         self.reads += 1
-        if wait and not self.incoming and self.script:
-            self.script.popleft()()
-        found: list[Datagram] = []
-        while self.incoming:
-            item = self.incoming[0]
-            if isinstance(item, OSError):
-                if found:
-                    break
-                self.incoming.popleft()
-                raise item
-            found.append(item)
-            self.incoming.popleft()
-        return found
+        if not self.incoming:
+            raise BlockingIOError
+        item = self.incoming.popleft()
+        if isinstance(item, OSError):
+            raise item
+        control = [(socket.SOL_SOCKET, 35, struct.pack("@ll", *divmod(item.wall_ns, SECOND)))]
+        if item.dropped is not None:
+            control.append((socket.SOL_SOCKET, 40, struct.pack("@I", item.dropped)))
+        return item.data[:size], control, item.flags, None
 
     def close(self) -> None:
         self.closed = True
@@ -142,7 +135,6 @@ class Rig:
             identifiers,
             open_socket=lambda: cast(socket.socket, self.socket),
             wait_readable=self.wait,
-            open_reader=lambda _: self.socket.read,
         )
 
     def wait(self, descriptor: int, timeout_s: float) -> bool:
@@ -320,15 +312,6 @@ def test_frames_that_came_before_the_interface_went_down_are_given_and_do_not_me
         rig.bus.receive(0)
 
 
-def test_frames_that_wait_together_are_one_system_call_and_are_given_in_order() -> None:
-    rig = Rig()
-    for identifier in (0x080, 0x100, 0x101):
-        rig.socket.arrives(identifier)
-    given = [rig.bus.receive(0) for _ in range(3)]
-    assert [frame.identifier for frame in given if frame] == [0x080, 0x100, 0x101]
-    assert rig.socket.reads == 1
-
-
 def test_a_waiting_frame_is_one_system_call_and_no_wait() -> None:
     rig = Rig()
     rig.socket.arrives(0x100, b"\x01\x02", at_ns=-5_000)
@@ -452,7 +435,6 @@ def test_a_real_wait_sees_what_is_readable_and_what_is_not() -> None:
             "vcan0",
             MonotonicClock(),
             open_socket=lambda: cast(socket.socket, fake),
-            open_reader=lambda _: fake.read,
         )
         now_ns = MonotonicClock().now_ns()
         assert bus.receive(now_ns + 1_000_000) is None
@@ -461,98 +443,6 @@ def test_a_real_wait_sees_what_is_readable_and_what_is_not() -> None:
         reads = fake.reads
         assert bus.receive(MonotonicClock().now_ns() + 5_000_000) is None  # readable, but there is no frame
         assert fake.reads > reads + 1
-
-
-class Bell:
-    """An alarm that only remembers."""
-
-    def __init__(self) -> None:
-        self.set_to: list[int] = []
-        self.closed = False
-
-    def set(self, time_ns: int) -> None:
-        self.set_to.append(time_ns)
-
-    def close(self) -> None:
-        self.closed = True
-
-
-def with_an_alarm(clock: Clock | None = None) -> tuple[SocketCan, FakeSocket, Bell]:
-    """A SocketCan that waits by a read that blocks."""
-    fake, bell = FakeSocket(), Bell()
-
-    def no_select(_descriptor: int, _timeout: float) -> bool:
-        raise AssertionError("the read itself waits")
-
-    bus = SocketCan(
-        "vcan0",
-        clock or SettableClock(),
-        open_socket=lambda: cast(socket.socket, fake),
-        wait_readable=no_select,
-        open_reader=lambda _: fake.read,
-        make_alarm=lambda: cast(Alarm, bell),
-    )
-    return bus, fake, bell
-
-
-def test_with_an_alarm_the_call_that_waits_has_read_the_frame() -> None:
-    bus, fake, bell = with_an_alarm()
-    assert fake.blocking
-    assert fake.options[socket.SOL_SOCKET, socket.SO_RCVTIMEO] == bytes(8) + (1).to_bytes(8, "little")
-    fake.script.append(lambda: fake.arrives(0x101, b"ab", at_ns=700_000))
-    frame = bus.receive(1_000_000)
-    assert frame is not None
-    assert (frame.identifier, frame.data, frame.time_ns) == (0x101, b"ab", 700_000)
-    assert (bell.set_to, fake.reads) == ([1_000_000], 2)  # it had looked before it waited
-    bus.close()
-    assert (bell.closed, fake.closed) == (True, True)
-
-
-def test_a_read_that_ends_without_a_frame_is_tried_again_until_the_deadline() -> None:
-    clock = SettableClock()
-    bus, fake, bell = with_an_alarm(clock)
-    fake.script += [lambda: clock.advance_to(999_999), lambda: clock.advance_to(1_000_000)]
-    assert bus.receive(1_000_000) is None
-    assert bell.set_to == [1_000_000, 1_000_000]
-    assert bus.receive(0) is None  # only looks, and sets none
-    assert len(bell.set_to) == 2
-
-
-def test_a_frame_is_the_newest_if_the_read_left_none_behind() -> None:
-    rig = Rig()
-    for _ in range(2):
-        rig.socket.arrives(0x100)
-    newest = []
-    for _ in range(2):
-        assert rig.bus.receive(0) is not None
-        newest.append(rig.bus.gave_newest())
-    assert newest == [False, True]
-    for _ in range(16):  # as many as one call reads: there may be more
-        rig.socket.arrives(0x100)
-    for _ in range(16):
-        assert rig.bus.receive(0) is not None
-        assert not rig.bus.gave_newest()
-    assert rig.bus.receive(0) is None
-    assert rig.bus.gave_newest()
-
-
-class DearClock(SteppedClock):
-    """A clock of which each reading takes as long as a system call in User-Mode Linux."""
-
-    def now_ns(self) -> int:
-        self.advance_to(super().now_ns() + 7_000)
-        return super().now_ns()
-
-
-def test_the_loop_is_told_which_sample_is_the_newest_where_the_clock_is_dear_and_the_bus_knows() -> None:
-    rig = Rig()
-    told = newest_of(Bus("vcan0", rig.bus, DearClock()))
-    assert told is not None
-    assert told() is False
-    assert newest_of(Bus("vcan0", rig.bus, SteppedClock())) is None
-    with_one = PythonCan("virtual", next(channels), 1_000_000, DearClock())
-    assert newest_of(Bus("virtual:x", with_one, DearClock())) is None
-    with_one.close()
 
 
 @pytest.fixture

@@ -159,9 +159,8 @@ def test_a_damaged_frame_is_not_answered_and_is_logged(simulate: Simulate, layou
     assert_ended_safely(run, layout)
 
 
-@pytest.mark.parametrize("clock_is_dear", [False, True])
 def test_when_several_pairs_wait_the_newest_is_answered_and_the_others_are_recorded(
-    simulate: Simulate, layout: Layout, clock_is_dear: bool
+    simulate: Simulate, layout: Layout
 ) -> None:
     held: list[Frame] = []
 
@@ -179,47 +178,12 @@ def test_when_several_pairs_wait_the_newest_is_answered_and_the_others_are_recor
             return held.pop(0)
         return frame
 
-    run = simulate(on_receive=stall, gave_newest=(lambda: not held) if clock_is_dear else None)
+    run = simulate(on_receive=stall)
     counters = run.outcome.counters
     assert (counters.unanswered, counters.missed, counters.answered, counters.pairs) == (2, 0, 498, 501)
     left = [c for c in run.journal.cycles if c.reasons & Reason.MISSED]
     assert len(left) == counters.unanswered
     assert all(c.command_counter == 15 for c in left)
-    assert_ended_safely(run, layout)
-
-
-def test_where_the_clock_is_dear_the_newest_sample_is_in_hand_when_it_arrives(
-    simulate: Simulate, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    read, reads = SteppedClock.now_ns, 0
-
-    def count(clock: SteppedClock) -> int:
-        nonlocal reads
-        reads += 1
-        return read(clock)
-
-    monkeypatch.setattr(SteppedClock, "now_ns", count)
-    usual = simulate(lambda *_: 2.0)
-    usual_reads, reads = reads, 0
-    run = simulate(lambda *_: 2.0, gave_newest=lambda: True)
-    assert run.outcome == usual.outcome
-    assert run.sent == usual.sent
-    assert all(c.wake_time_ns == c.receive_time_ns for c in run.journal.cycles)
-    assert usual_reads - reads == run.outcome.counters.pairs  # one for each sample
-
-
-def test_where_the_clock_is_dear_a_watchdog_that_is_silent_still_ends_the_run(
-    simulate: Simulate, layout: Layout
-) -> None:
-    class Silent(Unwatched):
-        samples = 0
-
-        def watched(self, _now_ns: int) -> bool:
-            self.samples += 1
-            return self.samples <= 100
-
-    run = simulate(pulse=Silent(), gave_newest=lambda: True)
-    assert run.outcome.fault is Fault.WATCHDOG_LOST
     assert_ended_safely(run, layout)
 
 

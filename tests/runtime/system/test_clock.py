@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_runtime.system.clock import DEAR_NS, Clock, MonotonicClock, SteppedClock, TimeUnwrapper, is_dear
+from emb_runtime.system.clock import Clock, MonotonicClock, SteppedClock, TimeUnwrapper
 
 PERIOD_NS = 4_194_304_000
 
@@ -25,18 +25,6 @@ def test_the_wall_offset_is_the_tightest_of_three_measurements(monkeypatch: pyte
     monkeypatch.setattr(time, "monotonic_ns", lambda: next(monotonic))
     monkeypatch.setattr(time, "time_ns", lambda: next(wall))
     assert MonotonicClock().wall_offset_ns() == 1_000_000
-
-
-@pytest.mark.parametrize(("least_ns", "dear"), [(DEAR_NS, False), (DEAR_NS + 1, True)])
-def test_a_clock_is_dear_by_its_fastest_reading(least_ns: int, dear: bool) -> None:
-    class Slow(SteppedClock):
-        readings = iter([50_000, 50_000, least_ns, *[50_000] * 6])
-
-        def now_ns(self) -> int:
-            self.advance_to(super().now_ns() + next(self.readings))
-            return super().now_ns()
-
-    assert is_dear(Slow()) is dear
 
 
 def test_stepped_time_stands_still_until_it_is_moved() -> None:
