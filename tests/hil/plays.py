@@ -116,7 +116,8 @@ PLAYS = (
         (_signal("recorder", "SIGKILL", LATE), _signal("run", "SIGKILL")), may_lose=HALF_A_SECOND,
     ),
     Play(
-        "recorder_killed", "kill -9 of the recorder", ("LOG_INCOMPLETE",), (6,), (_signal("recorder", "SIGKILL", LATE),),
+        "recorder_killed", "kill -9 of the recorder", ("LOG_INCOMPLETE",), (6,),
+        (_signal("recorder", "SIGKILL", LATE),),
         stops=False, may_lose=HALF_A_SECOND,
     ),
     Play(
