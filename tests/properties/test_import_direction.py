@@ -26,8 +26,8 @@ ROOMS = {
     "commission cli",
     "bench/emb_bench": "numbers compiled figures parallel output brake sim information design excitation logs "
     "recordings experiment export hil replay estimate analysis commission report live batch api cli",
-    "train/emb_train": "names rewards envs structured ppo plants training presets evaluation cli",
-    "export/emb_export": "file network plant stateful export entry",
+    "train/emb_train": "names rewards envs structured ppo training presets evaluation cli entry",
+    "export/emb_export": "file network stateful export entry",
 }
 """Sub-packages and single modules of each package, lowest first: each imports from those before it only."""
 SIDE_BY_SIDE = 14  # The most modules in one room
