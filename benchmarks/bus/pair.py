@@ -40,7 +40,7 @@ class _LocalSocket(socket.socket):
     def bind(self, address: Any) -> None:
         """It is connected already."""
 
-    def recvmsg(self, *arguments: int) -> Any:  # type: ignore[override]
+    def recvmsg(self, *arguments: int) -> Any:
         """A frame; a marked one is an echo."""
         data, control, flags, sender = super().recvmsg(*arguments)
         return data, control, socket.MSG_CONFIRM if data[_PAD_AT] == _MARK else flags, sender
