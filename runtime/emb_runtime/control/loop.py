@@ -480,9 +480,8 @@ class Loop:
             self._attempt("CLOCK_FAILED", self._read_clock)
         tripped, fault_ns, before = self._has_tripped(), self._now_ns, self._machine.run
         if fault is not None:
-            fault = (
-                Fault.WATCHDOG_TRIPPED if tripped else fault
-            )  # it takes the bus from this process: that is the cause
+            if tripped:  # it takes the bus from this process: that is the cause
+                fault = Fault.WATCHDOG_TRIPPED
             self._machine.latch(fault, fault_ns)
         frames = STOP_FRAMES if self.state is RunState.STOPPING and not tripped else 0  # else the watchdog sends them
         if frames:
@@ -507,23 +506,25 @@ class Loop:
         """Let the watchdog go, and watch the node come to rest."""
         self._attempt("DISARM_FAILED", self.pulse.disarm)
         self._attempt("CLOCK_FAILED", self._read_clock)
-        now_ns, before = self._now_ns, self._machine.run
-        if before.fault is None and self._has_tripped():  # while the stop frames went out
-            self._machine.latch(Fault.WATCHDOG_TRIPPED, now_ns)
-            self._record_fault(before, Fault.WATCHDOG_TRIPPED, "", now_ns)
+        if self._machine.run.fault is None and self._has_tripped():  # while the stop frames went out
+            self._fail(Fault.WATCHDOG_TRIPPED, "")
         self._reception.status = None  # what it said of a stop was of another one
-        self._listen(now_ns + STOP_LISTEN_NS, until_idle=True)
-        if self._machine.run.fault is None and not self._at_rest:
-            self._machine.latch(Fault.NOT_AT_REST, self._now_ns)
-            self._record_fault(self._machine.run, Fault.NOT_AT_REST, self._last_state(), self._now_ns)
-        elif (before := self._machine.run).fault is None and self._moves_at_rest:
-            self._machine.latch(Fault.MOTION_UNEXPLAINED, self._now_ns)
-            self._record_fault(before, Fault.MOTION_UNEXPLAINED, self._moves_at_rest, self._now_ns)
+        self._listen(self._now_ns + STOP_LISTEN_NS, until_idle=True)
+        if self._machine.run.fault is None:
+            if not self._at_rest:
+                self._fail(
+                    Fault.NOT_AT_REST, f"the node's last state is {self._last.node_state.name}" if self._last else ""
+                )
+            elif self._moves_at_rest:
+                self._fail(Fault.MOTION_UNEXPLAINED, self._moves_at_rest)
         self._attempt("CLOCK_FAILED", self._read_clock)
         self._attempt("RECORD_FAILED", lambda: self._machine.handle_event(Event.STOPPED, self._now_ns))
 
-    def _last_state(self) -> str:
-        return f"the node's last state is {self._last.node_state.name}" if self._last else ""
+    def _fail(self, fault: Fault, detail: str) -> None:
+        """Take a fault that shows itself while the run is stopped, and record it."""
+        before = self._machine.run
+        self._machine.latch(fault, self._now_ns)
+        self._record_fault(before, fault, detail, self._now_ns)
 
     def _attempt(self, failure: str, call: Callable[[], object]) -> None:
         """Do a step of the stop. Its failure keeps nothing back; it is recorded as an event, after the fault's."""
