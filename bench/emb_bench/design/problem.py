@@ -12,7 +12,7 @@ from emb_bench.brake.parameters import OFFSET, PARAMETERS
 from emb_bench.compiled import compiled
 from emb_bench.design import kernel
 from emb_bench.design.kernel import Box
-from emb_bench.information.criteria import Concave
+from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import Kind, Weights, weights_of
 from emb_bench.information.symmetric import packed_size, unpack
 from emb_bench.sim.open_loop import advance_periods, check_unknowns, trajectory
@@ -33,7 +33,7 @@ class Problem:
     plant: Plant
     brake: BrakeParameters
     params: tuple[str, ...]
-    goal: Concave
+    goal: Criterion
     weights: Weights
     box: Box
     sample_time: float  # [s]
@@ -153,7 +153,7 @@ class Design:
 
 def make_problem(
     bench: Bench,
-    goal: Concave,
+    goal: Criterion,
     params: tuple[str, ...],
     *,
     model: str = DEFAULT_PLANT,

@@ -11,8 +11,7 @@ D is log |M|, A is tr M⁻¹, E is λ_min (Atkinson, Donev and Tobias, Optimum E
   (:mod:`emb_bench.information.symmetric`).
 
 A design's φ are all logarithms, so that they share a scale: 0.1 is worth as much, whatever the criterion. Concavity
-gives the tangent bound φ(M) ≤ φ(M₀) + tr(∇φ(M₀) (M − M₀)), on which both the search and the estimate of what is left
-rest.
+gives the tangent bound φ(M) ≤ φ(M₀) + tr(∇φ(M₀) (M − M₀)), on which the search rests.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, Protocol, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -29,7 +28,6 @@ from emb_bench.information.identifiability import TOUCHED, Spectrum, combination
 from emb_bench.information.symmetric import (
     LOG_DET,
     LOG_LAMBDA_MIN,
-    LOG_TANGENT,
     MINUS_LOG_TRACE,
     SINGULAR,
     Floats,
@@ -163,25 +161,9 @@ def criteria_series(matrices: Floats, params: Sequence[str], interest: Sequence[
     return found
 
 
-class Concave(Protocol):
-    """Concave function of the Fisher information, which a search maximises."""
-
-    def phi(self, m: Floats, softness: float = 0.0) -> Floats:
-        """Its value at one or many matrices, shape (..., p, p) to (...); if it has kinks, rounded by ``softness``."""
-        ...
-
-    def gradient(self, m: Floats) -> Floats:
-        """Its gradient at one matrix, shape (p, p)."""
-        ...
-
-    def compiled(self, size: int) -> Goal:
-        """φ of matrices of a size, for compiled loops."""
-        ...
-
-
 @dataclass(frozen=True)
 class Criterion:
-    """One of the criteria of :data:`NAMES`."""
+    """One of the criteria of :data:`NAMES`: a concave function of the Fisher information, which a search maximises."""
 
     name: Name
     wanted: tuple[int, ...]  # Rows of M that are of interest; the others are nuisances. All of them but for Ds.
@@ -226,7 +208,7 @@ class Criterion:
         """φ for compiled loops: of a singular matrix −inf."""
         kind = {"D": LOG_DET, "A": MINUS_LOG_TRACE, "E": LOG_LAMBDA_MIN, "Ds": LOG_DET}[self.name]
         rest = self._nuisances(size)
-        return Goal(kind, np.array([*rest, *self.wanted], np.int64), len(rest), np.zeros((size, size)))
+        return Goal(kind, np.array([*rest, *self.wanted], np.int64), len(rest))
 
     def value(self, phi: float) -> float:
         """The criterion in its own unit: log |M|, tr M⁻¹, λ_min, log of the determinant of the Schur complement."""
@@ -239,26 +221,6 @@ class Criterion:
 
     def _nuisances(self, size: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
         return np.array([i for i in range(size) if i not in self.wanted], np.int64)
-
-
-@dataclass(frozen=True)
-class Tangent:
-    """log tr(W M): what is maximised to see how far a tangent is from being touched elsewhere."""
-
-    slope: Floats
-
-    def phi(self, m: Floats, softness: float = 0.0) -> Floats:
-        """Of one or many matrices; it has no kinks to round."""
-        return np.asarray(np.log(np.maximum((m * self.slope).sum(axis=(-2, -1)), 1e-300)))
-
-    def gradient(self, m: Floats) -> Floats:
-        """Its gradient."""
-        result: Floats = self.slope / float((m * self.slope).sum())
-        return result
-
-    def compiled(self, size: int) -> Goal:
-        """φ for compiled loops."""
-        return Goal(LOG_TANGENT, np.arange(size), 0, np.asarray(self.slope, np.float64))
 
 
 def criterion(name: Name, params: Sequence[str], of: Sequence[str] = ()) -> Criterion:

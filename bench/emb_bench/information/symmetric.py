@@ -25,9 +25,8 @@ Floats = NDArray[np.float64]
 SINGULAR = 1e-14
 """A pivot below this share of its diagonal element is what rounding leaves of zero after some hundred increments."""
 
-LOG_DET, LAMBDA_MIN, LOG_LAMBDA_MIN, MINUS_LOG_TRACE, LOG_TANGENT = range(5)
-"""Criteria: ln |M| (D), λ_min and ln λ_min (E), −ln tr M⁻¹ (A), and ln tr(W M) of a tangent; :func:`each` has the first
-four, :func:`phi` all but λ_min itself."""
+LOG_DET, LAMBDA_MIN, LOG_LAMBDA_MIN, MINUS_LOG_TRACE = range(4)
+"""Criteria: ln |M| (D), λ_min and ln λ_min (E), −ln tr M⁻¹ (A); :func:`each` has all, :func:`phi` all but λ_min itself."""
 
 _ORTHOGONAL = 1e-15  # cosine of two rows that counts as zero
 _SWEEPS = 30  # Jacobi needs 3 to 6; the bound only guarantees an end
@@ -164,12 +163,11 @@ def lambda_min(m: Floats, work: Floats) -> float:
 
 
 class Goal(NamedTuple):
-    """φ of a :class:`emb_bench.information.criteria.Concave` of n×n matrices, for :func:`phi`."""
+    """φ of a :class:`emb_bench.information.criteria.Criterion` of n×n matrices, for :func:`phi`."""
 
-    criterion: int  # ``LOG_DET``, ``LOG_LAMBDA_MIN``, ``MINUS_LOG_TRACE`` or ``LOG_TANGENT``
+    criterion: int  # ``LOG_DET``, ``LOG_LAMBDA_MIN`` or ``MINUS_LOG_TRACE``
     order: NDArray[np.int64]  # The rows of M, nuisances first, shape (n,)
     nuisances: int  # Their number; 0 for all but Ds
-    slope: Floats  # W of a tangent, shape (n, n); zero for all others
 
 
 def phi(goal: Goal, m: Floats, rows: int, softness: float, packed: Floats, work: Floats) -> float:
@@ -186,15 +184,10 @@ def phi(goal: Goal, m: Floats, rows: int, softness: float, packed: Floats, work:
         work: scratch, shape (n, n).
     """
     n = work.shape[0]
-    tangent = 0.0
     for i in range(n):
         for j in range(i, n):
             a, b = goal.order[i], goal.order[j]
-            element = m[packed_index(rows, min(a, b), max(a, b))]
-            packed[packed_index(n, i, j)] = element
-            tangent += (1.0 if i == j else 2.0) * goal.slope[a, b] * element
-    if goal.criterion == LOG_TANGENT:
-        return math.log(tangent) if tangent > 0.0 else -math.inf
+            packed[packed_index(n, i, j)] = m[packed_index(rows, min(a, b), max(a, b))]
     if not cholesky(packed, work):
         return -math.inf
     if goal.criterion == MINUS_LOG_TRACE:

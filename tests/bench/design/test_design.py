@@ -19,7 +19,7 @@ from emb_bench.design.problem import MARGIN, Problem, make_problem
 from emb_bench.design.report import check
 from emb_bench.design.search import NEAR, coarse, search
 from emb_bench.information import symmetric
-from emb_bench.information.criteria import Concave, Criterion, Name, Tangent, criterion, distances
+from emb_bench.information.criteria import Criterion, Name, criterion, distances
 from emb_bench.information.fisher import Kind
 from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
@@ -99,8 +99,8 @@ def test_e_of_four_parameters_is_found_where_a_brake_waits_before_it_moves() -> 
 
 
 @given(information(), st.sampled_from([0.0, 0.03, 0.3]))
-@pytest.mark.parametrize("goal", [*GOALS, Tangent(np.eye(4))], ids=lambda goal: getattr(goal, "name", "tangent"))
-def test_a_compiled_loop_has_the_same_phi(goal: Concave, m: Floats, softness: float) -> None:
+@pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
+def test_a_compiled_loop_has_the_same_phi(goal: Criterion, m: Floats, softness: float) -> None:
     found = symmetric.phi(goal.compiled(4), symmetric.pack(m), 4, softness, np.empty(10), np.empty((4, 4)))
     assert found == pytest.approx(float(goal.phi(m, softness)), rel=1e-6)
 
@@ -112,8 +112,8 @@ def test_a_compiled_loop_takes_the_unknowns_that_come_first(goal: Criterion, m: 
     assert found == pytest.approx(float(goal.phi(m[:2, :2])), rel=1e-6)
 
 
-@pytest.mark.parametrize("goal", [*GOALS, Tangent(np.eye(4))], ids=lambda goal: getattr(goal, "name", "tangent"))
-def test_a_compiled_loop_has_minus_infinity_where_nothing_is_known(goal: Concave) -> None:
+@pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
+def test_a_compiled_loop_has_minus_infinity_where_nothing_is_known(goal: Criterion) -> None:
     nothing = symmetric.pack(np.zeros((4, 4)))
     assert symmetric.phi(goal.compiled(4), nothing, 4, 0.03, np.empty(10), np.empty((4, 4))) == -math.inf
 
@@ -143,8 +143,7 @@ def test_ds_is_the_determinant_of_the_schur_complement(m: Floats) -> None:
 def test_many_matrices_are_judged_as_each_alone() -> None:
     m = np.random.default_rng(0).normal(size=(5, 4, 7))
     many = m @ m.transpose(0, 2, 1)
-    goals: list[Concave] = [*GOALS, Tangent(many[0])]
-    for goal in goals:
+    for goal in GOALS:
         np.testing.assert_allclose(goal.phi(many), [float(goal.phi(one)) for one in many], rtol=1e-12)
 
 
@@ -154,8 +153,7 @@ def test_e_with_its_kinks_rounded_is_lower_by_no_more_than_four_equal_eigenvalue
 ) -> None:
     lower = float(GOALS[2].phi(m) - GOALS[2].phi(m, soft))
     assert -1e-9 <= lower <= soft * math.log(4.0) + 1e-9
-    smooth: list[Concave] = [*GOALS[:2], GOALS[3], Tangent(m)]
-    for goal in smooth:
+    for goal in (*GOALS[:2], GOALS[3]):
         assert goal.phi(m, soft) == goal.phi(m)
 
 
