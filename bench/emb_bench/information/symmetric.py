@@ -26,7 +26,7 @@ SINGULAR = 1e-14
 """A pivot below this share of its diagonal element is what rounding leaves of zero after some hundred increments."""
 
 LOG_DET, LAMBDA_MIN, LOG_LAMBDA_MIN, MINUS_LOG_TRACE = range(4)
-"""Criteria: ln |M| (D), λ_min and ln λ_min (E), −ln tr M⁻¹ (A); :func:`each` has all, :func:`phi` all but λ_min itself."""
+"""Criteria: ln |M| (D), λ_min and ln λ_min (E), −ln tr M⁻¹ (A); :func:`phi` has all but λ_min itself."""
 
 _ORTHOGONAL = 1e-15  # cosine of two rows that counts as zero
 _SWEEPS = 30  # Jacobi needs 3 to 6; the bound only guarantees an end
