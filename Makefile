@@ -132,7 +132,7 @@ study-thesis: $(VENV)/.dev
 	$(BIN)/python -m studies.thesis --out build/thesis
 
 study-reproduce: $(VENV)/.dev
-	$(BIN)/python -m studies.reproduce --out build/reproduction
+	$(BIN)/python -m studies.thesis.training --out build/reproduction
 
 proof: $(VENV)/.dev
 	$(BIN)/python -m tools.proof
