@@ -60,6 +60,8 @@ CYCLES, FRAMES = "/cycle", ["/can/rx", "/can/tx"]
 """Topics of a log."""
 RENAMED: dict[str, str] = {}
 """Keys of JSON documents: the new name, and the frozen one. ``{"identified": "told"}``."""
+RENAMED_FROZEN = {"told": "identified"}
+"""Frozen keys and their new names, where other frozen documents have the new name already."""
 GONE: dict[str, str] = {}
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, each with the commit that says why."""
 REST = "0abcadc: a run is watched until the node is at rest, and recorded so far"
@@ -868,12 +870,18 @@ def main() -> int:
     return code
 
 
+def _with_new_names(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {RENAMED_FROZEN.get(key, key): _with_new_names(entry) for key, entry in value.items()}
+    return [_with_new_names(entry) for entry in value] if isinstance(value, list) else value
+
+
 def compared(section: str, old: Any, new: Any, words: bool) -> int:
     """Print what differs; 1 if something does."""
     if "emps" not in str(list(new)):
         old = {key: value for key, value in old.items() if not key.startswith("emps")}
     comparison = Comparison(section, words)
-    comparison.compare(section, old, json.loads(json.dumps(new)))
+    comparison.compare(section, _with_new_names(old), json.loads(json.dumps(new)))
     for line in comparison.differences:
         say(line)
     found, explained = len(comparison.differences), len(comparison.explained)

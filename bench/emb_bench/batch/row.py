@@ -58,7 +58,6 @@ def column(about: str, unit: str = "", default: Any = None) -> Any:
     return field(default=default, metadata={"about": about, "unit": unit})
 
 
-COLUMN = {"identified": "told"}  # Columns of the file whose names differ from those of :class:`Parameter`
 RELATIVE = "1, or the unknown's unit"
 """Stands for 1 where a deviation is relative to the value, and for the unit of a parameter without a scale."""
 
@@ -200,9 +199,7 @@ def write_rows(path: Path, ending: str, rows: Sequence[Row], options: Options) -
         for entry in fields(Parameter)[1:]:
             described = dict(entry.metadata) | {"unit": unit_of(name, entry.metadata["unit"])}
             kind = kinds[str(entry.type)]
-            columns.append(
-                pa.field(f"{name}_{COLUMN.get(entry.name, entry.name)}", kind, metadata=_metadata(described))
-            )
+            columns.append(pa.field(f"{name}_{entry.name}", kind, metadata=_metadata(described)))
             values.append(pa.array([getattr(p, entry.name) for p in found], kind))
     about = {
         "tool": f"emb-excite {metadata.version('emb-excite')}",

@@ -144,7 +144,6 @@ def document(c: Campaign) -> dict[str, Any]:
     }
     for name, entry in found["parameters"].items():
         entry["trend"] = _trend_document(c.parameters[name].trend)
-        entry["told"] = entry.pop("identified")
         if entry["estimate"] is None:
             del entry["estimate"]
     return found

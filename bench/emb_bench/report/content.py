@@ -362,7 +362,7 @@ def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
         said["alone"] = {
             "model_fits": run.alone.model_fits,
             "conclusions": [
-                {"label": c.label, "value": c.value, "interval_95": list(c.interval), "told": c.identified}
+                {"label": c.label, "value": c.value, "interval_95": list(c.interval), "identified": c.identified}
                 for c in run.alone.conclusions
             ],
         }

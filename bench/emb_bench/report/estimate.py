@@ -74,7 +74,7 @@ def document(study: Study) -> dict[str, Any]:
         "conclusions": [
             _fields(c, "label", "value", "unit")
             | {"interval": list(c.interval)}
-            | {"of_interest": c.of_interest, "told": c.identified, "why_not": c.why_not}
+            | {"of_interest": c.of_interest, "identified": c.identified, "why_not": c.why_not}
             | {"words": phrase("conclusion", c)}
             for c in study.conclusions
         ],
@@ -174,7 +174,7 @@ def _parameters(study: Study) -> dict[str, dict[str, Any]]:
             "sandwich": float(robust),
             "left_open": float(left_open),
             "left_open_by": None if (suspect := e.left_open_by(i)) is None else suspect.name,
-            "told": c.identified,
+            "identified": c.identified,
             "why_not": c.why_not,
             "traded_with": {} if finding is None else dict(finding.traded_with),
             "at_bound": c.label in e.at_bound,

@@ -66,8 +66,8 @@ def document(evaluation: Evaluation) -> dict[str, Any]:
     document["physical"] |= {
         "cramer_rao": fisher.cramer_rao(),
         "correlation": fisher.correlation().tolist(),
-        "told": verdict.identified,
-        "findings": [asdict(finding) | {"told": finding.identified} for finding in verdict.findings],
+        "identified": verdict.identified,
+        "findings": [asdict(finding) | {"identified": finding.identified} for finding in verdict.findings],
         "directions": [asdict(direction) for direction in verdict.directions],
     }
     return document

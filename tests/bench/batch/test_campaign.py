@@ -130,7 +130,7 @@ def test_rows_say_what_fim_says_of_the_log_alone(folder: Path, said: Said, repla
         for name in ("log_det", "lambda_min", "trace_inverse"):
             assert finite(row[name]) == its["physical"][name]
             assert finite(row[f"weighted_{name}"]) == its["weighted"][name]
-        told = {finding["name"]: finding["told"] for finding in its["physical"]["findings"]}
+        told = {finding["name"]: finding["identified"] for finding in its["physical"]["findings"]}
         assert {name: finite(row[f"{name}_cramer_rao"]) for name in told} == its["physical"]["cramer_rao"]
         assert (row["nominal_angle_sigmas"], row["nominal_velocity_sigmas"], row["nominal_fits"]) == (
             its["fit_sigmas"]["angle"],
@@ -150,7 +150,7 @@ def test_rows_say_what_estimate_says_of_the_log_alone(folder: Path, said: Said, 
             assert row[f"{name}_estimate"] == found["value"]
             assert [finite(row[f"{name}_low"]), finite(row[f"{name}_high"])] == found["interval_95"]
             assert finite(row[f"{name}_deviation"]) == found["deviation"]
-            assert (row[f"{name}_told"], row[f"{name}_true"]) == (found["told"], found.get("true"))
+            assert (row[f"{name}_identified"], row[f"{name}_true"]) == (found["identified"], found.get("true"))
             if "true" not in found:
                 assert row[f"{name}_error_sigmas"] is None
                 continue

@@ -127,10 +127,10 @@ def test_nuisances_cost_information_and_a_prior_gives_some(log: Log, replay: Rep
     for name, bound in alone["physical"]["cramer_rao"].items():
         assert bound < along["physical"]["cramer_rao"][name]
     inertia = replay.document("fim", path, "--nuisance", "J")["physical"]
-    assert (inertia["told"], inertia["log_det"]) == (False, None)
+    assert (inertia["identified"], inertia["log_det"]) == (False, None)
     known = replay.document("fim", path, "--nuisance", "J", "--prior", "pm50")
     assert known["prior"] == "pm50"
-    assert known["physical"]["told"]
+    assert known["physical"]["identified"]
     difference = np.array(known["physical"]["matrix"]) - np.array(inertia["matrix"])
     np.testing.assert_allclose(np.diag(difference), [12.0, 12.0, 12.0, 12.0, 0.0], rtol=1e-3, atol=1e-3)
     assert "prior        the ranges 'pm50'" in replay.text("fim", path, "--prior", "pm50")

@@ -147,7 +147,7 @@ def test_each_parameter_is_concluded_with_value_interval_and_truth(report: Repor
     numbers = report.numbers["estimate"]["parameters"]
     assert numbers["f_v"]["true"] == 3e-5
     for concluded in report.numbers["estimate"]["conclusions"]:
-        assert concluded["told"]
+        assert concluded["identified"]
         shown, _, standing = concluded["words"].partition("; ")
         assert standing == "identified"
         assert f"{concluded['label']} {shown}" in report.reader.text
