@@ -20,12 +20,14 @@ Counted is how many end with that range named, no bench file written and no limi
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
 import re
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +36,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "drives"))  # which registers sim-drive
 
 import simulated_drives
-from emb_bench.commission.examiner import LogExaminer
+from emb_bench.commission.commissioning import Commissioning
 from emb_bench.sim import transport
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.simulated_brake import SimulatedBrake
-from emb_runtime.cli.commissioning import Commissioning
-from emb_runtime.cli.session import Console
-from emb_runtime.commission.bench_file import measured_ranges
+from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import EmbError
@@ -62,6 +62,14 @@ def recorded(kind: type[SimulatedBrake]) -> Callable[..., SimulatedBrake]:
         return brakes[-1]
 
     return make
+
+
+def run(arguments: Sequence[str]) -> dict[str, Any]:
+    """``emb-run --json`` in this process, for the true extremes of its brake."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exit_code = emb_run(list(arguments))
+    return {**json.loads(printed.getvalue()), "exit_code": exit_code}
 
 
 def mapped_iface(folder: Path, name: str) -> str:
@@ -124,13 +132,12 @@ def commissioned(
     options = {"plant": "drawn", "seed": 1000 * number + 1, **drawn, **{f"{n}_noise": v for n, v in noise.items()}}
     bus = mapped_iface(folder, drive) if plant == "mapped" else "sim:"
     iface = bus + ",".join(f"{name}={value}" for name, value in options.items())
-    alone = Console(stop_requested=lambda: False, show=lambda *_: None, may_arm=lambda _: True)
     brakes.clear()
     begin = time.perf_counter()
     name = drive if plant == "mapped" else plant
     row: dict[str, Any] = {"number": number, "plant": name, "truth": drawn, "outside": outside, "error": ""}
     try:
-        result = Commissioning(folder, sheet, iface, (), LogExaminer(), lambda _: alone, said).run()
+        result = Commissioning(folder, sheet, iface, ("--yes",), run, said).run()
     except EmbError as err:
         row["error"] = str(err)
         result = None
@@ -142,9 +149,8 @@ def commissioned(
         row["named"] = widened is not None and outside in widened[1].split(", ")
         row["written"] = (folder / "bench.toml").exists()
         row["refused"] = row["named"] and not row["written"] and not row["passed"]
-    if result is not None and result.found.identified is not None:
-        one = result.found.identified
-        found = measured_ranges(sheet, one)
+    if result is not None:
+        one, found = result.identified, result.ranges
         row |= {"model": one.model, "fits": one.fits, "delays": (one.command_delay, one.measurement_delay)}
         row["inside"] = {n: bool(found[n][0] <= drawn[n] <= found[n][1]) for n in PARAMETER_NAMES}
         row["in_95"] = {n: bool(one.intervals[n][0] <= drawn[n] <= one.intervals[n][1]) for n in PARAMETER_NAMES}

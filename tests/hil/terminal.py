@@ -29,7 +29,7 @@ PAUSE = 0.3  # Time that a question stays unanswered, in which nothing may leave
 
 
 class Scene:
-    """One call of emb-run with a terminal."""
+    """One call of emb-commission with a terminal."""
 
     def __init__(self, scene: dict[str, Any], commands: Any) -> None:
         self.answers: list[str] = list(scene.get("answers", ()))
@@ -38,7 +38,7 @@ class Scene:
         self.questions: list[tuple[int, int]] = []
         self.process, self.terminal = pty.fork()
         if self.process == 0:
-            os.execv(sys.executable, [sys.executable, "-m", "emb_runtime.cli.main", *scene["run"]])
+            os.execv(sys.executable, [sys.executable, "-m", "emb_bench.cli.commission", *scene["run"]])
 
     def count(self) -> int:
         """Command frames on the bus so far."""

@@ -1,4 +1,4 @@
-"""A commissioning on a vcan0, from a terminal: node, loop, watchdog and examiner are processes, in slow time.
+"""A commissioning on a vcan0, from a terminal: node, loop and watchdog are processes, in slow time.
 
 What a person at a bench goes through: no node yet; a step that is interrupted, one that is not agreed to, another bench
 identity of the node before the last step; and each time the same command again. Then the same brake behind a drive
@@ -19,7 +19,7 @@ import pytest
 
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import load_bench
-from tests.bench.commission.test_examiner import TRUTH, mapping_for, sheet
+from tests.bench.commission.test_commissioning import TRUTH, mapping_for, sheet
 from tests.drives import EXAMPLES
 from tests.hil.plays import ROOT, SLOWLY
 
@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "sheet.toml").write_text(sheet().text.replace("[0, 3]", "[0, 0]"))
 
     def call(iface: str, bench: str, into: str, *more: str) -> list[str]:
-        return ["--iface", iface, "--bench", str(folder / bench), "--commission", str(folder / into), "--no-rt", *more]
+        return [str(folder / into), "--iface", iface, "--bench", str(folder / bench), "--no-rt", *more]
 
     run = call("vcan0", "sheet.toml", "brake")
     (folder / "late.toml").write_text(sheet().text.replace("[0, 3]", "[0, 1]"))
@@ -79,8 +79,8 @@ def steps_begun(scene: dict[str, Any]) -> list[str]:
 
 
 def test_each_scene_ends_as_it_should_and_the_last_one_with_a_bench_file(played: dict[str, Any]) -> None:
-    done = {"finished": 0, "mapped": 0}
-    assert {name: played[name]["exit"] for name in SCENES} == dict.fromkeys(SCENES, 3) | done
+    codes = {"nobody": 4, "finished": 0, "mapped": 0}
+    assert {name: played[name]["exit"] for name in SCENES} == dict.fromkeys(SCENES, 3) | codes
     assert "NO_NODE" in played["nobody"]["out"]
     assert "4-first-move was not completed: INTERRUPTED" in played["interrupted"]["out"]
     assert "stopped by the operator before anything was sent" in played["refused"]["out"]

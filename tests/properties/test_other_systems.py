@@ -87,7 +87,7 @@ def test_a_commissioning_goes_from_step_to_step(tmp_path: Path) -> None:
     """Up to the one that contradicts this data sheet: the brake is not as late as it may be."""
     sheet, folder = tmp_path / "sheet.toml", tmp_path / "brake"
     sheet.write_text(shipped_bench_text())
-    ended = run("win32", "emb-run", "--iface", "sim:plant=late", "--bench", sheet, "--commission", folder)
+    ended = run("win32", "emb-commission", folder, "--iface", "sim:plant=late", "--bench", sheet)
     assert ended.returncode == 3, ended.stderr
     assert "commands act 1 samples late" in ended.stderr.splitlines()[-1]
     assert {path.name for path in folder.glob("*.mcap")} == {"1-listen.mcap", "2-zero.mcap", "3-current.mcap"}

@@ -33,6 +33,12 @@ def _for_short_work() -> None:
     gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
 
 
+def emb_commission() -> int:
+    """``emb-commission``."""
+    message = "emb-commission: interrupted while a log was examined; the same command goes on from there"
+    return start("emb_bench.cli.commission", message, prepare=_for_short_work)
+
+
 def emb_hil() -> int:
     """``emb-hil``."""
     if sys.platform != "linux":

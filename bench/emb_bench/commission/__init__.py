@@ -1,1 +1,1 @@
-"""Examination of the logs of a commissioning: what each step of it has found."""
+"""Commissioning of an unknown brake: runs of ``emb-run``, from a data sheet's ranges to a bench file."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import signal
 import sys
 import time
@@ -49,13 +48,12 @@ class Operator:
     Args:
         plan: says whether to ask, and how to print.
         stop_requested: whether an end is wanted.
-        briefly: of the pre-flight only what is not as it should be, unless it is asked about.
     """
 
-    def __init__(self, plan: Plan, stop_requested: StopRequest, briefly: bool = False) -> None:
+    def __init__(self, plan: Plan, stop_requested: StopRequest) -> None:
         self._plan = plan
         self._stop_requested = stop_requested
-        self._seen, self._agreed = briefly and plan.ask is not Ask.ALWAYS, False
+        self._seen = self._agreed = False
 
     def console(self) -> Console:
         """Operator's end, for a run."""
@@ -101,14 +99,8 @@ def main(argv: list[str] | None = None) -> int:
         args = parser().parse_args(argv)
         if args.write_bench is not None:
             return _write_bench(args.write_bench)
-        plan = None if args.commission is not None else prepare(args)
-        stop = StopRequest()
-        if plan is None:
-            from emb_runtime.cli.commissioning import commission  # takes its time, and no other way needs it
-
-            steps = itertools.count()  # the first one only listens
-            return commission(args, lambda plan: Operator(plan, stop, briefly=next(steps) > 1).console(), stop)
-        console = Operator(plan, stop).console()
+        plan = prepare(args)
+        console = Operator(plan, StopRequest()).console()
         try:
             with log_folder(plan.log), shown(plan):
                 if plan.stage is Stage.READ_ONLY:

@@ -70,8 +70,6 @@ examples:
   emb-run --iface can0 --quick                      all four parameters to about 1 % in a tenth of a second, and home
   emb-run --quick --stop-when k_1=1%,f_v=5%         as short as what has to be known allows
   emb-run --iface can0 --repeat 20 --log runs/      twenty experiments, each from the origin
-  emb-run --iface can0 --bench sheet.toml --commission brake-7/
-                                                    an unknown brake: from a data sheet's ranges to a bench file
   emb-hil --slow 100 -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0'
                                                     where the kernel has no CAN
 """
@@ -205,13 +203,6 @@ def parser() -> argparse.ArgumentParser:
         "--repeat", type=int, default=1, metavar="N",
         help="N experiments, one log each, with --home in between; sim:seed=K counts up. Ends after a fault that wants "
         "to be looked at first, or if the brake does not come home",
-    )  # fmt: skip
-
-    campaign.add_argument(
-        "--commission", type=_place, metavar="DIR",
-        help="take an unknown brake into service: --bench is a data sheet's, with the ranges of the shield's set as "
-        "wide as it says; steps that each rest on those before, each a guarded run with its log in DIR, confirmed "
-        "where the bus is real; the bench file that they find is DIR/bench.toml. Goes on where the logs in DIR end",
     )  # fmt: skip
 
     machine = p.add_argument_group("real time")

@@ -1,4 +1,4 @@
-"""The examiner's model: it grows where experiments ask for more, and goes on from what it found."""
+"""The model: it grows where experiments ask for more, and goes on from what it found."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from emb_bench.commission.examiner import LogExaminer
-from emb_runtime.commission.records import Identification
+from emb_bench.commission.examination import identify
+from emb_bench.commission.records import Identification
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
@@ -25,7 +25,7 @@ def logs_of(folder: Path, simulate: Simulate, plant: str, seeds: tuple[int, ...]
 
 def identified(bench: Bench, logs: list[Path], before: Identification | None = None) -> Identification:
     wide = replace(bench, shield=replace(bench.shield, ranges="pm50"))
-    return LogExaminer().identify(logs, wide, bench.noise, before)
+    return identify(logs, wide, bench.noise, before)
 
 
 def holds_the_truth(bench: Bench, one: Identification) -> bool:

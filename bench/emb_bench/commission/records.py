@@ -1,14 +1,12 @@
-"""Records of a commissioning: a step, what was found by it, and who finds it."""
+"""Records of a commissioning: a step, and what its log shows."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
-from typing import Protocol
 
-from emb_runtime.config.bench import Bench, Noise
+from emb_runtime.config.bench import Noise
 
 
 class Kind(StrEnum):
@@ -32,24 +30,24 @@ class Window:
 
 @dataclass(frozen=True)
 class Step:
-    """One guarded run: what is done, within which limits, and what that rests on."""
+    """One guarded run: what is done, within which limits, and what these rest on."""
 
     name: str  # Name of its files
     kind: Kind
     purpose: str  # Description of what is done, for the operator
-    rests_on: str  # Numbers that its limits come from, and where those come from
+    rests_on: str  # Origin of the numbers that its limits come from
     limit: float  # Largest current that may leave [A]; 0 for none but 0 A
     duration: float  # [s]
     window: Window
     currents: tuple[float, ...] = ()  # Wanted current by sample [A]; after the last one it stays
     learns: bool = False  # With the learning shield
     final: bool = False  # With the bench file that was found
-    asks: bool = False  # At rest: the samples come only when they are asked for, by 0 A
+    asks: bool = False  # At rest: the drive sends samples only in answer to 0 A
 
 
 @dataclass(frozen=True)
 class Rest:
-    """Findings at rest."""
+    """Sensors and clock at rest."""
 
     noise: Noise  # Standard deviations
     period: float  # Of the samples by the node's clock [s]
@@ -57,26 +55,37 @@ class Rest:
     clock_ratio: float  # Node's time over the computer's
     angle: float  # Mean [rad]
 
+    def __str__(self) -> str:
+        return (
+            f"noise {self.noise.angle:.3g} rad and {self.noise.velocity:.3g} rad/s, a sample each "
+            f"{1e3 * self.period:.6g} ms, jitter {1e6 * self.jitter:.3f} us"
+        )
+
 
 @dataclass(frozen=True)
 class CurrentCheck:
-    """Findings about the current."""
+    """Reported against commanded current."""
 
     delay: int  # Samples by which commands act late, by the node's reports
     scale: float  # Reported current over commanded one
     error: float  # Standard deviation of the rest [A]
     moved: float  # Farthest from the angle at the start [rad]
-    uncertain: int = 0
-    """Samples by which commands may act later than it looks, of a drive that does not say which one it obeyed."""
+    uncertain: int = 0  # Samples by which commands may act later, of a drive that does not report which one it obeyed
+
+    def __str__(self) -> str:
+        return f"commands {self.delay} samples late, current times {self.scale:.4f}, error {self.error:.2g} A"
 
 
 @dataclass(frozen=True)
 class FirstMove:
-    """Findings of the first move."""
+    """Currents of the first move."""
 
     up: float  # Current at which the brake began to move in the positive direction [A]; NaN if it did not
     down: float  # Size of the current at which it began to move in the negative direction [A]; NaN if it did not
     scale: float  # Angle travelled over the integral of the velocity
+
+    def __str__(self) -> str:
+        return f"moves at {self.up:.3f} A and {-self.down:.3f} A, angle over velocity {self.scale:.3f}"
 
 
 @dataclass(frozen=True)
@@ -85,46 +94,38 @@ class Identification:
 
     values: Mapping[str, float]  # [SI]
     units: Mapping[str, str]  # Of the values, by name
-    intervals: Mapping[str, tuple[float, float]]
-    """95 %, with the systematic errors that the bench file does not exclude."""
-    model: str  # Of the best one: the plant and what was added to it
-    fits: bool  # The residuals do not speak against it
-    ratio: float  # Mean square of the residuals in standard deviations of the noise at rest
+    intervals: Mapping[str, tuple[float, float]]  # 95 %, allowing for systematic errors that are not excluded
+    model: str  # Plant of the best model, with what was added to it
+    fits: bool  # The residuals do not contradict the model
+    ratio: float  # Mean square of the residuals, in variances of the noise at rest
     command_delay: int  # [samples]
     measurement_delay: int  # [samples]
-    current_lag: tuple[float, float]
-    """Interval of the current loop's time constant [s]; zeros where the logs ask for none."""
-    features: Mapping[str, float]  # Features beyond eq. 3.12-3.14 that the model needed, by name [SI].
+    current_lag: tuple[float, float]  # Interval of the current loop's time constant [s]; zeros where none is needed
+    features: Mapping[str, float]  # Features beyond eq. 3.12-3.14 that the model needed, by name [SI]
     jitter: float  # Standard deviation of the instants of sampling, by residuals that grow with the speed [s]
-    noise: Noise  # Standard deviations of the residuals where the brake is slow, beyond what jitter explains
+    noise: Noise  # Standard deviations of the residuals of slow motion, without jitter
     contact: tuple[float, float]  # Interval of the encoder's reading at the origin [rad]
     objections: tuple[str, ...] = ()  # Alarms of the tests on the residuals, and what would explain them
 
+    def __str__(self) -> str:
+        fits = "" if self.fits else f", which does not fit yet{self.reasons()}"
+        return f"at 95 % {', '.join(map(self._within, self.intervals))}; model {self.model}{fits}"
 
-class Examiner(Protocol):
-    """Reads logs; made by another package, since the bench computer need not have an estimator."""
+    def reasons(self) -> str:
+        """Objections in brackets; "" without any."""
+        return f" ({'; '.join(self.objections)})" if self.objections else ""
 
-    def rest(self, log: Path) -> Rest:
-        """Findings of a listen-only log."""
-        ...
+    def _within(self, name: str) -> str:
+        value, (low, high) = self.values[name], self.intervals[name]
+        aside = max(high - value, value - low) / abs(value)
+        return f"{name} {value:.5g} {self.units[name]} ± {100.0 * aside:.2g} %"
 
-    def current(self, log: Path) -> CurrentCheck:
-        """Findings about the current."""
-        ...
 
-    def first_move(self, log: Path, noise: Noise) -> FirstMove:
-        """Findings of the first move."""
-        ...
+@dataclass(frozen=True)
+class Findings:
+    """What the steps so far have found."""
 
-    def identify(
-        self, logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identification | None
-    ) -> Identification:
-        """Parameters from experiments, for ranges and errors of a data sheet and the noise at rest.
-
-        The model that was found before is begun with.
-        """
-        ...
-
-    def ended(self, log: Path) -> str:
-        """Reason why a run ended, ``DONE`` if it was completed; empty for a log that is not whole."""
-        ...
+    rest: Rest | None = None
+    current: CurrentCheck | None = None
+    first_move: FirstMove | None = None
+    identified: Identification | None = None

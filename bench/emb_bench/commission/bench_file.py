@@ -1,18 +1,19 @@
 """Bench files of a commissioning: the one that its steps run with, and the one that it finds.
 
-A file is written from the data sheet's, number by number; each number that is not the sheet's has its origin behind it.
+A file is made from the data sheet's; each number that is not the sheet's has its origin behind it.
 """
 
 from __future__ import annotations
 
-import json
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
-from emb_runtime.commission.records import CurrentCheck, FirstMove, Identification, Rest
+import tomlkit
+
+from emb_bench.commission.records import CurrentCheck, Findings, Identification, Rest
 from emb_runtime.config.bench import LEARNING, PARAMETER_NAMES, Bench, Noise, parse_bench
 from emb_runtime.config.plants import SHORTEST_LAG
 from emb_runtime.config.toml_text import parse_toml
@@ -21,26 +22,16 @@ from emb_runtime.learning.assumptions import make_assumptions
 from emb_runtime.safety.shield_design import make_law
 
 SHEET, MEASURED = "sheet", "measured"  # Names of the sets of ranges
-WRITTEN = "# Written by `emb-run --commission` from a data sheet's bench file. SI units."
+WRITTEN = "Written by emb-commission from a data sheet's bench file. SI units."
 """First line of a bench file of a commissioning."""
-WIDENED = 0.1
-"""Share of its value by which a range goes beyond the interval of the estimate: brakes change as they warm and wear."""
-WIDENED_MISFIT = 0.25  # Share where the residuals speak against every model
+WIDENED = 0.1  # Share of its value by which a range exceeds the interval: brakes change as they warm and wear
+WIDENED_MISFIT = 0.25  # Share where the residuals contradict every model
 UNEXPLAINED = 9.0  # Mean square of the residuals, in variances of the noise at rest, from which on nothing is explained
 NOISE_WIDENED = 1.2  # Factor from a standard deviation that was measured to the one that is written
 LAG_WIDENED = 1.25  # Factor from the interval of the current loop's time constant to the bound that is written
 LEARNING_SHARE = 0.5  # Least share of the angle that is given up for a shield that may learn
 NARROWEST, STEP_DOWN = 10.0, 5.0  # Least upper angle limit that is tried, and by how much each try is lower [rad]
-
-
-@dataclass(frozen=True)
-class Findings:
-    """Findings of the steps so far."""
-
-    rest: Rest | None = None
-    current: CurrentCheck | None = None
-    first_move: FirstMove | None = None
-    identified: Identification | None = None
+SHEETS = "the data sheet's"
 
 
 def working_text(sheet: Bench, *, learns: bool = False) -> str:
@@ -54,20 +45,12 @@ def working_text(sheet: Bench, *, learns: bool = False) -> str:
         BenchFileError: there is no shield for these ranges.
     """
     document, origins = _of_sheet(sheet), dict[str, str]()
-    for key in LEARNING:
-        document["shield"].pop(key, None)
-    highest = _highest_angle(document)
-    learn = False
+    highest, kind = _highest_angle(document), "a shield"
     with suppress(BenchFileError):
-        covered = _highest_angle({**document, "shield": {**document["shield"], "learn": True}})
-        if learn := covered >= LEARNING_SHARE * highest:
-            highest = covered
-    if highest < sheet.limits.angle[1]:
-        document["limits"]["angle"][1] = highest
-        shield = "a learning shield" if learn else "a shield"
-        origins["limits.angle"] = (
-            f"{sheet.limits.angle[1]:g} rad by the data sheet; the largest for which {shield} covers its ranges"
-        )
+        covered = _highest_angle(_learning(document))
+        if covered >= LEARNING_SHARE * highest:
+            highest, kind = covered, "a learning shield"
+    _limit_angle(document, origins, highest, f"{kind} covers its ranges")
     if learns:
         document["shield"]["learn"] = True
         origins["shield.learn"] = "the experiments so far do not contradict what it assumes"
@@ -75,14 +58,11 @@ def working_text(sheet: Bench, *, learns: bool = False) -> str:
 
 
 def learning_possible(work: Bench) -> bool:
-    """Returns True if the learning shield covers the ranges of a bench."""
-    document = _of_sheet(work)
-    document["shield"]["learn"] = True
-    try:
-        _require_shield(document)
-    except BenchFileError:
-        return False
-    return True
+    """True if the learning shield covers the ranges of a bench."""
+    with suppress(BenchFileError):
+        _require_shield(_learning(_of_sheet(work)))
+        return True
+    return False
 
 
 def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
@@ -91,7 +71,7 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
     Args:
         sheet: bench file with the data sheet's ranges.
         found: by all steps.
-        logs: name of the log by its kind: ``rest``, ``current``, ``first move``, ``experiments``.
+        logs: name of the log by its kind: ``rest``, ``current``, ``experiments``.
 
     Raises:
         BenchFileError: no shield can be made for what was found.
@@ -101,28 +81,14 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
     assert current is not None
     assert one is not None
     document, origins = _of_sheet(sheet), dict[str, str]()
-    for key in LEARNING:
-        document["shield"].pop(key, None)
+    how = f"output error, model {one.model}, {logs['experiments']}"
     measured = measured_ranges(sheet, one)
     document["ranges"][MEASURED] = {name: list(measured[name]) for name in PARAMETER_NAMES}
-    document["shield"]["ranges"] = MEASURED
-    bent = _secants(sheet, one) != (1.0, 1.0)
-    how = f"output error, model {one.model}, {logs['experiments']}"
-    for name in PARAMETER_NAMES:
-        low, high = one.intervals[name]
-        document["brake"][name] = _rounded(_within(one.values[name], measured[name]))
+    for name, (low, high) in measured.items():
+        document["brake"][name] = _rounded(min(max(one.values[name], low), high))
         origins[f"brake.{name}"] = how
-        cut = [side for side, at in (("below", 0), ("above", 1)) if measured[name][at] == _range(sheet, name)[at]]
-        origins[f"ranges.{MEASURED}.{name}"] = (
-            f"the data sheet's: no model explains the experiments; residuals {math.sqrt(one.ratio):.3g} times the noise"
-            if _is_unexplained(one)
-            else f"95 %: {low:.5g} to {high:.5g}, widened by {widening(one):.0%} of the value"
-            + ("" if one.fits else " as no model fits")
-            + (", and by the curve and hysteresis of the force" if name == "k_1" and bent else "")
-            + (", and by the play" if name == "T_c" and "play" in one.features else "")
-            + (f", cut {' and '.join(cut)} to the data sheet's range" if cut else "")
-        )
-    noise = written_noise(one, rest)
+        origins[f"ranges.{MEASURED}.{name}"] = _origin_of_range(sheet, one, name, (low, high))
+    noise = _written_noise(one, rest)
     document["noise"] = {"angle": noise.angle, "velocity": noise.velocity}
     for name, at_rest, moving in (
         ("angle", rest.noise.angle, one.noise.angle),
@@ -133,30 +99,40 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
             f"{NOISE_WIDENED:g}"
         )
     age = current.delay + current.uncertain + one.measurement_delay
-    document["shield"]["frame_age"] = [min(age, sheet.shield.frame_age[0]), age]
+    lag = min(sheet.shield.current_lag, _rounded(LAG_WIDENED * one.current_lag[1], up=True))
+    frame_age = [min(age, sheet.shield.frame_age[0]), age]
+    document["shield"] |= {"ranges": MEASURED, "frame_age": frame_age, "current_lag": lag}
     origins["shield.frame_age"] = (
         f"commands {current.delay} samples late by the node's reports ({logs['current']}), measurements "
         f"{one.measurement_delay} by the best fit"
         + (f", and {current.uncertain} as the drive does not say which command it obeyed" if current.uncertain else "")
     )
-    lag = min(sheet.shield.current_lag, _rounded(LAG_WIDENED * one.current_lag[1], up=True))
-    document["shield"]["current_lag"] = lag
     origins["shield.current_lag"] = (
-        f"95 % up to {one.current_lag[1]:.3g} s ({how}), times {LAG_WIDENED:g}, at most the data sheet's"
+        f"95 % up to {one.current_lag[1]:.3g} s ({how}), times {LAG_WIDENED:g}, at most {SHEETS}"
         if one.current_lag[1] > 0.0
         else "the experiments ask for none"
     )
-    origins["shield.break_away"] = origins["shield.f_l"] = "the data sheet's bound: not measured by itself"
+    origins["shield.break_away"] = origins["shield.f_l"] = f"{SHEETS} bound: not measured by itself"
     origins["systematic.offset"] = f"contact found at {one.contact[0]:.4g} to {one.contact[1]:.4g} rad"
-    origins["limits.current"] = origins["limits.angle"] = origins["limits.velocity"] = "the data sheet's"
-    document["plants"] = {**document.get("plants", {}), MEASURED: _plant(one, current)}
-    highest = _highest_angle(document)
-    if highest < sheet.limits.angle[1]:
-        document["limits"]["angle"][1] = highest
-        origins["limits.angle"] = (
-            f"{sheet.limits.angle[1]:g} rad by the data sheet; the largest for which a shield covers the ranges"
-        )
+    origins |= dict.fromkeys(("limits.current", "limits.angle", "limits.velocity"), SHEETS)
+    document.setdefault("plants", {})[MEASURED] = _plant(one, current)
+    _limit_angle(document, origins, _highest_angle(document), "a shield covers the ranges")
     return _toml(document, origins)
+
+
+def _origin_of_range(sheet: Bench, one: Identification, name: str, measured: tuple[float, float]) -> str:
+    if _is_unexplained(one):
+        return f"{SHEETS}: no model explains the experiments; residuals {math.sqrt(one.ratio):.3g} times the noise"
+    low, high = one.intervals[name]
+    origin = f"95 %: {low:.5g} to {high:.5g}, widened by {_widening(one):.0%} of the value"
+    origin += "" if one.fits else " as no model fits"
+    if name == "k_1" and _secants(sheet, one) != (1.0, 1.0):
+        origin += ", and by the curve and hysteresis of the force"
+    if name == "T_c" and "play" in one.features:
+        origin += ", and by the play"
+    sides = zip(("below", "above"), measured, _range(sheet, name), strict=True)
+    cut = " and ".join(side for side, written, border in sides if written == border)
+    return f"{origin}, cut {cut} to {SHEETS} range" if cut else origin
 
 
 def _plant(one: Identification, current: CurrentCheck) -> dict[str, float | int]:
@@ -168,6 +144,9 @@ def _plant(one: Identification, current: CurrentCheck) -> dict[str, float | int]
         found["clock_jitter"] = _rounded(one.jitter)
     delays = {"command_delay": current.delay, "measurement_delay": one.measurement_delay}
     return found | {name: delay for name, delay in delays.items() if delay}
+
+
+# --- ranges ---------------------------------------------------------------------------------------------------------
 
 
 def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float, float]]:
@@ -187,7 +166,7 @@ def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float,
         if _is_unexplained(one):
             continue
         low, high = one.intervals[name]
-        aside = widening(one) * one.values[name]
+        aside = _widening(one) * one.values[name]
         low, high = low - aside, high + aside
         if name == "k_1":
             least, greatest = _secants(sheet, one)
@@ -239,8 +218,7 @@ def _is_unexplained(one: Identification) -> bool:
     return not one.fits and one.ratio > UNEXPLAINED
 
 
-def widening(one: Identification) -> float:
-    """Share of its value by which a range goes beyond the interval."""
+def _widening(one: Identification) -> float:
     return WIDENED if one.fits else WIDENED_MISFIT
 
 
@@ -253,15 +231,14 @@ def _secants(sheet: Bench, one: Identification) -> tuple[float, float]:
 
 
 def _by_play(sheet: Bench, one: Identification) -> float:
-    """Largest torque by which play makes the clamping force's another than that at the angle [N·m]."""
+    """Largest torque by which the clamping force differs, through play, from that at the angle [N·m]."""
     quadratic, cubic = one.features.get("quadratic", 0.0), one.features.get("cubic", 0.0)
     highest = sheet.limits.angle[1]
     steepest = one.values["k_1"] * (1.0 + highest * (2.0 * quadratic + 3.0 * cubic * highest))
     return 0.5 * one.features.get("play", 0.0) * sheet.brake.gamma * steepest
 
 
-def written_noise(one: Identification, rest: Rest) -> Noise:
-    """Standard deviations that are written."""
+def _written_noise(one: Identification, rest: Rest) -> Noise:
     return Noise(
         _rounded(NOISE_WIDENED * max(rest.noise.angle, one.noise.angle), up=True),
         _rounded(NOISE_WIDENED * max(rest.noise.velocity, one.noise.velocity), up=True),
@@ -273,10 +250,6 @@ def _range(sheet: Bench, name: str) -> tuple[float, float]:
     return getattr(ends.low, name), getattr(ends.high, name)
 
 
-def _within(value: float, pair: tuple[float, float]) -> float:
-    return min(max(value, pair[0]), pair[1])
-
-
 def _rounded(value: float, *, up: bool = False) -> float:
     """To five digits, down or up, so that a range holds what it held."""
     if value == 0.0 or not math.isfinite(value):
@@ -285,12 +258,26 @@ def _rounded(value: float, *, up: bool = False) -> float:
     return float(f"{(math.ceil if up else math.floor)(value * scale) / scale:.5g}")
 
 
+# --- documents ------------------------------------------------------------------------------------------------------
+
+
 def _of_sheet(sheet: Bench) -> dict[str, Any]:
-    """The data sheet's document with its ranges as one whole set."""
+    """The data sheet's document with its ranges as one whole set, without the learning shield."""
     document = parse_toml(sheet.text)
     document["ranges"] = {SHEET: {name: list(_range(sheet, name)) for name in PARAMETER_NAMES}}
+    document["shield"] = {key: value for key, value in document["shield"].items() if key not in LEARNING}
     document["shield"]["ranges"] = SHEET
     return document
+
+
+def _learning(document: Mapping[str, Any]) -> dict[str, Any]:
+    return {**document, "shield": {**document["shield"], "learn": True}}
+
+
+def _limit_angle(document: dict[str, Any], origins: dict[str, str], highest: float, why: str) -> None:
+    if highest < (own := document["limits"]["angle"][1]):
+        document["limits"]["angle"][1] = highest
+        origins["limits.angle"] = f"{own:g} rad by the data sheet; the largest for which {why}"
 
 
 def _highest_angle(document: Mapping[str, Any]) -> float:
@@ -299,7 +286,7 @@ def _highest_angle(document: Mapping[str, Any]) -> float:
     Raises:
         BenchFileError: there is none; of the document's own limit, what the shield cannot guarantee there.
     """
-    trial = json.loads(json.dumps(document))
+    trial = copy.deepcopy(dict(document))
     low, own = trial["limits"]["angle"]
     try:
         _require_shield(trial)
@@ -314,46 +301,20 @@ def _highest_angle(document: Mapping[str, Any]) -> float:
 
 
 def _require_shield(document: Mapping[str, Any]) -> None:
-    bench = parse_bench(_toml(document, {}), "the bench of a commissioning")
+    bench = parse_bench(tomlkit.dumps(document), "the bench of a commissioning")
     make_law(bench)
     if bench.shield.learn:
         make_assumptions(bench)
 
 
 def _toml(document: Mapping[str, Any], origins: Mapping[str, str]) -> str:
-    """A document as TOML, with an origin behind each entry that has one."""
-    head = [
-        WRITTEN,
-        "# A number without an origin behind it is that file's.",
-        "",
-        *(_line(key, value, origins.get(key, "")) for key, value in document.items() if not isinstance(value, dict)),
-    ]
-    return "\n".join(head + _tables(document, "", origins)) + "\n"
-
-
-def _tables(document: Mapping[str, Any], path: str, origins: Mapping[str, str]) -> list[str]:
-    lines = []
-    for key, value in document.items():
-        if not isinstance(value, dict):
-            continue
-        name = f"{path}{_key(key)}"
-        own = [(k, v) for k, v in value.items() if not isinstance(v, dict)]
-        if own or not value:
-            lines += ["", f"[{name}]", *(_line(k, v, origins.get(f"{name}.{k}", "")) for k, v in own)]
-        lines += _tables(value, f"{name}.", origins)
-    return lines
-
-
-def _line(key: str, value: Any, origin: str) -> str:
-    entry = f"{_key(key)} = {_value(value)}"
-    return f"{entry:<45} # {origin}" if origin else entry
-
-
-def _key(key: str) -> str:
-    return key if key.replace("_", "").replace("-", "").isalnum() and key.isascii() else json.dumps(key)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, list):
-        return "[" + ", ".join(_value(item) for item in value) + "]"
-    return json.dumps(value) if isinstance(value, bool | str) else repr(value)
+    """A document as TOML, with its origin behind each entry that has one and is there."""
+    written = tomlkit.parse(tomlkit.dumps(document))
+    for path, origin in origins.items():
+        *tables, key = path.split(".")
+        table: Any = written
+        for name in tables:
+            table = table.get(name, {})
+        if key in table:
+            table.value.item(key).comment(origin)
+    return f"# {WRITTEN}\n# A number without an origin behind it is that file's.\n\n{tomlkit.dumps(written)}"

@@ -1,0 +1,89 @@
+"""``emb-commission``: an unknown brake, from a data sheet's ranges to a bench file, by runs of ``emb-run``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from importlib import metadata
+from pathlib import Path
+
+from emb_runtime.can.transport import is_private
+from emb_runtime.config.bench import load_bench
+from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.system.terminal import as_json, complain, mention, show
+
+EPILOG = """\
+Each step is a run of emb-run behind shield, guard and watchdog, with its policy and its log in DIR, and rests on what
+those before it have found. The same command goes on with the first step that has no completed log. The bench file that
+is found is DIR/bench.toml.
+
+exit codes:
+  0    done
+  2    usage: wrong argument, a file that cannot be read or written, a parameter outside of the data sheet's ranges
+  3    a step was stopped, or contradicts the data sheet
+  4 to 8 as emb-run, whose run ended so
+  130  Ctrl-C while a log was examined
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(
+        prog="emb-commission",
+        description="Take an unknown brake into service: from a data sheet's ranges to a bench file.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("folder", type=Path, metavar="DIR", help="folder for bench files, policies and logs")
+    p.add_argument(
+        "--bench", type=Path, metavar="FILE", help="bench file with the data sheet's ranges in the set of its shield"
+    )
+    p.add_argument("--iface", default="sim", metavar="NAME", help="the bus, as for emb-run (default: sim)")
+    asking = p.add_mutually_exclusive_group()
+    asking.add_argument("--confirm", action="store_true", help="confirm each step (default where the bus is real)")
+    asking.add_argument("--yes", action="store_true", help="do not ask")
+    p.add_argument("--json", action="store_true", help="print the result as JSON")
+    p.add_argument("--version", action="version", version=f"emb-commission {metadata.version('emb-excite')}")
+    each = p.add_argument_group("for each run of emb-run, see there")
+    for option in ("--operator", "--serial", "--cpu"):
+        each.add_argument(option, metavar="TEXT" if option != "--cpu" else "N")
+    for option in ("--no-rt", "--no-watchdog", "--long-timeouts"):
+        each.add_argument(option, action="store_true")
+    return p
+
+
+def options(args: argparse.Namespace) -> list[str]:
+    """Options of each run. On a bus that another program can be on, each one is confirmed."""
+    given = [f"--{name.replace('_', '-')}" for name in ("no_rt", "no_watchdog", "long_timeouts") if getattr(args, name)]
+    for name in ("operator", "serial", "cpu"):
+        if getattr(args, name) is not None:
+            given += [f"--{name}", getattr(args, name)]
+    bus = args.iface.rpartition("@")[2] if args.iface.startswith("map:") else args.iface
+    in_process = bus.partition(":")[0] in ("sim", "sim-drive") or is_private(bus)
+    if args.yes:
+        return [*given, "--yes"]
+    return [*given, "--confirm"] if args.confirm or not in_process else given
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of ``emb-commission``."""
+    args = parser().parse_args(argv)
+    try:
+        sheet = load_bench(args.bench)
+        try:
+            from emb_bench.commission.commissioning import Commissioning, emb_run
+        except ImportError as err:
+            raise UsageError(f"{err}; pip install 'emb-excite[bench]'") from err
+        try:
+            args.folder.mkdir(parents=True, exist_ok=True)
+            result = Commissioning(args.folder, sheet, args.iface, options(args), emb_run, mention).run()
+        except OSError as err:
+            raise UsageError(f"{args.folder}: {err.strerror}; expected a folder, made if there is none") from err
+        show(as_json(result.document()) if args.json else str(result))
+    except EmbError as err:
+        return complain("emb-commission", err)
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,327 @@
+"""A commissioning from the data sheet to the bench file, on a simulated brake: what is found, and that it goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emb_bench.cli import commission
+from emb_bench.commission import examination
+from emb_bench.commission.bench_file import working_text
+from emb_bench.commission.commissioning import Commissioned, Commissioning, Run, StepFailedError, simulated
+from emb_bench.experiment.experiment import REST_SIGMAS, read_experiment
+from emb_bench.logs.log import read_log
+from emb_runtime.cli.main import main
+from emb_runtime.config.bench import Bench, Noise, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.errors import EmbError
+from tests.bench.commission.test_steps import sheet_text
+from tests.drives import EXAMPLES
+from tests.runtime.operating import Sim
+
+TRUTH = {"k_m": 0.03, "k_1": 17.0, "T_c": 0.0075, "f_v": 3.4e-5}
+NOISE = Noise(7e-4, 0.6)
+BRAKE = {**TRUTH, "angle_noise": NOISE.angle, "velocity_noise": NOISE.velocity}
+
+
+def sheet(frame_age: str = "[0, 3]") -> Bench:
+    """A factor of two for all four, and up to three samples late."""
+    return parse_bench(sheet_text(frame_age=frame_age), "sheet")
+
+
+def in_process(arguments: Sequence[str]) -> dict[str, Any]:
+    """``emb-run --json`` without a process of its own."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exit_code = main(list(arguments))
+    for number, handler in before.items():
+        signal.signal(number, handler)
+    document: dict[str, Any] = json.loads(printed.getvalue())
+    return {**document, "exit_code": exit_code}
+
+
+def _gives(document: Mapping[str, Any], _arguments: Sequence[str]) -> Mapping[str, Any]:
+    return document
+
+
+class EnoughError(Exception):
+    """Ends a commissioning before a step."""
+
+
+def up_to(step: str) -> Run:
+    """Runs of all steps before this one."""
+
+    def run(arguments: Sequence[str]) -> Mapping[str, Any]:
+        if Path(arguments[arguments.index("--log") + 1]).stem == step:
+            raise EnoughError
+        return in_process(arguments)
+
+    return run
+
+
+def commissioning(folder: Path, run: Run = in_process, bench: Bench | None = None, iface: str = "") -> Commissioning:
+    own = "sim:plant=late," + ",".join(f"{name}={value}" for name, value in BRAKE.items())
+    return Commissioning(folder, bench or sheet(), iface or own, (), run, lambda _: None)
+
+
+def mapping_for(folder: Path, drive: str, *edits: tuple[str, str]) -> Path:
+    """A drive's mapping file, edited, for the data sheet's wide ranges."""
+    text = re.sub(r"(?m)^end_stop_speed = \d+", "end_stop_speed = 5000", (EXAMPLES / f"{drive}.toml").read_text())
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / f"{drive}.dbc").write_text((EXAMPLES / f"{drive}.dbc").read_text())
+    path = folder / f"{drive}.toml"
+    path.write_text(text)
+    return path
+
+
+def on_a_drive(
+    folder: Path, run: Run, *edits: tuple[str, str], drive: str = "odrive", frame_age: str = "[0, 3]"
+) -> Commissioning:
+    """The commissioning of a brake on a simulated drive, whose mapping is edited."""
+    iface = f"map:{mapping_for(folder, drive, *edits)}@sim-drive:{drive},plant=late-command"
+    bench = parse_bench(sheet(frame_age).text + "\n[plants.late-command]\ncommand_delay = 1\n", "sheet")
+    return commissioning(folder, run, bench, iface)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Commissioned]:
+    folder = tmp_path_factory.mktemp("brake")
+    return folder, commissioning(folder).run()
+
+
+def test_the_truth_lies_inside_of_ranges_much_narrower_than_the_data_sheets(done: tuple[Path, Commissioned]) -> None:
+    _, result = done
+    assert result.identified.fits
+    for name, (low, high) in result.ranges.items():
+        assert low <= TRUTH[name] <= high, name
+        assert high - low <= 0.25 * TRUTH[name], name  # 150 % by the data sheet
+
+
+def test_delays_and_noise_are_found(done: tuple[Path, Commissioned]) -> None:
+    folder, result = done
+    check, rest = result.found.current, result.found.rest
+    assert check is not None
+    assert rest is not None
+    assert (check.delay, result.identified.measurement_delay) == (1, 1)
+    assert check.scale == pytest.approx(1.0, abs=1e-3)
+    assert (rest.noise.angle, rest.noise.velocity) == pytest.approx((NOISE.angle, NOISE.velocity), rel=0.1)
+    written = load_bench(folder / "bench.toml")
+    assert written.shield.frame_age == (0, 2)
+    assert NOISE.angle <= written.noise.angle <= 1.4 * NOISE.angle
+
+
+def test_each_step_has_left_a_log_of_the_same_brake_and_a_policy(done: tuple[Path, Commissioned]) -> None:
+    _, result = done
+    assert len(result.logs) == result.runs == 9
+    seeds = set()
+    for log in result.logs:
+        assert log.with_suffix(".onnx").exists()
+        read = read_log(log)
+        assert read.exit_reason == "DONE"
+        assert read.truth is not None
+        assert read.truth._asdict().items() >= TRUTH.items()
+        seeds.add(read.run["iface"].partition("seed=")[2])
+    assert len(seeds) == 9  # each with noise of its own
+
+
+def test_it_goes_on_where_the_logs_end_and_comes_to_the_same(done: tuple[Path, Commissioned]) -> None:
+    folder, result = done
+    (folder / "9-full.mcap").unlink()
+    again = commissioning(folder).run()
+    assert again.runs == 1
+    assert again.found == result.found
+    assert json.dumps(again.document())
+
+
+def test_a_mapped_drive_is_commissioned_up_to_its_first_move(tmp_path: Path) -> None:
+    with pytest.raises(EnoughError):
+        on_a_drive(tmp_path, up_to("5-free-stroke")).run()
+    assert examination.first_move(tmp_path / "4-first-move.mcap", NOISE).scale == pytest.approx(1.0, abs=0.05)
+    check = examination.current(tmp_path / "3-current.mcap")
+    assert (check.delay, check.uncertain) == (1, 0)
+    assert check.scale == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_wrong_scale_of_the_current_ends_it_before_the_brake_has_moved(tmp_path: Path) -> None:
+    """Five times the current that was meant would make the way home and the drive's stop run away."""
+    factor_five = ("per_ampere = 0.0217, range = [-0.1303, 0.1303]", "per_ampere = 0.1085, range = [-0.66, 0.66]")
+    with pytest.raises(EmbError, match="the drive reports 5 A for 1 A commanded"):
+        on_a_drive(tmp_path, in_process, factor_five).run()
+    log = read_log(tmp_path / "3-current.mcap")
+    assert np.ptp(log.signals(log.layout.angle.name)["Angle"]) < 0.05
+    assert not list(tmp_path.glob("*homing*"))
+
+
+def test_a_polled_drive_is_asked_for_its_samples(tmp_path: Path) -> None:
+    with pytest.raises(EnoughError):
+        on_a_drive(tmp_path, up_to("2-zero"), drive="mit", frame_age="[1, 3]").run()
+    sent = read_log(tmp_path / "1-listen.mcap").cycles["sent_current"]
+    assert set(np.asarray(sent)[np.isfinite(sent)]) == {0.0}
+
+
+def test_a_run_that_was_not_completed_is_done_again_under_another_name(tmp_path: Path) -> None:
+    def short(arguments: Sequence[str]) -> Mapping[str, Any]:  # as by Ctrl-C
+        return in_process([*arguments, "--duration", "0.1"])
+
+    with pytest.raises(StepFailedError, match="1-listen was not completed: it was ended before its time"):
+        commissioning(tmp_path, short).run()
+    with pytest.raises(EnoughError):
+        commissioning(tmp_path, up_to("2-zero")).run()
+    assert {path.name for path in tmp_path.glob("*.mcap")} == {"1-listen.mcap", "1-listen-attempt2.mcap"}
+
+
+def test_a_motion_of_no_brake_of_the_data_sheet_ends_it_with_what_to_look_at_and_its_exit_code(tmp_path: Path) -> None:
+    fine = {"result": "done", "detail": "", "cause": "", "exit_code": 3, "homing": {}}
+    for fault in ("OUT_OF_LIMITS", "MOTION_OUTSIDE_SET", "SET_CONTRADICTED"):
+        failed = {**fine, "result": fault, "cause": "the brake moves as none"}
+        for document in (failed, {**fine, "homing": {"before": failed}}):
+            with pytest.raises(StepFailedError, match=rf"{fault}: the brake moves.*; no parameter that was") as ended:
+                commissioning(tmp_path, partial(_gives, document)).run()
+            assert ended.value.exit_code == 3
+    with pytest.raises(StepFailedError, match="begin again in the same folder") as ended:
+        commissioning(tmp_path, lambda _: {**fine, "result": "NO_NODE", "exit_code": 4}).run()
+    assert ended.value.exit_code == 4
+
+
+def test_a_start_that_a_few_samples_at_rest_tell_is_not_taken_for_exact(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sim, log = Sim(), tmp_path / "run.mcap"
+    sim.angle = -0.1
+    monkeypatch.setattr("emb_runtime.cli.repeat.open_transport", lambda _iface, bench, _ids: sim.open("", bench))
+    assert in_process(["--iface", "sim", "--log", str(log), "--json"])["exit_code"] == 0
+    own = read_experiment(read_log(log))
+    assert own.x0() != (0.0, 0.0)
+    one_sigma = own.before.slack / REST_SIGMAS
+    for error in (-2.5, 2.5):
+        unlucky = replace(own, before=own.before._replace(angle=-0.1 + error * one_sigma))
+        monkeypatch.setattr(examination, "read_experiment", lambda _log, unlucky=unlucky: unlucky)
+        bench = load_bench()
+        one = examination.identify([log], bench, bench.noise, None)
+        assert one.fits
+        for name, (low, high) in one.intervals.items():
+            assert low <= getattr(bench.brake, name) <= high, name
+
+
+def test_a_data_sheet_may_be_corrected_before_the_first_log_and_its_time_outs_later(tmp_path: Path) -> None:
+    def run(text: str) -> None:
+        with pytest.raises(EnoughError):
+            commissioning(tmp_path, up_to("2-zero"), parse_bench(text, "sheet")).run()
+
+    other = sheet().text.replace("0.5", "0.4", 1)
+    (tmp_path / "working.toml").write_text(working_text(parse_bench(other, "before")))
+    run(sheet().text)
+    run(sheet().text.replace("start_timeout = 5.0", "start_timeout = 9.0"))
+    written = load_bench(tmp_path / "working.toml")
+    assert written.watch.start_timeout == 9.0
+    with pytest.raises(EmbError, match=r"which rest on it; go on with the data sheet .* or take another folder"):
+        commissioning(tmp_path, in_process, parse_bench(other, "after")).run()
+
+
+def test_a_bench_file_of_somebody_else_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "working.toml").write_text(shipped_bench_text())
+    with pytest.raises(EmbError, match="another bench"):
+        commissioning(tmp_path).run()
+
+
+@pytest.mark.parametrize(
+    ("brake", "to_widen"),
+    [
+        ("seed=29,T_c=0.0048,k_m=0.03", "T_c"),
+        ("seed=24,k_m=0.0456,T_c=0.0055", "k_m"),
+        ("seed=30,f_v=4.6e-5", "f_v"),
+    ],
+)
+def test_a_brake_a_little_outside_of_the_data_sheet_ends_it_with_the_range_to_widen_and_no_file(
+    tmp_path: Path, brake: str, to_widen: str
+) -> None:
+    with pytest.raises(EmbError, match=rf"widen {to_widen} in \[ranges\.wide\]"):
+        commissioning(tmp_path, in_process, sheet("[0, 0]"), f"sim:{brake}").run()
+    assert not (tmp_path / "bench.toml").exists()
+
+
+def test_a_brake_whose_latency_the_data_sheet_excludes_is_not_moved(tmp_path: Path) -> None:
+    with pytest.raises(EmbError, match="commands act 1 samples late"):
+        commissioning(tmp_path, in_process, sheet("[0, 0]")).run()
+    assert not (tmp_path / "4-first-move.mcap").exists()
+
+
+# --- emb-commission -------------------------------------------------------------------------------------------------
+
+
+def test_a_simulated_brake_keeps_its_parameters_and_any_other_bus_stays_as_it_is() -> None:
+    bench = load_bench()
+    assert simulated("sim:k_m=0.03, seed = 7", bench, 2).startswith("sim:k_m=0.03,")
+    assert simulated("sim:k_m=0.03, seed = 7", bench, 2).endswith(f"velocity_noise={bench.noise.velocity},seed=9")
+    assert simulated("map:d@x.toml@sim-drive:vesc", bench, 0).startswith("map:d@x.toml@sim-drive:vesc,k_m=")
+    for iface in ("can0", "sim0", "virtual:x", "map:d@x.toml@can0", "can0@sim0"):
+        assert simulated(iface, bench, 3) == iface
+
+
+def test_every_step_is_confirmed_unless_told_otherwise_or_nobody_else_is_on_the_bus() -> None:
+    real = ("can0", "virtual", "sim0", "pcan:PCAN_USBBUS1", "map:d@x.toml@can0", "map:drive.toml@virtual", "can0@sim")
+    private = ("sim", "sim:seed=3", "virtual:x", "map:d@x.toml@sim-drive:vesc")
+    for iface in (*real, *private):
+        for more in ([], ["--yes"], ["--confirm"]):
+            given = commission.options(commission.parser().parse_args(["brake", "--iface", iface, *more]))
+            assert ("--confirm" in given) is (more != ["--yes"] and (iface in real or more == ["--confirm"])), iface
+            assert ("--yes" in given) is (more == ["--yes"])
+
+
+def test_what_cannot_be_done_is_a_line_and_an_exit_code(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    for folder in ("file", "file/below"):
+        assert commission.main([str(tmp_path / folder)]) == 2
+        assert capfd.readouterr().err.count("\n") == 1
+    sent_nothing = ["--bench", str(tmp_path / "sheet.toml"), "--iface", "can0", str(tmp_path / "brake"), "--no-rt"]
+    (tmp_path / "sheet.toml").write_text(sheet().text)
+    assert commission.main(sent_nothing) == 3  # nobody is there who could confirm
+    assert "--confirm: there is nobody to ask" in capfd.readouterr().err
+    assert not list((tmp_path / "brake").glob("*.mcap"))
+
+
+@pytest.fixture
+def begun(tmp_path: Path) -> Callable[[str], subprocess.Popen[str]]:
+    """``emb-commission`` in a process of its own, as soon as the log of a step grows."""
+    (tmp_path / "sheet.toml").write_text(sheet_text())
+
+    def begin(step: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "emb_bench.cli.commission", "brake", "--bench", "sheet.toml", "--iface"]
+        process = subprocess.Popen(
+            [*command, "virtual:nobody"], cwd=tmp_path, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        while not (tmp_path / "brake" / step).exists() and process.poll() is None:
+            time.sleep(0.05)
+        return process
+
+    return begin
+
+
+def test_a_signal_ends_the_run_and_the_commissioning_after_it(
+    tmp_path: Path, begun: Callable[[str], subprocess.Popen[str]]
+) -> None:
+    for name, number in (("1-listen", signal.SIGTERM), ("1-listen-attempt2", signal.SIGINT)):
+        process = begun(f"{name}.mcap")
+        process.send_signal(number)
+        _, said = process.communicate(timeout=60)
+        assert process.returncode == 4, said  # nobody was heard until then
+        assert "Traceback" not in said
+        log = read_log(tmp_path / "brake" / f"{name}.mcap")
+        assert log.complete
+        assert json.loads(log.metadata["result"]["heard"])["duration"] < 3.9  # of 4 s
