@@ -93,8 +93,11 @@ def become(system: str) -> None:
         vars(semaphores)["sys"] = SimpleNamespace(platform="linux")
 
     class Popen(subprocess.Popen[bytes]):
-        def __init__(self, *_arguments: Any, pass_fds: Any = (), **_keywords: Any) -> None:
-            raise AssertionError(f"a process is started, with the descriptors {pass_fds}")
+        def __init__(self, command: list[str], pass_fds: Any = (), **keywords: Any) -> None:
+            if command[:2] != [sys.executable, "-c"]:
+                raise AssertionError(f"a process is started, with the descriptors {pass_fds}")
+            run = [sys.executable, "-m", "tests.other_system", system, "emb-run"]  # of emb-commission
+            super().__init__([*run, *command[3:]], **keywords)
 
     subprocess.Popen = Popen  # type: ignore[assignment, misc]
 
