@@ -123,7 +123,7 @@ class Identification:
 
 @dataclass(frozen=True)
 class Findings:
-    """What the steps so far have found."""
+    """Findings of the steps so far."""
 
     rest: Rest | None = None
     current: CurrentCheck | None = None
