@@ -19,9 +19,10 @@ from scipy import signal
 
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import make_problem
-from emb_bench.estimate.records import Estimate, EstimationProblem, Record, record_of
+from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.estimate.windows import predict_windows
-from emb_bench.experiment.experiment import read_experiment
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_bench.recordings.run_file import import_recording
 
@@ -162,19 +163,15 @@ def _ours(mass: float, viscous: float, coulomb: float, offset: float, *share: fl
     return np.array([mass * TRAVEL**2, viscous * TRAVEL**2, coulomb * TRAVEL, *share, -offset * TRAVEL])
 
 
-def _record(path: Path, log: Path) -> Record:
+def _record(path: Path, log: Path) -> Experiment:
     (log.parent / "map.toml").write_text(MAP)
     import_recording(path, log.parent / "map.toml", log)
     read = read_log(log)
-    return record_of(log.stem, read_experiment(read), read.bench, read.bench.plant("recorded"))
+    return read_experiment(read, name=log.stem).seen_by(read.bench.plant("recorded"))
 
 
-def _part(record: Record, begin: int, end: int) -> Record:
-    late = None if record.late is None else record.late[begin:end]
-    angle, velocity = (record.angle, record.velocity) if begin == 0 else record.samples[begin - 1].tolist()
-    before = float(record.currents[begin - 1]) if begin else 0.0
-    name, samples = f"{record.name}-{begin}", record.samples[begin:end]
-    return Record(name, record.currents[begin:end], samples, angle, velocity, 0.0, False, late, before=before)
+def _part(record: Experiment, begin: int, end: int) -> Experiment:
+    return replace(record.part(begin, end), name=f"{record.name}-{begin}")
 
 
 if __name__ == "__main__":

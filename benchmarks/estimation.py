@@ -31,9 +31,10 @@ from emb_bench.brake.motion import Floats
 from emb_bench.design.problem import make_problem
 from emb_bench.design.search import search
 from emb_bench.estimate.methods import run_method
-from emb_bench.estimate.records import STARTS, EstimationProblem, Record
+from emb_bench.estimate.records import STARTS, EstimationProblem
 from emb_bench.excitation.reference import parse_excitation, run_excitation
-from emb_bench.experiment.experiment import read_experiment
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.information.criteria import criterion
 from emb_bench.information.fisher import fisher
 from emb_bench.logs.log import read_log
@@ -71,7 +72,7 @@ def brake_of(bench: Bench) -> BrakeParameters:
     return bench.brake._replace(f_v=F_V)
 
 
-def drawn(bench: Bench, name: str, currents: Floats, states: Floats, seed: int) -> Record:
+def drawn(bench: Bench, name: str, currents: Floats, states: Floats, seed: int) -> Experiment:
     """One draw of what a plant's instruments show of a motion."""
     rng, instruments, t_s = np.random.default_rng(seed), bench.plant(name).instruments, bench.timing.sample_time
     errors = rng.standard_normal((len(currents), 2)) * [bench.noise.angle, bench.noise.velocity]
@@ -85,7 +86,7 @@ def drawn(bench: Bench, name: str, currents: Floats, states: Floats, seed: int) 
     rows = zip(states[1:].tolist(), accelerations.tolist(), late.tolist(), errors.tolist(), strict=True)
     for k, ((x1, x2), acceleration, tau, (e1, e2)) in enumerate(rows):
         samples[k] = measure(instruments, memory, t_s, x1, x2, acceleration, tau, e1, e2)
-    return Record(f"draw {seed}", currents, samples, seen, 0.0, slack, abs(seen) <= 4.0 * slack)
+    return Experiment(f"draw {seed}", currents, samples, seen, 0.0, slack, abs(seen) <= 4.0 * slack)
 
 
 def work(job: Job) -> list[Drawn]:

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.estimate.records import Record
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.plants import EULER, Plant
 
@@ -252,7 +252,7 @@ def simulate(
     losses: Losses | None = None,
     *,
     charge: bool = False,
-) -> Record:
+) -> Experiment:
     """An experiment: a random excitation that is turned around near the limits.
 
     Where the report of a period is lost, the record assumes that its command acted, or where none was sent, the node's
@@ -303,7 +303,7 @@ def simulate(
         alone[-1] = False  # after it nothing was received
         currents, assumed = np.where(alone, acted, currents), np.where(alone, np.nan, assumed)
     known = None if losses is None or not losses.samples.any() else assumed
-    return Record(name, currents, samples, float(rest[0]), 0.0, slack, bool(at_origin), assumed=known)
+    return Experiment(name, currents, samples, float(rest[0]), 0.0, slack, bool(at_origin), assumed=known)
 
 
 def motion(brake: Brake, currents: Floats, t_s: float) -> Floats:
@@ -329,7 +329,7 @@ def _disturbed(  # type: ignore[no-untyped-def]
     return state
 
 
-def started(record: Record, plant: Plant) -> Record:
+def started(record: Experiment, plant: Plant) -> Experiment:
     """The record as a model of that plant takes it, whose encoder's offset defines the origin."""
     at_origin = abs(record.angle - plant.instruments.encoder_offset) <= ORIGIN_SIGMAS * record.slack
     return replace(record, from_origin=bool(at_origin))

@@ -36,7 +36,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # the simulator is a neighbo
 from benchmarks.independent_simulator import Brake, Floats, Losses, brake_of, simulate
 from benchmarks.intervals import share
 from emb_bench.estimate.methods import run_method
-from emb_bench.estimate.records import EstimationProblem, Record, with_systematic
+from emb_bench.estimate.records import EstimationProblem, with_systematic
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.config.plants import Plant
 
@@ -51,7 +52,7 @@ class Drawn(NamedTuple):
     row: str
     bench: Bench
     plant: Plant
-    record: Record
+    record: Experiment
     brake: Brake
     params: tuple[str, ...] = PARAMETER_NAMES  # Parameters that are estimated
     causes: tuple[str, ...] = ()  # Suspects that lead to the remedy; none where the model is right

@@ -29,7 +29,8 @@ from benchmarks.independent_simulator import Brake, brake_of, simulate, started
 from benchmarks.intervals import share
 from emb_bench.analysis.model_choice import choose_model, model_of
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import LATEST, STARTS, EstimationProblem, Record, with_systematic
+from emb_bench.estimate.records import LATEST, STARTS, EstimationProblem, with_systematic
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT, Plant
 
@@ -64,7 +65,7 @@ def with_errors(bench: Bench, plant: Plant, brake: Brake, size: float, rng: np.r
     )
 
 
-def fitted(bench: Bench, plant: str, record: Record, truth: dict[str, float], seed: int) -> Outcome:
+def fitted(bench: Bench, plant: str, record: Experiment, truth: dict[str, float], seed: int) -> Outcome:
     """All plants fitted."""
     asked = with_systematic(EstimationProblem(), bench, bench.plant(DEFAULT_PLANT))
     right = model_of(bench.plant(plant), asked)
@@ -92,7 +93,7 @@ def fitted(bench: Bench, plant: str, record: Record, truth: dict[str, float], se
     )
 
 
-def compared(bench: Bench, plant: str, record: Record) -> Outcome:
+def compared(bench: Bench, plant: str, record: Experiment) -> Outcome:
     """All plants at nominal parameters."""
     begun, found = time.perf_counter(), {}
     for name, model in bench.plants.items():

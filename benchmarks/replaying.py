@@ -33,7 +33,7 @@ import numpy as np
 from benchmarks.logs.damage import OUTCOMES, WRONG, outcomes
 from benchmarks.logs.long_log import BEFORE, Writer
 from emb_bench.experiment.evaluation import Question, evaluate
-from emb_bench.experiment.experiment import open_experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import load_layout
 from emb_runtime.cli.main import main as emb_run
@@ -101,7 +101,7 @@ def rate(path: Path, logs: int) -> bool:
         log = read_log(path)
         bench = log.bench
         question = Question(PARAMETER_NAMES)
-        experiment = open_experiment(log)
+        experiment = read_experiment(log)
         found = evaluate(log, experiment, bench, bench.plant("exact"), question, "nominal", bench.brake)
         told = [found.fisher(kind).criteria().log_det for kind in found.histories]
         times.append(time.process_time() - begin)

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, cast
 from emb_bench.design.problem import COARSE_SEARCHES, make_problem
 from emb_bench.estimate.records import STARTS, EstimationProblem
 from emb_bench.experiment.evaluation import Evaluation, Question, bench_for, default_model, evaluate
-from emb_bench.experiment.experiment import open_experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.export.picture import draw_on
 from emb_bench.export.tables import arrow_batches
 from emb_bench.information.criteria import Name, criterion
@@ -167,7 +167,7 @@ def fisher_information(
     given = {name: str(value) for name, value in (theta or {}).items()}
     name = ",".join(f"{n}={value}" for n, value in given.items()) or "nominal"
     brake = true_parameters(its, given) if given else its.brake
-    return evaluate(run, open_experiment(run, its), its, plant, question, name, brake)
+    return evaluate(run, read_experiment(run, its), its, plant, question, name, brake)
 
 
 def estimate(

@@ -15,8 +15,8 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
 from emb_bench.experiment.evaluation import Evaluation, Question, evaluate
-from emb_bench.experiment.experiment import read_experiment
-from emb_bench.experiment.info import Experiment
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.columns import message_class
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import RunLog, read_log
@@ -89,9 +89,7 @@ def judge(path: Path, whole: Read) -> Read | None:
         assert found.numbers == whole.numbers
     count, measured = found.experiment.periods, found.experiment.measured
     assert count <= whole.experiment.periods
-    for name in ("angle", "velocity"):
-        seen, true = getattr(found.experiment, name)[1:], getattr(whole.experiment, name)[1 : count + 1]
-        np.testing.assert_array_equal(seen[measured], true[measured])
+    np.testing.assert_array_equal(found.experiment.samples[measured], whole.experiment.samples[:count][measured])
     np.testing.assert_array_equal(found.experiment.currents[measured], whole.experiment.currents[:count][measured])
     return found
 

@@ -13,8 +13,9 @@ from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate, EstimationProblem, Record
+from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.excitation.reference import parse_excitation, run_excitation
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.instruments import MEMORY, measure, settle
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
@@ -44,7 +45,7 @@ def record(
     seed: int | None = 0,
     noise: float = 1.0,
     x0: tuple[float, float] = (0.0, 0.0),
-) -> Record:
+) -> Experiment:
     """What a plant's instruments show of a brake under a sequence of currents.
 
     Args:
@@ -71,12 +72,12 @@ def record(
         acceleration = float(states[k + 1, 1] - states[k, 1]) / t_s
         (x1, x2), (e1, e2) = states[k + 1].tolist(), errors[k].tolist()
         samples[k] = measure(instruments, memory, t_s, x1, x2, acceleration, float(late[k]), e1, e2)
-    return Record("simulated", currents, samples, seen, x0[1], slack, abs(seen) <= 4.0 * slack and x0[1] == 0.0)
+    return Experiment("simulated", currents, samples, seen, x0[1], slack, abs(seen) <= 4.0 * slack and x0[1] == 0.0)
 
 
 def disturbed(
     bench: Bench, currents: Floats, brake: BrakeParameters, seed: int, walk: float = WALK, fine: int = FINE
-) -> Record:
+) -> Experiment:
     """The exact brake whose velocity is kicked several times a period."""
     rng, t = np.random.default_rng(seed), bench.timing.sample_time / fine
     mechanics, move = bench.plant("exact").mechanics, compiled(advance)
@@ -87,13 +88,13 @@ def disturbed(
             x[1] += kick
         states[k] = x[:2]
     noise = rng.standard_normal(states.shape) * [bench.noise.angle, bench.noise.velocity]
-    return Record("disturbed", currents, states + noise, 0.0, 0.0, 0.0, True)
+    return Experiment("disturbed", currents, states + noise, 0.0, 0.0, 0.0, True)
 
 
 def fit(
     bench: Bench,
     plant: Plant | str,
-    records: Sequence[Record],
+    records: Sequence[Experiment],
     asked: EstimationProblem | None = None,
     *,
     method: str = "oem",
@@ -105,7 +106,7 @@ def fit(
     return run_method(method, bench, model, records, asked or EstimationProblem(), starts=starts, seed=seed)
 
 
-def problem_of(bench: Bench, names: tuple[str, ...], *records: Record, plant: str = "exact") -> Problem:
+def problem_of(bench: Bench, names: tuple[str, ...], *records: Experiment, plant: str = "exact") -> Problem:
     """Problem of some unknowns."""
     return Problem(bench, bench.plant(plant), EstimationProblem(names), records)
 
@@ -116,7 +117,7 @@ def hard(bench: Bench) -> BrakeParameters:
     return b._replace(k_m=0.99 * b.k_m, k_1=1.31 * b.k_1, T_c=1.35 * b.T_c, f_v=0.89 * b.f_v)
 
 
-def coloured(bench: Bench) -> Record:
+def coloured(bench: Bench) -> Experiment:
     """Record of a chirp whose errors are a moving average, of the bench's variance at each sample."""
     clean = record(bench, bench.plant("exact"), currents_of(bench, "chirp"), seed=None)
     white = np.random.default_rng(2).standard_normal((503, 2)) * [bench.noise.angle, bench.noise.velocity]

@@ -23,9 +23,10 @@ from emb_bench.estimate.methods import refit
 from emb_bench.estimate.model_validation import taken
 from emb_bench.estimate.output_error import search, settled
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate, Record
+from emb_bench.estimate.records import Estimate
 from emb_bench.estimate.search import minimise
 from emb_bench.estimate.windows import predict_windows
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.errors import UsageError
 
 LEVEL = 0.01  # Chance of a false alarm with the right model, for all predictions together
@@ -52,7 +53,7 @@ class HeldOut:
         return self.chi2 / max(self.freedom, 1)
 
 
-def held_out(e: Estimate, record: Record, *, among: int = 1) -> HeldOut:
+def held_out(e: Estimate, record: Experiment, *, among: int = 1) -> HeldOut:
     """Predict a record from an estimate of others.
 
     Args:
@@ -79,7 +80,7 @@ def leave_one_out(e: Estimate) -> tuple[HeldOut, ...]:
     return tuple(found)
 
 
-def _predicted(e: Estimate, record: Record, level: float) -> HeldOut:
+def _predicted(e: Estimate, record: Experiment, level: float) -> HeldOut:
     if e.method == "windows":
         return _windows_predicted(e, record, level)
     problem = Problem(e.bench, e.plant, replace(e.asked, prior=None), (record,))
@@ -92,7 +93,7 @@ def _predicted(e: Estimate, record: Record, level: float) -> HeldOut:
     known = np.zeros((len(index), len(start)))
     known[:, index] = _root(e.shared_information() / np.outer(scale, scale))
     weights = problem.weights(start)
-    if record.open and e.method != "pem":
+    if record.gap_unknowns and e.method != "pem":
         problem, _, _ = settled(problem, *search(problem, start, weights), weights)
     parts = _errors(e, problem, start, weights)
 
@@ -107,14 +108,14 @@ def _predicted(e: Estimate, record: Record, level: float) -> HeldOut:
     measured = sum(root.size for root in weights)
     starts = len(rows) - len(known) - measured
     if e.method != "pem":
-        starts -= record.open
+        starts -= record.gap_unknowns
         fitted += taken(problem.marginal(z, weights).basis, measured)
     freedom = max(samples + starts - fitted, 1)
     p_value = float(special.chdtrc(freedom, end.cost))
     return HeldOut(record.name, end.cost, freedom, p_value, p_value >= level)
 
 
-def _windows_predicted(e: Estimate, record: Record, level: float) -> HeldOut:
+def _windows_predicted(e: Estimate, record: Experiment, level: float) -> HeldOut:
     """Prediction of the windows of a record, each from the start that fits it best.
 
     What a window was disturbed by is not in the parameters, so that their uncertainty is not released.

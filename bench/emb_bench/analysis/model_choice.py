@@ -42,19 +42,19 @@ from emb_bench.estimate.records import (
     End,
     Estimate,
     EstimationProblem,
-    Record,
     Unknown,
     has_time_for_a_delay,
     with_systematic,
 )
 from emb_bench.estimate.search import released
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.instruments import observer_gains
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 
 NEGLIGIBLE = 0.01  # Weight below which a model adds nothing to an interval
 WRONG = 25  # Simulations after which the search of a model that does not explain the records ends
-RecordsOf = Callable[[Plant], Sequence[Record]]
+RecordsOf = Callable[[Plant], Sequence[Experiment]]
 """The records as a model takes them: its encoder's offset says whether one starts at the origin."""
 
 
@@ -314,7 +314,7 @@ def _deviance_at(problem: Problem, z: Floats) -> float:
     return total
 
 
-def _observed(record: Record, bandwidth: float, t_s: float) -> float:
+def _observed(record: Experiment, bandwidth: float, t_s: float) -> float:
     """−2 log L of a velocity that an observer derives from the angles."""
     alpha, beta = observer_gains(bandwidth, t_s)
     angle, velocity = record.samples.T
@@ -346,7 +346,7 @@ def held_out_score(e: Estimate, deviance: float) -> float:
     return score
 
 
-def _parts(records: Sequence[Record]) -> list[tuple[list[int], tuple[Record, ...]]]:
+def _parts(records: Sequence[Experiment]) -> list[tuple[list[int], tuple[Experiment, ...]]]:
     """The parts that are fitted to when the rest is held out: numbers of the records, and the records."""
     if len(records) > 1:
         left = [[i for i in range(len(records)) if i != out] for out in range(len(records))]

@@ -22,7 +22,8 @@ import numpy as np
 from emb_bench.analysis.model_choice import Candidate, ModelChoice, candidate, fit_from, ranked
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate, EstimationProblem, Record, check_model, with_systematic
+from emb_bench.estimate.records import Estimate, EstimationProblem, check_model, with_systematic
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
@@ -76,7 +77,7 @@ class ModelGrowth:
 
 
 def grow_model(
-    bench: Bench, plant: Plant, records: Sequence[Record], asked: EstimationProblem, *, starts: int, seed: int
+    bench: Bench, plant: Plant, records: Sequence[Experiment], asked: EstimationProblem, *, starts: int, seed: int
 ) -> ModelGrowth:
     """Adds features to a plant until the records ask for nothing more.
 
@@ -129,7 +130,7 @@ def grow_model(
 
 
 def grow_with_errors(
-    bench: Bench, plant: Plant, records: Sequence[Record], asked: EstimationProblem, *, starts: int, seed: int
+    bench: Bench, plant: Plant, records: Sequence[Experiment], asked: EstimationProblem, *, starts: int, seed: int
 ) -> ModelGrowth:
     """Growth as of :func:`grow_model`, and where no model fits so, with the bench's systematic errors estimated along.
 

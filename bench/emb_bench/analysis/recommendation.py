@@ -18,8 +18,9 @@ import numpy as np
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate, Record, Unknown
+from emb_bench.estimate.records import Estimate, Unknown
 from emb_bench.excitation.reference import parse_excitation, run_excitation
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.criteria import criteria
 from emb_bench.information.identifiability import GROSS, Spectrum, combination, schur_complement
 from emb_runtime.config.bench import Bench, BrakeParameters
@@ -124,7 +125,7 @@ def _information(e: Estimate, text: str) -> Floats:
     played = run_excitation(bench, parse_excitation(text, bench), e.plant.mechanics, brake, shielded=True)
     samples = np.zeros((len(played.currents), 2))
     slack = max(record.slack for record in e.records)
-    record = Record(text, played.currents, samples, instruments.encoder_offset, 0.0, slack, True)
+    record = Experiment(text, played.currents, samples, instruments.encoder_offset, 0.0, slack, True)
     problem = Problem(bench, e.plant, replace(e.asked, prior=None), (record,))
     own = [i for i, unknown in enumerate(problem.unknowns) if unknown.record is None]
     values = dict(zip(e.unknowns, e.values.tolist(), strict=True)) | {

@@ -30,15 +30,13 @@ from emb_bench.estimate.records import (
     End,
     Estimate,
     EstimationProblem,
-    Record,
     Suspect,
     Unknown,
-    record_of,
     with_systematic,
 )
 from emb_bench.experiment.evaluation import default_model, other_sample_time
-from emb_bench.experiment.experiment import read_experiment
-from emb_bench.experiment.info import Experiment
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import RunLog
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import DEFAULT_PLANT, EVERY, Plant
@@ -196,15 +194,15 @@ def make_study(
     warnings: list[str] = []
     notes: list[str] = []
     for log, shown in zip(all_logs, names, strict=True):
-        experiment, said = _read(log, bench)
+        experiment, said = _read(log, bench, shown)
         said += [] if wanted.method in GAPS else _hidden(experiment)
         experiments.append(experiment)
         of_which = f"{shown}: " if len(all_logs) > 1 else ""
         warnings += [of_which + warning for warning in said]
         notes += [of_which + note for note in experiment.notes]
 
-    def records_of(plant: Plant) -> list[Record]:
-        return [record_of(shown, own, bench, plant) for shown, own in zip(names, experiments, strict=True)]
+    def records_of(plant: Plant) -> list[Experiment]:
+        return [own.seen_by(plant) for own in experiments]
 
     _check_different(records_of(plant))
     choice = growth = None
@@ -274,7 +272,7 @@ def begun_with(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions) -> tu
 
 
 def _answer(
-    wanted: StudyOptions, bench: Bench, plant: Plant, records: Sequence[Record], choice: ModelChoice | None
+    wanted: StudyOptions, bench: Bench, plant: Plant, records: Sequence[Experiment], choice: ModelChoice | None
 ) -> Estimate:
     """Estimate with the errors that the bench cannot exclude, where that is wanted.
 
@@ -306,7 +304,7 @@ def _predicts(*found: Sequence[HeldOut]) -> bool:
     return all(h.fits for some in found for h in some)
 
 
-def _check_different(records: Sequence[Record]) -> None:
+def _check_different(records: Sequence[Experiment]) -> None:
     """Refuse a run that is given twice, whatever its files are called and however much of it each of them holds.
 
     Two runs never have the same noise; counted twice one would halve its variance, and predict itself.
@@ -333,9 +331,9 @@ def was_stopped(log: RunLog) -> bool:
     return log.end.get("exit_reason", DONE) != DONE
 
 
-def _read(log: RunLog, bench: Bench) -> tuple[Experiment, list[str]]:
+def _read(log: RunLog, bench: Bench, name: str) -> tuple[Experiment, list[str]]:
     """Experiment of a log, and warnings about what the log lacks."""
-    experiment = read_experiment(log, bench)
+    experiment = read_experiment(log, bench, name)
     said = [log.missing] if log.missing else []
     missing = experiment.missing
     if was_stopped(log):

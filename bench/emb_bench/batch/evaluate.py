@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from emb_bench.batch.row import NONE, Options, Parameter, Row, Source, failed, is_relative, one_line, printable
-from emb_bench.estimate.records import Estimate, EstimationProblem, record_of, with_systematic
+from emb_bench.estimate.records import Estimate, EstimationProblem, with_systematic
 from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
-from emb_bench.experiment.experiment import open_experiment, read_experiment
-from emb_bench.experiment.info import Experiment, ExperimentInfo, Piece
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
@@ -78,20 +78,20 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
     plant = bench.plant(options.model or default_model(log)[0])
     prior = None if options.prior is None else bench.range_set(options.prior)
     question = Question(options.params, options.nuisances, prior)
-    # An estimate needs all of the experiment at once, the information goes through a log of any length.
-    experiment = open_experiment(log, bench) if options.method == NONE else read_experiment(log, bench)
+    experiment = read_experiment(log, bench, source.path)
     yield _of_the_experiment(log, experiment, bench) | {"model": plant.name}
     import numba  # noqa: F401  # what is loaded is used, which pays for many logs and not for one
 
     evaluation = evaluate(log, experiment, bench, plant, question, "nominal", bench.brake)
     yield _of_the_information(evaluation)
-    if not isinstance(experiment, Experiment):
+    if options.method == NONE:
         return
     from emb_bench.estimate.methods import run_method
 
-    record = record_of(source.path, experiment, bench, plant)
     asked = with_systematic(EstimationProblem(options.params, options.nuisances, prior), bench, plant)
-    estimate = run_method(options.method, bench, plant, [record], asked, starts=options.starts, seed=options.seed)
+    estimate = run_method(
+        options.method, bench, plant, [experiment.seen_by(plant)], asked, starts=options.starts, seed=options.seed
+    )
     yield _of_the_estimate(estimate, evaluation, log.truth)
 
 
@@ -116,22 +116,19 @@ def _of_the_run(log: RunLog) -> dict[str, Any]:
     }
 
 
-def _of_the_experiment(log: RunLog, experiment: ExperimentInfo, bench: Bench) -> dict[str, Any]:
+def _of_the_experiment(log: RunLog, experiment: Experiment, bench: Bench) -> dict[str, Any]:
     missing = [log.missing] if log.missing else []
     missing += experiment.missing
     (low, high), speed = bench.limits.angle, bench.limits.velocity
-    beyond, beginning = 0, None
-    for piece in experiment.pieces():
-        if beginning is None:
-            beginning = _beginning(piece)
-        beyond += int(((piece.angle < low) | (piece.angle > high) | (np.abs(piece.velocity) > speed)).sum())
+    angle, velocity = experiment.samples.T
+    beyond = int(((angle < low) | (angle > high) | (np.abs(velocity) > speed)).sum())
     return {
-        "beginning": beginning,
+        "beginning": _beginning(experiment),
         "complete": not missing and log.complete,
         "missing": printable("; ".join(missing)),
         "planned": experiment.planned,
         "periods": experiment.periods,
-        "measured": experiment.samples,
+        "measured": int(experiment.measured.sum()),
         "command_delay": experiment.command_delay,
         "bench_name": printable(bench.name),
         "bench_hash": bench.contract_hash,
@@ -139,9 +136,9 @@ def _of_the_experiment(log: RunLog, experiment: ExperimentInfo, bench: Bench) ->
     }
 
 
-def _beginning(piece: Piece) -> str | None:
+def _beginning(experiment: Experiment) -> str | None:
     """A fingerprint of the first samples, whatever the file is called and wherever it was cut; none of ideal ones."""
-    samples = np.stack([piece.angle[:FIRST], piece.velocity[:FIRST]])
+    samples = np.ascontiguousarray(experiment.samples[:FIRST].T)
     seen = samples[:, ~np.isnan(samples).any(axis=0)]
     if not (seen != seen[:, :1]).any():
         return None

@@ -13,7 +13,7 @@ from emb_bench.experiment.evaluation import (
     default_model,
     evaluate_all,
 )
-from emb_bench.experiment.experiment import open_experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.experiment.theta import read_theta
 from emb_bench.logs.log import read_log, require_driven
 from emb_bench.report.fim import document, models_text, text
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     model, why = (args.model, "asked for") if args.model is not None else default_model(log)
     plants = list(bench.plants.values()) if args.model == EVERY else [bench.plant(model)]
     theta_name, theta, errors = read_theta(args.theta, log, bench)
-    experiment = open_experiment(log, bench)
+    experiment = read_experiment(log, bench)
     evaluations = evaluate_all(log, experiment, bench, plants, question, theta_name, theta, errors)
     if args.model != EVERY:
         show(as_json(document(evaluations[0])) if args.json else text(evaluations[0], why))

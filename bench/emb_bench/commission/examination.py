@@ -17,9 +17,9 @@ from emb_bench.commission.noise import noise_at_rest, noise_in_motion
 from emb_bench.commission.records import CurrentCheck, FirstMove, Identification, Rest
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import FEATURES, Estimate, EstimationProblem, record_of, with_systematic
-from emb_bench.experiment.experiment import read_experiment
-from emb_bench.experiment.info import Booleans, Experiment, Floats
+from emb_bench.estimate.records import FEATURES, Estimate, EstimationProblem, with_systematic
+from emb_bench.experiment.experiment import Booleans, Experiment, Floats
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, Ranges
 from emb_runtime.config.plants import Instruments, Mechanics, Plant
@@ -77,7 +77,8 @@ def current(log: Path) -> CurrentCheck:
     experiment = read_experiment(opened)
     late = experiment.command_delay
     scale, error = _of_commands(opened, late)
-    angles = experiment.angle[np.isfinite(experiment.angle)]
+    angles = experiment.all_samples[:, 0]
+    angles = angles[np.isfinite(angles)]
     moved = float(np.max(np.abs(_smoothed(angles) - np.mean(angles[:20]))))
     return CurrentCheck(late, scale, error, moved, int(opened.drive_files is not None and late == 0))
 
@@ -87,12 +88,13 @@ def first_move(log: Path, noise: Noise) -> FirstMove:
     opened = read_log(log)
     experiment = read_experiment(opened)
     t_s = opened.bench.timing.sample_time
-    seen = np.isfinite(experiment.angle) & np.isfinite(experiment.velocity)
-    moving = seen & (np.abs(experiment.velocity) > MOVING * noise.velocity)
+    angle, velocity = experiment.all_samples.T
+    seen = np.isfinite(angle) & np.isfinite(velocity)
+    moving = seen & (np.abs(velocity) > MOVING * noise.velocity)
     before = np.concatenate([[0.0], experiment.currents])[: len(moving)]
     up, down = moving & (before > 0.0), moving & (before < 0.0)
-    velocity = np.where(seen, experiment.velocity, 0.0)
-    travelled = np.diff(experiment.angle)
+    velocity = np.where(seen, velocity, 0.0)
+    travelled = np.diff(angle)
     shown = 0.5 * t_s * (velocity[1:] + velocity[:-1])
     used = np.isfinite(travelled) & (moving[1:] | moving[:-1])
     # Over stretches of the same direction noise averages out; each sample's share has the sign of its motion.
@@ -114,7 +116,7 @@ def identify(logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identific
     bench = replace(sheet, noise=noise)
     prior = bench.range_set(bench.shield.ranges)
     experiments = [read_experiment(log) for log in opened]
-    best = _best(_Fits(bench, prior, [log.name for log in logs], experiments), before)
+    best = _best(_Fits(bench, prior, experiments), before)
     first = _with_systematic(bench, best)
     features = {u.name: float(v) for u, v in zip(first.unknowns, first.values, strict=True) if u.name in FEATURES}
     lag = _interval(first, "current_lag")
@@ -159,7 +161,6 @@ class _Fits:
 
     bench: Bench
     prior: Ranges
-    names: Sequence[str]  # Of the logs
     experiments: Sequence[Experiment]
 
     def fit(
@@ -173,8 +174,7 @@ class _Fits:
         """Estimate by a model with some features, whose measurements come late by some samples."""
         mechanics = Mechanics(**cast(dict[str, Any], features or {}))
         plant = Plant(name, mechanics, Instruments(measurement_delay=late, clock_jitter=jitter))
-        logs = zip(self.names, self.experiments, strict=True)
-        records = [record_of(log, own, self.bench, plant) for log, own in logs]
+        records = [own.seen_by(plant) for own in self.experiments]
         lags = ("current_lag",) if self.bench.shield.current_lag > 0.0 else ()
         if any(own.x0() != (0.0, 0.0) for own in self.experiments):  # known by some samples at rest only
             lags = (*lags, "x1_0")

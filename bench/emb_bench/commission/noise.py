@@ -8,7 +8,7 @@ import numpy as np
 from scipy import optimize, stats
 
 from emb_bench.experiment.drive_steps import step_of
-from emb_bench.experiment.info import Floats
+from emb_bench.experiment.experiment import Floats
 from emb_runtime.config.bench import Noise
 from emb_runtime.drives.mapping import Mapping
 

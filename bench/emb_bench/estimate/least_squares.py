@@ -21,7 +21,8 @@ from scipy.optimize import lsq_linear
 from emb_bench.brake.motion import Floats, is_plain
 from emb_bench.estimate.output_error import finished, sandwich
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import End, Estimate, Record
+from emb_bench.estimate.records import End, Estimate
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.instruments import observer_noise
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.plants import EXACT
@@ -94,7 +95,7 @@ def estimate(problem: Problem) -> Estimate:
     )
 
 
-def regression(problem: Problem, record: Record) -> tuple[Floats, Floats]:
+def regression(problem: Problem, record: Experiment) -> tuple[Floats, Floats]:
     """A record's equations of motion, each over the deviation that the noise of the velocities gives it.
 
     Returns:

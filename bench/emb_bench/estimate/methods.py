@@ -9,7 +9,8 @@ import numpy as np
 
 from emb_bench.brake.quantities import command, quantity
 from emb_bench.estimate.prediction import Problem, make_problem
-from emb_bench.estimate.records import METHODS, STARTS, Estimate, EstimationProblem, Record, Unknown
+from emb_bench.estimate.records import METHODS, STARTS, Estimate, EstimationProblem, Unknown
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import Plant
 from emb_runtime.config.units import CURRENT
@@ -29,7 +30,7 @@ def run_method(
     name: str,
     bench: Bench,
     plant: Plant,
-    records: Sequence[Record],
+    records: Sequence[Experiment],
     asked: EstimationProblem,
     *,
     starts: int = STARTS,

@@ -85,7 +85,7 @@ def _without_outliers(problem: Problem, z: Floats, weights: Sequence[Floats]) ->
     found = [outliers(r, root > 0.0) for r, root in zip(residuals, weights, strict=True)]
     if not few(found):
         return problem
-    return replace(problem, records=tuple(r.without(mask) for r, mask in zip(problem.records, found, strict=True)))
+    return replace(problem, records=tuple(r.lose(mask) for r, mask in zip(problem.records, found, strict=True)))
 
 
 def of_losses(problem: Problem) -> tuple[str, ...]:
@@ -125,7 +125,7 @@ def settled(problem: Problem, z: Floats, end: End, weights: Sequence[Floats]) ->
     Returns:
         The problem whose records hold what was found in their gaps, and the search's new end. Without gaps, the same.
     """
-    if not any(record.open for record in problem.records):
+    if not any(record.gap_unknowns for record in problem.records):
         return problem, z, end
     count = len(z)
     found, after = minimise(

@@ -13,7 +13,8 @@ from scipy.linalg import block_diag
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, Integers, no_sensitivity, rest
 from emb_bench.brake.parameters import COMMAND, DELAY, OFFSET, VELOCITY_GAIN
 from emb_bench.compiled import compiled
-from emb_bench.estimate.records import FEATURES, EstimationProblem, Record, Unknown, check_model, searched
+from emb_bench.estimate.records import FEATURES, EstimationProblem, Unknown, check_model, searched
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.model_evaluator import later
 from emb_bench.information.fisher import uniform_prior, weights_along
 from emb_bench.sim.open_loop import advance_periods, advance_through_gaps, trajectory
@@ -29,7 +30,7 @@ class Prediction(NamedTuple):
     sensitivities: Floats
     """Of ``shown`` to the unknowns of this record, shape (n, names, 2), as in ``open_loop.Trajectory``."""
     states: Floats  # Of the brake at the n + 1 instants around the periods, shape (n + 1, 2)
-    gaps: Floats  # Sensitivities of ``shown`` to the unknowns of the record's gaps, shape (n, Record.open, 2)
+    gaps: Floats  # Sensitivities of ``shown`` to the unknowns of the record's gaps, shape (n, gap_unknowns, 2)
 
 
 class Marginal(NamedTuple):
@@ -80,7 +81,7 @@ class Problem:
     bench: Bench
     plant: Plant
     asked: EstimationProblem
-    records: tuple[Record, ...]
+    records: tuple[Experiment, ...]
 
     @cached_property
     def unknowns(self) -> tuple[Unknown, ...]:
@@ -182,9 +183,11 @@ class Problem:
         """Predicts a record, with sensitivities to its unknowns and to those ``besides``, which come last."""
         at = self.opening(z, record, (*self.names(record), *besides))
         data, delay, t_s = self.records[record], self.plant.instruments.measurement_delay, self.bench.timing.sample_time
-        whole, moved = self._through(record, at, self.mechanics(z), data.currents + at.current_offset, data.open)
+        whole, moved = self._through(
+            record, at, self.mechanics(z), data.currents + at.current_offset, data.gap_unknowns
+        )
         late, count = max(at.late, 0.0), len(at.chosen)
-        chosen = np.concatenate([at.chosen, np.full(data.open, COMMAND)])
+        chosen = np.concatenate([at.chosen, np.full(data.gap_unknowns, COMMAND)])
         states, shifts = whole[:, :2].copy(), moved[:, :, :2].copy()
         states[:, 0] += at.contact
         shifts[1:, chosen == DELAY] /= 1.0 - late  # of the samples, not of the start
@@ -207,7 +210,7 @@ class Problem:
     ) -> tuple[Floats, Floats]:
         """States and sensitivities at all instants of a record, those to ``unknowns`` of its gaps last."""
         data, t_s, late = self.records[record], self.bench.timing.sample_time, max(at.late, 0.0)
-        if not data.open:
+        if not data.gap_unknowns:
             return trajectory(compiled(advance_periods), mechanics, at.p, currents, t_s, late, at.chosen, at.x, at.s)
         states = np.empty((len(currents) + 1, STATES))
         moved = np.empty((len(currents) + 1, len(at.chosen) + unknowns, SENSITIVE))
@@ -290,7 +293,7 @@ class Problem:
             parts.append((np.nan_to_num(record.samples - said.shown) * root, said.sensitivities * root[:, None]))
             columns.append((said.gaps * root[:, None]).transpose(0, 2, 1).reshape(root.size, -1))
         residuals, rows = self.stacked(z, parts)
-        count = sum(record.open for record in self.records)
+        count = sum(record.gap_unknowns for record in self.records)
         if not count:
             return residuals, rows
         held, assumed, inverse = (
@@ -323,11 +326,11 @@ class Problem:
         """The problem whose records hold these unknowns in their gaps, in the order of :meth:`in_gaps`."""
         left, records = gaps, []
         for record in self.records:
-            own, left = left[: record.open], left[record.open :]
+            own, left = left[: record.gap_unknowns], left[record.gap_unknowns :]
             pulses, currents = record.gaps[0], record.currents.copy()
             currents[pulses] = own[: len(pulses)]
             places = own[len(pulses) :].reshape(-1, 2)
-            records.append(replace(record, currents=currents, places=places) if record.open else record)
+            records.append(replace(record, currents=currents, places=places) if record.gap_unknowns else record)
         return replace(self, records=tuple(records))
 
     def stacked(self, z: Floats, parts: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
@@ -372,7 +375,7 @@ class Problem:
         return np.concatenate(residuals), np.concatenate(rows)
 
 
-def make_problem(bench: Bench, plant: Plant, records: Sequence[Record], asked: EstimationProblem) -> Problem:
+def make_problem(bench: Bench, plant: Plant, records: Sequence[Experiment], asked: EstimationProblem) -> Problem:
     """Makes the problem to be solved, and checks that it can be.
 
     Raises:

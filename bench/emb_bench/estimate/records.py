@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from emb_bench.brake.motion import Floats, Integers, is_plain
+from emb_bench.brake.motion import Floats, is_plain
 from emb_bench.brake.parameters import UNITS
 from emb_bench.brake.quantities import Quantity, quantity
 from emb_bench.experiment.evaluation import Question
-from emb_bench.experiment.experiment import REST_SIGMAS
-from emb_bench.experiment.info import Experiment
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.model_evaluator import SystematicErrors
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
@@ -83,93 +80,6 @@ DONE = "DONE"  # Exit reason of a run that came to its planned end
 NORMAL_95 = estimate.NORMAL_95  # Standard deviations that 95 % of a Gaussian lie within
 LATEST = 0.9  # Longest delay of a command [samples]: whole ones are in the record, because the node reports what acted
 EARLIEST = -0.1  # Least delay [samples]: samples that are taken late look like commands that act early
-
-
-@dataclass(frozen=True, eq=False)
-class Record:
-    """One experiment: n periods, the current that acted in each, and what was measured at its end."""
-
-    name: str
-    currents: Floats  # [A], shape (n,)
-    samples: Floats  # Measured angle [rad] and velocity [rad/s] at the end of each period, NaN where lost, shape (n, 2)
-    angle: float  # Angle measured before the experiment [rad]
-    velocity: float  # Velocity measured before the experiment [rad/s]
-    slack: float  # Standard deviation of ``angle``; 0 if it is not known [rad]
-    from_origin: bool  # True if the start cannot be distinguished from rest at the origin
-    late: Floats | None = None
-    """Lateness of each sample after the grid, by the node's own stamps [s], shape (n,); None without stamps."""
-    assumed: Floats | None = None
-    """Current that is assumed where no report says what acted [A], NaN where one does, shape (n,); None without gaps.
-
-    ``currents`` holds it too, or what an estimate has made of it."""
-    places: Floats | None = None
-    """True angle [rad] and velocity [rad/s] after each gap of several periods, as an estimate has found them, shape
-    (gaps, 2); None before."""
-    before: float = 0.0  # Current that acted before the first period [A]
-
-    outliers: int = 0  # Samples that were left out because they lie apart from their neighbours
-
-    def without(self, mask: NDArray[np.bool_]) -> Record:
-        """The record without the samples of a mask of shape (n,); what acted before them is known all the same."""
-        samples = np.where(mask[:, None], np.nan, self.samples)
-        return replace(self, samples=samples, outliers=self.outliers + int(mask.sum()))
-
-    def until(self, n: int) -> Record:
-        """The first ``n`` periods of the record."""
-        late, assumed = (None if row is None else row[:n] for row in (self.late, self.assumed))
-        cut = replace(self, currents=self.currents[:n], samples=self.samples[:n], late=late, assumed=assumed)
-        return cut if self.places is None else replace(cut, places=self.places[: len(cut.gaps[1])])
-
-    @property
-    def measured(self) -> NDArray[np.bool_]:
-        """True for each sample that was received, shape (n,)."""
-        return np.isfinite(self.samples[:, 0]) & np.isfinite(self.samples[:, 1])
-
-    @cached_property
-    def gaps(self) -> tuple[Integers, Integers]:
-        """Periods of which it is not known what acted: single ones, and the last ones of several in a row."""
-        lost = np.zeros(len(self.currents) + 2, np.bool_)
-        if self.assumed is not None:
-            lost[1:-1] = np.isfinite(self.assumed)
-        ends = lost[1:-1] & ~lost[2:]
-        return np.flatnonzero(ends & ~lost[:-2]), np.flatnonzero(ends & lost[:-2])
-
-    @cached_property
-    def inside(self) -> NDArray[np.bool_]:
-        """True for each period at whose end the brake is inside a gap of several, shape (n,)."""
-        lost = np.zeros(len(self.currents) + 1, np.bool_)
-        if self.assumed is not None:
-            lost[:-1] = np.isfinite(self.assumed)
-        return lost[:-1] & lost[1:]
-
-    @property
-    def open(self) -> int:
-        """Number of unknowns that the gaps bring: a current, or an angle and a velocity after them."""
-        return len(self.gaps[0]) + 2 * len(self.gaps[1])
-
-    def start(self, offset: float) -> tuple[float, float]:
-        """True angle [rad] and velocity [rad/s] at sample 0, of an encoder that shows ``offset`` at the origin."""
-        return (0.0 if self.from_origin else self.angle - offset), self.velocity
-
-
-def record_of(name: str, experiment: Experiment, bench: Bench, plant: Plant) -> Record:
-    """Record for an estimator from a recorded experiment.
-
-    Args:
-        name: what to call it.
-        experiment: from :func:`emb_bench.experiment.experiment.read_experiment`.
-        bench: its sample time.
-        plant: the model, whose encoder's offset defines the origin.
-    """
-    before = experiment.before
-    samples = np.stack([experiment.angle, experiment.velocity], axis=1)[1:]
-    at_origin = experiment.x0(plant.instruments.encoder_offset) == (0.0, 0.0)
-    slack = before.slack / REST_SIGMAS
-    grid = np.arange(1, len(samples) + 1) * bench.timing.sample_time_ns
-    late = np.asarray(experiment.device_time_ns[1:] - grid, dtype=np.float64) * 1e-9
-    lost = ~experiment.reported
-    assumed = np.where(lost, experiment.currents, np.nan) if lost.any() else None
-    return Record(name, experiment.currents, samples, before.angle, before.velocity, slack, at_origin, late, assumed)
 
 
 def chance(p_value: float) -> str:
@@ -403,7 +313,7 @@ class Estimate:
 
     bench: Bench
     plant: Plant
-    records: tuple[Record, ...]
+    records: tuple[Experiment, ...]
     asked: EstimationProblem
     unknowns: tuple[Unknown, ...]
     theta: BrakeParameters  # The estimated brake; what is not among the unknowns is nominal

@@ -16,7 +16,8 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import WINDOW, End, Record
+from emb_bench.estimate.records import WINDOW, End
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Spectrum
 from emb_runtime.errors import UsageError
 
@@ -84,13 +85,13 @@ def windowed(problem: Problem) -> list[Problem]:
     return [Problem(problem.bench, problem.plant, asked, (window,)) for window in cut]
 
 
-def _between(record: Record) -> Record:
+def _between(record: Experiment) -> Experiment:
     """The record with commands that go straight from stamp to stamp, of one in which they are held."""
     following = np.append(record.currents[1:], record.currents[-1:])
     return replace(record, currents=0.5 * (record.currents + following))
 
 
-def _cut(record: Record, length: int, t_s: float) -> list[Record]:
+def _cut(record: Experiment, length: int, t_s: float) -> list[Experiment]:
     """The windows of a record; one that begins with lost samples starts from the last that was received.
 
     An observer's velocity lags. Where it is one, and ``t_s`` is not 0, a window starts with the slope of a parabola
@@ -109,7 +110,7 @@ def _cut(record: Record, length: int, t_s: float) -> list[Record]:
             currents = record.currents[begin:end]
             name = f"{record.name}[{begin}:{end}]"
             speed = _slope(every, begin, t_s) if t_s else velocity
-            found.append(Record(name, currents, samples, angle, speed, 0.0, False, late, before=before))
+            found.append(Experiment(name, currents, samples, angle, speed, 0.0, False, late, before=before))
         if len(received):
             angle, velocity = samples[received[-1]].tolist()
     return found

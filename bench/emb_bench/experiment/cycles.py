@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.experiment.drive_steps import carried
-from emb_bench.experiment.info import PIECE, Booleans, Floats, Integers
+from emb_bench.experiment.experiment import Booleans, Floats, Integers
 from emb_bench.logs.log import RunLog, Table
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER
 from emb_runtime.can.messages import CHARGE, Layout
@@ -26,6 +26,7 @@ from emb_runtime.errors import LogError
 from emb_runtime.records import CycleRecord, Frame, RunState, SensorSample
 
 SPARSEST = 1000  # Most periods for each control cycle in a log; a log that claims more contradicts itself
+LONGEST = 10_000_000  # Most periods of an experiment: it is taken into memory
 UNKNOWN = -1  # Counter of a command that is not known
 
 _COLUMNS = ("step", "state", "counter", "command_counter", "device_time_ns")
@@ -38,42 +39,28 @@ _RECENT = COUNTER_MODULUS  # Of the node's messages before a control cycle, thos
 class Samples(NamedTuple):
     """Samples of the experiment, as columns of shape (n,)."""
 
-    step: Integers  # Sampling period since the experiment began
     angle: Floats  # [rad]
     velocity: Floats  # [rad/s]
-    device_time_ns: Integers  # The node's own time since sample 0 [ns]
+    late: Floats  # Lateness after the grid, by the node's own stamps [s]
     applied: Floats  # Current that acted in the period before the sample [A]
-    obeyed: Integers
+    obeyed: NDArray[np.int8]
     """Counter of the command that acted in that period, by the node's report; ``UNKNOWN`` where that is missing."""
-    answer: Integers  # Counter of the command that was sent for the sample; ``UNKNOWN`` where none was
+    answer: NDArray[np.int8]  # Counter of the command that was sent for the sample; ``UNKNOWN`` where none was
     sent: Floats  # Current of that command, as the bus of a mapped drive carried it [A]; NaN where none was sent
     charge: Floats  # Integral of the current up to the sample, by the node's report [A·s]; NaN where none came
-
-    def part(self, index: Any) -> Samples:
-        """The samples at an index, a slice or a mask."""
-        return Samples(*(column[index] for column in self))
-
-    def followed_by(self, other: Samples) -> Samples:
-        """These samples, and then others."""
-        columns: Any = zip(self, other, strict=True)
-        return Samples(*(np.concatenate(pair) for pair in columns))
 
     @property
     def received(self) -> Booleans:
         """Mask of the samples that were received, shape (n,)."""
         return np.isfinite(self.angle)
 
-    @classmethod
-    def lost(cls, begin: int, end: int, period_ns: int) -> Samples:
-        """The steps from ``begin`` up to ``end`` without a single sample."""
-        step, size = np.arange(begin, end), end - begin
-        angle, velocity, applied, sent, charge = np.full((5, size), np.nan)
-        obeyed, answer = np.full((2, size), UNKNOWN)
-        return cls(step, angle, velocity, step * period_ns, applied, obeyed, answer, sent, charge)
+
+LOST = Samples(math.nan, math.nan, 0.0, math.nan, UNKNOWN, UNKNOWN, math.nan, math.nan)  # type: ignore[arg-type]
+"""Values of a sample that was lost."""
 
 
-def samples_on_grid(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]:
-    """One sample for each step from 0 to the last one, received or not, at most ``PIECE`` of them at a time.
+def samples_on_grid(log: RunLog, bench: Bench, planned: int) -> Samples:
+    """One sample for each step from 0 to the last one, received or not.
 
     Args:
         log: the log.
@@ -83,33 +70,25 @@ def samples_on_grid(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples
     Raises:
         LogError: the log has no experiment, or none of which a whole period is left, or contradicts itself.
     """
-    begin, held = 0, Samples.lost(0, 0, 1)
-    for samples in control_cycles(log, bench, planned):
-        held = held.followed_by(samples)
-        if not len(held.step):
-            continue
-        # The last step may come again in the next batch; of two samples of one step the later one counts.
-        end = min(int(held.step[-1]), planned + 1)
-        yield from _spread(held, begin, end, bench.timing.sample_time_ns)
-        begin, held = end, held.part(held.step >= end)
-    if not len(held.step) or held.step[-1] < 1:
+    found = [*control_cycles(log, bench, planned)]
+    steps = np.concatenate([step for step, _ in found])
+    if not len(steps) or steps[-1] < 1:
         raise LogError(f"{log.path}: not one whole period of the experiment is left")
-    yield from _spread(held, begin, min(int(held.step[-1]), planned) + 1, bench.timing.sample_time_ns)
+    last = min(int(steps[-1]), planned)
+    chosen = steps <= last
+    columns = [[*samples] for _, samples in found]
+    del found
+    grid: list[Any] = []
+    for lost in LOST:  # one column after the other leaves the batches, so that a long log is not twice in memory
+        values = np.concatenate([own.pop(0) for own in columns])
+        column = np.full(last + 1, lost, values.dtype)
+        column[steps[chosen]] = values[chosen]  # of two samples of one step the later one counts
+        grid.append(column)
+    return Samples(*grid)
 
 
-def _spread(samples: Samples, begin: int, end: int, period_ns: int) -> Iterator[Samples]:
-    for first in range(begin, end, PIECE):
-        last = min(first + PIECE, end)
-        low, high = np.searchsorted(samples.step, [first, last])
-        piece = Samples.lost(first, last, period_ns)
-        at = samples.step[low:high] - first
-        for column, values in zip(piece, samples, strict=True):
-            column[at] = values[low:high]
-        yield piece
-
-
-def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]:
-    """The samples in the control cycles, some at a time; arguments and errors as for :func:`samples_on_grid`."""
+def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[tuple[Integers, Samples]]:
+    """Step and content of the samples in the control cycles, some at a time; errors as for :func:`samples_on_grid`."""
     layout, period_ns = log.layout, bench.timing.sample_time_ns
     log.require("/cycle", CycleRecord._fields)
     apart_ns = 0 if log.imported else contracts(layout, bench).pair.fresh_ns
@@ -132,28 +111,36 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[Samples]
             raise LogError(
                 f"{log.path}: {active} control cycles of an experiment of {planned} periods claim that it had {last}"
             )
+        if last > LONGEST:
+            raise LogError(f"{log.path}: expected an experiment of at most {LONGEST} periods, got {last}")
         if origin_ns is None:
             origin_ns = cycles["device_time_ns"][:1] - steps[:1] * period_ns
         since_ns = cycles["device_time_ns"] - origin_ns
         answered = cycles["command_counter"] != NO_COUNTER
-        samples = Samples(
-            step=steps,
-            angle=cycles["angle"],
-            velocity=cycles["velocity"],
-            device_time_ns=since_ns,
-            applied=cycles["applied_current"],
-            obeyed=obeyed[chosen],
-            answer=np.where(answered, cycles["command_counter"], UNKNOWN),
-            sent=np.where(answered, carried(cycles["sent_current"], log.drive), np.nan),
-            charge=charge[chosen],
-        )
         measured = np.isfinite(cycles["angle"]) if log.imported else _measured(cycles, layout)
-        yield samples.part(measured & (np.rint(since_ns / period_ns) == steps))
+        on_time = measured & (np.rint(since_ns / period_ns) == steps)
+        samples = (
+            cycles["angle"],
+            cycles["velocity"],
+            (since_ns - steps * period_ns) * 1e-9,
+            cycles["applied_current"],
+            _counters(obeyed[chosen]),
+            _counters(np.where(answered, cycles["command_counter"], UNKNOWN)),
+            np.where(answered, carried(cycles["sent_current"], log.drive), np.nan),
+            charge[chosen],
+        )
+        yield steps[on_time], Samples(*(column[on_time] for column in samples))
     if not active:
         why = log.missing or f"it never became active ({log.exit_reason})"
         raise LogError(f"{log.path}: no experiment in this log: {why}")
     if not reports.found and not log.imported:
         raise LogError(f"{log.path}: the frames of the experiment are missing: what acted is not known")
+
+
+def _counters(values: NDArray[Any]) -> NDArray[np.int8]:
+    """Counters in little memory; one that cannot be is the first that cannot be."""
+    result: NDArray[np.int8] = np.clip(values, UNKNOWN, COUNTER_MODULUS + 1).astype(np.int8)
+    return result
 
 
 def in_experiment(cycles: Table) -> Booleans:

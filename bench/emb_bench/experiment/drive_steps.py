@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from emb_bench.experiment.info import Floats
+from emb_bench.experiment.experiment import Floats
 from emb_runtime.can.messages import Layout
 from emb_runtime.drives.mapping import Mapping, Measured
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from emb_bench.brake.parameters import UNITS
-from emb_bench.experiment.info import ExperimentInfo
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.model_evaluator import NO_ERRORS, Fit, ModelEvaluator, SystematicErrors
 from emb_bench.information.fisher import Fisher, Kind, uniform_prior
 from emb_bench.information.identifiability import Identifiability
@@ -23,6 +23,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ra
 from emb_runtime.config.plants import DEFAULT_PLANT, IMPORTED_PLANT, THESIS_PLANT, Plant
 from emb_runtime.errors import LogError, UsageError
 
+PIECE = 8192  # Periods that are evaluated together
 INSTANTS = 1000  # Instants after which the information is kept; of a record that is no longer, after each sample
 
 
@@ -73,7 +74,7 @@ class Evaluation:
 
     log: RunLog
     bench: Bench
-    experiment: ExperimentInfo
+    experiment: Experiment
     plant: Plant  # The model
     theta_name: str
     theta: BrakeParameters  # Parameters at which the information was computed, and to which relative values refer
@@ -163,7 +164,7 @@ class Evaluation:
 
 def evaluate(
     log: RunLog,
-    experiment: ExperimentInfo,
+    experiment: Experiment,
     bench: Bench,
     plant: Plant,
     question: Question,
@@ -175,7 +176,7 @@ def evaluate(
 
     Args:
         log: the record.
-        experiment: its content, from :func:`emb_bench.experiment.experiment.open_experiment` or ``read_experiment``.
+        experiment: its content, from :func:`emb_bench.experiment.from_log.read_experiment`.
         bench: noise, limits and sample time.
         plant: the model.
         question: unknown parameters and prior.
@@ -188,7 +189,7 @@ def evaluate(
 
 def evaluate_all(
     log: RunLog,
-    experiment: ExperimentInfo,
+    experiment: Experiment,
     bench: Bench,
     plants: Sequence[Plant],
     question: Question,
@@ -212,7 +213,7 @@ def evaluate_all(
         )
         for plant in plants
     ]
-    for piece in experiment.pieces():
+    for piece in experiment.split(PIECE):
         for evaluator in evaluators:
             evaluator.take(piece)
     return [

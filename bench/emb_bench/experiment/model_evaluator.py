@@ -15,7 +15,7 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats, no_sensitivity, rest
 from emb_bench.brake.parameters import DELAY, OFFSET, VELOCITY_GAIN
-from emb_bench.experiment.info import Piece
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import Kind, information_over_time, weights_along
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_bench.sim.open_loop import fast_loop, trajectory
@@ -144,8 +144,8 @@ class ModelEvaluator:
         settle(plant.instruments, self._memory, x0[0])
         self._squares, self._samples = np.zeros(2), 0
 
-    def take(self, piece: Piece) -> None:
-        """Go through the next periods."""
+    def take(self, piece: Experiment) -> None:
+        """Go through the next periods of the experiment."""
         chosen, mechanics, t_s = self._chosen, self._plant.mechanics, self._bench.timing.sample_time
         currents, late = piece.currents + self._errors.current_offset, max(self._errors.delay, 0.0)
         x, moved = trajectory(self._loop, mechanics, self._theta, currents, t_s, late, chosen, self._x, self._s)
@@ -163,7 +163,7 @@ class ModelEvaluator:
         self._compare(piece, states)
         self._done += len(piece.currents)
 
-    def _inform(self, piece: Piece, states: Floats, s: Floats) -> None:
+    def _inform(self, piece: Experiment, states: Floats, s: Floats) -> None:
         wanted = self._instants - self._done
         wanted = wanted[(wanted >= 0) & (wanted < len(s))]
         for kind in KINDS:
@@ -173,7 +173,7 @@ class ModelEvaluator:
             self._totals[kind] = history[-1]
             self._kept[kind].append(history[wanted])
 
-    def _compare(self, piece: Piece, states: Floats) -> None:
+    def _compare(self, piece: Experiment, states: Floats) -> None:
         """Add up how far the samples lie from what the instruments show of the motion, but for their noise."""
         instruments, t_s = self._plant.instruments, self._bench.timing.sample_time
         offset = np.array([instruments.encoder_offset, 0.0])
@@ -186,8 +186,7 @@ class ModelEvaluator:
         shown = self._lines["shown"](shown, states[:1] + offset)
         shown[:, 1] *= 1.0 + self._errors.velocity_gain
         deviations = self._lines["deviations"](deviations, deviations[:1])
-        measured = np.stack([piece.angle, piece.velocity], axis=1)
-        seen = ((measured - shown) / deviations)[piece.measured]
+        seen = ((piece.samples - shown) / deviations)[piece.measured]
         self._squares += np.sum(seen**2, axis=0)
         self._samples += len(seen)
 

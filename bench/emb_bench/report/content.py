@@ -18,8 +18,8 @@ from emb_bench.analysis.growth import Growth, growth
 from emb_bench.analysis.study import Study, StudyOptions, begun_with, make_study, was_stopped
 from emb_bench.estimate.prediction import too_few
 from emb_bench.estimate.records import DONE
-from emb_bench.experiment.experiment import read_experiment
-from emb_bench.experiment.info import Experiment
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.information.criteria import criteria
 from emb_bench.logs import timing
 from emb_bench.logs.info import cycle_summary, info_document
@@ -355,8 +355,8 @@ def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
             "missing": list(run.experiment.missing),
             "notes": list(run.experiment.notes),
             "applied_current": run.experiment.currents.tolist(),
-            "angle": run.experiment.angle.tolist(),
-            "velocity": run.experiment.velocity.tolist(),
+            "angle": run.experiment.all_samples[:, 0].tolist(),
+            "velocity": run.experiment.all_samples[:, 1].tolist(),
         }
     if run.alone is not None:
         said["alone"] = {

@@ -12,7 +12,7 @@ from emb_bench.analysis.growth import Growth
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.quantities import angle, command, velocity
 from emb_bench.estimate.model_validation import LAGS, NEIGHBOURS, OUTPUTS
-from emb_bench.experiment.info import Experiment
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.figures import COLOURS, DASHED, GREY, log_scale, svg
 from emb_bench.logs.timing import Timing
 from emb_bench.report.content import ActiveCycles, Run, StopSamples
@@ -145,7 +145,7 @@ def motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) -> 
         assert cycles is not None
         time, measured = cycles.time, np.stack([cycles.angle, cycles.velocity], axis=1)
     else:
-        measured = np.stack([run.experiment.angle, run.experiment.velocity], axis=1)
+        measured = run.experiment.all_samples
         time = period * np.arange(len(measured), dtype=np.float64)
     units = (angle(run.bench.machine), velocity(run.bench.machine))
     factors = np.array([unit.factor for unit in units])

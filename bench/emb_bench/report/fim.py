@@ -40,7 +40,7 @@ def document(evaluation: Evaluation) -> dict[str, Any]:
         "samples": {
             "planned": e.experiment.planned,
             "periods": e.experiment.periods,
-            "measured": e.experiment.samples,
+            "measured": int(e.experiment.measured.sum()),
             "braked_periods": e.experiment.braked,
             "command_delay": e.experiment.command_delay,
         },
@@ -169,7 +169,7 @@ def _fits(fit: Fit) -> str:
 
 def _heading(e: Evaluation) -> list[str]:
     x, late, machine = e.experiment, e.experiment.command_delay, e.bench.machine
-    periods = f"{x.periods} of {x.planned} periods, {x.samples} samples"
+    periods = f"{x.periods} of {x.planned} periods, {int(x.measured.sum())} samples"
     if not e.log.imported:
         periods += f", {x.braked} periods braked by the node"
     if machine is None:

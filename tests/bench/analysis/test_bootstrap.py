@@ -9,7 +9,8 @@ import pytest
 from emb_bench.analysis import bootstrap as module
 from emb_bench.analysis.bootstrap import bootstrap
 from emb_bench.estimate.methods import refit, run_method
-from emb_bench.estimate.records import Estimate, EstimationProblem, Record
+from emb_bench.estimate.records import Estimate, EstimationProblem
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
 
@@ -19,14 +20,14 @@ from tests.bench.measurements import fit, record  # isort: skip
 CURRENTS = square(15, 3.0)[:90]
 
 
-def runs(bench: Bench, spread: float = 0.0, count: int = 4) -> list[Record]:
+def runs(bench: Bench, spread: float = 0.0, count: int = 4) -> list[Experiment]:
     """Runs of brakes whose k_m differs by ``spread`` from one to the next, symmetrically around nominal."""
     shares = 1.0 + spread * (np.arange(count) - 0.5 * (count - 1))
     brakes = [bench.brake._replace(k_m=bench.brake.k_m * share) for share in shares.tolist()]
     return [record(bench, bench.plant("exact"), CURRENTS, brake=p, seed=n) for n, p in enumerate(brakes)]
 
 
-def estimated(bench: Bench, records: Sequence[Record], params: tuple[str, ...], *nuisances: str) -> Estimate:
+def estimated(bench: Bench, records: Sequence[Experiment], params: tuple[str, ...], *nuisances: str) -> Estimate:
     return fit(bench, "exact", records, EstimationProblem(params, nuisances))
 
 

@@ -9,7 +9,8 @@ from scipy import stats
 
 from emb_bench.analysis.held_out import held_out, leave_one_out
 from emb_bench.estimate.methods import run_method
-from emb_bench.estimate.records import Estimate, EstimationProblem, Record
+from emb_bench.estimate.records import Estimate, EstimationProblem
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
@@ -21,11 +22,13 @@ CURRENTS, OTHERS = square(15, 3.0)[:60], square(10, -2.0)[:40]
 PARAMS = ("k_m", "f_v")
 
 
-def estimated(bench: Bench, records: Sequence[Record], *nuisances: str, params: tuple[str, ...] = PARAMS) -> Estimate:
+def estimated(
+    bench: Bench, records: Sequence[Experiment], *nuisances: str, params: tuple[str, ...] = PARAMS
+) -> Estimate:
     return fit(bench, "exact", records, EstimationProblem(params, nuisances))
 
 
-def run(bench: Bench, seed: int, plant: str = "exact", currents: object = CURRENTS, **changes: float) -> Record:
+def run(bench: Bench, seed: int, plant: str = "exact", currents: object = CURRENTS, **changes: float) -> Experiment:
     brake = bench.brake._replace(**changes)
     return record(bench, bench.plant(plant), np.asarray(currents, dtype=np.float64), brake=brake, seed=seed)
 
@@ -104,7 +107,7 @@ def test_the_record_of_a_brake_that_has_changed_stands_out(bench: Bench) -> None
 def test_prediction_errors_of_a_disturbed_brake_are_those_of_its_filter(bench: Bench) -> None:
     """A brake that is pushed at random is no longer where a simulation has it, and the innovations know."""
 
-    def disturbed(seed: int) -> Record:
+    def disturbed(seed: int) -> Experiment:
         rng, t_s, x = np.random.default_rng(seed), bench.timing.sample_time, (0.0, 0.0)
         states = []
         for u in CURRENTS:
@@ -112,7 +115,7 @@ def test_prediction_errors_of_a_disturbed_brake_are_those_of_its_filter(bench: B
             x = (float(after[0]), float(after[1]) + 1.5 * float(rng.standard_normal()))
             states.append(x)
         noise = rng.standard_normal((len(states), 2)) * [bench.noise.angle, bench.noise.velocity]
-        return Record(f"{seed}", np.asarray(CURRENTS), np.array(states) + noise, 0.0, 0.0, 1e-4, True)
+        return Experiment(f"{seed}", np.asarray(CURRENTS), np.array(states) + noise, 0.0, 0.0, 1e-4, True)
 
     e = run_method(
         "pem", bench, bench.plant("exact"), [disturbed(n) for n in range(3)], EstimationProblem(PARAMS), starts=1

@@ -12,7 +12,8 @@ from scipy import stats
 from emb_bench.analysis.model_choice import ModelChoice, choose_model, mixture_interval
 from emb_bench.analysis.study import StudyOptions, make_study
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.records import EstimationProblem, Record, Unknown, with_systematic
+from emb_bench.estimate.records import EstimationProblem, Unknown, with_systematic
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document, text
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
@@ -31,12 +32,12 @@ FACTORS = {"k_m": 0.9, "k_1": 1.2, "T_c": 1.3, "f_v": 1.4}
 def chosen(bench: Bench, true: str, currents: Floats, models: list[str], runs: int = 1) -> ModelChoice:
     brake = bench.brake._replace(**{name: factor * getattr(bench.brake, name) for name, factor in FACTORS.items()})
 
-    def records(plant: Plant) -> list[Record]:
+    def records(plant: Plant) -> list[Experiment]:
         own = bench.plant(true)
         made = [record(bench, own, currents, brake=brake, seed=seed) for seed in range(runs)]
         offset = plant.instruments.encoder_offset
         return [
-            Record(f"{i}", r.currents, r.samples, r.angle, 0.0, r.slack, abs(r.angle - offset) <= 4.0 * r.slack)
+            Experiment(f"{i}", r.currents, r.samples, r.angle, 0.0, r.slack, abs(r.angle - offset) <= 4.0 * r.slack)
             for i, r in enumerate(made)
         ]
 

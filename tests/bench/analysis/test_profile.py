@@ -9,14 +9,15 @@ from scipy.optimize import minimize_scalar
 
 from emb_bench.analysis.profile import LEVEL, profile
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import NORMAL_95, Estimate, EstimationProblem, Record
+from emb_bench.estimate.records import NORMAL_95, Estimate, EstimationProblem
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
 
 from tests.bench.measurements import currents_of, fit, record  # isort: skip
 
 
-def estimated(bench: Bench, records: Sequence[Record], *params: str, **asked: object) -> Estimate:
+def estimated(bench: Bench, records: Sequence[Experiment], *params: str, **asked: object) -> Estimate:
     question = EstimationProblem(params, **asked)  # type: ignore[arg-type]
     return fit(bench, "exact", records, question)
 

@@ -8,8 +8,9 @@ import pytest
 
 from emb_bench.analysis.recommendation import HELPS, PRECISE, advise, candidates
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.records import Estimate, EstimationProblem, Record
+from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.excitation.reference import parse_excitation, run_excitation
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import fisher
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 
@@ -17,7 +18,7 @@ from tests.bench.measurements import currents_of, disturbed, fit, record  # isor
 
 
 def estimated(
-    bench: Bench, records: Sequence[Record], *nuisances: str, params: tuple[str, ...] = PARAMETER_NAMES
+    bench: Bench, records: Sequence[Experiment], *nuisances: str, params: tuple[str, ...] = PARAMETER_NAMES
 ) -> Estimate:
     return fit(bench, "exact", records, EstimationProblem(params, nuisances), starts=2)
 

@@ -13,7 +13,8 @@ from emb_bench.analysis.profile import profile
 from emb_bench.analysis.study import ModelStanding, Study, StudyOptions, make_study
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
-from emb_bench.estimate.records import Estimate, EstimationProblem, Record
+from emb_bench.estimate.records import Estimate, EstimationProblem
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.numbers import amount
 from emb_bench.report.estimate import document, text
@@ -40,7 +41,7 @@ def log(tmp_path: Path, simulate: Simulate) -> Log:
     return made
 
 
-def estimated(bench: Bench, *records: Record, **asked: object) -> Estimate:
+def estimated(bench: Bench, *records: Experiment, **asked: object) -> Estimate:
     return fit(bench, "exact", records, EstimationProblem(**asked))  # type: ignore[arg-type]
 
 

@@ -21,7 +21,7 @@ from pyarrow import parquet
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
 from emb_bench.cli.replay import main
-from emb_bench.experiment.experiment import read_experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.run_type import RunType
@@ -262,7 +262,7 @@ def test_a_log_of_another_sample_time_than_the_bench_fails_with_what_is_known_of
 def test_samples_beyond_a_limit_are_counted(folder: Path, bench: Bench) -> None:
     path = folder / "monday/a.mcap"
     experiment = read_experiment(read_log(path))
-    speeds = np.sort(np.abs(experiment.velocity))
+    speeds = np.sort(np.abs(experiment.all_samples[:, 1]))
     limit = f"{0.5 * (speeds[-8] + speeds[-7]):.6f}"
     narrow = re.sub(r"(?m)^velocity = [0-9.e]+( .*rad/s.*)$", f"velocity = {limit}", bench.text, count=1)
     row = evaluate_one(Source(str(path), "", "a.mcap", "."), Options(method="none", bench_text=narrow))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from emb_bench.cli.replay import main
-from emb_bench.estimate.records import METHODS, record_of
-from emb_bench.experiment.experiment import read_experiment
+from emb_bench.estimate.records import METHODS
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_bench.report.text import WIDTH
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
@@ -115,7 +115,7 @@ def test_lost_samples_are_said_first_and_left_out(
     # Parameters, systematic errors with the true start, and the currents of the periods whose reports were lost.
     assert got["misfit"]["freedom"] == 2 * 497 - 4 - 5 - 3
     assert got["model_fits"]
-    record = record_of("x", read_experiment(read_log(path)), bench, bench.plant("exact"))
+    record = read_experiment(read_log(path))
     assert np.isnan(record.samples).all(axis=1).sum() == 3
     assert record.measured.sum() == 497
 

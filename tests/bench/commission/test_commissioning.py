@@ -23,7 +23,7 @@ from emb_bench.cli import commission
 from emb_bench.commission import examination
 from emb_bench.commission.bench_file import working_text
 from emb_bench.commission.commissioning import Commissioned, Commissioning, Run, StepFailedError, simulated
-from emb_bench.experiment.experiment import REST_SIGMAS, read_experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import Bench, Noise, load_bench, parse_bench, shipped_bench_text
@@ -208,9 +208,8 @@ def test_a_start_that_a_few_samples_at_rest_tell_is_not_taken_for_exact(
     assert in_process(["--iface", "sim", "--log", str(log), "--json"])["exit_code"] == 0
     own = read_experiment(read_log(log))
     assert own.x0() != (0.0, 0.0)
-    one_sigma = own.before.slack / REST_SIGMAS
     for error in (-2.5, 2.5):
-        unlucky = replace(own, before=own.before._replace(angle=-0.1 + error * one_sigma))
+        unlucky = replace(own, angle=-0.1 + error * own.slack)
         monkeypatch.setattr(examination, "read_experiment", lambda _log, unlucky=unlucky: unlucky)
         bench = load_bench()
         one = examination.identify([log], bench, bench.noise, None)

@@ -7,8 +7,9 @@ import pytest
 
 from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
-from emb_bench.estimate.records import EstimationProblem, Record, with_systematic
+from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.estimate.suspects import DRIFTS, Simulated, explained, secants
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 
 from tests.bench.measurements import currents_of, errors_in_sigmas, fit, problem_of, record  # isort: skip
@@ -29,7 +30,7 @@ def motion(bench: Bench, currents: Floats, name: str, drift: float) -> Floats:
     return states
 
 
-def drifting(bench: Bench, text: str, name: str, drift: float, seed: int) -> Record:
+def drifting(bench: Bench, text: str, name: str, drift: float, seed: int) -> Experiment:
     currents = currents_of(bench, text)
     still = record(bench, bench.plant("exact"), currents, seed=seed)
     moved = motion(bench, currents, name, drift) - motion(bench, currents, name, 0.0)

@@ -10,7 +10,8 @@ from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.output_error import search, start_points
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import METHODS, EstimationProblem, Record
+from emb_bench.estimate.records import METHODS, EstimationProblem
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import fisher, uniform_prior
 from emb_bench.sim.open_loop import advance_periods, simulate, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
@@ -33,7 +34,9 @@ def brake_of(bench: Bench, **factors: float) -> BrakeParameters:
     return bench.brake._replace(**{name: getattr(bench.brake, name) * f for name, f in factors.items()})
 
 
-def exactly(bench: Bench, text: str = "chirp", brake: BrakeParameters | None = None, seed: int | None = 0) -> Record:
+def exactly(
+    bench: Bench, text: str = "chirp", brake: BrakeParameters | None = None, seed: int | None = 0
+) -> Experiment:
     return record(bench, bench.plant("exact"), currents_of(bench, text, brake), brake=brake, seed=seed)
 
 
@@ -115,7 +118,7 @@ def test_a_command_that_acts_a_fraction_of_a_period_late_is_one_that_acts_late_o
     problem = problem_of(bench, ("delay",), exactly(bench))
     assert problem.predict(np.array([0.3]), 0).states == pytest.approx(states, rel=1e-9, abs=1e-9)
     noise = np.random.default_rng(0).standard_normal((500, 2)) * [bench.noise.angle, bench.noise.velocity]
-    data = Record("late", currents, states[1:] + noise, 0.0, 0.0, 0.0, True)
+    data = Experiment("late", currents, states[1:] + noise, 0.0, 0.0, 0.0, True)
     found = fit(bench, "exact", [data], EstimationProblem(nuisances=("delay",)), starts=2)
     assert found.validation.fits
     assert abs(found.values[4] - 0.3) < 4.0 * found.deviations()[4] < 0.01
@@ -130,7 +133,7 @@ def test_samples_count_at_the_instants_that_the_node_stamped(bench: Bench) -> No
     steps[-1] = 0
     seen = fine[100 * np.arange(1, 501) + steps]
     samples = seen + rng.standard_normal((500, 2)) * [bench.noise.angle, bench.noise.velocity]
-    blind = Record("off the grid", currents, samples, 0.0, 0.0, 0.0, True)
+    blind = Experiment("off the grid", currents, samples, 0.0, 0.0, 0.0, True)
     assert not fit(bench, plant, [blind]).validation.fits
     found = fit(bench, plant, [replace(blind, late=1e-5 * steps.astype(np.float64))])
     assert found.validation.fits

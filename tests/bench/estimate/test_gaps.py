@@ -14,7 +14,8 @@ from emb_bench.estimate.least_squares import regression
 from emb_bench.estimate.methods import refit
 from emb_bench.estimate.output_error import settled
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import End, EstimationProblem, Record
+from emb_bench.estimate.records import End, EstimationProblem
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 
 from tests.bench.measurements import currents_of, errors_in_sigmas, fit, problem_of, record  # isort: skip
@@ -24,7 +25,7 @@ SEVERAL = (range(150, 170), range(230, 232))
 EVERY = sorted({*SINGLE, *SEVERAL[0], *SEVERAL[1]})
 
 
-def lossy(data: Record, lost: list[int], assumed: float | None = None) -> Record:
+def lossy(data: Experiment, lost: list[int], assumed: float | None = None) -> Experiment:
     """The record without the reports of some periods, of which a current is assumed, or rightly that which acted."""
     currents, samples, guess = data.currents.copy(), data.samples.copy(), np.full(len(data.currents), np.nan)
     samples[lost] = np.nan
@@ -115,7 +116,7 @@ def test_the_first_periods_of_a_record_keep_their_gaps_and_what_was_found_in_the
     assert cut.places is not None
     assert cut.places.tolist() == [[1.0, 2.0]]
     assert len(cut.currents) == len(cut.samples) == 200
-    assert whole.until(200).open == 0
+    assert whole.until(200).gap_unknowns == 0
 
 
 def test_innovations_of_the_right_brake_are_as_large_as_stated_whatever_is_assumed_of_its_gaps(bench: Bench) -> None:
@@ -212,4 +213,4 @@ def test_of_late_samples_those_that_show_the_inside_of_a_gap_do_not_count(bench:
     assert delay == 1
     assert np.flatnonzero(~counts).tolist() == list(range(100, 110))
     shorter = lossy(data, [])
-    assert shorter.open == 0
+    assert shorter.gap_unknowns == 0

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from emb_bench.estimate.least_squares import SURE, recursion
 from emb_bench.estimate.methods import NOT_ALONG
-from emb_bench.estimate.records import EstimationProblem, Record, with_systematic
+from emb_bench.estimate.records import EstimationProblem, with_systematic
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
 
@@ -20,11 +21,11 @@ estimate = partial(fit, method="rls")
 Floats = NDArray[np.float64]
 
 
-def chirped(bench: Bench, plant: str = "exact", seed: int | None = 0) -> Record:
+def chirped(bench: Bench, plant: str = "exact", seed: int | None = 0) -> Experiment:
     return record(bench, bench.plant(plant), currents_of(bench, "chirp"), seed=seed)
 
 
-def equations(bench: Bench, data: Record) -> tuple[Floats, Floats]:
+def equations(bench: Bench, data: Experiment) -> tuple[Floats, Floats]:
     """Of the periods that surely keep their direction, in SI units, from the equation of motion, one by one."""
     p, t_s, rows, wholes = bench.brake, bench.timing.sample_time, [], []
     for k in range(1, len(data.currents)):

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from emb_bench.estimate.outliers import few, outliers
-from emb_bench.estimate.records import Record
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import Bench
 
 from tests.bench.measurements import currents_of, fit, record  # isort: skip
 
 
-def with_jumps(data: Record, *jumps: tuple[int, int, float]) -> Record:
+def with_jumps(data: Experiment, *jumps: tuple[int, int, float]) -> Experiment:
     """The record whose samples show some more at some places: sample, output, and by how much."""
     samples = data.samples.copy()
     for k, output, by in jumps:

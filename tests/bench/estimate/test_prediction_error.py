@@ -12,8 +12,9 @@ from scipy import linalg, stats
 from emb_bench.estimate.innovations import GAIN, START, Filter, march_filtered
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import EstimationProblem, Record, with_systematic
+from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.estimate.search import converge, minimise, released, strong
+from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.errors import UsageError
 
@@ -50,7 +51,7 @@ AWAY = {"delay": 0.3, "contact": 0.2, "current_offset": 0.1, "velocity_gain": 0.
 """What is added to those unknowns, where derivatives are compared."""
 
 
-def known_start(data: Record) -> Record:
+def known_start(data: Experiment) -> Experiment:
     """The same, not to be questioned."""
     return replace(data, slack=0.0)
 

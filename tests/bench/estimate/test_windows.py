@@ -9,10 +9,11 @@ import pytest
 
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import make_problem
-from emb_bench.estimate.records import Estimate, EstimationProblem, Record, record_of
+from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.estimate.shooting import begun_at, by_windows, linearised, weights_of, windowed
 from emb_bench.estimate.windows import predict_windows
-from emb_bench.experiment.experiment import read_experiment
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_bench.recordings.map_file import parse_map
 from emb_bench.recordings.readers import Column
@@ -26,14 +27,14 @@ BY_DIRECTION = Machine(forward=160.0, backward=240.0)
 ASKED = EstimationProblem(("T_c", "f_v", "J"), ("current_offset",))
 
 
-def made(found: Recording, text: str = MAP) -> tuple[Bench, Record]:
+def made(found: Recording, text: str = MAP) -> tuple[Bench, Experiment]:
     """Bench and record of a recording, without a file between."""
     wanted = parse_map(text, "map", Path("r.csv"), Path())
     columns = {name: Column(c, None) for name, c in zip(("t", "x", "F"), found, strict=True)}
     ours = recorded(columns, wanted, "r.csv")
     bench = parse_bench(bench_of(ours, wanted), "made", analysis=True)
     samples = np.stack([ours.angle, ours.velocity], axis=1)[1:]
-    return bench, Record("r", ours.applied[1:], samples, float(ours.angle[0]), float(ours.velocity[0]), 0.0, False)
+    return bench, Experiment("r", ours.applied[1:], samples, float(ours.angle[0]), float(ours.velocity[0]), 0.0, False)
 
 
 def fitted(found: Recording, asked: EstimationProblem = ASKED, text: str = MAP) -> Estimate:
@@ -95,7 +96,9 @@ def test_a_window_that_begins_at_rest_is_predicted_from_a_start_that_does_not_di
     begin, end = 42, 542  # friction holds at 42: a whole Gauss-Newton step starts the machine at -56 rad/s
     angle, velocity = data.samples[begin - 1].tolist()
     before = float(data.currents[begin - 1])
-    part = Record("r", data.currents[begin:end], data.samples[begin:end], angle, velocity, 0.0, False, before=before)
+    part = Experiment(
+        "r", data.currents[begin:end], data.samples[begin:end], angle, velocity, 0.0, False, before=before
+    )
     problem = make_problem(bench, bench.plant("recorded"), [part], ASKED)
     true = {"T_c": 20.0 * TRAVEL, "f_v": 200.0 * TRAVEL**2, "J": 95.0 * TRAVEL**2, "current_offset": -3.0 * TRAVEL}
     values = np.array([true[u.name] for u in problem.unknowns])
@@ -201,5 +204,4 @@ def test_an_imported_recording_is_estimated_by_the_command(tmp_path: Path, capsy
     assert main(["fim", run]) == 0
     log = read_log(run)
     experiment = read_experiment(log)
-    data_of = record_of("r", experiment, log.bench, log.bench.plant("recorded"))
-    assert math.isfinite(float(data_of.samples.sum()))
+    assert math.isfinite(float(experiment.samples.sum()))

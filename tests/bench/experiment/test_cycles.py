@@ -52,14 +52,18 @@ def test_the_samples_are_those_that_the_run_took_from_its_frames(
     begin = next(n for n, sample in enumerate(every) if sample.device_time_ns == first.device_time_ns)
     rows = [
         row
-        for samples in control_cycles(log, bench, STEPS)
-        for row in zip(*(column.tolist() for column in samples), strict=True)
+        for step, samples in control_cycles(log, bench, STEPS)
+        for row in zip(*(column.tolist() for column in (step, *samples)), strict=True)
     ]
     assert rows
     assert UNKNOWN not in [row[5] for row in rows]
-    assert [row[1:6] for row in rows] == [
-        (s.angle, s.velocity, s.device_time_ns - first.device_time_ns, s.applied_current, s.command_counter)
-        for s in every[begin : begin + len(rows)]
+    t_s = bench.timing.sample_time_ns
+    assert [(*row[1:3], *row[4:6]) for row in rows] == [
+        (s.angle, s.velocity, s.applied_current, s.command_counter) for s in every[begin : begin + len(rows)]
+    ]
+    assert [row[3] for row in rows] == [
+        (s.device_time_ns - first.device_time_ns - row[0] * t_s) * 1e-9
+        for s, row in zip(every[begin : begin + len(rows)], rows, strict=True)
     ]
     before = samples_before(log, bench, 50)
     expected = every[: begin + 1][-50:]

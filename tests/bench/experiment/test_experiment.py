@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emb_bench.experiment.cycles import Samples
-from emb_bench.experiment.experiment import currents_by_charge, fit, read_experiment
-from emb_bench.experiment.info import Experiment
-from emb_bench.experiment.model_evaluator import Fit
+from emb_bench.experiment.cycles import LOST, Samples
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.from_log import currents_by_charge, read_experiment
+from emb_bench.experiment.model_evaluator import Fit, ModelEvaluator
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.sim.transport import SimTransport
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import Layout
-from emb_runtime.config.bench import Bench
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.plants import Plant
 from emb_runtime.errors import LogError
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
@@ -60,6 +61,12 @@ def recorded(tmp_path: Path, run: SimRun, steps: int = 500) -> tuple[RunLog, Exp
     return log, read_experiment(log)
 
 
+def fit(experiment: Experiment, bench: Bench, theta: BrakeParameters, plant: Plant) -> Fit:
+    evaluator = ModelEvaluator(bench, plant, theta, experiment.x0(plant.instruments.encoder_offset))
+    evaluator.take(experiment)
+    return evaluator.fit
+
+
 def test_what_acted_is_exactly_what_the_node_was_told(
     tmp_path: Path, simulate: Simulate, layout: Layout, bench: Bench
 ) -> None:
@@ -69,9 +76,10 @@ def test_what_acted_is_exactly_what_the_node_was_told(
     assert experiment.measured.all()
     assert (experiment.planned, experiment.braked, experiment.missing) == (500, 0, ())
     assert experiment.x0() == (0.0, 0.0)
-    assert experiment.angle[:-1].tolist() == [c.angle for c in run.journal.cycles[:-1]]
-    assert experiment.velocity.tolist() == [c.velocity for c in run.journal.cycles]
-    assert experiment.device_time_ns.tolist() == [k * bench.timing.sample_time_ns for k in range(501)]
+    assert experiment.all_samples[:-1, 0].tolist() == [c.angle for c in run.journal.cycles[:-1]]
+    assert experiment.all_samples[:, 1].tolist() == [c.velocity for c in run.journal.cycles]
+    assert experiment.late is not None
+    assert experiment.late.tolist() == [0.0] * 500
     assert log.complete
 
 
@@ -96,14 +104,14 @@ def test_a_lost_sample_is_a_gap_whose_currents_are_assumed_and_said_to_be(
     log, experiment = recorded(tmp_path, run)
     lost = np.flatnonzero(~experiment.measured)
     assert len(lost) == 3
-    assert np.isnan(experiment.angle[1:][lost]).all()
+    assert np.isnan(experiment.samples[lost, 0]).all()
     assert experiment.missing[0].startswith("3 samples were lost")
     # A period that begins at a lost sample has no command: the node braked, and of two in a row one is not reported.
     assert experiment.braked == 2
     sent = {c.step: c.sent_current for c in run.journal.cycles if c.command_counter != 15}
     first, second, third = lost.tolist()
     assert (experiment.currents[first], experiment.currents[second]) == (sent[first], sent[second])
-    assert experiment.currents[third] == pytest.approx(np.clip(-0.1 * experiment.velocity[second], -6.0, 6.0))
+    assert experiment.currents[third] == pytest.approx(np.clip(-0.1 * experiment.samples[second - 1, 1], -6.0, 6.0))
     assert log.truth is not None
     near = fit(experiment, bench, log.truth, bench.plant("exact"))
     assert near.velocity < 3.0  # the assumption about one braked period is close, not exact
@@ -154,7 +162,7 @@ def test_the_charge_tells_what_acted_before_a_single_lost_sample_and_nothing_els
 
 
 def test_a_charge_that_cannot_be_is_not_believed(bench: Bench, layout: Layout) -> None:
-    samples = Samples.lost(0, 5, 1_000_000)
+    samples = Samples(*(np.full(5, value) for value in LOST))
     samples.angle[[0, 1, 3, 4]] = 0.0
     samples.applied[[0, 1, 3, 4]] = 1.0
     wrap = 2e-7 * 2**40
@@ -257,7 +265,7 @@ def test_a_cut_log_has_the_experiment_up_to_the_cut(tmp_path: Path, simulate: Si
     assert 100 < count < 400
     assert part.missing == (f"the experiment ends after {count} of 500 samples",)
     np.testing.assert_array_equal(part.currents, whole.currents[:count])
-    np.testing.assert_array_equal(part.angle, whole.angle[: count + 1])
+    np.testing.assert_array_equal(part.all_samples, whole.all_samples[: count + 1])
 
 
 def test_an_experiment_that_was_stopped_ends_there(tmp_path: Path, simulate: Simulate) -> None:

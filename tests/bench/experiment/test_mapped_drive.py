@@ -10,8 +10,8 @@ import pytest
 
 import simulated_drives
 from emb_bench import api
-from emb_bench.experiment.experiment import read_experiment
-from emb_bench.experiment.info import Floats
+from emb_bench.experiment.experiment import Floats
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.numbers import in_samples
 from emb_bench.report import estimate as report

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emb_bench.experiment.info import Piece
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.model_evaluator import NO_ERRORS, ModelEvaluator, SystematicErrors
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
@@ -14,7 +14,9 @@ FINE = 20  # Steps of the simulation in a period
 CURRENTS = np.repeat([2.0, -1.5, 1.0, 0.3], 20)
 
 
-def shown(bench: Bench, late: int = 0, offset: float = 0.0, current_offset: float = 0.0, gain: float = 0.0) -> Piece:
+def shown(
+    bench: Bench, late: int = 0, offset: float = 0.0, current_offset: float = 0.0, gain: float = 0.0
+) -> Experiment:
     """What the sensors of a brake show without noise, simulated in short steps.
 
     Args:
@@ -28,21 +30,17 @@ def shown(bench: Bench, late: int = 0, offset: float = 0.0, current_offset: floa
     fine = simulate(bench.plant("exact").mechanics, bench.brake, acted, bench.timing.sample_time / FINE).states
     at = np.arange(FINE, len(CURRENTS) * FINE, FINE)
     x = fine[at - min(late, 0)]
-    n = len(x)
-    return Piece(
-        CURRENTS[:n], np.ones(n, bool), x[:, 0] + offset, x[:, 1] * (1.0 + gain), np.zeros(n, np.int64), at > 0
-    )
+    return Experiment("", CURRENTS[: len(x)], x * [1.0, 1.0 + gain] + [offset, 0.0], 0.0, 0.0, 0.0, True)
 
 
-def evaluated(bench: Bench, piece: Piece, errors: SystematicErrors, *names: str) -> ModelEvaluator:
-    """Evaluates a piece in two halves."""
+def evaluated(bench: Bench, piece: Experiment, errors: SystematicErrors, *names: str) -> ModelEvaluator:
+    """Evaluates an experiment in parts."""
     n = len(piece.currents)
     found = ModelEvaluator(
         bench, bench.plant("exact"), bench.brake, (0.0, 0.0), errors=errors, names=names, periods=n, instants=[n - 1]
     )
-    for half in (slice(0, 30), slice(30, n)):
-        columns: Any = [column[half] for column in piece]
-        found.take(Piece(*columns))
+    for part in piece.split(30):
+        found.take(part)
     return found
 
 
@@ -77,10 +75,8 @@ def test_the_information_about_systematic_errors_is_that_of_finite_differences(b
     rows = []
     for option, step, size in steps.values():
         more, less = (shown(bench, **at | {option: at[option] + sign * step}) for sign in (1, -1))
-        angle, velocity = (
-            (a - b) / (2.0 * size) for a, b in ((more.angle, less.angle), (more.velocity, less.velocity))
-        )
-        rows.append(np.concatenate([angle / bench.noise.angle, velocity / bench.noise.velocity]))
+        derivative = (more.samples - less.samples) / (2.0 * size)
+        rows.append((derivative / [bench.noise.angle, bench.noise.velocity]).ravel())
     found = evaluated(bench, shown(bench, **at), SystematicErrors(0.01, 0.05, 0.3, 0.02), *steps)
     expected = np.array(rows) @ np.array(rows).T
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))

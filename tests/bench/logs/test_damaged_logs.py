@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.cli.replay import main
-from emb_bench.experiment.experiment import read_experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.logs.mcap_reader import MAGIC

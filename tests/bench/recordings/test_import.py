@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from emb_bench.cli.replay import main
-from emb_bench.experiment.experiment import read_experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import BenchFileError
@@ -46,9 +46,9 @@ def check(path: Path, found: Recording = RECORDING) -> None:
     log = read_log(path)
     assert log.complete
     experiment = read_experiment(log)
-    np.testing.assert_allclose(experiment.angle, found.position / TRAVEL, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(experiment.all_samples[:, 0], found.position / TRAVEL, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(experiment.currents, found.force[:-1] * TRAVEL, rtol=1e-9, atol=1e-9)
-    assert experiment.samples == len(found.time) - 1
+    assert experiment.measured.sum() == len(found.time) - 1
 
 
 def test_a_csv_file_becomes_a_log_with_its_samples_and_the_machine(tmp_path: Path) -> None:
@@ -169,12 +169,12 @@ T_c = 0.01
 f_v = 1e-4
 """
     experiment = read_experiment(read_log(imported(tmp_path, tmp_path / "drive.log", text)))
-    np.testing.assert_allclose(experiment.angle, angles, atol=1e-3)
-    np.testing.assert_allclose(experiment.velocity, -np.array(angles), atol=1e-3)
+    np.testing.assert_allclose(experiment.all_samples[:, 0], angles, atol=1e-3)
+    np.testing.assert_allclose(experiment.all_samples[:, 1], -np.array(angles), atol=1e-3)
     np.testing.assert_allclose(experiment.currents, torques[:-1], atol=1e-4)
     # The frames came up to 2 ms late; their own stamps say so.
-    late = experiment.device_time_ns - np.arange(60) * 10_000_000
-    np.testing.assert_allclose(late, [1_000_000 * (k % 3) for k in range(60)], atol=1000)
+    assert experiment.late is not None
+    np.testing.assert_allclose(experiment.late, np.array([1e-3 * (k % 3) for k in range(1, 60)]), atol=1e-6)
 
 
 def test_a_linear_command_is_the_mean_of_what_lies_between_its_stamps(tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ def test_lost_and_shifted_samples_stay_where_their_times_are(tmp_path: Path) -> 
     assert experiment.periods == len(RECORDING.time) - 1
     lost = np.flatnonzero(~experiment.measured) + 1
     assert lost.tolist() == [50, 51, 90]
-    np.testing.assert_allclose(experiment.angle[kept], found.position / TRAVEL)
+    np.testing.assert_allclose(experiment.all_samples[kept, 0], found.position / TRAVEL)
     assert any("3 samples" in line for line in experiment.missing)
 
 

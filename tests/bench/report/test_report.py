@@ -23,7 +23,7 @@ from emb_bench.analysis.study import StudyOptions, make_study
 from emb_bench.cli.replay import main
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.evaluation import Question, evaluate
-from emb_bench.experiment.experiment import read_experiment
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.figures import COLOURS
 from emb_bench.logs.log import read_log
 from emb_bench.report import certainty
@@ -204,7 +204,7 @@ def test_residuals_and_motion_are_in_the_numbers(report: Report, good: Path) -> 
     run = report.numbers["runs"][0]
     errors = np.array([run["residuals"]["angle"], run["residuals"]["velocity"]])
     assert (errors**2).sum() == pytest.approx(report.numbers["estimate"]["misfit"]["chi2"])
-    assert run["experiment"]["angle"] == read_experiment(read_log(good)).angle.tolist()
+    assert run["experiment"]["angle"] == read_experiment(read_log(good)).all_samples[:, 0].tolist()
 
 
 def test_a_model_that_does_not_fit_is_said_before_any_number(validation: Report) -> None:
