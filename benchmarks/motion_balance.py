@@ -31,6 +31,8 @@ from emb_bench.sim.instruments import MEMORY as INSTRUMENTS_MEMORY
 from emb_bench.sim.instruments import command, settle
 from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.config.plants import Instruments, Mechanics
+from emb_runtime.estimator.kalman import Model, follow, make_model, start
+from emb_runtime.estimator.speed_loop import Scale
 from emb_runtime.safety.motion_balance import MEMORY as BALANCE_MEMORY
 from emb_runtime.safety.motion_balance import (
     BalanceModel,
@@ -45,8 +47,7 @@ from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current, shield, window
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
-from emb_train.structured.estimator import Model, make_model, start
-from emb_train.structured.law import Loop, act
+from emb_train.structured.law import Box, box_of, wanted_current
 from emb_train.structured.stored import stored
 
 Floats = NDArray[np.float64]
@@ -65,9 +66,9 @@ def fly(
     mechanics: Mechanics,
     instruments: Instruments,
     model: Model,
-    loop: Loop,
+    scale: Scale,
+    box: Box,
     table: Floats,
-    begun: Floats,
     scripted: bool,
     script: Script,
     out: Floats,
@@ -75,12 +76,12 @@ def fly(
     """Play each experiment of a script to its end, whatever the monitor or the balance says."""
     ts = law.sample_time
     memory, sums, instrument = np.zeros(MEMORY), np.zeros(BALANCE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
-    x, state = np.zeros(STATES), np.zeros(begun.shape[0])
+    x, reference = np.zeros(STATES), np.zeros(table.shape[0])
     no_unknowns, no_sensitivity = np.zeros(0, np.int64), np.zeros((0, SENSITIVE))
     for m in range(out.shape[0]):
         b = script.brakes[m]
         p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
-        x[:], state[:] = 0.0, begun
+        x[:], state = 0.0, start(model)
         settle(instruments, instrument, 0.0)
         angle, velocity = script.errors[m, 0, 0] + instruments.encoder_offset, script.errors[m, 0, 1]
         begin_monitor(memory, angle, velocity)
@@ -90,7 +91,8 @@ def fly(
             if scripted:
                 wanted = script.wanted[m, k]
             elif periods == 0:
-                wanted = act(model, loop, table, state, angle, velocity, float(k), felt)
+                state = follow(model, state, angle, velocity, float(k), felt)
+                wanted = wanted_current(model, state, scale, box, table, reference)
             limit = largest_current(law, limits, memory, law.current)
             u, _ = shield(law, angle, velocity, wanted, past, k)
             if not -limit <= u <= limit:
@@ -134,7 +136,8 @@ def results(bench: Bench, plant: str, count: int, rng: np.random.Generator) -> F
     """Rows of results of so many experiments: half of them under a shipped actor."""
     case = covered(bench, plant) if plant in COVERED else bench
     law, chosen = make_law(case), case.plant(plant)
-    model = make_model(bench, bench.range_set("pm50"), "exact")
+    prior = bench.range_set(bench.prior)
+    model, box = make_model(bench, prior, sticks=True), box_of(bench, prior)
     rows = []
     for turn in range(0, count, CHUNK):
         script = draw(rng, case, min(CHUNK, count - turn), plant)
@@ -148,9 +151,9 @@ def results(bench: Bench, plant: str, count: int, rng: np.random.Generator) -> F
             chosen.mechanics,
             chosen.instruments,
             model,
-            actor.loop(bench),
+            actor.scale(bench),
+            box,
             actor.array(),
-            start(model),
             bool(rng.integers(2)),
             script,
             out,

@@ -12,6 +12,7 @@ import onnx.parser
 from onnx import TensorProto, helper
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.estimator.estimate import Quantity
 from emb_runtime.policy.contract import (
     ACTION,
     APPLIED_CURRENT,
@@ -19,7 +20,6 @@ from emb_runtime.policy.contract import (
     MIN_VECTORS,
     OBSERVATION,
     Contract,
-    Quantity,
     Vector,
 )
 

@@ -122,8 +122,6 @@ class MemoryJournal:
 class FunctionActor:
     """An actor made of a function of (angle, velocity, step)."""
 
-    estimate: tuple[float, ...] = ()
-
     def begin(self) -> None:
         pass
 

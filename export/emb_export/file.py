@@ -19,6 +19,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.excitation.reference import parse_excitation
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.estimator.estimate import Quantity
 from emb_runtime.policy.contract import (
     ACTION,
     CONTRACT_KEY,
@@ -26,7 +27,6 @@ from emb_runtime.policy.contract import (
     OBSERVATION,
     VECTOR_TOLERANCE,
     Contract,
-    Quantity,
     Vector,
 )
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME

@@ -19,7 +19,8 @@ from emb_export.file import add_contract, contract_for
 from emb_export.network import graph_of, recorded
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
 from emb_runtime.errors import PolicyRefusedError, UsageError
-from emb_runtime.policy.contract import APPLIED_CURRENT, OBSERVATION, VECTOR_TOLERANCE, Quantity, Vector
+from emb_runtime.estimator.estimate import Quantity
+from emb_runtime.policy.contract import APPLIED_CURRENT, OBSERVATION, VECTOR_TOLERANCE, Vector
 from emb_runtime.policy.inference import ESTIMATE_NAME, INPUT_NAME, NEXT_STATE_NAME, OUTPUT_NAME, STATE_NAME
 from emb_runtime.policy.policy import Policy, load_policy
 from emb_train.envs.excitations import StatefulNetwork

@@ -16,6 +16,7 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError
+from emb_runtime.estimator.estimate import Quantity
 from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.log.ring_buffer import (
     Direction,
@@ -27,7 +28,6 @@ from emb_runtime.log.ring_buffer import (
     LineRecord,
     Record,
 )
-from emb_runtime.policy.contract import Quantity
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.run_type import FIRST_CURRENT, FIRST_MOVE, STOPPABLE
 from emb_runtime.safety.guard import Guard

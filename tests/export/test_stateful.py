@@ -27,7 +27,8 @@ from emb_export.stateful import (
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError, UsageError
-from emb_runtime.policy.contract import APPLIED_CURRENT, OBSERVATION, Quantity
+from emb_runtime.estimator.estimate import Quantity
+from emb_runtime.policy.contract import APPLIED_CURRENT, OBSERVATION
 from emb_runtime.policy.policy import Policy, load_policy
 
 HORIZON = 60

@@ -22,7 +22,8 @@ MAY_IMPORT = {
 }
 OURS = set.union(*MAY_IMPORT.values())
 ROOMS = {
-    "runtime/emb_runtime": "errors records run_type system config can policy log safety drives learning control cli",
+    "runtime/emb_runtime": "errors records run_type system config can estimator policy log safety drives learning "
+    "control cli",
     "bench/emb_bench": "numbers compiled figures parallel output brake sim information design excitation logs "
     "recordings experiment export hil replay estimate analysis commission report live batch api cli",
     "train/emb_train": "names rewards envs structured ppo training presets evaluation cli entry",

@@ -267,6 +267,7 @@ def _of_sheet(sheet: Bench) -> dict[str, Any]:
     document["ranges"] = {SHEET: {name: list(_range(sheet, name)) for name in PARAMETER_NAMES}}
     document["shield"] = {key: value for key, value in document["shield"].items() if key not in LEARNING}
     document["shield"]["ranges"] = SHEET
+    document.pop("estimator", None)  # it begins with the shield's ranges
     return document
 
 

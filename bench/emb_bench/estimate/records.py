@@ -19,7 +19,7 @@ from emb_bench.information.identifiability import Identifiability, Spectrum, jud
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.plants import ASYMMETRIES, EXACT, Plant
 from emb_runtime.errors import UsageError
-from emb_runtime.policy import estimate
+from emb_runtime.estimator import estimate
 
 FEATURES: Mapping[str, tuple[float, float, float]] = {
     "break_away": (1.0, 1.1, 5.0),

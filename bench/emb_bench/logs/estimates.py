@@ -1,4 +1,4 @@
-"""The actor's own estimates while it ran: the topic ``/estimate`` of a log."""
+"""The running estimate of an experiment: the topic ``/estimate`` of a log."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from typing import Any
 
 from emb_bench.logs.log import RunLog, Table
 from emb_runtime.errors import LogError
+from emb_runtime.estimator.estimate import Quantity, by_name
 from emb_runtime.log.mcap_schema import ESTIMATE, deviation_of, estimate_topic
-from emb_runtime.policy.contract import Quantity
-from emb_runtime.policy.estimate import by_name
 
 _STEP = "step"
 

@@ -231,11 +231,6 @@ class Playback:
 
     # --- the actor --------------------------------------------------------------------------------------------------
 
-    @property
-    def estimate(self) -> tuple[float, ...]:
-        """Estimate of the actor."""
-        return self._actor.estimate
-
     def begin(self) -> None:
         """A run begins."""
         self._actor.begin()
@@ -266,7 +261,7 @@ class Playback:
                 self._differ_at(item.step, name, repr(recorded), repr(came))
 
     def push_estimate(self, _time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
-        """Compare an estimate of the actor."""
+        """Compare an estimate."""
         self._compare_numbers("estimate", self._estimates, step, estimate)
 
     def push_learnt(self, _time_ns: int, step: int, numbers: tuple[float, ...]) -> None:

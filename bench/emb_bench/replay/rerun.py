@@ -22,6 +22,7 @@ from emb_runtime.control.result import Outcome
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.drives.mapping import mapping_hash
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
+from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder_process import DIED
 from emb_runtime.run_type import FIRST_CURRENT, FIRST_MOVE, RunType
 from emb_runtime.safety.guard import Guard
@@ -92,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
         carried: dict[str, str] = {}
     else:
         policy = carried_policy(log)
-        again = rerun(log, policy, policy.contract.action_limit, _stop_condition(log, policy))
+        again = rerun(log, policy, policy.contract.action_limit, _stop_condition(log))
         carried = {"policy_sha256": policy.sha256}
     again = replace(again, differences=(*_identity(log, carried), *again.differences))
     show(as_json(document(log, again)) if args.json else text(log, again))
@@ -182,11 +183,11 @@ def _steps(log: RunLog) -> int:
     return int(recorded)
 
 
-def _stop_condition(log: RunLog, policy: Policy) -> StopCondition | None:
+def _stop_condition(log: RunLog) -> StopCondition | None:
     """Stop condition of the run, if it had one."""
     stop_when = log.run.get("stop_when")
     try:
-        return None if stop_when is None else parse_stop_condition(stop_when, policy.contract.estimates)
+        return None if stop_when is None else parse_stop_condition(stop_when, estimated(log.bench))
     except UsageError as err:
         raise LogError(f"{log.path}: emb.run: stop_when: {err}") from err
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from emb_bench.logs.log import IMPORT
 from emb_bench.report.text import facts
-from emb_runtime.policy.estimate import words
+from emb_runtime.estimator.estimate import words
 from emb_runtime.system.terminal import one_line
 
 

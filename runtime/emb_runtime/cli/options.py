@@ -17,6 +17,7 @@ from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.errors import BenchFileError, PolicyRefusedError, UsageError
+from emb_runtime.estimator.estimator import estimated
 from emb_runtime.learning.assumptions import make_assumptions
 from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
@@ -165,8 +166,8 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     what.add_argument(
         "--stop-when", metavar="NAME=P%[,...]",
-        help="end the experiment early, by the shield's way home, once the actor's own standard deviations are below "
-        "these parts of its estimates: k_1=1%%,f_v=5%%; needs an actor that estimates",
+        help="end the experiment early, by the shield's way home, once the standard deviations of the running estimate "
+        "are below these parts of its values: k_1=1%%,f_v=5%%",
     )  # fmt: skip
     what.add_argument(
         "--live", nargs="?", const=str(LIVE_PORT), metavar="PORT|lines",
@@ -270,7 +271,7 @@ def prepare(args: argparse.Namespace) -> Plan:
         law=law,
         policy=policy,
         steps=steps,
-        stop_condition=_stop_condition(args, policy),
+        stop_condition=_stop_condition(args, bench),
         listen=listen,
         stage=stage,
         limit=limit,
@@ -371,8 +372,8 @@ def _live(wanted: str | None) -> str | None:
     raise UsageError(f"--live: expected a port, 0 to 65535, or 'lines', got '{wanted}'")
 
 
-def _stop_condition(args: argparse.Namespace, policy: Policy | None) -> StopCondition | None:
-    estimates = policy.contract.estimates if policy is not None else ()
+def _stop_condition(args: argparse.Namespace, bench: Bench) -> StopCondition | None:
+    estimates = estimated(bench)
     if args.stop_when is not None:
         return parse_stop_condition(args.stop_when, estimates)
     goal = ",".join(f"{quantity.name}={QUICK_GOAL}" for quantity in estimates)

@@ -16,14 +16,15 @@ from emb_runtime.cli.options import Plan
 from emb_runtime.cli.preflight import CheckResult
 from emb_runtime.config.bench import LEARNING
 from emb_runtime.drives.transport import MappedTransport
+from emb_runtime.estimator.estimate import Quantity
+from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder import Attachment, LogHeader
-from emb_runtime.policy.contract import Quantity
 from emb_runtime.run_type import FIRST_CURRENT, FIRST_MOVE, STOPPABLE, RunType
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.system import compiled_core
 from emb_runtime.system.clock import Clock
 
-ESTIMATE_RATE = 25_000  # Log rate of each quantity that the actor estimates [bytes per second]
+ESTIMATE_RATE = 25_000  # Log rate of each parameter that is estimated [bytes per second]
 LEARNT_RATE = 150_000  # Log rate of what the shield learns [bytes per second]
 LOG_RATE = 500_000  # Log rate of a run at 1 kHz, with room to spare: measured are 250 to 310 kB [bytes per second]
 
@@ -89,7 +90,7 @@ def header(
         }
         if plan.stop_condition is not None:
             records["emb.run"]["stop_when"] = plan.stop_condition.text
-        estimates = policy.contract.estimates
+        estimates = estimated(bench)
         attachments.append(Attachment("policy.onnx", "application/octet-stream", policy.data))
     if lines:
         records["emb.preflight"] = {
@@ -126,5 +127,5 @@ def log_bytes(plan: Plan, duration: float) -> int:
     rate = LOG_RATE + LEARNT_RATE * plan.bench.shield.learn
     if plan.policy is not None:
         carried += len(plan.policy.data)
-        rate += ESTIMATE_RATE * len(plan.policy.contract.estimates)
+        rate += ESTIMATE_RATE * len(estimated(plan.bench))
     return carried + round(rate * duration * 1e-3 / plan.bench.timing.sample_time)

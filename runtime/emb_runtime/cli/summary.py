@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 from emb_runtime.cli.preflight import CheckResult, RefusedError
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG, BusError, EmbError
+from emb_runtime.estimator import estimate
+from emb_runtime.estimator.estimator import estimated
 from emb_runtime.learning.learner import ranges_of
 from emb_runtime.log.recorder import RecorderResult
-from emb_runtime.policy import estimate
 from emb_runtime.run_type import RunType
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.safety.watchdog import WatchdogResult
@@ -98,7 +99,7 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         **asdict(outcome.counters),
         "rejections": dict(outcome.rejections),
         "bus_error_classes": dict(outcome.bus_errors),
-        "estimate": estimate.by_name(plan.policy.contract.estimates, outcome.estimate),
+        "estimate": estimate.by_name(estimated(plan.bench), outcome.estimate),
         "learnt": {} if outcome.learnt is None else ranges_of(outcome.learnt),
         **motion(outcome),
         "goal_reached": outcome.goal_reached,

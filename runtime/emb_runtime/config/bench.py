@@ -57,6 +57,7 @@ LEARNING = ("learn", "model", "model_error", "current_error")
 OPTIONAL = (
     *(
         "budgets",
+        "estimator",
         "machine",
         "plants",
         "systematic",
@@ -198,6 +199,7 @@ class Bench:
     noise: Noise
     timing: Timing
     shield: Shield
+    prior: str  # Name of the set of ranges that the running estimate begins with; the shield's where none is named
     watch: Watch
     guard: GuardLimits
     node: Node
@@ -339,7 +341,8 @@ def parse_bench(text: str, source: str, *, analysis: bool = False) -> Bench:
         limits=_limits(top.table("limits"), machine),
         noise=_noise(top.table("noise")),
         timing=timing,
-        shield=_shield(top.table("shield"), ranges, brake),
+        shield=(shield := _shield(top.table("shield"), ranges, brake)),
+        prior=_prior(top, ranges) or shield.ranges,
         watch=_watch(top.table("watch"), cycle),
         guard=_guard(top.table("guard")),
         node=_node(top.table("node"), cycle),
@@ -494,6 +497,17 @@ def _shield(table: Table, ranges: Mapping[str, Ranges], brake: BrakeParameters) 
     )
     table.nothing_else(key.removeprefix("shield.") for key in OPTIONAL if key.startswith("shield."))
     return record
+
+
+def _prior(top: Table, ranges: Mapping[str, Ranges]) -> str:
+    if "estimator" not in top.names():
+        return ""
+    table = top.table("estimator")
+    name = table.text("ranges")
+    if name not in ranges:
+        raise table.fail("ranges", f"no set [ranges.{name}] in this file")
+    table.nothing_else()
+    return name
 
 
 def _bound(table: Table, name: str, check: Callable[[float], bool], wanted: str, absent: float) -> float:

@@ -13,8 +13,6 @@ LONGEST_WAY = 3.0  # Time for a way home; from anywhere inside the limits it tak
 class Still:
     """An actor that wants 0 A."""
 
-    estimate: tuple[float, ...] = ()  # It estimates nothing
-
     def begin(self) -> None:
         """Do nothing: there is no memory."""
 

@@ -11,11 +11,6 @@ from emb_runtime.records import CycleRecord, Frame
 class Actor(Protocol):
     """Source of the wanted currents: a policy, or the way home."""
 
-    @property
-    def estimate(self) -> tuple[float, ...]:
-        """Estimated quantities, then their standard deviations; empty if the actor estimates nothing."""
-        ...
-
     def begin(self) -> None:
         """Reset the actor's memory: a run begins."""
         ...
@@ -35,7 +30,7 @@ class Journal(Protocol):
         """Record one control cycle."""
 
     def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
-        """Record the actor's estimate at a sample: values, then standard deviations."""
+        """Record the estimate at a sample: values, then standard deviations."""
 
     def push_learnt(self, time_ns: int, step: int, numbers: tuple[float, ...]) -> None:
         """Record what is possible at a sample, see :func:`emb_runtime.learning.known.numbers`."""

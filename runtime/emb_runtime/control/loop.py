@@ -29,6 +29,7 @@ from emb_runtime.control.result import Outcome, RunCounters
 from emb_runtime.control.start_conditions import READY_PAIRS, Bounds, StartConditions
 from emb_runtime.control.stop_condition import REACHED, StopCondition
 from emb_runtime.errors import BusError, PolicyRefusedError
+from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.learning.known import numbers
 from emb_runtime.learning.learner import Learner, words
 from emb_runtime.log.ring_buffer import Level
@@ -103,6 +104,7 @@ class Loop:
         self._moves_at_rest = ""  # velocity that the node measures at rest, in words
         # The way home may begin anywhere, and is not worth learning for.
         self._learner = Learner(bench, self.law, active=not self.homing)
+        self._estimator = Estimator(bench)
         self._reversed: StopError | None = None  # the sign may be wrong, and friction is stopping the brake
         self._coasting = 0.0  # time left for that [s]
         self._late_step = self.law.steps - 2 - math.ceil(self.law.settling / self.law.sample_time)
@@ -120,7 +122,7 @@ class Loop:
         self._past = NO_PAST  # the last own commands, newest first
         self._answered: int | None = None  # counter of the sample that the newest of them answered
         self._permitted = True
-        self._estimate: tuple[float, ...] = ()  # the actor's latest
+        self._estimate: tuple[float, ...] = ()  # the latest
         self._condition_met = False
         self._met_ns = 0  # from the first sample to that at which it was met, device time
         self._at_rest = False  # the newest sample since the first stop frame says idle
@@ -242,6 +244,8 @@ class Loop:
         self._balance.judge()
         self._learner.begin(sample)
         self._learner.hear(sample, 1)
+        self._estimator.begin()
+        self._estimator.take(sample.angle, sample.velocity, 0, sample.applied_current)
         law, angle, velocity = self._learner.question(sample)
         decide(law, reach, angle, velocity, 0.0, NO_PAST, 0.0, 0)
 
@@ -255,13 +259,14 @@ class Loop:
         self._monitor.begin(sample)
         self._balance.begin(sample)
         self._learner.begin(sample)
+        self._estimator.begin()
         self.counters.pairs = 1
         self.actor.begin()
         at_home = 0
         # With a wrong sign beyond the last sample as well, until friction has stopped the brake: that ends as a fault.
         while ((step := self._step_of(sample)) < self.steps and at_home < HOME_PAIRS) or self._reversed is not None:
             self._answer(sample, step)
-            if estimate := self.actor.estimate:
+            if not self.homing and (estimate := self._estimator.estimate):
                 self._keep_estimate(estimate, sample, step)
             if self._learner.known is not None:
                 learnt = numbers(self._learner.known, self._learner.age)
@@ -346,6 +351,7 @@ class Loop:
         self._check_requests()
         self._check_sample(sample)
         self._remember(*NO_PAST[: self._missed])
+        self._estimator.take(sample.angle, sample.velocity, step, sample.applied_current)
         asked = self.actor.act(sample.angle, sample.velocity, step, sample.applied_current)
         wanted = checked(asked, self.current_limit)
         decision = self._decide(sample, wanted, step)
@@ -452,7 +458,7 @@ class Loop:
         self._record(sample, self._step_of(sample), reasons or Reason.MISSED, missed=missed, decide_ns=decide_ns)
 
     def _keep_estimate(self, estimate: tuple[float, ...], sample: SensorSample, step: int) -> None:
-        """Record the actor's estimate; once it meets the stop condition, all that is left is the way home."""
+        """Record the estimate; once it meets the stop condition, all that is left is the way home."""
         self._estimate = estimate
         self.journal.push_estimate(sample.receive_time_ns, step, self._estimate)
         condition = self.stop_condition

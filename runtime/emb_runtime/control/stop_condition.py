@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from emb_runtime.errors import UsageError
-from emb_runtime.policy.contract import Quantity
+from emb_runtime.estimator.estimate import Quantity
 
 REACHED = "KNOWN_ENOUGH"  # Code of the event that says so in the log
 
 
 @dataclass(frozen=True)
 class StopCondition:
-    """Standard deviations, each as a part of its value, that an actor's estimate has to fall below."""
+    """Standard deviations, each as a part of its value, that the estimate has to fall below."""
 
     text: str  # Text as :func:`parse_stop_condition` reads it
-    names: tuple[str, ...]  # Names of all quantities that the actor estimates, in its order
+    names: tuple[str, ...]  # Names of all parameters that are estimated, in their order
     parts: tuple[tuple[int, float], ...]  # Indices among them, and the bound of each relative deviation; 0.01 is 1 %
 
     def reached(self, estimate: Sequence[float]) -> bool:
@@ -42,19 +42,19 @@ def parse_stop_condition(text: str, estimates: Sequence[Quantity]) -> StopCondit
 
     Args:
         text: names and percentages.
-        estimates: what the actor estimates.
+        estimates: what is estimated.
 
     Raises:
-        UsageError: it is none, or names what the actor does not estimate.
+        UsageError: it is none, or names what is not estimated.
     """
     names = tuple(quantity.name for quantity in estimates)
     if not names:
-        raise UsageError("--stop-when: this actor estimates nothing, so nobody knows when; leave it out")
+        raise UsageError("--stop-when: the bench's [estimator] leaves no parameter open: leave it out")
     parts: dict[int, float] = {}
     for item in text.split(","):
         name, _, percent = item.partition("=")
         if (name := name.strip()) not in names:
-            raise UsageError(f"--stop-when: the actor estimates {', '.join(names)}, got '{name}'")
+            raise UsageError(f"--stop-when: expected one of {', '.join(names)}, which are estimated, got '{name}'")
         if names.index(name) in parts:
             raise UsageError(f"--stop-when: {name} is named twice")
         parts[names.index(name)] = _part(name, percent.strip())

@@ -58,7 +58,7 @@ class LogHeader:
     dbc: str  # Text of the DBC: it decodes the frames, and travels as the attachment ``emb.dbc``
     metadata: Mapping[str, Mapping[str, str]]  # Metadata records by name; ``emb.run`` has the run's identity
     attachments: Sequence[Attachment] = ()  # Further files: ``policy.onnx``, ``bench.toml``
-    estimates: Sequence[tuple[str, str]] = ()  # Names and units of what the actor estimates
+    estimates: Sequence[tuple[str, str]] = ()  # Names and units of what is estimated
     learns: bool = False  # The shield learns which brakes are possible
     drive: bool = False  # The drive is a mapped one, with a bus of its own
 
@@ -182,7 +182,7 @@ class Recorder:
         self._ring.push(Kind.CYCLE, pack_cycle(record))
 
     def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
-        """Record what the actor estimates at a sample: values, then standard deviations, in the header's order."""
+        """Record an estimate: values, then standard deviations, in the header's order."""
         self._push_held()
         self._ring.push(Kind.ESTIMATE, pack_estimate(time_ns, step, estimate))
 

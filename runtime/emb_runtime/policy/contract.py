@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, NoReturn, TypedDict
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import PolicyRefusedError
+from emb_runtime.estimator.estimate import Quantity
 
 CONTRACT_KEY = "emb.contract"  # Key of the contract in the ONNX ``metadata_props``
 
@@ -34,13 +35,6 @@ MAX_PROVENANCE_NAME = 120
 
 VECTOR_TOLERANCE = 1e-5
 """Largest difference of a replayed test vector from the recorded action, as a part of the action limit."""
-
-
-class Quantity(NamedTuple):
-    """A signal with its unit."""
-
-    name: str
-    unit: str
 
 
 OBSERVATION = (Quantity("angle", "rad"), Quantity("velocity", "rad/s"), Quantity("step", "1"))

@@ -1,4 +1,4 @@
-"""What an actor estimated, in its log: read, compared when the loop decides again, and not believed if it is other."""
+"""The running estimate in a log: read, compared when the loop decides again, and refused if its topic is another."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.stop_condition import parse_stop_condition
 from emb_runtime.errors import LogError
+from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log import mcap_schema
 from emb_runtime.log.mcap_schema import Field, Topic
 from emb_runtime.log.ring_buffer import EstimateRecord, Record
-from emb_runtime.policy.policy import load_policy
 from emb_runtime.records import CycleRecord
 
 from tests.bench.conftest import Replay  # isort: skip
-from tests.actors import LEAKY_ESTIMATES, leaky_actor
+from tests.actors import constant_actor
 from tests.bench.hostile import TraceJournal, write_trace
-from tests.conftest import SimRun, Simulate
+from tests.conftest import FunctionActor, SimRun, Simulate
 
 STEPS = 300
-STOP_WHEN = "k_1=1%"
+STOP_WHEN = "k_m=1%"
+ACTOR = FunctionActor(lambda *_: 3.0)
 
 Write = Callable[..., Path]
 Alter = Callable[[list[Record]], None]
@@ -38,10 +39,8 @@ Alter = Callable[[list[Record]], None]
 def driven(simulate: Simulate, bench: Bench) -> tuple[SimRun, list[Record]]:
     """A run that ended early, and its records in order."""
     journal = TraceJournal()
-    stop_condition = parse_stop_condition(STOP_WHEN, LEAKY_ESTIMATES)
-    run = simulate(
-        actor=load_policy(leaky_actor(bench), bench), steps=STEPS, journal=journal, stop_condition=stop_condition
-    )
+    stop_condition = parse_stop_condition(STOP_WHEN, estimated(bench))
+    run = simulate(actor=ACTOR, steps=STEPS, journal=journal, stop_condition=stop_condition)
     assert (run.outcome.fault, run.outcome.goal_reached) == (None, True)
     return run, journal.records
 
@@ -60,8 +59,8 @@ def write(driven: tuple[SimRun, list[Record]], bench: Bench, layout: Layout, tmp
             layout,
             None if cut else run.outcome,
             steps=STEPS,
-            policy=leaky_actor(bench),
-            estimates=LEAKY_ESTIMATES,
+            policy=constant_actor(bench, 3.0),
+            estimates=estimated(bench),
             stop_when=stop_when,
         )
 
@@ -69,23 +68,24 @@ def write(driven: tuple[SimRun, list[Record]], bench: Bench, layout: Layout, tmp
 
 
 def again(path: Path, bench: Bench) -> Rerun:
-    policy = load_policy(leaky_actor(bench), bench)
-    return rerun(read_log(path), policy, 6.0, parse_stop_condition(STOP_WHEN, LEAKY_ESTIMATES))
+    return rerun(read_log(path), ACTOR, 6.0, parse_stop_condition(STOP_WHEN, estimated(bench)))
 
 
 def estimates(records: list[Record]) -> list[int]:
     return [n for n, record in enumerate(records) if isinstance(record, EstimateRecord)]
 
 
-def test_all_of_them_are_read_with_their_names_and_units(write: Write, driven: tuple[SimRun, list[Record]]) -> None:
+def test_all_of_them_are_read_with_their_names_and_units(
+    write: Write, driven: tuple[SimRun, list[Record]], bench: Bench
+) -> None:
     log, records = read_log(write()), [r for r in driven[1] if isinstance(r, EstimateRecord)]
-    assert quantities(log) == LEAKY_ESTIMATES
+    assert quantities(log) == estimated(bench)
     assert by_step(log) == {record.step: record.numbers for record in records}
     said = last_estimate(log)
-    assert list(said) == ["k_1", "f_v"]
-    _, value, _, deviation = records[-1].numbers
+    assert list(said) == ["k_m", "k_1", "T_c", "f_v"]
+    value, deviation = records[-1].numbers[3::4]
     assert {**said["f_v"], "interval_95": None} == {
-        "value": value, "deviation": deviation, "interval_95": None, "unit": "N m s/rad"
+        "value": value, "deviation": deviation, "interval_95": None, "unit": "N·m·s/rad"
     }  # fmt: skip
     assert said["f_v"]["interval_95"] == pytest.approx([value - 1.959964 * deviation, value + 1.959964 * deviation])
     assert info_document(log)["estimate"] == said
@@ -102,7 +102,7 @@ def test_an_estimate_that_is_other_in_its_last_bit_or_missing_is_reported(write:
     def change(records: list[Record]) -> None:
         record = records[estimates(records)[50]]
         assert isinstance(record, EstimateRecord)
-        numbers = (*record.numbers[:3], float(np.nextafter(record.numbers[3], 1.0)))
+        numbers = (*record.numbers[:7], float(np.nextafter(record.numbers[7], 1.0)))
         records[estimates(records)[50]] = record._replace(numbers=numbers)
 
     def remove(records: list[Record]) -> None:
@@ -122,32 +122,14 @@ def test_a_log_that_is_cut_before_an_estimate_is_followed_up_to_there(write: Wri
     assert result.decisions == 81
 
 
-@pytest.mark.parametrize("breaks", ["STATE", "VALUE", "ACTION"])
-def test_a_run_that_ended_because_the_actor_broke_ends_so_again(
-    breaks: str, simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path, replay: Replay
-) -> None:
-    journal, data = TraceJournal(), leaky_actor(bench, breaks)
-    run = simulate(actor=load_policy(data, bench), steps=STEPS, journal=journal)
-    path = write_trace(
-        tmp_path / "run.mcap",
-        *(journal.records, bench, layout, run.outcome),
-        steps=STEPS,
-        policy=data,
-        estimates=LEAKY_ESTIMATES,
-    )
-    out = replay.text("rerun", path)
-    assert out.startswith("reproduced   each of 100 decisions")
-    assert "POLICY_NOT_FINITE, not home" in out
-
-
-def test_a_goal_that_the_logged_actor_cannot_reach_is_refused_in_one_line(write: Write, replay: Replay) -> None:
-    err = replay.refused("rerun", write(stop_when="T_c=1%"), code=6)
-    assert "emb.run: stop_when: --stop-when: the actor estimates k_1, f_v" in err
+def test_a_goal_that_nothing_estimates_is_refused_in_one_line(write: Write, replay: Replay) -> None:
+    err = replay.refused("rerun", write(stop_when="J=1%"), code=6)
+    assert "emb.run: stop_when: --stop-when: " in err
     assert err.count("\n") == 1
 
 
-def test_without_its_goal_the_run_goes_another_way(write: Write, bench: Bench) -> None:
-    result = rerun(read_log(write()), load_policy(leaky_actor(bench), bench), 6.0)
+def test_without_its_goal_the_run_goes_another_way(write: Write) -> None:
+    result = rerun(read_log(write()), ACTOR, 6.0)
     assert not result.reproduced
 
 
@@ -177,7 +159,7 @@ def test_a_topic_with_other_fields_is_refused_in_one_line(
         assert "\n" not in str(caught.value)
 
 
-def test_a_log_of_an_actor_that_estimates_nothing_has_no_such_topic(
+def test_a_log_without_estimates_has_no_such_topic(
     simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path
 ) -> None:
     journal = TraceJournal()

@@ -18,8 +18,9 @@ import pytest
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, shipped_bench_text
 from emb_runtime.errors import EXIT_LOG
+from emb_runtime.estimator.estimate import Quantity
 from emb_runtime.log.recorder import Recorder, RecorderResult
-from emb_runtime.policy.contract import MIN_VECTORS, Quantity, Vector
+from emb_runtime.policy.contract import MIN_VECTORS, Vector
 from tests.actors import alone, constant_actor
 from tests.runtime.operating import Edited, EmbRun, Sim
 

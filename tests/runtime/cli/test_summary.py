@@ -170,7 +170,7 @@ def test_what_the_actor_estimated_last_is_told_with_its_interval_and_unit(bench:
     assert said["goal_s"] == pytest.approx(0.094)
     k_1, f_v = "k_1 = 0.05000 ± 0.00078 N m/rad (1.6 %) at 95 %", "f_v = 2.000e-05 ± 2.0e-07 N m s/rad (0.98 %) at 95 %"
     for line in (k_1, f_v):
-        assert f"  estimate   {line}, by the actor itself, if the brake is as its model says" in lines
+        assert f"  estimate   {line}, if the brake is as the model says" in lines
     assert trailer(known, {})["goal_reached"] == "True"
 
 

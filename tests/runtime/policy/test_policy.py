@@ -27,6 +27,7 @@ from onnx import TensorProto, helper
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.estimator.estimate import Quantity
 from emb_runtime.policy.contract import (
     APPLIED_CURRENT,
     CONTRACT_KEY,
@@ -35,7 +36,6 @@ from emb_runtime.policy.contract import (
     MAX_VECTORS,
     MIN_VECTORS,
     Contract,
-    Quantity,
     Vector,
 )
 from emb_runtime.policy.inference import open_session

@@ -382,7 +382,7 @@ def test_every_reference_excitation_can_be_played_where_samples_are_lost() -> No
 def test_a_structured_actor_that_nobody_asks_remembers_what_it_knew_in_training_as_in_evaluation() -> None:
     kept, draws = stored("four-d-exact-quadratic"), fresh_draws(PM50, 9, 4)
     trials = Trials(BENCH, PM50, PARAMETER_NAMES, draws, "exact", LOSSY)
-    (tuned,) = trials.play(kept.loop(BENCH), kept.array()[None])
+    (tuned,) = trials.play(kept.scale(BENCH), kept.array()[None])
     actor = StatefulNetwork(actor_of(kept, BENCH))
     played = play(BENCH, PM50, PARAMETER_NAMES, actor, draws, "exact", LOSSY)
     values = MEASURES["D"].values

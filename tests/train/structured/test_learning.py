@@ -24,7 +24,7 @@ def test_behind_the_shield_that_learns_the_limits_hold_the_truth_stays_possible_
     kept, scores = stored("four-d-exact-quadratic"), []
     for shield in ("worst case", "bounded"):
         task = replace(FOUR, plant=plant, shield=shield)
-        (found,) = task.trials(BENCH, task.draws(BENCH, 6, 24)).play(kept.loop(BENCH), kept.array()[None])
+        (found,) = task.trials(BENCH, task.draws(BENCH, 6, 24)).play(kept.scale(BENCH), kept.array()[None])
         assert not found.left.any()
         assert found.home.all()
         assert not found.mistaken.any()
@@ -37,7 +37,7 @@ def test_a_truth_outside_of_what_was_learnt_is_counted() -> None:
     strong = [d._replace(brake=d.brake._replace(k_m=2.0 * BENCH.brake.k_m)) for d in draws]  # the set ends at 1.5
     trials = replace(FOUR, shield="bounded").trials(BENCH, strong)
     kept = stored("four-d-exact-quadratic")
-    (found,) = trials.play(kept.loop(BENCH), kept.array()[None])
+    (found,) = trials.play(kept.scale(BENCH), kept.array()[None])
     assert found.mistaken.all()
 
 

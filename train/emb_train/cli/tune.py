@@ -14,10 +14,11 @@ from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.estimator.speed_loop import scale_of
 from emb_runtime.system.terminal import complain, show
 from emb_train.names import listed
 from emb_train.structured.evolution import BATCH, Progress, evolve
-from emb_train.structured.law import TERMS, speed_loop
+from emb_train.structured.law import TERMS
 from emb_train.structured.learning import SHIELDS
 from emb_train.structured.stored import FORMS, Stored, stored
 from emb_train.structured.task import TASKS, Task
@@ -113,7 +114,7 @@ def run(arguments: argparse.Namespace) -> Stored:
     found = evolve(
         task,
         bench,
-        speed_loop(bench, arguments.gain),
+        scale_of(bench, arguments.gain),
         _begin(arguments, task),
         steps=arguments.steps,
         seed=arguments.seed,

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from emb_bench.brake.euler import sign
 from emb_bench.information.symmetric import Floats, packed_index, packed_size, upper
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
 from emb_train.structured.columns import on_columns
@@ -25,6 +26,7 @@ from emb_train.structured.estimator import (
     MISFIT,
     MOTION,
     UNKNOWNS,
+    Four,
     Model,
     Prediction,
     begin_slopes,
@@ -34,11 +36,31 @@ from emb_train.structured.estimator import (
     start,
     stuck,
 )
-from emb_train.structured.law import PRODUCTS, Loop, current_for
+from emb_train.structured.law import PRODUCTS
 from emb_train.structured.stored import Stored
 
 JOINED = UNKNOWNS + 1  # Rows of the matrix that mean and covariance are corrected in
 _CONSTANTS = {"forget": 1.0 / MEMORY, "misfit": MISFIT}
+
+
+class Loop(NamedTuple):
+    """Scaling of a reference, and gain of the loop that follows it; numbers only."""
+
+    scale: float
+    gain: float
+    horizon: float
+
+
+def current_for(
+    model: Model, x: float, v: float, variance: float, parameters: Four, speed: float, gain: float
+) -> float:
+    """See :func:`emb_runtime.estimator.speed_loop.current_for`; without a branch."""
+    km, k1, tc, fv = parameters
+    change = gain * (speed - v)
+    drive = change / model.sample_time + model.spring * k1 * max(x, 0.0)
+    toward = sign(v + change) if model.sticks else direction(v, variance)
+    drive = drive + (model.coulomb * tc * toward + model.viscous * fv * v)
+    return min(max(drive / (model.motor * km), -model.current), model.current)
 
 
 class StructuredActor(nn.Module):
@@ -301,4 +323,10 @@ def actor_of(kept: Stored, bench: Bench) -> StructuredActor:
         BenchFileError: the bench lacks the set of ranges or the plant.
     """
     task = kept.asked()
-    return StructuredActor(bench, bench.range_set(task.ranges), task.plant, kept.loop(bench), kept.array())
+    return StructuredActor(
+        bench,
+        bench.range_set(task.ranges),
+        task.plant,
+        Loop(bench.limits.velocity, kept.gain, float(bench.timing.horizon)),
+        kept.array(),
+    )

@@ -19,9 +19,9 @@ import numpy as np
 
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import Bench
+from emb_runtime.estimator.speed_loop import Scale
 from emb_train.envs.measure import mean_score
 from emb_train.envs.play import begin_all
-from emb_train.structured.law import Loop
 from emb_train.structured.task import Task
 
 TUNING_SEED = 1_000_000  # Brakes to tune on have seeds from here on; those of evaluations are smaller
@@ -42,7 +42,7 @@ JUDGED = 1024  # Brakes on which the result is compared with what it began with
 class Tuned:
     """Result of a search."""
 
-    table: Floats  # See :func:`emb_train.structured.law.share_after`
+    table: Floats  # See :func:`emb_train.structured.law.set_reference`
     score: float  # Mean over the brakes that it was judged on
 
 
@@ -58,7 +58,7 @@ class Progress(NamedTuple):
 def evolve(
     task: Task,
     bench: Bench,
-    loop: Loop,
+    scale: Scale,
     begin: Floats,
     *,
     steps: int,
@@ -72,7 +72,7 @@ def evolve(
     Args:
         task: what counts, on which brakes, behind which shield.
         bench: limits, noise, timing.
-        loop: how the reference is followed.
+        scale: of the reference.
         begin: table to begin with, shape [2 n − 1, TERMS].
         steps: number of them.
         seed: of the changes and of the brakes.
@@ -97,7 +97,7 @@ def evolve(
         change = rng.standard_normal((batch, len(table)))
         moved = np.zeros((batch, *table.shape))
         moved[:, :, 0] = change * reach
-        up, down = trials.perturbed(loop, [table + moved, table - moved])
+        up, down = trials.perturbed(scale, [table + moved, table - moved])
         scores = task.score(up), task.score(down)
         gain = 0.5 * (scores[0] - scores[1])
         gain = np.clip(gain / max(float(gain.std()), 1e-12), -OUTLIER, OUTLIER)
@@ -115,6 +115,6 @@ def evolve(
         show(Progress(k + 1, float(both.mean()), int(up.home.sum() + down.home.sum()), int(up.left.sum())))
     fresh = task.trials(bench, task.draws(bench, first - 1, JUDGED))
     found = summed / max(parts, 1)
-    values = [task.score(outcome) for outcome in fresh.play(loop, np.array([found, begin]))]
+    values = [task.score(outcome) for outcome in fresh.play(scale, np.array([found, begin]))]
     better = float(mean_score(values[0]).value) > float(mean_score(values[1]).value)
     return Tuned(found, float(values[0].mean())) if better else Tuned(begin, float(values[1].mean()))

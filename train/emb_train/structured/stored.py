@@ -14,9 +14,10 @@ from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import OLDEST_FRAME, Bench
 from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
+from emb_runtime.estimator.speed_loop import Scale, scale_of
 from emb_runtime.system.input_file import read_bytes
 from emb_train.names import reference_names
-from emb_train.structured.law import TERMS, Loop, speed_loop
+from emb_train.structured.law import TERMS
 from emb_train.structured.learning import SHIELDS, Shield
 from emb_train.structured.task import TASKS, Task
 
@@ -36,7 +37,7 @@ class Stored:
     form: Form
     plant: str  # Name of the bench's plant that it was tuned on
     gain: float  # Of the speed loop
-    table: tuple[tuple[float, ...], ...]  # See :func:`emb_train.structured.law.share_after`
+    table: tuple[tuple[float, ...], ...]  # See :func:`emb_train.structured.law.set_reference`
     seed: int  # Of the search
     score: float  # Mean over the brakes that it was tuned on
     draws: int  # Number of those brakes
@@ -48,9 +49,9 @@ class Stored:
         """The table, shape [2 n − 1, TERMS]."""
         return np.array(self.table)
 
-    def loop(self, bench: Bench) -> Loop:
-        """Loop that follows it."""
-        return speed_loop(bench, self.gain)
+    def scale(self, bench: Bench) -> Scale:
+        """Its scale on a bench."""
+        return scale_of(bench, self.gain)
 
     def asked(self) -> Task:
         """Task that it was tuned for."""

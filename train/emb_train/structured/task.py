@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.plants import DEFAULT_PLANT
+from emb_runtime.estimator.kalman import Four
 from emb_train.envs.conditions import Conditions, Randomisation
 from emb_train.envs.measure import MEASURES, Measure
 from emb_train.envs.play import Draw, Outcome, fresh_draws
-from emb_train.structured.estimator import Four
 from emb_train.structured.learning import Shield
 from emb_train.structured.trial import ANY_PRECISION, ReportedOutcome, Trials
 

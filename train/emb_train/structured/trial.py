@@ -17,24 +17,17 @@ import numpy as np
 from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import Bench, Ranges
-from emb_runtime.config.plants import DEFAULT_PLANT
+from emb_runtime.config.plants import DEFAULT_PLANT, EULER
+from emb_runtime.errors import UsageError
+from emb_runtime.estimator.kalman import MISFIT, Four, Model, State, believed, deviations, follow, make_model, start
+from emb_runtime.estimator.speed_loop import Scale, share_after
 from emb_runtime.learning.known import known
 from emb_runtime.learning.law import law_for, middle
 from emb_train.envs.batch import Batch
 from emb_train.envs.closed_loop import Experiments, Setup, advance_one, with_law
 from emb_train.envs.conditions import BENCH_CONDITIONS, Bools, Conditions
 from emb_train.envs.play import Draw, Outcome, begin_all, joined
-from emb_train.structured.estimator import (
-    MISFIT,
-    WORST,
-    Four,
-    Model,
-    believed,
-    deviation,
-    make_model,
-    start,
-)
-from emb_train.structured.law import FEATURES, PRODUCTS, Loop, act, features, share_after
+from emb_train.structured.law import FEATURES, PRODUCTS, Box, box_of, features, wanted_current
 from emb_train.structured.learning import Learning, Shield, begin, holds, listen, make_learning, miss
 
 CHUNK = 64  # Experiments that a thread plays at a time
@@ -46,7 +39,8 @@ ANY_PRECISION: Four = (math.inf, math.inf, math.inf, math.inf)
 class ReportedOutcome(Outcome):
     """Final results of N experiments and of their estimators."""
 
-    estimates: Floats  # State of the estimator at the end, shape [N, STATE]
+    estimates: Floats
+    """Relative parameters at the end, their standard deviations, and the worst innovation, shape [N, 9]."""
     mistaken: Bools
     """Mask of the experiments in which the truth was at some time outside what the shield had learnt, shape [N]."""
     known: Floats
@@ -85,47 +79,51 @@ class Trials(Batch):
 
         Raises:
             BenchFileError: the bench has no such plant, or the shield cannot hold the limits.
-            UsageError: see :class:`emb_train.envs.batch.Batch`, :func:`emb_train.structured.estimator.make_model` and
+            UsageError: J or γ vary in these ranges; see :class:`emb_train.envs.batch.Batch` and
                 :func:`emb_train.structured.learning.make_learning`.
         """
         super().__init__(bench, ranges, parameters, len(draws), compiled, plant, conditions)
         self.learning = make_learning(self.bench, shield, self._plant, conditions.randomised)
-        self.model = make_model(bench, ranges, plant)
+        for name in ("J", "gamma"):
+            if getattr(ranges.low, name) < getattr(ranges.high, name):
+                raise UsageError(f"the estimator takes {name} as known, the set of ranges '{ranges.name}' varies it")
+        self.model = make_model(bench, ranges, sticks=self._plant.mechanics.solver != EULER)
+        self.box = box_of(bench, ranges)
         self.precision = precision
         begin_all(self, draws)
 
-    def play(self, loop: Loop, tables: Floats) -> list[ReportedOutcome]:
+    def play(self, scale: Scale, tables: Floats) -> list[ReportedOutcome]:
         """Play every reference on all the brakes.
 
         Args:
-            loop: how they are followed.
-            tables: of the references, see :func:`emb_train.structured.law.share_after`, shape [C, 2 n − 1, TERMS].
+            scale: of the references.
+            tables: of the references, see :func:`emb_train.structured.law.set_reference`, shape [C, 2 n − 1, TERMS].
         """
         count = len(self.k)
         each = [np.tile(table, (count, 1, 1)) for table in np.asarray(tables, np.float64)]
-        return self._all(loop, each, 0)
+        return self._all(scale, each, 0)
 
-    def perturbed(self, loop: Loop, tables: Sequence[Floats]) -> list[ReportedOutcome]:
+    def perturbed(self, scale: Scale, tables: Sequence[Floats]) -> list[ReportedOutcome]:
         """Play several times, with a reference for each brake; says with which features it was used.
 
         Args:
-            loop: how they are followed.
+            scale: of the references.
             tables: of the references, each of shape [N, 2 n − 1, TERMS].
         """
-        return self._all(loop, tables, tables[0].shape[1])
+        return self._all(scale, tables, tables[0].shape[1])
 
-    def _all(self, loop: Loop, tables: Sequence[Floats], noted: int) -> list[ReportedOutcome]:
+    def _all(self, scale: Scale, tables: Sequence[Floats], noted: int) -> list[ReportedOutcome]:
         parts = [slice(i, i + CHUNK) for i in range(0, len(self.k), CHUNK)]
         pieces = [(table[part], part, noted) for table in tables for part in parts]
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            found = list(pool.map(lambda piece: self._play(loop, *piece), pieces))
+            found = list(pool.map(lambda piece: self._play(scale, *piece), pieces))
         return [joined(found[i : i + len(parts)]) for i in range(0, len(found), len(parts))]
 
-    def _play(self, loop: Loop, tables: Floats, part: slice, noted: int) -> ReportedOutcome:
+    def _play(self, scale: Scale, tables: Floats, part: slice, noted: int) -> ReportedOutcome:
         experiments = Experiments._make(array[part].copy() for array in self.experiments)
         x, count, shield = experiments.x, len(experiments.k), self.bench.shield
         m, left, mistaken = np.zeros_like(experiments.m), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
-        states, reached = np.tile(start(self.model), (count, 1)), np.zeros(count)
+        estimates, reached = np.zeros((count, 9)), np.zeros(count)
         learnt = np.tile(begin(self.learning), (count, 1))
         used = np.zeros((count, noted, tables.shape[2]))
         play = compiled(play_trials)
@@ -134,10 +132,11 @@ class Trials(Batch):
             experiments,
             self.model,
             self.learning,
-            loop,
+            scale,
+            self.box,
             np.ascontiguousarray(tables),
             self.precision,
-            states,
+            estimates,
             learnt,
             m,
             left,
@@ -147,7 +146,7 @@ class Trials(Batch):
         )
         home = (np.abs(x[:, 0]) <= shield.home_angle) & (np.abs(x[:, 1]) <= shield.home_velocity) & ~left
         matrices = unpack(m, len(self.parameters))
-        return ReportedOutcome(matrices, left, home, x[:, 0], x[:, 1], states, mistaken, reached, used)
+        return ReportedOutcome(matrices, left, home, x[:, 0], x[:, 1], estimates, mistaken, reached, used)
 
 
 def play_trials(
@@ -155,10 +154,11 @@ def play_trials(
     experiments: Experiments,
     model: Model,
     learning: Learning,
-    loop: Loop,
+    scale: Scale,
+    box: Box,
     tables: Floats,  # Of the references, shape [N, 2 n − 1, TERMS]
     precision: Four,  # At which 0 A is asked for from then on, and the estimate rests
-    states: Floats,  # Of the estimators, shape [N, STATE]
+    estimates: Floats,  # Become the estimates at the end, shape [N, 9]
     learnt: Floats,  # What the shields have learnt, one row each
     informed: Floats,  # Becomes the packed FIM, up to where the limits were left, shape [N, n (n + 1) / 2]
     left: Bools,  # Becomes whether they were, shape [N]
@@ -168,15 +168,20 @@ def play_trials(
 ) -> None:
     """N experiments from their first sample to their end, or to where they leave the limits, in place."""
     k, duration = experiments.k, setup.rules.sample_time * setup.rules.horizon
-    weights = np.zeros(used.shape[1])
+    weights, reference = np.zeros(used.shape[1]), np.zeros(tables.shape[1])
     for i in range(k.shape[0]):
         weights[:] = 0.0
+        state = start(model)
         now, wanted, missing, over = setup, 0.0, math.inf, False
         for _ in range(setup.rules.horizon):
             if not experiments.lost[i, k[i]]:  # else the law is not called
                 if not over:
-                    wanted = asked(experiments, i, model, loop, tables[i], states[i], used[i], weights)
-                    before, missing = missing, lacking(model, states[i], precision)
+                    y, u = experiments.y, experiments.applied[i]
+                    state = follow(model, state, y[i, 0], y[i, 1], float(k[i]), u)
+                    wanted = wanted_current(model, state, scale, box, tables[i], reference)
+                    if used.shape[1] > 0:
+                        note_use(scale, features(box, believed(model, state)), reference, state.step, used[i], weights)
+                    before, missing = missing, lacking(model, state, precision)
                     over = missing <= 1.0
                     reached[i] = reached_at(setup.rules.sample_time, k[i], before, missing)
                 if over:
@@ -195,17 +200,8 @@ def play_trials(
         if not over:
             reached[i] = duration * (1.0 + math.log(max(missing, 1.0)))
         average(used[i], weights)
-
-
-def asked(
-    experiments: Experiments, i: int, model: Model, loop: Loop, table: Any, state: Any, used: Any, weights: Any
-) -> float:
-    """Current that the reference requests for the newest sample of an experiment [A]; notes what it used."""
-    y, step = experiments.y, float(experiments.k[i])
-    wanted = act(model, loop, table, state, y[i, 0], y[i, 1], step, experiments.applied[i])
-    if used.shape[0] > 0:
-        note_use(model, loop, table, state, step, used, weights)
-    return wanted
+        estimates[i, :4], estimates[i, 4:8] = believed(model, state), deviations(model, state)
+        estimates[i, 8] = state.worst
 
 
 def with_learnt(
@@ -230,22 +226,21 @@ def reached_at(sample_time: float, step: int, before: float, missing: float) -> 
     return sample_time * step
 
 
-def lacking(model: Model, state: Any, precision: Four) -> float:
+def lacking(model: Model, state: State, precision: Four) -> float:
     """Greatest ratio of a relative deviation to the one asked for; infinite if none is, or the model does not fit."""
-    if state[WORST] > MISFIT or min(precision) == math.inf:
+    if state.worst > MISFIT or min(precision) == math.inf:
         return math.inf
-    missing = 0.0
+    missing, values, known = 0.0, believed(model, state), deviations(model, state)
     for i in range(FEATURES):
-        missing = max(missing, deviation(model, state, i) / (precision[i] * believed(model, state, i)))
+        missing = max(missing, known[i] / (precision[i] * values[i]))
     return missing
 
 
-def note_use(model: Model, loop: Loop, table: Any, state: Any, step: float, used: Any, weights: Any) -> None:
+def note_use(scale: Scale, f: Four, reference: Any, step: float, used: Any, weights: Any) -> None:
     """Add the features with which each level is used now, by its share of the period, and each switch that begins."""
-    f = features(model, state)
-    levels, before = (table.shape[0] + 1) // 2, 1.0
+    levels, before = (len(reference) + 1) // 2, 1.0
     for i in range(levels):
-        after = min(before, share_after(table, i + 1, f, step, loop.horizon))
+        after = min(before, share_after(reference[levels + i], step, scale.horizon)) if i < levels - 1 else 0.0
         if before > after:
             _add(used[i], f, before - after)
             weights[i] += before - after

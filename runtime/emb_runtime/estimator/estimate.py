@@ -1,14 +1,19 @@
-"""Estimates of an actor as plain data by name, and in words."""
+"""An estimate as plain data by name, and in words."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
-
-from emb_runtime.policy.contract import Quantity
+from typing import Any, NamedTuple
 
 NORMAL_95 = 1.959963984540054  # Standard deviations that 95 % of a Gaussian lie within
+
+
+class Quantity(NamedTuple):
+    """A signal with its unit."""
+
+    name: str
+    unit: str
 
 
 def by_name(quantities: Sequence[Quantity], numbers: Sequence[float]) -> dict[str, dict[str, Any]]:
@@ -40,7 +45,7 @@ def words(estimate: Mapping[str, Any]) -> list[str]:
         value, half = said["value"], NORMAL_95 * said["deviation"]
         part = f" ({100.0 * half / abs(value):.2g} %)" if value else ""
         known = f"{name} = {_with_zeros(value, _digits(value, half))} ± {_with_zeros(half, 2)} {said['unit']}{part}"
-        lines.append(f"{known} at 95 %, by the actor itself, if the brake is as its model says")
+        lines.append(f"{known} at 95 %, if the brake is as the model says")
     return lines
 
 

@@ -1,0 +1,51 @@
+"""The estimator of a run: what the loop calls at each sample, whatever the policy is."""
+
+from __future__ import annotations
+
+import math
+
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.estimator.estimate import Quantity
+from emb_runtime.estimator.kalman import State, believed, deviations, follow, make_model, start
+
+UNITS = {"k_m": "N·m/A", "k_1": "N/rad", "T_c": "N·m", "f_v": "N·m·s/rad"}  # Of the parameters
+
+
+def estimated(bench: Bench) -> tuple[Quantity, ...]:
+    """Parameters that are estimated on a bench: those that its prior leaves open."""
+    ranges = bench.range_set(bench.prior)
+    names = (name for name in PARAMETER_NAMES if getattr(ranges.low, name) < getattr(ranges.high, name))
+    return tuple(Quantity(name, UNITS[name]) for name in names)
+
+
+class Estimator:
+    """Kalman filter with the noise, the ranges and the model of brake of a bench."""
+
+    def __init__(self, bench: Bench) -> None:
+        """Make the model, and begin."""
+        ranges = bench.range_set(bench.prior)
+        self.model = make_model(bench, ranges, sticks=bench.shield.model != "euler")
+        self._varied = [PARAMETER_NAMES.index(quantity.name) for quantity in estimated(bench)]
+        self.state: State = start(self.model)
+
+    def begin(self) -> None:
+        """Begin anew: the next sample is the first one of a run."""
+        self.state = start(self.model)
+
+    def take(self, angle: float, velocity: float, step: float, applied: float) -> None:
+        """Take in one sample; arguments as of :func:`emb_runtime.estimator.kalman.follow`."""
+        self.state = follow(self.model, self.state, angle, velocity, step, applied)
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """k_m, k_1, T_c and f_v in SI units, then their standard deviations."""
+        model, state = self.model, self.state
+        numbers = believed(model, state), deviations(model, state)
+        return tuple(value * unit for four in numbers for value, unit in zip(four, model.nominal, strict=True))
+
+    @property
+    def estimate(self) -> tuple[float, ...]:
+        """Values of :func:`estimated`, then their standard deviations, in SI units; empty if one is not finite."""
+        numbers = self.parameters
+        chosen = tuple(numbers[i + offset] for offset in (0, len(PARAMETER_NAMES)) for i in self._varied)
+        return chosen if all(map(math.isfinite, chosen)) else ()

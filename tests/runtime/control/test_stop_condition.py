@@ -1,0 +1,233 @@
+"""The running estimate in a run, and how a run ends early by it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emb_bench.cli.replay import main as emb_replay
+from emb_bench.logs.log import read_log
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.control.loop import HOME_PAIRS
+from emb_runtime.control.stop_condition import REACHED, parse_stop_condition
+from emb_runtime.errors import UsageError
+from emb_runtime.estimator.estimate import Quantity
+from emb_runtime.estimator.estimator import Estimator
+from emb_runtime.log.ring_buffer import MAX_PAYLOAD, EstimateRecord, Kind, pack_estimate, unpack
+from emb_runtime.records import Reason
+from emb_runtime.safety.shield_design import make_law
+from emb_runtime.safety.state_machine import Fault
+from tests.actors import constant_actor
+from tests.conftest import FunctionActor, SimRun, Simulate
+from tests.runtime.operating import EmbRun
+
+BENCH = load_bench()
+BOX = BENCH.range_set(BENCH.shield.ranges)
+TWO = (Quantity("k_1", "N/rad"), Quantity("f_v", "N·m·s/rad"))
+
+
+class At:
+    """A stop condition that is reached at a sample, whatever is estimated."""
+
+    def __init__(self, at: int) -> None:
+        self.left = at + 1
+
+    def reached(self, _estimate: Sequence[float]) -> bool:
+        self.left -= 1
+        return self.left <= 0
+
+    def describe(self, _estimate: Sequence[float]) -> str:
+        return "by count"
+
+
+LAWS: dict[str, Callable[[float, float, float], float]] = {
+    "forward": lambda *_: 6.0,
+    "backward": lambda *_: -6.0,
+    "away": lambda y, v, k: math.copysign(6.0, y),
+    "faster": lambda y, v, k: math.copysign(6.0, v),
+    "square": lambda y, v, k: 6.0 if k // 20 % 2 == 0 else -6.0,
+}
+
+
+def ended(simulate: Simulate, law: str, step: int, options: str = "") -> SimRun:
+    return simulate(actor=FunctionActor(LAWS[law]), stop_condition=At(step), options=options)
+
+
+def test_the_loop_estimates_along_whatever_the_policy_is_and_records_each_estimate(simulate: Simulate) -> None:
+    run = simulate(actor=FunctionActor(LAWS["square"]))
+    estimator = Estimator(BENCH)
+    for cycle, (time_ns, step, estimate) in zip(run.journal.cycles[:-1], run.journal.estimates, strict=True):
+        estimator.take(cycle.angle, cycle.velocity, cycle.step, cycle.applied_current)
+        assert (time_ns, step, estimate) == (cycle.receive_time_ns, cycle.step, estimator.estimate)
+    assert run.outcome.estimate == run.journal.estimates[-1][2]
+    for value, deviation, true in zip(estimate[:4], estimate[4:], BENCH.brake[2:], strict=True):
+        assert abs(value - true) < 4.0 * deviation < 0.2 * true
+    assert not run.outcome.goal_reached
+
+
+def test_on_the_way_home_and_where_the_bench_leaves_nothing_open_nothing_is_recorded(simulate: Simulate) -> None:
+    run = simulate(homing=True)
+    assert (run.journal.estimates, run.outcome.estimate, run.outcome.goal_reached) == ([], (), False)
+    run = simulate(on_bench=dataclasses.replace(BENCH, prior="nominal"))
+    assert (run.journal.estimates, run.outcome.estimate) == ([], ())
+
+
+@given(
+    step=st.integers(-(2**31), 2**31 - 1),
+    numbers=st.lists(st.floats(allow_nan=False), min_size=2, max_size=24).map(tuple),
+)
+def test_an_estimate_survives_the_ring_however_many_there_are(step: int, numbers: tuple[float, ...]) -> None:
+    payload = pack_estimate(123, step, numbers)
+    assert len(payload) <= MAX_PAYLOAD
+    assert unpack(Kind.ESTIMATE, payload) == EstimateRecord(123, step, numbers)
+
+
+def test_a_condition_is_reached_when_each_deviation_is_below_its_part_of_the_value() -> None:
+    condition = parse_stop_condition(" k_1 = 1%, f_v=50 % ", TWO)
+    assert condition.parts == ((0, 0.01), (1, 0.5))
+    assert condition.reached((-2.0, 1.0, 0.0199, 0.49))
+    assert not condition.reached((-2.0, 1.0, 0.0201, 0.49))
+    assert not condition.reached((-2.0, 1.0, 0.0199, 0.51))
+    assert not condition.reached((0.0, 1.0, 0.0, 0.1))
+    assert not condition.reached((-2.0, 1.0, 0.0, 0.49)), "what is certain was not measured"
+    assert condition.describe((-2.0, 1.0, 0.019, 0.4)) == "k_1 to 0.95 % of 1 %, f_v to 40 % of 50 %"
+    assert parse_stop_condition("f_v=5%", TWO).reached((1.0, 1.0, 1e9, 0.04))
+
+
+def test_what_is_no_condition_is_refused_in_one_line() -> None:
+    wrong = ["", "k_1", "k_1=1", "k_1=%", "k_1=0%", "k_1=-1%", "k_1=101%", "k_1=nan%", "k_1=inf%", "k_1=1%%", "k_1=1%,"]
+    for text in (*wrong, "T_c=1%", "k_1=1%,k_1=2%", "k_1=1%;f_v=2%", "=1%"):
+        with pytest.raises(UsageError, match=r"--stop-when: ") as caught:
+            parse_stop_condition(text, TWO)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(UsageError):
+        parse_stop_condition("k_1=1%", ())
+
+
+def test_once_it_is_reached_the_brake_comes_home_and_it_ends(simulate: Simulate) -> None:
+    lengths = {}
+    for law in LAWS:
+        for at in (0, 60, 150, 300, 400, 480, 499) if law in ("forward", "square") else (150, 400):
+            run = ended(simulate, law, at)
+            assert (run.outcome.fault, run.outcome.home, run.outcome.goal_reached) == (None, True, True)
+            assert run.journal.codes == ["SILENT", "ARMED", "ACTIVE", REACHED, "STOPPING", "OVER"]
+            cycles = run.journal.cycles
+            last = lengths[law, at] = cycles[-1].step
+            assert last == 500 or all(abs(c.angle) <= BENCH.shield.home_angle for c in cycles[-HOME_PAIRS:])
+            after = [c for c in cycles if at < c.step < last]
+            assert all(c.reasons & Reason.RETURNING and c.clipped_current == 0.0 for c in after)
+            assert all(c.policy_current == pytest.approx(LAWS[law](c.angle, c.velocity, c.step)) for c in after)
+            assert all(not c.reasons & Reason.CLIPPED for c in after)
+            assert [step for _, step, _ in run.journal.estimates] == [c.step for c in cycles[:-1]]
+            assert -10.0 <= run.outcome.counters.angle_min <= run.outcome.counters.angle_max <= 100.0
+            assert run.outcome.counters.top_speed <= 510.0  # measured
+    early = [lengths["forward", at] for at in (0, 60, 150)]
+    assert early == sorted(early)
+    assert all(at + HOME_PAIRS <= lengths["forward", at] < 500 for at in (0, 60, 150))
+    never = ended(simulate, "forward", 10_000)
+    assert not never.outcome.goal_reached
+    assert never.journal.cycles[-1].step == 500
+
+
+@given(
+    corner=st.tuples(*(st.sampled_from((getattr(BOX.low, n), getattr(BOX.high, n))) for n in PARAMETER_NAMES)),
+    at=st.integers(0, 499),
+    law=st.sampled_from(sorted(LAWS)),
+    plant=st.sampled_from(["euler", "exact"]),
+)
+@settings(max_examples=25)
+def test_every_corner_of_the_set_comes_home_within_its_limits(
+    simulate: Simulate, corner: tuple[float, ...], at: int, law: str, plant: str
+) -> None:
+    theta = ",".join(f"{name}={value!r}" for name, value in zip(PARAMETER_NAMES, corner, strict=True))
+    outcome = ended(simulate, law, at, f"plant={plant},{theta}").outcome
+    assert (outcome.fault, outcome.home, outcome.goal_reached) == (None, True, True)
+
+
+def test_a_policy_that_answers_no_number_on_the_way_home_is_stopped_as_ever(simulate: Simulate) -> None:
+    actor = FunctionActor(lambda _y, _v, k: math.nan if k == 90 else 6.0)
+    run = simulate(actor=actor, stop_condition=At(80))
+    assert (run.outcome.fault, run.outcome.goal_reached) == (Fault.POLICY_NOT_FINITE, True)
+
+
+def test_the_view_of_time_on_the_way_home_is_late_but_never_beyond_the_end() -> None:
+    law = make_law(BENCH)
+    late = law.steps - 2 - math.ceil(law.settling / law.sample_time)
+    assert 0 < late < law.steps - 2
+
+
+# emb-run --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def steady(tmp_path: Path, bench: Bench, handlers: None, capsys: pytest.CaptureFixture[str]) -> EmbRun:
+    path = tmp_path / "steady.onnx"
+    path.write_bytes(constant_actor(bench, 3.0))
+    return EmbRun(("--policy", str(path)), capsys, tmp_path / "run.mcap")
+
+
+def test_a_run_is_logged_with_its_estimates_and_decides_the_same_again(
+    steady: EmbRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run.mcap"
+    summary = steady.document()
+    assert (summary["answered"], summary["home"], summary["goal_reached"]) == (500, True, False)
+    assert summary["estimate"]["k_m"]["value"] == pytest.approx(BENCH.brake.k_m, rel=1e-2)
+    log = steady.log()
+    table = log.tables["/estimate"]
+    assert [*table][3:6] == ["step", "k_m", "k_m_deviation"]
+    assert table["step"].tolist() == list(range(500))
+    assert table["publish_time"].tolist() == log.cycles["publish_time"][:500].tolist()
+    assert (np.diff(table["k_m_deviation"]) < 1e-4 * BENCH.brake.k_m).all()
+    assert emb_replay(["rerun", str(path)]) == 0
+    assert capsys.readouterr().out.startswith("reproduced   each of 501 decisions, 503 sent frames")
+    assert emb_replay(["info", str(path)]) == 0
+    assert "estimate     f_v = " in capsys.readouterr().out
+    assert emb_replay(["info", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["estimate"] == summary["estimate"]
+
+
+def test_it_ends_early_where_that_is_asked_for(
+    steady: EmbRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run.mcap"
+    out = steady.text("--stop-when", "k_m=1%")
+    answered = re.match(r"done: (\d+) of 500 samples answered, ended early: enough is known after 0\.\d+ s\n", out)
+    assert answered is not None
+    assert HOME_PAIRS < int(answered[1]) < 500
+    log = steady.log()
+    assert log.run["stop_when"] == "k_m=1%"
+    assert (log.exit_reason, log.end["goal_reached"]) == ("DONE", "True")
+    (event,) = (event for event in log.events if event.code == REACHED)
+    assert event.text.startswith("k_m to 0.9")
+    assert emb_replay(["rerun", str(path)]) == 0
+    assert f"reproduced   each of {int(answered[1]) + 1} decisions" in capsys.readouterr().out
+    for command in (["fim"], ["timing"], ["info"], ["estimate"], ["report", "-o", str(tmp_path / "page.html")]):
+        assert emb_replay([command[0], str(path), *command[1:]]) in (0, 2), command
+        describe = capsys.readouterr()
+        assert "the experiment ends after" not in describe.out + describe.err, command
+        assert "did not come to its end" not in describe.err, command
+
+
+def test_what_cannot_be_stopped_for_is_a_usage_error(steady: EmbRun) -> None:
+    for arguments in (
+        ["--stop-when", "J=1%"],
+        ["--stop-when", "k_1=1"],
+        ["--stop-when", "k_1=1%", "--read-only"],
+    ):
+        steady.refused("--stop-when", *arguments)
+
+
+def test_a_campaign_asks_each_run_anew(steady: EmbRun, tmp_path: Path) -> None:
+    runs = steady.documents("--log", str(tmp_path), "--repeat", "2", "--stop-when", "k_m=2%")
+    assert [run["goal_reached"] for run in runs] == [True, True]
+    assert all(read_log(Path(run["log"])).tables["/estimate"]["step"][0] == 0 for run in runs)

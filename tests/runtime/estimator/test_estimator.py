@@ -1,0 +1,87 @@
+"""The estimator of a run, and the forms in which its estimate is given."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+
+from emb_bench.compiled import compiled
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.errors import BenchFileError
+from emb_runtime.estimator.estimate import by_name, words
+from emb_runtime.estimator.estimator import Estimator, estimated
+from emb_runtime.estimator.kalman import follow, start
+from emb_runtime.estimator.speed_loop import follow_reference, scale_of
+
+BENCH = load_bench()
+SAMPLES = [(0.0, 0.3, 0.0, 0.0), (0.02, 15.0, 1.0, 6.0), (0.4, 80.0, 6.0, 6.0), (0.45, 60.0, 7.0, -6.0)]
+
+
+def test_it_begins_with_the_set_that_the_bench_names_and_reports_what_is_open_in_it() -> None:
+    assert [q.name for q in estimated(BENCH)] == list(PARAMETER_NAMES)
+    assert [q.unit for q in estimated(BENCH)] == ["N·m/A", "N/rad", "N·m", "N·m·s/rad"]
+    brake, high = BENCH.brake, BENCH.range_set("pm50").high
+    values, deviations = Estimator(BENCH).estimate[:4], Estimator(BENCH).estimate[4:]
+    assert values == pytest.approx(brake[2:])
+    assert deviations == pytest.approx([(b - a) / math.sqrt(3.0) for a, b in zip(brake[2:], high[2:], strict=True)])
+    one = dataclasses.replace(BENCH, prior="viscous")
+    assert [q.name for q in estimated(one)] == ["f_v"]
+    assert Estimator(one).estimate == pytest.approx((3e-5, 4e-5 / math.sqrt(12.0)))
+    nothing = dataclasses.replace(BENCH, prior="nominal")
+    assert (estimated(nothing), Estimator(nothing).estimate) == ((), ())
+
+
+def test_a_bench_file_may_name_the_set_or_leave_the_shields() -> None:
+    text = shipped_bench_text()
+    assert parse_bench(text, "it").prior == "pm50"
+    without = text.replace("[estimator] ", "[plants.none] ").replace('ranges = "pm50"', "play = 0.1")
+    assert parse_bench(without, "it").prior == "envelope"
+    for wrong in ('ranges = "none"', "ranges = 1", 'ranges = "pm50"\nmodel = 1'):
+        with pytest.raises(BenchFileError, match="estimator"):
+            parse_bench(text.replace('ranges = "pm50"', wrong), "it")
+
+
+def test_it_takes_samples_and_begins_anew() -> None:
+    for model in ("flow", "euler"):
+        estimator = Estimator(dataclasses.replace(BENCH, shield=dataclasses.replace(BENCH.shield, model=model)))
+        assert estimator.model.sticks == (model == "flow")
+        fresh = estimator.state
+        for sample in SAMPLES:
+            before = estimator.state
+            estimator.take(*sample)
+            assert estimator.state == follow(estimator.model, before, *sample)
+        assert estimator.parameters == estimator.estimate != Estimator(BENCH).estimate
+        estimator.begin()
+        assert estimator.state == fresh == start(estimator.model)
+
+
+def test_an_estimate_that_is_not_finite_is_none() -> None:
+    estimator = Estimator(BENCH)
+    estimator.take(math.nan, 0.0, 0.0, 0.0)
+    assert estimator.estimate == ()
+
+
+def test_compiled_for_the_batch_it_has_the_same_bits() -> None:
+    for sticks in (False, True):
+        model = Estimator(BENCH).model._replace(sticks=sticks)
+        plain = fast = start(model)
+        for sample in SAMPLES:
+            plain, fast = follow(model, plain, *sample), compiled(follow)(model, fast, *sample)
+            assert plain == fast
+            asked = model, plain, scale_of(BENCH), (1.0, -1.0), (0.0131,), 6.0
+            assert follow_reference(*asked) == compiled(follow_reference)(*asked)
+
+
+def test_an_estimate_is_given_by_name_and_in_as_many_digits_as_its_interval_allows() -> None:
+    quantities = estimated(BENCH)[:2]
+    assert by_name(quantities, ()) == {}
+    record = by_name(quantities, (0.0217, 23.04, 1.5e-7, 0.05))
+    assert record["k_1"]["interval_95"] == pytest.approx([22.942, 23.138], abs=1e-4)
+    assert (record["k_m"]["value"], record["k_m"]["deviation"], record["k_m"]["unit"]) == (0.0217, 1.5e-7, "N·m/A")
+    assert [line.partition(" at 95 %")[0] for line in words(record)] == [
+        "k_m = 0.02170000 ± 2.9e-07 N·m/A (0.0014 %)",
+        "k_1 = 23.040 ± 0.098 N/rad (0.43 %)",
+    ]
+    assert words(by_name(quantities[:1], (0.0, 0.0)))[0].startswith("k_m = 0.000 ± 0.0 N·m/A at")

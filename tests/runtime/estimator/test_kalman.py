@@ -1,0 +1,213 @@
+"""The Kalman filter, against the brakes it models, textbook formulas and an older implementation of its own."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from emb_bench.brake import euler
+from emb_bench.brake.motion import advance, no_sensitivity, rest
+from emb_bench.information.symmetric import Floats, unpack
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.estimator.kalman import (
+    MISFIT,
+    Model,
+    State,
+    believed,
+    deviations,
+    direction,
+    follow,
+    make_model,
+    predict,
+    start,
+)
+from emb_runtime.estimator.speed_loop import current_for
+
+BENCH = load_bench()
+PM50 = BENCH.range_set("pm50")
+EULER, EXACT = (make_model(BENCH, PM50, sticks=sticks) for sticks in (False, True))
+NOMINAL = np.array([getattr(BENCH.brake, n) for n in PARAMETER_NAMES])
+T_S = BENCH.timing.sample_time
+UNIT = (1.0, 1.0, 1.0, 1.0)
+FROZEN = json.loads((Path(__file__).parent / "frozen.json").read_text(encoding="utf-8"))
+"""Answers of the estimator at commit c2c9e5a, where it worked on one row of numbers in place."""
+
+
+def state_of(mean: Any, covariance: Floats) -> State:
+    packed: Any = tuple(covariance[np.triu_indices(6)].tolist())
+    six: Any = tuple(map(float, mean))
+    return State(0.0, six, packed, 1.0, 1.0)
+
+
+def known(x: float, v: float, variance: float = 0.0) -> State:
+    return state_of((x, v, *UNIT), variance * np.eye(6))
+
+
+def random_state(seed: int, velocity: float) -> State:
+    """A state with a full covariance, so fast that the direction is sure."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(6, 6)) * np.array([1e-2, 0.5, 0.05, 0.05, 0.05, 0.05])[:, None]
+    return state_of((rng.uniform(1.0, 90.0), velocity, *rng.uniform(0.6, 1.4, 4)), root @ root.T)
+
+
+def after(model: Model, unknowns: Floats, current: float) -> Floats:
+    """One period of the bench's own brake from angle, velocity and relative parameters."""
+    brake = BENCH.brake._replace(**dict(zip(PARAMETER_NAMES, unknowns[2:] * NOMINAL, strict=True)))
+    if not model.sticks:
+        return np.array([*euler.step(brake, unknowns[0], unknowns[1], current, T_S), *unknowns[2:]])
+    x, (chosen, s) = rest(), no_sensitivity(["k_m"])
+    x[0], x[1] = unknowns[0], unknowns[1]
+    advance(BENCH.plant("exact").mechanics, brake, x, current, T_S, chosen, s)
+    return np.array([x[0], x[1], *unknowns[2:]])
+
+
+def jacobian(model: Model, unknowns: Floats, current: float, steps: Floats) -> Floats:
+    """Derivatives of what comes after a period to what was before, by central differences."""
+    columns = [
+        (after(model, unknowns + h * e, current) - after(model, unknowns - h * e, current)) / (2.0 * h)
+        for h, e in zip(steps, np.eye(6), strict=True)
+    ]
+    return np.array(columns).T
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([-300.0, 300.0]), st.floats(-6.0, 6.0))
+def test_a_prediction_of_eulers_brake_is_its_step_and_its_derivatives(seed: int, v: float, current: float) -> None:
+    state = random_state(seed, v)
+    mean, covariance = predict(EULER, state, 1.0, current)
+    unknowns, p = np.array(state.mean), unpack(np.array(state.covariance), 6)
+    f = jacobian(EULER, unknowns, current, np.full(6, 1e-4))
+    assert mean == pytest.approx(after(EULER, unknowns, current), rel=1e-12)
+    assert unpack(np.array(covariance), 6) == pytest.approx(f @ p @ f.T, rel=1e-6, abs=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(0.5, 95.0), st.floats(-490.0, 490.0), st.floats(-6.0, 6.0))
+def test_a_prediction_of_the_exact_brake_is_its_period_and_its_derivatives(x: float, v: float, current: float) -> None:
+    unknowns = np.array([x, v, *UNIT])
+    end = after(EXACT, unknowns, current)
+    mean, _ = predict(EXACT, known(x, v), 1.0, current)
+    assert mean[0] == pytest.approx(end[0], abs=3e-5)
+    assert mean[1] == pytest.approx(end[1], abs=3e-4)
+    pull = EXACT.motor * current - EXACT.spring * x
+    assume(min(abs(v), abs(end[1])) > 0.05 and abs(abs(pull) - EXACT.coulomb) > 50.0)  # no derivative at a kink
+    f = jacobian(EXACT, unknowns, current, np.array([1e-6, 1e-5, 1e-6, 1e-6, 1e-6, 1e-6]))
+    _, packed = predict(EXACT, known(x, v, 1e-12), 1.0, current)
+    covariance = unpack(np.array(packed), 6) / 1e-12
+    assert covariance[0, 2:] == pytest.approx(f[0, 2:], rel=2e-2, abs=1e-5)
+    assert covariance[1, 2:] == pytest.approx(f[1, 2:], rel=1e-2, abs=2e-2)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6))
+def test_two_corrections_in_turn_are_the_textbooks_joint_one(seed: int) -> None:
+    state = random_state(seed, 100.0)
+    mean, p = np.array(state.mean), unpack(np.array(state.covariance), 6)
+    y, noise = mean[:2] + np.array([0.003, -0.7]), np.diag([EULER.angle_variance, EULER.velocity_variance])
+    gain = p[:, :2] @ np.linalg.inv(p[:2, :2] + noise)
+    found = follow(EULER, state, y[0], y[1], state.step, 0.0)
+    assert found.mean == pytest.approx(mean + gain @ (y - mean[:2]), rel=1e-9)
+    assert unpack(np.array(found.covariance), 6) == pytest.approx(p - gain @ p[:2], rel=1e-6, abs=1e-12)
+
+
+def test_it_answers_as_before_it_was_written_in_tuples() -> None:
+    for model, name in ((EULER, "euler"), (EXACT, "exact")):
+        for case in FROZEN[name]:
+            step, *numbers, innovation, worst = case["before"]
+            before = State(step, tuple(numbers[:6]), tuple(numbers[6:]), innovation, worst)
+            state = follow(model, before, *case["sample"])
+            assert [state.step, *state.mean, *state.covariance, state.innovation, state.worst] == case["after"]
+            assert list(believed(model, state)) == case["believed"]
+            expected = np.array(case["deviations"])
+            if state.worst > MISFIT:
+                expected = np.maximum(expected, (np.array(model.high) - model.low) / math.sqrt(12.0))
+            assert deviations(model, state) == pytest.approx(expected, rel=1e-15)
+            assert current_for(model, state, believed(model, state), *case["speed"]) == case["current"]
+    assert {case["after"][-1] > MISFIT for case in FROZEN["exact"]} == {True, False}
+
+
+def test_the_prior_is_uniform_in_the_ranges_and_at_home() -> None:
+    ranges = BENCH.range_set("viscous")
+    state = start(make_model(BENCH, ranges, sticks=True))
+    assert state.mean == pytest.approx((0.0, 0.0, 1.0, 1.0, 1.0, 3.0e-5 / 2.16e-5))
+    deviation = np.sqrt(np.diag(unpack(np.array(state.covariance), 6)))
+    assert deviation == pytest.approx([0.5, 5.0, 0.0, 0.0, 0.0, 4.0e-5 / 2.16e-5 / math.sqrt(12.0)])
+    assert (state.step, state.innovation, state.worst) == (0.0, 1.0, 1.0)
+    widths = np.sqrt(np.diag(unpack(np.array(start(EXACT).covariance), 6)))[2:]
+    assert widths == pytest.approx(np.full(4, 1.0 / math.sqrt(12.0)))
+
+
+def test_the_model_has_the_numbers_of_the_bench() -> None:
+    p, model = BENCH.brake, EXACT
+    assert (model.sample_time, model.current, model.nominal) == (1e-3, 6.0, (p.k_m, p.k_1, p.T_c, p.f_v))
+    acceleration = euler.step(p, 2.0, 3.0, 0.5, 1e-3)[1] - 3.0
+    assert 1e-3 * (0.5 * model.motor - 2.0 * model.spring - model.coulomb - 3.0 * model.viscous) == pytest.approx(
+        acceleration
+    )
+    assert (model.angle_variance, model.velocity_variance) == pytest.approx((1e-6, 1.0))
+    assert (model.start_angle_variance, model.start_velocity_variance) == pytest.approx((0.25, 25.0))
+    assert model.lost == pytest.approx(6.0 * 1.5 * model.motor * 1e-3)
+    assert model.low == pytest.approx([0.5] * 4)
+    assert model.high == pytest.approx([1.5] * 4)
+
+
+def test_the_direction_of_an_uncertain_velocity_has_the_mean_sign_of_a_gaussian_number() -> None:
+    for v, sigma in [(0.0, 1.0), (0.5, 1.0), (-2.0, 1.5), (3.0, 0.2)]:
+        assert direction(v, sigma**2) == pytest.approx(math.erf(v / sigma / math.sqrt(2.0)), abs=0.03)
+    assert direction(1.0, 0.0) == 1.0
+
+
+def test_lost_samples_leave_it_less_sure_by_the_currents_that_may_have_acted() -> None:
+    for model in (EULER, EXACT):
+        state = known(10.0, 100.0, 1e-8)
+        variances = [unpack(np.array(predict(model, state, n, 0.0)[1]), 6)[1, 1] for n in (1.0, 2.0, 4.0)]
+        assert variances[1] - variances[0] == pytest.approx(model.lost**2, rel=1e-2)
+        assert variances[2] - variances[0] == pytest.approx((3.0 * model.lost) ** 2, rel=1e-2)
+        for periods in (0.0, -3.0):
+            assert predict(model, state, periods, 6.0) == (state.mean, state.covariance)
+    late = follow(EXACT, start(EXACT), 0.5, 3.0, 40.0, 0.0)
+    assert late.mean[0] == pytest.approx(0.5, abs=2e-3)
+
+
+def test_a_brake_that_surely_sticks_stands_still_and_tells_nothing_of_the_friction() -> None:
+    state = before = state_of((0.2, 0.0, *UNIT), np.diag([0.0, 0.0, *[0.02**2] * 4]))
+    for k in range(1, 20):
+        state = follow(EXACT, state, 0.2, 0.0, float(k), 0.1)
+    assert abs(state.mean[1]) < 1e-12
+    assert state.mean[2:] == pytest.approx(before.mean[2:], abs=1e-12)
+    assert deviations(EXACT, state) == pytest.approx([0.02] * 4, rel=1e-9)
+
+
+def test_where_it_is_not_sure_whether_the_brake_sticks_it_stays_unsure() -> None:
+    state = before = follow(EXACT, start(EXACT), 0.0, 0.0, 0.0, 0.0)
+    for k in range(1, 40):
+        state = follow(EXACT, state, 0.0, 0.0, float(k), EXACT.coulomb / EXACT.motor)  # breaks the nominal one away
+    assert deviations(EXACT, state)[2] > 0.8 * deviations(EXACT, before)[2]
+
+
+def test_a_running_mean_of_the_innovations_is_kept_and_its_greatest_value_decides() -> None:
+    state = follow(EXACT, start(EXACT), 30.0, 0.0, 0.0, 0.0)  # 60 standard deviations from home
+    assert state.innovation > 20.0
+    assert state.worst == state.innovation
+    for _ in range(200):
+        state = follow(EXACT, state, state.mean[0], state.mean[1], 0.0, 0.0)
+    assert state.innovation < 2.0
+    assert state.worst > 20.0
+    sure = known(1.0, 0.0, 1e-8)._replace(worst=MISFIT)
+    assert deviations(EXACT, sure) == pytest.approx([1e-4] * 4)
+    assert deviations(EXACT, sure._replace(worst=1.01 * MISFIT)) == pytest.approx([1.0 / math.sqrt(12.0)] * 4)
+
+
+def test_values_are_cut_off_at_their_ranges_and_known_no_better_than_by_what_is_cut_off() -> None:
+    state = state_of((0.0, 0.0, 0.3, 1.7, 1.1, -1.0), 1e-8 * np.eye(6))
+    assert believed(EXACT, state) == pytest.approx((0.5, 1.5, 1.1, 0.5))
+    assert deviations(EXACT, state) == pytest.approx((0.2, 0.2, 1e-4, 1.5))
+    broken = state_of(state.mean, -1e-8 * np.eye(6))  # by rounding
+    assert deviations(EXACT, broken)[2] == 0.0
