@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -149,8 +150,9 @@ STEP, VALUE, DEVIATION = Field("step", "int64"), Field("x", "double"), Field("x_
 def test_a_topic_with_other_fields_is_refused_in_one_line(
     fields: tuple[Field, ...], write: Write, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    four = (*fields, *(Field(name, "double") for name in ("v", "v_deviation", "w", "w_deviation")))
     with monkeypatch.context() as patch:
-        patch.setattr(mcap_schema, "estimate_topic", lambda _: Topic(mcap_schema.ESTIMATE, "emb.Estimate", fields, {}))
+        patch.setattr(mcap_schema, "estimate_topic", lambda _: Topic(mcap_schema.ESTIMATE, "emb.Estimate", four, {}))
         path = write()
     readers: tuple[Callable[[RunLog], object], ...] = (by_step, last_estimate, info_document)
     for read in readers:
@@ -163,7 +165,7 @@ def test_a_log_without_estimates_has_no_such_topic(
     simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path
 ) -> None:
     journal = TraceJournal()
-    run = simulate(steps=20, journal=journal)
+    run = simulate(steps=20, journal=journal, on_bench=replace(bench, prior="nominal"))
     log = read_log(write_trace(tmp_path / "run.mcap", journal.records, bench, layout, run.outcome, steps=20))
     assert mcap_schema.ESTIMATE not in log.topics
     assert (quantities(log), by_step(log), last_estimate(log)) == ((), {}, {})
