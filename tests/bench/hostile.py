@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import random
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError
-from emb_runtime.estimator.estimate import Quantity
+from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.log.ring_buffer import (
     Direction,
@@ -81,7 +81,6 @@ def write_trace(
     *,
     steps: int,
     policy: bytes = b"",
-    estimates: Sequence[Quantity] = (),
     flush_every: int = 100_000,
     **identity: str,
 ) -> Path:
@@ -95,7 +94,7 @@ def write_trace(
         "wall_offset_ns": WALL,
         "dbc": layout.text,
         "metadata": {"emb.run": {"steps": str(steps), FIRST_CURRENT: "2.15", FIRST_MOVE: STOPPABLE, **identity}},
-        "estimates": [list(quantity) for quantity in estimates],
+        "estimates": [list(quantity) for quantity in estimated(bench)],
         "attachments": files,
         "learns": any(isinstance(record, LearntRecord) for record in records),
     }

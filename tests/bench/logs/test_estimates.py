@@ -61,7 +61,6 @@ def write(driven: tuple[SimRun, list[Record]], bench: Bench, layout: Layout, tmp
             None if cut else run.outcome,
             steps=STEPS,
             policy=constant_actor(bench, 3.0),
-            estimates=estimated(bench),
             stop_when=stop_when,
         )
 
@@ -165,8 +164,8 @@ def test_a_log_without_estimates_has_no_such_topic(
     simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path
 ) -> None:
     journal = TraceJournal()
-    run = simulate(steps=20, journal=journal, on_bench=replace(bench, prior="nominal"))
-    log = read_log(write_trace(tmp_path / "run.mcap", journal.records, bench, layout, run.outcome, steps=20))
+    run = simulate(steps=20, journal=journal, on_bench=(closed := replace(bench, prior="nominal")))
+    log = read_log(write_trace(tmp_path / "run.mcap", journal.records, closed, layout, run.outcome, steps=20))
     assert mcap_schema.ESTIMATE not in log.topics
     assert (quantities(log), by_step(log), last_estimate(log)) == ((), {}, {})
     assert "estimate" not in info_document(log)

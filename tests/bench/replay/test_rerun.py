@@ -113,7 +113,6 @@ def test_every_decision_of_the_shipped_actor_is_reproduced_on_every_brake(
         run.outcome,
         steps=500,
         policy=actor.data,
-        estimates=actor.contract.estimates,
         policy_evaluated_by=actor.evaluated_by,
     )
     log = read_log(path)
