@@ -22,7 +22,7 @@ from emb_runtime.records import NodeState
 from emb_runtime.run_type import RunType
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.safety.watchdog import WatchdogResult
-from tests.actors import LEAKY_ESTIMATES, contract_for
+from tests.actors import contract_for
 
 
 class Plan:
@@ -30,7 +30,7 @@ class Plan:
 
     def __init__(self, bench: Bench) -> None:
         self.bench, self.stage, self.limit = bench, "full", 6.0
-        self.policy = SimpleNamespace(contract=contract_for(bench, 1.0, {"estimates": LEAKY_ESTIMATES}))
+        self.policy = SimpleNamespace(contract=contract_for(bench, 1.0, {}))
 
 
 @pytest.fixture
@@ -160,15 +160,17 @@ def test_a_loop_that_gave_no_outcome_is_an_internal_error_in_the_log() -> None:
     assert (end["exit_reason"], end["watchdog_tripped"]) == ("INTERNAL", "gone")
 
 
-def test_what_the_actor_estimated_last_is_told_with_its_interval_and_unit(bench: Bench, ran: RunResult) -> None:
-    known = replace(ran.outcome, estimate=(0.05, 2e-5, 0.0004, 1e-7), goal_reached=True, goal_ns=94_000_000)
+def test_the_last_estimate_is_told_with_its_interval_and_unit(bench: Bench, ran: RunResult) -> None:
+    known = replace(
+        ran.outcome, estimate=(0.02, 0.05, 0.01, 2e-5, 1e-5, 0.0004, 1e-5, 1e-7), goal_reached=True, goal_ns=94_000_000
+    )
     said: Any = document(Plan(bench), "sim", replace(ran, outcome=known))  # type: ignore[arg-type]  # it is enough of one
     interval = pytest.approx([2e-5 - 1.96e-7, 2e-5 + 1.96e-7])
-    assert said["estimate"]["f_v"] == {"value": 2e-5, "deviation": 1e-7, "interval_95": interval, "unit": "N m s/rad"}
+    assert said["estimate"]["f_v"] == {"value": 2e-5, "deviation": 1e-7, "interval_95": interval, "unit": "N·m·s/rad"}
     lines = text(said).splitlines()
     assert lines[0] == "done: 490 of 500 samples answered, ended early: enough is known after 0.094 s"
     assert said["goal_s"] == pytest.approx(0.094)
-    k_1, f_v = "k_1 = 0.05000 ± 0.00078 N m/rad (1.6 %) at 95 %", "f_v = 2.000e-05 ± 2.0e-07 N m s/rad (0.98 %) at 95 %"
+    k_1, f_v = "k_1 = 0.05000 ± 0.00078 N/rad (1.6 %) at 95 %", "f_v = 2.000e-05 ± 2.0e-07 N·m·s/rad (0.98 %) at 95 %"
     for line in (k_1, f_v):
         assert f"  estimate   {line}, if the brake is as the model says" in lines
     assert trailer(known, {})["goal_reached"] == "True"
