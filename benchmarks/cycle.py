@@ -39,7 +39,7 @@ from emb_runtime.can.transport import SocketCan, Transport
 from emb_runtime.cli import main as run
 from emb_runtime.cli import repeat, session
 from emb_runtime.config.bench import Bench
-from emb_runtime.control import loop
+from emb_runtime.control import core, loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE
 from emb_runtime.log.recorder import Recorder
@@ -53,12 +53,11 @@ STEPS: dict[str, tuple[Any, str]] = {
     "reading a frame (after the wait)": (SocketCan, "_frame"),
     "reception": (Reception, "take"),
     "policy": (Policy, "act"),
-    "clip, slew, shield": (loop, "decide"),
+    "clip, slew, shield": (core, "decide"),
     "encoding": (Layout, "encode_command"),
     "guard and bus": (Guard, "send"),
     "  of it, the bus": (SocketCan, "send"),
-    "recording frames": (Recorder, "push_frame"),
-    "recording the cycle": (Recorder, "push_cycle"),
+    "recording": (Recorder, "push"),
 }
 
 
@@ -82,9 +81,9 @@ def main() -> int:
     p.add_argument("--actor", type=Path, metavar="FILE", help="of emb-export (default: the shipped one)")
     args = p.parse_args()
     samples = round(args.seconds * 1000)
-    core = compiled_core.running()
+    taken = compiled_core.running()
     plain = run_once(samples, args.actor)
-    print(f"core: {core.text}; {plain.answered} of {samples} samples answered; {plain.said}")
+    print(f"core: {taken.text}; {plain.answered} of {samples} samples answered; {plain.said}")
     quantiles = (50.0, 90.0, 99.0, 99.9, 100.0)
     print(f"{'':34}" + "".join(f"{q:9g} %" for q in quantiles))
     for said, values in (("pair arrived to pair in hand", plain.age), ("pair in hand to command sent", plain.work)):
@@ -92,7 +91,7 @@ def main() -> int:
     print(
         f"processor time per cycle, waiting excluded: {1e6 * plain.busy:.1f} us, {plain.busy / 1e-3:.1%} of the period"
     )
-    if not core.compiled:
+    if not taken.compiled:
         watched = run_once(samples, args.actor, STEPS)
         print(f"{'step':34}{'median':>11}{'per cycle':>11}")
         for said, values in watched.steps.items():

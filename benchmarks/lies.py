@@ -12,23 +12,21 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the node lives with the tests
 
-from emb_runtime.can.messages import bench_identity, load_layout
+from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import load_bench
-from emb_runtime.control.loop import Loop
 from emb_runtime.control.stop_condition import parse_stop_condition
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
-from emb_runtime.safety.guard import Guard
-from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import FAULTS
-from tests.conftest import MemoryJournal
+from tests.conftest import Journal, make_loop
 from tests.lying.node import HONEST, Lie, LyingNode
 from tests.runtime.control.test_lies import LyingBus
 
-BENCH, LAYOUT = load_bench(), load_layout()
+BENCH = load_bench()
 KNOWN: dict[str, tuple[Lie, ...]] = {
     "honest": (HONEST, Lie(lost=0.02), Lie(lost=0.05)),
     "sliding scale [1/s]": tuple(Lie(slide=r, blind=True, begin=0.0) for r in (1.0, 0.5, 0.2, -0.5, -1.0)),
@@ -57,20 +55,14 @@ def played(lie: Lie, policy: Policy, goal: str, seed: int = 1) -> tuple[str, int
     """Result, exit code, unexplained velocity and greatest stated deviation of one experiment, and its node."""
     node = LyingNode(bench_identity(BENCH.contract_hash), lie, seed)
     bus = LyingBus(node, lambda: 0)
-    outcome = Loop(
-        bench=BENCH,
-        layout=LAYOUT,
-        law=make_law(BENCH),
-        actor=policy,
-        current_limit=policy.contract.action_limit,
-        steps=BENCH.timing.horizon,
-        guard=Guard(LAYOUT, BENCH, bus.send),
-        receive=bus.receive,
-        clock=bus.clock,
-        journal=MemoryJournal(),
-        stop_requested=lambda: False,
-        stop_condition=parse_stop_condition(goal, estimated(BENCH)) if goal else None,
-    ).run()
+    driven: Any = {
+        "send": bus.send,
+        "receive": bus.receive,
+        "now_ns": bus.clock.now_ns,
+        "push": Journal().push,
+    }
+    condition = parse_stop_condition(goal, estimated(BENCH)) if goal else None
+    outcome = make_loop(BENCH, policy, BENCH.timing.horizon, **driven, stop_condition=condition).run()
     for _ in range(400):  # until it rests
         node.tick()
     fault = outcome.fault

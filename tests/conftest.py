@@ -6,7 +6,7 @@ import importlib
 import os
 import pkgutil
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,11 +16,14 @@ from hypothesis import HealthCheck, settings
 from emb_bench.sim.transport import SimTransport, open_sim
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
+from emb_runtime.control.core import Core
+from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
+from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord, LineRecord, Record
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.safety.guard import Guard
-from emb_runtime.safety.heartbeat import Unwatched
+from emb_runtime.safety.heartbeat import Pulse, Unwatched
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.clock import SteppedClock
 
@@ -86,37 +89,41 @@ def layout() -> Layout:
 
 
 @dataclass
-class MemoryJournal:
-    """A journal that keeps everything."""
+class Journal:
+    """All that was recorded, in its order."""
 
-    frames: list[Frame] = field(default_factory=list)
-    cycles: list[CycleRecord] = field(default_factory=list)
-    estimates: list[tuple[int, int, tuple[float, ...]]] = field(default_factory=list)
-    learnt: list[tuple[int, int, tuple[float, ...]]] = field(default_factory=list)
-    events: list[tuple[int, str, str]] = field(default_factory=list)
-    lines: list[tuple[int, int, str]] = field(default_factory=list)
+    records: list[Record] = field(default_factory=list)
 
-    def push_frame(self, frame: Frame) -> None:
-        self.frames.append(frame)
+    def push(self, record: Record) -> None:
+        self.records.append(record)
 
-    def push_cycle(self, record: CycleRecord) -> None:
-        self.cycles.append(record)
+    @property
+    def frames(self) -> list[Frame]:
+        return [record.frame for record in self.records if isinstance(record, FrameRecord)]
 
-    def push_learnt(self, time_ns: int, step: int, numbers: tuple[float, ...]) -> None:
-        self.learnt.append((time_ns, step, numbers))
+    @property
+    def cycles(self) -> list[CycleRecord]:
+        return [record for record in self.records if isinstance(record, CycleRecord)]
 
-    def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
-        self.estimates.append((time_ns, step, estimate))
+    @property
+    def estimates(self) -> list[EstimateRecord]:
+        return [record for record in self.records if isinstance(record, EstimateRecord)]
 
-    def push_event(self, time_ns: int, code: str, text: str) -> None:
-        self.events.append((time_ns, code, text))
+    @property
+    def learnt(self) -> list[LearntRecord]:
+        return [record for record in self.records if isinstance(record, LearntRecord)]
 
-    def push_log(self, time_ns: int, level: int, text: str) -> None:
-        self.lines.append((time_ns, level, text))
+    @property
+    def events(self) -> list[EventRecord]:
+        return [record for record in self.records if isinstance(record, EventRecord)]
+
+    @property
+    def lines(self) -> list[LineRecord]:
+        return [record for record in self.records if isinstance(record, LineRecord)]
 
     @property
     def codes(self) -> list[str]:
-        return [code for _, code, _ in self.events]
+        return [event.code for event in self.events]
 
 
 class FunctionActor:
@@ -132,12 +139,40 @@ class FunctionActor:
         return self.law(angle, velocity, step)
 
 
+def make_loop(
+    bench: Bench,
+    actor: Actor,
+    steps: int,
+    *,
+    send: Callable[[Frame], None],
+    receive: Callable[[int], Frame | None],
+    now_ns: Callable[[], int],
+    push: Callable[[Record], object],
+    stop_requested: Callable[[], bool] = lambda: False,
+    pulse: Pulse | None = None,
+    overheard: Sequence[Frame] = (),
+    **core: Any,
+) -> Loop:
+    """A loop between an actor and a bus; ``core`` replaces what the core takes."""
+    pulse, layout = pulse or Unwatched(), core.get("layout") or load_layout()
+    given: dict[str, Any] = {
+        "bench": bench,
+        "layout": layout,
+        "law": make_law(bench)._replace(steps=steps),
+        "actor": actor,
+        "current_limit": 6.0,
+        "steps": steps,
+        "guard": Guard(layout, bench, send, pulse, core.get("limit", CEILING_CURRENT)),
+    }
+    return Loop(Core(**(given | core)), receive, now_ns, push, stop_requested, pulse, overheard)
+
+
 @dataclass
 class SimRun:
     """A run on the simulated bus, and all that can be looked at afterwards."""
 
     outcome: Outcome
-    journal: MemoryJournal
+    journal: Journal
     transport: SimTransport
     guard: Guard
     sent: list[Frame]
@@ -147,7 +182,7 @@ Simulate = Callable[..., SimRun]
 
 
 @pytest.fixture(scope="session")
-def simulate(bench: Bench, layout: Layout) -> Simulate:
+def simulate(bench: Bench) -> Simulate:
     """Runs the loop on ``--iface sim``; ``on_receive`` may change, drop or add what the loop receives.
 
     ``angle``: where a hand has turned the brake before [rad].
@@ -160,15 +195,15 @@ def simulate(bench: Bench, layout: Layout) -> Simulate:
         angle: float = 0.0,
         on_bench: Bench = bench,
         steps: int | None = None,
-        current_limit: float = 6.0,
+        actor: Actor | None = None,
+        journal: Journal | None = None,
         on_receive: Callable[[Frame | None, SimTransport, SteppedClock], Frame | None] | None = None,
         on_send: Callable[[Frame], None] | None = None,
-        stop_requested: Callable[[], bool] = lambda: False,
         **replaced: Any,
     ) -> SimRun:
         transport, clock = open_sim(options, on_bench)
         transport.node.angle = angle
-        journal = MemoryJournal()
+        journal = journal or Journal()
         sent: list[Frame] = []
 
         def send(frame: Frame) -> None:
@@ -181,23 +216,13 @@ def simulate(bench: Bench, layout: Layout) -> Simulate:
             frame = transport.receive(deadline_ns)
             return on_receive(frame, transport, clock) if on_receive is not None else frame
 
-        pulse, limit = replaced.get("pulse", Unwatched()), replaced.get("limit", CEILING_CURRENT)
-        guard = Guard(layout, on_bench, send, pulse, limit)
-        wanted = steps if steps is not None else on_bench.timing.horizon
-        arguments: dict[str, Any] = {
-            "bench": on_bench,
-            "layout": layout,
-            "law": make_law(on_bench)._replace(steps=wanted),
-            "actor": FunctionActor(law),
-            "current_limit": current_limit,
-            "steps": wanted,
-            "guard": guard,
+        driven: Any = {
+            "send": send,
             "receive": receive,
-            "clock": clock,
-            "journal": journal,
-            "stop_requested": stop_requested,
-        }
-        outcome = Loop(**(arguments | replaced)).run()
-        return SimRun(outcome, journal, transport, guard, sent)
+            "now_ns": clock.now_ns,
+            "push": journal.push,
+        } | replaced
+        loop = make_loop(on_bench, actor or FunctionActor(law), steps or on_bench.timing.horizon, **driven)
+        return SimRun(loop.run(), journal, transport, loop.core.guard, sent)
 
     return run

@@ -8,68 +8,27 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.plant_spec import gaussian_noise
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
-from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.log.ring_buffer import (
-    Direction,
-    EstimateRecord,
     EventRecord,
-    FrameRecord,
     LearntRecord,
-    Level,
-    LineRecord,
     Record,
 )
-from emb_runtime.records import CycleRecord, Frame
-from emb_runtime.run_type import FIRST_CURRENT, FIRST_MOVE, STOPPABLE
-from emb_runtime.safety.guard import Guard
-from emb_runtime.safety.shield_design import make_law
-from tests.conftest import FunctionActor
+from emb_runtime.records import Frame
+from tests.conftest import FunctionActor, Journal, make_loop
 
 WALL = 1_700_000_000_000_000_000
 US = 1_000
 MS = 1_000_000
-
-
-class TraceJournal:
-    """Keeps everything in the order in which the loop pushed it."""
-
-    def __init__(self) -> None:
-        self.records: list[Record] = []
-
-    def push_frame(self, frame: Frame) -> None:
-        self.records.append(FrameRecord(Direction.TX if frame.own else Direction.RX, frame))
-
-    def push_cycle(self, record: CycleRecord) -> None:
-        self.records.append(record)
-
-    def push_learnt(self, time_ns: int, step: int, numbers: tuple[float, ...]) -> None:
-        self.records.append(LearntRecord(time_ns, step, numbers))
-
-    def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
-        self.records.append(EstimateRecord(time_ns, step, estimate))
-
-    def push_event(self, time_ns: int, code: str, text: str) -> None:
-        self.records.append(EventRecord(time_ns, code, text))
-
-    def push_log(self, time_ns: int, level: Level, text: str) -> None:
-        self.records.append(LineRecord(time_ns, level, text))
-
-    @property
-    def cycles(self) -> list[CycleRecord]:
-        return [record for record in self.records if isinstance(record, CycleRecord)]
-
-    @property
-    def codes(self) -> list[str]:
-        return [record.code for record in self.records if isinstance(record, EventRecord)]
 
 
 def write_trace(
@@ -93,7 +52,7 @@ def write_trace(
         "start_ns": begin_ns,
         "wall_offset_ns": WALL,
         "dbc": layout.text,
-        "metadata": {"emb.run": {"steps": str(steps), FIRST_CURRENT: "2.15", FIRST_MOVE: STOPPABLE, **identity}},
+        "metadata": {"emb.run": {"steps": str(steps), "purpose": "experiment", "limit": "6.0", **identity}},
         "estimates": [list(quantity) for quantity in estimated(bench)],
         "attachments": files,
         "learns": any(isinstance(record, LearntRecord) for record in records),
@@ -168,13 +127,6 @@ class HostileBus:
         self._let_pass(self.dice.randrange(1, self.reading_us * US))
         return self.now
 
-    def wall_offset_ns(self) -> int:
-        return WALL
-
-    def sleep_until(self, time_ns: int) -> int:
-        self._let_pass(max(0, time_ns - self.now))
-        return self.now
-
     def receive(self, deadline_ns: int) -> Frame | None:
         if deadline_ns and self.dice.random() < self.dying:
             raise BusError("vcan0: the interface is down")
@@ -212,7 +164,7 @@ class Driven:
     """A run on a hostile bus."""
 
     outcome: Outcome
-    journal: TraceJournal
+    journal: Journal
     steps: int
 
 
@@ -230,18 +182,7 @@ class Thoughtful(FunctionActor):
 
 def drive(bus: HostileBus, law: Callable[[float, float, float], float], steps: int) -> Driven:
     """Run the loop on a hostile bus."""
-    journal = TraceJournal()
-    outcome = Loop(
-        bench=bus.bench,
-        layout=bus.layout,
-        law=make_law(bus.bench)._replace(steps=steps),
-        actor=Thoughtful(law, bus.think),
-        current_limit=6.0,
-        steps=steps,
-        guard=Guard(bus.layout, bus.bench, bus.send),
-        receive=bus.receive,
-        clock=bus,
-        journal=journal,
-        stop_requested=bus.stop_requested,
-    ).run()
-    return Driven(outcome, journal, steps)
+    journal = Journal()
+    driven: Any = {"send": bus.send, "receive": bus.receive, "now_ns": bus.now_ns, "push": journal.push}
+    loop = make_loop(bus.bench, Thoughtful(law, bus.think), steps, **driven, stop_requested=bus.stop_requested)
+    return Driven(loop.run(), journal, steps)

@@ -38,7 +38,7 @@ def write_log(
         "wall_offset_ns": wall,
         "dbc": load_layout().text,
         "metadata": {
-            "emb.run": {"steps": str(steps), "iface": "sim"},
+            "emb.run": {"steps": str(steps), "iface": "sim", "purpose": "experiment", "limit": "6.0"},
             "emb.truth": {name: str(value) for name, value in run.transport.truth.items()},
         },
         "estimates": [],

@@ -8,21 +8,20 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import Any
 
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.transport import SimTransport, open_sim
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import load_bench
-from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
 from emb_runtime.safety.guard import Guard
-from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.clock import SteppedClock
-from tests.conftest import MemoryJournal
+from tests.conftest import Journal, make_loop
 from tests.fuzz.draws import Draw, chance, pick
 from tests.fuzz.model import ReceptionModel
 from tests.fuzz.stream import ANGLE, COMMAND, MS, STATUS, anything, damaged
@@ -30,7 +29,6 @@ from tests.fuzz.targets import Played, demand
 from tests.independent import read
 
 BENCH, LAYOUT = load_bench(), load_layout()
-LAW = make_law(BENCH)
 MOST_RECEIVES = 200_000
 """Far more than any run needs: the longest waits for its node through 5 s, and each period has a handful of frames."""
 FRAME_NS = 50_000  # Least time that a frame takes on the bus
@@ -218,28 +216,16 @@ def run(draw: Draw) -> Played:
         homing, steps = False, 450  # long enough to miss it
     if homing:
         transport.node.angle = draw.integer(-3, 80)
-    journal = MemoryJournal()
-    guard = Guard(LAYOUT, BENCH, bus.send)
+    journal = Journal()
     stop = chance(draw, 5)
-    outcome = Loop(
-        bench=BENCH,
-        layout=LAYOUT,
-        law=LAW._replace(steps=steps),
-        actor=Actor(draw, bus),
-        current_limit=6.0,
-        steps=steps,
-        guard=guard,
-        receive=bus.receive,
-        clock=clock,
-        journal=journal,
-        stop_requested=lambda: stop and chance(draw, 1),
-        homing=homing,
-    ).run()
-    judge_end(outcome, bus, guard, journal)
+    driven: Any = {"send": bus.send, "receive": bus.receive, "now_ns": clock.now_ns, "push": journal.push}
+    asked: Any = {"stop_requested": lambda: stop and chance(draw, 1), "homing": homing}
+    loop = make_loop(BENCH, Actor(draw, bus), steps, layout=LAYOUT, **driven, **asked)
+    judge_end(loop.run(), bus, loop.core.guard, journal)
     return Played(bus.receives, bus.judge.enabled + bus.judge.stops)
 
 
-def judge_end(outcome: Outcome, bus: HostileBus, guard: Guard, journal: MemoryJournal) -> None:
+def judge_end(outcome: Outcome, bus: HostileBus, guard: Guard, journal: Journal) -> None:
     """A run ends for a reason that it can name, with stop frames if anything could have left before."""
     internal = outcome.fault is Fault.INTERNAL and not outcome.detail.startswith(PolicyError.__name__)
     demand(not internal, outcome.detail, *(text for _, _, text in journal.lines))

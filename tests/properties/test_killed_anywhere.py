@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.sim.transport import open_sim
-from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
-from emb_runtime.control.loop import Loop
 from emb_runtime.records import Frame, NodeState
-from emb_runtime.safety.guard import Guard
-from emb_runtime.safety.shield_design import make_law
-from tests.conftest import FunctionActor, MemoryJournal
+from tests.conftest import FunctionActor, Journal, make_loop
 
 BENCH = load_bench()
-LAYOUT = load_layout()
-LAW = make_law(BENCH)
 BOX = BENCH.range_set(BENCH.shield.ranges)
 
 POLICIES = {
@@ -69,21 +64,9 @@ def test_a_runtime_killed_at_any_moment_leaves_the_brake_inside_its_limits(
             raise Killed
         return transport.receive(deadline_ns)
 
-    loop = Loop(
-        bench=BENCH,
-        layout=LAYOUT,
-        law=LAW,
-        actor=FunctionActor(POLICIES[policy]),
-        current_limit=6.0,
-        steps=500,
-        guard=Guard(LAYOUT, BENCH, send),
-        receive=receive,
-        clock=clock,
-        journal=MemoryJournal(),
-        stop_requested=lambda: False,
-    )
+    driven: Any = {"send": send, "receive": receive, "now_ns": clock.now_ns, "push": Journal().push}
     try:
-        loop.run()
+        make_loop(BENCH, FunctionActor(POLICIES[policy]), 500, **driven).run()
     except Killed:
         obeyed, braked_until_stop = node.obeyed, 0
         while node.state is not NodeState.STOPPING:

@@ -1,44 +1,41 @@
-"""Bus, clock, journal and operator of a rerun, played from a log.
+"""A run again: what the log says of frames, times and faults from outside goes into the core, its records come out.
 
-The loop records every frame that it takes, every cycle and every event, in one order, and all that it does between two
-of them follows from them. So that order decides each call of the loop in a rerun: a frame is there if it was taken
-next, a wait times out if another record comes next, an operator pressed Ctrl-C if that comes next.
-
-The loop reads its clock once per event, and the cycle record has the readings of its cycle. Outside of a cycle a
-reading decides only between two ways whose ends are recorded; a bound on it is enough:
-
-* before arming, the arrival of the last frame, or :attr:`Trace.listening_ns` if that is later;
-* before a fault that left no cycle record, the latest for waking, the earliest for deciding;
-* while the run stops, the latest: the stop frames show where a wait ended (:attr:`Trace.pauses`).
+The log has the frames of each read with its time, and the cycle records have the times of deciding and sending. A fault
+from outside (the operator, the watchdog, a lost bus) and a wait in vain stand in the log as events: where the next
+record is one, it is given to the core. A stop frame names the newest sample, and so its place among the frames.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections import deque
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from emb_bench.replay.trace import LATCHED, RUNS_ON, Item, Trace
+from emb_bench.logs import learnt
+from emb_bench.logs.estimates import by_step
+from emb_bench.logs.log import RunLog
 from emb_runtime.can.e2e import COUNTER_MODULUS
-from emb_runtime.can.messages import Layout
-from emb_runtime.can.transport import STEP_SLACK_NS, TransmitQueueFullError
-from emb_runtime.control.interfaces import Actor
-from emb_runtime.errors import BusError
-from emb_runtime.log.ring_buffer import EventRecord, Level
+from emb_runtime.can.transport import TransmitQueueFullError
+from emb_runtime.control.core import Core, Proposal
+from emb_runtime.control.loop import detail_of, fault_of
+from emb_runtime.errors import BusError, FrameError, LogError
+from emb_runtime.log.ring_buffer import Direction, EstimateRecord, EventRecord, FrameRecord, LearntRecord
 from emb_runtime.records import CycleRecord, Frame, RunState
+from emb_runtime.safety.heartbeat import STOP_FRAMES
 from emb_runtime.safety.state_machine import FAULTS, Fault
 
-_IN_CONTROL = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
+Item = FrameRecord | CycleRecord | EventRecord
 
-_RAISED = frozenset({Fault.BUS_LOST.name, Fault.INTERNAL.name, "LISTENING_FAILED"})
-"""Events of a failed wait for a frame."""
-_IN_VAIN = frozenset(
-    {
-        *("SENSOR_LATE", "STOP_FRAME_NOT_SENT", RunState.OVER.name),
-        *(Fault.SENSOR_LOST.name, Fault.NO_NODE.name, Fault.NODE_NOT_READY.name, Fault.NOT_AT_REST.name),
-    }
+WAITED = frozenset({Fault.SENSOR_LATE, Fault.SENSOR_LOST, Fault.NO_NODE, Fault.NODE_NOT_READY})
+"""Faults by a wait in which no frame came."""
+FROM_OUTSIDE = frozenset(
+    {Fault.INTERRUPTED, Fault.WATCHDOG_TRIPPED, Fault.WATCHDOG_LOST, Fault.BUS_LOST, Fault.INTERNAL}
 )
-"""Events that follow a wait in which no frame came."""
+"""Faults that the driver gives to the core."""
+AT_REST = frozenset({RunState.OVER.name, Fault.NOT_AT_REST.name, Fault.MOTION_UNEXPLAINED.name})
+"""Events at the end of a stop."""
 
 
 class Difference(NamedTuple):
@@ -50,50 +47,61 @@ class Difference(NamedTuple):
     came: str
 
 
-class PlaybackOverError(BaseException):
-    """Ends the loop: the trace has nothing more, or the loop has left it. What its stop then does does not count."""
+class LeftError(Exception):
+    """The core has left the log: nothing after this can be compared."""
 
 
-class _Sent(NamedTuple):
-    frame: Frame
-    step: int | None
+def read_items(log: RunLog) -> tuple[Item, ...]:
+    """Frames, cycles and events of a log, in the order in which the loop recorded them; times are monotonic [ns].
+
+    Raises:
+        LogError: the log has no bench, layout, clock or control cycles, topics with other fields, or not the beginning
+            of the run.
+    """
+    offset_ns, tables = log.wall_offset_ns, log.tables
+    ordered: list[tuple[int, Item]] = []
+    reads: list[tuple[int, int]] = []
+    for topic in ("/can/rx", "/can/tx"):
+        if topic in tables:
+            log.require(topic, ["read_time_ns"])
+            reads += zip(tables[topic]["order"].tolist(), tables[topic]["read_time_ns"].tolist(), strict=True)
+    for (order, read_ns), frame in zip(sorted(reads), log.frames, strict=True):
+        ordered.append((order, FrameRecord(Direction.TX if frame.own else Direction.RX, frame, read_ns)))
+    cycles = log.cycles
+    rows = zip(*(cycles[name].tolist() for name in CycleRecord._fields), strict=True)
+    ordered += zip(cycles["order"].tolist(), map(CycleRecord._make, rows), strict=True)
+    events = [EventRecord(event.time_ns - offset_ns, event.code, event.text) for event in log.events]
+    ordered += zip(tables["/safety"]["order"].tolist() if events else [], events, strict=True)
+    items = tuple(item for _, item in sorted(ordered, key=lambda pair: pair[0]))
+    if not items or not isinstance(items[0], EventRecord) or items[0].code != RunState.SILENT.name:
+        raise LogError(f"{log.path}: the beginning of the run is not in this log, and a rerun starts there")
+    return items
 
 
 class Playback:
-    """Inputs of a loop, played from a trace; compares the loop's outputs with the log.
+    """One run again.
 
     Args:
-        trace: the records of the run.
-        layout: of its bus.
-        actor: decides.
+        log: what was recorded.
     """
 
-    def __init__(self, trace: Trace, layout: Layout, actor: Actor) -> None:
-        self._layout = layout
-        self._items = trace.items
-        self._pauses = dict(trace.pauses)
-        self._last_ns = trace.last_ns
-        self._actor = actor
-        self._estimates = trace.estimates
-        self._learnt = trace.learnt
+    def __init__(self, log: RunLog) -> None:
+        self._items = read_items(log)
+        self._estimates, self._learnt = by_step(log), learnt.by_step(log)
+        self._layout = log.layout
         self._at = 0
-        self._state = RunState.INIT
         self._step: int | None = None
-        self._reading = "wake_time_ns"  # of the cycle record: the event that the loop dates next
-        self._arrived_ns = trace.listening_ns
-        self._stops_tried = 0
-        self._is_over = False
-        self._tripped = False
-        self._sent: list[_Sent] = []
-        self._echoed = 0
+        self._refusal: BusError | None = None  # of the next frame by the bus
+        self._sent: list[tuple[int | None, Frame]] = []
+        self._echoed = 0  # frames of those that were found on the bus
+        self._stop_echoes = deque(self._recorded_stop_frames())
+        self._stops = 0  # stop frames tried
         self.decisions = 0
         """Cycle records compared."""
         self.frames = 0
         """Sent frames found on the bus."""
         self.events = 0
         """Safety events compared."""
-        self.bus_lost = False
-        """The bus was lost: what was sent last may never have been on it."""
         self.differences: list[Difference] = []
         """Differences in the order in which they came."""
 
@@ -102,232 +110,196 @@ class Playback:
         """Returns True if all that was recorded has been played."""
         return self._at == len(self._items)
 
-    def finish(self) -> None:
-        """Compare what is left when the loop has returned."""
-        if not self.at_end:
-            self._differ("what came next", _words(self._items[self._at]), "the run was over")
-        if not self.bus_lost:
-            for sent in self._sent[self._echoed :]:
-                self._differ_at(sent.step, "sent frame", "no such frame", _hex(sent.frame))
-
-    # --- the clock --------------------------------------------------------------------------------------------------
-
-    def now_ns(self) -> int:
-        """Time of the event that the loop has in hand [ns]."""
-        if self._state in (RunState.INIT, RunState.SILENT):
-            return self._arrived_ns
-        if self._state not in _IN_CONTROL:
-            return self._last_ns
-        cycle, end_ns = self._ahead()
-        if cycle is not None:
-            return int(getattr(cycle, self._reading))
-        return min(end_ns, self._arrived_ns) if self._reading == "decide_time_ns" else end_ns
-
-    def wall_offset_ns(self) -> int:
-        """Zero: all times of a rerun are monotonic."""
-        return 0
-
-    def sleep_until(self, time_ns: int) -> int:
-        """Time passes by itself here."""
-        return time_ns
-
-    def _ahead(self) -> tuple[CycleRecord | None, int]:
-        """The record of the present cycle; None if it left none, and when the experiment ended [ns]."""
-        for n in range(self._at, len(self._items)):
-            item = self._items[n]
-            if isinstance(item, CycleRecord):
-                return item, self._last_ns
-            if isinstance(item, EventRecord) and item.code not in RUNS_ON:
-                return None, item.time_ns
-        return None, self._last_ns
-
-    # --- the bus ----------------------------------------------------------------------------------------------------
-
-    def receive(self, deadline_ns: int) -> Frame | None:
-        """The frame that was taken next, or None if the wait timed out.
-
-        Raises:
-            BusError: it was lost here.
-            PlaybackOverError: there is nothing more, or the loop had not waited here.
-        """
-        self._reading = "wake_time_ns"
-        item = self._next()
-        if self._state is RunState.STOPPING and self._at >= self._pauses.get(self._stops_tried, len(self._items)):
-            del self._pauses[self._stops_tried]
-            return None
-        if isinstance(item, Frame):
-            self._arrived_ns = max(self._arrived_ns, item.time_ns)
-            return item
-        if deadline_ns <= 0:
-            return None  # it only looked
-        if isinstance(item, EventRecord) and item.code in _RAISED:
-            raise RuntimeError(item.text) if item.code == Fault.INTERNAL.name else _bus_error(item)
-        if isinstance(item, CycleRecord) or item.code not in _IN_VAIN:
-            raise self._left("the loop waited for another frame")
-        # A deadline comes from a frame's stamp, which is the wall clock's, translated: it may be off by a small step.
-        if self._state in _IN_CONTROL and deadline_ns > item.time_ns + STEP_SLACK_NS:
-            raise self._left(f"the loop waited for another {(deadline_ns - item.time_ns) / 1e6:.1f} ms")
-        if self._state is RunState.SILENT:
-            self._arrived_ns = max(self._arrived_ns, deadline_ns)
-        return None
-
     def send(self, frame: Frame) -> None:
         """Take a frame that the guard has let out.
 
         Raises:
-            BusError: the bus did not take it.
+            BusError: the bus had not taken it.
         """
-        if self._is_over:
+        refusal, self._refusal = self._refusal, None
+        if refusal is not None:
+            raise refusal
+        self._sent.append((self._step, frame))
+
+    def play(self, core: Core) -> None:
+        """Play all that was recorded, or until the core leaves it."""
+        try:
+            core.begin(_time_ns(self._items[0]))
+            self._compare(core)
+            while not self.at_end:
+                self._send_stop_frames(core)
+                item = self._items[self._at]
+                if isinstance(item, FrameRecord):
+                    self._give_read(core)
+                elif isinstance(item, EventRecord):
+                    self._give_event(core, item)
+                else:
+                    raise self._left(_words(item), "no command was due")
+                self._compare(core)
+        except LeftError:
             return
-        stops = not self._layout.decode_command(frame).enable
-        self._stops_tried += stops
-        # The first stop frame leaves before its fault is recorded.
-        item = self._behind_the_fault() if stops else None if self.at_end else self._items[self._at]
-        if isinstance(item, EventRecord) and item.code == ("STOP_FRAME_NOT_SENT" if stops else Fault.BUS_LOST.name):
-            raise _bus_error(item)
-        if self._comes(Fault.SEND_QUEUE_FULL):
-            raise TransmitQueueFullError(_detail(self._items[self._at]))
-        self._sent.append(_Sent(frame, self._step))
-        self._reading = "send_time_ns"
+        if core.state is RunState.OVER and core.fault is not Fault.BUS_LOST:  # else the last one may have been lost
+            for step, frame in self._sent[self._echoed :]:
+                self.differences.append(Difference(step, "sent frame", "no such frame", _hex(frame)))
 
-    def _behind_the_fault(self) -> Item | None:
-        """The next record that is not the fault which ended the run, nor the state after it."""
-        skipped = {RunState.STOPPING.name, *LATCHED}
-        rest = self._items[self._at :]
-        return next((item for item in rest if not (isinstance(item, EventRecord) and item.code in skipped)), None)
+    # --- what goes in -----------------------------------------------------------------------------------------------
 
-    def stop_requested(self) -> bool:
-        """Returns True if the operator had requested the end."""
-        return self._comes(Fault.INTERRUPTED)
+    def _give_read(self, core: Core) -> None:
+        """Give the frames of one read, and let the command be sent as it was."""
+        frames: list[Frame] = []
+        for item in self._items[self._at :]:
+            if isinstance(item, FrameRecord):
+                frames.append(item.frame)
+                if item.read_ns:
+                    break
+        else:
+            self._at = len(self._items)  # the log was cut within it
+            return
+        try:
+            proposal = core.take(frames, item.read_ns)
+        except Exception as err:  # of the actor
+            self._fail(core, fault_of(err), detail_of(err), item.read_ns)
+            return
+        self._compare(core)
+        if proposal is not None and not self.at_end:
+            self._step = proposal.step
+            self._answer(core, proposal)
 
-    # --- the watchdog -----------------------------------------------------------------------------------------------
+    def _answer(self, core: Core, proposal: Proposal) -> None:
+        lost = ""
+        for item in self._items[self._at :]:
+            if isinstance(item, EventRecord) and item.code == Fault.SEND_QUEUE_FULL.name:
+                lost = _detail(item)
+                self._refusal = TransmitQueueFullError(lost)
+            elif not isinstance(item, EventRecord) or item.code != Fault.PERMISSION_LOST.name:
+                break
+        else:
+            self._at = len(self._items)
+            return
+        if isinstance(item, CycleRecord):
+            decide_ns, send_ns = item.decide_time_ns, item.send_time_ns
+        else:
+            decide_ns = send_ns = _time_ns(item)
+            if not isinstance(item, EventRecord) or item.code not in (Fault.BUS_LOST.name, Fault.WATCHDOG_TRIPPED.name):
+                raise self._left(_words(item), f"the record of step {proposal.step}")
+            self._refusal = BusError(_detail(item))
+        frame = core.commit(proposal, decide_ns)
+        if frame is None:
+            return
+        try:
+            core.guard.send(frame, core.state, proposal.sample.receive_time_ns, decide_ns)
+        except TransmitQueueFullError:
+            core.sent(proposal, decide_ns, lost)
+        except BusError:
+            pass  # the next record says what came of it
+        else:
+            core.sent(proposal, send_ns)
 
-    @property
-    def tripped(self) -> bool:
-        """The watchdog had stopped the run; never taken back."""
-        self._tripped |= self._comes(Fault.WATCHDOG_TRIPPED)
-        return self._tripped
+    def _give_event(self, core: Core, event: EventRecord) -> None:
+        """Give what stands in the log as an event, and does not follow from the frames."""
+        fault = Fault.__members__.get(event.code)
+        if core.running and fault in WAITED:
+            if core.state is RunState.SILENT:
+                core.timeout(event.time_ns)
+            while not core.records and core.deadline_ns <= event.time_ns:
+                core.timeout(event.time_ns)
+        elif fault in FROM_OUTSIDE and core.fault is None:
+            assert fault is not None
+            self._fail(core, fault, _detail(event), event.time_ns)
+        elif core.state is RunState.STOPPING and event.code == "STOP_FRAME_NOT_SENT":
+            self._refusal = BusError(_detail(event))
+            self._send_stop_frame(core, event.time_ns)
+            core.note(event.time_ns, event.code, event.text)
+        elif core.state is RunState.STOPPING and event.code.endswith("_FAILED"):  # a step of the stop
+            core.note(event.time_ns, event.code, event.text)
+        elif core.state is RunState.STOPPING and event.code in AT_REST:
+            while self._stops < STOP_FRAMES and core.fault is not Fault.WATCHDOG_TRIPPED:
+                self._send_stop_frame(core, event.time_ns)
+            core.end(event.time_ns)
+        if not core.records:
+            raise self._left(_words(event), "no such event")
 
-    def watched(self, _now_ns: int) -> bool:
-        """Returns True if there was a sign of life from it."""
-        return not self._comes(Fault.WATCHDOG_LOST)
+    @staticmethod
+    def _fail(core: Core, fault: Fault, detail: str, time_ns: int) -> None:
+        core.fail(fault, time_ns)
+        core.explain(fault, detail)
 
-    def arm(self, now_ns: int) -> None:
-        """Nobody watches a rerun."""
+    def _send_stop_frames(self, core: Core) -> None:
+        """Send the stop frames that were sent before the next sample."""
+        while core.state is RunState.STOPPING and self._stop_echoes and self._stop_echoes[0] == core.newest_counter:
+            self._stop_echoes.popleft()
+            self._send_stop_frame(core, 0)
 
-    def disarm(self) -> None:
-        """Nobody watches a rerun."""
+    def _send_stop_frame(self, core: Core, time_ns: int) -> None:
+        self._stops += 1
+        with contextlib.suppress(BusError):
+            core.guard.send(core.stop_frame(), core.state, time_ns, time_ns)
 
-    def beat(self, now_ns: int) -> None:
-        """Nobody watches a rerun."""
+    def _recorded_stop_frames(self) -> list[int]:
+        """Samples that the stop frames on the bus answer."""
+        answers = []
+        for item in self._items:
+            if isinstance(item, FrameRecord) and item.frame.own:
+                with contextlib.suppress(FrameError):  # of another log than ours
+                    command = self._layout.decode_command(item.frame)
+                    answers += [] if command.enable else [command.answers]
+        return answers
 
-    def publish(self, counter: int, answers: int) -> None:
-        """Nobody watches a rerun."""
+    # --- what comes out ---------------------------------------------------------------------------------------------
 
-    def _comes(self, fault: Fault) -> bool:
-        """Returns True if that fault is the next record."""
-        item = None if self.at_end else self._items[self._at]
-        return isinstance(item, EventRecord) and item.code == fault.name
+    def _compare(self, core: Core) -> None:
+        records, core.records = core.records, []
+        for record in records:
+            if isinstance(record, EstimateRecord):
+                self._compare_numbers("estimate", self._estimates, record.step, record.numbers)
+            elif isinstance(record, LearntRecord):
+                self._compare_numbers("learnt", self._learnt, record.step, record.numbers)
+            elif isinstance(record, FrameRecord | CycleRecord | EventRecord) and not self.at_end:
+                item = self._items[self._at]
+                self._at += 1
+                self._compare_record(item, record)
 
-    # --- the actor --------------------------------------------------------------------------------------------------
-
-    def begin(self) -> None:
-        """A run begins."""
-        self._actor.begin()
-
-    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
-        """Current that the actor requests [A]."""
-        self._step = int(step)
-        self._reading = "decide_time_ns"
-        return self._actor.act(angle, velocity, step, applied_current)
-
-    # --- the journal ------------------------------------------------------------------------------------------------
-
-    def push_frame(self, frame: Frame) -> None:
-        """Handles a frame that was taken; the echo of a sent one identifies its record."""
-        self._at += 1
-        if frame.own:
-            self._compare_echo(frame)
-
-    def push_cycle(self, record: CycleRecord) -> None:
-        """Compare a cycle."""
-        item = self._next()
-        if not isinstance(item, CycleRecord):
-            raise self._left(_words(record))
-        self._at += 1
-        self.decisions += 1
-        for name, recorded, came in zip(record._fields, item, record, strict=True):
-            if not _same(recorded, came):
-                self._differ_at(item.step, name, repr(recorded), repr(came))
-
-    def push_estimate(self, _time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
-        """Compare an estimate."""
-        self._compare_numbers("estimate", self._estimates, step, estimate)
-
-    def push_learnt(self, _time_ns: int, step: int, numbers: tuple[float, ...]) -> None:
-        """Compare what the shield has learnt."""
-        self._compare_numbers("learnt", self._learnt, step, numbers)
+    def _compare_record(self, item: Item, record: Item) -> None:
+        if isinstance(item, CycleRecord) and isinstance(record, CycleRecord):
+            self.decisions += 1
+            for name, recorded, came in zip(record._fields, item, record, strict=True):
+                if not _same(recorded, came):
+                    self.differences.append(Difference(item.step, name, repr(recorded), repr(came)))
+        elif isinstance(item, EventRecord) and isinstance(record, EventRecord) and item.code == record.code:
+            self.events += 1
+        elif isinstance(item, FrameRecord) and isinstance(record, FrameRecord):
+            if item.frame.own:
+                self._find_sent(item.frame)
+        else:
+            raise self._left(_words(item), _words(record))
 
     def _compare_numbers(
         self, what: str, of_step: Mapping[int, tuple[float, ...]], step: int, came: tuple[float, ...]
     ) -> None:
         recorded = of_step.get(step)
         if recorded is None and self.at_end:
-            raise self._over()  # the log was cut just there
+            return  # the log was cut just there
         if recorded is None or len(recorded) != len(came) or not all(map(_same, recorded, came)):
-            self._differ_at(step, what, repr(recorded), repr(came))
+            self.differences.append(Difference(step, what, repr(recorded), repr(came)))
 
-    def push_event(self, _time_ns: int, code: str, text: str) -> None:
-        """Compare an event."""
-        item = self._next()
-        if not isinstance(item, EventRecord) or item.code != code:
-            raise self._left(f"{code} ({text})")
-        self._at += 1
-        self.events += 1
-        if code in RunState.__members__:
-            self._state = RunState[code]
-        self.bus_lost |= code == Fault.BUS_LOST.name
-        if code == "LISTENING_FAILED":
-            self._pauses.pop(self._stops_tried, None)
-
-    def push_log(self, time_ns: int, level: Level, text: str) -> None:
-        """Lines are for people; nothing follows from them."""
-
-    # --- comparing --------------------------------------------------------------------------------------------------
-
-    def _next(self) -> Item:
-        if self.at_end or self._is_over:
-            raise self._over()
-        return self._items[self._at]
-
-    def _left(self, came: str) -> PlaybackOverError:
-        """The loop has left the trace: nothing after this can be compared."""
-        self._differ("what came next", _words(self._items[self._at]), came)
-        return self._over()
-
-    def _over(self) -> PlaybackOverError:
-        self._is_over = True
-        return PlaybackOverError()
-
-    def _compare_echo(self, echo: Frame) -> None:
+    def _find_sent(self, echo: Frame) -> None:
+        """Find the sent frame whose echo was recorded; those before it were not on the bus."""
         waiting = self._sent[self._echoed : self._echoed + COUNTER_MODULUS]
-        echo = echo._replace(time_ns=0, own=False, dropped=0)
-        for n, sent in enumerate(waiting):
-            if sent.frame == echo:
-                for lost in waiting[:n]:
-                    self._differ_at(lost.step, "sent frame", "no such frame", _hex(lost.frame))
-                self._echoed += n + 1
-                self.frames += 1
-                return
-        step, came = (waiting[0].step, _hex(waiting[0].frame)) if waiting else (self._step, "no such frame")
-        self._differ_at(step, "sent frame", _hex(echo), came)
-        self._echoed += bool(waiting)
+        bare = echo._replace(time_ns=0, own=False, dropped=0)
+        at = next((n for n, (_, frame) in enumerate(waiting) if frame == bare), None)
+        if at is None:
+            step, came = (waiting[0][0], _hex(waiting[0][1])) if waiting else (self._step, "no such frame")
+            self.differences.append(Difference(step, "sent frame", _hex(echo), came))
+            self._echoed += bool(waiting)
+            return
+        for step, frame in waiting[:at]:
+            self.differences.append(Difference(step, "sent frame", "no such frame", _hex(frame)))
+        self._echoed += at + 1
+        self.frames += 1
 
-    def _differ(self, what: str, recorded: str, came: str) -> None:
-        self._differ_at(self._step, what, recorded, came)
-
-    def _differ_at(self, step: int | None, what: str, recorded: str, came: str) -> None:
-        self.differences.append(Difference(step, what, recorded, came))
+    def _left(self, recorded: str, came: str) -> LeftError:
+        self.differences.append(Difference(self._step, "what came next", recorded, came))
+        return LeftError()
 
 
 def _same(recorded: float, came: float) -> bool:
@@ -337,15 +309,20 @@ def _same(recorded: float, came: float) -> bool:
     return recorded == came and math.copysign(1.0, recorded) == math.copysign(1.0, came)
 
 
-def _detail(item: Item) -> str:
+def _detail(event: EventRecord) -> str:
     """Text of a fault's event without its cause."""
-    assert isinstance(item, EventRecord)
-    cause = FAULTS[Fault[item.code]].cause if item.code in Fault.__members__ else ""
-    return item.text.removeprefix(f"{cause}: ")
+    cause = FAULTS[Fault[event.code]].cause if event.code in Fault.__members__ else ""
+    return "" if event.text == cause else event.text.removeprefix(f"{cause}: ")
 
 
-def _bus_error(event: EventRecord) -> BusError:
-    return BusError(_detail(event))
+def _time_ns(item: Item) -> int:
+    match item:
+        case FrameRecord():
+            return item.frame.time_ns
+        case CycleRecord():
+            return item.receive_time_ns
+        case EventRecord():
+            return item.time_ns
 
 
 def _hex(frame: Frame) -> str:
@@ -354,8 +331,8 @@ def _hex(frame: Frame) -> str:
 
 def _words(item: Item) -> str:
     match item:
-        case Frame():
-            return f"frame {_hex(item)}"
+        case FrameRecord():
+            return f"frame {_hex(item.frame)}"
         case CycleRecord():
             return f"the record of step {item.step}"
         case EventRecord(_, code, text):

@@ -12,19 +12,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from emb_bench.logs.log import RunLog, read_log, require_driven
-from emb_bench.replay.playback import Difference, Playback, PlaybackOverError
-from emb_bench.replay.trace import Trace, read_trace
+from emb_bench.replay.playback import Difference, Playback
 from emb_runtime.config.bench import CEILING_CURRENT
+from emb_runtime.control.core import Core
 from emb_runtime.control.homing import Still, homing_steps
 from emb_runtime.control.interfaces import Actor
-from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.drives.mapping import mapping_hash
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageError
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder_process import DIED
-from emb_runtime.run_type import FIRST_CURRENT, FIRST_MOVE, RunType
+from emb_runtime.records import RunState
+from emb_runtime.run_type import RunType
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.terminal import as_json, show
@@ -128,38 +128,49 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
     Raises:
         LogError: the log lacks what a rerun needs.
     """
-    steps, trace = _steps(log), read_trace(log)
-    played, outcome = _play(log, trace, actor, current_limit, steps, stop_condition)
-    differences = list(played.differences)
-    if outcome is not None:
-        differences += _end(log.end, outcome)
+    bench, layout, limit, steps = log.bench, log.layout, _limit(log), _steps(log)
+    playback = Playback(log)
+    core = Core(
+        bench=bench,
+        layout=layout,
+        law=make_law(bench)._replace(steps=steps),
+        actor=actor,
+        current_limit=current_limit,
+        steps=steps,
+        guard=Guard(layout, bench, playback.send, limit=limit),
+        limit=limit,
+        homing=run_type(log) is RunType.HOMING,
+        stop_condition=stop_condition,
+    )
+    playback.play(core)
+    outcome = core.outcome() if core.state is RunState.OVER and playback.at_end else None
     return Rerun(
-        decisions=played.decisions,
-        frames=played.frames,
-        events=played.events,
-        differences=tuple(differences),
-        followed=played.at_end,
+        decisions=playback.decisions,
+        frames=playback.frames,
+        events=playback.events,
+        differences=(*playback.differences, *(() if outcome is None else _end(log.end, outcome))),
+        followed=playback.at_end,
         outcome=outcome,
     )
 
 
 def run_type(log: RunLog) -> RunType:
-    """Run type of a log; an experiment if the log, of an older version, has none.
+    """Run type of a log.
 
     Raises:
         UsageError: nothing was driven.
         LogError: its run type is unknown.
     """
     require_driven(log)
-    recorded = log.run.get("purpose", RunType.EXPERIMENT)
+    recorded = log.run.get("purpose", "")
     if recorded not in (RunType.EXPERIMENT, RunType.HOMING):
         raise LogError(f"{log.path}: emb.run: purpose: expected experiment or homing, got {recorded[:40]!r}")
     return RunType(recorded)
 
 
 def _limit(log: RunLog) -> float:
-    """Largest current that might be sent [A]; ``CEILING_CURRENT`` if the log, of an older version, has none."""
-    recorded = log.run.get("limit", repr(CEILING_CURRENT))
+    """Largest current that might be sent [A]."""
+    recorded = log.run.get("limit", "")
     try:
         limit = float(recorded)
     except ValueError:
@@ -190,44 +201,6 @@ def _stop_condition(log: RunLog) -> StopCondition | None:
         return None if stop_when is None else parse_stop_condition(stop_when, estimated(log.bench))
     except UsageError as err:
         raise LogError(f"{log.path}: emb.run: stop_when: {err}") from err
-
-
-def _play(
-    log: RunLog,
-    trace: Trace,
-    actor: Actor,
-    current_limit: float,
-    steps: int,
-    stop_condition: StopCondition | None,
-) -> tuple[Playback, Outcome | None]:
-    """One run of the loop; without an outcome if it was left on the way."""
-    bench, layout, limit, homing = log.bench, log.layout, _limit(log), run_type(log) is RunType.HOMING
-    playback = Playback(trace, layout, actor)
-    loop = Loop(
-        bench=bench,
-        layout=layout,
-        law=make_law(bench)._replace(steps=steps),
-        actor=playback,
-        current_limit=current_limit,
-        steps=steps,
-        guard=Guard(layout, bench, playback.send, limit=limit),
-        receive=playback.receive,
-        clock=playback,
-        journal=playback,
-        stop_requested=playback.stop_requested,
-        pulse=playback,
-        limit=limit,
-        homing=homing,
-        judges_sensors=FIRST_CURRENT in log.run,
-        constant_first_move=FIRST_MOVE not in log.run,
-        stop_condition=stop_condition,
-    )
-    try:
-        outcome = loop.run()
-    except PlaybackOverError:
-        return playback, None
-    playback.finish()
-    return playback, outcome
 
 
 def _end(recorded: Mapping[str, str], outcome: Outcome) -> list[Difference]:

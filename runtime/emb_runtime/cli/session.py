@@ -21,6 +21,7 @@ from emb_runtime.cli.options import Plan, Stage
 from emb_runtime.cli.preflight import CheckResult, Findings, check, interrupted, refuse
 from emb_runtime.cli.run_metadata import header, log_bytes
 from emb_runtime.cli.summary import RunResult, trailer
+from emb_runtime.control.core import Core
 from emb_runtime.control.homing import Still, homing_steps
 from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import Loop
@@ -115,7 +116,7 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
                 recorder.push_log(bus.clock.now_ns(), Level.INFO, f"real time, {name}: {value}")
             push_clock(recorder, bus.clock)
             pulse = watchdog.pulse if watchdog is not None else Unwatched()
-            loop = Loop(
+            core = Core(
                 bench=plan.bench,
                 layout=plan.layout,
                 law=plan.law,
@@ -123,15 +124,18 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
                 current_limit=plan.policy.contract.action_limit,
                 steps=steps,
                 guard=Guard(plan.layout, plan.bench, bus.transport.send, pulse, plan.limit),
-                receive=paced_receive(bus, recorder),
-                clock=bus.clock,
-                journal=recorder,
-                stop_requested=console.stop_requested,
-                pulse=pulse,
                 limit=plan.limit,
                 homing=homing,
-                overheard=drop_backlog(bus, plan.layout),
                 stop_condition=None if homing else plan.stop_condition,
+            )
+            loop = Loop(
+                core=core,
+                receive=paced_receive(bus, recorder),
+                now_ns=bus.clock.now_ns,
+                push=recorder.push,
+                stop_requested=console.stop_requested,
+                pulse=pulse,
+                overheard=drop_backlog(bus, plan.layout),
             )
             with _armed_drive(bus, recorder, zero=plan.stage is Stage.ZERO):
                 outcome = loop.run()

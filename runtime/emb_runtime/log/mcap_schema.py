@@ -123,6 +123,7 @@ _FRAME_FIELDS = (  # the names of can_msgs/Frame, then what only we know
     Field("dlc", "uint32"),
     Field("data", "bytes"),
     Field("dropped", "uint64"),
+    Field("read_time_ns", "int64", "ns"),
 )
 
 
@@ -130,6 +131,7 @@ def _frame_topic(name: str, what: str) -> Topic:
     notes = {
         "description": what,
         "dropped": "frames that the kernel has dropped on this socket so far",
+        "read_time_ns": "monotonic time at which the loop had the frames of one read; 0 in all but the last of them",
     }
     return Topic(name, "emb.CanFrame", _FRAME_FIELDS, notes)
 

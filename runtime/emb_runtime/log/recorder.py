@@ -19,25 +19,21 @@ from typing import Any, Final, NamedTuple
 
 from emb_runtime.errors import LogError
 from emb_runtime.log.ring_buffer import (
+    ClockRecord,
     Direction,
-    Kind,
+    EventRecord,
+    FrameRecord,
     Level,
+    LineRecord,
+    Record,
     Ring,
-    pack_clock,
-    pack_cycle,
-    pack_estimate,
-    pack_event,
-    pack_frame,
-    pack_line,
+    pack,
 )
-from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.records import Frame
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 
 START_TIMEOUT: Final = 30.0  # Longest wait for the recorder process to have the file on disk [s]
 FINISH_TIMEOUT: Final = 30.0  # Longest wait for it to write what is left and close the file [s]
-
-FRAMES_HELD: Final = 4
-"""Frames that wait at most; killing the runtime costs fewer than that. A cycle has three: pair and echo."""
 
 
 class Attachment(NamedTuple):
@@ -107,7 +103,6 @@ class Recorder:
         self.path = path
         self._ring = ring
         self._child = child
-        self._held: list[Frame] = []
 
     @classmethod
     def start(
@@ -157,39 +152,17 @@ class Recorder:
         while len(self._ring) > self._ring.slots // 2 and self._child.alive:
             self._child.make_room()
 
+    def push(self, record: Record) -> None:
+        """Record anything; never waits."""
+        self._ring.push(*pack(record))
+
     def push_frame(self, frame: Frame) -> None:
-        """Record a frame that was on the bus; one whose echo came back (``own``) is one that was sent.
-
-        It waits for the next record, or for :data:`FRAMES_HELD` frames: those of a cycle are packed when its command
-        has left, and not while it is waited for.
-        """
-        self._held.append(frame)
-        if len(self._held) == FRAMES_HELD:
-            self._push_held()
-
-    def _push_held(self) -> None:
-        for frame in self._held:
-            self._ring.push(Kind.FRAME, pack_frame(frame, Direction.TX if frame.own else Direction.RX))
-        self._held.clear()
+        """Record a frame that was on the bus; one whose echo came back (``own``) is one that was sent."""
+        self.push(FrameRecord(Direction.TX if frame.own else Direction.RX, frame))
 
     def push_drive_frame(self, frame: Frame) -> None:
         """Record a frame of the bus of a mapped drive; ``own`` says that it was sent."""
-        self._ring.push(Kind.FRAME, pack_frame(frame, Direction.DRIVE_TX if frame.own else Direction.DRIVE_RX))
-
-    def push_cycle(self, record: CycleRecord) -> None:
-        """Record a control cycle."""
-        self._push_held()
-        self._ring.push(Kind.CYCLE, pack_cycle(record))
-
-    def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
-        """Record an estimate: values, then standard deviations, in the header's order."""
-        self._push_held()
-        self._ring.push(Kind.ESTIMATE, pack_estimate(time_ns, step, estimate))
-
-    def push_learnt(self, time_ns: int, step: int, numbers: tuple[float, ...]) -> None:
-        """Record what is possible at a sample, see :func:`emb_runtime.learning.known.numbers`."""
-        self._push_held()
-        self._ring.push(Kind.LEARNT, pack_estimate(time_ns, step, numbers))
+        self.push(FrameRecord(Direction.DRIVE_TX if frame.own else Direction.DRIVE_RX, frame))
 
     def push_event(self, time_ns: int, code: str, text: str) -> None:
         """Record something that the safety chain did.
@@ -199,18 +172,15 @@ class Recorder:
             code: a short, stable name, at most 40 bytes.
             text: the same for a person; cut beyond about 190 bytes.
         """
-        self._push_held()
-        self._ring.push(Kind.EVENT, pack_event(time_ns, code, text))
+        self.push(EventRecord(time_ns, code, text))
 
     def push_log(self, time_ns: int, level: Level, text: str) -> None:
         """Record a line of text for a person; cut beyond about 230 bytes."""
-        self._push_held()
-        self._ring.push(Kind.LINE, pack_line(time_ns, level, text))
+        self.push(LineRecord(time_ns, level, text))
 
     def push_clock(self, monotonic_ns: int, wall_ns: int) -> None:
         """Record one reading of the monotonic and of the Unix clock; once a second is plenty."""
-        self._push_held()
-        self._ring.push(Kind.CLOCK, pack_clock(monotonic_ns, wall_ns))
+        self.push(ClockRecord(monotonic_ns, wall_ns))
 
     def finish(self, trailer: Mapping[str, str], timeout: float = FINISH_TIMEOUT) -> RecorderResult:
         """Have the rest written and the file closed; ends the process in any case.
@@ -222,7 +192,6 @@ class Recorder:
         Returns:
             What became of the log; a failure is told there, never raised.
         """
-        self._push_held()
         with contextlib.suppress(OSError):  # if the process is gone, what it last said follows
             self._child.tell(trailer)
         answer = self._child.answer(timeout)

@@ -152,7 +152,7 @@ class LogWriter:
         self._mcap.finish()  # type: ignore[no-untyped-call]
 
     def _write_frame(self, record: FrameRecord, log_time: int) -> None:
-        direction, frame = record
+        direction, frame, read_ns = record
         values = {
             "id": frame.identifier,
             "is_rtr": frame.remote,
@@ -161,6 +161,7 @@ class LogWriter:
             "dlc": len(frame.data),
             "data": frame.data,
             "dropped": frame.dropped,
+            "read_time_ns": read_ns,
         }
         self._add(_FRAME_TOPICS[direction], log_time, frame.time_ns, values)
         if direction in (Direction.DRIVE_RX, Direction.DRIVE_TX):
@@ -312,7 +313,7 @@ class Recording:
 
 def _time(record: Record) -> int:
     match record:
-        case FrameRecord(_, frame):
+        case FrameRecord(_, frame, _):
             return frame.time_ns
         case CycleRecord():
             return record.receive_time_ns

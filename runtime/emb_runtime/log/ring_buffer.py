@@ -188,6 +188,7 @@ class FrameRecord(NamedTuple):
 
     direction: Direction
     frame: Frame
+    read_ns: int = 0  # Time at which the loop had it, monotonic [ns]; 0 if more frames of the same read follow
 
 
 class EventRecord(NamedTuple):
@@ -231,7 +232,7 @@ class LearntRecord(NamedTuple):
 
 Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | LineRecord | EstimateRecord | LearntRecord
 
-_FRAME: Final = struct.Struct("<qQIBBB8s")
+_FRAME: Final = struct.Struct("<qQIBBB8sq")
 _CYCLE: Final = struct.Struct(
     "<"
     + "".join(
@@ -252,11 +253,28 @@ def _clipped(text: str, room: int) -> bytes:
     return data if len(data) <= room else data[: room - 3].decode("utf-8", "ignore").encode() + "…".encode()
 
 
-def pack_frame(frame: Frame, direction: Direction) -> bytes:
+def pack(record: Record) -> tuple[Kind, bytes]:
+    """Kind and payload of a record."""
+    if isinstance(record, FrameRecord):
+        return Kind.FRAME, pack_frame(*record)
+    if isinstance(record, CycleRecord):
+        return Kind.CYCLE, pack_cycle(record)
+    if isinstance(record, EstimateRecord):
+        return Kind.ESTIMATE, pack_estimate(*record)
+    if isinstance(record, LearntRecord):
+        return Kind.LEARNT, pack_estimate(*record)
+    if isinstance(record, EventRecord):
+        return Kind.EVENT, pack_event(*record)
+    if isinstance(record, LineRecord):
+        return Kind.LINE, pack_line(*record)
+    return Kind.CLOCK, pack_clock(*record)
+
+
+def pack_frame(direction: Direction, frame: Frame, read_ns: int = 0) -> bytes:
     """Payload of a frame."""
     identifier, data, time_ns, extended, remote, error, own, dropped = frame
     flags = extended | remote << 1 | error << 2 | own << 3
-    return _FRAME.pack(time_ns, dropped, identifier, flags, direction, len(data), data)
+    return _FRAME.pack(time_ns, dropped, identifier, flags, direction, len(data), data, read_ns)
 
 
 def pack_cycle(record: CycleRecord) -> bytes:
@@ -295,10 +313,10 @@ def unpack(kind: int, payload: bytes) -> Record:
     """
     match kind:
         case Kind.FRAME:
-            time_ns, dropped, identifier, flags, direction, length, data = _FRAME.unpack(payload)
+            time_ns, dropped, identifier, flags, direction, length, data, read_ns = _FRAME.unpack(payload)
             extended, remote, error, own = (bool(flags & 1 << i) for i in range(4))
             frame = Frame(identifier, data[:length], time_ns, extended, remote, error, own, dropped)
-            return FrameRecord(Direction(direction), frame)
+            return FrameRecord(Direction(direction), frame, read_ns)
         case Kind.CYCLE:
             return CycleRecord._make(_CYCLE.unpack(payload))
         case Kind.EVENT:

@@ -99,7 +99,8 @@ def test_parquet_has_the_same_numbers_and_units_and_says_what_is_missing(path: P
 
 def test_a_value_that_does_not_exist_is_null_in_parquet(simulate: Simulate, tmp_path: Path) -> None:
     run = simulate(square, steps=STEPS)
-    run.journal.cycles = [cycle._replace(policy_current=math.nan) for cycle in run.journal.cycles]
+    records = run.journal.records
+    records[:] = [r._replace(policy_current=math.nan) if isinstance(r, CycleRecord) else r for r in records]
     source = write_log(tmp_path / "nan.mcap", run, steps=STEPS)
     assert export(source, "--to", "parquet", "-o", tmp_path / "out.parquet") == 0
     assert pq.read_table(tmp_path / "out.parquet")["policy_current"].null_count == len(run.journal.cycles)

@@ -15,6 +15,7 @@ import pytest
 from emb_bench.export.repair import repair
 from emb_bench.logs.can_files import McapReader
 from emb_bench.logs.log import read_log
+from emb_runtime.log.ring_buffer import Direction, FrameRecord
 from emb_runtime.records import Frame
 
 from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
@@ -42,12 +43,13 @@ def facts(messages: Iterable[can.Message], fields: tuple[str, ...] = FIELDS) -> 
 def run(simulate: Simulate) -> SimRun:
     run = simulate(square, steps=STEPS)
     last = max(frame.time_ns for frame in run.journal.frames)
-    run.journal.frames += [  # what a run on a real bus also sees
+    for frame in (  # what a run on a real bus also sees
         Frame(0x1ABCDEF, b"\x01\x02", last + 1_000_000, extended=True),
         Frame(0x321, bytes(3), last + 2_000_000, remote=True),
         Frame(0x88, bytes(8), last + 3_000_000, error=True),
         Frame(0x7FF, b"", last + 4_000_000),
-    ]
+    ):
+        run.journal.push(FrameRecord(Direction.RX, frame))
     return run
 
 

@@ -25,8 +25,8 @@ from emb_runtime.records import CycleRecord
 
 from tests.bench.conftest import Replay  # isort: skip
 from tests.actors import constant_actor
-from tests.bench.hostile import TraceJournal, write_trace
-from tests.conftest import FunctionActor, SimRun, Simulate
+from tests.bench.hostile import write_trace
+from tests.conftest import FunctionActor, Journal, SimRun, Simulate
 
 STEPS = 300
 STOP_WHEN = "k_m=1%"
@@ -39,7 +39,7 @@ Alter = Callable[[list[Record]], None]
 @pytest.fixture(scope="module")
 def driven(simulate: Simulate, bench: Bench) -> tuple[SimRun, list[Record]]:
     """A run that ended early, and its records in order."""
-    journal = TraceJournal()
+    journal = Journal()
     stop_condition = parse_stop_condition(STOP_WHEN, estimated(bench))
     run = simulate(actor=ACTOR, steps=STEPS, journal=journal, stop_condition=stop_condition)
     assert (run.outcome.fault, run.outcome.goal_reached) == (None, True)
@@ -163,7 +163,7 @@ def test_a_topic_with_other_fields_is_refused_in_one_line(
 def test_a_log_without_estimates_has_no_such_topic(
     simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path
 ) -> None:
-    journal = TraceJournal()
+    journal = Journal()
     run = simulate(steps=20, journal=journal, on_bench=(closed := replace(bench, prior="nominal")))
     log = read_log(write_trace(tmp_path / "run.mcap", journal.records, closed, layout, run.outcome, steps=20))
     assert mcap_schema.ESTIMATE not in log.topics

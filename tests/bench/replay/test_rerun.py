@@ -24,11 +24,11 @@ from emb_runtime.records import CycleRecord, Frame, Reason, RunState
 from emb_runtime.safety.state_machine import Fault
 from tests.actors import constant_actor
 from tests.bench.conftest import Replay
-from tests.bench.hostile import Driven, HostileBus, Thoughtful, TraceJournal, drive, write_trace
+from tests.bench.hostile import Driven, HostileBus, Thoughtful, drive, write_trace
 from tests.bench.simulated_logs import square, write_log
 from tests.runtime.control.test_faults import INJECTIONS
 
-from tests.conftest import SimRun, Simulate  # isort: skip
+from tests.conftest import Journal, SimRun, Simulate  # isort: skip
 
 Law = Callable[[float, float, float], float]
 NOT_PLAYED = {Fault.GUARD_REJECTED}  # Fault of a guard that a log does not carry
@@ -68,7 +68,7 @@ def recorded(simulate: Simulate) -> Callable[..., Driven]:
     """A run on ``--iface sim``, with its journal in order."""
 
     def run(law: Law = square, steps: int = 150, **arguments: Any) -> Driven:
-        journal = TraceJournal()
+        journal = Journal()
         done: SimRun = simulate(law, steps=steps, journal=journal, **arguments)
         return Driven(done.outcome, journal, steps)
 
@@ -262,7 +262,7 @@ def test_a_log_that_was_cut_anywhere_is_followed_up_to_there(hostile: Callable[.
     run = hostile(1, slow=0.05, backlog_ms=50)
     total = len(run.journal.records)
     for length in (2, 30, 60, 61, 62, 63, 64, 65, 66, 67, 200, 201, 202, 203, 204, total - 300, total - 2, total - 1):
-        cut = Driven(run.outcome, TraceJournal(), run.steps)
+        cut = Driven(run.outcome, Journal(), run.steps)
         cut.journal.records = run.journal.records[:length]
         result = again(cut, outcome=None)
         assert result.differences == ()
@@ -482,6 +482,6 @@ def test_a_number_of_steps_that_is_none_is_one_line(
         ["bench.toml", "application/toml", b64encode(bench.text.encode()).decode()],
         ["policy.onnx", "application/octet-stream", b64encode(constant_actor(bench)).decode()],
     ]
-    run = {"emb.run": {"steps": steps}}
+    run = {"emb.run": {"steps": steps, "purpose": "experiment", "limit": "6.0"}}
     path = write_log(tmp_path / "odd.mcap", simulate(steps=20), metadata=run, attachments=files)
     assert "steps: expected a whole number from 1 to 500" in replay.refused("rerun", path, code=6)

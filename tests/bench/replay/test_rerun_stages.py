@@ -20,8 +20,8 @@ from emb_runtime.records import RunState
 from emb_runtime.run_type import RunType
 from tests.actors import constant_actor
 from tests.bench.conftest import Replay
-from tests.bench.hostile import TraceJournal, write_trace
-from tests.conftest import FunctionActor, SimRun, Simulate
+from tests.bench.hostile import write_trace
+from tests.conftest import FunctionActor, Journal, SimRun, Simulate
 
 Run = Callable[..., Path]
 
@@ -50,7 +50,7 @@ def test_a_run_of_any_stage_is_reproduced_with_its_limit(run: Run, stage: list[s
 def test_a_limit_that_was_altered_in_the_log_is_found(
     simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path
 ) -> None:
-    journal = TraceJournal()
+    journal = Journal()
     done: SimRun = simulate(lambda *_: 6.0, steps=100, journal=journal, limit=2.0)
     for limit, reproduced in (("2.0", True), ("2.5", False), ("6.0", False)):
         path = write_trace(
@@ -65,7 +65,7 @@ WANTS = FunctionActor(lambda *_: 6.0)  # An actor that wants all
 @pytest.fixture
 def homed(simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path) -> Path:
     """The log of a way home from 60 rad."""
-    journal = TraceJournal()
+    journal = Journal()
 
     def turned(frame: object, transport: object, _clock: object) -> object:
         node = transport.node  # type: ignore[attr-defined]
@@ -125,7 +125,7 @@ def test_of_a_run_with_no_current_it_is_said_in_one_line_that_nothing_was_excite
 def test_a_log_that_says_nonsense_of_its_run_is_refused(
     simulate: Simulate, bench: Bench, layout: Layout, tmp_path: Path, name: str, said: str, replay: Replay
 ) -> None:
-    journal = TraceJournal()
+    journal = Journal()
     done = simulate(lambda *_: 1.0, steps=20, journal=journal)
     path = tmp_path / "odd.mcap"
     stated: dict[str, Any] = {"purpose": "experiment", "limit": "6.0"} | {name: said}

@@ -32,7 +32,7 @@ from emb_bench.report.figures import applied_as_sent
 from emb_bench.report.page import timing_part
 from emb_bench.report.render import phrase, section
 from emb_runtime.config.bench import Bench, shipped_bench_text
-from emb_runtime.log.ring_buffer import Level
+from emb_runtime.log.ring_buffer import EventRecord, Level, LineRecord
 from emb_runtime.system.terminal import as_json
 
 from tests.bench.conftest import Replay  # isort: skip
@@ -292,8 +292,8 @@ def test_a_run_that_a_fault_ended_says_so(folder: Path, bench: Bench, simulate: 
 
 def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate) -> None:
     run = simulate(square, options="plant=exact", stop_requested=lambda: True)
-    run.journal.events.append((run.journal.events[-1][0], HOSTILE, HOSTILE))
-    run.journal.push_log(run.journal.events[-1][0], Level.INFO, HOSTILE)
+    when = run.journal.events[-1].time_ns
+    run.journal.records += [EventRecord(when, HOSTILE, HOSTILE), LineRecord(when, Level.INFO, HOSTILE)]
     path = folder / "<script>alert(3)<"  # as the name of a folder
     path.mkdir()
     log = write_log(

@@ -12,14 +12,14 @@ from emb_bench.sim.transport import SimTransport
 from emb_runtime.can.messages import Layout
 from emb_runtime.errors import BusError, FrameError, PolicyRefusedError, UsageError
 from emb_runtime.learning.learner import Learner
-from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.records import Frame
 from emb_runtime.safety.guard import Guard, GuardRejectedError
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat, Pulse, Unwatched
 from emb_runtime.safety.sensor_monitor import SensorMonitor
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.clock import SteppedClock
 
-from tests.conftest import MemoryJournal, Simulate  # isort: skip
+from tests.conftest import Simulate  # isort: skip
 
 
 class HostileError(Exception):
@@ -55,8 +55,9 @@ FAULTS: dict[type[BaseException], Fault] = {
     RecursionError: Fault.INTERNAL,
     MemoryError: Fault.INTERNAL,
     HostileError: Fault.INTERNAL,
+    SystemExit: Fault.INTERNAL,
 }
-LEAVING = (BaseException, KeyboardInterrupt, SystemExit, GeneratorExit)
+LEAVING = (BaseException, KeyboardInterrupt, GeneratorExit)
 """No Exceptions: raised again, once the run has stopped."""
 
 HANDED_IN: tuple[str, ...] = (
@@ -67,10 +68,12 @@ HANDED_IN: tuple[str, ...] = (
     "clock",
     "receive",
     "send",
-    "push_frame",
-    "push_cycle",
+    "push",
+    "beat",
+    "watched",
+    "tripped",
+    "publish",
 )
-HANDED_IN += ("push_estimate", "push_event", "beat", "watched", "tripped", "publish")
 OURS: dict[str, tuple[type, str]] = {
     "monitor": (SensorMonitor, "check"),
     "learner": (Learner, "hear"),
@@ -82,8 +85,7 @@ WHILE_STOPPING = (
     "clock",
     "receive",
     "send",
-    "push_frame",
-    "push_event",
+    "push",
     "beat",
     "tripped",
     "publish",
@@ -95,29 +97,6 @@ SILENCING = ("send", "guard", "publish", "tripped")
 
 
 At = Callable[[str], None]
-
-
-class Journal(MemoryJournal):
-    """A journal in which each call may raise."""
-
-    def __init__(self, at: At) -> None:
-        super().__init__()
-        self._at = at
-
-    def push_frame(self, frame: Frame) -> None:
-        self._at("push_frame")
-        super().push_frame(frame)
-
-    def push_cycle(self, record: CycleRecord) -> None:
-        self._at("push_cycle")
-        super().push_cycle(record)
-
-    def push_estimate(self, time_ns: int, step: int, estimate: tuple[float, ...]) -> None:
-        self._at("push_estimate")
-
-    def push_event(self, time_ns: int, code: str, text: str) -> None:
-        self._at("push_event")
-        super().push_event(time_ns, code, text)
 
 
 class PlantedPulse:
@@ -209,9 +188,9 @@ class Planted:
             on_receive=receive,
             on_send=send,
             stop_requested=ask,
-            journal=Journal(self.at),
+            push=lambda _record: self.at("push"),
             pulse=PlantedPulse(self.at, pulse),
-            clock=clock,
+            now_ns=clock.now_ns,
         ).outcome
 
 

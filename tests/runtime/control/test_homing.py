@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from emb_runtime.can.messages import Layout, StopReason, load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.control.core import HOME_PAIRS
 from emb_runtime.control.homing import TRUSTED_AFTER, Still, homing_steps, may_go_home
-from emb_runtime.control.loop import HOME_PAIRS
 from emb_runtime.control.result import Outcome, RunCounters
 from emb_runtime.records import Reason, RunState
 from emb_runtime.safety.shield_design import make_law

@@ -10,25 +10,22 @@ import random
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 
-from emb_runtime.can.messages import bench_identity, load_layout
+from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.control.interfaces import Actor
-from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import Frame
-from emb_runtime.safety.guard import Guard
-from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.system.clock import SteppedClock
-from tests.conftest import FunctionActor, MemoryJournal
+from tests.conftest import FunctionActor, Journal, make_loop
 from tests.lying.node import COMMAND, HONEST, PERIOD_NS, Lie, LyingNode
 
-BENCH, LAYOUT = load_bench(), load_layout()
-LAW = make_law(BENCH)
+BENCH = load_bench()
 IDENTITY = bench_identity(BENCH.contract_hash)
 
 
@@ -79,7 +76,7 @@ class Seen:
 
     outcome: Outcome
     node: LyingNode
-    journal: MemoryJournal
+    journal: Journal
     detected: int | None  # Periods from the first lie to the first stop frame
 
 
@@ -93,21 +90,14 @@ def run(
     actor: Actor | None = None,
 ) -> Seen:
     node = LyingNode(bench_identity(bench.contract_hash), lie, seed)
-    bus, journal = LyingBus(node, delay_ns), MemoryJournal()
-    loop = Loop(
-        bench=bench,
-        layout=LAYOUT,
-        law=make_law(bench)._replace(steps=steps),
-        actor=actor or FunctionActor(law),
-        current_limit=6.0,
-        steps=steps,
-        guard=Guard(LAYOUT, bench, bus.send),
-        receive=bus.receive,
-        clock=bus.clock,
-        journal=journal,
-        stop_requested=lambda: False,
-    )
-    outcome = loop.run()
+    bus, journal = LyingBus(node, delay_ns), Journal()
+    driven: Any = {
+        "send": bus.send,
+        "receive": bus.receive,
+        "now_ns": bus.clock.now_ns,
+        "push": journal.push,
+    }
+    outcome = make_loop(bench, actor or FunctionActor(law), steps, **driven).run()
     detected = None if bus.stopped is None or node.began is None else bus.stopped - node.began
     return Seen(outcome, node, journal, detected)
 
@@ -258,7 +248,7 @@ def test_a_tenth_is_survived_and_reported(name: str) -> None:
 def run_without_every(nth: int) -> Outcome:
     """A run of which every nth pair is lost on the way, once the node has obeyed."""
     node = LyingNode(IDENTITY)
-    bus, journal = LyingBus(node, lambda: 0), MemoryJournal()
+    bus = LyingBus(node, lambda: 0)
 
     def receive(deadline_ns: int) -> Frame | None:
         frame = bus.receive(deadline_ns)
@@ -266,19 +256,8 @@ def run_without_every(nth: int) -> Outcome:
             frame = bus.receive(deadline_ns)
         return frame
 
-    return Loop(
-        bench=BENCH,
-        layout=LAYOUT,
-        law=LAW,
-        actor=FunctionActor(lambda *_: 6.0),
-        current_limit=6.0,
-        steps=500,
-        guard=Guard(LAYOUT, BENCH, bus.send),
-        receive=receive,
-        clock=bus.clock,
-        journal=journal,
-        stop_requested=lambda: False,
-    ).run()
+    driven: Any = {"send": bus.send, "receive": receive, "now_ns": bus.clock.now_ns, "push": Journal().push}
+    return make_loop(BENCH, FunctionActor(lambda *_: 6.0), 500, **driven).run()
 
 
 @pytest.mark.parametrize(("nth", "within"), [(2, 60), (3, 120), (4, 320)])

@@ -239,7 +239,7 @@ def test_a_policy_that_takes_too_long_is_not_sent_late(simulate: Simulate, layou
 
     # The loop reads its clock before the first frame, so the real one has to be there by then.
     clock.base = SteppedClock(10**15)
-    run = simulate(law, on_receive=tie, clock=clock)
+    run = simulate(law, on_receive=tie, now_ns=clock.now_ns)
     assert run.outcome.counters.unanswered == 3
     assert run.transport.node.braked == 3
     assert_ended_safely(run, layout)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from emb_bench.cli.replay import main as emb_replay
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
-from emb_runtime.control.loop import HOME_PAIRS
+from emb_runtime.control.core import HOME_PAIRS
 from emb_runtime.control.stop_condition import REACHED, parse_stop_condition
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimate import Quantity

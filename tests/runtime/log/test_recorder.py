@@ -82,10 +82,10 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         recorder.push_frame(LAYOUT.encode_velocity(k % 15, -3.5, 0.0, NodeState.IDLE, 15)._replace(time_ns=now))
         command = LAYOUT.encode_command(CurrentCommand(k % 15, k % 15, 1.5, True))
         recorder.push_frame(command._replace(time_ns=now + 1000, own=True))
-        recorder.push_cycle(cycle(k, now + 2000))
+        recorder.push(cycle(k, now + 2000))
     recorder.push_frame(Frame(0x100, b"\x00damage", START + 30_000_000))
     recorder.push_frame(Frame(0x20, b"", START + 31_000_000, error=True))
-    recorder.push_cycle(cycle(20, START + 32_000_000, policy_current=math.nan, state=RunState.STOPPING))
+    recorder.push(cycle(20, START + 32_000_000, policy_current=math.nan, state=RunState.STOPPING))
     recorder.push_event(START + 33_000_000, "SENSOR_LATE", "5 periods ohne Δ")
     recorder.push_log(START + 34_000_000, Level.WARNING, "hello")
     recorder.push_clock(START + 35_000_000, WALL + START + 35_000_000 + 7)
@@ -101,7 +101,7 @@ def test_a_log_that_was_removed_or_replaced_while_it_was_written_is_not_complete
 ) -> None:
     path = tmp_path / "run.mcap"
     recorder = Recorder.start(path, HEADER)
-    recorder.push_cycle(cycle(0, START + 1000))
+    recorder.push(cycle(0, START + 1000))
     path.unlink()
     if replaced:
         path.write_bytes(b"another file")
@@ -223,7 +223,7 @@ def test_frames_that_wait_keep_their_place_among_the_other_records(tmp_path: Pat
             recorder.push_frame(next(frames))
 
     some(1)
-    recorder.push_cycle(cycle(0, START))
+    recorder.push(cycle(0, START))
     some(2)
     recorder.push_event(START, "FIRST", "")
     some(3)

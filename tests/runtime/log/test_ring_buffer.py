@@ -22,10 +22,10 @@ from emb_runtime.log.ring_buffer import (
     Level,
     LineRecord,
     Ring,
+    pack,
     pack_clock,
     pack_cycle,
     pack_event,
-    pack_frame,
     pack_line,
     unpack,
 )
@@ -164,9 +164,11 @@ def test_memory_that_is_no_ring_is_refused(content: bytes) -> None:
         st.integers(0, 2**29 - 1), st.binary(max_size=8), INT64, st.booleans(), st.booleans(), st.booleans(),
         st.booleans(), st.integers(0, 2**32 - 1),
     ),
+    INT64,
 )  # fmt: skip
-def test_frames_travel_unchanged(direction: Direction, frame: Frame) -> None:
-    assert unpack(Kind.FRAME, pack_frame(frame, direction)) == FrameRecord(direction, frame)
+def test_frames_travel_unchanged(direction: Direction, frame: Frame, read_ns: int) -> None:
+    record = FrameRecord(direction, frame, read_ns)
+    assert unpack(*pack(record)) == record
 
 
 @given(st.tuples(*[INT32] * 7, *[st.floats(allow_nan=False)] * 6, *[INT64] * 5).map(CycleRecord._make))
