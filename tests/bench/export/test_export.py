@@ -178,7 +178,7 @@ def test_a_missing_extra_is_named(
 
 
 def test_a_picture_needs_control_cycles(tmp_path: Path, run: SimRun, replay: Replay) -> None:
-    run.journal.cycles.clear()
+    run.journal.records[:] = [r for r in run.journal.records if not isinstance(r, CycleRecord)]
     source = write_log(tmp_path / "none.mcap", run, steps=STEPS)
     said = replay.refused("export", source, "--to", "plot", "-o", tmp_path / "out.png", code=6)
     assert "not one control cycle is in this log" in said
