@@ -252,7 +252,7 @@ def fault_of(err: BaseException) -> Fault:
 
 
 def detail_of(err: BaseException) -> str:
-    """What was raised in one line: the message of a refusal, class and message of an error in the program."""
+    """Message of a refusal; class and message of an error in the program. One line."""
     if issubclass(type(err), StopError):
         return cast("StopError", err).detail
     return one_line(err, named=not issubclass(type(err), GuardRejectedError | PolicyRefusedError | BusError))
