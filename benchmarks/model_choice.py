@@ -28,8 +28,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # the simulator is a neighbo
 from benchmarks.independent_simulator import Brake, brake_of, simulate, started
 from benchmarks.intervals import share
 from emb_bench.analysis.model_choice import choose_model, model_of
+from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import LATEST, STARTS, EstimationProblem, with_systematic
+from emb_bench.estimate.records import STARTS, EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT, Plant
@@ -60,7 +61,7 @@ def with_errors(bench: Bench, plant: Plant, brake: Brake, size: float, rng: np.r
         brake,
         encoder_offset=brake.encoder_offset + errors["offset"],
         current_offset=errors["current_offset"],
-        delay=min(abs(errors.get("delay", 0.0)), LATEST),
+        delay=min(abs(errors.get("delay", 0.0)), PARAMETERS["delay"].high),
         velocity_gain=errors.get("velocity_gain", 0.0),
     )
 

@@ -4,10 +4,9 @@
 with the compiled callees in place of the plain ones. Without ``fastmath`` the compiled arithmetic is that of Python,
 bit for bit.
 
-Compiling takes seconds, so the machine code is kept on disk. numba itself notices a change in the file of the function
-that it has stored, and none in a callee's or a constant's file. So each function gets a directory named after a
-fingerprint of the code and the constants it reaches, taken from what this process has loaded, not from the disk: other
-code is another directory. Where no directory can be written, functions are compiled anew in each process.
+Compiling takes seconds, so the machine code is kept on disk. numba itself does not notice a change in the file of a
+callee or a constant. So each function has a directory named after a fingerprint of the code and the constants that it
+reaches, as this process has loaded them. Where no directory can be written, each process compiles anew.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from functools import cache
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -31,25 +29,23 @@ import emb_runtime
 from emb_runtime.errors import UsageError
 
 PACKAGES = ("emb_runtime", "emb_bench", "emb_train", "emb_export")
-UNUSED_LIFE = 30 * 86400.0  # s; every edit of a function leaves its old directory behind
-LOCK_WAIT = 30.0  # s; then a function is compiled as if nothing were kept
-LOCK_PAUSE = 0.05  # s, between two tries
+UNUSED_LIFE = 30 * 86400.0  # [s]; each edit of a function leaves its old directory behind
+LOCK_WAIT = 30.0  # [s]; then a function is compiled as if nothing were kept
+LOCK_PAUSE = 0.05  # [s], between two tries
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_done: dict[tuple[FunctionType, bool], Any] = {}
-_turn = threading.RLock()
-"""Lock on numba's setting of where machine code is kept: it is one for all threads, and numba reads it twice."""
+_done: dict[tuple[FunctionType, bool, bool], Any] = {}
+_turn = threading.RLock()  # numba's setting of where machine code is kept is one for all threads, and is read twice
 
 
 def compiled(fn: Callable[P, R], *, parallel: bool = False) -> Callable[P, R]:
     """Compile a plain function, and every function of ours that it calls, with numba.
 
     It may call functions of our packages and of its own package by their plain names, ``math`` and what numba
-    supports of numpy; a function reached through a module (``euler.step``) or a closure is refused. Module
-    constants are frozen as they are at this moment. In one process the same function gives the same object again. The
-    compiled function releases the interpreter lock.
+    supports of numpy. Module constants are frozen as they are at this moment. In one process the same function gives
+    the same object again. The compiled function releases the interpreter lock.
 
     Args:
         fn: a module-level Python function; one that loops over numpy arrays is the usual case.
@@ -59,21 +55,37 @@ def compiled(fn: Callable[P, R], *, parallel: bool = False) -> Callable[P, R]:
         UsageError: numba is not installed.
         TypeError: ``fn`` or a callee is not a plain function, is a closure, or calls one of ours through a module.
     """
-    fn = _source_of(fn)
+    return cast("Callable[P, R]", _built(_source_of(fn), parallel, entry=True))
+
+
+def on_compiling(told: Callable[[int, bool], None]) -> None:
+    """Call back after each function that this process compiles, with their number; True after the outermost one."""
+    from numba.core import event
+
+    class Listener(event.Listener):
+        count = depth = 0
+
+        def on_start(self, _: Any) -> None:
+            self.depth += 1
+
+        def on_end(self, _: Any) -> None:
+            self.count, self.depth = self.count + 1, self.depth - 1
+            told(self.count, self.depth == 0)
+
+    register: Any = event.register  # numba has no types
+    register("numba:compile", Listener())
+
+
+def _built(fn: Any, parallel: bool, *, entry: bool) -> Any:
+    """The compiled function; one that is no ``entry`` is called by compiled code only and has no Python wrapper."""
     if not isinstance(fn, FunctionType):
         raise TypeError(f"expected a plain Python function to compile, got {fn!r}")
-    key = (fn, parallel)
+    key = (fn, parallel, entry)
     if key not in _done:
         with _turn:
             if key not in _done:
-                _done[key] = _jit(_with_compiled_callees(fn), _cache_directory(fn, parallel), parallel)
-    return cast("Callable[P, R]", _done[key])
-
-
-def nothing_kept() -> bool:
-    """Returns True if no compiled function is on disk: this run then takes up to a minute longer than the next."""
-    root = _cache_root()
-    return root is None or next(root.glob("*/*/*.nbi"), None) is None
+                _done[key] = _jit(_with_compiled_callees(fn), _cache_directory(fn, parallel, entry), parallel, entry)
+    return _done[key]
 
 
 def _with_compiled_callees(fn: FunctionType) -> FunctionType:
@@ -85,7 +97,7 @@ def _with_compiled_callees(fn: FunctionType) -> FunctionType:
         if isinstance(value, ModuleType) and value.__name__.partition(".")[0] in PACKAGES:
             raise TypeError(f"{_name(fn)} uses the module {value.__name__}: import the functions that it calls by name")
         if _is_ours(value, fn):
-            scope[name] = compiled(value)
+            scope[name] = _built(value, False, entry=False)
     clone = FunctionType(fn.__code__, scope, fn.__name__, fn.__defaults__)
     clone.__module__, clone.__qualname__, clone.__doc__ = fn.__module__, fn.__qualname__, fn.__doc__
     return clone
@@ -110,7 +122,7 @@ def source_module(name: str) -> ModuleType:
     return module
 
 
-def _jit(fn: FunctionType, directory: str | None, parallel: bool) -> Any:
+def _jit(fn: FunctionType, directory: str | None, parallel: bool, entry: bool) -> Any:
     try:
         import numba
     except ImportError as err:
@@ -118,8 +130,9 @@ def _jit(fn: FunctionType, directory: str | None, parallel: bool) -> Any:
     config: Any = numba.config
     before = config.CACHE_DIR
     config.CACHE_DIR = directory or before  # numba reads it once, here, for this function
+    bare: dict[str, Any] = {} if entry else {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     try:
-        function: Any = numba.njit(nogil=True, parallel=parallel, cache=directory is not None)(fn)
+        function: Any = numba.njit(nogil=True, parallel=parallel, cache=directory is not None, **bare)(fn)
     finally:
         config.CACHE_DIR = before
     if directory is not None and not config.DISABLE_JIT:  # which leaves the function as it is
@@ -130,30 +143,26 @@ def _jit(fn: FunctionType, directory: str | None, parallel: bool) -> Any:
 
 
 def _one_process_at_a_time(action: Callable[..., Any], directory: str) -> Callable[..., Any]:
-    """Use a function's directory alone; where that cannot be, or not for :data:`LOCK_WAIT`, not at all.
+    """Use a function's directory alone; where that cannot be for :data:`LOCK_WAIT`, not at all.
 
-    numba writes down the number of a signature and then, to the file of that number, its machine code: a process that
-    came between two such steps of another would find there the code for other types.
+    numba writes the number of a signature and then, to the file of that number, its machine code: a process that came
+    between two such steps of another would find the code for other types. The lock is tried for, not waited for: numba
+    compiles under one lock for all threads, and a holder that is stopped would hang them all.
     """
 
     def alone(*arguments: Any) -> Any:
-        with ExitStack() as stack:
-            try:
-                lock = stack.enter_context(Path(directory, "lock").open("w"))
-                mine = _locked(lock)
-            except OSError:
-                mine = False
-            return action(*arguments) if mine else None
+        try:
+            file = Path(directory, "lock").open("w")  # noqa: SIM115  # an error of the action is not one of the lock
+        except OSError:
+            return None
+        with file:
+            return action(*arguments) if _locked(file) else None
 
     return alone
 
 
 def _locked(file: IO[str]) -> bool:
-    """Lock a file until it is closed; False where another holds it for all of :data:`LOCK_WAIT`.
-
-    Not by a call that waits: numba compiles under one lock for all threads, so a holder that is stopped, or a server
-    that is gone, would hang them all.
-    """
+    """Lock a file until it is closed; False where another process holds it for all of :data:`LOCK_WAIT`."""
     end = time.monotonic() + LOCK_WAIT
     while True:
         try:
@@ -162,12 +171,13 @@ def _locked(file: IO[str]) -> bool:
             if time.monotonic() >= end:
                 return False
             time.sleep(LOCK_PAUSE)
+        except OSError:
+            return False
         else:
             return True
 
 
 def _lock(file: IO[str]) -> None:
-    """Lock a file until it is closed; raises OSError where another process holds it."""
     if sys.platform == "win32":
         import msvcrt
 
@@ -183,10 +193,7 @@ def _name(fn: FunctionType) -> str:
 
 
 def _globals_of(fn: FunctionType) -> list[tuple[str, Any]]:
-    """The globals that the function names, with their names; those of its attribute names too, which does no harm.
-
-    A function of the compiled core is the one of its source: its code counts, not its name.
-    """
+    """The globals that the function names, with their names; those of its attribute names too, which does no harm."""
     names = sorted(set(_names(fn.__code__)))
     return [(name, _source_of(fn.__globals__[name])) for name in names if name in fn.__globals__]
 
@@ -219,33 +226,35 @@ def _fingerprint(fn: FunctionType) -> str:
 
 
 def _describe(value: Any) -> str:
-    if isinstance(value, CodeType):
-        shape = (value.co_argcount, value.co_flags, value.co_varnames, value.co_names, value.co_code)
-        return f"{shape!r} {_describe(value.co_consts)}"
-    if isinstance(value, tuple):
-        return f"{type(value).__qualname__}({', '.join(_describe(v) for v in value)})"
-    if isinstance(value, frozenset):
-        return f"frozenset{sorted(_describe(v) for v in value)}"
-    if isinstance(value, (type(None), bool, int, float, str, bytes)):
-        return repr(value)
-    if isinstance(value, type) and issubclass(value, enum.Enum):
-        return repr(list(value))
-    if isinstance(value, type):
-        return f"{value.__module__}.{value.__qualname__} {getattr(value, '_fields', '')}"
-    if isinstance(value, ModuleType):
-        return value.__name__
-    if isinstance(value, (FunctionType, BuiltinFunctionType)):
-        return f"{value.__module__}.{value.__qualname__}"
+    match value:
+        case CodeType():
+            shape = (value.co_argcount, value.co_flags, value.co_varnames, value.co_names, value.co_code)
+            return f"{shape!r} {_describe(value.co_consts)}"
+        case tuple():
+            return f"{type(value).__qualname__}({', '.join(_describe(v) for v in value)})"
+        case frozenset():
+            return f"frozenset{sorted(_describe(v) for v in value)}"
+        case None | bool() | int() | float() | str() | bytes():
+            return repr(value)
+        case enum.EnumMeta():
+            return repr(list(value))
+        case type():
+            return f"{value.__module__}.{value.__qualname__} {getattr(value, '_fields', '')}"
+        case ModuleType():
+            return value.__name__
+        case FunctionType() | BuiltinFunctionType():
+            return f"{value.__module__}.{value.__qualname__}"
     raise _UnknownValueError(f"{value!r}")
 
 
-def _cache_directory(fn: FunctionType, parallel: bool) -> str | None:
+def _cache_directory(fn: FunctionType, parallel: bool, entry: bool) -> str | None:
     """A writable directory for just this code, or None."""
     root = _cache_root()
     if root is None:
         return None
     try:
-        directory = root / f"{_fingerprint(fn)}{'-parallel' if parallel else ''}"
+        kind = "-parallel" if parallel else "" if entry else "-callee"
+        directory = root / f"{_fingerprint(fn)}{kind}"
         directory.mkdir(exist_ok=True)
         os.utime(directory)  # in use
     except (OSError, _UnknownValueError):

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from emb_bench.compiled import nothing_kept
+from emb_bench.compiled import on_compiling
+from emb_bench.parallel.progress import StatusLine
 from emb_runtime.errors import UsageError
-from emb_runtime.system.terminal import mention
 
 
 @contextmanager
@@ -72,6 +73,14 @@ def reported_if_interrupted(command: str) -> Iterator[None]:
 
 
 def say_if_compiling() -> None:
-    """Tell who waits at a terminal why the first estimate takes longer than all that follow."""
-    if sys.stderr.isatty() and nothing_kept():
-        mention("compiling the brake's equations, once: up to a minute")
+    """Show who waits at a terminal why the first estimate takes longer than all that follow."""
+    if not sys.stderr.isatty():
+        return
+    line = StatusLine(sys.stderr)
+
+    def told(count: int, last: bool) -> None:
+        line.say(f"compiling the brake's equations, once: {count} functions", time.monotonic())
+        if last:
+            line.end()
+
+    on_compiling(told)

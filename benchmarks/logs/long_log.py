@@ -18,7 +18,7 @@ from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.logs.log import read_log
 from emb_bench.logs.mcap_reader import MAGIC
-from emb_bench.sim.open_loop import advance_periods, trajectory
+from emb_bench.sim.open_loop import held, march, trajectory
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, protect
 from emb_runtime.can.messages import Layout, Message
 from emb_runtime.config.bench import Bench, shipped_bench_text
@@ -182,8 +182,8 @@ class Writer:
             acted = np.concatenate([[last], command[:-1]])  # in the period that ends at each sample
             last = float(command[-1])
             plant, t_s = self._bench.plant("exact"), self._bench.timing.sample_time
-            brake, loop = self._bench.brake, compiled(advance_periods)
-            x, _ = trajectory(loop, plant.mechanics, brake, acted, t_s, 0.0, self._chosen, self._x, self._s)
+            brake, loop = self._bench.brake, compiled(march)
+            x, _ = trajectory(loop, plant.mechanics, brake, held(acted, t_s), self._chosen, self._x, self._s)
             self._x = x[-1]
             noise = self._rng.standard_normal((len(k), 2)) * [self._bench.noise.angle, self._bench.noise.velocity]
             octets, used = self._rows(k, x[1:, :2] + noise, acted, command)

@@ -9,7 +9,7 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats, no_sensitivity, rest
 from emb_bench.compiled import compiled
-from emb_bench.sim.open_loop import advance_periods, simulate, trajectory
+from emb_bench.sim.open_loop import held, march, simulate, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 from emb_runtime.config.plants import EULER, Mechanics
 
@@ -40,7 +40,7 @@ def whole(
     (chosen, s), x = no_sensitivity(params), rest()
     x[:2], x[3] = (x0[0] - contact, x0[1]), current_offset
     acting = currents + current_offset
-    states, sensitivities = trajectory(compiled(advance_periods), mechanics, p, acting, T_S, late, chosen, x, s)
+    states, sensitivities = trajectory(compiled(march), mechanics, p, held(acting, T_S, late), chosen, x, s)
     states[:, 0] += contact
     return states, sensitivities[1:, :, :2]
 

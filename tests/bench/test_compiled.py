@@ -21,7 +21,7 @@ from numba.core.caching import IndexDataCacheFile
 
 from emb_bench.brake import euler
 from emb_bench.brake.euler import sensitivity_step, sign, step
-from emb_bench.compiled import LOCK_WAIT, _fingerprint, compiled, nothing_kept
+from emb_bench.compiled import LOCK_WAIT, _fingerprint, compiled, on_compiling
 from emb_bench.information.symmetric import Floats, add_increment, lambda_min, log_det, pack, trace_inverse
 from emb_runtime.config.bench import BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
@@ -233,6 +233,11 @@ def test_where_numba_is_told_to_compile_nothing_the_plain_function_runs(tmp_path
     assert (done.stdout, done.stderr) == ("-1.0\n", "")
 
 
+def kept(root: Path) -> bool:
+    """True if the machine code of a function is on disk."""
+    return next(root.glob("*/*/*.nbi"), None) is not None
+
+
 def trebled(x: float) -> float:
     return 3.0 * x
 
@@ -276,9 +281,8 @@ def test_no_other_process_can_come_between_the_steps_in_which_machine_code_is_ke
     monkeypatch.setattr("emb_bench.compiled._cache_root", lambda: tmp_path)
     for name in ("load", "save"):
         monkeypatch.setattr(IndexDataCacheFile, name, watched(name))
-    assert nothing_kept()
     assert compiled(trebled)(3.0) == 9.0
-    assert not nothing_kept()
+    assert kept(tmp_path)
     assert done == ["load", "save"]
 
 
@@ -320,7 +324,7 @@ def test_a_process_that_never_gives_the_lock_back_delays_and_stops_nobody(
     with holder:
         assert fast(3.0) == 1.5
     assert holder.now == pytest.approx(2 * LOCK_WAIT, abs=1.0)  # to read, and to write
-    assert nothing_kept()
+    assert not kept(tmp_path)
 
 
 def quartered(x: float) -> float:
@@ -333,7 +337,7 @@ def test_a_process_that_gives_the_lock_back_is_waited_for(tmp_path: Path, monkey
     with holder:
         assert fast(2.0) == 0.5
     assert holder.now == pytest.approx(LOCK_WAIT - 1.0, abs=0.1)
-    assert not nothing_kept()
+    assert kept(tmp_path)
 
 
 def tenfold(x: float) -> float:
@@ -350,3 +354,21 @@ def test_an_error_of_numba_s_own_files_is_told_as_numba_tells_it(
     monkeypatch.setattr(IndexDataCacheFile, "save", full)
     with pytest.raises(OSError, match="no space"):
         compiled(tenfold)(1.0)
+
+
+def counted(x: float) -> float:
+    return halved(x) + quartered(x)
+
+
+def test_a_command_can_show_how_many_functions_were_compiled_and_when_the_last_one_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("emb_bench.compiled._cache_root", lambda: tmp_path)
+    monkeypatch.setattr("emb_bench.compiled._done", {})
+    told: list[tuple[int, bool]] = []
+    on_compiling(lambda count, last: told.append((count, last)))
+    fast = compiled(counted)
+    assert fast(2.0) == 1.5
+    assert told == [(1, False), (2, False), (3, True)]
+    assert fast(4.0) == 3.0
+    assert len(told) == 3

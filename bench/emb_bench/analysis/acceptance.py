@@ -17,8 +17,8 @@ from typing import Any
 
 from emb_bench.analysis.drift import Drift, comparable
 from emb_bench.analysis.study import Study
-from emb_bench.brake.parameters import SI, UNITS
-from emb_bench.estimate.records import DONE, ESTIMATED, NORMAL_95, OF_A_RECORD
+from emb_bench.brake.parameters import OF_A_RECORD, PARAMETERS, SI, UNITS
+from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.numbers import amount, between, plain, share, share_between
 from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
@@ -26,7 +26,7 @@ from emb_runtime.system.input_file import read_text
 
 LONGEST = 2**20  # Size limit of the file [bytes]
 RULES = Rules(UsageError, 200, 1e-30)
-SHARED = tuple(name for name in ESTIMATED if name not in OF_A_RECORD)  # Unknowns that a tolerance can be stated for
+SHARED = tuple(name for name in PARAMETERS if name not in OF_A_RECORD)  # Unknowns that a tolerance can be stated for
 
 
 class Result(StrEnum):

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from emb_bench.analysis.model_choice import Candidate, ModelChoice, candidate, fit_from, ranked
+from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, EstimationProblem, check_model, with_systematic
@@ -29,15 +30,9 @@ from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
 
 ADDITIONS: Mapping[str, tuple[str, ...]] = {
-    "static friction": ("break_away", "stribeck_velocity"),
-    "static friction by load": ("f_l",),
-    "curved stiffness": ("quadratic", "cubic"),
-    "hysteresis": ("hysteresis",),
-    "play": ("play",),
-    "lag of the current": ("current_lag",),
-    "delay of commands": ("delay",),
-    "encoder offset": ("offset",),
-    "place of contact": ("contact",),
+    row.addition: tuple(name for name, other in PARAMETERS.items() if other.addition == row.addition)
+    for row in PARAMETERS.values()
+    if row.addition
 }
 """Possible additions, and the unknowns of each."""
 WANTED = 3.0  # Standard deviations of the score from which on an addition is tried

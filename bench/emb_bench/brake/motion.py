@@ -74,7 +74,7 @@ def no_sensitivity(params: Sequence[str]) -> tuple[Integers, Floats]:
     Raises:
         ValueError: a name is not in ``PARAMETERS``.
     """
-    chosen = np.array([PARAMETERS.index(name) for name in params], np.int64)
+    chosen = np.array([list(PARAMETERS).index(name) for name in params], np.int64)
     s = np.zeros((len(chosen), SENSITIVE))
     s[chosen == X1_0, 0] = 1.0
     s[chosen == X2_0, 1] = 1.0

@@ -1,87 +1,244 @@
-"""Parameters of a brake and its instruments that can be estimated from a record, by name and by index.
+"""The one table of what can be estimated from a record: parameters of a brake, of its features and its instruments.
 
 The thesis identifies k_m, k_1, T_c and f_v. The others are what the record depends on besides: nuisances that are
-estimated along, or constants whose error has a price.
+estimated along, or constants whose error has a price. All that the tool says or does with a parameter by its name
+follows from its row here: index, unit, range of a search, score test, remedy.
 """
 
 from __future__ import annotations
 
-from emb_runtime.config.bench import PARAMETER_NAMES
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
-K_M = 0
-K_1 = 1
-T_C = 2
-F_V = 3
-J = 4
-CONTACT = 5
-DELAY = 6
-X1_0 = 7
-X2_0 = 8
-OFFSET = 9
-BREAK_AWAY = 10
-STRIBECK_VELOCITY = 11
-F_L = 12
-QUADRATIC = 13
-CUBIC = 14
-HYSTERESIS = 15
-CURRENT_LAG = 16
-CURRENT_OFFSET = 17
-VELOCITY_GAIN = 18
-COULOMB_ASYMMETRY = 19
-VISCOUS_ASYMMETRY = 20
-PLAY = 21
-COMMAND = 22
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Parameter(NamedTuple):
+    """One row."""
+
+    unit: str  # Of its value, SI; ``1`` for a number
+    relative: bool = True  # Its sensitivity is θ ∂/∂θ (eq. 4.17); False for an absolute one, per unit
+    about: str = ""  # What it is
+    low: float = 0.0  # Lowest value that is searched; where low = high, limits of the bench
+    high: float = 0.0  # Highest value that is searched
+    start: float = 0.0  # Value of a feature to begin with where the plant has none; 0 for what is no feature
+    of_a_record: bool = False  # Each record has one of its own
+    gross: float = 1.0  # Deviation from which on an estimate is of no use: relative, or in its unit
+    effect: str = ""  # Noun phrase for a score test; empty where there is none
+    remedy: str = ""  # What to do if the score test finds it
+    step: float = 0.0  # Of the score test's secant; 0 where the brake has a sensitivity
+    positive: bool = False  # It cannot be negative
+    addition: str = ""  # What a growing model calls it; rows of one name are added together
+
+
+_HELD = "estimate it as well: --params"
+_PLANT = "estimate with a plant that has it: --model"
+
+PARAMETERS: Mapping[str, Parameter] = {
+    "k_m": Parameter("N·m/A", effect="a change of k_m, which is held fixed,", remedy=_HELD),
+    "k_1": Parameter("N/rad", effect="a change of k_1, which is held fixed,", remedy=_HELD),
+    "T_c": Parameter("N·m", effect="a change of T_c, which is held fixed,", remedy=_HELD),
+    "f_v": Parameter("N·m·s/rad", effect="a change of f_v, which is held fixed,", remedy=_HELD),
+    "J": Parameter(
+        "kg·m²",
+        about="moment of inertia [kg·m²]; scales with all torques, so that one of them has to be known",
+        effect="another moment of inertia",
+        remedy="correct J in the bench file",
+    ),
+    "offset": Parameter(
+        "rad",
+        False,
+        "what the encoder shows at the origin [rad], of each log",
+        of_a_record=True,
+        effect="an encoder offset",
+        remedy="home the encoder, or --nuisance offset,x1_0",
+        addition="encoder offset",
+    ),
+    "contact": Parameter(
+        "rad",
+        False,
+        "angle at which the clamping begins [rad], nominally 0",
+        effect="a contact away from the origin",
+        remedy="home the encoder at the contact, or --nuisance contact",
+        addition="place of contact",
+    ),
+    "x1_0": Parameter(
+        "rad",
+        False,
+        "angle at the start [rad], of each log",
+        of_a_record=True,
+        effect="another angle at the start",
+        remedy="let the brake rest before the run, or --nuisance x1_0",
+    ),
+    "x2_0": Parameter(
+        "rad/s",
+        False,
+        "velocity at the start [rad/s], of each log",
+        of_a_record=True,
+        gross=10.0,
+        effect="a motion at the start",
+        remedy="let the brake rest before the run, or --nuisance x2_0",
+    ),
+    "delay": Parameter(
+        "samples",
+        False,
+        "time by which commands act late [samples], -0.1 to 0.9; below 0, samples are late",
+        -0.1,  # samples that are taken late look like commands that act early
+        0.9,  # whole samples are in the record, because the node reports what acted
+        effect="a delay of the commands",
+        remedy="--nuisance delay",
+        addition="delay of commands",
+    ),
+    "current_offset": Parameter(
+        "A",
+        False,
+        "current that acts beyond what the node reports [A]",
+        effect="an offset of the current",
+        remedy="calibrate it, or --nuisance current_offset",
+    ),
+    "velocity_gain": Parameter(
+        "1",
+        False,
+        "relative error of the velocity's scale",
+        -0.5,
+        0.5,
+        effect="an error of the velocity's scale",
+        remedy="calibrate it, or --nuisance velocity_gain",
+    ),
+    "quadratic": Parameter(
+        "1/rad",
+        about="curvature of the clamping force, k_1 x (1 + quadratic x + cubic x²) [1/rad]",
+        low=1e-8,
+        high=0.1,
+        start=1e-4,
+        effect="a quadratic stiffness",
+        remedy=_PLANT,
+        step=1e-5,
+        addition="curved stiffness",
+    ),
+    "cubic": Parameter(
+        "1/rad²",
+        about="the next term of that curve [1/rad²]",
+        low=1e-10,
+        high=1e-2,
+        start=1e-6,
+        effect="a cubic stiffness",
+        remedy=_PLANT,
+        step=1e-7,
+        addition="curved stiffness",
+    ),
+    "hysteresis": Parameter(
+        "1",
+        about="share by which the clamping force is larger while tightening, smaller while releasing",
+        low=1e-6,
+        high=0.5,
+        start=1e-2,
+        effect="a hysteresis of the clamping force",
+        remedy=_PLANT,
+        step=1e-3,
+        positive=True,
+        addition="hysteresis",
+    ),
+    "play": Parameter(
+        "rad",
+        about="travel of the motor after a turn until the clamp follows [rad]; not together with hysteresis",
+        low=1e-4,
+        high=10.0,
+        start=0.1,
+        effect="play of the gear",
+        remedy=_PLANT,
+        step=0.02,
+        positive=True,
+        addition="play",
+    ),
+    "break_away": Parameter(
+        "1",
+        about="static friction as a multiple of T_c",
+        low=1.0,
+        high=5.0,
+        start=1.1,
+        effect="a static friction beyond T_c",
+        remedy=_PLANT,
+        step=1e-2,
+        positive=True,
+        addition="static friction",
+    ),
+    "stribeck_velocity": Parameter(
+        "rad/s",
+        about="speed at which the static friction has decayed [rad/s]",
+        low=1.0,
+        high=500.0,
+        start=30.0,
+        addition="static friction",
+    ),
+    "f_l": Parameter(
+        "m",
+        about="static friction that grows with the load [m]",
+        low=1e-10,
+        high=1e-4,
+        start=1e-6,
+        effect="a static friction that grows with the load",
+        remedy=_PLANT,
+        step=1e-9,
+        positive=True,
+        addition="static friction by load",
+    ),
+    "current_lag": Parameter(
+        "s",
+        about="time constant of the current loop [s]",
+        low=1e-7,
+        high=0.1,
+        start=1e-3,
+        effect="a lag of the current",
+        remedy=_PLANT,
+        step=2e-5,
+        positive=True,
+        addition="lag of the current",
+    ),
+    "coulomb_asymmetry": Parameter(
+        "1", False, "share by which T_c is larger in the positive direction and smaller in the negative", -0.9, 0.9
+    ),
+    "viscous_asymmetry": Parameter("1", False, "the same of f_v", -0.9, 0.9),
+}
+
+_index = list(PARAMETERS).index
+K_M = _index("k_m")
+K_1 = _index("k_1")
+T_C = _index("T_c")
+F_V = _index("f_v")
+J = _index("J")
+CONTACT = _index("contact")
+DELAY = _index("delay")
+X1_0 = _index("x1_0")
+X2_0 = _index("x2_0")
+OFFSET = _index("offset")
+BREAK_AWAY = _index("break_away")
+STRIBECK_VELOCITY = _index("stribeck_velocity")
+F_L = _index("f_l")
+QUADRATIC = _index("quadratic")
+CUBIC = _index("cubic")
+HYSTERESIS = _index("hysteresis")
+CURRENT_LAG = _index("current_lag")
+CURRENT_OFFSET = _index("current_offset")
+VELOCITY_GAIN = _index("velocity_gain")
+COULOMB_ASYMMETRY = _index("coulomb_asymmetry")
+VISCOUS_ASYMMETRY = _index("viscous_asymmetry")
+PLAY = _index("play")
+COMMAND = len(PARAMETERS)
 """Current that is commanded in the period at hand, and in no other [A]: what is unknown where a report was lost."""
-PAST_COMMAND = 23  # That current in the periods after it, in which it shows in the state alone
+PAST_COMMAND = COMMAND + 1  # That current in the periods after it, in which it shows in the state alone
 
-PARAMETERS = (
-    *PARAMETER_NAMES,
-    "J",
-    "contact",
-    "delay",
-    "x1_0",
-    "x2_0",
-    "offset",
-    "break_away",
-    "stribeck_velocity",
-    "f_l",
-    "quadratic",
-    "cubic",
-    "hysteresis",
-    "current_lag",
-    "current_offset",
-    "velocity_gain",
-    "coulomb_asymmetry",
-    "viscous_asymmetry",
-    "play",
-)
-
-UNITS = {
-    "contact": "rad",  # angle at which the clamping begins, nominally 0
-    "delay": "samples",  # of the command
-    "x1_0": "rad",  # angle and
-    "x2_0": "rad/s",  # velocity at the start
-    "offset": "rad",  # of the encoder: it shows x1 + offset
-    "current_offset": "A",  # what acts beyond what the node reports
-    "velocity_gain": "1",  # of the velocity sensor: it shows x2 (1 + velocity_gain)
-    "coulomb_asymmetry": "1",  # T_c (1 ± it) in the positive and the negative direction
-    "viscous_asymmetry": "1",  # f_v (1 ± it), likewise
-}
-"""Units of the unknowns whose sensitivity is absolute; the others are relative to their value, θ ∂/∂θ (eq. 4.17)."""
-
-SI = UNITS | {
-    "k_m": "N·m/A",
-    "k_1": "N/rad",
-    "T_c": "N·m",
-    "f_v": "N·m·s/rad",
-    "J": "kg·m²",
-    "break_away": "1",  # static over Coulomb friction
-    "stribeck_velocity": "rad/s",
-    "f_l": "m",
-    "quadratic": "1/rad",
-    "cubic": "1/rad²",
-    "hysteresis": "1",
-    "current_lag": "s",
-    "play": "rad",
-}
+SI = {name: row.unit for name, row in PARAMETERS.items()}
 """Units of the values of all of them."""
+UNITS = {name: row.unit for name, row in PARAMETERS.items() if not row.relative}
+"""Units of the unknowns whose sensitivity is absolute; the others are relative to their value."""
+FEATURES = tuple(name for name, row in PARAMETERS.items() if row.start)
+"""Features of a brake beyond the thesis's equations."""
+OF_A_RECORD = tuple(name for name, row in PARAMETERS.items() if row.of_a_record)
+"""Unknowns that each record has for itself: its start, and the homing of its encoder."""
+
+
+def scale(names: Iterable[str], values: Iterable[float]) -> NDArray[np.float64]:
+    """Factors from relative changes to those of the values: the value where a parameter is relative, else 1."""
+    return np.array([value if PARAMETERS[name].relative else 1.0 for name, value in zip(names, values, strict=True)])

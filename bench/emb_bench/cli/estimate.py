@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from emb_bench.estimate.records import ESTIMATED, METHODS, SAID_OF, STARTS, TERMS, WINDOW, EstimationProblem
+from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.estimate.records import METHODS, STARTS, TERMS, WINDOW, EstimationProblem
 from emb_bench.experiment.evaluation import names_of
 from emb_bench.logs.log import read_log, require_driven
 from emb_bench.output import reported_if_interrupted, say_if_compiling
@@ -35,7 +36,7 @@ methods:
   windows  output error over windows, each with a start of its own: for machines without a spring and disturbed ones
 """
 NUISANCES_EXPLAINED = "\nunknowns for --nuisance, besides the parameters:\n" + "".join(
-    f"  {name:17} {said}\n" for name, said in SAID_OF.items()
+    f"  {name:17} {row.about}\n" for name, row in PARAMETERS.items() if row.about
 )
 HELP = "the brake's parameters, with uncertainties, and whether the model fits"
 DESCRIPTION = f"""\
@@ -122,7 +123,7 @@ def add_question(p: argparse.ArgumentParser, *, all_models: bool = False) -> Non
     p.add_argument(
         "--nuisance",
         metavar="NAMES",
-        help=f"what is unknown besides, of {', '.join(ESTIMATED)}, see above (default: nothing, or what the map says)",
+        help=f"what is unknown besides, of {', '.join(PARAMETERS)}, see above (default: nothing, or what the map says)",
     )
     p.add_argument(
         "--model",

@@ -12,12 +12,12 @@ import numpy as np
 
 from emb_bench.analysis.model_choice import fit_from
 from emb_bench.analysis.model_growth import grow_model
-from emb_bench.brake.parameters import SI
+from emb_bench.brake.parameters import FEATURES, SI
 from emb_bench.commission.noise import noise_at_rest, noise_in_motion
 from emb_bench.commission.records import CurrentCheck, FirstMove, Identification, Rest
 from emb_bench.estimate.methods import run_method
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import FEATURES, Estimate, EstimationProblem, with_systematic
+from emb_bench.estimate.records import Estimate, EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Booleans, Experiment, Floats
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import RunLog, read_log

@@ -11,8 +11,7 @@ from emb_bench.brake.parameters import UNITS
 from emb_bench.design.report import Report
 from emb_bench.figures import COLOURS, DASHED, GREY, drawn
 from emb_bench.information.identifiability import Spectrum
-
-SYMBOLS = {"k_m": "$k_m$", "k_1": "$k_1$", "T_c": "$T_c$", "f_v": "$f_v$", "J": "$J$"}
+from emb_runtime.config.bench import BrakeParameters
 
 
 def draw(report: Report, path: Path) -> None:
@@ -73,7 +72,8 @@ def _information(axes: Any, report: Report) -> None:
     for i, name in enumerate(params):
         unit = UNITS.get(name)
         scale = 1.0 if unit else 100.0
-        label = f"{SYMBOLS.get(name, name)} [{unit}]" if unit else SYMBOLS.get(name, name)
+        symbol = f"${name}$" if name in BrakeParameters._fields else name
+        label = f"{symbol} [{unit}]" if unit else symbol
         axes[1].plot(time[known], scale * deviations[known, i], color=COLOURS[i % len(COLOURS)], label=label)
     axes[1].set_yscale("log")
     top = 1e2 if known.any() else 1.0

@@ -15,7 +15,7 @@ from emb_bench.design.kernel import Box
 from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import Kind, Weights, weights_of
 from emb_bench.information.symmetric import packed_size, unpack
-from emb_bench.sim.open_loop import advance_periods, check_unknowns, trajectory
+from emb_bench.sim.open_loop import check_unknowns, held, march, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import DEFAULT_PLANT, EXACT, Plant
 from emb_runtime.errors import UsageError
@@ -54,8 +54,8 @@ class Problem:
     def design(self, currents: Floats) -> Design:
         """Simulate a sequence of currents."""
         chosen, start, bias = self.start
-        loop, mechanics = compiled(advance_periods), self.plant.mechanics
-        x, s = trajectory(loop, mechanics, self.brake, currents, self.sample_time, 0.0, chosen, rest(), start)
+        acting = held(currents, self.sample_time)
+        x, s = trajectory(compiled(march), self.plant.mechanics, self.brake, acting, chosen, rest(), start)
         y = s[1:, :, :2].copy()
         y[:, :, 0] += bias
         root = np.sqrt(self.weights)

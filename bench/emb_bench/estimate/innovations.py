@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -110,17 +111,13 @@ class Filter:
         Returns:
             Shapes (n, 2) and (n, unknowns, 2).
         """
-        problem, record, t_s = self.problem, self.problem.records[i], self.problem.bench.timing.sample_time
+        problem, record = self.problem, self.problem.records[i]
         n, names = len(record.currents), (*problem.names(i), *besides)
         start = problem.opening(z, i, (*START, *names))
         innovations, shares = np.zeros((n, 2)), np.zeros((n, len(names), 2))
-        compiled(march_filtered)(
-            problem.mechanics(z) if mechanics is None else mechanics,
-            start.p,
-            start.x,
-            self._uncertainty(i),
+        given = FilterInput(
             record.currents + start.current_offset + added,
-            t_s,
+            problem.bench.timing.sample_time,
             max(start.late, 0.0),
             problem.plant.instruments.measurement_delay,
             np.nan_to_num(record.samples) + shifted,
@@ -131,13 +128,11 @@ class Filter:
             1.0 + start.velocity_gain,
             self.walk,
             self.load,
-            start.chosen,
-            start.s,
-            held,
-            gain,
-            innovations,
-            shares,
         )
+        moves, results = problem.mechanics(z) if mechanics is None else mechanics, Innovations(innovations, shares)
+        covariance = self._uncertainty(i)
+        loop = compiled(march_filtered)
+        loop(moves, start.p, given, start.chosen, start.x, start.s, covariance, held, gain, results)
         if start.late < 0.0:  # to first order, as in the simulation
             innovations -= start.late * shares[:, names.index("delay")]
         return innovations, shares
@@ -201,63 +196,67 @@ class Followed:
         return expected
 
 
+class FilterInput(NamedTuple):
+    """What a filter takes of a record of n samples and of the instruments."""
+
+    currents: Floats  # [A], shape (n,)
+    t_s: float  # Period [s]
+    late: float  # Share of the period in which the command before still acts
+    delay: int  # Periods that a sample waits before it is sent
+    samples: Floats  # Angle [rad] and velocity [rad/s], shape (n, 2)
+    stamps: Floats  # Lateness of each sample after the grid [s], shape (n,)
+    unreported: Floats  # Variances of the currents, zero where what acted is known [A²], shape (n,)
+    root: Floats  # Inverse standard deviations of the samples, zero where one does not count, shape (n, 2)
+    bias: float  # Reading at the angle zero [rad]
+    velocity_scale: float  # Reading at a velocity of 1 rad/s [rad/s]
+    walk: float  # q [rad/s per √s]
+    load: float  # r [A per √s]
+
+
+class Innovations(NamedTuple):
+    """Results of a filter."""
+
+    errors: Floats  # Innovations over their standard deviations, shape (n, 2)
+    shares: Floats  # Of the unknowns after ``START``, what each adds to the reading, likewise, shape (n, unknowns, 2)
+
+
 def march_filtered(
     mechanics: Mechanics,
     p: BrakeParameters,
-    x: Floats,
-    covariance: Floats,
-    currents: Floats,
-    t_s: float,
-    late: float,
-    delay: int,
-    samples: Floats,
-    stamps: Floats,
-    unreported: Floats,
-    root: Floats,
-    bias: float,
-    velocity_scale: float,
-    walk: float,
-    load: float,
+    given: FilterInput,
     chosen: Integers,
+    x: Floats,
     s: Floats,
+    covariance: Floats,
     held: bool,
     gains: Floats,
-    innovations: Floats,
-    shares: Floats,
+    results: Innovations,
 ) -> None:
     """One record through the filter, which corrects the state between two periods; runs as it is or compiled.
 
     Args:
         mechanics: how the brake moves.
         p: its parameters.
-        x: state, in place.
-        covariance: of angle, velocity and load, shape (3, 3), in place.
-        currents: shape (n,) [A].
-        t_s: period [s].
-        late: share of the period in which the command before still acts.
-        delay: periods that a sample waits before it is sent.
-        samples: angle [rad] and velocity [rad/s], shape (n, 2).
-        stamps: how much later than on the grid each was taken [s], shape (n,).
-        unreported: variances of the currents, zero where what acted is known [A²], shape (n,).
-        root: inverse standard deviations of the samples, zero where one does not count, shape (n, 2).
-        bias: what is shown of a brake at the angle zero [rad].
-        velocity_scale: what is shown of a velocity of 1 rad/s [rad/s].
-        walk: q [rad/s per √s].
-        load: r [A per √s].
+        given: record and instruments.
         chosen: indices of the unknowns, ``START`` first.
+        x: state, in place.
         s: sensitivities of the state, in place.
+        covariance: of angle, velocity and load, shape (3, 3), in place.
         held: True if the gains are given; else they are computed.
         gains: shape (n, 2, 4), in the order of ``GAIN``.
-        innovations: become those, over their standard deviation, shape (n, 2).
-        shares: become what the unknowns after ``START`` add to what is shown, in the same unit, shape (n, unknowns, 2).
+        results: filled.
     """
+    currents, t_s, late, delay, samples, stamps, unreported, root, bias, velocity_scale, walk, load = given
+    innovations, shares = results
     before, acting, known = float(x[3]), 0.0, len(START)
     follows = np.zeros(chosen.shape[0])  # derivatives of the load
     for i in range(currents.shape[0]):
         k, acceleration, tau = i - delay, 0.0, stamps[i]
         if k >= 0:  # the first samples are of the brake at its start
             u, velocity = float(currents[k]), float(x[1])
-            s[:known] = 0.0
+            for j in range(known):
+                for m in range(s.shape[1]):
+                    s[j, m] = 0.0
             s[0, 0] = s[1, 1] = 1.0
             advance_period(mechanics, p, x, before + acting, u + acting, t_s, late, chosen, s)
             before = u
@@ -312,7 +311,7 @@ def _spread(covariance: Floats, s: Floats, walk: float, load: float, t_s: float)
             for m in range(3):
                 for n in range(3):
                     carried[i, j] += f[i, m] * covariance[m, n] * f[j, n]
-    covariance[:] = carried
+    _copy(carried, covariance)
     covariance[0, 0] += walk * t_s**3 / 3.0 + load * t_s * g1 * g1 / 5.0
     covariance[1, 1] += walk * t_s + load * t_s * g2 * g2 / 3.0
     covariance[2, 2] += load * t_s
@@ -323,6 +322,12 @@ def _spread(covariance: Floats, s: Floats, walk: float, load: float, t_s: float)
     covariance[2, 0] += across[1]
     covariance[1, 2] += across[2]
     covariance[2, 1] += across[2]
+
+
+def _copy(source: Floats, target: Floats) -> None:
+    for i in range(3):
+        for j in range(3):
+            target[i, j] = source[i, j]
 
 
 def _push(covariance: Floats, variance: float, change: float, t_s: float) -> None:
@@ -360,5 +365,5 @@ def _weigh(covariance: Floats, h1: float, h2: float, variance: float, gain: Floa
             for m in range(3):
                 for n in range(3):
                     after[i, j] += kept[i, m] * covariance[m, n] * kept[j, n]
-    covariance[:] = after
+    _copy(after, covariance)
     gain[0], gain[1], gain[2], gain[3] = k[0], k[1], 1.0 / math.sqrt(whole), k[2]

@@ -259,7 +259,7 @@ def finished(
     found = problem.marginal(z, weights) if parts is None else None
     errors, jacobian = (found.residuals, found.jacobian) if found is not None else parts or (np.zeros(0), np.zeros(0))
     residuals = by_record(errors, weights)
-    scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
+    scale = problem.scale(z)
     relative = jacobian * scale
     information = relative.T @ relative
     fields = {

@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from emb_bench.brake.motion import SENSITIVE, STATES, Floats, Integers, no_sensitivity, rest
-from emb_bench.brake.parameters import COMMAND, DELAY, OFFSET, VELOCITY_GAIN
+from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
+from emb_bench.brake.parameters import COMMAND, DELAY, FEATURES, OFFSET, PARAMETERS, VELOCITY_GAIN, scale
 from emb_bench.compiled import compiled
-from emb_bench.estimate.records import FEATURES, EstimationProblem, Unknown, check_model, searched
+from emb_bench.estimate.records import EstimationProblem, Unknown, check_model, searched
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.model_evaluator import later
 from emb_bench.information.fisher import uniform_prior, weights_along
-from emb_bench.sim.open_loop import advance_periods, advance_through_gaps, trajectory
+from emb_bench.sim.open_loop import Input, march, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import ASYMMETRIES, Mechanics, Plant
+from emb_runtime.config.plants import Mechanics, Plant
 from emb_runtime.errors import LogError, UsageError
 
 
@@ -91,8 +91,12 @@ class Problem:
     @cached_property
     def units(self) -> Floats:
         """Factors from z to SI units."""
-        nominal = self.bench.brake._asdict() | {name: typical for name, (_, typical, _) in FEATURES.items()}
-        return np.array([nominal[u.name] if u.relative else 1.0 for u in self.unknowns])
+        nominal = {name: row.start for name, row in PARAMETERS.items()} | self.bench.brake._asdict()
+        return scale([u.name for u in self.unknowns], [nominal[u.name] for u in self.unknowns])
+
+    def scale(self, z: Floats) -> Floats:
+        """Factors from relative changes of the unknowns, or those in their units, to changes of z."""
+        return scale([u.name for u in self.unknowns], z.tolist())
 
     @cached_property
     def bounds(self) -> tuple[Floats, Floats]:
@@ -125,8 +129,8 @@ class Problem:
         z = np.ones(len(self.unknowns))
         for i, unknown in enumerate(self.unknowns):
             if unknown.name in FEATURES:
-                own, (lowest, typical, _) = getattr(self.plant.mechanics, unknown.name), FEATURES[unknown.name]
-                z[i] = own / typical if own > lowest else 1.0
+                own, row = getattr(self.plant.mechanics, unknown.name), PARAMETERS[unknown.name]
+                z[i] = own / row.start if own > row.low else 1.0
                 continue
             if unknown.record is None:
                 z[i] = z[i] if unknown.relative else getattr(self.plant.mechanics, unknown.name, 0.0)
@@ -151,9 +155,9 @@ class Problem:
 
         Static friction of a plant without a Stribeck velocity gets one: at rest alone it has no derivative.
         """
-        m, found = self.plant.mechanics, self._named(z, (*FEATURES, *ASYMMETRIES))
+        m, found = self.plant.mechanics, self._named(z, Mechanics._fields)
         if m.stribeck_velocity == 0.0 and {"break_away", "f_l"} & {*found}:
-            found.setdefault("stribeck_velocity", FEATURES["stribeck_velocity"][1])
+            found.setdefault("stribeck_velocity", PARAMETERS["stribeck_velocity"].start)
         return m._replace(**found)
 
     def columns(self, record: int) -> list[int]:
@@ -209,17 +213,15 @@ class Problem:
         self, record: int, at: Opening, mechanics: Mechanics, currents: Floats, unknowns: int
     ) -> tuple[Floats, Floats]:
         """States and sensitivities at all instants of a record, those to ``unknowns`` of its gaps last."""
-        data, t_s, late = self.records[record], self.bench.timing.sample_time, max(at.late, 0.0)
-        if not data.gap_unknowns:
-            return trajectory(compiled(advance_periods), mechanics, at.p, currents, t_s, late, at.chosen, at.x, at.s)
-        states = np.empty((len(currents) + 1, STATES))
-        moved = np.empty((len(currents) + 1, len(at.chosen) + unknowns, SENSITIVE))
-        states[0], moved[0] = at.x, np.concatenate([at.s, np.zeros((unknowns, SENSITIVE))])
-        places = self.places(record) - [at.contact, 0.0]
-        pulses = data.gaps[0] if unknowns else data.gaps[0][:0]
-        loop = compiled(advance_through_gaps)
-        loop(mechanics, at.p, currents, t_s, late, at.chosen, pulses, self.breaks(record), places, states, moved)
-        return states, moved
+        acting = Input(
+            currents,
+            self.bench.timing.sample_time,
+            max(at.late, 0.0),
+            self.records[record].gaps[0],
+            self.breaks(record),
+            self.places(record) - [at.contact, 0.0],
+        )
+        return trajectory(compiled(march), mechanics, at.p, acting, at.chosen, at.x, at.s, unknowns)
 
     def breaks(self, record: int) -> Integers:
         """Periods at whose ends the brake is found again after a longer gap: those of the first sample that shows it.
@@ -344,12 +346,11 @@ class Problem:
         Returns:
             As :meth:`jacobian`.
         """
-        residuals, rows = [], []
+        residuals, rows, factors = [], [], self.scale(z)
         for i, (errors, shares) in enumerate(parts):
             columns = self.columns(i)
             block = np.zeros((*errors.shape, len(z)))
-            scale = np.array([1.0 / z[c] if self.unknowns[c].relative else 1.0 for c in columns])
-            block[:, :, columns] = -shares.transpose(0, 2, 1) * scale
+            block[:, :, columns] = -shares.transpose(0, 2, 1) / factors[columns]
             residuals.append(errors.ravel())
             rows.append(block.reshape(-1, len(z)))
         known, their_rows = self.known(z)

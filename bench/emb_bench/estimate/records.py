@@ -10,55 +10,19 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import Floats, is_plain
-from emb_bench.brake.parameters import UNITS
+from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS, scale
 from emb_bench.brake.quantities import Quantity, quantity
 from emb_bench.experiment.evaluation import Question
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.model_evaluator import SystematicErrors
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import ASYMMETRIES, EXACT, Plant
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator import estimate
 
-FEATURES: Mapping[str, tuple[float, float, float]] = {
-    "break_away": (1.0, 1.1, 5.0),
-    "stribeck_velocity": (1.0, 30.0, 500.0),
-    "f_l": (1e-10, 1e-6, 1e-4),
-    "quadratic": (1e-8, 1e-4, 0.1),
-    "cubic": (1e-10, 1e-6, 1e-2),
-    "hysteresis": (1e-6, 1e-2, 0.5),
-    "current_lag": (1e-7, 1e-3, 0.1),
-    "play": (1e-4, 0.1, 10.0),
-}
-"""Features that can be estimated: the lowest value, one to begin with where the plant has none, the highest."""
 SYSTEMATIC = SystematicErrors._fields
 """Systematic errors that are estimated along by default, each with the prior of the bench file."""
-ESTIMATED = (*PARAMETER_NAMES, "J", "contact", "x1_0", "x2_0", *SYSTEMATIC, *FEATURES, *ASYMMETRIES)
-"""The unknowns that an estimator can vary; what else a plant has beyond the thesis's brake is known from its name."""
-SAID_OF = {
-    "J": "moment of inertia [kg·m²]; scales with all torques, so that one of them has to be known",
-    "contact": "angle at which the clamping begins [rad], nominally 0",
-    "delay": "time by which commands act late [samples], -0.1 to 0.9; below 0, samples are late",
-    "x1_0": "angle at the start [rad], of each log",
-    "x2_0": "velocity at the start [rad/s], of each log",
-    "offset": "what the encoder shows at the origin [rad], of each log",
-    "break_away": "static friction as a multiple of T_c",
-    "stribeck_velocity": "speed at which the static friction has decayed [rad/s]",
-    "f_l": "static friction that grows with the load [m]",
-    "quadratic": "curvature of the clamping force, k_1 x (1 + quadratic x + cubic x²) [1/rad]",
-    "cubic": "the next term of that curve [1/rad²]",
-    "hysteresis": "share by which the clamping force is larger while tightening, smaller while releasing",
-    "current_lag": "time constant of the current loop [s]",
-    "play": "travel of the motor after a turn until the clamp follows [rad]; not together with hysteresis",
-    "current_offset": "current that acts beyond what the node reports [A]",
-    "velocity_gain": "relative error of the velocity's scale",
-    "coulomb_asymmetry": "share by which T_c is larger in the positive direction and smaller in the negative",
-    "viscous_asymmetry": "the same of f_v",
-}
-"""Descriptions of the unknowns beyond the thesis's parameters."""
-OF_A_RECORD = ("x1_0", "x2_0", "offset")
-"""Unknowns that each record has for itself: its start, and the homing of its encoder."""
 FACTOR = 10.0  # Brakes beyond nominal by this factor are not searched
 METHODS: Mapping[str, str] = {
     "oem": "output error",
@@ -78,8 +42,6 @@ WINDOW = 0.5  # Length of a window of the method ``windows`` where nothing else 
 STARTS = 8  # Default number of local searches
 DONE = "DONE"  # Exit reason of a run that came to its planned end
 NORMAL_95 = estimate.NORMAL_95  # Standard deviations that 95 % of a Gaussian lie within
-LATEST = 0.9  # Longest delay of a command [samples]: whole ones are in the record, because the node reports what acted
-EARLIEST = -0.1  # Least delay [samples]: samples that are taken late look like commands that act early
 
 
 def chance(p_value: float) -> str:
@@ -90,13 +52,13 @@ def chance(p_value: float) -> str:
 class Unknown(NamedTuple):
     """One number to be estimated."""
 
-    name: str  # One of ``ESTIMATED``
+    name: str  # Key of ``PARAMETERS``
     record: int | None = None  # Number of the record that it belongs to; None if all share it
 
     @property
     def relative(self) -> bool:
         """True if sensitivities to it are relative to its value."""
-        return self.name not in UNITS
+        return PARAMETERS[self.name].relative
 
 
 @dataclass(frozen=True)
@@ -117,22 +79,22 @@ class EstimationProblem(Question):
         """Check the names and the bounds.
 
         Raises:
-            UsageError: a name is missing, unknown or comes twice, or cannot be estimated; bounds are of something that
-                is not estimated, or hold nothing that it can be.
+            UsageError: a name is missing, unknown or comes twice; bounds are of something that is not estimated, or
+                hold nothing that it can be.
         """
-        for name in self.names if any(self.params) else ():
-            if name not in ESTIMATED:
-                raise UsageError(f"'{name}' is not estimated; expected some of {', '.join(ESTIMATED)}")
         super().__post_init__()
         for name, (low, high) in self.bounds.items():
             if name not in self.names:
                 raise UsageError(f"bounds of {name}, which is not estimated; expected some of {', '.join(self.names)}")
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise UsageError(f"bounds of {name}: expected two finite numbers, the lower first, got {low}, {high}")
-            if low <= 0.0 and name not in UNITS:
+            row = PARAMETERS[name]
+            if low <= 0.0 and row.relative:
                 raise UsageError(f"bounds of {name}: expected positive numbers, got {low:g}, {high:g}")
-            if name == "delay" and not EARLIEST <= low < high <= LATEST:
-                raise UsageError(f"bounds of delay: expected {EARLIEST:g} to {LATEST:g} samples, got {low:g}, {high:g}")
+            if name == "delay" and not row.low <= low < high <= row.high:
+                raise UsageError(
+                    f"bounds of delay: expected {row.low:g} to {row.high:g} samples, got {low:g}, {high:g}"
+                )
 
     @property
     def along(self) -> tuple[str, ...]:
@@ -152,24 +114,16 @@ def searched(bench: Bench, asked: EstimationProblem, unknown: Unknown) -> tuple[
     """Search range of an unknown: lowest and highest value in SI units."""
     if unknown.name in asked.bounds:
         return asked.bounds[unknown.name]
-    if unknown.name in FEATURES:
-        lowest, _, highest = FEATURES[unknown.name]
-        return lowest, highest
-    if unknown.relative:
+    row, limits = PARAMETERS[unknown.name], bench.limits
+    if row.low < row.high:
+        return row.low, row.high
+    if row.relative:
         nominal = getattr(bench.brake, unknown.name)
         return nominal / FACTOR, nominal * FACTOR
-    low, high = bench.limits.angle
-    speed = bench.limits.velocity
-    return {
-        "contact": (low, high),
-        "delay": (EARLIEST, LATEST),
-        "x1_0": (low, high),
-        "x2_0": (-speed, speed),
-        "offset": (low, high),
-        "current_offset": (-bench.limits.current, bench.limits.current),
-        "velocity_gain": (-0.5, 0.5),
-        **dict.fromkeys(ASYMMETRIES, (-0.9, 0.9)),
-    }[unknown.name]
+    low, high = limits.angle
+    return {"rad": (low, high), "rad/s": (-limits.velocity, limits.velocity), "A": (-limits.current, limits.current)}[
+        row.unit
+    ]
 
 
 def has_time_for_a_delay(plant: Plant) -> bool:
@@ -339,6 +293,11 @@ class Estimate:
         """Labels of the unknowns, in their order."""
         return tuple(self.label(unknown) for unknown in self.unknowns)
 
+    @property
+    def scale(self) -> Floats:
+        """Factors from relative deviations, or those in an unknown's unit, to SI units."""
+        return np.abs(scale([unknown.name for unknown in self.unknowns], self.values.tolist()))
+
     def cramer_rao(self) -> Floats:
         """Least standard deviations by the physical FIM: relative or in the unknown's unit, inf if not identified."""
         bounds: Floats = np.sqrt(np.diag(Spectrum(self.information).inverse()))
@@ -369,8 +328,7 @@ class Estimate:
 
     def intervals(self) -> Floats:
         """Gaussian 95 % intervals in SI units, shape (unknowns, 2)."""
-        scale = np.array([abs(v) if u.relative else 1.0 for u, v in zip(self.unknowns, self.values, strict=True)])
-        half = NORMAL_95 * self.deviations() * scale
+        half = NORMAL_95 * self.deviations() * self.scale
         return np.stack([self.values - half, self.values + half], axis=1)
 
     def correlation(self) -> Floats:

@@ -154,8 +154,7 @@ def linearised(cut: Sequence[Problem], at: Point, weights: Sequence[Floats]) -> 
         said = window.predict(z, 0)
         counts = root.ravel() > 0.0
         errors = (np.nan_to_num(window.records[0].samples - said.shown) * root).ravel()[counts]
-        scale = np.array([1.0 / v if u.relative else 1.0 for u, v in zip(window.unknowns, z, strict=True)])
-        rows = (said.sensitivities * root[:, None]).transpose(0, 2, 1).reshape(-1, len(z))[counts] * scale
+        rows = (said.sensitivities * root[:, None]).transpose(0, 2, 1).reshape(-1, len(z))[counts] / window.scale(z)
         shared, own = rows[:, : -len(START)], rows[:, -len(START) :]
         lengths = np.linalg.norm(own, axis=0)
         unit = np.where(lengths > 0.0, lengths, 1.0)

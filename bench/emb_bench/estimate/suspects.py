@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from scipy import special
 
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.parameters import SI
+from emb_bench.brake.parameters import PARAMETERS, SI, Parameter
 from emb_bench.brake.quantities import Quantity, quantity
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Suspect, has_time_for_a_delay
@@ -30,6 +30,8 @@ from emb_runtime.config.plants import EXACT, Mechanics
 from emb_runtime.config.systematic import Systematic
 
 SLOW = 30.0  # Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]
+
+_PLANT = PARAMETERS["play"].remedy
 
 PRESENT = 1.0 / 3.0
 """Probability, before any record, that the brake has the one effect that its interval has to allow for."""
@@ -87,48 +89,22 @@ class Simulated:
         return self.problem.shown(self.z, record, self.problem.mechanics(self.z))
 
 
-class Effect(NamedTuple):
-    """One effect that a plant may lack."""
-
-    said: str  # Noun phrase
-    remedy: str
-    step: float = 0.0  # Of the secant, in the effect's unit; 0 where the brake has a sensitivity
-    positive: bool = False  # True if it cannot be negative
-
-
-HELD = "estimate it as well: --params"
-PLANT = "estimate with a plant that has it: --model"
-EFFECTS: Mapping[str, Effect] = {
-    **{name: Effect(f"a change of {name}, which is held fixed,", HELD) for name in PARAMETER_NAMES},
-    "J": Effect("another moment of inertia", "correct J in the bench file"),
-    "offset": Effect("an encoder offset", "home the encoder, or --nuisance offset,x1_0"),
-    "contact": Effect("a contact away from the origin", "home the encoder at the contact, or --nuisance contact"),
-    "x1_0": Effect("another angle at the start", "let the brake rest before the run, or --nuisance x1_0"),
-    "x2_0": Effect("a motion at the start", "let the brake rest before the run, or --nuisance x2_0"),
-    "delay": Effect("a delay of the commands", "--nuisance delay"),
-    "current_offset": Effect("an offset of the current", "calibrate it, or --nuisance current_offset"),
-    "velocity_gain": Effect("an error of the velocity's scale", "calibrate it, or --nuisance velocity_gain"),
-    "quadratic": Effect("a quadratic stiffness", PLANT, 1e-5),
-    "cubic": Effect("a cubic stiffness", PLANT, 1e-7),
-    "hysteresis": Effect("a hysteresis of the clamping force", PLANT, 1e-3, True),
-    "play": Effect("play of the gear", PLANT, 0.02, True),
-    "break_away": Effect("a static friction beyond T_c", PLANT, 1e-2, True),
-    "f_l": Effect("a static friction that grows with the load", PLANT, 1e-9, True),
-    "current_lag": Effect("a lag of the current", PLANT, 2e-5, True),
-    "velocity_lag": Effect("a velocity that lags, as an observer's does", PLANT, 0.0, True),
-    "k_m_drift": Effect("a change of k_m over the run", "keep the motor cool, or use a shorter run"),
-    "k_1_drift": Effect("a change of k_1 over the run", "clamp some times before the run, or use a shorter one"),
-    "T_c_drift": Effect("a change of T_c over the run", "begin when all that moves is warm, or use a shorter run"),
-    "f_v_drift": Effect("a change of f_v over the run", "begin when all that moves is warm, or use a shorter run"),
-}
-"""Effects by their names, in the order of their tests."""
-UNITS = {name: "" if unit == "1" else unit for name, unit in SI.items()}
 DRIFTS = tuple(f"{name}_drift" for name in PARAMETER_NAMES)
 """Linear changes of the parameters, as shares of them from the begin of a run to its end."""
+_COOL = "keep the motor cool, or use a shorter run"
+_CLAMP = "clamp some times before the run, or use a shorter one"
+_WARM = "begin when all that moves is warm, or use a shorter run"
+EFFECTS: Mapping[str, Parameter] = {
+    **{name: row for name, row in PARAMETERS.items() if row.effect},
+    "velocity_lag": Parameter("s", effect="a velocity that lags, as an observer's does", remedy=_PLANT, positive=True),
+    **{
+        name: Parameter("", effect=f"a change of {name.removesuffix('_drift')} over the run", remedy=remedy)
+        for name, remedy in zip(DRIFTS, (_COOL, _CLAMP, _WARM, _WARM), strict=True)
+    },
+}
+"""Effects that a plant may lack, in the order of their tests."""
 ALONE = DRIFTS[1:]
 """Effects that are no part of the test of all together, which noise with a slow colour would fail by them."""
-UNITS |= dict.fromkeys((*PARAMETER_NAMES, "J", *DRIFTS), "") | {"velocity_lag": "s"}
-"""Units of their amounts; parameters, which are relative, and shares have none."""
 OF_THE_SPRING = ("k_1", "k_1_drift", "contact", "play", "f_l", "quadratic", "cubic", "hysteresis")
 """Effects that a machine without a spring cannot have."""
 
@@ -283,7 +259,7 @@ def score(
         every = {name: column for name, column in every.items() if name not in OF_THE_SPRING}
     pseudo = np.linalg.pinv(jacobian / _lengths(jacobian)) / _lengths(jacobian)[:, None]
     known = _deviations_before(problem, DISTURBED if disturbed else 1.0)
-    scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
+    scale = np.abs(problem.scale(z))
     found, beside_all = [], []
     for name, column in every.items():
         whole = np.zeros(len(errors))
@@ -302,7 +278,7 @@ def score(
         rest = (PRESENT * (share * length**-2 + (share * amount) ** 2)) ** 0.5
         # What drifts is fitted as it is in the middle of a run, and meant from the begin to the end.
         ends = np.array([0.5 if f"{u.name}_drift" == name else 0.0 for u in problem.unknowns])
-        moves = (np.abs(pseudo @ whole) / np.abs(scale) + ends) * rest
+        moves = (np.abs(pseudo @ whole) / scale + ends) * rest
         found.append(Suspect(name, amount, sigmas / max(ratio, 1e-300) ** 0.5, p, tuple(moves.tolist())))
     if not found:
         return Scores((), 0.0, 0, 1.0)
@@ -351,8 +327,10 @@ def shown_as(s: Suspect, machine: Machine | None) -> Quantity:
     if s.name in DRIFTS:
         parameter = s.name.removesuffix("_drift")
         return Quantity(f"{quantity(machine, parameter).name}_drift", "", 1.0)
-    found = quantity(machine, s.name) if s.name in SI else Quantity(s.name, UNITS[s.name], 1.0)
-    return found if UNITS[s.name] else Quantity(found.name, "", 1.0)
+    row = EFFECTS[s.name]
+    found = quantity(machine, s.name) if s.name in SI else Quantity(s.name, row.unit, 1.0)
+    a_share = row.unit == "1" or (s.name in SI and row.relative and row.step == 0.0)
+    return found._replace(unit="", factor=1.0) if a_share else found
 
 
 def explained(s: Suspect, machine: Machine | None = None) -> str:
@@ -360,7 +338,7 @@ def explained(s: Suspect, machine: Machine | None = None) -> str:
     effect, (_, unit, factor) = EFFECTS[s.name], shown_as(s, machine)
     share = 100.0 * s.value
     amount = f"{s.value * factor:.2g} {unit}" if unit else f"{share:.0f} %" if abs(share) >= 99.5 else f"{share:.2g} %"
-    said = effect.said
+    said = effect.effect
     for parameter in PARAMETER_NAMES:
         said = said.replace(parameter, quantity(machine, parameter).name)
     return f"{said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma): {effect.remedy}"

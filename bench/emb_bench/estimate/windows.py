@@ -29,10 +29,11 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import Floats
+from emb_bench.brake.parameters import OF_A_RECORD
 from emb_bench.estimate.model_validation import examine
 from emb_bench.estimate.output_error import by_record, estimate_at, start_points
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import NORMAL_95, OF_A_RECORD, End, Estimate, ModelValidation
+from emb_bench.estimate.records import NORMAL_95, End, Estimate, ModelValidation
 from emb_bench.estimate.shooting import (
     HELD,
     LINEAR,
@@ -256,7 +257,7 @@ def predict_windows(problem: Problem, values: Floats) -> tuple[float, float, int
 def _sums(problem: Problem, shared: Floats, windows: Sequence[Window]) -> tuple[Floats, Floats, Floats]:
     """Information of relative parameters, the score of each window, and the factors to scaled values."""
     p = len(problem.unknowns)
-    scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, shared, strict=True)])
+    scale = problem.scale(shared)
     parts = [window.projected() for window in windows]
     information = sum((columns.T @ columns for _, columns in parts), np.zeros((p, p))) * np.outer(scale, scale)
     return information, np.array([columns.T @ errors for errors, columns in parts]) * scale, scale

@@ -18,7 +18,7 @@ from emb_bench.brake.parameters import DELAY, OFFSET, VELOCITY_GAIN
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import Kind, information_over_time, weights_along
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
-from emb_bench.sim.open_loop import fast_loop, trajectory
+from emb_bench.sim.open_loop import fast_loop, held, trajectory
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
 
@@ -148,7 +148,8 @@ class ModelEvaluator:
         """Go through the next periods of the experiment."""
         chosen, mechanics, t_s = self._chosen, self._plant.mechanics, self._bench.timing.sample_time
         currents, late = piece.currents + self._errors.current_offset, max(self._errors.delay, 0.0)
-        x, moved = trajectory(self._loop, mechanics, self._theta, currents, t_s, late, chosen, self._x, self._s)
+        acting = held(currents, t_s, late)
+        x, moved = trajectory(self._loop, mechanics, self._theta, acting, chosen, self._x, self._s)
         self._x, self._s = x[-1], moved[-1]
         states, s = x[:, :2].copy(), moved[1:, : self._unknowns, :2].copy()
         if self._errors.delay < 0.0:  # to first order: what acts early does so by thousandths of a period

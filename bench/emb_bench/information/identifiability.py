@@ -6,7 +6,7 @@ those of the exact brake, about 1e-9 of the sensitivity, would have to grow a hu
 zero above that, and one that is not zero and not below it stands for a direction whose trace they do not make up.
 
 **What counts as not identified.** A bound can be finite and worthless. A parameter is identified if the least standard
-deviation of its estimate is below 100 % of its value, or below the gross error of one with a unit (``GROSS``). Beyond
+deviation of its estimate is below 100 % of its value, or below the gross error of one with a unit. Beyond
 that not even its order of magnitude follows from the data, and the linearisation that the bound rests on does not hold.
 
 A singular matrix has the worst values there are and a verdict, never a NaN.
@@ -21,23 +21,15 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.brake.parameters import UNITS
+from emb_bench.brake.parameters import PARAMETERS, UNITS
 from emb_bench.brake.quantities import quantity, renamed
 from emb_bench.information.symmetric import SINGULAR, Floats
 from emb_runtime.config.machine import Machine
 from emb_runtime.errors import UsageError
 
 TRADED_OFF = 0.95  # Correlation from which on two estimates are traded off against each other
-GROSS: Mapping[str, float] = {
-    "contact": 1.0,
-    "delay": 1.0,
-    "x1_0": 1.0,
-    "x2_0": 10.0,
-    "offset": 1.0,
-    "current_offset": 1.0,
-    "velocity_gain": 1.0,
-}
-"""Error of an unknown with a unit at which it is of no use, in that unit; for the others it is their own value."""
+GROSS: Mapping[str, float] = {name: row.gross for name, row in PARAMETERS.items()}
+"""Error at which an unknown is of no use: of its value, or in its unit."""
 NEWS = 0.9  # Share of the deviation known beforehand above which the data have added nothing
 
 TOUCHED = 1e-6  # share of a flat direction from which on a parameter belongs to it

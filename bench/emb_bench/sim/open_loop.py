@@ -1,9 +1,8 @@
 """Open-loop simulation: a brake driven through a record of currents, with the sensitivities of its state.
 
-:func:`advance_periods` is the one loop over a record; every module that needs trajectories calls it, compiled or as it
-is. Loops that need the state between two periods, because a filter corrects it or a current answers it, share its step
-:func:`advance_period`, compiled, which is :func:`emb_bench.brake.motion.advance` where no command is late, or
-:func:`feedback`, in plain Python.
+:func:`march` is the one loop over a record; every module that needs trajectories calls it, compiled or as it is. Loops
+that need the state between two periods, because a filter corrects it or a current answers it, are
+:mod:`emb_bench.estimate.innovations` on :func:`advance_period`, and :func:`feedback` in plain Python.
 
 **Which samples count.** A sequence of n currents u_0..u_{n−1} moves the brake from the state x_0 to x_n, and the
 samples y_1..y_n after each period count. y_0 holds no information on a brake that starts from a known state (eq. 4.26).
@@ -64,72 +63,120 @@ def simulate(
         UsageError: ``currents`` is not one row of finite numbers, or a name is unknown or comes twice.
     """
     check_unknowns(params)
-    applied = _finite(currents)
     chosen, s = no_sensitivity(params)
     x = rest()
     x[:2] = x0
-    states, sensitivities = trajectory(advance_periods, mechanics, p, applied, t_s, 0.0, chosen, x, s)
+    states, sensitivities = trajectory(march, mechanics, p, held(_finite(currents), t_s), chosen, x, s)
     shown = sensitivities[1:, :, :2].copy()
     shown[:, chosen == OFFSET, 0] += 1.0
     shown[:, chosen == VELOCITY_GAIN, 1] += states[1:, 1:2]
     return Trajectory(states[:, :2].copy(), shown)
 
 
+class Input(NamedTuple):
+    """What acts on a brake in n periods, and where it is put after periods of which that is not known."""
+
+    currents: Floats  # [A], shape (n,)
+    t_s: float  # Period [s]
+    late: float  # Share of a period in which the command before still acts, 0 to below 1
+    pulses: Integers  # Single periods whose current is an unknown, in ascending order, shape (g,)
+    breaks: Integers  # Periods at whose ends the brake is put somewhere after longer gaps, ascending, shape (h,)
+    places: Floats  # Angle [rad] and velocity [rad/s] at these ends, shape (h, 2)
+
+
+def held(currents: Floats, t_s: float, late: float = 0.0) -> Input:
+    """Input that is known in every period."""
+    none = np.zeros(0, np.int64)
+    return Input(currents, t_s, late, none, none, np.zeros((0, 2)))
+
+
 def trajectory(
     loop: Callable[..., None],
     mechanics: Mechanics,
     p: BrakeParameters,
-    currents: Floats,
-    t_s: float,
-    late: float,
+    acting: Input,
     chosen: Integers,
     x: Floats,
     s: Floats,
+    gaps: int = 0,
 ) -> tuple[Floats, Floats]:
     """Whole states and sensitivities at all instants, from those at the first one.
 
     Args:
-        loop: :func:`advance_periods`, as it is or compiled.
+        loop: :func:`march`, as it is or compiled.
         mechanics: how the brake moves.
         p: its parameters.
-        currents: shape (n,) [A].
-        t_s: period [s].
-        late: share of the period in which the command before still acts, 0 to below 1.
+        acting: the input.
         chosen: indices of the parameters in ``PARAMETERS``, shape (m,).
         x: state at the start, shape (STATES,).
         s: sensitivities at the start, shape (m, SENSITIVE).
+        gaps: unknowns of the gaps, 0 or all g + 2 h: the currents of ``pulses`` [per A], then angle and velocity at
+            the end of each of ``breaks``.
 
     Returns:
-        Shapes (n + 1, STATES) and (n + 1, m, SENSITIVE).
+        Shapes (n + 1, STATES) and (n + 1, m + gaps, SENSITIVE).
     """
-    n = len(currents)
-    states, sensitivities = np.empty((n + 1, STATES)), np.empty((n + 1, len(chosen), SENSITIVE))
-    states[0], sensitivities[0] = x, s
-    loop(mechanics, p, currents, t_s, late, chosen, states, sensitivities)
+    n = len(acting.currents)
+    states, sensitivities = np.empty((n + 1, STATES)), np.zeros((n + 1, len(chosen) + gaps, SENSITIVE))
+    states[0], sensitivities[0, : len(chosen)] = x, s
+    loop(mechanics, p, acting if gaps else acting._replace(pulses=acting.pulses[:0]), chosen, states, sensitivities)
     return states, sensitivities
 
 
-def advance_periods(
-    mechanics: Mechanics,
-    p: BrakeParameters,
-    currents: Floats,
-    t_s: float,
-    late: float,
-    chosen: Integers,
-    x: Floats,
-    s: Floats,
-) -> None:
-    """Fills states ``x`` and sensitivities ``s`` from their first rows on; arguments are those of :func:`trajectory`.
+def march(mechanics: Mechanics, p: BrakeParameters, acting: Input, chosen: Integers, x: Floats, s: Floats) -> None:
+    """Fills states ``x`` and sensitivities ``s`` from their first rows on; see :func:`trajectory`.
 
-    Runs as it is or compiled (:func:`emb_bench.compiled.compiled`).
+    A single period of which it is not known what acted adds its current to the unknowns. After a longer gap the brake
+    is put to where it is taken to be, and its angle and velocity there are unknowns: what came before says nothing of
+    what comes after. Runs as it is or compiled (:func:`emb_bench.compiled.compiled`).
     """
-    before = float(x[0, 3])
-    for k in range(currents.shape[0]):
-        x[k + 1] = x[k]
-        s[k + 1] = s[k]
-        u = float(currents[k])
-        advance_period(mechanics, p, x[k + 1], before, u, t_s, late, chosen, s[k + 1])
+    t_s, late, pulses, breaks, places = acting.t_s, acting.late, acting.pulses, acting.breaks, acting.places
+    m, count = chosen.shape[0], chosen.shape[0] + pulses.shape[0]
+    every = np.full(s.shape[1], PAST_COMMAND)
+    for j in range(m):
+        every[j] = chosen[j]
+    before, begun, broken, unknown = float(x[0, 3]), 0, 0, -1
+    for k in range(acting.currents.shape[0]):
+        _carry(x, s, k)
+        after_gap = broken < breaks.shape[0] and breaks[broken] == k
+        if after_gap:
+            x[k + 1, 0], x[k + 1, 1] = places[broken, 0], places[broken, 1]
+        u = float(acting.currents[k])
+        if late > 0.0:
+            if unknown >= 0:
+                every[unknown] = COMMAND
+            advance(mechanics, p, x[k + 1], before, late * t_s, every, s[k + 1])
+        if unknown >= 0:
+            every[unknown] = PAST_COMMAND
+            unknown = -1
+        if begun < pulses.shape[0] and pulses[begun] == k:
+            unknown = m + begun
+            every[unknown] = COMMAND
+            begun += 1
+        advance(mechanics, p, x[k + 1], u, (1.0 - late) * t_s, every, s[k + 1])
         before = u
+        if after_gap:
+            _put(x, s, k, places[broken], count + 2 * broken)
+            broken += 1
+
+
+def _carry(x: Floats, s: Floats, k: int) -> None:
+    """Row k into the next one; an assignment of rows would take numba seconds to compile."""
+    for i in range(STATES):
+        x[k + 1, i] = x[k, i]
+        for j in range(s.shape[1]):
+            s[k + 1, j, i] = s[k, j, i]
+
+
+def _put(x: Floats, s: Floats, k: int, place: Floats, own: int) -> None:
+    """Put the brake to an angle and a velocity at the end of period k, whose sensitivities begin at row ``own``."""
+    x[k, 1] = 2.0 * place[1] - x[k + 1, 1]  # keeps the acceleration near the place
+    for i in range(2):
+        x[k + 1, i] = place[i]
+        for j in range(s.shape[1]):
+            s[k + 1, j, i] = 0.0
+        if s.shape[1] > own:
+            s[k + 1, own + i, i] = 1.0
 
 
 def advance_period(
@@ -151,72 +198,6 @@ def advance_period(
     if late > 0.0:
         advance(mechanics, p, x, before, late * t_s, chosen, s)
     advance(mechanics, p, x, u, (1.0 - late) * t_s, chosen, s)
-
-
-def advance_through_gaps(
-    mechanics: Mechanics,
-    p: BrakeParameters,
-    currents: Floats,
-    t_s: float,
-    late: float,
-    chosen: Integers,
-    pulses: Integers,
-    breaks: Integers,
-    places: Floats,
-    x: Floats,
-    s: Floats,
-) -> None:
-    """:func:`advance_periods` through periods of which it is not known what acted; runs as it is or compiled.
-
-    A single one adds its current to the unknowns. After a longer gap the brake is put to where it is taken to be, and
-    its angle and velocity there are unknowns: what came before tells nothing of what comes after.
-
-    Args:
-        mechanics: how the brake moves.
-        p: its parameters.
-        currents: shape (n,) [A].
-        t_s: period [s].
-        late: share of the period in which the command before still acts, 0 to below 1.
-        chosen: indices of the parameters, shape (m,).
-        pulses: single periods, in ascending order, shape (g,).
-        breaks: periods at whose ends the brake is put somewhere after longer gaps, in ascending order, shape (h,).
-        places: angle [rad] and velocity [rad/s] at their ends, shape (h, 2).
-        x: states, filled from the first row on, shape (n + 1, STATES).
-        s: sensitivities to the parameters, the currents of ``pulses`` [per A], and angle and velocity at the end of
-            each of ``breaks``, shape (n + 1, m + g + 2 h, SENSITIVE).
-    """
-    m, count = chosen.shape[0], chosen.shape[0] + pulses.shape[0]
-    every = np.full(s.shape[1], PAST_COMMAND)
-    every[:m] = chosen
-    before, begun, broken, held = float(x[0, 3]), 0, 0, -1
-    for k in range(currents.shape[0]):
-        x[k + 1] = x[k]
-        s[k + 1] = s[k]
-        if broken < breaks.shape[0] and breaks[broken] == k:
-            x[k + 1, :2] = places[broken]
-        u = float(currents[k])
-        if late > 0.0:
-            if held >= 0:
-                every[held] = COMMAND
-            advance(mechanics, p, x[k + 1], before, late * t_s, every, s[k + 1])
-        if held >= 0:
-            every[held] = PAST_COMMAND
-            held = -1
-        if begun < pulses.shape[0] and pulses[begun] == k:
-            held = m + begun
-            every[held] = COMMAND
-            begun += 1
-        advance(mechanics, p, x[k + 1], u, (1.0 - late) * t_s, every, s[k + 1])
-        before = u
-        if broken < breaks.shape[0] and breaks[broken] == k:
-            x[k, 1] = 2.0 * places[broken, 1] - x[k + 1, 1]  # keeps the acceleration near the place
-            for i in range(2):
-                x[k + 1, i] = places[broken, i]
-                for j in range(s.shape[1]):
-                    s[k + 1, j, i] = 0.0
-                if s.shape[1] > count:
-                    s[k + 1, count + 2 * broken + i, i] = 1.0
-            broken += 1
 
 
 def delay_share(unknown: int, late: float) -> float:
@@ -253,19 +234,19 @@ def feedback(
 
 
 def fast_loop(periods: int) -> Callable[..., None]:
-    """Returns :func:`advance_periods`, compiled where that pays or has been done; equal results.
+    """Returns :func:`march`, compiled where that pays or has been done; equal results.
 
     Args:
         periods: how many are to be gone through.
     """
     if periods < WORTH_COMPILING and "numba" not in sys.modules:
-        return advance_periods
+        return march
     from emb_bench.compiled import compiled
 
     try:
-        return compiled(advance_periods)
+        return compiled(march)
     except UsageError:  # the base install
-        return advance_periods
+        return march
 
 
 def check_unknowns(params: Sequence[str]) -> None:

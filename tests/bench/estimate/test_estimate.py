@@ -13,7 +13,7 @@ from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import METHODS, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import fisher, uniform_prior
-from emb_bench.sim.open_loop import advance_periods, simulate, trajectory
+from emb_bench.sim.open_loop import held, march, simulate, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.errors import LogError, UsageError
 
@@ -389,6 +389,6 @@ def test_the_prediction_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
     chosen, s = no_sensitivity(("k_m", "delay"))
     p, currents = brake_of(bench, k_m=1.1), problem.records[0].currents
     mechanics = bench.plant("exact").mechanics
-    states, s = trajectory(advance_periods, mechanics, p, currents, 0.001, 0.25, chosen, rest(), s)
+    states, s = trajectory(march, mechanics, p, held(currents, 0.001, 0.25), chosen, rest(), s)
     assert said.states.tolist() == states[:, :2].tolist()
     assert said.sensitivities.tolist() == (s[1:, :, :2] / np.array([[1.0], [0.75]])).tolist()

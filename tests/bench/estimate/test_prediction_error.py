@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
-from emb_bench.estimate.innovations import GAIN, START, Filter, march_filtered
+from emb_bench.estimate.innovations import GAIN, START, Filter, FilterInput, Innovations, march_filtered
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import EstimationProblem, with_systematic
@@ -152,11 +152,7 @@ def test_the_filter_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
     gains = found.gains(z, weights)
     start = problem.opening(z, 0, (*START, "k_m", "x1_0"))
     plain, innovations, shares = np.zeros((120, 2, GAIN)), np.zeros((120, 2)), np.zeros((120, 2, 2))
-    march_filtered(
-        problem.plant.mechanics,
-        start.p,
-        start.x,
-        np.zeros((3, 3)),
+    given = FilterInput(
         currents,
         bench.timing.sample_time,
         0.0,
@@ -169,13 +165,10 @@ def test_the_filter_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
         1.0,
         WALK,
         0.0,
-        start.chosen,
-        start.s,
-        False,
-        plain,
-        innovations,
-        shares,
     )
+    results, covariance = Innovations(innovations, shares), np.zeros((3, 3))
+    moves = problem.plant.mechanics
+    march_filtered(moves, start.p, given, start.chosen, start.x, start.s, covariance, False, plain, results)
     assert plain.tolist() == gains[0].tolist()
     assert innovations.ravel().tolist() == found.jacobian(z, weights, gains)[0][:240].tolist()
 

@@ -59,7 +59,7 @@ def matrices(seed: int, n: int) -> Floats:
 def test_a_subset_is_judged_by_what_is_left_of_it_when_the_others_are_unknown_too(
     seed: int, n: int, data: st.DataObject
 ) -> None:
-    names = PARAMETERS[:n]
+    names = tuple(PARAMETERS)[:n]
     interest = data.draw(st.lists(st.sampled_from(names), min_size=1, max_size=n, unique=True))
     m = matrices(seed, n)
     rows = [names.index(name) for name in interest]
@@ -107,7 +107,7 @@ def test_a_singular_matrix_of_any_rank_has_the_worst_values_and_a_verdict_and_no
     s = np.zeros((9, 40))
     s[dead:] = rng.normal(size=(9 - dead, rank)) @ rng.normal(size=(rank, 40))
     s *= 10.0 ** rng.uniform(-3.0, 3.0, 9)[:, None]
-    names = PARAMETERS[:9]
+    names = tuple(PARAMETERS)[:9]
     found = criteria(s @ s.T, names)
     assert (found.log_det, found.trace_inverse, found.lambda_min, found.condition) == (
         -math.inf,
@@ -135,7 +135,7 @@ def test_flat_directions_without_a_parameter_in_common_are_not_mixed() -> None:
     rng = np.random.default_rng(8)
     s = rng.normal(size=(5, 30))
     s[1], s[4] = 2.0 * s[0], -s[3]
-    flat = criteria(s @ s.T, PARAMETERS[:5]).flat
+    flat = criteria(s @ s.T, tuple(PARAMETERS)[:5]).flat
     assert sorted(combination(direction) for direction in flat) == [
         "+0.707 f_v +0.707 J",
         "+0.894 k_m -0.447 k_1",
