@@ -15,7 +15,7 @@ the excitation wants.
 | multisine | equal harmonics with Schroeder's phases (IEEE Trans. Information Theory 16, 1970, p. 85) |
 | ramp, step | what the thesis tried first (4.4) |
 
-Everything here is numpy and plain Python and runs on the base install.
+All but prbs, which is scipy's, runs on the base install.
 """
 
 from __future__ import annotations
@@ -56,26 +56,7 @@ COMPARED = (
 SPEED_GAIN = 0.5
 """Share of a speed error that constant-speed removes per sample on the nominal brake; up to 2 would be stable."""
 
-TAPS: Mapping[int, tuple[int, ...]] = MappingProxyType(
-    {
-        2: (2, 1),
-        3: (3, 2),
-        4: (4, 3),
-        5: (5, 3),
-        6: (6, 5),
-        7: (7, 6),
-        8: (8, 6, 5, 4),
-        9: (9, 5),
-        10: (10, 7),
-        11: (11, 9),
-        12: (12, 6, 4, 1),
-        13: (13, 4, 3, 1),
-        14: (14, 5, 3, 1),
-        15: (15, 14),
-        16: (16, 15, 13, 4),
-    }
-)
-"""Exponents of a primitive polynomial over GF(2) by its degree (Xilinx XAPP 052, 1996, table 3): all give 2^n − 1."""
+LONGEST_REGISTER = 16  # Order of the longest binary sequence
 
 
 class Parameter(NamedTuple):
@@ -144,7 +125,7 @@ def excitation(name: str, bench: Bench, **parameters: float) -> Excitation:
         if given not in known:
             raise UsageError(f"{name}: no parameter '{given}'; expected some of {', '.join(known)}")
     values = {key: _checked(name, known[key], parameters.get(key, known[key].default)) for key in known}
-    built = _KINDS[name].build(bench, **values)
+    built = _SIGNALS[name](bench, **values)
     if not isinstance(built, np.ndarray):
         return Excitation(name, MappingProxyType(values), built, None)
     built.setflags(write=False)
@@ -157,9 +138,35 @@ def parameters_of(name: str, bench: Bench) -> tuple[Parameter, ...]:
     Raises:
         UsageError: the name is unknown.
     """
-    if name not in _KINDS:
-        raise UsageError(f"no excitation is called '{name}'; expected one of {', '.join(_KINDS)}")
-    return _KINDS[name].parameters(bench)
+    t_s, current, speed = bench.timing.sample_time, bench.limits.current, bench.limits.velocity
+    lasting, nyquist = bench.timing.horizon * t_s, 0.5 / t_s
+
+    def amplitude(share: float, name: str = "amplitude") -> Parameter:
+        return Parameter(name, "A", share * current, -current, current)
+
+    def frequency(name: str, default: float) -> Parameter:
+        return Parameter(name, "Hz", min(default, nyquist), 0.01 / lasting, nyquist)
+
+    def time(name: str, default: float, low: float) -> Parameter:
+        return Parameter(name, "s", max(default, low), low, max(100.0 * lasting, low))
+
+    table = {
+        "constant-speed": (Parameter("speed", "rad/s", speed, -speed, speed), time("turn", lasting, 0.0)),
+        "square": (amplitude(1.0), time("period", 0.020, 2.0 * t_s)),
+        "chirp": (amplitude(0.5), frequency("f0", 1.0), frequency("f1", 50.0)),
+        "prbs": (
+            amplitude(0.5),
+            time("hold", 0.008, t_s),
+            Parameter("order", "", 6, 2, LONGEST_REGISTER, whole=True),
+            Parameter("seed", "", 1, 1, 2**LONGEST_REGISTER - 1, whole=True),
+        ),
+        "multisine": (amplitude(0.5), frequency("f0", 1.0 / lasting), frequency("f1", 50.0)),
+        "ramp": (amplitude(0.5), amplitude(0.0, "start")),
+        "step": (amplitude(0.25), time("at", 0.0, 0.0)),
+    }
+    if name not in table:
+        raise UsageError(f"no excitation is called '{name}'; expected one of {', '.join(table)}")
+    return table[name]
 
 
 def parse_excitation(text: str, bench: Bench) -> Excitation:
@@ -245,32 +252,10 @@ def run_excitation(
     return Response(wanted, currents, reasons, states, bool(inside.all()), bool(home))
 
 
-def prbs_bits(order: int, seed: int) -> NDArray[np.int64]:
-    """One period of a maximum-length sequence of zeros and ones, shape (2^order − 1,).
-
-    Args:
-        order: length of the shift register, a key of ``TAPS``.
-        seed: its first content, 1..2^order − 1; another one is another point of the same cycle.
-    """
-    register, bits = seed, np.empty(2**order - 1, np.int64)
-    for i in range(len(bits)):
-        bits[i] = register & 1
-        fed = 0
-        for tap in TAPS[order]:  # the recurrence of the polynomial, whose bit `order` is the oldest
-            fed ^= register >> (order - tap)
-        register = (register >> 1) | ((fed & 1) << (order - 1))
-    return bits
-
-
 def schroeder_phases(count: int) -> Floats:
     """Phases of equally strong harmonics 1..count that make a low peak, −π j (j − 1) / count [rad]."""
     j = np.arange(1.0, count + 1.0)
     return -math.pi * j * (j - 1.0) / count
-
-
-class _Kind(NamedTuple):
-    parameters: Callable[[Bench], tuple[Parameter, ...]]
-    build: Callable[..., Floats | Law]
 
 
 def _checked(name: str, parameter: Parameter, value: float) -> float:
@@ -291,6 +276,10 @@ def _played(currents: Floats) -> Law:
     return lambda _angle, _velocity, k: sequence[k]
 
 
+def _lasting(bench: Bench) -> float:
+    return bench.timing.horizon * bench.timing.sample_time
+
+
 def _times(bench: Bench) -> Floats:
     """Begin of each period [s], shape (horizon,)."""
     times: Floats = bench.timing.sample_time * np.arange(bench.timing.horizon, dtype=np.float64)
@@ -305,62 +294,6 @@ def _elapsed(bench: Bench, seconds: float) -> NDArray[np.int64]:
 def _periods(bench: Bench, seconds: float) -> int:
     """The first period that begins at a time or after it."""
     return math.ceil(seconds / bench.timing.sample_time - 1e-9)
-
-
-# --- The parameters, with the defaults and ranges that a bench gives --------------------------------------------------
-
-
-def _amplitude(bench: Bench, share: float) -> Parameter:
-    limit = bench.limits.current
-    return Parameter("amplitude", "A", share * limit, -limit, limit)
-
-
-def _lasting(bench: Bench) -> float:
-    return bench.timing.horizon * bench.timing.sample_time
-
-
-def _frequency(bench: Bench, name: str, default: float) -> Parameter:
-    """Frequency parameter: from one cycle in 100 experiments up to the Nyquist frequency."""
-    nyquist = 0.5 / bench.timing.sample_time
-    return Parameter(name, "Hz", min(default, nyquist), 0.01 / _lasting(bench), nyquist)
-
-
-def _time(bench: Bench, name: str, default: float, low: float) -> Parameter:
-    return Parameter(name, "s", max(default, low), low, max(100.0 * _lasting(bench), low))
-
-
-def _speed_parameters(bench: Bench) -> tuple[Parameter, ...]:
-    limit = bench.limits.velocity
-    return (Parameter("speed", "rad/s", limit, -limit, limit), _time(bench, "turn", _lasting(bench), 0.0))
-
-
-def _square_parameters(bench: Bench) -> tuple[Parameter, ...]:
-    return (_amplitude(bench, 1.0), _time(bench, "period", 0.020, 2.0 * bench.timing.sample_time))
-
-
-def _chirp_parameters(bench: Bench) -> tuple[Parameter, ...]:
-    return (_amplitude(bench, 0.5), _frequency(bench, "f0", 1.0), _frequency(bench, "f1", 50.0))
-
-
-def _prbs_parameters(bench: Bench) -> tuple[Parameter, ...]:
-    orders = Parameter("order", "", 6, min(TAPS), max(TAPS), whole=True)
-    seeds = Parameter("seed", "", 1, 1, 2 ** max(TAPS) - 1, whole=True)
-    return (_amplitude(bench, 0.5), _time(bench, "hold", 0.008, bench.timing.sample_time), orders, seeds)
-
-
-def _multisine_parameters(bench: Bench) -> tuple[Parameter, ...]:
-    return (_amplitude(bench, 0.5), _frequency(bench, "f0", 1.0 / _lasting(bench)), _frequency(bench, "f1", 50.0))
-
-
-def _ramp_parameters(bench: Bench) -> tuple[Parameter, ...]:
-    return (_amplitude(bench, 0.5), _amplitude(bench, 0.0)._replace(name="start"))
-
-
-def _step_parameters(bench: Bench) -> tuple[Parameter, ...]:
-    return (_amplitude(bench, 0.25), _time(bench, "at", 0.0, 0.0))
-
-
-# --- The signals ------------------------------------------------------------------------------------------------------
 
 
 def _constant_speed(bench: Bench, speed: float, turn: float) -> Law:
@@ -389,9 +322,13 @@ def _chirp(bench: Bench, amplitude: float, f0: float, f1: float) -> Floats:
 
 
 def _prbs(bench: Bench, amplitude: float, hold: float, order: float, seed: float) -> Floats:
+    """Each bit of a sequence of maximum length, which repeats; another seed is another point of the same cycle."""
+    from scipy.signal import max_len_seq  # slow to import, and for this one only
+
     if seed > 2**order - 1:
         raise UsageError(f"prbs: seed: expected at most {2**order - 1:g} for order={order:g}, got {seed:g}")
-    bits = prbs_bits(int(order), int(seed))
+    register = [int(seed) >> i & 1 for i in range(int(order))]
+    bits, _ = max_len_seq(int(order), state=register)
     return np.where(bits[_elapsed(bench, hold) % len(bits)] == 1, amplitude, -amplitude)
 
 
@@ -416,16 +353,16 @@ def _step(bench: Bench, amplitude: float, at: float) -> Floats:
     return np.where(np.arange(bench.timing.horizon) >= _periods(bench, at), amplitude, 0.0)
 
 
-_KINDS: Mapping[str, _Kind] = MappingProxyType(
+_SIGNALS: Mapping[str, Callable[..., Floats | Law]] = MappingProxyType(
     {
-        "constant-speed": _Kind(_speed_parameters, _constant_speed),
-        "square": _Kind(_square_parameters, _square),
-        "chirp": _Kind(_chirp_parameters, _chirp),
-        "prbs": _Kind(_prbs_parameters, _prbs),
-        "multisine": _Kind(_multisine_parameters, _multisine),
-        "ramp": _Kind(_ramp_parameters, _ramp),
-        "step": _Kind(_step_parameters, _step),
+        "constant-speed": _constant_speed,
+        "square": _square,
+        "chirp": _chirp,
+        "prbs": _prbs,
+        "multisine": _multisine,
+        "ramp": _ramp,
+        "step": _step,
     }
 )
 
-EXCITATIONS: tuple[str, ...] = tuple(_KINDS)  # The names
+EXCITATIONS: tuple[str, ...] = tuple(_SIGNALS)  # The names
