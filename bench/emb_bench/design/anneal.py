@@ -15,17 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emb_bench.brake.euler import sign, step
-from emb_bench.brake.motion import SENSITIVE, STATES, Integers, advance
+from emb_bench.brake.euler import sign
+from emb_bench.brake.motion import STATES, advance
 from emb_bench.compiled import compiled
-from emb_bench.design.kernel import Box, excess, inform, is_stepped, rows
+from emb_bench.design.kernel import Task, excess, inform
 from emb_bench.design.problem import Problem
 from emb_bench.information.symmetric import Floats, Goal, packed_size, phi
-from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import Mechanics
 
-VARIATIONS = 28  # For each sample of a design, that one annealing simulates,
-VARIATIONS_STEPPED = 84  # where a period takes far less time (:func:`emb_bench.design.kernel.is_stepped`)
+VARIATIONS = 28  # For each sample of a design, that one annealing simulates
 TEMPERATURE = 2e-4  # Loss of φ that is taken at the start, on average; it falls to zero as a parabola
 SOFTNESS = 0.03
 """Of a criterion at the start, by which E's kinks are rounded; it falls to zero in the warmer half. Where the two
@@ -43,13 +40,13 @@ HIT = 1e-3  # Distance from a speed that counts as having reached it [rad/s]
 
 
 class Tracks(NamedTuple):
-    """Designs that were given by their speeds, and what they do; q is :func:`emb_bench.design.kernel.rows`."""
+    """Designs that were given by their speeds, and what they do."""
 
     speeds: Floats  # Reached at the ends of the periods, shape (count, n) [rad/s]
     u: Floats  # Currents, shape (count, n) [A]
     x: Floats  # States, shape (count, n + 1, STATES)
-    s: Floats  # Sensitivities, shape (count, n + 1, q, SENSITIVE)
-    m: Floats  # Packed FIM of the samples up to each, shape (count, n + 1, q (q + 1) / 2)
+    s: Floats  # Sensitivities, shape (count, n + 1, m, SENSITIVE)
+    m: Floats  # Packed FIM of the samples up to each, shape (count, n + 1, m (m + 1) / 2)
     price: Floats  # That of :func:`emb_bench.design.kernel.excess`, shape (count,)
 
 
@@ -63,167 +60,77 @@ def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floa
     """
     tracks = tracked(problem, np.tile(speeds, (2, 1)))  # the present one and its variation
     best: Floats = tracks.u[0].copy()
-    size = len(problem.params)
-    stepped = is_stepped(problem.plant.mechanics, problem.start[0])
-    count = (VARIATIONS_STEPPED if stepped else VARIATIONS) * len(speeds)
-    scratch = np.empty(packed_size(size)), np.empty((size, size))
-    compiled(anneal)(*_arguments(problem), problem.goal.compiled(size), count, rng, tracks, *scratch, best)
+    goal = problem.goal.compiled(len(problem.params))
+    compiled(anneal)(problem.task, goal, VARIATIONS * len(speeds), rng, tracks, best)
     return best
 
 
 def tracked(problem: Problem, speeds: Floats) -> Tracks:
     """Designs that reach speeds, shape (count, n) [rad/s], as far as the currents' limit lets them."""
-    chosen, start, _ = problem.start
+    start = problem.task.start
     count, n = speeds.shape
-    size = rows(problem.plant.mechanics, chosen)
-    s = np.zeros((count, n + 1, size, SENSITIVE))
-    s[:, 0, : len(chosen)] = start
-    m = np.zeros((count, n + 1, packed_size(size)))
+    s = np.zeros((count, n + 1, *start.shape))
+    s[:, 0] = start
+    m = np.zeros((count, n + 1, packed_size(len(start))))
     u, x = np.zeros((count, n)), np.zeros((count, n + 1, STATES))
     tracks = Tracks(speeds.copy(), u, x, s, m, np.zeros(count))
-    loop, arguments = compiled(track), _arguments(problem)
     for number in range(count):
-        loop(*arguments, number, tracks)
+        compiled(track)(problem.task, number, tracks)
     return tracks
 
 
-class _Arguments(NamedTuple):
-    """A problem, for compiled loops."""
-
-    mechanics: Mechanics
-    brake: BrakeParameters
-    box: Box
-    t_s: float
-    chosen: Integers
-    bias: Floats
-    w1: float
-    w2: float
-
-
-def _arguments(problem: Problem) -> _Arguments:
-    chosen, _, bias = problem.start
-    w1, w2 = problem.weights
-    return _Arguments(problem.plant.mechanics, problem.brake, problem.box, problem.sample_time, chosen, bias, w1, w2)
-
-
-def track(
-    mechanics: Mechanics,
-    p: BrakeParameters,
-    box: Box,
-    t_s: float,
-    chosen: Integers,
-    bias: Floats,
-    w1: float,
-    w2: float,
-    number: int,
-    tracks: Tracks,
-) -> None:
-    """Simulate a design.
-
-    Args:
-        mechanics: how the brake moves.
-        p: the brake.
-        box: what is kept; only the currents' limit for sure.
-        t_s: period [s].
-        chosen: indices in ``PARAMETERS``, shape (q,).
-        bias: what the encoder adds to each sensitivity of the angle, shape (q,).
-        w1: weight of the angle.
-        w2: weight of the velocity.
-        number: of the design, whose speeds are those that are wanted.
-        tracks: results.
-    """
+def track(task: Task, number: int, tracks: Tracks) -> None:
+    """Simulate the design of a number, whose speeds are those that are wanted."""
     u, x, s, m = tracks.u[number], tracks.x[number], tracks.s[number], tracks.m[number]
-    reach(mechanics, p, box, t_s, chosen, 0, tracks.speeds[number], u, x)
-    tracks.price[number] = excess(x, box)[0]
-    inform(mechanics, p, t_s, chosen, bias, w1, w2, 0, u, x, s, m)
+    reach(task, 0, tracks.speeds[number], u, x)
+    tracks.price[number] = excess(x, task.box)[0]
+    inform(task, 0, u, x, s, m)
 
 
-def reach(
-    mechanics: Mechanics,
-    p: BrakeParameters,
-    box: Box,
-    t_s: float,
-    chosen: Integers,
-    first: int,
-    speeds: Floats,
-    u: Floats,
-    x: Floats,
-) -> None:
+def reach(task: Task, first: int, speeds: Floats, u: Floats, x: Floats) -> None:
     """Find the currents for a design's speeds from a period on, and the speeds that they reach.
 
     Args:
-        mechanics: how the brake moves.
-        p: the brake.
-        box: of it, the currents' limit.
-        t_s: period [s].
-        chosen: indices in ``PARAMETERS``, shape (q,).
+        task: the brake; of the box, only the currents' limit is kept for sure.
         first: the period.
         speeds: wanted at the ends of the periods, and then reached, shape (n,) [rad/s].
         u: currents, a result, shape (n,) [A].
         x: states, a result but for those up to the start of the period, shape (n + 1, STATES).
     """
-    stepped = is_stepped(mechanics, chosen)
-    nothing, none = chosen[:0], np.zeros((0, SENSITIVE))
-    rate = p.J / (t_s * p.k_m)
-    x1, x2 = x[first, 0], x[first, 1]
+    p, most = task.brake, task.box.current
+    nothing, none = task.chosen[:0], task.start[:0]
+    rate = p.J / (task.t_s * p.k_m)
     for k in range(first, u.shape[0]):
+        x1, x2 = x[k, 0], x[k, 1]
         rubbing = x2 if x2 != 0.0 else speeds[k]
         torque = p.gamma * p.k_1 * max(x1, 0.0) + p.T_c * sign(rubbing) + p.f_v * x2
-        current = min(max(torque / p.k_m + rate * (speeds[k] - x2), -box.current), box.current)
-        if stepped:
+        current = min(max(torque / p.k_m + rate * (speeds[k] - x2), -most), most)
+        for _ in range(CORRECTIONS):
             u[k] = current
-            x1, x2 = step(p, x1, x2, current, t_s)
-            x[k + 1, 0], x[k + 1, 1] = x1, x2
-        else:
-            for _ in range(CORRECTIONS):
-                u[k], x[k + 1] = current, x[k]
-                advance(mechanics, p, x[k + 1], current, t_s, nothing, none)
-                x1, x2 = x[k + 1, 0], x[k + 1, 1]
-                missed = speeds[k] - x2
-                corrected = min(max(current + rate * missed, -box.current), box.current)
-                if abs(missed) < HIT or corrected == current:
-                    break
-                current = corrected
-        speeds[k] = x2
+            for i in range(STATES):
+                x[k + 1, i] = x[k, i]
+            advance(task.mechanics, p, x[k + 1], current, task.t_s, nothing, none)
+            missed = speeds[k] - x[k + 1, 1]
+            corrected = min(max(current + rate * missed, -most), most)
+            if abs(missed) < HIT or corrected == current:
+                break
+            current = corrected
+        speeds[k] = x[k + 1, 1]
 
 
-def anneal(
-    mechanics: Mechanics,
-    p: BrakeParameters,
-    box: Box,
-    t_s: float,
-    chosen: Integers,
-    bias: Floats,
-    w1: float,
-    w2: float,
-    goal: Goal,
-    count: int,
-    rng: np.random.Generator,
-    tracks: Tracks,
-    packed: Floats,
-    work: Floats,
-    best: Floats,
-) -> None:
+def anneal(task: Task, goal: Goal, count: int, rng: np.random.Generator, tracks: Tracks, best: Floats) -> None:
     """Vary a design again and again, and go on with the variation unless it is too much worse.
 
     Args:
-        mechanics: how the brake moves.
-        p: the brake.
-        box: what is kept; only the currents' limit for sure.
-        t_s: period [s].
-        chosen: indices in ``PARAMETERS``, shape (q,).
-        bias: what the encoder adds to each sensitivity of the angle, shape (q,).
-        w1: weight of the angle.
-        w2: weight of the velocity.
+        task: what is designed.
         goal: φ.
         count: variations.
         rng: random numbers.
         tracks: two designs, of which the first one is varied first; both change.
-        packed: scratch of :func:`emb_bench.information.symmetric.phi`.
-        work: scratch likewise.
         best: currents of the best design of the colder half, a result, shape (n,).
     """
-    n, rows = tracks.u.shape[1], tracks.s.shape[2]
+    box, n, rows = task.box, tracks.u.shape[1], tracks.s.shape[2]
+    packed, work = np.empty(tracks.m.shape[2]), np.empty((rows, rows))
     at, most = 0, -math.inf
     for number in range(count):
         to = 1 - at
@@ -232,15 +139,15 @@ def anneal(
         for _ in range(DRAWS):
             speeds[:] = tracks.speeds[at]
             first = vary(speeds, box.speed, rng)
-            if t_s * abs(speeds.sum()) <= box.home_angle + STRAY:
+            if task.t_s * abs(speeds.sum()) <= box.home_angle + STRAY:
                 break
         u[:first], x[: first + 1] = tracks.u[at, :first], tracks.x[at, : first + 1]
-        reach(mechanics, p, box, t_s, chosen, first, speeds, u, x)
+        reach(task, first, speeds, u, x)
         tracks.price[to] = excess(x, box)[0]
         if PRICE * (tracks.price[to] - tracks.price[at]) > HOPELESS:
             continue
         s[first], m[first] = tracks.s[at, first], tracks.m[at, first]
-        inform(mechanics, p, t_s, chosen, bias, w1, w2, first, u, x, s, m)
+        inform(task, first, u, x, s, m)
         left = 1.0 - number / count
         softness = max(0.0, 2.0 * left - 1.0) * SOFTNESS
         now = phi(goal, tracks.m[at, n], rows, softness, packed, work) - PRICE * tracks.price[at]

@@ -12,12 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emb_bench.brake.euler import sensitivity_step, sign, step
+from emb_bench.brake.euler import sign
 from emb_bench.brake.motion import SENSITIVE, STATES, Integers, advance
-from emb_bench.brake.parameters import DELAY, PAST_COMMAND
-from emb_bench.information.symmetric import Floats, add_increment, information, packed_index, packed_size
+from emb_bench.information.symmetric import Floats, add_increment
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import EULER, Mechanics
+from emb_runtime.config.plants import Mechanics
 
 STATE_STEP = 1e-5
 """Half width of the differences in state and current [rad, rad/s, 1, A]: the maps are smooth, of order 1."""
@@ -28,7 +27,6 @@ SPEED_PRICE = 0.02
 """Price of 1 rad/s beyond the speed limit for one sample, where 1 rad beyond an angle, and 1 rad or 1 rad/s at the
 end, cost 1. More than it brings: the speed limit brings some 1e-4 per sample and rad/s, in the logarithm of a
 criterion, and home 0.1 per rad."""
-FEW = 4  # Unknowns at most, for which the Euler brake's sensitivities are computed in loops of fixed length
 ARRIVED = 0.02  # Distance from the end of a journey that counts as having arrived [rad]
 ARRIVAL = 4.0  # Periods that a coarse return home keeps in hand; the polish takes them back
 
@@ -42,6 +40,20 @@ class Box(NamedTuple):
     speed: float  # Largest speed, both signs [rad/s]
     home_angle: float  # Largest |angle| at the end [rad]; inf without a return
     home_velocity: float  # Largest |velocity| at the end [rad/s]; inf without a return
+
+
+class Task(NamedTuple):
+    """What is designed, for compiled loops: a brake, the m unknowns, and limits."""
+
+    mechanics: Mechanics
+    brake: BrakeParameters
+    box: Box
+    t_s: float  # Period [s]
+    chosen: Integers  # Indices of the unknowns in ``PARAMETERS``, shape (m,)
+    start: Floats  # Their sensitivities at the start, shape (m, SENSITIVE)
+    bias: Floats  # What the encoder adds to each sensitivity of the angle, shape (m,)
+    w1: float  # Weight of the angle
+    w2: float  # Weight of the velocity
 
 
 def excess(x: Floats, box: Box) -> tuple[float, float]:
@@ -61,166 +73,49 @@ def excess(x: Floats, box: Box) -> tuple[float, float]:
     return total + angle + speed, max(worst, angle, speed)
 
 
-def is_stepped(mechanics: Mechanics, chosen: Integers) -> bool:
-    """Returns True if a period is one step of the Euler brake and of the sensitivities of few unknowns, and no more."""
-    return mechanics.solver == EULER and chosen.shape[0] <= FEW and not (chosen == DELAY).any()
-
-
-def rows(mechanics: Mechanics, chosen: Integers) -> int:
-    """Number of sensitivities that :func:`inform` computes; those beyond the unknowns are zero."""
-    return FEW if is_stepped(mechanics, chosen) else chosen.shape[0]
-
-
-def inform(
-    mechanics: Mechanics,
-    p: BrakeParameters,
-    t_s: float,
-    chosen: Integers,
-    bias: Floats,
-    w1: float,
-    w2: float,
-    first: int,
-    u: Floats,
-    x: Floats,
-    s: Floats,
-    m: Floats,
-) -> None:
+def inform(task: Task, first: int, u: Floats, x: Floats, s: Floats, m: Floats) -> None:
     """Sensitivities and information of a motion from a period on.
 
     Args:
-        mechanics: how the brake moves.
-        p: the brake.
-        t_s: period [s].
-        chosen: indices in ``PARAMETERS``.
-        bias: what the encoder adds to each sensitivity of the angle, of the length of ``chosen``.
-        w1: weight of the angle.
-        w2: weight of the velocity.
+        task: brake and unknowns.
         first: the period.
         u: currents, shape (n,).
         x: states, shape (n + 1, STATES).
-        s: sensitivities, a result but for those up to the start of the period, shape (n + 1, q, SENSITIVE), where q is
-            :func:`rows`.
-        m: packed FIM of the samples up to each, likewise, shape (n + 1, q (q + 1) / 2).
+        s: sensitivities, a result but for those up to the start of the period, shape (n + 1, m, SENSITIVE).
+        m: packed FIM of the samples up to each, likewise, shape (n + 1, m (m + 1) / 2).
     """
-    if is_stepped(mechanics, chosen):
-        inform_stepped(p, t_s, chosen, bias, w1, w2, first, u, x, s, m)
-        return
-    y, trial = np.zeros((chosen.shape[0], 2)), np.zeros(STATES)
+    size = task.chosen.shape[0]
+    y, trial = np.zeros((size, 2)), np.zeros(STATES)
     for k in range(first, u.shape[0]):
-        trial[:] = x[k]
-        s[k + 1], m[k + 1] = s[k], m[k]
-        advance(mechanics, p, trial, u[k], t_s, chosen, s[k + 1])
-        for i in range(chosen.shape[0]):
-            y[i, 0], y[i, 1] = s[k + 1, i, 0] + bias[i], s[k + 1, i, 1]
-        add_increment(m[k + 1], y, w1, w2)
+        for i in range(STATES):
+            trial[i] = x[k, i]
+        for i in range(size):
+            for j in range(SENSITIVE):
+                s[k + 1, i, j] = s[k, i, j]
+        for i in range(m.shape[1]):
+            m[k + 1, i] = m[k, i]
+        advance(task.mechanics, task.brake, trial, u[k], task.t_s, task.chosen, s[k + 1])
+        for i in range(size):
+            y[i, 0], y[i, 1] = s[k + 1, i, 0] + task.bias[i], s[k + 1, i, 1]
+        add_increment(m[k + 1], y, task.w1, task.w2)
 
 
-def inform_stepped(
-    p: BrakeParameters,
-    t_s: float,
-    chosen: Integers,
-    bias: Floats,
-    w1: float,
-    w2: float,
-    first: int,
-    u: Floats,
-    x: Floats,
-    s: Floats,
-    m: Floats,
-) -> None:
-    """As :func:`inform`, of the Euler brake: without loops over the unknowns, whose numbers then stay in registers.
-
-    The velocity's sensitivity after a step is linear in both before it, in the current, the angle and the number 1 in
-    contact, and in the velocity and its sign. The coefficients are what ``sensitivity_step`` makes of ones and zeros.
-    """
-    of, offset = np.zeros((FEW, 5)), np.zeros(FEW)
-    for i in range(chosen.shape[0]):
-        c = chosen[i]
-        of[i, 0] = sensitivity_step(p, -1.0, 0.0, 1.0, t_s, 0.0, 0.0, c)[1]
-        of[i, 1] = sensitivity_step(p, 0.0, 0.0, 0.0, t_s, 0.0, 0.0, c)[1]
-        of[i, 2] = sensitivity_step(p, 1.0, 0.0, 0.0, t_s, 0.0, 0.0, c)[1] - of[i, 1]
-        of[i, 3] = sensitivity_step(p, -1.0, 2.0, 0.0, t_s, 0.0, 0.0, c)[1]
-        of[i, 4] = sensitivity_step(p, -1.0, 1.0, 0.0, t_s, 0.0, 0.0, c)[1]
-        of[i, 3] -= of[i, 4]
-        of[i, 4] -= of[i, 3]
-        offset[i] = bias[i]
-    kept = sensitivity_step(p, -1.0, 0.0, 0.0, t_s, 0.0, 1.0, PAST_COMMAND)[1]
-    pulled = sensitivity_step(p, 0.0, 0.0, 0.0, t_s, 1.0, 0.0, PAST_COMMAND)[1]
-    f0, f1, f2, f3 = five(of[0]), five(of[1]), five(of[2]), five(of[3])
-    o0, o1, o2, o3 = offset[0], offset[1], offset[2], offset[3]
-    a0, a1, a2, a3 = s[first, 0, 0], s[first, 1, 0], s[first, 2, 0], s[first, 3, 0]
-    b0, b1, b2, b3 = s[first, 0, 1], s[first, 1, 1], s[first, 2, 1], s[first, 3, 1]
-    m00, m01, m02, m03, m11 = five(m[first])
-    m12, m13, m22, m23, m33 = five(m[first, 5:])
-    for k in range(first, u.shape[0]):
-        x1, x2 = x[k, 0], x[k, 1]
-        touching = 1.0 if x1 >= 0.0 else 0.0
-        by, back = (u[k], touching, touching * x1, x2, sign(x2)), touching * pulled
-        a0, b0 = a0 + t_s * b0, kept * b0 + back * a0 + dot5(f0, by)
-        a1, b1 = a1 + t_s * b1, kept * b1 + back * a1 + dot5(f1, by)
-        a2, b2 = a2 + t_s * b2, kept * b2 + back * a2 + dot5(f2, by)
-        a3, b3 = a3 + t_s * b3, kept * b3 + back * a3 + dot5(f3, by)
-        s[k + 1, 0, 0], s[k + 1, 1, 0], s[k + 1, 2, 0], s[k + 1, 3, 0] = a0, a1, a2, a3
-        s[k + 1, 0, 1], s[k + 1, 1, 1], s[k + 1, 2, 1], s[k + 1, 3, 1] = b0, b1, b2, b3
-        y0, y1, y2, y3 = a0 + o0, a1 + o1, a2 + o2, a3 + o3
-        m00 += information(y0, b0, y0, b0, w1, w2)
-        m01 += information(y0, b0, y1, b1, w1, w2)
-        m02 += information(y0, b0, y2, b2, w1, w2)
-        m03 += information(y0, b0, y3, b3, w1, w2)
-        m11 += information(y1, b1, y1, b1, w1, w2)
-        m12 += information(y1, b1, y2, b2, w1, w2)
-        m13 += information(y1, b1, y3, b3, w1, w2)
-        m22 += information(y2, b2, y2, b2, w1, w2)
-        m23 += information(y2, b2, y3, b3, w1, w2)
-        m33 += information(y3, b3, y3, b3, w1, w2)
-        m[k + 1, 0], m[k + 1, 1], m[k + 1, 2], m[k + 1, 3], m[k + 1, 4] = m00, m01, m02, m03, m11
-        m[k + 1, 5], m[k + 1, 6], m[k + 1, 7], m[k + 1, 8], m[k + 1, 9] = m12, m13, m22, m23, m33
-
-
-Five = tuple[float, float, float, float, float]
-
-
-def five(v: Floats) -> Five:
-    """The first five numbers."""
-    return v[0], v[1], v[2], v[3], v[4]
-
-
-def dot5(a: Five, b: Five) -> float:
-    """Their dot product."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4]
-
-
-def linearise(
-    mechanics: Mechanics,
-    p: BrakeParameters,
-    u: Floats,
-    t_s: float,
-    chosen: Integers,
-    x: Floats,
-    s: Floats,
-    work_x: Floats,
-    work_s: Floats,
-    jacobian: Floats,
-) -> None:
+def linearise(task: Task, u: Floats, x: Floats, s: Floats, jacobian: Floats) -> None:
     """Derivatives of every period's map (z, u) → z by central differences.
 
     The map is linear in the sensitivities, and each row of them moves as the brake's state does: their derivatives are
     differences over a unit step, of one row for all.
 
     Args:
-        mechanics: how the brake moves.
-        p: the brake.
+        task: brake and unknowns.
         u: currents, shape (n,).
-        t_s: period [s].
-        chosen: indices in ``PARAMETERS``, shape (m,).
         x: states, shape (n + 1, STATES).
         s: sensitivities, shape (n + 1, m, SENSITIVE).
-        work_x: scratch, shape (2, STATES).
-        work_s: scratch, shape (2, m, SENSITIVE).
         jacobian: the result, shape (n, Z, Z + 1); its last column is the current's.
     """
-    m = chosen.shape[0]
+    m = task.chosen.shape[0]
     size = STATES + SENSITIVE * m
+    work_x, work_s = np.empty((2, STATES)), np.empty((2, m, SENSITIVE))
     jacobian[:] = 0.0
     for k in range(u.shape[0]):
         for column in range(STATES + SENSITIVE + 1):
@@ -236,7 +131,7 @@ def linearise(
                 elif not of_current:
                     work_s[side, 0, column - STATES] += shift
                 current = u[k] + shift if of_current else u[k]
-                advance(mechanics, p, work_x[side], current, t_s, chosen, work_s[side])
+                advance(task.mechanics, task.brake, work_x[side], current, task.t_s, task.chosen, work_s[side])
             if of_state or of_current:
                 to = column if of_state else size
                 for row in range(STATES):
@@ -258,21 +153,18 @@ def aside(value: float) -> float:
     return ASIDE if value >= 0.0 else -ASIDE
 
 
-def gradients(jacobian: Floats, s: Floats, bias: Floats, w1: float, w2: float, adjoint: Floats, result: Floats) -> None:
+def gradients(task: Task, jacobian: Floats, s: Floats, result: Floats) -> None:
     """Derivatives of every element of the FIM with respect to every current, by one adjoint sweep.
 
     Args:
+        task: unknowns and weights.
         jacobian: of :func:`linearise`, shape (n, Z, Z + 1).
         s: sensitivities, shape (n + 1, m, SENSITIVE).
-        bias: what the encoder adds to each sensitivity of the angle, shape (m,).
-        w1: weight of the angle.
-        w2: weight of the velocity.
-        adjoint: scratch, shape (2, Z), zero where it is not known.
         result: shape (m (m + 1) / 2, n), packed elements by currents.
     """
+    w1, w2, bias = task.w1, task.w2, task.bias
     n, size = jacobian.shape[0], jacobian.shape[1]
-    m = s.shape[1]
-    element = 0
+    m, element, adjoint = s.shape[1], 0, np.zeros((2, size))
     for i in range(m):
         for j in range(i, m):
             adjoint[0] = 0.0
@@ -294,21 +186,7 @@ def gradients(jacobian: Floats, s: Floats, bias: Floats, w1: float, w2: float, a
             element += 1
 
 
-def explore(
-    mechanics: Mechanics,
-    p: BrakeParameters,
-    box: Box,
-    t_s: float,
-    genes: Floats,
-    chosen: Integers,
-    start_s: Floats,
-    bias: Floats,
-    w1: float,
-    w2: float,
-    u: Floats,
-    m: Floats,
-    price: Floats,
-) -> None:
+def explore(task: Task, genes: Floats, u: Floats, m: Floats, price: Floats) -> None:
     """Simulate a population of coarse designs: journeys, driven by a deadbeat loop within the box.
 
     A journey is the fastest way to an angle, and a speed from there on. Where a brake waits, and on which side of
@@ -316,28 +194,19 @@ def explore(
     gives only speeds has it as the small difference of long ways.
 
     Args:
-        mechanics: how the brake moves.
-        p: the brake.
-        box: what is kept, but for what the loop's simple laws miss.
-        t_s: period [s].
+        task: brake, unknowns, and the box, which is kept but for what the loop's simple laws miss.
         genes: shape (count, 3 g): the angles −1..1 of g journeys, of which the cube is the share of the angle's limit
             on that side; the speeds −1..1 thereafter, of which it is the share of the largest; their lengths in any
             unit.
-        chosen: indices in ``PARAMETERS``, shape (q,).
-        start_s: sensitivities at the start, shape (q, SENSITIVE).
-        bias: what the encoder adds to each sensitivity of the angle, shape (q,).
-        w1: weight of the angle.
-        w2: weight of the velocity.
         u: currents, a result, shape (count, n).
-        m: packed FIM, a result, shape (count, q (q + 1) / 2).
+        m: packed FIM, a result, shape (count, m (m + 1) / 2).
         price: a result, that of :func:`excess`, shape (count,).
     """
-    n, q = u.shape[1], chosen.shape[0]
-    journeys, stepped, size = genes.shape[1] // 3, is_stepped(mechanics, chosen), rows(mechanics, chosen)
-    nothing, none = chosen[:0], start_s[:0]
-    x, s = np.zeros((n + 1, STATES)), np.zeros((n + 1, size, SENSITIVE))
-    total = np.zeros((n + 1, packed_size(size)))
-    s[0, :q] = start_s
+    p, box, t_s, n = task.brake, task.box, task.t_s, u.shape[1]
+    journeys, nothing, none = genes.shape[1] // 3, task.chosen[:0], task.start[:0]
+    x, s = np.zeros((n + 1, STATES)), np.zeros((n + 1, task.chosen.shape[0], SENSITIVE))
+    total = np.zeros((n + 1, m.shape[1]))
+    s[0] = task.start
     for e in range(genes.shape[0]):
         whole = 0.0
         for g in range(journeys):
@@ -359,16 +228,11 @@ def explore(
             if toward != 0.0:
                 wanted = sign(left) * min(allowed(abs(left), deceleration(p, box), t_s), abs(left) / t_s, box.speed)
             u[e, k] = follow(p, box, t_s, x[k, 0], x[k, 1], wanted, n - k)
-            if stepped:
-                x[k + 1, 0], x[k + 1, 1] = step(p, x[k, 0], x[k, 1], u[e, k], t_s)
-            else:
-                x[k + 1] = x[k]
-                advance(mechanics, p, x[k + 1], u[e, k], t_s, nothing, none)
-        inform(mechanics, p, t_s, chosen, bias, w1, w2, 0, u[e], x, s, total)
-        price[e] = excess(x, box)[0]
-        for i in range(q):
-            for j in range(i, q):
-                m[e, packed_index(q, i, j)] = total[n, packed_index(size, i, j)]
+            for i in range(STATES):
+                x[k + 1, i] = x[k, i]
+            advance(task.mechanics, p, x[k + 1], u[e, k], t_s, nothing, none)
+        inform(task, 0, u[e], x, s, total)
+        price[e], m[e] = excess(x, box)[0], total[n]
 
 
 def deceleration(p: BrakeParameters, box: Box) -> float:

@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from emb_bench.brake.motion import SENSITIVE, STATES, Floats, no_sensitivity, rest
+from emb_bench.brake.motion import STATES, Floats, no_sensitivity, rest
 from emb_bench.brake.parameters import OFFSET, PARAMETERS
 from emb_bench.compiled import compiled
 from emb_bench.design import kernel
-from emb_bench.design.kernel import Box
+from emb_bench.design.kernel import Box, Task
 from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import Kind, Weights, weights_of
 from emb_bench.information.symmetric import packed_size, unpack
@@ -40,10 +40,11 @@ class Problem:
     horizon: int  # Periods
 
     @cached_property
-    def start(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats]:
-        """Indices of the unknowns, their sensitivities at the start, and what the encoder adds to each."""
-        chosen, s = no_sensitivity(self.params)
-        return chosen, s, (chosen == OFFSET).astype(np.float64)
+    def task(self) -> Task:
+        """The problem for compiled loops."""
+        chosen, start = no_sensitivity(self.params)
+        bias = (chosen == OFFSET).astype(np.float64)
+        return Task(self.plant.mechanics, self.brake, self.box, self.sample_time, chosen, start, bias, *self.weights)
 
     def narrowed(self, angle: float, speed: float) -> Problem:
         """Returns the problem with limits tighter by an angle [rad] and a speed [rad/s]."""
@@ -53,13 +54,13 @@ class Problem:
 
     def design(self, currents: Floats) -> Design:
         """Simulate a sequence of currents."""
-        chosen, start, bias = self.start
+        task = self.task
         acting = held(currents, self.sample_time)
-        x, s = trajectory(compiled(march), self.plant.mechanics, self.brake, acting, chosen, rest(), start)
+        x, s = trajectory(compiled(march), task.mechanics, task.brake, acting, task.chosen, rest(), task.start)
         y = s[1:, :, :2].copy()
-        y[:, :, 0] += bias
+        y[:, :, 0] += task.bias
         root = np.sqrt(self.weights)
-        scaled = (y * root).transpose(1, 0, 2).reshape(len(chosen), -1)
+        scaled = (y * root).transpose(1, 0, 2).reshape(len(task.chosen), -1)
         price, worst = compiled(kernel.excess)(x, self.box)
         matrix = scaled @ scaled.T
         phi = float(self.goal.phi(matrix)) if np.isfinite(matrix).all() else -np.inf
@@ -79,56 +80,23 @@ class Problem:
 
     def jacobian(self, design: Design) -> Floats:
         """Derivatives of each period's map of state and sensitivities, shape (n, Z, Z + 1)."""
-        chosen, start, _ = self.start
-        size = STATES + start.size
+        size = STATES + self.task.start.size
         jacobian = np.empty((len(design.currents), size, size + 1))
-        compiled(kernel.linearise)(
-            self.plant.mechanics,
-            self.brake,
-            design.currents,
-            self.sample_time,
-            chosen,
-            design.states,
-            design.sensitivities,
-            np.empty((2, STATES)),
-            np.empty((2, *start.shape)),
-            jacobian,
-        )
+        compiled(kernel.linearise)(self.task, design.currents, design.states, design.sensitivities, jacobian)
         return jacobian
 
     def gradients(self, design: Design, jacobian: Floats) -> Floats:
         """Derivatives of the FIM with respect to the currents, shape (n, p, p)."""
         size = len(self.params)
         result = np.empty((packed_size(size), len(design.currents)))
-        compiled(kernel.gradients)(
-            jacobian,
-            design.sensitivities,
-            self.start[2],
-            *self.weights,
-            np.zeros((2, STATES + SENSITIVE * size)),
-            result,
-        )
+        compiled(kernel.gradients)(self.task, jacobian, design.sensitivities, result)
         return unpack(result.T, size)
 
     def explore(self, genes: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Coarse designs: currents (count, n), FIM (count, p, p), φ (count,), price of leaving the box (count,)."""
-        chosen, start, bias = self.start
-        count, size = len(genes), len(chosen)
+        count, size = len(genes), len(self.params)
         u, m, price = np.empty((count, self.horizon)), np.empty((count, packed_size(size))), np.empty(count)
-        compiled(kernel.explore)(
-            self.plant.mechanics,
-            self.brake,
-            self.box,
-            self.sample_time,
-            genes,
-            chosen,
-            start,
-            bias,
-            *self.weights,
-            u,
-            m,
-            price,
-        )
+        compiled(kernel.explore)(self.task, genes, u, m, price)
         matrices = unpack(m, size)
         return u, matrices, self.goal.phi(matrices), price
 

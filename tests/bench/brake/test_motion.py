@@ -95,5 +95,5 @@ def test_at_the_start_only_the_initial_state_is_sensitive_to_itself() -> None:
     assert rest().shape == (STATES,)
     assert s.shape == (3, SENSITIVE)
     assert_array_equal(s, [[0, 1, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0]])
-    with pytest.raises(ValueError, match="not in tuple"):
+    with pytest.raises(ValueError, match="no_such_thing"):
         no_sensitivity(("no_such_thing",))

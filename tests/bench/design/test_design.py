@@ -239,9 +239,8 @@ def test_an_annealing_tells_of_its_designs_what_their_currents_are_worth(model: 
     told = 0
     for seed in range(40):
         tracks, best = tracked(p, np.zeros((2, 60))), np.empty(60)
-        scratch = np.empty(10), np.empty((4, 4))
         rng = np.random.default_rng(seed)
-        anneal.anneal(*anneal._arguments(p), p.goal.compiled(4), 20, rng, tracks, *scratch, best)
+        anneal.anneal(p.task, p.goal.compiled(4), 20, rng, tracks, best)
         designs = [p.design(u) for u in tracks.u]
         for design, x, price in zip(designs, tracks.x, tracks.price, strict=True):
             np.testing.assert_array_equal(design.states[:, :2], x[:, :2])
