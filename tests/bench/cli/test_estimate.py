@@ -146,9 +146,9 @@ def test_a_prior_is_named_and_counts(path: Path, replay: Replay) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--params", "mass"], "'mass' is not estimated; expected some of k_m"),
+        (["--params", "mass"], "'mass' is no parameter"),
         (["--params", ""], "at least one parameter"),
-        (["--nuisance", "stribeck_exponent"], "'stribeck_exponent' is not estimated"),
+        (["--nuisance", "stribeck_exponent"], "'stribeck_exponent' is no parameter"),
         (["--bounds", "k_m"], "expected name=value"),
         (["--bounds", "k_m=0.01"], "--bounds: k_m: expected two numbers as in 0.01:0.1, got '0.01'"),
         (["--bounds", "k_m=0.1:0.01"], "bounds of k_m: expected two finite numbers, the lower first"),

@@ -361,7 +361,7 @@ def test_a_wrong_argument_is_one_line(folder: Path, good: Path, replay: Replay) 
     assert "expected a name that ends in .html or .htm" in replay.refused("report", good, "-o", folder / "x.mcap")
     assert "No such file" in replay.refused("report", good, folder / "absent.mcap", "-o", page)
     assert "no plant is called 'rubber'" in replay.refused("report", good, "--model", "rubber", "-o", page)
-    assert "'mass' is not estimated" in replay.refused("report", good, "--params", "mass", "-o", page)
+    assert "'mass' is no parameter" in replay.refused("report", good, "--params", "mass", "-o", page)
     assert not page.exists()
 
 
