@@ -43,7 +43,7 @@ class Box(NamedTuple):
 
 
 class Task(NamedTuple):
-    """What is designed, for compiled loops: a brake, the m unknowns, and limits."""
+    """A design problem for compiled loops: a brake, the m unknowns, and limits."""
 
     mechanics: Mechanics
     brake: BrakeParameters

@@ -197,7 +197,7 @@ class Followed:
 
 
 class FilterInput(NamedTuple):
-    """What a filter takes of a record of n samples and of the instruments."""
+    """Record of n samples and instruments, as a filter takes them."""
 
     currents: Floats  # [A], shape (n,)
     t_s: float  # Period [s]

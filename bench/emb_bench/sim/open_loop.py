@@ -74,7 +74,7 @@ def simulate(
 
 
 class Input(NamedTuple):
-    """What acts on a brake in n periods, and where it is put after periods of which that is not known."""
+    """Currents of n periods, and places where the brake is put after periods without a report."""
 
     currents: Floats  # [A], shape (n,)
     t_s: float  # Period [s]
