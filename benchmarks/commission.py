@@ -109,7 +109,8 @@ def sheet_text(plant: str, generator: np.random.Generator, polled: bool = False)
 def put_outside(number: int, drawn: dict[str, float], sheet: Bench) -> str:
     """Put one parameter of a brake 1 to 10 % outside of the data sheet's range; its name."""
     generator = np.random.default_rng([25, number])
-    name, share = PARAMETER_NAMES[number % len(PARAMETER_NAMES)], float(generator.uniform(0.01, 0.1))
+    name: str = PARAMETER_NAMES[number % len(PARAMETER_NAMES)]
+    share = float(generator.uniform(0.01, 0.1))
     ends = sheet.range_set("sheet")
     below = bool(generator.integers(2))
     drawn[name] = getattr(ends.low, name) * (1.0 - share) if below else getattr(ends.high, name) * (1.0 + share)

@@ -60,7 +60,7 @@ def bench_of(case: Case) -> Bench:
     if case.quiet:
         bench = replace(bench, noise=Noise(angle=1e-7, velocity=1e-3))
     model_error, current_error = case.errors
-    return replace(bench, shield=replace(bench.shield, model_error=model_error, current_error=current_error))
+    return replace(bench, shield=bench.shield._replace(model_error=model_error, current_error=current_error))
 
 
 Counts = dict[str, Any]

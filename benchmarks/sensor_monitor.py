@@ -369,7 +369,7 @@ WEIGHT = {"euler": 4, "exact": 2}  # Shares of the experiments; one for the othe
 
 def covered(bench: Bench, plant: str) -> Bench:
     """The bench with a shield that covers a plant."""
-    return replace(bench, shield=replace(bench.shield, **COVERED[plant]))
+    return replace(bench, shield=bench.shield._replace(**COVERED[plant]))
 
 
 def tail(values: Floats, rate: float = 1e-6) -> float:

@@ -80,7 +80,7 @@ def bench_for(ranges: str = "envelope", **declared: Any) -> Bench:
     return replace(
         bench,
         ranges={**bench.ranges, "known": known},
-        shield=replace(bench.shield, ranges=ranges, **declared),
+        shield=bench.shield._replace(ranges=ranges, **declared),
     )
 
 

@@ -241,7 +241,7 @@ def setting_for(
         jitter: of the instant of a measurement, both ways [s].
         shaken: the declared errors of model and current act; else only what the plant has beyond the model.
     """
-    declared = replace(bench, shield=replace(bench.shield, learn=True, model="flow" if flow else "euler"))
+    declared = replace(bench, shield=bench.shield._replace(learn=True, model="flow" if flow else "euler"))
     law = make_law(declared)
     learning = Learning(True, shield_config(declared), bench.brake, assumptions_of(declared))
     true = bench.plant(plant or ("exact" if flow else "euler"))

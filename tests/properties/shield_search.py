@@ -53,7 +53,7 @@ COASTING: dict[str, Any] = {"envelope": "coasting", "angle_margin": 1.1}
 def bench_with(**declared: Any) -> Bench:
     """The shipped bench with other settings of its shield."""
     bench = load_bench()
-    return replace(bench, shield=replace(bench.shield, **declared))
+    return replace(bench, shield=bench.shield._replace(**declared))
 
 
 # --- What is wanted: (episodes, samples) in shares of the current limit -------------------------------------------

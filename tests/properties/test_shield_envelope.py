@@ -115,7 +115,7 @@ def other_bench(rng: np.random.Generator) -> Bench:
             float(rng.uniform(2.0, 6.0)), (-float(reach[0]), float(reach[1])), float(rng.uniform(60.0, 500.0))
         ),
         noise=Noise(float(rng.uniform(1e-4, 3e-3)), float(rng.uniform(0.2, 2.0))),
-        shield=replace(SHIPPED.shield, angle_margin=float(rng.uniform(0.1, 0.5))),
+        shield=SHIPPED.shield._replace(angle_margin=float(rng.uniform(0.1, 0.5))),
         node=replace(SHIPPED.node, damping_velocity=float(rng.uniform(50.0, 200.0))),
     )
 

@@ -39,7 +39,7 @@ def test_a_learner_with_a_pad_left_out_is_found_to_be_unsound(name: str) -> None
 
 
 def test_an_error_of_the_model_that_is_declared_is_one_that_the_brake_may_have() -> None:
-    declared = replace(BENCH, shield=replace(BENCH.shield, model_error=200.0, current_error=0.1))
+    declared = replace(BENCH, shield=BENCH.shield._replace(model_error=200.0, current_error=0.1))
     found = search(setting_for(declared, flow=True), declared, 500, seed=11)
     assert not (found.outside | found.falsified | found.violated).any()
     undeclared = search(setting_for(declared, flow=True), declared, 1, seed=11)

@@ -31,7 +31,7 @@ def law_with(**changed: Any) -> Case:
 
 
 def declared(**keys: Any) -> Case:
-    return case_of(replace(SHIPPED.bench, shield=replace(SHIPPED.bench.shield, learn=True, **keys)))
+    return case_of(replace(SHIPPED.bench, shield=SHIPPED.bench.shield._replace(learn=True, **keys)))
 
 
 @pytest.mark.parametrize("key", [key for key in LEMMAS if key not in SLOW])

@@ -45,7 +45,7 @@ def refused(key: str, case: Case = SHIPPED) -> str:
 
 
 def declared(**keys: Any) -> Case:
-    return case_of(replace(SHIPPED.bench, shield=replace(SHIPPED.bench.shield, **keys)))
+    return case_of(replace(SHIPPED.bench, shield=SHIPPED.bench.shield._replace(**keys)))
 
 
 # --- What is proved --------------------------------------------------------------------------------------------------

@@ -8,52 +8,69 @@ refuses it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, Literal, get_args
 
+from msgspec import Meta
+
+from emb_runtime.config.typed import FieldError, NotNegative
 from emb_runtime.config.units import ANGLE, CURRENT, FORCE, LENGTH, TORQUE
 from emb_runtime.config.validation import Table
 
-PARAMETERS = ("k_m", "k_1", "T_c", "f_v", "J", "coulomb_asymmetry", "viscous_asymmetry")
-"""Parameters of a machine that can be of interest."""
-BETWEEN = ("held", "open")  # Knowledge of the course of a command between its stamps
+Parameter = Literal["k_m", "k_1", "T_c", "f_v", "J", "coulomb_asymmetry", "viscous_asymmetry"]
+PARAMETERS = get_args(Parameter)  # Parameters of a machine that can be of interest
 WINDOWS = (lambda v: 1e-3 <= v <= 3600.0, "a time from 0.001 to 3600 s")  # Lengths of windows that are taken
+Window = Annotated[float, Meta(ge=1e-3, le=3600)]
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units in which results are shown; empty: as for every brake."""
+
+    angle: str = ""
+    command: str = ""
+
+    def check(self, linear: bool) -> None:
+        """Refuse an unknown unit, and a length or a force where the machine turns.
+
+        Raises:
+            FieldError: there is one.
+        """
+        known = {"angle": (*ANGLE, *(LENGTH if linear else ())), "command": (*CURRENT, *TORQUE)}
+        known["command"] += tuple(FORCE) if linear else ()
+        for key, units in known.items():
+            if (unit := getattr(self, key)) and unit not in units:
+                raise FieldError(f"units.{key}", f"expected one of {', '.join(units)}, got {unit!r}")
 
 
 @dataclass(frozen=True)
 class Machine:
     """Facts about a machine beyond its parameters."""
 
-    unknown: tuple[str, ...]  # Parameters that are estimated where a command names none
-    nuisances: tuple[str, ...]  # Other unknowns, likewise
-    window: float
-    """Length of the windows in which a recording is simulated, each from a start of its own [s]; 0: it chooses."""
-    between: str
-    """``held`` where it is known what acted in each period; ``open`` where a command may have gone straight to the next
-    instead of being held, which the recording chooses."""
-    travel: float  # Travel of a linear machine per radian of its motor [m/rad]; 0 for one that turns
-    angle: str  # Unit in which angles, or positions, are shown
-    command: str  # Unit in which commands are shown
+    unknown: tuple[Parameter, ...]  # Parameters that are estimated where a command names none
+    nuisances: tuple[str, ...] = ()  # Other unknowns, likewise
+    window: Window = 0.0  # Length of the windows in which a recording is simulated [s]; 0: the recording chooses
+    between: Literal["held", "open"] = "held"
+    """Command between samples: ``held`` (zero-order hold) or ``open`` (hold or linear, which the recording chooses)."""
+    travel: NotNegative = 0.0  # Travel of a linear machine per radian of its motor [m/rad]; 0 for one that turns
+    units: Units = Units()
 
+    def __post_init__(self) -> None:
+        """Refuse what is named twice, and units that do not go with the machine."""
+        for key in ("unknown", "nuisances"):
+            names = getattr(self, key)
+            if len(set(names)) < len(names):
+                raise FieldError(key, f"expected each once, got {list(names)}")
+        self.units.check(linear=self.travel > 0.0)
 
-def read_machine(table: Table) -> Machine:
-    """The table of a bench file.
+    @property
+    def angle(self) -> str:
+        """Unit in which angles, or positions, are shown."""
+        return self.units.angle or ("m" if self.travel else "rad")
 
-    Raises:
-        BenchFileError: a key is missing, unknown, of the wrong type or out of range.
-    """
-    given = table.names()
-    travel = table.number("travel", lambda v: v >= 0.0, "a length from 0") if "travel" in given else 0.0
-    shown = read_units(table.table("units"), travel) if "units" in given else {}
-    record = Machine(
-        unknown=table.texts("unknown", PARAMETERS),
-        nuisances=table.texts("nuisances") if "nuisances" in given else (),
-        window=table.number("window", *WINDOWS) if "window" in given else 0.0,
-        between=table.text("between", BETWEEN) if "between" in given else BETWEEN[0],
-        travel=travel,
-        angle=shown.get("angle", "m" if travel else "rad"),
-        command=shown.get("command", "A"),
-    )
-    table.nothing_else(("nuisances", "window", "between", "travel", "units"))
-    return record
+    @property
+    def command(self) -> str:
+        """Unit in which commands are shown."""
+        return self.units.command or "A"
 
 
 def read_units(table: Table, travel: float) -> dict[str, str]:

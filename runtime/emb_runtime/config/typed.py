@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import msgspec
 from msgspec import inspect
@@ -17,11 +17,13 @@ from msgspec import inspect
 from emb_runtime.errors import EmbError
 
 Record = TypeVar("Record")
+SMALLEST = 1e-30  # No quantity of a brake is smaller, or larger than its inverse; beyond it arithmetic overflows
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 LONGEST_VALUE = 120  # Characters of a foreign value that a message repeats
 _PLACE = re.compile(r" - at `(key` in `)?\$([^`]*)`$")
 _STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
-_MISSING = re.compile(r"Object missing required field `([^`]*)`")
 _RECORDS = (inspect.StructType, inspect.DataclassType)
 _LISTS = (inspect.ListType, inspect.VarTupleType)
 
@@ -53,6 +55,7 @@ def read(
     source: str,
     error: Callable[[str], EmbError],
     *,
+    at: Keys = (),
     remedy: str = "add it",
     longest_text: int = 200,
     smallest: float = 0.0,
@@ -64,6 +67,7 @@ def read(
         document: as a TOML or JSON parser returns it.
         source: name of the document in messages.
         error: makes the error that is raised from its message.
+        at: place of the value in the document, where it is part of one.
         remedy: advice where a key is missing.
         longest_text: most characters of a text; all are printable, and none is empty.
         smallest: smallest magnitude of a number other than 0; its inverse is the largest.
@@ -71,15 +75,35 @@ def read(
     Raises:
         EmbError: of the given kind: a key is missing or unknown, or a value has another type or is out of bounds.
     """
+    info = inspect.type_info(kind)
+    check = _Check(longest_text, smallest)
     try:
-        _check(document, inspect.type_info(kind), (), longest_text, smallest)
+        check.walk(document, info, ())
+        if check.missing:
+            raise _RefusedError((), _missing(check.missing, remedy))
         return msgspec.convert(document, kind)
     except _RefusedError as err:
         keys, reason = err.keys, str(err)
     except msgspec.ValidationError as err:
-        keys, reason = _explain(kind, document, err, remedy)
-    place = key_text(keys)
+        keys, reason = _explain(kind, document, err)
+    place = key_text((*at, *keys))
     raise error(f"{source}: {place}: {reason}" if place else f"{source}: {reason}")
+
+
+def struct_of(*kinds: type[Any], **others: tuple[Any, Any]) -> Any:
+    """A struct with the fields, bounds and defaults of named tuples, which msgspec itself reads from a list.
+
+    Args:
+        kinds: the named tuples.
+        others: types and defaults of further fields, or of those that a document writes in another way.
+    """
+    fields = {}
+    for kind in kinds:
+        for name, hint in get_type_hints(kind, include_extras=True).items():
+            fields[name] = hint, kind._field_defaults.get(name, msgspec.NODEFAULT)
+    return msgspec.defstruct(
+        "Table", [(name, *field) for name, field in (fields | others).items()], frozen=True, kw_only=True
+    )
 
 
 def key_text(keys: Keys) -> str:
@@ -97,23 +121,43 @@ def shown(value: object) -> str:
     return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."
 
 
-def _check(value: object, kind: inspect.Type | None, keys: Keys, longest_text: int, smallest: float) -> None:
-    """Refuse unknown keys, texts that are not printable and numbers that are not finite, which msgspec lets through."""
-    if isinstance(value, str):
-        if not value or not value.isprintable() or len(value) > longest_text:
-            wanted = f"expected a printable text of 1 to {longest_text} characters"
-            raise _RefusedError(keys, f"{wanted}, got {shown(value)}")
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        if (problem := _number_problem(value, smallest)) and _matching(kind, value) is not None:
-            raise _RefusedError(keys, problem)
-    elif isinstance(value, dict | list) and (kind := _matching(kind, value)) is not None:
-        if isinstance(kind, _RECORDS) and isinstance(value, dict):
-            known = sorted(field.encode_name for field in kind.fields)
-            for key in value:
-                if key not in known:
-                    raise _RefusedError((*keys, key), f"unknown key; expected some of {', '.join(known)}")
-        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            _check(inner, _inner(kind, key), (*keys, key), longest_text, smallest)
+class _Check:
+    """Looks for unknown keys, texts that are not printable and numbers that are not finite, which msgspec takes."""
+
+    def __init__(self, longest_text: int, smallest: float) -> None:
+        self._longest_text = longest_text
+        self._smallest = smallest
+        self.missing: list[tuple[Keys, inspect.Type]] = []  # Required keys that are not there
+
+    def walk(self, value: object, kind: inspect.Type | None, keys: Keys) -> None:
+        """Raises _RefusedError at the first such value."""
+        if isinstance(value, str):
+            if not value or not value.isprintable() or len(value) > self._longest_text:
+                wanted = f"expected a printable text of 1 to {self._longest_text} characters"
+                raise _RefusedError(keys, f"{wanted}, got {shown(value)}")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            if (problem := _number_problem(value, self._smallest)) and _matching(kind, value) is not None:
+                raise _RefusedError(keys, problem)
+        elif isinstance(value, dict | list) and (kind := _matching(kind, value)) is not None:
+            if isinstance(kind, _RECORDS) and isinstance(value, dict):
+                self._compare_keys(value, kind, keys)
+            for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+                self.walk(inner, _inner(kind, key), (*keys, key))
+
+    def _compare_keys(
+        self, value: Mapping[str, object], kind: inspect.StructType | inspect.DataclassType, keys: Keys
+    ) -> None:
+        known = {field.encode_name: field for field in kind.fields}
+        for key in value:
+            if key not in known:
+                raise _RefusedError((*keys, key), f"unknown key; expected some of {', '.join(sorted(known))}")
+        self.missing += [((*keys, n), f.type) for n, f in known.items() if f.required and n not in value]
+
+
+def _missing(missing: list[tuple[Keys, inspect.Type]], remedy: str) -> str:
+    names = ", ".join(key_text(keys) for keys, _ in missing)
+    wanted = f": expected {_wanted(missing[0][1])}" if len(missing) == 1 else ""
+    return f"{names}: missing{wanted}; {remedy}"
 
 
 def _number_problem(value: float, smallest: float) -> str:
@@ -157,7 +201,7 @@ def _inner(kind: inspect.Type | None, key: str | int) -> inspect.Type | None:
     return None
 
 
-def _explain(kind: type[Any], document: object, err: msgspec.ValidationError, remedy: str) -> tuple[Keys, str]:
+def _explain(kind: type[Any], document: object, err: msgspec.ValidationError) -> tuple[Keys, str]:
     """Place and reason of msgspec's error."""
     keys = _place(kind, document, err)
     if isinstance(err.__cause__, FieldError):
@@ -168,9 +212,6 @@ def _explain(kind: type[Any], document: object, err: msgspec.ValidationError, re
     for key in keys:
         container = _matching(here, value)
         here, value = _inner(container, key), value[key]
-    if missing := _MISSING.match(str(err)):
-        name = missing.group(1)
-        return (*keys, name), f"missing: expected {_wanted(_inner(_matching(here, value), name))}; {remedy}"
     if "at `key` in" in str(err) and isinstance(container, inspect.DictType):
         return keys, f"unknown key; expected {_wanted(container.key_type)}"
     return keys, f"expected {_wanted(here)}, got {shown(value)}"
@@ -227,9 +268,9 @@ def _wanted(kind: inspect.Type | None) -> str:
     if isinstance(kind, inspect.Metadata):
         return str((kind.extra_json_schema or {}).get("description") or _wanted(kind.type))
     if isinstance(kind, inspect.UnionType):
-        return " or ".join(_wanted(member) for member in kind.types)
+        return " or ".join(_wanted(member) for member in kind.types if not isinstance(member, inspect.NoneType))
     if isinstance(kind, inspect.LiteralType):
-        return f"one of {', '.join(map(str, kind.values))}"
+        return f"{'one of ' if len(kind.values) > 1 else ''}{', '.join(map(str, kind.values))}"
     if isinstance(kind, inspect.FloatType):
         return f"a number{_bounds(kind)}"
     if isinstance(kind, inspect.IntType):
@@ -243,6 +284,7 @@ def _wanted(kind: inspect.Type | None) -> str:
 
 
 def _bounds(kind: inspect.FloatType | inspect.IntType) -> str:
-    low = f" from {kind.ge:g}" if kind.ge is not None else f" above {kind.gt:g}" if kind.gt is not None else ""
-    high = f" to {kind.le:g}" if kind.le is not None else f" below {kind.lt:g}" if kind.lt is not None else ""
-    return low + (high if low else high.replace(" to ", " of at most "))
+    if kind.ge is not None and kind.le is not None:
+        return f" from {kind.ge:g} to {kind.le:g}"
+    bounds = (("from", kind.ge), ("above", kind.gt), ("at most", kind.le), ("below", kind.lt))
+    return ",".join(f" {words} {value:g}" for words, value in bounds if value is not None)

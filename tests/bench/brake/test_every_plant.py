@@ -81,7 +81,7 @@ def test_a_shield_that_is_told_how_late_the_plant_is_holds_its_limits(
     simulate: Simulate, bench: Bench, current: float
 ) -> None:
     """A sample late each way: the answer to what is measured acts two periods after that."""
-    told = replace(bench, shield=replace(bench.shield, frame_age=(2, 2)))
+    told = replace(bench, shield=bench.shield._replace(frame_age=(2, 2)))
     run = simulate(lambda *_: current, options="plant=late", on_bench=told)
     assert run.outcome.fault is None
     assert within_limits(run, told)

@@ -144,7 +144,7 @@ def test_an_observer_s_velocity_counts_for_nothing_and_that_is_said(bench: Bench
 
 
 def test_what_a_measurement_delay_hides_counts_for_nothing(bench: Bench, log: Log, replay: Replay) -> None:
-    path = log("late.mcap", "plant=late", on_bench=replace(bench, shield=replace(bench.shield, frame_age=(2, 2))))
+    path = log("late.mcap", "plant=late", on_bench=replace(bench, shield=bench.shield._replace(frame_age=(2, 2))))
     late, prompt = (replay.document("fim", path, "--model", name) for name in ("late", "exact"))
     assert late["warnings"] == []
     assert late["samples"]["command_delay"] == 1

@@ -24,7 +24,7 @@ def logs_of(folder: Path, simulate: Simulate, plant: str, seeds: tuple[int, ...]
 
 
 def identified(bench: Bench, logs: list[Path], before: Identification | None = None) -> Identification:
-    wide = replace(bench, shield=replace(bench.shield, ranges="pm50"))
+    wide = replace(bench, shield=bench.shield._replace(ranges="pm50"))
     return identify(logs, wide, bench.noise, before)
 
 

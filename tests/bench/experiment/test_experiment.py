@@ -53,7 +53,7 @@ def commanded(run: SimRun, layout: Layout) -> list[float]:
 
 def knowing_how_late(bench: Bench) -> Bench:
     """The bench whose shield and monitor expect the plant ``late``: a sample each way."""
-    return replace(bench, shield=replace(bench.shield, frame_age=(2, 2)))
+    return replace(bench, shield=bench.shield._replace(frame_age=(2, 2)))
 
 
 def recorded(tmp_path: Path, run: SimRun, steps: int = 500) -> tuple[RunLog, Experiment]:

@@ -12,11 +12,12 @@ from emb_bench.brake.quantities import Quantity, angle, command, quantity, veloc
 from emb_bench.cli.replay import main
 from emb_bench.recordings.map_file import parse_map
 from emb_runtime.config.machine import Machine as Kind
+from emb_runtime.config.machine import Units
 from emb_runtime.errors import UsageError
 from tests.bench.linear_machine import MAP, TRAVEL, Machine, record
 
-LINEAR = Kind(("J",), (), 0.5, "held", 2e-3, "mm", "kN")
-TURNING = Kind(("J",), (), 0.5, "held", 0.0, "deg", "V")
+LINEAR = Kind(("J",), (), 0.5, "held", 2e-3, Units("mm", "kN"))
+TURNING = Kind(("J",), (), 0.5, "held", 0.0, Units("deg", "V"))
 IN_VOLTS = (
     MAP.partition("[machine]")[0].replace('unit = "m"', 'unit = "deg"').replace('"N"', '"V"')
     + "[machine]\nwindow = 0.5\n[machine.known]\nJ = 1e-5\nk_m = 0.02\n[machine.guess]\nT_c = 0.01\nf_v = 1e-4\n"

@@ -50,12 +50,11 @@ def test_the_shield_covers_every_brake_that_the_shipped_actor_meets(bench: Bench
         assert envelope.uncovered(inner.low, inner.high) == ()
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "key", "reason"),
-    [
+def test_what_is_wrong_is_refused_with_file_key_and_reason() -> None:
+    for old, new, key, reason in [
         ("schema = 1", "schema = 2", "schema", "expected 1, got 2"),
         ("schema = 1", "schema = 1\nspeed = 3", "speed", "unknown key"),
-        ("J     = 4.624e-6", "J     = -4.624e-6", "brake.J", "positive"),
+        ("J     = 4.624e-6", "J     = -4.624e-6", "brake.J", "above 0"),
         ("J     = 4.624e-6", 'J     = "big"', "brake.J", "got 'big'"),
         ("J     = 4.624e-6", "J     = true", "brake.J", "got True"),
         ("J     = 4.624e-6", "J     = nan", "brake.J", "finite"),
@@ -65,7 +64,7 @@ def test_the_shield_covers_every_brake_that_the_shipped_actor_meets(bench: Bench
         ("angle    = [-10.0, 100.0]", "angle    = [-10.0, 101.0]", "limits.angle", "beyond the ceiling"),
         ("angle    = [-10.0, 100.0]", "angle    = [50.0, 20.0]", "limits.angle", "is above the upper"),
         ("angle    = [-10.0, 100.0]", "angle    = [1.0, 100.0]", "limits.angle", "origin"),
-        ("angle    = [-10.0, 100.0]", "angle    = 100.0", "limits.angle", "expected [lower, upper]"),
+        ("angle    = [-10.0, 100.0]", "angle    = 100.0", "limits.angle", "expected [a number, a number]"),
         ("velocity = 500.0", "velocity = 501.0", "limits.velocity", "(0, 500]"),
         ("horizon     = 500", "horizon     = 500.5", "timing.horizon", "whole number"),
         ("horizon     = 500", "horizon     = 0", "timing.horizon", "from 1"),
@@ -73,8 +72,8 @@ def test_the_shield_covers_every_brake_that_the_shipped_actor_meets(bench: Bench
         ('ranges        = "envelope"', 'ranges        = "wide"', "shield.ranges", "no set [ranges.wide]"),
         ("frame_age     = [0, 0]", "frame_age     = [1, 0]", "shield.frame_age", "is above the upper"),
         ("frame_age     = [0, 0]", "frame_age     = [0, 6]", "shield.frame_age", "from 0 to 5"),
-        ("f_v = [1.0e-5, 5.0e-5]", "f_v = [0.0, 5.0e-5]", "ranges.viscous.f_v", "positive"),
-        ("f_v = [1.0e-5, 5.0e-5]", "mass = [1.0, 2.0]", "ranges.viscous.mass", "not a parameter"),
+        ("f_v = [1.0e-5, 5.0e-5]", "f_v = [0.0, 5.0e-5]", "ranges.viscous.f_v[0]", "above 0"),
+        ("f_v = [1.0e-5, 5.0e-5]", "mass = [1.0, 2.0]", "ranges.viscous.mass", "unknown key"),
         ("soft_missed  = 5", "soft_missed  = 50", "watch.soft_missed", "above stop_missed"),
         ("stop_missed  = 20", "stop_missed  = 4000", "watch.stop_missed", "from 1 to 400"),
         ("heartbeat    = 0.005", "heartbeat    = 0.001", "watch.heartbeat", "from 0.002 to 0.5 s"),
@@ -82,8 +81,8 @@ def test_the_shield_covers_every_brake_that_the_shipped_actor_meets(bench: Bench
         ('stop             = "damped"', 'stop             = "hold"', "node.stop", "one of damped, freewheel"),
         ("watchdog         = 0.010", "watchdog         = 5.0", "node.watchdog", "from 0.002 to 0.5 s"),
         ("watchdog         = 0.010", "watchdog         = 0.001", "node.watchdog", "from 0.002 to 0.5 s"),
-        ("home_angle    = 0.5", "home_angle    = 1e20", "shield.home_angle", "(0, 10] rad"),
-        ("home_velocity = 5.0", "home_velocity = 1e9", "shield.home_velocity", "(0, 50] rad/s"),
+        ("home_angle    = 0.5", "home_angle    = 1e20", "shield.home_angle", "above 0, at most 10"),
+        ("home_velocity = 5.0", "home_velocity = 1e9", "shield.home_velocity", "above 0, at most 50"),
         ('name = "drum brake, Guo 2024"', 'name = "drum\\nbrake"', "name", "printable"),
         ("schema = 1", 'schema = 1\n"a\\nb" = 3', r"'a\nb'", "unknown key"),
         ("bitrate = 1000000", "bitrate = 10", "can.bitrate", "from 125000"),
@@ -96,20 +95,18 @@ def test_the_shield_covers_every_brake_that_the_shipped_actor_meets(bench: Bench
         ("J     = 4.624e-6", "J     = 1" + "0" * 5000, "", "not valid TOML"),
         ("k_m   = 2.170e-2", "k_m   = 9.0e-2", "shield.ranges", "leaves out the nominal k_m = 0.09"),
         ("[can]\nbitrate = 1000000", "can = 3", "can", "expected a table"),
-    ],
-)
-def test_what_is_wrong_is_refused_with_file_key_and_reason(old: str, new: str, key: str, reason: str) -> None:
-    assert old in TEXT
-    broken = TEXT.replace(old, new, 1)
-    if new == "can = 3":  # a bare key has to stand before the first table
-        broken = "can = 3\n" + TEXT.replace(old, "", 1)
-    with pytest.raises(BenchFileError) as caught:
-        parse_bench(broken, "my.toml")
-    message = str(caught.value)
-    assert message.startswith(f"my.toml: {key}")
-    assert reason in message
-    assert "\n" not in message
-    assert caught.value.exit_code == EXIT_USAGE
+    ]:
+        assert old in TEXT
+        broken = TEXT.replace(old, new, 1)
+        if new == "can = 3":  # a bare key has to stand before the first table
+            broken = "can = 3\n" + TEXT.replace(old, "", 1)
+        with pytest.raises(BenchFileError) as caught:
+            parse_bench(broken, "my.toml")
+        message = str(caught.value)
+        assert message.startswith(f"my.toml: {key}"), (new, message)
+        assert reason in message, new
+        assert "\n" not in message
+        assert caught.value.exit_code == EXIT_USAGE
 
 
 def test_all_that_an_old_file_lacks_is_named_at_once_with_where_to_find_it() -> None:
@@ -117,7 +114,7 @@ def test_all_that_an_old_file_lacks_is_named_at_once_with_where_to_find_it() -> 
     old = old[: old.index("[guard]")] + old[old.index("[node]") :]
     with pytest.raises(BenchFileError) as caught:
         parse_bench(old, "old.toml")
-    assert str(caught.value).startswith("old.toml: watch.heartbeat, guard, node.damping_velocity: missing; ")
+    assert str(caught.value).startswith("old.toml: guard, watch.heartbeat, node.damping_velocity: missing; ")
     assert "emb-run --write-bench" in str(caught.value)
 
 
@@ -151,23 +148,20 @@ def test_the_shipped_time_outs_are_the_longest_with_which_a_brake_is_driven(benc
         parse_bench(TEXT.replace(old, f"{old.split(' ')[0]} {tight}"), "t").refuse_long_timeouts()
 
 
-@pytest.mark.parametrize(
-    ("old", "long", "message"),
-    [
+def test_a_longer_time_out_is_read_and_not_armed() -> None:
+    for old, long, message in [
         ("stop_missed  = 20", "stop_missed = 21", "watch.stop_missed: expected at most 20, got 21"),
         ("rejected     = 5", "rejected = 6", "watch.rejected: expected at most 5, got 6"),
         ("rejected     = 5", "rejected = 16", "watch.rejected: expected at most 5, got 16"),
         ("heartbeat    = 0.005", "heartbeat = 0.0051", "watch.heartbeat: expected at most 0.005, got 0.0051"),
         ("heartbeat    = 0.005", "heartbeat = 0.5", "watch.heartbeat: expected at most 0.005, got 0.5"),
         ("watchdog         = 0.010", "watchdog = 0.011", "node.watchdog: expected at most 0.01, got 0.011"),
-    ],
-)
-def test_a_longer_time_out_is_read_and_not_armed(old: str, long: str, message: str) -> None:
-    assert old in TEXT
-    bench = parse_bench(TEXT.replace(old, long), "t")
-    with pytest.raises(BenchFileError) as caught:
-        bench.refuse_long_timeouts()
-    assert str(caught.value).startswith(message)
+    ]:
+        assert old in TEXT
+        bench = parse_bench(TEXT.replace(old, long), "t")
+        with pytest.raises(BenchFileError) as caught:
+            bench.refuse_long_timeouts()
+        assert str(caught.value).startswith(message)
 
 
 def test_the_contract_hash_ignores_time_outs_and_comments_but_not_the_physics(bench: Bench) -> None:

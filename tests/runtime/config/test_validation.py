@@ -6,9 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from emb_runtime.config.bench import parse_bench, shipped_bench_text
 from emb_runtime.config.validation import Rules, Table
-from emb_runtime.errors import BenchFileError, UsageError
+from emb_runtime.errors import UsageError
 
 RULES = Rules(UsageError, 20, remedy="make it anew")
 
@@ -41,11 +40,3 @@ def test_a_key_that_is_missing_is_told_with_what_was_expected_and_what_to_do(
 def test_a_document_of_another_version_is_refused() -> None:
     with pytest.raises(UsageError, match=r"^file: schema: expected 3, got 2$"):
         Table("file", "", {"schema": 2}, RULES).schema(3)
-
-
-def test_a_bench_file_without_its_version_is_refused_with_where_to_see_one() -> None:
-    text = shipped_bench_text().replace("schema =", "version =", 1)
-    remedy = "add it, as in the file that `emb-run --write-bench FILE` writes"
-    with pytest.raises(BenchFileError) as refused:
-        parse_bench(text, "my.toml")
-    assert str(refused.value) == f"my.toml: schema: missing: expected a whole number; {remedy}"

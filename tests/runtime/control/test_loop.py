@@ -119,7 +119,7 @@ def test_a_shorter_experiment_still_comes_home(simulate: Simulate, layout: Layou
 
 def test_the_policy_is_clipped_to_a_narrower_bench(simulate: Simulate, bench: Bench, layout: Layout) -> None:
     narrow = replace(bench, limits=replace(bench.limits, current=4.0))
-    narrow = replace(narrow, shield=replace(narrow.shield, ranges="viscous"))
+    narrow = replace(narrow, shield=narrow.shield._replace(ranges="viscous"))
     run = simulate(on_bench=narrow)
     assert run.outcome.counters.clipped > 0
     assert max(abs(c.current) for c in commands(run, layout)) == pytest.approx(4.0)

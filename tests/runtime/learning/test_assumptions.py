@@ -16,7 +16,7 @@ BENCH = load_bench()
 
 
 def with_shield(bench: Bench = BENCH, **change: Any) -> Bench:
-    return replace(bench, shield=replace(bench.shield, **change))
+    return replace(bench, shield=bench.shield._replace(**change))
 
 
 def test_each_number_is_the_benchs() -> None:

@@ -25,7 +25,9 @@ SHARES = st.tuples(*[st.floats(0.0, 1.0)] * 4)
 
 
 def assumed(model: str, model_error: float = 0.0) -> Assumptions:
-    shield = replace(BENCH.shield, learn=True, model=model, model_error=model_error, current_error=0.0)
+    shield = BENCH.shield._replace(
+        learn=True, model="euler" if model == "euler" else "flow", model_error=model_error, current_error=0.0
+    )
     return make_assumptions(replace(BENCH, shield=shield))
 
 

@@ -290,7 +290,7 @@ def motion(a: Assumptions, dice: np.random.Generator) -> Iterator[tuple[float, f
 @pytest.mark.parametrize("seed", range(14))
 def test_each_number_is_that_of_the_lemmas(flow: bool, seed: int) -> None:
     dice = np.random.default_rng(seed)
-    bench = BENCH if seed % 4 else replace(BENCH, shield=replace(BENCH.shield, ranges="viscous"))
+    bench = BENCH if seed % 4 else replace(BENCH, shield=BENCH.shield._replace(ranges="viscous"))
     shrunk = (1.0, 0.01)[seed % 2]  # with better sensors the pads of the flow count
     a: Any = make_assumptions(bench)
     a = a._replace(

@@ -24,7 +24,7 @@ SET = BENCH.range_set("envelope")
 
 
 def learning(bench: Bench = BENCH, model_error: float = 0.0) -> Bench:
-    return replace(bench, shield=replace(bench.shield, learn=True, model_error=model_error))
+    return replace(bench, shield=bench.shield._replace(learn=True, model_error=model_error))
 
 
 def of(low: BrakeParameters, high: BrakeParameters, model_error: float = 0.0) -> ShieldLaw:

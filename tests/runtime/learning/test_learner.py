@@ -30,7 +30,7 @@ BENCH = load_bench()
 def learning(model: str = "flow", **shield: Any) -> Bench:
     keys = f'learn = true\nmodel = "{model}"\n'
     bench = parse_bench(shipped_bench_text().replace("[shield]", f"[shield]\n{keys}#"), "learning")
-    return replace(bench, shield=replace(bench.shield, **shield))
+    return replace(bench, shield=bench.shield._replace(**shield))
 
 
 def square(_angle: float, _velocity: float, step: float) -> float:

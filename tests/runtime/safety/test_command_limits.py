@@ -125,5 +125,5 @@ def test_a_narrower_limit_clips_the_wish() -> None:
 
 
 def test_the_bench_s_own_limit_is_the_shield_s() -> None:
-    narrow = replace(BENCH, limits=replace(BENCH.limits, current=5.0), shield=replace(BENCH.shield, ranges="viscous"))
+    narrow = replace(BENCH, limits=replace(BENCH.limits, current=5.0), shield=BENCH.shield._replace(ranges="viscous"))
     assert decide(make_law(narrow), Reach(5.0, 12.0), 0.0, 0.0, 6.0, NO_PAST, 0.0, 0).current == 5.0

@@ -28,7 +28,7 @@ def test_a_node_that_brakes_hits_no_stop() -> None:
 
 
 def test_nor_does_a_drive_that_lets_go_inside_the_coasting_envelope() -> None:
-    coasting = replace(SHIPPED.shield, envelope="coasting", angle_margin=1.1)
+    coasting = SHIPPED.shield._replace(envelope="coasting", angle_margin=1.1)
     assert end_stop_speed(replace(FREEWHEEL, shield=coasting)) == 0
 
 
@@ -43,8 +43,8 @@ def test_without_viscous_friction_the_speed_is_what_the_wound_spring_and_the_spe
 def test_viscous_friction_and_a_narrower_set_make_it_slower_and_a_lag_faster() -> None:
     speed = end_stop_speed(FREEWHEEL)
     assert 930.0 < speed < end_stop_speed(without_viscous_friction(FREEWHEEL))  # a search saw 930 rad/s
-    assert end_stop_speed(replace(FREEWHEEL, shield=replace(SHIPPED.shield, ranges="viscous"))) < 0.7 * speed
-    assert end_stop_speed(replace(FREEWHEEL, shield=replace(SHIPPED.shield, current_lag=0.002))) > speed
+    assert end_stop_speed(replace(FREEWHEEL, shield=SHIPPED.shield._replace(ranges="viscous"))) < 0.7 * speed
+    assert end_stop_speed(replace(FREEWHEEL, shield=SHIPPED.shield._replace(current_lag=0.002))) > speed
 
 
 def test_without_a_spring_it_is_the_speed_from_which_full_braking_would_just_have_stopped() -> None:
@@ -60,7 +60,7 @@ def test_without_a_spring_it_is_the_speed_from_which_full_braking_would_just_hav
 
 def test_a_bench_that_cannot_be_shielded_is_refused() -> None:
     with pytest.raises(BenchFileError, match="angle_margin"):
-        end_stop_speed(replace(SHIPPED, shield=replace(SHIPPED.shield, angle_margin=0.05)))
+        end_stop_speed(replace(SHIPPED, shield=SHIPPED.shield._replace(angle_margin=0.05)))
 
 
 def coasted(bench: Bench, hold: float, dice: random.Random) -> float:

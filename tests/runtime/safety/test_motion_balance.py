@@ -209,7 +209,7 @@ def test_the_edges_of_a_period_that_counts() -> None:
     ],
 )
 def test_what_the_bench_declares_decides_whether_it_is_judged(changes: dict[str, Any], judged: bool) -> None:
-    bench = replace(BENCH, shield=replace(BENCH.shield, **changes))
+    bench = replace(BENCH, shield=BENCH.shield._replace(**changes))
     assert math.isfinite(balance_model(bench).allowed) == judged
 
 

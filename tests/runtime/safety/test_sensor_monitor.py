@@ -145,7 +145,7 @@ def test_honest_sensors_of_any_brake_of_the_set_never_alarm(
 @pytest.mark.parametrize("declared", [{"frame_age": (0, 2)}, {"current_lag": 0.002}], ids=["late", "lag"])
 @pytest.mark.parametrize("seed", range(5))
 def test_honest_sensors_never_alarm_where_frames_or_currents_may_be_late(declared: dict[str, Any], seed: int) -> None:
-    bench = replace(BENCH, shield=replace(BENCH.shield, **declared))
+    bench = replace(BENCH, shield=BENCH.shield._replace(**declared))
     rng = random.Random(seed)
     run = Run(brakes(seed), bench=bench, noise=rng, lost=lambda _k: rng.random() < 0.1, samples=150)
     assert run.verdict == HONEST

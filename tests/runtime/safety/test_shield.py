@@ -16,7 +16,7 @@ from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, chatter_ex
 SHIPPED = load_bench()
 AGES = [(0, 0), (0, 1), (0, 3), (1, 1), (2, 3), (3, 3)]
 LAW = make_law(SHIPPED)
-LAWS = [make_law(replace(SHIPPED, shield=replace(SHIPPED.shield, frame_age=ages))) for ages in AGES]
+LAWS = [make_law(replace(SHIPPED, shield=SHIPPED.shield._replace(frame_age=ages))) for ages in AGES]
 
 anything = st.floats(allow_nan=True, allow_infinity=True)
 angles = st.floats(-15.0, 105.0)
@@ -109,7 +109,7 @@ def test_the_damped_stop_needs_no_more_beyond_full_braking_than_the_excess(speed
 
 def test_every_shipped_set_can_be_shielded() -> None:
     for name, ages in itertools.product(sorted(SHIPPED.ranges), AGES):
-        law = make_law(replace(SHIPPED, shield=replace(SHIPPED.shield, ranges=name, frame_age=ages)))
+        law = make_law(replace(SHIPPED, shield=SHIPPED.shield._replace(ranges=name, frame_age=ages)))
         assert 400.0 < law.cruise < law.homeward_speed
         assert all(math.isfinite(value) for value in law)
 

@@ -59,7 +59,7 @@ def drawn_bench(rng: Random) -> Bench:
             rng.uniform(5.0, 6.0), (-rng.uniform(8.0, 10.0), rng.uniform(80.0, 100.0)), rng.uniform(450, 500)
         ),
         noise=Noise(rng.uniform(5e-4, 1e-3), rng.uniform(0.5, 1.0)),
-        shield=replace(SHIPPED.shield, **settings),
+        shield=SHIPPED.shield._replace(**settings),
         node=replace(SHIPPED.node, damping_velocity=rng.uniform(55.0, 65.0)),
     )
 

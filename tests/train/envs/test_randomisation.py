@@ -308,7 +308,7 @@ def test_the_shield_covers_the_delay_or_lag_that_is_randomised_and_the_losses() 
 def test_the_shield_is_made_for_what_is_randomised_and_for_nothing_more() -> None:
     plain = Conditions().applied(BENCH).shield
     wide = with_(Conditions(), command_delay=(1, 2), measurement_delay=(0, 1)).applied(BENCH)
-    assert wide.shield == dataclasses.replace(plain, frame_age=(0, 3))
+    assert wide.shield == plain._replace(frame_age=(0, 3))
     assert with_(Conditions(), command_delay=(1, 2)).applied(wide) == wide
     assert with_(Conditions(), current_lag=(0.0, 0.001)).applied(BENCH).shield.current_lag == 0.001
     assert with_(frame_loss=(0.0, 0.1)).applied(BENCH).shield == plain

@@ -54,7 +54,7 @@ def test_a_shield_that_learns_is_refused_where_its_model_is_not_the_brake_s() ->
         {"encoder_offset": (-0.1, 0.0)},
     ]
     cases = [(BENCH, plant, Randomisation()) for plant in ("late", "lag", "offset", "observer", "rough")]
-    cases += [(replace(BENCH, shield=replace(BENCH.shield, **s)), "exact", Randomisation()) for s in shields]
+    cases += [(replace(BENCH, shield=BENCH.shield._replace(**s)), "exact", Randomisation()) for s in shields]
     cases += [(BENCH, "exact", Randomisation(**way)) for way in ways]
     for bench, plant, randomised in cases:
         for shielded in (True, False):

@@ -149,12 +149,12 @@ class Conditions:
         delay and a lag of its own of the randomised kind.
         """
         timing = replace(bench.timing, horizon=self.horizon or bench.timing.horizon)
-        shield = replace(bench.shield, ranges=self.shield_ranges or bench.shield.ranges)
+        shield = bench.shield._replace(ranges=self.shield_ranges or bench.shield.ranges)
         if self.shielded and self.randomised != NOTHING_RANDOM:
             least, most = self.randomised.delay
             age = min(shield.frame_age[0], least), max(shield.frame_age[1], most)
             lag = max(shield.current_lag, self.randomised.current_lag[1])
-            shield = replace(shield, frame_age=age, current_lag=lag)
+            shield = shield._replace(frame_age=age, current_lag=lag)
         return replace(bench, timing=timing, shield=shield)
 
 

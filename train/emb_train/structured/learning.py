@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.bench import Bench, BrakeParameters, LearntModel
 from emb_runtime.config.plants import EULER, Plant
 from emb_runtime.config.shield_config import ShieldConfig, shield_config
 from emb_runtime.errors import UsageError
@@ -43,8 +43,8 @@ def make_learning(bench: Bench, shield: Shield, plant: Plant, randomised: Random
             "a shield that learns needs fresh frames, no lag, an encoder without an offset, a velocity that is "
             "measured and the braking envelope"
         )
-    model = "euler" if plant.mechanics.solver == EULER else "flow"
-    declared = replace(bench.shield, learn=learns, model=model)
+    model: LearntModel = "euler" if plant.mechanics.solver == EULER else "flow"
+    declared = bench.shield._replace(learn=learns, model=model)
     bench = replace(bench, shield=declared)
     assumptions = make_assumptions(bench) if learns else assumptions_of(bench)
     return Learning(learns, shield_config(bench), bench.brake, assumptions)

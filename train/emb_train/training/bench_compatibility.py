@@ -66,7 +66,7 @@ def shield_changes(trained: Bench, bench: Bench) -> str:
 
 
 def _changes(trained: Bench, bench: Bench) -> Iterator[str]:
-    before, now = asdict(trained.shield), asdict(bench.shield)
+    before, now = trained.shield._asdict(), bench.shield._asdict()
     boxes = [b.range_set(b.shield.ranges) for b in (trained, bench)]
     if (boxes[0].low, boxes[0].high) == (boxes[1].low, boxes[1].high):  # whatever they are called
         before["ranges"] = now["ranges"]
