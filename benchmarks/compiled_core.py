@@ -28,7 +28,6 @@ from typing import Any, NamedTuple
 from emb_runtime.can import e2e, receiver
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import Bench, load_bench
-from emb_runtime.config.shield_config import shield_config
 from emb_runtime.control import result, start_conditions
 from emb_runtime.learning import assumptions, bounded
 from emb_runtime.learning import known as estimate_set
@@ -298,7 +297,7 @@ def _sensors(dice: random.Random) -> Iterator[Any]:
 
 def _learning(dice: random.Random) -> Iterator[Any]:
     """Answers to a brake that moves about as it should, with both models, and the law then."""
-    bench, setting = _bench(), shield_config(_bench())
+    bench, inputs = _bench(), shield_design.design_inputs(_bench())
     plain = assumptions.make_assumptions(bench)
     while True:
         assumed = plain._replace(flow=dice.random() < 0.5, model_error=dice.choice((0.0, 50.0)))
@@ -312,7 +311,7 @@ def _learning(dice: random.Random) -> Iterator[Any]:
                 heard = (_number(dice, 100.0), velocity) if dice.random() < 0.01 else measured
                 answer = _tried(bounded.hear, assumed, state, *heard, current)
             known = estimate_set.known(state)
-            yield answer, list(state), known, _tried(law_for, setting, bench.brake, known)
+            yield answer, list(state), known, _tried(law_for, inputs, bench.brake, known)
             current = dice.uniform(-6.0, 6.0)
             push = plain.motor * current - plain.spring * max(angle, 0.0) - plain.viscous * velocity
             angle += 1e-3 * velocity

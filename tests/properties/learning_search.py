@@ -20,12 +20,11 @@ from emb_bench.brake.motion import SENSITIVE, STATES, advance
 from emb_bench.compiled import compiled
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.config.plants import Mechanics
-from emb_runtime.config.shield_config import shield_config
 from emb_runtime.learning.assumptions import assumptions_of
 from emb_runtime.learning.known import HIGH, LOW, Known, known
 from emb_runtime.learning.law import law_for, middle
 from emb_runtime.safety.shield import NO_PAST, damped_current, shield
-from emb_runtime.safety.shield_design import ShieldLaw, make_law
+from emb_runtime.safety.shield_design import ShieldLaw, design_inputs, make_law
 from emb_train.structured.learning import Learning, begin, holds, listen, miss
 from tests.properties.shield_search import (
     DROPS,
@@ -118,7 +117,7 @@ def _answer(s: Setting, script: Script, i: int, k: int, now: Known, seen: tuple[
     if now.falsified:
         return shield(s.law, seen[0], seen[1], wish, NO_PAST, k)
     y, w = middle(now)
-    return shield(law_for(s.learning.setting, s.learning.nominal, now), y, w, wish, NO_PAST, k)
+    return shield(law_for(s.learning.inputs, s.learning.nominal, now), y, w, wish, NO_PAST, k)
 
 
 def episode(s: Setting, script: Script, i: int, state: Any, row: Any) -> None:
@@ -243,7 +242,7 @@ def setting_for(
     """
     declared = replace(bench, shield=bench.shield._replace(learn=True, model="flow" if flow else "euler"))
     law = make_law(declared)
-    learning = Learning(True, shield_config(declared), bench.brake, assumptions_of(declared))
+    learning = Learning(True, design_inputs(declared), bench.brake, assumptions_of(declared))
     true = bench.plant(plant or ("exact" if flow else "euler"))
     return Setting(learning, law, true.mechanics, excess, jitter, shaken)
 

@@ -27,6 +27,7 @@ _STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
 _RECORDS = (inspect.StructType, inspect.DataclassType)
 _LISTS = (inspect.ListType, inspect.VarTupleType)
 
+
 Keys = tuple[str | int, ...]  # Keys and indices that lead to a value
 
 

@@ -12,9 +12,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError
-from emb_runtime.safety.shield_design import VELOCITY_PAD, make_law
+from emb_runtime.safety.shield_design import VELOCITY_PAD, design_inputs, make_law
 
 Four = tuple[float, float, float, float]  # One number for each of k_m, k_1, T_c and f_v
 
@@ -102,7 +101,7 @@ def not_covered(bench: Bench) -> str:
         )
     # Of all parts of the set, the one with the strongest motor and the stiffest spring speeds up most towards home.
     change = law.motor_high * law.current + law.spring_high * bench.limits.angle[1] - law.friction_low
-    flow = 0.5 * law.sample_time**2 * law.viscous_high * (change - 2.0 * shield_config(bench).model_error)
+    flow = 0.5 * law.sample_time**2 * law.viscous_high * (change - 2.0 * design_inputs(bench).model_error)
     if flow > EXACT * VELOCITY_PAD:
         return (
             f"within a sample of {law.sample_time:g} s viscous friction of a part of the set changes by {flow:.3f} "

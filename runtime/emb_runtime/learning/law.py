@@ -6,9 +6,8 @@ Any part that holds the true brake will do, in any sequence: see ``docs/explanat
 from __future__ import annotations
 
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.shield_config import ShieldConfig
 from emb_runtime.learning.known import Known
-from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, law_of, stoppable
+from emb_runtime.safety.shield_design import VELOCITY_PAD, DesignInputs, Part, ShieldLaw, law_of, stoppable
 
 COVERED = 0.97
 """Share of the velocity pad that viscous friction may use; the rest is for a state a little beyond its limits."""
@@ -20,17 +19,17 @@ PLANNED = 0.8
 """Share of the speed that the weakest motor reaches against the greatest friction, for the plan of the way home."""
 
 
-def law_for(setting: ShieldConfig, nominal: BrakeParameters, known: Known) -> ShieldLaw:
+def law_for(inputs: DesignInputs, nominal: BrakeParameters, known: Known) -> ShieldLaw:
     """The law for what is known, to be asked with the middle of the box of states as the measurement.
 
     Args:
-        setting: the bench's.
+        inputs: of the bench.
         nominal: brake that the parameters are relative to.
         known: brakes and states that are possible.
     """
     angle, velocity = middle(known)
     return law_between(
-        setting,
+        inputs,
         relative_brake(nominal, known.k_m_low, known.k_1_low, known.t_c_low, known.f_v_low),
         relative_brake(nominal, known.k_m_high, known.k_1_high, known.t_c_high, known.f_v_high),
         max(known.angle_high - angle, angle - known.angle_low),
@@ -47,11 +46,11 @@ def fits(law: ShieldLaw, known: Known) -> bool:
     )
 
 
-def with_room(setting: ShieldConfig, known: Known) -> Known:
+def with_room(inputs: DesignInputs, known: Known) -> Known:
     """Known brakes with some more states around the same middle, so that a law for them fits for some samples."""
     angle, velocity = middle(known)
-    angle_half = (1.0 + ROUNDING) * setting.angle_noise
-    half = min(ROOM * 0.5 * (known.velocity_high - known.velocity_low), (1.0 + ROUNDING) * setting.velocity_noise)
+    angle_half = (1.0 + ROUNDING) * inputs.angle_noise
+    half = min(ROOM * 0.5 * (known.velocity_high - known.velocity_low), (1.0 + ROUNDING) * inputs.velocity_noise)
     return known._replace(
         angle_low=min(known.angle_low, angle - angle_half),
         angle_high=max(known.angle_high, angle + angle_half),
@@ -77,62 +76,43 @@ def relative_brake(nominal: BrakeParameters, k_m: float, k_1: float, t_c: float,
     )
 
 
-def covered_viscous(setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters) -> float:
+def covered_viscous(inputs: DesignInputs, low: BrakeParameters, high: BrakeParameters) -> float:
     """Least f_v to count on: as much as the velocity pad covers the change of, within a sample of full braking (L1).
 
     A part of the set may have a stronger motor and a stiffer spring for sure than the set has, and then brakes harder.
     """
-    slowed = (
-        setting.current * low.k_m / high.J + low.T_c / high.J + low.gamma * low.k_1 / high.J * setting.highest_angle
-    )
-    slowed += low.f_v / high.J * setting.speed
-    return min(low.f_v, COVERED * 2.0 * VELOCITY_PAD * high.J / (setting.sample_time * setting.sample_time * slowed))
+    slowed = inputs.current * low.k_m / high.J + low.T_c / high.J + low.gamma * low.k_1 / high.J * inputs.highest_angle
+    slowed += low.f_v / high.J * inputs.speed
+    return min(low.f_v, COVERED * 2.0 * VELOCITY_PAD * high.J / (inputs.sample_time * inputs.sample_time * slowed))
 
 
-def farthest(setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters) -> float:
+def farthest(inputs: DesignInputs, low: BrakeParameters, high: BrakeParameters) -> float:
     """Greatest angle at which every brake between these two can be held, at most the limit [rad] (L5 d)."""
-    motor, friction = setting.current * low.k_m / high.J, low.T_c / high.J - setting.model_error
-    room = -setting.lowest_angle - setting.angle_margin
-    homeward = min(setting.speed - VELOCITY_PAD, stoppable(room, 0.0, motor + friction, setting.sample_time))
-    braking = motor * min(1.0, homeward / setting.damping_velocity) + friction + low.f_v / high.J * homeward
-    return min(setting.highest_angle, HELD * braking * low.J / (high.gamma * high.k_1))
+    motor, friction = inputs.current * low.k_m / high.J, low.T_c / high.J - inputs.model_error
+    room = -inputs.lowest_angle - inputs.shield.angle_margin
+    homeward = min(inputs.speed - VELOCITY_PAD, stoppable(room, 0.0, motor + friction, inputs.sample_time))
+    braking = motor * min(1.0, homeward / inputs.damping_velocity) + friction + low.f_v / high.J * homeward
+    return min(inputs.highest_angle, HELD * braking * low.J / (high.gamma * high.k_1))
 
 
 def law_between(
-    setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters, angle_noise: float, velocity_noise: float
+    inputs: DesignInputs, low: BrakeParameters, high: BrakeParameters, angle_noise: float, velocity_noise: float
 ) -> ShieldLaw:
     """The law for every brake between these two, up to the angle at which they can all be held.
 
     Args:
-        setting: the bench's.
+        inputs: of the bench.
         low: least parameters.
         high: greatest parameters.
         angle_noise: the angle is known to within this [rad].
         velocity_noise: the velocity is known to within this [rad/s].
     """
-    driving = setting.current * low.k_m / high.J - setting.break_away * high.T_c / low.J - setting.model_error
-    nearer = ShieldConfig(
-        sample_time=setting.sample_time,
-        steps=setting.steps,
-        age_low=setting.age_low,
-        age_high=setting.age_high,
-        current=setting.current,
-        lowest_angle=setting.lowest_angle,
-        highest_angle=farthest(setting, low, high),
-        speed=setting.speed,
-        planned_speed=min(setting.planned_speed, PLANNED * driving * low.J / high.f_v),
+    driving = inputs.current * low.k_m / high.J - inputs.shield.break_away * high.T_c / low.J - inputs.model_error
+    part = Part(
+        highest_angle=farthest(inputs, low, high),
+        planned_speed=min(inputs.speed, PLANNED * driving * low.J / high.f_v),
         angle_noise=angle_noise,
         velocity_noise=velocity_noise,
-        measured_noise=setting.measured_noise,
-        angle_margin=setting.angle_margin,
-        damping_velocity=setting.damping_velocity,
-        lag=setting.lag,
-        coasting=setting.coasting,
-        break_away=setting.break_away,
-        f_l=setting.f_l,
-        home_angle=setting.home_angle,
-        home_velocity=setting.home_velocity,
-        model_error=setting.model_error,
     )
     least = BrakeParameters(
         J=low.J,
@@ -140,6 +120,6 @@ def law_between(
         k_m=low.k_m,
         k_1=low.k_1,
         T_c=low.T_c,
-        f_v=covered_viscous(setting, low, high),
+        f_v=covered_viscous(inputs, low, high),
     )
-    return law_of(nearer, least, high)
+    return law_of(inputs, least, high, part)

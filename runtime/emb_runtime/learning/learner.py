@@ -9,13 +9,12 @@ from __future__ import annotations
 from typing import Final
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.config.shield_config import shield_config
 from emb_runtime.learning import bounded
 from emb_runtime.learning.assumptions import Assumptions, make_assumptions
 from emb_runtime.learning.known import Known, State, known
 from emb_runtime.learning.law import fits, law_for, middle, with_room
 from emb_runtime.records import SensorSample
-from emb_runtime.safety.shield_design import ShieldLaw
+from emb_runtime.safety.shield_design import ShieldLaw, design_inputs
 
 LONGEST_GAP: Final = 50
 """Periods between two samples beyond which nothing more is learnt: a node's clock may say that millions have passed."""
@@ -44,7 +43,7 @@ class Learner:
         """Possible brakes and states at the newest sample heard; None where nothing is being learnt."""
         self.contradicted = False
         """The samples contradict the assumptions; :attr:`known` is then what was known just before."""
-        self._nominal, self._setting = bench.brake, shield_config(bench)._replace(steps=whole.steps)
+        self._nominal, self._inputs = bench.brake, design_inputs(bench)._replace(steps=whole.steps)
         self._prior = make_assumptions(bench) if active and bench.shield.learn else None
         self.age = 0
         """Periods since the law was made."""
@@ -89,7 +88,7 @@ class Learner:
         if self.known is None or self.contradicted:
             return self.whole, sample.angle, sample.velocity
         if self._law is None or self.age >= LONGEST_KEPT or not fits(self._law, self.known):
-            self._law, self.age = law_for(self._setting, self._nominal, with_room(self._setting, self.known)), 0
+            self._law, self.age = law_for(self._inputs, self._nominal, with_room(self._inputs, self.known)), 0
         angle, velocity = middle(self.known)
         return self._law, angle, velocity
 

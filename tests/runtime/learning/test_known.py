@@ -6,12 +6,11 @@ import pytest
 
 from emb_bench.compiled import compiled
 from emb_runtime.config.bench import load_bench, parse_bench, shipped_bench_text
-from emb_runtime.config.shield_config import shield_config
 from emb_runtime.errors import BenchFileError
 from emb_runtime.learning.assumptions import make_assumptions
 from emb_runtime.learning.known import FALSIFIED, HEAD, HEARD, Known, falsify, known, numbers, start_head
 from emb_runtime.learning.law import fits, law_for, middle, with_room
-from emb_runtime.safety.shield_design import make_law
+from emb_runtime.safety.shield_design import design_inputs, make_law
 
 BENCH = load_bench()
 
@@ -51,7 +50,7 @@ def test_before_anything_is_heard_of_the_brake_the_law_is_the_benchs_compiled_or
     assert found.falsified
     assert middle(found) == pytest.approx((3.0, 40.0))
     for function in (law_for, compiled(law_for)):
-        law = function(shield_config(BENCH), BENCH.brake, found)
+        law = function(design_inputs(BENCH), BENCH.brake, found)
         assert law == pytest.approx(make_law(BENCH), rel=1e-12)
 
 
@@ -70,7 +69,7 @@ def test_the_keys_of_learning_are_read_and_change_no_contract() -> None:
 
 
 def test_a_law_is_kept_while_the_possible_states_fit_into_its_noise_and_it_serves_a_part_of_its_set() -> None:
-    setting = shield_config(BENCH)
+    setting = design_inputs(BENCH)
     assumptions = make_assumptions(BENCH)
     state = [0.0] * HEAD
     falsify(assumptions, state, 3.0, 40.0)

@@ -11,13 +11,20 @@ import pytest
 from emb_bench.brake.euler import acceleration
 from emb_bench.compiled import compiled
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
-from emb_runtime.config.shield_config import ShieldConfig, shield_config
 from emb_runtime.errors import BenchFileError
 from emb_runtime.learning.assumptions import make_assumptions
 from emb_runtime.learning.known import Known
 from emb_runtime.learning.law import covered_viscous, farthest, fits, law_between, law_for, middle, with_room
 from emb_runtime.safety.shield import NO_PAST, shield, successor
-from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, make_law
+from emb_runtime.safety.shield_design import (
+    VELOCITY_PAD,
+    DesignInputs,
+    Part,
+    ShieldLaw,
+    design_inputs,
+    law_of,
+    make_law,
+)
 
 BENCH = load_bench()
 SET = BENCH.range_set("envelope")
@@ -28,7 +35,7 @@ def learning(bench: Bench = BENCH, model_error: float = 0.0) -> Bench:
 
 
 def of(low: BrakeParameters, high: BrakeParameters, model_error: float = 0.0) -> ShieldLaw:
-    law: ShieldLaw = compiled(law_between)(shield_config(learning(model_error=model_error)), low, high, 0.006, 6.0)
+    law: ShieldLaw = compiled(law_between)(design_inputs(learning(model_error=model_error)), low, high, 0.006, 6.0)
     return law
 
 
@@ -39,7 +46,7 @@ def change_of_viscous_friction(law: ShieldLaw, viscous: float) -> float:
 
 
 def test_a_part_counts_on_viscous_friction_as_far_as_the_pad_covers_its_change() -> None:
-    setting, law = shield_config(BENCH), of(SET.high, SET.high)
+    setting, law = design_inputs(BENCH), of(SET.high, SET.high)
     assert change_of_viscous_friction(law, SET.high.f_v / SET.high.J) > VELOCITY_PAD
     assert 0.9 * VELOCITY_PAD < change_of_viscous_friction(law, law.viscous_low) <= VELOCITY_PAD
     assert law.viscous_low == pytest.approx(covered_viscous(setting, SET.high, SET.high) / SET.high.J)
@@ -81,7 +88,7 @@ def test_viscous_friction_that_the_pad_does_not_cover_for_some_part_of_the_set_i
 
 def test_a_law_is_asked_with_the_middle_of_the_box_and_its_noise_holds_the_whole_box_rounding_or_not() -> None:
     """In floats the middle is not always as far from one end as from the other: the farther one counts."""
-    setting, n = shield_config(BENCH), BENCH.brake
+    setting, n = design_inputs(BENCH), BENCH.brake
     shares = (getattr(end, p) / getattr(n, p) for p in PARAMETER_NAMES for end in (SET.low, SET.high))
     everything = Known._make([*shares, 0.0, 0.0, 0.0, 0.0, False])
     dice, uneven = np.random.default_rng(0), 0
@@ -115,7 +122,7 @@ def test_a_law_is_asked_with_the_middle_of_the_box_and_its_noise_holds_the_whole
 
 
 def test_a_box_as_wide_as_the_measurement_stays_as_wide_and_a_wider_one_is_not_cut() -> None:
-    setting, rounding = shield_config(BENCH), 1e-6
+    setting, rounding = design_inputs(BENCH), 1e-6
     a, n = setting.angle_noise, setting.velocity_noise
     box = Known._make([*[1.0] * 8, -a, a, -n, n, False])
     assert with_room(setting, box)[8:12] == pytest.approx(
@@ -129,7 +136,7 @@ def test_a_box_as_wide_as_the_measurement_stays_as_wide_and_a_wider_one_is_not_c
 
 def test_a_brake_that_rests_at_the_edge_of_the_rest_zone_is_not_pushed_home_just_before_the_end() -> None:
     """The push would make its velocity as badly known as before, and it would not be at rest again in time."""
-    setting, low, high = shield_config(BENCH), SET.low, SET.high
+    setting, low, high = design_inputs(BENCH), SET.low, SET.high
     law = law_between(setting, low, high, 0.003, 1.2)
     assert law.settling == pytest.approx((2.0 * 6.0 + 5.0) * low.J / low.T_c)
     for left, pushed in ((15, False), (7, False), (16, True)):
@@ -137,10 +144,10 @@ def test_a_brake_that_rests_at_the_edge_of_the_rest_zone_is_not_pushed_home_just
         assert (current > 1.0) == pushed
 
 
-def held_up_to(setting: ShieldConfig, low: BrakeParameters, high: BrakeParameters) -> float:
+def held_up_to(setting: DesignInputs, low: BrakeParameters, high: BrakeParameters) -> float:
     """L5 (d) by the definition: where the damped stop at V_down, or full braking, is 95 % of the stiffest spring."""
     m, d = setting.current * low.k_m / high.J, low.T_c / high.J - setting.model_error
-    t, room = setting.sample_time, -setting.lowest_angle - setting.angle_margin
+    t, room = setting.sample_time, -setting.lowest_angle - setting.shield.angle_margin
     # The sample before still moves at that speed: v²/2A + 3 v t/2 = room.
     a = m + d
     stopped = float(max(np.roots([0.5 / a, 1.5 * t, -room]).real))
@@ -150,11 +157,13 @@ def held_up_to(setting: ShieldConfig, low: BrakeParameters, high: BrakeParameter
 
 
 @pytest.mark.parametrize("error", [0.0, 300.0])
-@pytest.mark.parametrize("change", [{}, {"speed": 900.0}, {"damping_velocity": 700.0}, {"angle_margin": 9.0}])
+@pytest.mark.parametrize("change", [{}, {"speed": 900.0}, {"damping_velocity": 700.0}])
+@pytest.mark.parametrize("margin", [0.3, 9.0])
 def test_a_law_reaches_as_far_as_the_weakest_motor_holds_the_stiffest_spring(
-    error: float, change: dict[str, Any]
+    error: float, margin: float, change: dict[str, Any]
 ) -> None:
-    setting = shield_config(learning(model_error=error))._replace(**change)
+    setting = design_inputs(learning(model_error=error))
+    setting = setting._replace(shield=setting.shield._replace(angle_margin=margin), **change)
     low, high = (
         SET.low._replace(J=0.9 * SET.low.J),
         SET.high._replace(k_1=3.0 * SET.high.k_1, gamma=1.1 * SET.high.gamma),
@@ -164,11 +173,15 @@ def test_a_law_reaches_as_far_as_the_weakest_motor_holds_the_stiffest_spring(
 
 
 def test_the_plan_of_the_way_home_leaves_a_fifth_of_what_the_weakest_motor_reaches() -> None:
-    setting = shield_config(learning(model_error=100.0))._replace(planned_speed=1e9, break_away=1.3)
-    low, high = SET.low, SET.high._replace(J=1.2 * SET.high.J, f_v=4.0 * SET.high.f_v)
+    bench = learning(model_error=100.0)
+    setting = design_inputs(replace(bench, shield=bench.shield._replace(break_away=1.3)))
+    low, high = SET.low, SET.high._replace(J=1.2 * SET.high.J, f_v=40.0 * SET.high.f_v)
+    driving = setting.current * low.k_m / high.J - 1.3 * high.T_c / low.J - setting.model_error
+    least = low._replace(f_v=covered_viscous(setting, low, high))
+    part = Part(farthest(setting, low, high), 0.8 * driving * low.J / high.f_v, 0.006, 6.0)
     law = law_between(setting, low, high, 0.006, 6.0)
-    driving = setting.current * low.k_m / high.J - 1.3 * high.T_c / low.J - 100.0
-    planned = law_between(setting._replace(planned_speed=0.8 * driving * low.J / high.f_v), low, high, 0.006, 6.0)
-    faster = law_between(setting._replace(planned_speed=0.79 * driving * low.J / high.f_v), low, high, 0.006, 6.0)
-    assert law == pytest.approx(planned, rel=1e-12)
-    assert law.cruise != pytest.approx(faster.cruise, rel=1e-6)
+    assert law == pytest.approx(law_of(setting, least, high, part), rel=1e-12)
+    assert law.cruise == pytest.approx(part.planned_speed)
+    assert part.planned_speed < 0.5 * setting.speed
+    thin = high._replace(f_v=1e-2 * high.f_v)  # of which no speed within the limit takes a fifth
+    assert law_between(setting, low, thin, 0.006, 6.0).cruise < setting.speed

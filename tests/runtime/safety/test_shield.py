@@ -115,10 +115,10 @@ def test_every_shipped_set_can_be_shielded() -> None:
 
 
 UNREADABLE = [
-    ("current_lag   = 0.0", "current_lag   = -1e-3", "shield.current_lag: expected a time from 0 to 0.1 s"),
-    ("current_lag   = 0.0", "current_lag   = 0.2", "shield.current_lag: expected a time from 0 to 0.1 s"),
-    ("break_away    = 1.0", "break_away    = 0.9", "shield.break_away: expected a ratio from 1 to 5"),
-    ("f_l           = 0.0", "f_l           = 2.0e-4", "shield.f_l: expected a length from 0 to 1e-4 m"),
+    ("current_lag   = 0.0", "current_lag   = -1e-3", "shield.current_lag: expected a number from 0 to 0.1 s"),
+    ("current_lag   = 0.0", "current_lag   = 0.2", "shield.current_lag: expected a number from 0 to 0.1 s"),
+    ("break_away    = 1.0", "break_away    = 0.9", "shield.break_away: expected a number from 1 to 5"),
+    ("f_l           = 0.0", "f_l           = 2.0e-4", "shield.f_l: expected a number from 0 to 0.0001"),
     ('envelope      = "braking"', 'envelope      = "gliding"', "shield.envelope: expected one of braking, coasting"),
     ("f_l           = 0.0", "f_k           = 0.0", r"shield.f_k: unknown key; expected some of .*break_away.* f_l,"),
 ]

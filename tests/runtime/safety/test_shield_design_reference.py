@@ -13,10 +13,18 @@ from typing import Any
 
 import pytest
 
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Limits, Noise, Ranges, load_bench
-from emb_runtime.config.shield_config import shield_config
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Limits, Noise, Ranges, Shield, load_bench
 from emb_runtime.errors import BenchFileError
-from emb_runtime.safety.shield_design import chatter_excess, coasting_excess, damped_excess, law_of, make_law, stoppable
+from emb_runtime.safety.shield_design import (
+    chatter_excess,
+    coasting_excess,
+    damped_excess,
+    design_inputs,
+    law_of,
+    make_law,
+    stoppable,
+    whole,
+)
 
 SHIPPED = load_bench()
 PAD = 0.3  # rad/s, as docs/explanation/shield.md says
@@ -158,8 +166,9 @@ def test_a_law_s_numbers_are_those_of_their_definitions(kind: dict[str, Any]) ->
 def test_a_velocity_that_is_better_known_shortens_all_of_the_landing_but_the_time_in_which_no_hop_is_begun() -> None:
     """A hop begins anew with the noise of a measurement, and comes to rest by friction from it."""
     brakes = SHIPPED.range_set("envelope")
-    config = shield_config(SHIPPED)._replace(velocity_noise=0.5)
-    known, measured = law_of(config, brakes.low, brakes.high), make_law(SHIPPED)
+    inputs = design_inputs(SHIPPED)
+    part = whole(inputs)._replace(velocity_noise=0.5)
+    known, measured = law_of(inputs, brakes.low, brakes.high, part), make_law(SHIPPED)
     friction = brakes.low.T_c / brakes.low.J
     assert known.rest_velocity == pytest.approx(0.5 + 5.0)
     assert measured.reserve - known.reserve == pytest.approx(2.0 * (6.0 - 0.5) / friction)
@@ -194,7 +203,9 @@ def taken(bench: Bench, **changes: Any) -> Bench:
             bench = replace(bench, ranges={"drawn": drawn})
         else:
             part = next(p for p in ("limits", "shield", "node", "noise", "timing") if hasattr(getattr(bench, p), name))
-            bench = replace(bench, **{part: replace(getattr(bench, part), **{name: value})})
+            at = getattr(bench, part)
+            changed: Any = at._replace(**{name: value}) if isinstance(at, Shield) else replace(at, **{name: value})
+            bench = replace(bench, **{part: changed})
     return bench
 
 
@@ -391,16 +402,18 @@ def test_the_stoppable_velocity_is_the_greatest_whose_way_the_room_allows(seed: 
 def test_where_the_current_lags_in_a_short_stroke_the_strongest_brake_limits_the_speed(seed: int) -> None:
     bench = taken(drawn_bench(Random(seed)), angle_low=-0.45, current_lag=2e-3)
     low, high = bench.ranges["drawn"].low, bench.ranges["drawn"].high
-    law, expected = law_of(shield_config(bench), low, high), defined(bench)
+    inputs = design_inputs(bench)
+    law, expected = law_of(inputs, low, high, whole(inputs)), defined(bench)
     assert law.homeward_speed == pytest.approx(expected["homeward_speed"], rel=1e-9)
-    weakest = law_of(shield_config(bench), low, high._replace(k_m=low.k_m))
+    weakest = law_of(inputs, low, high._replace(k_m=low.k_m), whole(inputs))
     assert law.homeward_speed < weakest.homeward_speed - 1.0
 
 
 def test_the_way_home_is_planned_with_no_more_than_the_speed_that_is_set() -> None:
     bench = drawn_bench(Random(5))
     low, high = bench.ranges["drawn"].low, bench.ranges["drawn"].high
-    slow = law_of(shield_config(bench)._replace(planned_speed=50.0), low, high)
+    inputs = design_inputs(bench)
+    slow = law_of(inputs, low, high, whole(inputs)._replace(planned_speed=50.0))
     assert slow.cruise == 50.0
     assert slow.homeward_speed == make_law(bench).homeward_speed
 

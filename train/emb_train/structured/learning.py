@@ -10,11 +10,11 @@ import numpy as np
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import Bench, BrakeParameters, LearntModel
 from emb_runtime.config.plants import EULER, Plant
-from emb_runtime.config.shield_config import ShieldConfig, shield_config
 from emb_runtime.errors import UsageError
 from emb_runtime.learning.assumptions import Assumptions, assumptions_of, make_assumptions
 from emb_runtime.learning.bounded import hear, lose, start
 from emb_runtime.learning.known import Known
+from emb_runtime.safety.shield_design import DesignInputs, design_inputs
 from emb_train.envs.conditions import NOTHING_RANDOM, Randomisation
 
 Shield = Literal["worst case", "bounded"]
@@ -25,7 +25,7 @@ class Learning(NamedTuple):
     """Prior knowledge of a learning shield; numbers only."""
 
     learns: bool
-    setting: ShieldConfig  # The bench's
+    inputs: DesignInputs  # Of the bench
     nominal: BrakeParameters  # Brake that the parameters are relative to
     assumptions: Assumptions
 
@@ -47,7 +47,7 @@ def make_learning(bench: Bench, shield: Shield, plant: Plant, randomised: Random
     declared = bench.shield._replace(learn=learns, model=model)
     bench = replace(bench, shield=declared)
     assumptions = make_assumptions(bench) if learns else assumptions_of(bench)
-    return Learning(learns, shield_config(bench), bench.brake, assumptions)
+    return Learning(learns, design_inputs(bench), bench.brake, assumptions)
 
 
 def can_learn(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:
@@ -55,11 +55,11 @@ def can_learn(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:
 
     It matters whether the shield covers one, the plant has it or it is drawn.
     """
-    setting, between = shield_config(bench), plant.instruments
-    late = max(setting.age_high, between.command_delay, between.measurement_delay, randomised.delay[1]) > 0
-    lagging = max(setting.lag, plant.mechanics.current_lag, randomised.current_lag[1]) > 0.0
+    shield, between = bench.shield, plant.instruments
+    late = max(shield.frame_age[1], between.command_delay, between.measurement_delay, randomised.delay[1]) > 0
+    lagging = max(shield.current_lag, plant.mechanics.current_lag, randomised.current_lag[1]) > 0.0
     off = between.encoder_offset != 0.0 or randomised.encoder_offset != NOTHING_RANDOM.encoder_offset
-    return not (late or lagging or off or between.observer_bandwidth > 0.0 or setting.coasting)
+    return not (late or lagging or off or between.observer_bandwidth > 0.0 or shield.envelope == "coasting")
 
 
 def begin(learning: Learning) -> Floats:

@@ -215,7 +215,7 @@ def with_learnt(
         mistaken[i] = mistaken[i] or not holds(learning.nominal, possible, brakes[i], x[i, 0], x[i, 1])
         if not possible.falsified:
             y[i, 0], y[i, 1] = middle(possible)
-            return with_law(setup, law_for(learning.setting, learning.nominal, possible))
+            return with_law(setup, law_for(learning.inputs, learning.nominal, possible))
     return setup
 
 
