@@ -214,21 +214,10 @@ def _e2e(dice: random.Random) -> Iterator[Any]:
 
 def _codec(dice: random.Random) -> Iterator[Any]:
     layout = load_layout()
-    decoders = (layout.decode_command, layout.decode_angle, layout.decode_velocity, layout.decode_status)
     while True:
-        for message, decode in zip(layout.messages.values(), decoders, strict=True):
-            wanted = [_drawn_value(dice, signal) for signal in message.signals[1:]]
-            packed = _tried(message.pack, *wanted)
-            frame = packed if isinstance(packed, Frame) else _drawn_frame(dice, message)
-            yield packed, _tried(decode, frame), _tried(message.decode, frame), message.unpack(frame.data.ljust(8))
-
-
-def _drawn_value(dice: random.Random, signal: Any) -> Any:
-    """A value in a signal's range, mostly: an int where it is whole."""
-    if dice.random() < 0.03:
-        return _number(dice, 2.0 * abs(signal.maximum) + 1.0)
-    raw = dice.randint(signal.raw_minimum, signal.raw_maximum)
-    return raw * signal.factor + signal.offset
+        for message in layout.messages.values():
+            frame = _drawn_frame(dice, message)
+            yield _tried(message.decode, frame), _tried(layout.decode_any, frame)
 
 
 def _drawn_frame(dice: random.Random, message: Any) -> Frame:
@@ -259,7 +248,7 @@ def _reception(dice: random.Random) -> Iterator[Any]:
         for frame in frames[: 2 + (dice.random() < 0.1)]:
             sample = take.take(frame._replace(time_ns=time_ns, own=dice.random() < 0.01, dropped=counter // 14))
             yield (
-                *(sample, take.permitted(time_ns + dice.randrange(-(10**7), 10**8)), take.rejected, take.dropped),
+                *(sample, take.inhibit_reason(time_ns + dice.randrange(-(10**7), 10**8)), take.rejected, take.dropped),
                 *(take.too_many_rejected, take.foreign_command, list(told), take.status, str(take.rejections())),
             )
             told.clear()

@@ -48,7 +48,7 @@ def bit_errors(draw: Draw) -> Played:
         data = (word ^ (1 << first | 1 << second)).to_bytes(message.length, "little")
         count += 1
         try:
-            message.values(Frame(frame.identifier, data))
+            message.decode(Frame(frame.identifier, data))
         except FrameRejectedError:
             continue
         raise ViolationError(frame, "with bits", first, second, "wrong was accepted")

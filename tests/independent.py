@@ -24,6 +24,11 @@ def protected(identifier: int, body: bytes, *, by: int | None = None) -> bytes:
     return with_crc(DATA_IDS[identifier] if by is None else by, body)
 
 
+def encoded(identifier: int, values: Values) -> Frame:
+    """A protected frame of these values, of every signal but the CRC."""
+    return Frame(identifier, protected(identifier, MESSAGES[identifier].encode({**values, "CRC": 0}, strict=True)[1:]))
+
+
 def with_crc(data_id: int, body: bytes) -> bytes:
     """A payload with the CRC byte of end-to-end profile 1 before it."""
     payload = bytearray(b"\0" + body)

@@ -23,7 +23,7 @@ from emb_runtime.safety.state_machine import FAULTS, Event, Fault, Run, StopErro
 from tests.fuzz.draws import Draw, chance, pick
 from tests.fuzz.model import MachineModel, ReceptionModel
 from tests.fuzz.stream import COMMAND, MS, Stream, anything, damaged
-from tests.independent import protected, read
+from tests.independent import encoded, protected, read
 
 LENGTH = 100  # Frames or events in a sequence
 BENCH, LAYOUT = load_bench(), load_layout()
@@ -70,7 +70,7 @@ def decoder(draw: Draw) -> Played:
                 said = None
             demand((said is None) == (expected is None), frame, "decoded to", said)
         if expected is not None and named is not None:
-            again = LAYOUT.messages[named[0]].encode(named[1])
+            again = encoded(frame.identifier, named[1])
             demand(again.data == frame.data, frame, "is written as", again)
     return Played(LENGTH)
 
@@ -79,7 +79,8 @@ def valid_frame(draw: Draw) -> Frame:
     """A frame of ours that says anything that it may."""
     message = pick(draw, list(LAYOUT.messages.values()))
     raws = [draw.integer(s.raw_minimum, s.raw_maximum) for s in message.signals[1:]]
-    return message.pack(*(raw * s.factor + s.offset for raw, s in zip(raws, message.signals[1:], strict=True)))
+    word = sum((raw & s.mask) << s.shift for raw, s in zip(raws, message.signals[1:], strict=True))
+    return Frame(message.identifier, protected(message.identifier, word.to_bytes(message.length, "little")[1:]))
 
 
 def reception(draw: Draw) -> Played:
@@ -93,7 +94,7 @@ def reception(draw: Draw) -> Played:
             ours, expected = taken.take(frame), model.take(frame)
             demand(ours == expected, frame, "made", ours, "expected", expected)
             now_ns = frame.time_ns + draw.integer(-2 * MS, 3 * MS)
-            demand((taken.permitted(now_ns) == "") == model.permitted(now_ns), "permission at", now_ns, taken)
+            demand((taken.inhibit_reason(now_ns) == "") == model.permitted(now_ns), "permission at", now_ns, taken)
             compare(taken, model)
     return Played(count)
 
@@ -102,11 +103,10 @@ def compare(taken: Reception, model: ReceptionModel) -> None:
     """The reception has counted what the model has."""
     seen = (taken.rejected, taken.too_many_rejected, taken.foreign_command)
     demand(seen == (model.rejected, model.too_many, model.foreign), "counted", seen, "expected", model)
-    for watched in taken.watched:
-        key = 0 if watched.contract.name == "pair" else watched.contract.identifier
-        demand(watched.errors.errors == model.errors[key], watched.contract.name, "leaky count", watched.errors.errors)
-        stored = getattr(watched.errors, "last", None)
-        demand(stored == model.counters.get(key), watched.contract.name, "stored counter", stored)
+    for state in taken.states:
+        key = 0 if state.name == "pair" else state.identifier
+        demand(state.errors.errors == model.errors[key], state.name, "leaky count", state.errors.errors)
+        demand(state.errors.last == model.counters.get(key), state.name, "stored counter", state.errors.last)
 
 
 def machine(draw: Draw) -> Played:

@@ -65,14 +65,14 @@ def test_choices_from_bytes_use_the_bytes_in_order_and_end() -> None:
 
 
 def reserved_bits_are_ignored(patch: Patch) -> None:
-    values = Message.values
+    decode = Message.decode
 
-    def careless(self: Message, frame: Frame) -> list[Any]:
+    def careless(self: Message, frame: Frame) -> dict[str, Any]:
         object.__setattr__(self, "reserved", 0)
-        return values(self, frame)
+        return decode(self, frame)
 
     originals = {id(m): m.reserved for m in runs.LAYOUT.messages.values()}
-    patch.setattr(Message, "values", careless)
+    patch.setattr(Message, "decode", careless)
     for message in runs.LAYOUT.messages.values():  # so that undoing puts them back
         patch.setitem(message.__dict__, "reserved", originals[id(message)])
 
@@ -88,7 +88,7 @@ def a_rejected_counter_is_stored(patch: Patch) -> None:
 
 
 def permission_never_ends(patch: Patch) -> None:
-    patch.setattr(Reception, "permitted", lambda *_: "")
+    patch.setattr(Reception, "inhibit_reason", lambda *_: "")
 
 
 def a_run_that_stops_can_be_begun_again(patch: Patch) -> None:
@@ -126,7 +126,7 @@ def a_stop_frame_carries_a_current(patch: Patch) -> None:
 
 
 def the_loop_fails_at_what_it_does_not_know(patch: Patch) -> None:
-    patch.setattr(Reception, "permitted", lambda *_: 1 / 0)
+    patch.setattr(Reception, "inhibit_reason", lambda *_: 1 / 0)
 
 
 @pytest.mark.parametrize(

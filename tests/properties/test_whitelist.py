@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from emb_runtime.can.error_frames import ErrorClass
+from emb_runtime.can.error_frames import BUS_OFF
 from emb_runtime.can.messages import Layout, StopReason
 from emb_runtime.can.receiver import Reception
 from emb_runtime.config.bench import Bench
@@ -49,11 +49,11 @@ def test_the_reception_believes_exactly_its_messages_and_is_touched_by_nothing_e
 ) -> None:
     believed, rejected, foreign = set(), set(), set()
     reception = Reception(layout, bench, lambda _frame, _why: None)
-    fresh = [w.valid_ns for w in reception.watched]
+    fresh = [w.valid_ns for w in reception.states]
     for frame in every(kind, valid):
         reception.take(frame)
         touched = (frame.identifier, len(frame.data))
-        if [w.valid_ns for w in reception.watched] != fresh:
+        if [w.valid_ns for w in reception.states] != fresh:
             believed.add(touched)
         if reception.rejected:
             rejected.add(touched)
@@ -71,8 +71,8 @@ def test_the_reception_believes_exactly_its_messages_and_is_touched_by_nothing_e
         "error": (set(), set(), set()),
     }
     assert (believed, rejected, foreign) == expected[kind]
-    reported = reception.bus_errors.counts
-    assert reported.get(ErrorClass.BUS_OFF, 0) == (1024 * 9 if kind == "error" else 0)  # half of all have that bit
+    reported = reception.bus_errors
+    assert reported.get(BUS_OFF, 0) == (1024 * 9 if kind == "error" else 0)  # half of all have that bit
 
 
 @pytest.mark.parametrize("length", FD_LENGTHS)
@@ -81,13 +81,13 @@ def test_no_frame_of_can_fd_is_believed_or_let_out(
 ) -> None:
     reception, bus = Reception(layout, bench, lambda _frame, _why: None), list[Frame]()
     guard = Guard(layout, bench, bus.append)
-    fresh = [w.valid_ns for w in reception.watched]
+    fresh = [w.valid_ns for w in reception.states]
     for identifier in range(0x800):
         frame = Frame(identifier, valid.get(identifier, b"").ljust(length, b"\0"))
         assert reception.take(frame) is None
         with pytest.raises(GuardRejectedError):
             guard.send(frame, RunState.ACTIVE, 0, 0)
-    assert [w.valid_ns for w in reception.watched] == fresh
+    assert [w.valid_ns for w in reception.states] == fresh
     assert (reception.rejected, reception.foreign_command, bus) == (3, True, [])
 
 
@@ -99,7 +99,7 @@ def test_no_29_bit_identifier_that_ends_like_one_of_ours_is_taken_for_it(
     """Whether the frame says that it has 29 bits, or its number alone does."""
     reception, bus = Reception(layout, bench, lambda _frame, _why: None), list[Frame]()
     guard = Guard(layout, bench, bus.append)
-    fresh = [w.valid_ns for w in reception.watched]
+    fresh = [w.valid_ns for w in reception.states]
     refused = 0
     for high in range(0 if extended else 1, HIGH_BITS):
         frame = Frame(high << 11 | identifier, valid[identifier], extended=extended)
@@ -109,7 +109,7 @@ def test_no_29_bit_identifier_that_ends_like_one_of_ours_is_taken_for_it(
                 guard.send(frame, RunState.ACTIVE, 0, 0)
             except GuardRejectedError:
                 refused += 1
-    assert [w.valid_ns for w in reception.watched] == fresh
+    assert [w.valid_ns for w in reception.states] == fresh
     assert (reception.rejected, reception.foreign_command, bus) == (0, False, [])
     assert refused == (0 if identifier != COMMAND else HIGH_BITS - (not extended))
 

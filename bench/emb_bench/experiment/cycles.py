@@ -20,7 +20,7 @@ from emb_bench.experiment.experiment import Booleans, Floats, Integers
 from emb_bench.logs.log import RunLog, Table
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER
 from emb_runtime.can.messages import CHARGE, Layout
-from emb_runtime.can.receiver import Reception, contracts
+from emb_runtime.can.receiver import Reception, fresh_ns
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import LogError
 from emb_runtime.records import CycleRecord, Frame, RunState, SensorSample
@@ -91,7 +91,7 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[tuple[In
     """Step and content of the samples in the control cycles, some at a time; errors as for :func:`samples_on_grid`."""
     layout, period_ns = log.layout, bench.timing.sample_time_ns
     log.require("/cycle", CycleRecord._fields)
-    apart_ns = 0 if log.imported else contracts(layout, bench).pair.fresh_ns
+    apart_ns = 0 if log.imported else fresh_ns(layout.velocity)
     reports = _Reports(log, layout.velocity.name, "CommandCounter", UNKNOWN, apart_ns)
     charges = _Reports(log, CHARGE, "Charge", math.nan, apart_ns)
     active = last = 0

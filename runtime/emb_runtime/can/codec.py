@@ -1,18 +1,18 @@
-"""A codec generated from a DBC file: plain little-endian signals, end-to-end protected.
+"""Messages as a DBC describes them: plain little-endian signals, end-to-end protected; and a decoder by that table.
 
-Loading turns each signal into a shift, a mask and a range of raw integers; encoding and decoding are then integer
-work on one word. What does not fit raises: nothing is wrapped, masked or clipped into shape.
+The loop uses functions that are generated from it (:mod:`emb_runtime.can.generated`); the guard, the log and whoever
+explains a rejection decode by the table. What does not fit raises: nothing is masked or clipped into shape.
 """
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from emb_runtime.can import e2e
 from emb_runtime.errors import FrameError
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from cantools.database.can import Signal as DbcSignal
 
 
-Number = int | float
-"""A value that is an int where it is whole. Annotated as a float it would become one in compiled code."""
+Number = int | float  # An int where it is whole
 
 
 class Fault(StrEnum):
@@ -63,68 +62,37 @@ class Signal:
     sign: int  # Its sign bit; 0 if unsigned
     raw_minimum: int
     raw_maximum: int
-    is_whole: bool  # Factor and offset are whole, and so are its values
-    is_plain: bool  # Its step is one as well
-    least: float  # ``minimum``; this and the next three are floats, with which compiled code computes fast
-    greatest: float
-    step: float
-    zero: float
+
+    @property
+    def is_plain(self) -> bool:
+        """Its values are whole numbers, and each of them."""
+        return self.factor == 1 and isinstance(self.offset, int)
 
     def raw(self, word: int) -> int:
         """The whole number that stands for it in the payload word."""
         return ((word >> self.shift & self.mask) ^ self.sign) - self.sign
 
+    @property
+    def range_text(self) -> str:
+        """The range for a message."""
+        return f"a value from {self.minimum:g} to {self.maximum:g} {self.unit}".rstrip()
+
 
 @dataclass(frozen=True)
 class Message:
-    """One message: its description, and its codec."""
+    """One message."""
 
     name: str
     identifier: int
     length: int  # Payload bytes
     data_id: int  # End-to-end data id, 16 bits; on the bus in the CRC only
     cycle_time: float  # [s]
-    signals: tuple[Signal, ...]  # In the order in which the protocol names them: the CRC first, then the alive counter
+    signals: tuple[Signal, ...]  # As they lie in the payload: the CRC first, then the alive counter
     reserved: int  # Ones where no signal is, in the payload word
     crc_start: int  # :func:`emb_runtime.can.e2e.profile1_start` of the data id
-    coded: tuple[Signal, ...]  # All signals but the CRC
-
-    def encode(self, values: Mapping[str, Number]) -> Frame:
-        """A protected frame from the physical value of every signal but the CRC, by name; see :meth:`pack`."""
-        return self.pack(*(values[signal.name] for signal in self.signals[1:]))
-
-    def pack(self, *values: Number) -> Frame:
-        """A protected frame from the physical values of ``signals[1:]``; the CRC comes from protecting them.
-
-        Raises:
-            FrameError: a value is not finite, out of its range, or not whole where it must be.
-        """
-        if len(values) != len(self.coded):
-            raise ValueError(f"{self.name}: expected {len(self.coded)} values, got {len(values)}")
-        word = 0
-        for at, signal in enumerate(self.coded):
-            value = values[at]
-            number = value + 0.0  # a float: what follows is then fast when compiled
-            if not signal.least <= number <= signal.greatest:  # this way round, NaN is refused
-                raise FrameError(f"{self.name}.{signal.name}: expected {_range(signal)}, got {value!r}")
-            if signal.is_plain:
-                raw = int(number - signal.zero)
-                if raw + signal.offset != value:
-                    raise FrameError(f"{self.name}.{signal.name}: expected a whole number, got {value!r}")
-            else:
-                raw = round((number - signal.zero) / signal.step)
-            word |= (raw & signal.mask) << signal.shift
-        body = word.to_bytes(self.length, "little")[1:]
-        data = e2e.protect(self.crc_start, body)
-        return tuple.__new__(Frame, (self.identifier, data, 0, False, False, False, False, 0))
 
     def decode(self, frame: Frame) -> dict[str, Number]:
-        """The physical value of every signal of a frame that is valid in all respects, by name; see :meth:`values`."""
-        values = self.values(frame)
-        return {signal.name: value for signal, value in zip(self.signals, (frame.data[0], *values), strict=True)}
-
-    def values(self, frame: Frame) -> list[Any]:
-        """The physical values of ``signals[1:]`` of a frame that is valid in all respects: ints where they are whole.
+        """The physical value of every signal of a frame that is valid in all respects, by name.
 
         Raises:
             FrameRejectedError: it is not; ``fault`` says why.
@@ -141,22 +109,23 @@ class Message:
         word = int.from_bytes(data, "little")
         if word & self.reserved:
             raise self._rejected(Fault.RESERVED, f"{data.hex(' ')}; does its sender speak another protocol version?")
-        values: list[Any] = []
-        for signal in self.coded:
-            raw = ((word >> signal.shift & signal.mask) ^ signal.sign) - signal.sign
+        values: dict[str, Number] = {}
+        for signal in self.signals:
+            raw = signal.raw(word)
+            value = values[signal.name] = raw * signal.factor + signal.offset
             if not signal.raw_minimum <= raw <= signal.raw_maximum:
-                got = raw * signal.factor + signal.offset
-                raise self._rejected(Fault.RANGE, f"{signal.name}: expected {_range(signal)}, got {got:g}")
-            if signal.is_whole:
-                values.append(raw * signal.factor + signal.offset)
-            else:
-                values.append(raw * signal.step + signal.zero)
+                raise self._rejected(Fault.RANGE, f"{signal.name}: expected {signal.range_text}, got {value:g}")
         return values
 
-    def unpack(self, data: bytes) -> dict[str, Number]:
-        """The physical value of every signal of a payload of the right length, whether valid or not."""
-        word = int.from_bytes(data, "little")
-        return {s.name: s.raw(word) * s.factor + s.offset for s in self.signals}
+    def refusal(self, values: Mapping[str, Number]) -> FrameError:
+        """The error about the first of these values, by signal, that a frame cannot carry."""
+        for name, value in values.items():
+            signal = self.signal(name)
+            if not signal.minimum <= value <= signal.maximum:  # this way round, NaN is refused
+                return FrameError(f"{self.name}.{name}: expected {signal.range_text}, got {value!r}")
+            if signal.is_plain and int(value) != value:
+                return FrameError(f"{self.name}.{name}: expected a whole number, got {value!r}")
+        raise ValueError(f"{self.name}: a frame can carry {values}")
 
     def _rejected(self, fault: Fault, detail: str) -> FrameRejectedError:
         return FrameRejectedError(f"{self.name}: frame rejected, {fault}: {detail}", fault)
@@ -183,10 +152,6 @@ def worst_bits(length: int, *, extended: bool = False) -> int:
         extended: its identifier has 29 bits.
     """
     return (80 if extended else 55) + 10 * length
-
-
-def _range(signal: Signal) -> str:
-    return f"a value from {signal.minimum:g} to {signal.maximum:g} {signal.unit}".rstrip()
 
 
 @contextmanager
@@ -223,13 +188,13 @@ def parse(text: str) -> Database:
     return database
 
 
-def generate(database: Database, name: str, expected: tuple[str, ...]) -> Message:
-    """The codec of one message of a DBC.
+def generate(database: Database, name: str, expected: Set[str]) -> Message:
+    """The description of one message of a DBC.
 
     Args:
         database: the DBC.
         name: of the message.
-        expected: names of its signals, ``CRC`` and ``Counter`` first; the DBC may place the others anywhere.
+        expected: names of its signals but ``CRC``; the DBC may place all but the counter anywhere.
 
     Raises:
         FrameError: there is no such message, or not as this protocol needs it.
@@ -239,9 +204,9 @@ def generate(database: Database, name: str, expected: tuple[str, ...]) -> Messag
     except KeyError:
         raise FrameError(f"DBC: no message {name}; this file is not a layout of this bench") from None
     found = {s.name: _generate_signal(name, s) for s in source.signals}
-    if found.keys() != set(expected):
-        raise FrameError(f"DBC: {name}: expected the signals {', '.join(expected)}")
-    signals = tuple(found[e] for e in expected)
+    if found.keys() != {"CRC", *expected}:
+        raise FrameError(f"DBC: {name}: expected the signals CRC, {', '.join(sorted(expected))}")
+    signals = tuple(sorted(found.values(), key=lambda signal: signal.shift))
     if source.is_extended_frame or source.is_fd:
         raise FrameError(f"DBC: {name}: expected a classical frame with an 11-bit identifier")
     header = [(s.name, s.shift, s.mask) for s in signals[:2]]
@@ -258,7 +223,6 @@ def generate(database: Database, name: str, expected: tuple[str, ...]) -> Messag
         signals=signals,
         reserved=((1 << 8 * source.length) - 1) & ~covered,
         crc_start=e2e.profile1_start(data_id),
-        coded=signals[1:],
     )
 
 
@@ -278,7 +242,6 @@ def _generate_signal(message: str, source: DbcSignal) -> Signal:
     factor, offset = _number(source.scale), _number(source.offset)
     if factor <= 0 or source.minimum is None or source.maximum is None:
         raise FrameError(f"{where}: expected a positive step and a range [minimum|maximum]")
-    is_whole = isinstance(factor, int) and isinstance(offset, int)
     # The range is meant to lie on steps; the slack absorbs the decimal fractions' rounding, never a whole step.
     raw_minimum = math.ceil((source.minimum - offset) / factor - 1e-6)
     raw_maximum = math.floor((source.maximum - offset) / factor + 1e-6)
@@ -297,12 +260,6 @@ def _generate_signal(message: str, source: DbcSignal) -> Signal:
         sign=sign,
         raw_minimum=raw_minimum,
         raw_maximum=raw_maximum,
-        is_whole=is_whole,
-        is_plain=is_whole and factor == 1,
-        least=float(source.minimum),
-        greatest=float(source.maximum),
-        step=float(factor),
-        zero=float(offset),
     )
 
 

@@ -27,11 +27,11 @@ def _table() -> bytes:
     return bytes(entries)
 
 
-_TABLE: Final = _table()
+CRC_TABLE: Final = _table()
 
 
 def _advance(state: int, data: bytes) -> int:
-    table = _TABLE
+    table = CRC_TABLE
     for byte in data:
         state = table[state ^ byte]
     return state
@@ -62,10 +62,7 @@ def protect(start: int, body: bytes) -> bytes:
 
 def check(start: int, payload: bytes) -> bool:
     """Returns True if byte 0 of a payload (at least 1 byte) is the CRC of the other bytes."""
-    table, state = _TABLE, start  # written out and not called: each received frame comes through here
-    for byte in payload[1:]:
-        state = table[state ^ byte]
-    return payload[0] == state
+    return payload[0] == _advance(start, payload[1:])
 
 
 def next_counter(counter: int) -> int:

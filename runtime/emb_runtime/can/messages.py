@@ -1,20 +1,21 @@
 """The CAN frames of the bench, typed; ``emb.dbc`` is the only source of their layout.
 
-What does not fit its signal raises. Two signals wrap and saturate by definition, and only their encoders do that: the
-device time and the count of rejected commands.
+What does not fit its signal raises. By definition device time and charge wrap, and the count of rejected commands
+saturates.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cache
 from importlib import resources
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from emb_runtime.can.codec import Fault, FrameRejectedError, Message, Signal, generate, parse
+from emb_runtime.can.generated import Field, generate_codec
 from emb_runtime.errors import FrameError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 
@@ -32,22 +33,8 @@ __all__ = [
     "load_layout",
 ]
 
-# What the typed encoders and decoders below fill in and read, in this order; a DBC that says otherwise is not ours.
-_SIGNALS = {
-    "EMB_Command": ("CRC", "Counter", "Answers", "Current", "Enable"),
-    "EMB_Angle": ("CRC", "Counter", "Angle", "DeviceTime"),
-    "EMB_Velocity": ("CRC", "Counter", "NodeState", "Velocity", "AppliedCurrent", "CommandCounter"),
-    "EMB_Status": (
-        *("CRC", "Counter", "NodeState", "ProtocolVersion", "StopReason", "RejectedCommands", "BenchIdentity"),
-    ),
-}
-
 CHARGE: Final = "EMB_Charge"  # Name of an optional message, which the layouts of older logs do not have
-_CHARGE_SIGNALS = ("CRC", "Counter", "Version", "Charge")
 CHARGE_VERSION: Final = 1  # Version of the charge message
-
-_NODE_STATES: Final = tuple(NodeState)
-"""By their value: calling the enumeration takes three times as long, and each velocity frame has one."""
 
 
 class StopReason(IntEnum):
@@ -89,9 +76,56 @@ class StatusFrame(NamedTuple):
     bench_identity: int  # :func:`bench_identity` of the node's bench file
 
 
+class ChargeFrame(NamedTuple):
+    """Content of the charge message."""
+
+    counter: int  # Alive counter of the sample, 0..14
+    version: int  # :data:`CHARGE_VERSION`
+    charge: float  # Integral of the current up to the sample, wrapped [A·s]
+
+
+_FIELDS: Mapping[str, tuple[type[Any], tuple[Field, ...]]] = {
+    "EMB_Command": (
+        CurrentCommand,
+        (Field("Counter"), Field("Answers"), Field("Current"), Field("Enable", choices=(False, True))),
+    ),
+    "EMB_Angle": (
+        AngleFrame,
+        (Field("Counter"), Field("Angle"), Field("DeviceTime", scale=10**9, wraps=True)),
+    ),
+    "EMB_Velocity": (
+        VelocityFrame,
+        (
+            Field("Counter"),
+            Field("Velocity"),
+            Field("AppliedCurrent"),
+            Field("NodeState", choices=tuple(NodeState)),
+            Field("CommandCounter"),
+        ),
+    ),
+    "EMB_Status": (
+        StatusFrame,
+        (
+            Field("Counter"),
+            Field("NodeState", choices=tuple(NodeState)),
+            Field("ProtocolVersion"),
+            Field("StopReason", choices=tuple(StopReason)),
+            Field("RejectedCommands", saturates=True),
+            Field("BenchIdentity"),
+        ),
+    ),
+    CHARGE: (ChargeFrame, (Field("Counter"), Field("Version", fixed=CHARGE_VERSION), Field("Charge", wraps=True))),
+}
+"""Record of each message, and the signal of each of its fields; a DBC that has others is not ours."""
+
+
 @dataclass(frozen=True)
 class Layout:
-    """All messages of the bench, their typed encoders and decoders, and the DBC text that they come from."""
+    """All messages of the bench with their encoders and decoders, and the DBC text that they come from.
+
+    An encoder takes the fields of its record, :meth:`encode_command` the record, and raises FrameError where a value
+    does not fit. A decoder raises FrameRejectedError for a frame that is not valid in all respects.
+    """
 
     text: str
     protocol_version: int
@@ -101,9 +135,16 @@ class Layout:
     velocity: Message
     status: Message
     charge: Message | None  # Optional: a node may send it, and a layout of an older log does not know it
-    device_time_step: float  # Resolution of the device time stamps [s]
-    device_time_step_ns: int  # Resolution of the device time in whole nanoseconds
     device_time_period_ns: int  # Period after which the device time wraps [ns]
+    encode_command_fields: Callable[[int, int, float, bool], Frame]
+    encode_angle: Callable[[int, float, int], Frame]
+    encode_velocity: Callable[[int, float, float, NodeState, int], Frame]
+    encode_status: Callable[[int, NodeState, StopReason, int, int], Frame]  # The version is the layout's
+    encode_charge: Callable[[int, float], Frame]
+    decode_command: Callable[[Frame], CurrentCommand]
+    decode_angle: Callable[[Frame], AngleFrame]
+    decode_velocity: Callable[[Frame], VelocityFrame]
+    decode_status: Callable[[Frame], StatusFrame]
 
     def encode_command(self, command: CurrentCommand) -> Frame:
         """The command frame.
@@ -111,94 +152,7 @@ class Layout:
         Raises:
             FrameError: the current is not finite or beyond the DBC's range, or a counter is not in 0..14.
         """
-        return self.command.pack(command.counter, command.answers, command.current, command.enable)
-
-    def decode_command(self, frame: Frame) -> CurrentCommand:
-        """Decodes a command frame; raises FrameRejectedError."""
-        counter, answers, current, enable = self.command.values(frame)
-        return tuple.__new__(CurrentCommand, (counter, answers, current, enable != 0))
-
-    def encode_angle(self, counter: int, angle: float, device_time_ns: int) -> Frame:
-        """The angle frame.
-
-        Args:
-            counter: alive counter, 0..14.
-            angle: [rad].
-            device_time_ns: unwrapped; rounded to the signal's step and wrapped here [ns].
-
-        Raises:
-            FrameError: a value does not fit.
-        """
-        step_ns = self.device_time_step_ns
-        steps = (device_time_ns + step_ns // 2) % self.device_time_period_ns // step_ns
-        return self.angle.pack(counter, angle, steps * self.device_time_step)
-
-    def decode_angle(self, frame: Frame) -> AngleFrame:
-        """Decodes an angle frame; raises FrameRejectedError."""
-        counter, angle, device_time = self.angle.values(frame)
-        return tuple.__new__(AngleFrame, (counter, angle, round(device_time * 1e9)))
-
-    def encode_velocity(
-        self, counter: int, velocity: float, applied_current: float, node_state: NodeState, command_counter: int
-    ) -> Frame:
-        """The velocity frame.
-
-        Args:
-            counter: alive counter, 0..14.
-            velocity: [rad/s].
-            applied_current: in the period that ends at this sample [A].
-            node_state: at the sampling instant.
-            command_counter: counter of the command that was applied, 15 if none was.
-
-        Raises:
-            FrameError: a value does not fit.
-        """
-        return self.velocity.pack(counter, node_state, velocity, applied_current, command_counter)
-
-    def decode_velocity(self, frame: Frame) -> VelocityFrame:
-        """Decodes a velocity frame; raises FrameRejectedError."""
-        counter, node_state, velocity, applied_current, command_counter = self.velocity.values(frame)
-        state = _NODE_STATES[node_state]
-        return tuple.__new__(VelocityFrame, (counter, velocity, applied_current, state, command_counter))
-
-    def encode_status(
-        self, counter: int, node_state: NodeState, stop_reason: StopReason, rejected: int, bench_identity: int
-    ) -> Frame:
-        """The status frame; the protocol version is this layout's.
-
-        Args:
-            counter: alive counter, 0..14.
-            node_state: now.
-            stop_reason: see :class:`StopReason`.
-            rejected: commands not obeyed so far; saturates at the signal's maximum.
-            bench_identity: :func:`bench_identity` of the node's bench file.
-
-        Raises:
-            FrameError: a value does not fit.
-        """
-        saturated = min(rejected, self.status.signal("RejectedCommands").raw_maximum)
-        return self.status.pack(counter, node_state, self.protocol_version, stop_reason, saturated, bench_identity)
-
-    def decode_status(self, frame: Frame) -> StatusFrame:
-        """Decodes a status frame; raises FrameRejectedError."""
-        counter, node_state, version, stop_reason, rejected, identity = self.status.values(frame)
-        return StatusFrame(counter, NodeState(node_state), version, StopReason(stop_reason), rejected, identity)
-
-    def encode_charge(self, counter: int, charge: float) -> Frame:
-        """The frame of the charge.
-
-        Args:
-            counter: alive counter of the sample, 0..14.
-            charge: integral of the current up to the sample [A·s]; rounded to the signal's step and wrapped here.
-
-        Raises:
-            FrameError: a value does not fit, or the layout has no such message.
-        """
-        if self.charge is None:
-            raise FrameError(f"DBC: no message {CHARGE}: expected a layout that has it")
-        signal = self.charge.signal("Charge")
-        steps = round(charge / signal.factor) % (signal.raw_maximum + 1)
-        return self.charge.pack(counter, CHARGE_VERSION, steps * signal.step)
+        return self.encode_command_fields(*command)
 
     @property
     def known(self) -> tuple[Message, ...]:
@@ -251,8 +205,9 @@ def _shipped_layout() -> Layout:
 
 def _generate(text: str) -> Layout:
     database = parse(text)
-    messages = {name: generate(database, name, signals) for name, signals in _SIGNALS.items()}
     has_charge = any(message.name == CHARGE for message in database.messages)
+    names = [name for name in _FIELDS if name != CHARGE or has_charge]
+    messages = {name: generate(database, name, {field.signal for field in _FIELDS[name][1]}) for name in names}
     time = messages["EMB_Angle"].signal("DeviceTime")
     step_ns = round(time.factor * 1e9)
     if step_ns < 1 or not math.isclose(step_ns * 1e-9, time.factor, rel_tol=1e-9):
@@ -263,19 +218,39 @@ def _generate(text: str) -> Layout:
     attributes = database.dbc.attributes if database.dbc else {}
     if "EmbProtocolVersion" not in attributes:
         raise FrameError("DBC: expected the attribute EmbProtocolVersion; this file is not a layout of this bench")
+    version = int(attributes["EmbProtocolVersion"].value)
+    codecs = {name: generate_codec(message, *_fields(name, version)) for name, message in messages.items()}
+    command, angle, velocity, status = list(codecs.values())[:4]
+    charge = messages.pop(CHARGE, None)
     return Layout(
         text=text,
-        protocol_version=int(attributes["EmbProtocolVersion"].value),
+        protocol_version=version,
         messages=messages,
         command=messages["EMB_Command"],
         angle=messages["EMB_Angle"],
         velocity=messages["EMB_Velocity"],
         status=messages["EMB_Status"],
-        charge=generate(database, CHARGE, _CHARGE_SIGNALS) if has_charge else None,
-        device_time_step=time.factor,
-        device_time_step_ns=step_ns,
+        charge=charge,
         device_time_period_ns=step_ns * (time.mask + 1),
+        encode_command_fields=command.encode,
+        encode_angle=angle.encode,
+        encode_velocity=velocity.encode,
+        encode_status=status.encode,
+        encode_charge=codecs[CHARGE].encode if charge else _no_charge,
+        decode_command=command.decode,
+        decode_angle=angle.decode,
+        decode_velocity=velocity.decode,
+        decode_status=status.decode,
     )
+
+
+def _fields(name: str, version: int) -> tuple[type[Any], tuple[Field, ...]]:
+    record, fields = _FIELDS[name]
+    return record, tuple(replace(f, fixed=version) if f.signal == "ProtocolVersion" else f for f in fields)
+
+
+def _no_charge(*_: object) -> Frame:
+    raise FrameError(f"DBC: no message {CHARGE}: expected a layout that has it")
 
 
 def _check_choices(message: Message, name: str, enum: type[IntEnum]) -> None:

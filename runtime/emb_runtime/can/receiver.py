@@ -1,7 +1,7 @@
 """Receiver: pairs valid, fresh and plausible frames to sensor samples, and counts the rejected ones.
 
-Pure: frames with their arrival times go in. Each message of the node has a :class:`Contract` and a record of how it
-keeps to it. What is asked of a frame, in this order:
+Pure: frames with their arrival times go in. Each message of the node has a :class:`MessageState`. What is asked of
+a frame, in this order:
 
 - kind: a standard data frame. Error frames, the echo of our own and frames of others are told apart before. Whoever
   else uses the identifier of our command is a second commander, with a copy of our own frame too: an echo is known by
@@ -17,13 +17,15 @@ keeps to it. What is asked of a frame, in this order:
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Final, NamedTuple
+from typing import Final
 
-from emb_runtime.can.e2e import CounterCheck, LeakyCount
-from emb_runtime.can.error_frames import BusErrors
-from emb_runtime.can.messages import AngleFrame, FrameRejectedError, Layout, StatusFrame, StopReason
+from emb_runtime.can.e2e import CounterCheck
+from emb_runtime.can.error_frames import classify
+from emb_runtime.can.messages import AngleFrame, FrameRejectedError, Layout, Message, StatusFrame, StopReason
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.system.clock import TimeUnwrapper
@@ -41,72 +43,21 @@ class Rejection(StrEnum):
     IMPLAUSIBLE = "the angle does not follow from the last one and the velocities between"
 
 
-class Contract(NamedTuple):
-    """Expected timing of a message of the node, or of the pairs that two of them make."""
+@dataclass
+class MessageState:
+    """Liveness of a message of the node, or of the pairs that two of them make."""
 
     name: str
     identifier: int
-    length: int  # Payload bytes
-    period_ns: int  # Time between two [ns]
-    tolerated: int
-    """Rejections in a row that stop the run; fewer if there are good ones between, see :class:`LeakyCount`."""
-
-    @property
-    def fresh_ns(self) -> int:
-        """Age up to which the last valid one permits a current [ns]."""
-        return FRESH_PERIODS * self.period_ns
+    fresh_ns: int  # Age up to which the last valid one permits a current [ns]
+    errors: CounterCheck  # Follows the counter and counts what was rejected; of a pair the latter only
+    valid_ns: int = _NEVER  # Arrival of the last valid one, monotonic [ns]
+    rejections: dict[str, int] = field(default_factory=dict)  # Number of rejections, by reason
 
 
-class Contracts(NamedTuple):
-    """The contract of every message that the node sends."""
-
-    angle: Contract
-    velocity: Contract
-    status: Contract
-
-    @property
-    def pair(self) -> Contract:
-        """That of the samples: a pair is complete when its velocity has come."""
-        return self.velocity._replace(name="pair")
-
-
-def contracts(layout: Layout, bench: Bench) -> Contracts:
-    """The contracts of the layout's messages: lengths and periods are the DBC's, the tolerance is the bench's."""
-    return Contracts(
-        *(
-            Contract(m.name, m.identifier, m.length, round(m.cycle_time * 1e9), bench.watch.rejected)
-            for m in (layout.angle, layout.velocity, layout.status)
-        )
-    )
-
-
-class Watched:
-    """State of a message against its expected timing.
-
-    Args:
-        contract: the contract.
-        errors: counts its rejections.
-    """
-
-    __slots__ = ("contract", "errors", "rejections", "valid_ns")
-
-    def __init__(self, contract: Contract, errors: LeakyCount) -> None:
-        self.contract = contract
-        self.errors = errors
-        self.valid_ns = _NEVER
-        """Arrival of the last valid one, monotonic [ns]."""
-        self.rejections: dict[str, int] = {}
-        """Number of rejections, by reason."""
-
-
-class _Message(Watched):
-    """A message, whose counter is followed."""
-
-    __slots__ = ("check",)
-
-    def __init__(self, contract: Contract) -> None:
-        self.check = CounterCheck(contract.tolerated)
-        super().__init__(contract, self.check)
+def fresh_ns(message: Message) -> int:
+    """Age up to which the last valid frame of a message permits a current [ns]."""
+    return FRESH_PERIODS * round(message.cycle_time * 1e9)
 
 
 class Reception:
@@ -125,29 +76,25 @@ class Reception:
         self._angle_noise, self._velocity_noise = sigmas * 1.5 * noise.angle, sigmas * noise.velocity
         self._period_ns = bench.timing.sample_time_ns
         self._half_top_acceleration = 0.5 * _top_acceleration(bench)
-        table = contracts(layout, bench)
-        self._angle, self._velocity, self._status = (_Message(contract) for contract in table)
-        self._pair = Watched(table.pair, LeakyCount(table.pair.tolerated))
-        self.watched: tuple[Watched, ...] = (self._angle, self._velocity, self._status, self._pair)
-        """State of each message, and of the pairs."""
-        self._fresh = tuple((watched, watched.contract.fresh_ns) for watched in self.watched)
+        self._angle, self._velocity, self._status = (
+            MessageState(m.name, m.identifier, fresh_ns(m), CounterCheck(bench.watch.rejected))
+            for m in (layout.angle, layout.velocity, layout.status)
+        )
+        self._pair = replace(self._velocity, name="pair", errors=CounterCheck(bench.watch.rejected), rejections={})
+        self.states = (self._angle, self._velocity, self._status, self._pair)
+        """State of each message, and of the pairs: a pair is complete when its velocity has come."""
         self._unwrap = TimeUnwrapper(layout.device_time_period_ns).unwrap
-        self._apart_ns = table.pair.fresh_ns
+        self._apart_ns = self._pair.fresh_ns
         self._waiting: AngleFrame | None = None
         self._waiting_since_ns = 0
         self._last: SensorSample | None = None
-        self.rejected = 0
-        """Frames rejected so far."""
-        self.too_many_rejected = False
-        """True after so many rejections, in a row or by their share, that the source is not trusted again."""
-        self.foreign_command = False
-        """Somebody else has sent our command message."""
-        self.status: StatusFrame | None = None
-        """The node's latest status."""
-        self.dropped = 0
-        """Frames that the kernel dropped for want of buffer."""
-        self.bus_errors = BusErrors()
-        """Reports of the CAN controller."""
+        self.rejected = 0  # Frames rejected so far
+        self.too_many_rejected = False  # Too many, in a row or by their share: the source is not trusted again
+        self.foreign_command = False  # Somebody else has sent our command message
+        self.status: StatusFrame | None = None  # The node's latest
+        self.dropped = 0  # Frames that the kernel dropped for want of buffer
+        self.bus_errors: Counter[str] = Counter()
+        """Reports of the CAN controller, by :func:`~emb_runtime.can.error_frames.classify`."""
 
     @property
     def stop_reason(self) -> StopReason | None:
@@ -156,37 +103,37 @@ class Reception:
         return None if status is None or status.node_state is NodeState.ACTIVE else status.stop_reason
 
     @property
-    def unpaired(self) -> str:
-        """Reason why no frames have made a sample although both kinds came; empty if a sample was made, or none can."""
+    def pairing_problem(self) -> str:
+        """Why angle and velocity frames have never paired; "" if they have, or one is missing."""
         if self._last is not None or _NEVER in (self._angle.valid_ns, self._velocity.valid_ns):
             return ""
         return "angle and velocity frames came, but no velocity next after the angle with its counter: that goes first"
 
-    def permitted(self, now_ns: int) -> str:
-        """Reason against commanding a current now; empty if there is none.
+    def inhibit_reason(self, now_ns: int) -> str:
+        """Why no current may be commanded now; "" if one may.
 
         Args:
             now_ns: now, monotonic [ns].
         """
         # The stamps are the wall clock's, translated: a small step of that clock may put one just ahead of now.
         ahead_ns = -self._period_ns
-        for watched, fresh_ns in self._fresh:
-            if not ahead_ns <= now_ns - watched.valid_ns <= fresh_ns:
-                return _overdue(watched, now_ns)
+        for state in self.states:
+            if not ahead_ns <= now_ns - state.valid_ns <= state.fresh_ns:
+                return _overdue(state, now_ns)
         if self.foreign_command:
             return "somebody else has sent a command"
         return "too many frames were rejected" if self.too_many_rejected else ""
 
     def rejections(self) -> dict[str, dict[str, int]]:
         """Number of rejections by message and reason, without those that never happened."""
-        return {w.contract.name: dict(w.rejections) for w in self.watched if w.rejections}
+        return {state.name: dict(state.rejections) for state in self.states if state.rejections}
 
     def take(self, frame: Frame) -> SensorSample | None:
         """Take one frame; gives a sample when it completes a valid pair."""
         if frame.dropped > self.dropped:
             self.dropped = frame.dropped
         if frame.error:
-            self.bus_errors.count(frame)
+            self.bus_errors.update(classify(frame))
             return None
         if frame.own or frame.extended:
             return None
@@ -241,12 +188,12 @@ class Reception:
         if self._accepted(frame, self._status, status.counter):
             self.status = status
 
-    def _accepted(self, frame: Frame, message: _Message, counter: int) -> bool:
+    def _accepted(self, frame: Frame, state: MessageState, counter: int) -> bool:
         """Returns True if a valid frame is a new one."""
-        if message.check.step(counter) == 0:
-            self._rejected(frame, message, Rejection.REPEATED, Rejection.REPEATED)
+        if state.errors.step(counter) == 0:
+            self._rejected(frame, state, Rejection.REPEATED, Rejection.REPEATED)
             return False
-        message.valid_ns = frame.time_ns
+        state.valid_ns = frame.time_ns
         return True
 
     def _believed(self, frame: Frame, sample: SensorSample) -> bool:
@@ -275,15 +222,15 @@ class Reception:
         tolerance = self._angle_noise + elapsed * (self._velocity_noise + elapsed * self._half_top_acceleration)
         return abs(travelled - expected) <= tolerance
 
-    def _reject(self, frame: Frame, watched: Watched, reason: str, why: str) -> None:
-        watched.errors.reject()
-        self._rejected(frame, watched, reason, why)
+    def _reject(self, frame: Frame, state: MessageState, reason: str, why: str) -> None:
+        state.errors.reject()
+        self._rejected(frame, state, reason, why)
 
-    def _rejected(self, frame: Frame, watched: Watched, reason: str, why: str) -> None:
+    def _rejected(self, frame: Frame, state: MessageState, reason: str, why: str) -> None:
         """Count a rejection that the leaky count knows already."""
         self.rejected += 1
-        watched.rejections[reason] = watched.rejections.get(reason, 0) + 1
-        if watched.errors.exceeded:
+        state.rejections[reason] = state.rejections.get(reason, 0) + 1
+        if state.errors.exceeded:
             self.too_many_rejected = True
         self._on_rejected(frame, why)
 
@@ -296,10 +243,10 @@ def _top_acceleration(bench: Bench) -> float:
     return (box.high.k_m * bench.limits.current + spring + friction) / box.low.J
 
 
-def _overdue(watched: Watched, now_ns: int) -> str:
-    name, age_ns = watched.contract.name, now_ns - watched.valid_ns
-    if watched.valid_ns == _NEVER:
-        return f"{name} has not come yet"
+def _overdue(state: MessageState, now_ns: int) -> str:
+    age_ns = now_ns - state.valid_ns
+    if state.valid_ns == _NEVER:
+        return f"{state.name} has not come yet"
     if age_ns < 0:
-        return f"{name} is stamped {-age_ns / 1e6:.3f} ms ahead of now"
-    return f"{name} is overdue: the last valid one is {age_ns / 1e6:.3f} ms old"
+        return f"{state.name} is stamped {-age_ns / 1e6:.3f} ms ahead of now"
+    return f"{state.name} is overdue: the last valid one is {age_ns / 1e6:.3f} ms old"

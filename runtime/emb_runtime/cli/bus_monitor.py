@@ -55,8 +55,7 @@ class BusStatistics:
     creep: float  # Slope of that line through the angles, 0 where it is none that the noise could not give [rad/s]
     load: float
     """Share of the bus that all frames took, with every stuff bit that there can be; of a mapped drive's its own."""
-    unpaired: str = ""
-    """Reason why the node's frames made no pair, see :attr:`~emb_runtime.can.receiver.Reception.unpaired`."""
+    pairing_problem: str = ""  # :attr:`~emb_runtime.can.receiver.Reception.pairing_problem`
 
 
 class BusMonitor:
@@ -136,7 +135,7 @@ class BusMonitor:
             others=self._others,
             rejections=reception.rejections(),
             distrusted=reception.too_many_rejected,
-            bus_errors={str(name): count for name, count in reception.bus_errors.counts.items()},
+            bus_errors=dict(reception.bus_errors),
             dropped=reception.dropped,
             commanded=reception.foreign_command,
             status=reception.status,
@@ -147,7 +146,7 @@ class BusMonitor:
             angle_scatter=angle.scatter,
             velocity_scatter=velocity.scatter,
             creep=angle.slope if abs(angle.slope) > CREEP_SIGMAS * angle.slope_error else 0.0,
-            unpaired=reception.unpaired,
+            pairing_problem=reception.pairing_problem,
             load=bits / duration / self._bitrate if duration > 0.0 else 0.0,
         )
 

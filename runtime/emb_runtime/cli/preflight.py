@@ -184,8 +184,8 @@ def _state(f: Findings) -> CheckResult:
     expected = f"IDLE, within {home.home_angle:g} rad and {home.home_velocity:g} rad/s of the origin"
     if f.start_conditions.anywhere:
         expected = "IDLE, inside the limits"
-    if sample is None and f.heard.unpaired:
-        return _faulty("node state", Fault.NODE_NOT_READY, f.heard.unpaired, expected)
+    if sample is None and f.heard.pairing_problem:
+        return _faulty("node state", Fault.NODE_NOT_READY, f.heard.pairing_problem, expected)
     if sample is None:
         return _faulty("node state", Fault.NO_NODE, "no valid sensor pair came", expected)
     if why := f.start_conditions.not_at_rest(sample):

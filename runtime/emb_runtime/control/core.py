@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, LeakyCount, next_counter
+from emb_runtime.can.error_frames import BUS_OFF
 from emb_runtime.can.messages import Layout, StatusFrame
 from emb_runtime.can.receiver import Reception
 from emb_runtime.config.bench import CEILING_CURRENT, Bench
@@ -326,7 +327,7 @@ class Core:
             last_angle=last.angle if last else NAN,
             duration_ns=end.device_time_ns - self._start_ns if end and self._start_ns else 0,
             rejections=reception.rejections(),
-            bus_errors={str(name): count for name, count in reception.bus_errors.counts.items()},
+            bus_errors=dict(reception.bus_errors),
             estimate=self._estimate,
             goal_reached=self._condition_met,
             goal_ns=self._met_ns,
@@ -384,10 +385,10 @@ class Core:
 
     def _count_error(self, frame: Frame) -> None:
         self.counters.bus_errors += 1
-        if self._reception.bus_errors.bus_off and self.running:
+        if BUS_OFF in self._reception.bus_errors and self.running:
             raise StopError(Fault.BUS_LOST, "the CAN controller reports bus-off: it has stopped taking part")
         if self.counters.bus_errors == 1:
-            self._machine.note(Fault.BUS_ERRORS, ", ".join(self._reception.bus_errors.counts), frame.time_ns)
+            self._machine.note(Fault.BUS_ERRORS, ", ".join(self._reception.bus_errors), frame.time_ns)
 
     def _watch_rest(self, sample: SensorSample) -> None:
         if sample.node_state is not NodeState.ACTIVE and not self._stopped:
@@ -417,7 +418,7 @@ class Core:
         try:
             self._machine.handle_event(Event.TIME, self._now_ns)
         except StopError as stop:
-            unpaired = self._reception.unpaired
+            unpaired = self._reception.pairing_problem
             fault = Fault.NODE_NOT_READY if unpaired else stop.fault
             raise StopError(fault, self._not_ready or unpaired or stop.detail) from None
 
@@ -571,7 +572,7 @@ class Core:
             return False
         if self.guard.too_fast(decide_ns):  # samples came in a burst, and there is a newer one
             return False
-        why = self._reception.permitted(decide_ns)
+        why = self._reception.inhibit_reason(decide_ns)
         if why and self._permitted:
             self._machine.note(Fault.PERMISSION_LOST, why, decide_ns)
         self._permitted = not why

@@ -1,11 +1,11 @@
 """The guard: the one place that can reach the bus, independent of all that computes a command.
 
-It takes a frame as bytes, decodes it by itself, and rejects: it never mends. A rejection is an error in the program
-and ends the run. What may pass is a command frame of the right identifier and length, with a valid CRC and the next
-counter, whose enable bit and current agree, within the current limit and the slew, permitted by the run's state,
-computed from a sample no older than two periods, and not faster than the bench's rate. It also holds what the drive
-reports against what it let out, and device time against this computer's. Once the watchdog process has spoken, nothing
-passes any more.
+It takes a frame as bytes, decodes it by the table of signals, not by the generated code that encoded it, and rejects:
+it never mends. A rejection is an error in the program and ends the run. What may pass is a command frame of the right
+identifier and length, with a valid CRC and the next counter, whose enable bit and current agree, within the current
+limit and the slew, permitted by the run's state, computed from a sample no older than two periods, and not faster than
+the bench's rate. It also holds what the drive reports against what it let out, and device time against this computer's.
+Once the watchdog process has spoken, nothing passes any more.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Guard:
     """Lets commands out that satisfy its contract, and counts.
 
     Args:
-        layout: the bus layout, to decode with.
+        layout: the bus layout, whose command message it decodes.
         bench: for the limits and the sample time.
         send: puts a frame on the bus; nobody else holds it.
         pulse: to the watchdog process.
@@ -52,7 +52,7 @@ class Guard:
         pulse: Pulse | None = None,
         limit: float = CEILING_CURRENT,
     ) -> None:
-        self._layout = layout
+        self._message = layout.command
         self._limit = layout.current_within(min(bench.limits.current, CEILING_CURRENT, limit))
         self._period_ns = bench.timing.sample_time_ns
         # The bus carries whole steps of the signal: what uses up the slew may be rounded beyond it, by half of one. A
@@ -153,12 +153,12 @@ class Guard:
     def _checked(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> CurrentCommand:
         if not may_send(state):
             raise _rejected(f"nothing may leave in state {state.name}")
-        if frame.extended or frame.remote or frame.error or frame.identifier != self._layout.command.identifier:
-            raise _rejected(f"not the command message: identifier {frame.identifier:#x}")
         try:
-            command = self._layout.decode_command(frame)
+            values = self._message.decode(frame)
         except FrameError as err:
             raise _rejected(str(err)) from err
+        counter, answers, current = int(values["Counter"]), int(values["Answers"]), float(values["Current"])
+        command = CurrentCommand(counter, answers, current, values["Enable"] != 0)
         if self._last is not None and command.counter != self.next_counter:
             raise _rejected(f"counter {command.counter} does not follow {self._last.counter}")
         if not math.isfinite(command.current) or abs(command.current) > self._limit:

@@ -23,6 +23,7 @@ from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.compiled_core import Core
 from tests.drives import EXAMPLES
+from tests.independent import encoded
 
 MS = 1_000_000
 
@@ -355,7 +356,7 @@ def test_the_scatter_is_that_about_a_line_so_that_a_creep_is_no_noise(listened: 
         seen = layout.decode_angle(frame)
         angles.append(seen.angle + 2e-4 * len(angles))
         values = {"Counter": seen.counter, "Angle": angles[-1], "DeviceTime": seen.device_time_ns * 1e-9}
-        return layout.angle.encode(values)._replace(time_ns=frame.time_ns)
+        return encoded(frame.identifier, values)._replace(time_ns=frame.time_ns)
 
     heard = listened(change=drift).statistics()
     recent = np.array(angles[:200])

@@ -322,9 +322,8 @@ def _a_reported_current_that_is_off(simulate: Simulate) -> SimRun:
 
     def more(frame: Frame) -> Frame:
         said = layout.decode_velocity(frame)
-        return layout.encode_velocity(**{**said._asdict(), "applied_current": said.applied_current + 0.4})._replace(
-            time_ns=frame.time_ns
-        )
+        said = said._replace(applied_current=said.applied_current + 0.4)
+        return layout.encode_velocity(*said)._replace(time_ns=frame.time_ns)
 
     return simulate(lambda _x, _v, step: 6.0 if step // 60 % 2 == 0 else -6.0, on_receive=changing(more, VELOCITY))
 

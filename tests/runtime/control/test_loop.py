@@ -16,6 +16,7 @@ from emb_runtime.records import Frame, NodeState, Reason
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Unwatched
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.clock import SteppedClock
+from tests.independent import encoded
 
 from tests.conftest import SimRun, Simulate  # isort: skip
 
@@ -51,7 +52,7 @@ def status_with(layout: Layout, **changes: int) -> Callable[[Frame], Frame]:
             "RejectedCommands": 0,
             "BenchIdentity": status.bench_identity,
         }
-        return layout.status.encode({**values, **changes})._replace(time_ns=frame.time_ns)
+        return encoded(frame.identifier, {**values, **changes})._replace(time_ns=frame.time_ns)
 
     return change
 

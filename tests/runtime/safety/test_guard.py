@@ -67,7 +67,7 @@ def test_a_command_within_the_contract_passes_unchanged(guard: Guard, bus: Bus) 
 
 def test_a_guard_begins_with_counter_0_and_counts_what_passed_and_what_it_refused(guard: Guard, bus: Bus) -> None:
     assert (guard.next_counter, guard.passed, guard.rejected) == (0, 0, 0)
-    refused(guard, bus, command(6.0)._replace(extended=True), "not the command message")
+    refused(guard, bus, command(6.0)._replace(extended=True), "not a classical data frame of this message")
     assert guard.next_counter == 0
     guard.send(command(), ACTIVE, 100 * MS, 100 * MS)
     assert (guard.next_counter, guard.passed, guard.rejected) == (1, 1, 1)
@@ -91,12 +91,12 @@ def test_a_disabled_command_with_a_current_is_refused(guard: Guard, bus: Bus) ->
 
 def test_no_other_identifier_leaves(guard: Guard, bus: Bus) -> None:
     for identifier in set(range(0x800)) - {0x80}:
-        refused(guard, bus, command()._replace(identifier=identifier), "not the command message")
+        refused(guard, bus, command()._replace(identifier=identifier), "not a classical data frame of this message")
 
 
 @pytest.mark.parametrize("change", [{"extended": True}, {"remote": True}, {"error": True}])
 def test_no_other_kind_of_frame_leaves(guard: Guard, bus: Bus, change: dict[str, Any]) -> None:
-    refused(guard, bus, command()._replace(**change), "not the command message")
+    refused(guard, bus, command()._replace(**change), "not a classical data frame of this message")
 
 
 @pytest.mark.parametrize("length", [n for n in range(9) if n != 5])
