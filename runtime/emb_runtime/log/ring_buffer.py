@@ -5,7 +5,7 @@ it, in the shared memory, so that both sides can read the count. Python promises
 processes on every processor, so each slot carries a checksum seeded with its index: a slot whose parts are not all
 visible yet reads as not written yet, and is read again later. A torn record can therefore not come out.
 
-The second half of the module is what travels: each record as a small fixed ``struct`` after a type byte.
+The second half of the module is what travels: the records, each as MessagePack after a type byte.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ import os
 import struct
 import zlib
 from enum import IntEnum
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
-from emb_runtime.records import CYCLE_UNITS, CycleRecord, Frame
+from msgspec import msgpack
+
+from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES
 
 SLOT: Final = 256  # Bytes of one slot
@@ -152,18 +154,6 @@ class Ring:
             os.close(self.fd)
 
 
-class Kind(IntEnum):
-    """The type byte of a record in the ring."""
-
-    FRAME = 1
-    CYCLE = 2
-    EVENT = 3
-    CLOCK = 4
-    LINE = 5
-    ESTIMATE = 6
-    LEARNT = 7
-
-
 class Direction(IntEnum):
     """Direction of a frame."""
 
@@ -232,106 +222,39 @@ class LearntRecord(NamedTuple):
 
 Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | LineRecord | EstimateRecord | LearntRecord
 
-_FRAME: Final = struct.Struct("<qQIBBB8sq")
-_CYCLE: Final = struct.Struct(
-    "<"
-    + "".join(
-        "d" if name in CYCLE_UNITS else "q" if name.endswith("_ns") else "i"
-        for name in CycleRecord._fields  # in their order
-    )
-)
-_EVENT: Final = struct.Struct("<qB")
-_CLOCK: Final = struct.Struct("<qq")
-_LINE: Final = struct.Struct("<qB")
-_ESTIMATE: Final = struct.Struct("<qi")
-_MAX_CODE: Final = 40
+RECORDS: Final = (FrameRecord, CycleRecord, EventRecord, ClockRecord, LineRecord, EstimateRecord, LearntRecord)
+"""Types of the records; a type's place is its type byte in the ring."""
+KINDS: Final = {record: kind for kind, record in enumerate(RECORDS)}
+
+_MAX_CODE: Final = 40  # Bytes of an event's code
+_MAX_EVENT_TEXT: Final = MAX_PAYLOAD - _MAX_CODE - 16
+_MAX_LINE: Final = MAX_PAYLOAD - 16
+
+_ENCODER: Final = msgpack.Encoder(enc_hook=lambda number: number.item())  # of numpy
+_DECODERS: Final = tuple(msgpack.Decoder(record) for record in RECORDS)
 
 
-def _clipped(text: str, room: int) -> bytes:
-    """UTF-8 of a text that fits, cut between characters."""
-    data = text.encode("utf-8", "replace")
-    return data if len(data) <= room else data[: room - 3].decode("utf-8", "ignore").encode() + "…".encode()
-
-
-def pack(record: Record) -> tuple[Kind, bytes]:
-    """Kind and payload of a record."""
-    if isinstance(record, FrameRecord):
-        return Kind.FRAME, pack_frame(*record)
-    if isinstance(record, CycleRecord):
-        return Kind.CYCLE, pack_cycle(record)
-    if isinstance(record, EstimateRecord):
-        return Kind.ESTIMATE, pack_estimate(*record)
-    if isinstance(record, LearntRecord):
-        return Kind.LEARNT, pack_estimate(*record)
+def pack(record: Record) -> tuple[int, bytes]:
+    """Type byte and payload of a record: MessagePack of its fields. Texts beyond the slot are cut."""
     if isinstance(record, EventRecord):
-        return Kind.EVENT, pack_event(*record)
-    if isinstance(record, LineRecord):
-        return Kind.LINE, pack_line(*record)
-    return Kind.CLOCK, pack_clock(*record)
-
-
-def pack_frame(direction: Direction, frame: Frame, read_ns: int = 0) -> bytes:
-    """Payload of a frame."""
-    identifier, data, time_ns, extended, remote, error, own, dropped = frame
-    flags = extended | remote << 1 | error << 2 | own << 3
-    return _FRAME.pack(time_ns, dropped, identifier, flags, direction, len(data), data, read_ns)
-
-
-def pack_cycle(record: CycleRecord) -> bytes:
-    """Payload of a cycle record."""
-    return _CYCLE.pack(*record)
-
-
-def pack_event(time_ns: int, code: str, text: str) -> bytes:
-    """Payload of a safety event; a code beyond 40 bytes and a text beyond the slot are cut."""
-    name = _clipped(code, _MAX_CODE)
-    head = _EVENT.pack(time_ns, len(name)) + name
-    return head + _clipped(text, MAX_PAYLOAD - len(head))
-
-
-def pack_clock(monotonic_ns: int, wall_ns: int) -> bytes:
-    """Payload of a clock reading."""
-    return _CLOCK.pack(monotonic_ns, wall_ns)
-
-
-def pack_line(time_ns: int, level: Level, text: str) -> bytes:
-    """Payload of a log line; a text beyond the slot is cut."""
-    return _LINE.pack(time_ns, level) + _clipped(text, MAX_PAYLOAD - _LINE.size)
-
-
-def pack_estimate(time_ns: int, step: int, numbers: tuple[float, ...]) -> bytes:
-    """Payload of an estimate; :data:`emb_runtime.policy.contract.MAX_ESTIMATES` of them fit."""
-    return _ESTIMATE.pack(time_ns, step) + struct.pack(f"<{len(numbers)}d", *numbers)
+        time_ns, code, text = record
+        record = EventRecord(time_ns, _clipped(code, _MAX_CODE), _clipped(text, _MAX_EVENT_TEXT))
+    elif isinstance(record, LineRecord):
+        record = record._replace(text=_clipped(record.text, _MAX_LINE))
+    return KINDS[type(record)], _ENCODER.encode(record)
 
 
 def unpack(kind: int, payload: bytes) -> Record:
-    """Unpacks a record of :func:`pack_frame` and its siblings.
+    """Unpacks a record of :func:`pack`.
 
     Raises:
-        ValueError: ``kind`` is unknown.
-        struct.error: the payload has the wrong length for it.
+        IndexError: ``kind`` is unknown.
+        msgspec.DecodeError: the payload is no such record.
     """
-    match kind:
-        case Kind.FRAME:
-            time_ns, dropped, identifier, flags, direction, length, data, read_ns = _FRAME.unpack(payload)
-            extended, remote, error, own = (bool(flags & 1 << i) for i in range(4))
-            frame = Frame(identifier, data[:length], time_ns, extended, remote, error, own, dropped)
-            return FrameRecord(Direction(direction), frame, read_ns)
-        case Kind.CYCLE:
-            return CycleRecord._make(_CYCLE.unpack(payload))
-        case Kind.EVENT:
-            time_ns, length = _EVENT.unpack_from(payload)
-            code, text = payload[_EVENT.size : _EVENT.size + length], payload[_EVENT.size + length :]
-            return EventRecord(time_ns, code.decode(), text.decode())
-        case Kind.CLOCK:
-            return ClockRecord._make(_CLOCK.unpack(payload))
-        case Kind.LINE:
-            time_ns, level = _LINE.unpack_from(payload)
-            return LineRecord(time_ns, Level(level), payload[_LINE.size :].decode())
-        case Kind.ESTIMATE | Kind.LEARNT:
-            time_ns, step = _ESTIMATE.unpack_from(payload)
-            count = (len(payload) - _ESTIMATE.size) // 8
-            numbers = struct.unpack_from(f"<{count}d", payload, _ESTIMATE.size)
-            return (EstimateRecord if kind == Kind.ESTIMATE else LearntRecord)(time_ns, step, numbers)
-        case _:
-            raise ValueError(f"no record in the ring has the kind {kind}")
+    return cast(Record, _DECODERS[kind].decode(payload))
+
+
+def _clipped(text: str, room: int) -> str:
+    """A text whose UTF-8 fits into so many bytes, cut between characters."""
+    data = text.encode("utf-8", "replace")
+    return data.decode() if len(data) <= room else data[: room - 3].decode("utf-8", "ignore") + "…"

@@ -115,8 +115,8 @@ def test_every_shipped_set_can_be_shielded() -> None:
 
 
 UNREADABLE = [
-    ("current_lag   = 0.0", "current_lag   = -1e-3", "shield.current_lag: expected a number from 0 to 0.1 s"),
-    ("current_lag   = 0.0", "current_lag   = 0.2", "shield.current_lag: expected a number from 0 to 0.1 s"),
+    ("current_lag   = 0.0", "current_lag   = -1e-3", "shield.current_lag: expected a number from 0 to 0.1"),
+    ("current_lag   = 0.0", "current_lag   = 0.2", "shield.current_lag: expected a number from 0 to 0.1"),
     ("break_away    = 1.0", "break_away    = 0.9", "shield.break_away: expected a number from 1 to 5"),
     ("f_l           = 0.0", "f_l           = 2.0e-4", "shield.f_l: expected a number from 0 to 0.0001"),
     ('envelope      = "braking"', 'envelope      = "gliding"', "shield.envelope: expected one of braking, coasting"),
