@@ -377,6 +377,7 @@ def _checked(found: _Document, text: str, source: str) -> Bench:
         BenchFileError: a plant is none.
     """
     brake = BrakeParameters(**msgspec.structs.asdict(found.brake))
+    shield = Shield(**msgspec.structs.asdict(found.shield))
     plants = {name: read_plant(name, table, source) for name, table in found.plants.items()}
     bench = Bench(
         name=found.name,
@@ -385,8 +386,8 @@ def _checked(found: _Document, text: str, source: str) -> Bench:
         limits=found.limits,
         noise=found.noise,
         timing=found.timing,
-        shield=Shield(**msgspec.structs.asdict(found.shield)),
-        prior=found.shield.ranges if found.estimator is None else found.estimator.ranges,
+        shield=shield,
+        prior=shield.ranges if found.estimator is None else found.estimator.ranges,
         watch=found.watch,
         guard=found.guard,
         node=found.node,

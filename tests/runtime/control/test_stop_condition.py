@@ -22,7 +22,6 @@ from emb_runtime.control.stop_condition import REACHED, parse_stop_condition
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimate import Quantity
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.log.ring_buffer import MAX_PAYLOAD, EstimateRecord, Kind, pack_estimate, unpack
 from emb_runtime.records import Reason
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import Fault
@@ -79,16 +78,6 @@ def test_on_the_way_home_and_where_the_bench_leaves_nothing_open_nothing_is_reco
     assert (run.journal.estimates, run.outcome.estimate, run.outcome.goal_reached) == ([], (), False)
     run = simulate(on_bench=dataclasses.replace(BENCH, prior="nominal"))
     assert (run.journal.estimates, run.outcome.estimate) == ([], ())
-
-
-@given(
-    step=st.integers(-(2**31), 2**31 - 1),
-    numbers=st.lists(st.floats(allow_nan=False), min_size=2, max_size=24).map(tuple),
-)
-def test_an_estimate_survives_the_ring_however_many_there_are(step: int, numbers: tuple[float, ...]) -> None:
-    payload = pack_estimate(123, step, numbers)
-    assert len(payload) <= MAX_PAYLOAD
-    assert unpack(Kind.ESTIMATE, payload) == EstimateRecord(123, step, numbers)
 
 
 def test_a_condition_is_reached_when_each_deviation_is_below_its_part_of_the_value() -> None:

@@ -45,7 +45,7 @@ def test_a_bench_file_may_name_the_set_or_leave_the_shields() -> None:
 
 def test_it_takes_samples_and_begins_anew() -> None:
     for model in ("flow", "euler"):
-        estimator = Estimator(dataclasses.replace(BENCH, shield=dataclasses.replace(BENCH.shield, model=model)))
+        estimator = Estimator(dataclasses.replace(BENCH, shield=BENCH.shield._replace(model=model)))
         assert estimator.model.sticks == (model == "flow")
         fresh = estimator.state
         for sample in SAMPLES:
