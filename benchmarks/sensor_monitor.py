@@ -242,7 +242,7 @@ def fly(
             halted[:] = x
             halt(law, mechanics, instruments, p, kind, 0.0, halted, instrument, row, HALTED)
             unseen = unseen_speed(law, limits, memory)
-            waits = coasting_time(law, told[0], told[1], 1.0, unseen) if memory[OBEYS] == 0.0 else 0.0
+            waits = coasting_time(law, told[0], told[1], unseen) if memory[OBEYS] == 0.0 else 0.0
             halt(law, mechanics, instruments, p, kind, waits, x, instrument, row, COASTED)
 
 

@@ -15,12 +15,3 @@ class RunType(StrEnum):
 
 HOMING_LOG = "-home"
 LISTEN_ONLY_LOG = "-read"  # Endings, before the suffix, of the names of logs that hold no experiment
-
-
-FIRST_CURRENT = "first_current"
-"""Entry of a log: largest current of the first move [A]. A log of a version that did not judge its sensors has none."""
-
-FIRST_MOVE = "first_move"
-"""Entry of a log: what limits the first move. A log without it was recorded with a constant limit, FIRST_CURRENT."""
-STOPPABLE = "stoppable"
-"""Value of FIRST_MOVE: what friction alone can stop if a sign is wrong, see ``safety/sensor_monitor.py``."""

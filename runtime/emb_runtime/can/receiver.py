@@ -104,13 +104,13 @@ class Reception:
 
     @property
     def pairing_problem(self) -> str:
-        """Why angle and velocity frames have never paired; "" if they have, or one is missing."""
+        """Reason why angle and velocity frames have never paired; "" if they have, or one is missing."""
         if self._last is not None or _NEVER in (self._angle.valid_ns, self._velocity.valid_ns):
             return ""
         return "angle and velocity frames came, but no velocity next after the angle with its counter: that goes first"
 
     def inhibit_reason(self, now_ns: int) -> str:
-        """Why no current may be commanded now; "" if one may.
+        """Reason why no current may be commanded now; "" if one may.
 
         Args:
             now_ns: now, monotonic [ns].

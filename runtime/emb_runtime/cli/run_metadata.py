@@ -19,8 +19,7 @@ from emb_runtime.drives.transport import MappedTransport
 from emb_runtime.estimator.estimate import Quantity
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder import Attachment, LogHeader
-from emb_runtime.run_type import FIRST_CURRENT, FIRST_MOVE, STOPPABLE, RunType
-from emb_runtime.safety.sensor_thresholds import sensor_thresholds
+from emb_runtime.run_type import RunType
 from emb_runtime.system import compiled_core
 from emb_runtime.system.clock import Clock
 
@@ -62,8 +61,6 @@ def header(
             "purpose": str(run_type),
             "stage": str(plan.stage),
             "limit": repr(plan.limit),
-            FIRST_CURRENT: repr(sensor_thresholds(bench, plan.law).first_current),
-            FIRST_MOVE: STOPPABLE,
             "steps": str(steps),
             "bench_name": bench.name,
             "bench_hash": bench.contract_hash,

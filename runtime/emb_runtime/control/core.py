@@ -655,7 +655,7 @@ class Core:
         try:
             self._monitor.check(elapsed, sample, obeyed, command)
         except StopError as stop:
-            self._coasting = self._monitor.coasting_time(stop.fault, sample)
+            self._coasting = self._monitor.coasting_time(sample)
             if self._coasting == 0.0:
                 raise
             self._reversed = stop

@@ -156,7 +156,7 @@ def largest_current(law: ShieldLaw, limits: SensorThresholds, memory: Any, limit
     return min(limit, stoppable)
 
 
-def coasting_time(law: ShieldLaw, angle: float, velocity: float, share: float = 1.0, unseen: float = 0.0) -> float:
+def coasting_time(law: ShieldLaw, angle: float, velocity: float, unseen: float = 0.0) -> float:
     """Time in which friction alone stops any brake of the set near the origin [s]; 0 where it may not.
 
     The signs of the sensors do not matter. Twice what the least friction takes of the measured speed, as the spring may
@@ -166,11 +166,10 @@ def coasting_time(law: ShieldLaw, angle: float, velocity: float, share: float = 
         law: of the shield.
         angle: measured [rad].
         velocity: measured [rad/s].
-        share: of the least friction that is relied on for the distance; a half in logs of a constant first move.
         unseen: from :func:`unseen_speed`. It only makes the wait longer: the limit of the first move has kept the
             distance for it.
     """
-    speed, friction = abs(velocity) + law.velocity_noise, share * law.friction_low
+    speed, friction = abs(velocity) + law.velocity_noise, law.friction_low
     now = abs(angle) + law.angle_noise
     farthest = now + 0.5 * speed * speed / friction
     near = now <= 0.5 * law.friction_low / law.spring_high
@@ -180,9 +179,9 @@ def coasting_time(law: ShieldLaw, angle: float, velocity: float, share: float = 
 
 
 def unseen_speed(law: ShieldLaw, limits: SensorThresholds, memory: Any) -> float:
-    """Speed that a brake of the set may have beyond the measured one, by what has acted in either direction [rad/s].
+    """Upper bound on the speed change not yet visible in the measurement [rad/s].
 
-    Frames that act late, a current that lags, a velocity that an observer makes of the angle.
+    Causes are frames that act late, a current that lags, and a velocity that an observer derives from the angle.
 
     Args:
         law: of the shield.
@@ -344,15 +343,13 @@ class SensorMonitor:
     Args:
         law: of the shield.
         limits: from :func:`~emb_runtime.safety.sensor_thresholds.sensor_thresholds`.
-        constant: the limit of the first move is constant until the polarity is confirmed, as in older logs.
     """
 
-    __slots__ = ("_constant", "_law", "_limits", "_memory")
+    __slots__ = ("_law", "_limits", "_memory")
 
-    def __init__(self, law: ShieldLaw, limits: SensorThresholds, *, constant: bool = False) -> None:
+    def __init__(self, law: ShieldLaw, limits: SensorThresholds) -> None:
         self._law = law
         self._limits = limits
-        self._constant = constant
         self._memory = [0.0] * MEMORY
 
     def begin(self, sample: SensorSample) -> None:
@@ -361,18 +358,14 @@ class SensorMonitor:
 
     def largest_current(self, limit: float) -> float:
         """Largest current that may be sent, at most ``limit`` [A]."""
-        if self._constant:
-            return limit if self._memory[CONFIRMED] != 0.0 else min(limit, self._limits.first_current)
         return largest_current(self._law, self._limits, self._memory, limit)
 
-    def coasting_time(self, fault: Fault, sample: SensorSample) -> float:
-        """Time for which friction alone is to stop the brake after this fault, as its node might drive it [s]."""
-        law, angle, velocity = self._law, sample.angle, sample.velocity
-        if self._constant:
-            return coasting_time(law, angle, velocity, 0.5) if fault is Fault.WRONG_POLARITY else 0.0
+    def coasting_time(self, sample: SensorSample) -> float:
+        """Time for which friction alone is to stop the brake, as its node might drive it [s]."""
         if self._memory[OBEYS] != 0.0:
             return 0.0
-        return coasting_time(law, angle, velocity, 1.0, unseen_speed(law, self._limits, self._memory))
+        law, limits, memory = self._law, self._limits, self._memory
+        return coasting_time(law, sample.angle, sample.velocity, unseen_speed(law, limits, memory))
 
     def check(self, elapsed: float, sample: SensorSample, obeyed: bool, command: float) -> None:
         """Take one more sample; arguments are as for :func:`judge`.
