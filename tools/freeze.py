@@ -786,7 +786,6 @@ def times(ours: Checkout, theirs: Checkout) -> None:
     for checkout in (ours, theirs):
         files(checkout, policies=False)
         require(checkout.type("run", "--iface", "sim:seed=11", "--log", "clean.mcap"))
-    train = ["emb-train", "--preset", "single-viscous", "--steps", "100000"]
     plays: dict[str, tuple[list[str], bool]] = {
         "fim, first": (["fim", "clean.mcap"], True),
         "fim": (["fim", "clean.mcap"], False),
@@ -794,7 +793,6 @@ def times(ours: Checkout, theirs: Checkout) -> None:
         "estimate": (["estimate", "clean.mcap"], False),
         "report": (["report", "clean.mcap", "-o", "page.html"], False),
         "emb-run --iface sim": (["run", "--iface", "sim", "--log", "{new}.mcap"], False),
-        "training": (["train", *train[1:], "--out", "{new}"], False),
     }
     say(f"{'':24}{'ours':>30}{'theirs':>30}{'ratio':>20}")
     say(f"{'':24}{'wall    processor    memory':>30}{'wall    processor    memory':>30}{'wall   processor':>20}")

@@ -22,8 +22,7 @@ from emb_train.names import reference_names, wrapped
 
 if TYPE_CHECKING:
     from emb_runtime.config.bench import Bench
-    from emb_train.training.checkpoint import Progress
-    from emb_train.training.configuration import Configuration
+    from emb_train.training import Trained
 
 WORST_CASE = "worst case"  # The kind of shield that a bench has: for all of its set, whatever is believed of the brake
 
@@ -64,11 +63,6 @@ def parser() -> argparse.ArgumentParser:
         help="bench that it is for (default: for a training the one that it was trained on, else the shipped drum "
         "brake); its shield may be another one than in a training, its limits, noise and timing may not",
     )
-    p.add_argument(
-        "--last",
-        action="store_true",
-        help="of a training, the last checkpoint, not the one that did best on brakes that no training draws",
-    )
     return p
 
 
@@ -80,14 +74,13 @@ class Exported(NamedTuple):
     said: str  # Notes on it for the user; starts with a comma or a semicolon, or is empty
 
 
-def export(directory: Path, bench_file: Path | None = None, last: bool = False) -> Exported:
+def export(directory: Path, bench_file: Path | None = None) -> Exported:
     """Export what was trained.
 
     Args:
         directory: of the training.
-        bench_file: bench that the file is for, see :func:`emb_train.training.bench_compatibility.require_alike`; the
+        bench_file: bench that the file is for, see :func:`emb_train.bench_compatibility.require_alike`; the
         training's without.
-        last: take the last checkpoint although there is a best one.
 
     Raises:
         UsageError: the directory holds no usable training, or the bench is none for its actor.
@@ -102,13 +95,13 @@ def export(directory: Path, bench_file: Path | None = None, last: bool = False) 
     from emb_runtime.policy.contract import OBSERVATION
     from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
     from emb_runtime.policy.policy import load_policy
+    from emb_train.bench_compatibility import require_alike, require_fit
     from emb_train.envs.conditions import EVERYTHING
-    from emb_train.ppo.networks import DeployedActor
-    from emb_train.training.bench_compatibility import require_alike, require_fit
-    from emb_train.training.checkpoint import chosen_checkpoint, load_actor
+    from emb_train.ppo import DeployedActor
+    from emb_train.training import load_training
 
-    name = chosen_checkpoint(directory, last)
-    config, trained_on, trained, progress = load_actor(directory, name)
+    trained = load_training(directory)
+    config, trained_on = trained.training, trained.bench
     if config.conditions.observes == EVERYTHING:
         raise UsageError(
             f"{directory}: this actor sees the parameters and the information, which no bench measures: no run could"
@@ -117,10 +110,12 @@ def export(directory: Path, bench_file: Path | None = None, last: bool = False) 
     bench, ranges = trained_on if bench_file is None else load_bench(bench_file), trained_on.range_set(config.ranges)
     require_alike(trained_on, bench, str(directory))
     require_fit(bench, ranges, str(directory))
-    said = f", {_checkpoint(name, config, progress)}{_shield_note(config.conditions.applied(trained_on), bench)}"
-    torch.set_num_threads(config.ppo.threads)
-    limit, provenance = bench.limits.current, _provenance(config, progress)
-    actor = DeployedActor(trained, limit)
+    said = (
+        f", of iteration {trained.iteration} of {config.ppo.iterations}, which returned {trained.score:.6g} on brakes "
+        f"that no training draws{_shield_note(config.conditions.applied(trained_on), bench)}"
+    )
+    torch.set_num_threads(1)
+    actor, provenance = DeployedActor(trained.actor, bench.limits.current), _provenance(trained)
     recorded = recorded_observations(actor, bench, ranges, config.parameters)
     observations = np.concatenate([recorded, random_observations(bench)])
     contract = contract_for(bench, ranges.low, ranges.high, vectors_of(actor, observations), provenance)
@@ -143,9 +138,9 @@ def export_structured(source: str, bench: Bench) -> Exported:
         PolicyRefusedError: the runtime would refuse it, or it differs from the module.
     """
     from emb_export.stateful import export_stateful
+    from emb_train.bench_compatibility import require_fit
     from emb_train.structured.actor import actor_of
     from emb_train.structured.stored import stored
-    from emb_train.training.bench_compatibility import require_fit
 
     kept = stored(source)
     task = kept.asked()
@@ -166,7 +161,7 @@ def export_structured(source: str, bench: Bench) -> Exported:
 
 def _shield_note(trained: Bench, bench: Bench, kind: str = WORST_CASE) -> str:
     """Note that the actor learned behind another shield than the bench's; empty where both are alike."""
-    from emb_train.training.bench_compatibility import shield_changes
+    from emb_train.bench_compatibility import shield_changes
 
     changes = [shield_changes(trained, bench), f"{kind}, here {WORST_CASE}" if kind != WORST_CASE else ""]
     if not any(changes):
@@ -179,19 +174,15 @@ def _versions() -> dict[str, str]:
     return {name: version(name) for name in ("emb-excite", "torch", "onnx", "onnxscript", "numpy")}
 
 
-def _checkpoint(name: str, config: Configuration, progress: Progress) -> str:
-    """Description of the checkpoint that was taken."""
-    score = "" if progress.score is None else f", which returned {progress.score:.6g} on brakes that no training draws"
-    return f"{name} of iteration {progress.iteration} of {config.ppo.iterations}{score}"
-
-
-def _provenance(config: Configuration, progress: Progress) -> dict[str, str | int | float]:
+def _provenance(trained: Trained) -> dict[str, str | int | float]:
     """The configuration, part by part, and what was exported of it; without time and place: the same file each time."""
-    parts = json.loads(config.to_json())
+    import msgspec
+
+    parts = json.loads(msgspec.json.encode(trained.training))
     return {
         **{k: json.dumps(v, separators=(",", ":")) if isinstance(v, dict | list) else v for k, v in parts.items()},
-        "steps": progress.iteration * config.ppo.batch,
-        **({} if progress.score is None else {"score": progress.score}),
+        "steps": trained.iteration * trained.training.ppo.batch,
+        "score": trained.score,
         **_versions(),
     }
 
@@ -216,10 +207,8 @@ def _export(arguments: argparse.Namespace) -> str:
             raise UsageError(
                 "--bench: expected --out FILE with it, for DIR/actor.onnx is for the bench of the training"
             )
-        path, made = path or source / "actor.onnx", export(source, arguments.bench, arguments.last)
+        path, made = path or source / "actor.onnx", export(source, arguments.bench)
         of = f"within {made.difference:.1e} of the trained network{made.said}"
-    elif arguments.last:
-        raise UsageError("--last: only the directory of a training has checkpoints; leave it out")
     elif path is None:
         raise UsageError("--out: expected a file to write to")
     elif source.suffix == ".json" or arguments.source in reference_names():

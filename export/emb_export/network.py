@@ -13,16 +13,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from emb_bench.compiled import compiled
 from emb_export.file import OPSET, VECTORS
 from emb_runtime.config.bench import Bench, Ranges
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy.contract import VECTOR_TOLERANCE, Vector
 from emb_runtime.policy.policy import Policy
 from emb_train.envs.batch import Batch
-from emb_train.envs.excitations import PLAIN, Excitation, Network
+from emb_train.envs.excitations import Excitation
+from emb_train.envs.network import PLAIN, Network
 from emb_train.envs.play import followed
-from emb_train.ppo.networks import DeployedActor
+from emb_train.ppo import DeployedActor
 
 Floats = NDArray[np.float32]
 
@@ -68,7 +68,7 @@ def vectors_of(actor: DeployedActor, observations: Floats) -> tuple[tuple[Vector
 
 def recorded(excitation: Excitation, bench: Bench, ranges: Ranges, parameters: Sequence[str]) -> Floats:
     """Observations of an excitation in a few experiments on random brakes, shape [horizon, EPISODES, 4]."""
-    batch = Batch(bench, ranges, parameters, EPISODES, compiled)
+    batch = Batch(bench, ranges, parameters, EPISODES)
     for i in range(EPISODES):
         batch.begin(i, np.random.default_rng(i))
     return np.stack(list(followed(batch, excitation)))

@@ -23,7 +23,7 @@ from emb_runtime.estimator.estimate import Quantity
 from emb_runtime.policy.contract import APPLIED_CURRENT, OBSERVATION, VECTOR_TOLERANCE, Vector
 from emb_runtime.policy.inference import ESTIMATE_NAME, INPUT_NAME, NEXT_STATE_NAME, OUTPUT_NAME, STATE_NAME
 from emb_runtime.policy.policy import Policy, load_policy
-from emb_train.envs.excitations import StatefulNetwork
+from emb_train.envs.network import StatefulNetwork
 
 SEQUENCES = 2  # Experiments whose samples become test vectors
 LONGEST = 512  # Samples of each

@@ -25,11 +25,10 @@ from emb_runtime.config.bench import Bench, load_bench, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, Contract
 from emb_runtime.policy.policy import Policy, load_policy
-from emb_train import CHECKPOINT
-from emb_train.cli.train import main as train_main
-from emb_train.ppo.networks import DeployedActor
+from emb_train.cli import main as train_main
+from emb_train.ppo import DeployedActor
 from emb_train.structured.stored import stored
-from emb_train.training.checkpoint import BEST, Progress, load_actor, save_checkpoint
+from emb_train.training import ACTOR, BENCH, CONFIGURATION, load_training, save_actor
 from tests.commands import refused
 from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench
 
@@ -44,7 +43,7 @@ def _tiny() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("training")
-    arguments = ["--preset", "single-viscous", "--out", str(folder / "run"), "--seed", "5"]
+    arguments = ["ppo", "single-viscous", "--out", str(folder / "run"), "--seed", "5"]
     assert train_main([*arguments, "--bench", str(short_bench(folder))]) == 0
     return folder / "run"
 
@@ -55,9 +54,8 @@ def exported(run: Path) -> bytes:
 
 
 def deployed(run: Path) -> tuple[DeployedActor, Bench]:
-    """Of the best checkpoint, which is what is exported."""
-    _, bench, actor, _ = load_actor(run, BEST)
-    return DeployedActor(actor, bench.limits.current), bench
+    trained = load_training(run)
+    return DeployedActor(trained.actor, trained.bench.limits.current), trained.bench
 
 
 def policy_of(run: Path, data: bytes) -> Policy:
@@ -81,35 +79,16 @@ def test_the_contract_says_what_the_actor_was_trained_for(run: Path, exported: b
     assert (contract.sample_time, contract.horizon, contract.action_limit) == (1e-3, HORIZON, 6.0)
     assert contract.ranges["f_v"] == (1e-5, 5e-5)
     assert contract.ranges["k_m"] == (bench.brake.k_m, bench.brake.k_m)
-    config = json.loads((run / "config.json").read_text())
+    config = json.loads((run / CONFIGURATION).read_text())
     for name, value in config.items():
         told = contract.provenance[name]
         assert (json.loads(str(told)) if isinstance(value, dict | list) else told) == value
     assert contract.provenance["seed"] == 5
-    _, _, _, best = load_actor(run, BEST)
+    best = load_training(run)
     assert contract.provenance["steps"] == best.iteration * ITERATION
     assert contract.provenance["score"] == best.score
     assert len(contract.vectors) >= MIN_VECTORS
     assert contract.vectors[0].observation[2] == 0.0
-
-
-def test_the_best_checkpoint_is_exported_and_the_last_one_where_that_is_asked_for(run: Path, tmp_path: Path) -> None:
-    other = shutil.copytree(run, tmp_path / "run")
-    _, bench, actor, _ = load_actor(run)
-    with torch.no_grad():
-        actor.layers[-1].weight.zero_()  # type: ignore[operator]  # the last layer is Linear
-        actor.layers[-1].bias.fill_(math.atanh(0.5))  # type: ignore[operator]  # see above
-    save_checkpoint(other, Progress(2, 1.25), actor, BEST)
-    alike = DeployedActor(actor, bench.limits.current)(torch.zeros(1, 3)).item()
-    assert main([str(other)]) == 0
-    best = load_policy(other / "actor.onnx", bench)
-    assert best.act(0.0, 0.0, 0.0, 0.0) == pytest.approx(alike, abs=1e-5)
-    assert (best.contract.provenance["steps"], best.contract.provenance["score"]) == (2 * ITERATION, 1.25)
-    assert main([str(other), "--last"]) == 0
-    last = load_policy(other / "actor.onnx", bench)
-    assert last.act(0.0, 0.0, 0.0, 0.0) != pytest.approx(alike, abs=1e-2)
-    assert last.contract.provenance["steps"] == 3 * ITERATION
-    assert "score" not in last.contract.provenance
 
 
 def test_an_actor_is_exported_for_another_bench_whose_shield_differs_and_nothing_else_that_it_knows(
@@ -160,7 +139,7 @@ def test_an_actor_for_brakes_that_the_shield_does_not_cover_is_exported_for_a_be
 
 
 def test_the_checkpoints_may_be_read_by_whoever_may_read_the_rest_of_a_training(run: Path) -> None:
-    modes = {name: (run / name).stat().st_mode for name in ("config.json", CHECKPOINT, BEST)}
+    modes = {name: (run / name).stat().st_mode for name in (CONFIGURATION, ACTOR)}
     assert len(set(modes.values())) == 1
 
 
@@ -206,9 +185,9 @@ def saved_beside(run: Path, actor: DeployedActor, name: str) -> Path:
     """A directory as that of the training, with another actor."""
     other = run.parent / name
     other.mkdir()
-    for part in ("config.json", "bench.toml"):
+    for part in (CONFIGURATION, BENCH):
         (other / part).write_bytes((run / part).read_bytes())
-    save_checkpoint(other, Progress(3), actor.actor)
+    save_actor(other, actor.actor, 3, 0.0)
     return other
 
 
@@ -324,7 +303,6 @@ def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(
         ["step", "--bench", "none.toml", "--out", "x.onnx"],
         ["step", "--out", "."],
         ["nowhere", "--out", "x.onnx"],
-        ["step", "--last", "--out", "x.onnx"],
         ["10:30"],
         [str(run), "--out", "none/actor.onnx"],
     ):

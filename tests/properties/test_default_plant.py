@@ -17,10 +17,11 @@ from emb_runtime.cli import options
 from emb_runtime.config.bench import Bench
 from emb_runtime.config.plants import DEFAULT_PLANT, EXACT
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
-from emb_train.cli import tune
+from emb_train import cli as train
 from emb_train.envs.batch import Batch
-from emb_train.presets import load_preset, preset_names
+from emb_train.presets import preset_summaries
 from emb_train.structured.task import TASKS
+from emb_train.training import load_preset
 
 from tests.bench.simulated_logs import write_log  # isort: skip
 from tests.conftest import Simulate  # isort: skip
@@ -35,7 +36,7 @@ def test_whatever_is_told_no_plant_takes_the_same(bench: Bench) -> None:
         open_sim("", bench)[0].truth["plant"],
         node.parser().parse_args(["--iface", "vcan0"]).plant,
         design.parser().parse_args([]).model,
-        tune.parser().parse_args(["four-d", "--out", "a.json"]).plant,
+        train.parser().parse_args(["reference", "four-d", "--out", "a"]).plant,
         *(inspect.signature(call).parameters["plant"].default for call in (api.simulate, Batch)),
         *(inspect.signature(call).parameters["model"].default for call in (api.design, make_problem)),
         *(task.plant for task in TASKS.values()),
@@ -45,7 +46,7 @@ def test_whatever_is_told_no_plant_takes_the_same(bench: Bench) -> None:
 
 
 def test_trainings_by_ppo_stay_with_the_thesis_s_brake() -> None:
-    assert {load_preset(name).plant for name in preset_names()} == {"euler"}
+    assert {load_preset(name).plant for name in preset_summaries()} == {"euler"}
 
 
 @pytest.mark.parametrize("told", [True, False], ids=["simulated", "over a bus"])

@@ -26,7 +26,8 @@ ROOMS = {
     "control cli",
     "bench/emb_bench": "numbers compiled figures parallel output brake sim information design excitation logs "
     "recordings experiment export hil replay estimate analysis commission report live batch api cli",
-    "train/emb_train": "names rewards envs structured ppo training presets evaluation cli entry",
+    "train/emb_train": "names presets rewards envs bench_compatibility ppo training structured optimum "
+    "evaluate cli entry",
     "export/emb_export": "file network stateful export entry",
 }
 """Sub-packages and single modules of each package, lowest first: each imports from those before it only."""

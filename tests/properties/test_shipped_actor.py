@@ -12,8 +12,9 @@ from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train.envs.conditions import Conditions
-from emb_train.envs.excitations import Constant, OnnxFile, StatefulNetwork
+from emb_train.envs.excitations import OnnxFile, Played
 from emb_train.envs.measure import MEASURES
+from emb_train.envs.network import StatefulNetwork
 from emb_train.envs.play import fresh_draws, play
 from emb_train.structured.actor import actor_of
 from emb_train.structured.stored import stored
@@ -55,7 +56,10 @@ def test_on_brakes_that_it_never_saw_the_shipped_actor_returns_within_limits_and
     bench: Bench,
 ) -> None:
     policy, ranges = load_policy(shipped_actor_path(), bench), bench.range_set("pm50")
-    shipped, constant = OnnxFile(policy.data, policy.contract.initial_state), Constant(bench.limits.current)
+    shipped, constant = (
+        OnnxFile(policy.data, policy.contract.initial_state),
+        Played(np.full(bench.timing.horizon, bench.limits.current)),
+    )
     draws = fresh_draws(ranges, 1000, 20)
     actor, push = (play(bench, ranges, PARAMETER_NAMES, e, draws, conditions=PHYSICAL) for e in (shipped, constant))
     for played in (actor, push):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from emb_train.cli.train import main
+from emb_train.cli import main
 from tests.train.trainings import make_tiny, short_bench
 
 
@@ -18,7 +18,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         make_tiny(patch)
         bench = short_bench(folder)
-        assert main(["--preset", "single-viscous", "--bench", str(bench), "--out", str(folder / "run")]) == 0
+        assert main(["ppo", "single-viscous", "--bench", str(bench), "--out", str(folder / "run")]) == 0
     return folder / "run"
 
 

@@ -16,27 +16,29 @@ from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import UsageError
 from emb_train.envs.batch import Batch
 from emb_train.envs.env import Scoring
-from emb_train.presets import load_preset, preset_names
+from emb_train.presets import preset_summaries
 from emb_train.rewards import (
-    REWARDS,
-    AdaptiveReturn,
-    DeterminantGain,
-    HybridReturn,
-    InformationIncrement,
-    LogDeterminant,
-    LogSmallest,
-    LogTrace,
-    Mark,
-    PenalisedIncrement,
-    Returning,
+    ONE_PARAMETER,
     Reward,
-    TrajectoryReturn,
     Transition,
+    Turn,
+    adaptive_return,
+    determinant_gain,
+    hybrid_return,
+    information_increment,
+    log_determinant,
+    log_smallest_eigenvalue,
+    log_trace,
+    penalised_increment,
     quintic,
+    require_defined,
+    squared_determinant_gain,
+    trajectory_return,
 )
-from studies.thesis.normalisation import NormalisedFisher, epsilon_identity
+from emb_train.training import load_preset
+from studies.thesis.determinant import normalised
 
-AT_HOME = Mark(np.zeros((1, 2)), np.zeros(1), np.zeros((1, 1)))
+AT_HOME = Turn(np.zeros((1, 2)), np.zeros(1), np.zeros((1, 1)))
 
 
 def step(
@@ -45,11 +47,11 @@ def step(
     x: tuple[float, float] = (50.0, 300.0),
     k: int = 100,
     violated: bool = False,
-    mark: Mark = AT_HOME,
+    turn: Turn = AT_HOME,
 ) -> Transition:
     """One step of one brake in an experiment of 500 steps of 1 ms; a number is an FIM of one parameter."""
     m0, m1 = (np.atleast_1d(np.asarray(m, np.float64))[None, :] for m in (before, after))
-    return Transition(m0, m1, np.array([x]), np.array([k]), np.array([violated]), mark, 500, 1e-3)
+    return Transition(m0, m1, np.array([x]), np.array([k]), np.array([violated]), turn, 500, 1e-3)
 
 
 def worth(reward: Reward, transition: Transition) -> float:
@@ -57,26 +59,17 @@ def worth(reward: Reward, transition: Transition) -> float:
     return float(value)
 
 
-def test_the_information_increment_is_the_step_s_own() -> None:
-    assert worth(InformationIncrement(scale=0.5), step(after=4000.0)) == 1500.0
-
-
-@pytest.mark.parametrize(
-    ("made", "expected"),
-    [
+# From 64 rad at rest the quintic is 64 (1 − 10 s³ + 15 s⁴ − 6 s⁵): half way 32 rad, and −64 · 1.875 / T rad/s.
+FROM_REST = Turn(np.array([[64.0, 0.0]]), np.zeros(1), np.array([[500.0]]))
+BRANCHES: dict[Reward, list[tuple[Transition, float]]] = {
+    information_increment: [(step(), 3000.0)],
+    penalised_increment: [
         (step(violated=True), -4e4),
         (step(x=(78.0, 100.0)), 3000.0 - 200.0 * 9.0),
         (step(x=(75.0, 400.0)), 3000.0),
         (step(x=(-9.0, 499.0)), 3000.0),  # no penalty for the speed, none at the lower limit
     ],
-)
-def test_every_branch_of_equation_5_14(made: Transition, expected: float) -> None:
-    assert worth(PenalisedIncrement(scale=1.0), made) == expected
-
-
-@pytest.mark.parametrize(
-    ("made", "expected"),
-    [
+    adaptive_return: [
         (step(k=450, violated=True), -1e7),
         # k/T = 0.8: q = 0.64; (10 · 77)² + 50² = 595400
         (step(x=(77.0, -50.0), k=400), 0.36 * 3000.0 - 200.0 * 4.0 - 0.1 * 0.64 * 595400.0),
@@ -85,9 +78,34 @@ def test_every_branch_of_equation_5_14(made: Transition, expected: float) -> Non
         (step(x=(2.0, -50.0), k=300), 3000.0),
         (step(x=(1.0, 2.0), k=500), -0.1 * 104.0),  # at the end the information is worth nothing
     ],
-)
-def test_every_branch_of_equation_5_15(made: Transition, expected: float) -> None:
-    assert worth(AdaptiveReturn(scale=1.0), made) == pytest.approx(expected, rel=1e-12)
+    trajectory_return: [
+        (step(k=450, violated=True, turn=FROM_REST), -1e7),
+        (step(x=(80.0, 0.0), k=300), 3000.0 - 200.0 * 25.0),
+        (step(x=(32.0, -600.0), k=400, turn=FROM_REST), 0.0),  # on the quintic of 200 ms information earns nothing
+        (step(x=(35.0, -590.0), k=400, turn=FROM_REST), -10.0 * 9.0 - 0.1 * 100.0),
+        (step(x=(85.0, -600.0), k=400, turn=FROM_REST), -10.0 * 53.0**2),  # not risky any more, only off the way
+        (step(x=(1.0, -10.0), k=500, turn=FROM_REST), -10.0 * 1.0 - 0.1 * 100.0 + 3500.0),
+        (step(x=(2.1, 0.0), k=500, turn=FROM_REST), -10.0 * 2.1**2),  # not home
+        (step(x=(0.0, 20.1), k=500, turn=FROM_REST), -0.1 * 20.1**2),
+        (step(x=(0.0, 0.0), k=499, turn=FROM_REST._replace(x=np.zeros((1, 2)))), 0.0),  # home, but not at the end
+    ],
+    hybrid_return: [
+        (step(k=480, violated=True, turn=FROM_REST), -1e7),
+        (step(x=(80.0, 0.0), k=300), 3000.0 - 200.0 * 25.0),
+        (step(x=(32.0, -800.0), k=375, turn=FROM_REST), 0.0),  # this quintic has 150 ms
+        (step(x=(34.0, -800.0), k=375, turn=FROM_REST), -10.0 * 4.0),
+        # s = 20/50: s² = 0.16
+        (step(x=(3.0, -30.0), k=470, turn=FROM_REST), -10.0 * 0.84 * 9.0 - 0.1 * 0.16 * 900.0),
+        (step(x=(1.0, -10.0), k=500, turn=FROM_REST), -0.1 * 100.0 + 0.1 * 3500.0),
+        (step(x=(3.0, -10.0), k=500, turn=FROM_REST), -0.1 * 100.0),
+    ],
+}
+
+
+def test_every_branch_of_equations_5_13_to_6_6() -> None:
+    for reward, branches in BRANCHES.items():
+        for made, expected in branches:
+            assert worth(reward, made) == pytest.approx(expected, rel=1e-9, abs=1e-9), (reward, made)
 
 
 @given(
@@ -115,63 +133,19 @@ def test_the_quintic_solves_the_six_equations_of_5_16(
     assert velocity == pytest.approx(solved.deriv()(now), abs=1e-5)
 
 
-def at_mark(x: tuple[float, float], acceleration: float, m: Any) -> Mark:
-    return Mark(np.array([x]), np.array([acceleration]), np.atleast_1d(np.asarray(m, np.float64))[None, :])
-
-
-# From 64 rad at rest the quintic is 64 (1 − 10 s³ + 15 s⁴ − 6 s⁵): half way 32 rad, and −64 · 1.875 / T rad/s.
-FROM_REST = at_mark((64.0, 0.0), 0.0, 500.0)
-
-
-@pytest.mark.parametrize(
-    ("made", "expected"),
-    [
-        (step(k=450, violated=True, mark=FROM_REST), -1e7),
-        (step(x=(80.0, 0.0), k=300), 3000.0 - 200.0 * 25.0),
-        (step(x=(32.0, -600.0), k=400, mark=FROM_REST), 0.0),  # on the quintic of 200 ms information earns nothing
-        (step(x=(35.0, -590.0), k=400, mark=FROM_REST), -10.0 * 9.0 - 0.1 * 100.0),
-        (step(x=(85.0, -600.0), k=400, mark=FROM_REST), -10.0 * 53.0**2),  # not risky any more, only off the way
-        (step(x=(1.0, -10.0), k=500, mark=FROM_REST), -10.0 * 1.0 - 0.1 * 100.0 + 3500.0),
-        (step(x=(2.1, 0.0), k=500, mark=FROM_REST), -10.0 * 2.1**2),  # not home
-        (step(x=(0.0, 20.1), k=500, mark=FROM_REST), -0.1 * 20.1**2),
-        (step(x=(0.0, 0.0), k=499, mark=at_mark((0.0, 0.0), 0.0, 500.0)), 0.0),  # home, but not at the end
-    ],
-)
-def test_every_branch_of_the_trajectory_reward(made: Transition, expected: float) -> None:
-    assert worth(TrajectoryReturn(scale=1.0), made) == pytest.approx(expected, rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("made", "expected"),
-    [
-        (step(k=480, violated=True, mark=FROM_REST), -1e7),
-        (step(x=(80.0, 0.0), k=300), 3000.0 - 200.0 * 25.0),
-        (step(x=(32.0, -800.0), k=375, mark=FROM_REST), 0.0),  # this quintic has 150 ms
-        (step(x=(34.0, -800.0), k=375, mark=FROM_REST), -10.0 * 4.0),
-        # s = 20/50: s² = 0.16
-        (step(x=(3.0, -30.0), k=470, mark=FROM_REST), -10.0 * 0.84 * 9.0 - 0.1 * 0.16 * 900.0),
-        (step(x=(1.0, -10.0), k=500, mark=FROM_REST), -0.1 * 100.0 + 0.1 * 3500.0),
-        (step(x=(3.0, -10.0), k=500, mark=FROM_REST), -0.1 * 100.0),
-    ],
-)
-def test_every_branch_of_the_hybrid_reward(made: Transition, expected: float) -> None:
-    assert worth(HybridReturn(scale=1.0), made) == pytest.approx(expected, rel=1e-9, abs=1e-9)
-
-
 def test_the_trajectory_rewards_take_the_smallest_eigenvalue_of_two_parameters() -> None:
     before, after = pack(np.diag([7.0, 900.0])), pack(np.array([[50.0, 30.0], [30.0, 50.0]]))  # λ: 7; 20 and 80
-    for reward in (TrajectoryReturn(scale=0.5), HybridReturn(scale=0.5)):
-        assert worth(reward, step(before, after)) == pytest.approx(0.5 * 13.0)
+    for reward in (trajectory_return, hybrid_return):
+        assert worth(reward, step(before, after)) == pytest.approx(13.0)
 
 
 def test_the_amplified_determinant_rewards() -> None:
     before, after = pack(np.diag([2.0, 3.0])), pack(np.diag([4.0, 6.0]))  # the determinant grows fourfold
     gain = math.log(4.0)
-    plain, squared = DeterminantGain(scale=1.0, epsilon=1e-12), DeterminantGain(scale=1.0, power=2, epsilon=1e-12)
-    assert worth(plain, step(before, after)) == pytest.approx(1e4 * gain)  # eq. 6.4
-    assert worth(squared, step(before, after)) == pytest.approx(1e4 * gain**2)  # eq. 6.5
-    assert worth(plain, step(before, after, x=(77.0, 0.0))) == pytest.approx(1e4 * gain - 800.0)
-    assert worth(plain, step(before, after, violated=True)) == -4e4
+    assert worth(determinant_gain, step(before, after)) == pytest.approx(1e4 * gain, rel=1e-6)  # eq. 6.4
+    assert worth(squared_determinant_gain, step(before, after)) == pytest.approx(1e4 * gain**2, rel=1e-6)  # eq. 6.5
+    assert worth(determinant_gain, step(before, after, x=(77.0, 0.0))) == pytest.approx(1e4 * gain - 800.0, rel=1e-6)
+    assert worth(determinant_gain, step(before, after, violated=True)) == -4e4
 
 
 def grown_matrices(seed: int, count: int, n: int) -> list[Any]:
@@ -181,11 +155,10 @@ def grown_matrices(seed: int, count: int, n: int) -> list[Any]:
 
 
 def test_the_determinant_reward_is_the_one_of_the_running_normalisation() -> None:
-    matrices, running = grown_matrices(1, 30, 2), NormalisedFisher.start(epsilon_identity(2, 1e-6))
-    reward = DeterminantGain(scale=1e-4)
-    for a, b in pairwise(matrices):
-        running, expected = running.add(b - a)
-        assert worth(reward, step(pack(a), pack(b))) == pytest.approx(expected, rel=1e-6, abs=1e-8)
+    matrices = grown_matrices(1, 30, 2)
+    expected, *_ = normalised(np.diff(matrices, axis=0), 1e-6)
+    found = [worth(determinant_gain, step(pack(a), pack(b))) for a, b in pairwise(matrices)]
+    np.testing.assert_allclose(found, 1e4 * expected, rtol=1e-6, atol=1e-4)
 
 
 @pytest.mark.parametrize("n", [1, 2, 4])
@@ -193,82 +166,62 @@ def test_the_logarithmic_rewards_add_up_to_their_criterion_from_the_prior_on(n: 
     matrices = grown_matrices(2, 20, n)
     eigenvalues = np.linalg.eigvalsh(matrices[-1] + 12.0 * np.eye(n))
     expected: dict[Reward, float] = {
-        LogDeterminant(1.0): np.log(eigenvalues).sum() - n * math.log(12.0),
-        LogSmallest(1.0): math.log(eigenvalues[0]) - math.log(12.0),
-        LogTrace(1.0): -math.log((1.0 / eigenvalues).sum()) + math.log(n / 12.0),
+        log_determinant: np.log(eigenvalues).sum() - n * math.log(12.0),
+        log_smallest_eigenvalue: math.log(eigenvalues[0]) - math.log(12.0),
+        log_trace: -math.log((1.0 / eigenvalues).sum()) + math.log(n / 12.0),
     }
     for reward, value in expected.items():
         total = sum(worth(reward, step(pack(a), pack(b))) for a, b in pairwise(matrices))
         assert total == pytest.approx(value, rel=1e-9)
 
 
-@pytest.mark.parametrize("kind", [LogDeterminant, LogSmallest, LogTrace])
-def test_a_logarithmic_reward_needs_a_prior(kind: type) -> None:
-    for prior in (0.0, math.nan):
+def test_the_rewards_of_one_parameter_refuse_two() -> None:
+    for reward in ONE_PARAMETER:
+        require_defined(reward, ("f_v",))
         with pytest.raises(UsageError):
-            kind(1.0, prior)
+            require_defined(reward, ("k_1", "f_v"))
+    require_defined(log_determinant, ("k_1", "f_v"))
 
 
-@pytest.mark.parametrize("reward", [InformationIncrement(1.0), PenalisedIncrement(1.0), AdaptiveReturn(1.0)])
-def test_the_rewards_of_one_parameter_refuse_two(reward: Reward) -> None:
-    reward.check(("f_v",))
-    with pytest.raises(UsageError):
-        reward.check(("k_1", "f_v"))
+def test_a_reward_gets_the_state_in_which_the_way_home_began(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("emb_train.envs.env.OUTWARD", 20)
+    turns = []
 
+    def noted(t: Transition) -> Any:
+        turns.append(Turn(*(part[0].copy() for part in t.turn)))
+        return t.after[:, 0]
 
-@pytest.mark.parametrize("kind", REWARDS.values(), ids=REWARDS)
-def test_every_reward_s_scale_is_a_factor(kind: Any) -> None:
-    for made in (step(), step(violated=True), step(x=(77.0, -50.0), k=460, mark=FROM_REST)):
-        assert worth(kind(scale=3e-7), made) == pytest.approx(3e-7 * worth(kind(scale=1.0), made))
-
-
-def test_a_returning_reward_is_told_how_the_brake_was_when_its_way_home_began() -> None:
-    marks = []
-
-    class Looks:
-        outward = 20
-
-        def check(self, parameters: tuple[str, ...]) -> None:
-            assert parameters
-
-        def __call__(self, transition: Transition) -> Any:
-            marks.append(tuple(part[0].copy() for part in transition.mark))
-            return transition.after[:, 0]
-
-    assert isinstance(Looks(), Returning)
-    assert not isinstance(PenalisedIncrement(1.0), Returning)
     bench = load_bench()
     batch = Batch(bench, bench.range_set("viscous"), ("f_v",), 1)
-    scoring = Scoring(batch, Looks())
+    scoring = Scoring(batch, noted)
     batch.begin(0, np.random.default_rng(0))
     states, informations = [batch.x[0, :2].copy()], [batch.m[0].copy()]
     for _ in range(30):
         scoring.advance(np.full(1, 5.0))
         states.append(batch.x[0, :2].copy())
         informations.append(batch.m[0].copy())
-    assert [m[0].any() for m in marks] == [False] * 19 + [True] * 11
-    for x, acceleration, m in marks[19:]:
-        np.testing.assert_array_equal(x, states[20])
-        np.testing.assert_array_equal(m, informations[20])
-        assert acceleration == pytest.approx((states[20][1] - states[19][1]) / 1e-3)
+    assert [turn.x.any() for turn in turns] == [False] * 19 + [True] * 11
+    for turn in turns[19:]:
+        np.testing.assert_array_equal(turn.x, states[20])
+        np.testing.assert_array_equal(turn.m, informations[20])
+        assert turn.acceleration == pytest.approx((states[20][1] - states[19][1]) / 1e-3)
 
 
 def test_the_packed_matrix_of_the_environment_is_the_one_that_the_rewards_unpack() -> None:
     bench = load_bench()
     batch = Batch(bench, bench.range_set("pm50"), ("k_1", "f_v"), 1)
-    scoring = Scoring(batch, TrajectoryReturn(scale=1.0))
+    scoring = Scoring(batch, trajectory_return)
     batch.begin(0, np.random.default_rng(0))
     total = sum(float(scoring.advance(np.full(1, 2.0))[0]) for _ in range(100))
     assert total == pytest.approx(np.linalg.eigvalsh(unpack(batch.m[0], 2))[0], rel=1e-9)
 
 
-@pytest.mark.parametrize("name", [n for n in preset_names() if n.startswith("thesis-")])
-def test_the_presets_of_the_thesis_have_its_printed_hyper_parameters(name: str) -> None:
-    preset = load_preset(name)
-    ppo = preset.ppo
-    assert preset.preset == name
-    assert (ppo.envs, ppo.rollout, ppo.epochs, ppo.batch // ppo.minibatch) == (4, 2048, 10, 32)
-    assert (ppo.learning_rate, ppo.gamma, ppo.gae_lambda, ppo.clip) == (1e-3, 0.99, 0.95, 0.2)
-    assert not preset.conditions.shielded
-    assert preset.conditions.horizon in (0, 300)
-    preset.reward.check(preset.parameters)
+def test_the_presets_of_the_thesis_have_its_printed_hyper_parameters() -> None:
+    names = [name for name in preset_summaries() if name.startswith("thesis-")]
+    assert len(names) == 9
+    for name in names:
+        preset = load_preset(name)
+        ppo, conditions = preset.ppo, preset.conditions
+        assert (ppo.envs, ppo.rollout, ppo.epochs, ppo.batch // ppo.minibatch) == (4, 2048, 10, 32), name
+        assert (ppo.learning_rate, ppo.gamma, ppo.gae_lambda, ppo.clip) == (1e-3, 0.99, 0.95, 0.2), name
+        assert (conditions.shielded, conditions.horizon in (0, 300)) == (False, True), name

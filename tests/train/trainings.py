@@ -2,43 +2,34 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from emb_runtime.config.bench import shipped_bench_text
-from emb_train import presets
-from emb_train.ppo.ppo import PpoConfig
-from emb_train.training.configuration import Configuration
+from emb_train.presets import preset_record
+from emb_train.training import Training, training_from
 
 HORIZON = 60
 ENVS = 8
 ITERATION = HORIZON * ENVS  # Environment steps in an iteration
+PPO = {"envs": ENVS, "rollout": HORIZON, "minibatch": 160, "epochs": 2, "hidden": [8, 8], "initial_mean": 0.5}
 
-TINY = dataclasses.replace(
-    presets.load_preset("single-viscous"),
-    ppo=PpoConfig(
-        total_steps=3 * ITERATION,
-        envs=ENVS,
-        rollout=HORIZON,
-        minibatch=160,
-        epochs=2,
-        hidden=(8, 8),
-        initial_mean=0.5,
-    ),
-)
+
+def tiny_record(name: str) -> dict[str, Any]:
+    """The table of a preset with little to do: three iterations of eight experiments."""
+    return {**preset_record(name), "ppo": {**PPO, "total_steps": 3 * ITERATION}}
+
+
+def tiny(**changes: Any) -> Training:
+    """``single-viscous`` with little to do."""
+    return training_from({**tiny_record("single-viscous"), **changes}, "tiny")
 
 
 def make_tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let ``--preset single-viscous`` be :data:`TINY`."""
-    load_preset = presets.load_preset
-
-    def tiny(name: str) -> Configuration:
-        return TINY if name == "single-viscous" else load_preset(name)
-
-    for module in ("presets", "cli.train"):
-        monkeypatch.setattr(f"emb_train.{module}.load_preset", tiny)
+    """Let every preset have little to do."""
+    monkeypatch.setattr("emb_train.training.preset_record", tiny_record)
 
 
 def short_bench(directory: Path, old: str = "", new: str = "") -> Path:

@@ -7,4 +7,4 @@ from emb_runtime.system.entry import start
 
 def emb_train() -> int:
     """``emb-train``."""
-    return start("emb_train.cli.train", "emb-train: interrupted")
+    return start("emb_train.cli", "emb-train: interrupted")

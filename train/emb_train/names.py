@@ -7,6 +7,15 @@ from collections.abc import Mapping
 from importlib import resources
 
 WIDTH = 118  # Of a help text's lines
+TASKS: Mapping[str, str] = {
+    "viscous": "f_v in 1e-5..5e-5, the others known, weighted",
+    "viscous-stiffness": "k_1 and f_v of Table 6.1, the others known, weighted E",
+    "four-d": "k_m, k_1, T_c, f_v within 50 %, D",
+    "four-e": "k_m, k_1, T_c, f_v within 50 %, E",
+    "four-a": "k_m, k_1, T_c, f_v within 50 %, A",
+    "four-time": "k_m, k_1, T_c, f_v within 50 %, until 95 % of each are within 1.2 %",
+}
+"""Tasks that a reference is learned for, in a line each."""
 
 
 def reference_names() -> list[str]:

@@ -1,7 +1,7 @@
-"""Presets: the trainings that ``emb-train --preset`` knows, read from ``presets.toml``.
+"""Presets: the trainings that ``emb-train ppo`` knows, read from ``presets.toml`` without torch.
 
 ``thesis-…`` are those of the thesis, under its conditions and with its hyper-parameters; the others are the project's
-own. Names and summaries are read without what needs torch.
+own.
 """
 
 from __future__ import annotations
@@ -9,12 +9,9 @@ from __future__ import annotations
 import tomllib
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from emb_runtime.errors import UsageError
-
-if TYPE_CHECKING:
-    from emb_train.training.configuration import Configuration
 
 
 @cache
@@ -22,27 +19,19 @@ def _file() -> dict[str, Any]:
     return tomllib.loads(resources.files("emb_train").joinpath("presets.toml").read_text(encoding="utf-8"))
 
 
-def preset_names() -> list[str]:
-    """Names of all presets, sorted."""
-    return sorted(_file()["preset"])
-
-
 def preset_summaries() -> dict[str, str]:
-    """One line on each preset: what it learns."""
-    return {name: _file()["preset"][name]["summary"] for name in preset_names()}
+    """One line on each preset, by name: what it learns."""
+    return {name: record["summary"] for name, record in sorted(_file()["preset"].items())}
 
 
-def load_preset(name: str) -> Configuration:
-    """The configuration of a preset.
+def preset_record(name: str) -> dict[str, Any]:
+    """The table of a preset, with its hyper-parameters.
 
     Raises:
-        UsageError: there is no such preset, or a value of it is not possible.
+        UsageError: there is no such preset.
     """
-    from emb_train.training.configuration import Configuration
-
-    if name not in preset_names():
-        raise UsageError(f"no preset is called '{name}'; there are: {', '.join(preset_names())}")
-    record = _file()["preset"][name]
-    own = dict(record["ppo"])
-    ppo = _file()["hyper_parameters"][own.pop("base")] | own
-    return Configuration.from_record({**record, "preset": name, "ppo": ppo}, defaults=True)
+    presets = _file()["preset"]
+    if name not in presets:
+        raise UsageError(f"no preset is called '{name}'; there are: {', '.join(sorted(presets))}")
+    own = dict(presets[name]["ppo"])
+    return {**presets[name], "preset": name, "ppo": _file()["hyper_parameters"][own.pop("base")] | own}

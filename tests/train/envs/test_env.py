@@ -22,25 +22,23 @@ from emb_runtime.safety.sensor_monitor import largest_current
 from emb_runtime.safety.shield import NO_PAST, shield
 from emb_runtime.safety.shield_design import make_law
 from emb_train.envs.batch import Batch
+from emb_train.envs.closed_loop import Experiments, advance
 from emb_train.envs.conditions import Conditions
+from emb_train.envs.critic_view import describe
 from emb_train.envs.env import ENV_ID, EmbExcitationEnv, EmbExcitationVectorEnv
-from emb_train.envs.excitations import Constant, switch
-from emb_train.envs.play import GRID, grid_of, run_grid
-from emb_train.presets import load_preset, preset_names
-from emb_train.rewards import InformationIncrement, PenalisedIncrement, Transition
+from emb_train.envs.excitations import Played
+from emb_train.envs.play import GRID, grid_draws, play
+from emb_train.presets import preset_summaries
+from emb_train.rewards import Transition, penalised_increment
+from emb_train.training import load_preset
 
 BENCH = load_bench()
 SHORT = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=60))
 
 
-class TraceReward:
-    """Any number of parameters: the trace's increment."""
-
-    def check(self, parameters: tuple[str, ...]) -> None:
-        assert parameters
-
-    def __call__(self, transition: Transition) -> Any:
-        return (transition.after - transition.before).sum(axis=1)
+def trace_increment(t: Transition) -> Any:
+    """A reward for any number of parameters."""
+    return (t.after - t.before).sum(axis=1)
 
 
 def actions(seed: int, steps: int) -> Any:
@@ -49,19 +47,12 @@ def actions(seed: int, steps: int) -> Any:
     return np.repeat(rng.uniform(-1.5, 1.5, (steps // 10 + 1, 1)), 10, axis=0)[:steps].astype(np.float32)
 
 
-def test_gymnasium_finds_nothing_wrong_with_the_registered_environment() -> None:
-    check_env(gymnasium.make(ENV_ID).unwrapped, skip_render_check=True)
-
-
 OPEN = Conditions(shielded=False, horizon=30, observes="everything", information="physical")
 
 
-def test_gymnasium_finds_nothing_wrong_under_the_conditions_of_the_thesis() -> None:
-    for conditions in (OPEN, Conditions(shielded=False)):
+def test_gymnasium_finds_nothing_wrong_with_the_registered_environment() -> None:
+    for conditions in (Conditions(), OPEN, Conditions(shielded=False)):
         check_env(gymnasium.make(ENV_ID, conditions=conditions).unwrapped, skip_render_check=True)
-
-
-def test_gymnasium_makes_the_vector_environment_by_the_same_name() -> None:
     env = gymnasium.make_vec(ENV_ID, num_envs=3)
     assert isinstance(env.unwrapped, EmbExcitationVectorEnv)
     observation, _ = env.reset(seed=1)
@@ -79,7 +70,7 @@ def compare_infos(vector: dict[str, Any], row: int, scalar: dict[str, Any]) -> N
 def test_the_vector_environment_is_the_scalar_one_step_for_step_and_reset_for_reset(
     seed: int, conditions: Conditions
 ) -> None:
-    kind: dict[str, Any] = {"bench": SHORT, "ranges": "pm50", "parameters": PARAMETER_NAMES, "reward": TraceReward()}
+    kind: dict[str, Any] = {"bench": SHORT, "ranges": "pm50", "parameters": PARAMETER_NAMES, "reward": trace_increment}
     kind["conditions"] = conditions
     many, ones = EmbExcitationVectorEnv(3, **kind), [EmbExcitationEnv(**kind) for _ in range(3)]
     seen, info = many.reset(seed=seed)
@@ -102,21 +93,10 @@ def test_the_vector_environment_is_the_scalar_one_step_for_step_and_reset_for_re
             compare_infos(info, i, last_info)
 
 
-def test_equal_seeds_give_equal_experiments_and_other_seeds_others() -> None:
-    env = EmbExcitationEnv(SHORT)
-    runs = []
-    for seed in (5, 5, 6):
-        seen = [env.reset(seed=seed)[0]]
-        seen += [env.step(a)[0] for a in actions(0, 60)]
-        runs.append(np.array(seen))
-    np.testing.assert_array_equal(runs[0], runs[1])
-    assert (runs[0][1:, :2] != runs[2][1:, :2]).all()
-
-
 def test_the_action_that_answers_a_measurement_is_shielded_with_it_and_acts_in_the_period_that_follows() -> None:
-    env, law = EmbExcitationEnv(BENCH, plant="euler"), make_law(BENCH)
+    env, law = EmbExcitationEnv(bench=BENCH, plant="euler"), make_law(BENCH)
     seen, info = env.reset(seed=3)
-    batch = env._batch
+    batch = env._rows.batch
     for k in range(150):
         angle, velocity = batch.y[0]
         assert seen == pytest.approx([angle, velocity, k], rel=1e-6)
@@ -157,9 +137,9 @@ def test_parameters_are_drawn_from_the_range_at_each_reset_and_all_others_stay_n
 
 
 def test_the_information_and_the_return_are_those_of_the_applied_currents() -> None:
-    env = EmbExcitationEnv(BENCH, reward=InformationIncrement(scale=1e-7), plant="euler")
+    env = EmbExcitationEnv(bench=BENCH, scale=1e-7, plant="euler")
     brake = BENCH.brake._replace(f_v=4e-5)
-    env.reset(seed=2, options={"brake": brake})
+    env.reset(seed=2, options={"brakes": [brake]})
     currents, total = [], 0.0
     for action in actions(1, BENCH.timing.horizon):
         _, reward, terminated, _, info = env.step(action)
@@ -174,7 +154,7 @@ def test_the_information_and_the_return_are_those_of_the_applied_currents() -> N
 
 
 def test_the_horizon_is_a_terminal_and_never_a_truncation() -> None:
-    env = EmbExcitationEnv(SHORT)
+    env = EmbExcitationEnv(bench=SHORT)
     env.reset(seed=0)
     ends = [env.step(np.zeros(1, np.float32))[2:4] for _ in range(60)]
     assert ends == [(False, False)] * 59 + [(True, False)]
@@ -191,23 +171,26 @@ PLANTS = {
 MANY = dataclasses.replace(SHORT, plants={**SHORT.plants, **PLANTS})
 
 
-@pytest.mark.parametrize("plant", ["exact", "fast", "slow"])
-def test_every_plant_is_the_same_in_plain_python_and_compiled(plant: str) -> None:
-    kind: dict[str, Any] = {"bench": MANY, "parameters": PARAMETER_NAMES, "reward": TraceReward(), "plant": plant}
-    many, ones = EmbExcitationVectorEnv(2, **kind), [EmbExcitationEnv(**kind) for _ in range(2)]
-    seen, _ = many.reset(seed=7)
-    np.testing.assert_array_equal(seen, np.stack([env.reset(seed=7 + i)[0] for i, env in enumerate(ones)]))
-    for action in actions(4, 59):
-        seen, rewards, _, _, _ = many.step(np.stack([action, -action]))
-        for i, env in enumerate(ones):
-            one = env.step(-action if i else action)
-            np.testing.assert_array_equal(seen[i], one[0])
-            assert rewards[i] == one[1]
+def test_every_plant_is_the_same_in_plain_python_and_compiled() -> None:
+    for plant in ("exact", "fast", "slow"):
+        batch = Batch(MANY, MANY.range_set("pm50"), PARAMETER_NAMES, 2, plant)
+        for i in range(2):
+            batch.begin(i, np.random.default_rng(7 + i))
+        plain = Experiments._make(array.copy() for array in batch.experiments)
+        critic = np.empty((2, batch.critic_size), np.float32)
+        for action in 6.0 * actions(4, 59).astype(np.float64):
+            wanted = np.concatenate([action, -action])
+            batch.advance(wanted)
+            advance(batch.setup, plain, wanted)
+        describe(batch.scale, plain, critic)
+        for name, own, other in zip(Experiments._fields, plain, batch.experiments, strict=True):
+            np.testing.assert_array_equal(own, other, err_msg=f"{plant}: {name}")
+        np.testing.assert_array_equal(critic, batch.critic_observation())
 
 
 def test_the_information_of_a_plant_is_that_of_its_own_motion() -> None:
-    env = EmbExcitationEnv(BENCH, plant="exact")
-    env.reset(seed=2, options={"brake": BENCH.brake})
+    env = EmbExcitationEnv(bench=BENCH, plant="exact")
+    env.reset(seed=2, options={"brakes": [BENCH.brake]})
     currents = []
     for action in actions(1, BENCH.timing.horizon):
         info = env.step(action)[4]
@@ -224,8 +207,8 @@ def test_a_command_of_a_late_plant_acts_later_and_its_measurement_comes_later() 
     delayed = dataclasses.replace(BENCH, noise=Noise(1e-12, 1e-12), plants={**BENCH.plants, "slow": late})
     seen: dict[str, list[Any]] = {}
     for plant in ("exact", "slow"):
-        env = EmbExcitationEnv(delayed, plant=plant)
-        env.reset(seed=0, options={"brake": BENCH.brake})
+        env = EmbExcitationEnv(bench=delayed, plant=plant)
+        env.reset(seed=0, options={"brakes": [BENCH.brake]})
         seen[plant] = [env.step(np.full(1, 0.3, np.float32))[0][:2] for _ in range(20)]
     np.testing.assert_allclose(seen["slow"][5:], seen["exact"][:-5], atol=1e-9)
     np.testing.assert_allclose(seen["slow"][:5], 0.0, atol=1e-9)
@@ -241,9 +224,9 @@ def test_ideal_instruments_draw_no_more_random_numbers_than_the_noise() -> None:
 
 
 def test_leaving_the_limits_is_a_terminal() -> None:
-    env = EmbExcitationEnv(BENCH)
+    env = EmbExcitationEnv(bench=BENCH)
     wild = BENCH.brake._replace(k_m=3.0 * BENCH.brake.k_m)  # far outside of what the shield covers
-    env.reset(seed=0, options={"brake": wild})
+    env.reset(seed=0, options={"brakes": [wild]})
     for _ in range(BENCH.timing.horizon):
         _, _, terminated, truncated, info = env.step(np.ones(1, np.float32))
         if terminated:
@@ -251,22 +234,21 @@ def test_leaving_the_limits_is_a_terminal() -> None:
     assert info["violated"]
     assert not truncated
     assert not info["home"]
-    assert env._batch.k[0] < BENCH.timing.horizon
+    assert env._rows.batch.k[0] < BENCH.timing.horizon
 
 
-@pytest.mark.parametrize("action", [1.0, -1.0, 0.3])
-def test_with_the_shield_every_brake_of_the_range_stays_inside_the_limits_and_comes_home(action: float) -> None:
-    env = EmbExcitationVectorEnv(40, BENCH, ranges="envelope", parameters=PARAMETER_NAMES, reward=TraceReward())
+def test_with_the_shield_every_brake_of_the_range_stays_inside_the_limits_and_comes_home() -> None:
+    env = EmbExcitationVectorEnv(60, BENCH, ranges="envelope", parameters=PARAMETER_NAMES, reward=trace_increment)
     env.reset(seed=8)
     for _ in range(BENCH.timing.horizon):
-        _, _, terminated, _, info = env.step(np.full((40, 1), action, np.float32))
+        _, _, terminated, _, info = env.step(np.repeat([[1.0], [-1.0], [0.3]], 20, axis=0).astype(np.float32))
     assert terminated.all()
     assert not info["final_info"]["violated"].any()
     assert info["final_info"]["home"].all()
 
 
 def test_an_action_that_is_not_a_number_counts_as_no_current() -> None:
-    env = EmbExcitationEnv(BENCH)
+    env = EmbExcitationEnv(bench=BENCH)
     env.reset(seed=0)
     _, reward, _, _, info = env.step(np.array([np.nan], np.float32))
     assert info["current"] == 0.0
@@ -279,7 +261,7 @@ def test_the_critic_sees_the_truth_in_scales_of_order_one() -> None:
     seen = [info["critic"]]
     seen += [env.step(np.full((64, 1), 1.0 if k < 190 else -1.0, np.float32))[4]["critic"] for k in range(499)]
     everything = np.concatenate(seen)
-    assert everything.shape[1] == env.critic_size == 7
+    assert everything.shape[1] == env.batch.critic_size == 7
     assert np.abs(everything).max() < 5.0
     batch = env.batch
     np.testing.assert_allclose(seen[-1][:, 0], batch.x[:, 0] / 100.0, rtol=1e-6)
@@ -291,29 +273,15 @@ def test_the_critic_sees_the_truth_in_scales_of_order_one() -> None:
 
 def test_the_training_path_and_the_evaluation_path_are_the_same_path() -> None:
     ranges = BENCH.range_set("viscous")
-    (result,) = run_grid(BENCH, ranges, "f_v", [Constant(6.0)], seed=11)
+    draws = grid_draws(ranges, "f_v", seed=11)
+    assert (draws[0].brake.f_v, draws[-1].brake.f_v, len(draws)) == (1e-5, 5e-5, GRID)
+    result = play(BENCH, ranges, ("f_v",), Played(np.full(500, 6.0)), draws)
     env = EmbExcitationVectorEnv(GRID, BENCH)
-    env.reset(seed=11, options={"brakes": grid_of(ranges, "f_v")})
+    env.reset(seed=11, options={"brakes": [draw.brake for draw in draws]})
     for _ in range(BENCH.timing.horizon):
         info = env.step(np.ones((GRID, 1), np.float32))[4]
-    np.testing.assert_array_equal(result.fim, info["final_info"]["fim"][:, 0])
-    assert (result.violations, result.home) == (0, GRID)
-
-
-def test_excitations_of_one_call_do_not_disturb_each_other() -> None:
-    ranges = BENCH.range_set("viscous")
-    together = run_grid(BENCH, ranges, "f_v", [Constant(6.0), switch(6.0, 180, 500)], 0, "euler")
-    apart = [run_grid(BENCH, ranges, "f_v", [e], 0, "euler")[0] for e in (Constant(6.0), switch(6.0, 180, 500))]
-    for a, b in zip(together, apart, strict=True):
-        np.testing.assert_array_equal(a.fim, b.fim)
-    assert together[1].mean > together[0].mean  # the known order of these two
-
-
-def test_the_grid_covers_the_range_with_both_ends() -> None:
-    grid = grid_of(BENCH.range_set("viscous"), "f_v")
-    assert len(grid) == 40
-    assert (grid[0].f_v, grid[-1].f_v) == (1e-5, 5e-5)
-    assert grid[7]._replace(f_v=BENCH.brake.f_v) == pytest.approx(BENCH.brake)
+    np.testing.assert_array_equal(result.matrices[:, 0, 0], info["final_info"]["fim"][:, 0])
+    assert (result.left.sum(), result.home.sum()) == (0, GRID)
 
 
 def widened(bench: Bench) -> Bench:
@@ -328,21 +296,20 @@ def test_what_cannot_be_trained_is_refused() -> None:
         ({"parameters": ()}, UsageError),
         ({"parameters": ("f_v", "k_1")}, UsageError),
         ({"parameters": ("J",)}, UsageError),
-        ({"parameters": ("f_v", "k_1"), "reward": TraceReward()}, UsageError),
+        ({"parameters": ("f_v", "k_1"), "reward": trace_increment}, UsageError),
         ({"ranges": "wide", "bench": widened(BENCH)}, UsageError),
     ]
     for arguments, error in cases:
-        for kind in (EmbExcitationEnv, EmbExcitationVectorEnv):
-            with pytest.raises(error):
-                kind(**arguments)
+        with pytest.raises(error):
+            EmbExcitationEnv(**arguments)
 
 
 def test_calls_that_do_not_fit_the_experiments_are_refused() -> None:
-    one, many = EmbExcitationEnv(SHORT), EmbExcitationVectorEnv(2, SHORT)
+    one, many = EmbExcitationEnv(bench=SHORT), EmbExcitationVectorEnv(2, SHORT)
     calls: list[Callable[[], object]] = [
         lambda: one.step(np.zeros(1, np.float32)),  # before the first reset
         lambda: many.step(np.zeros((2, 1), np.float32)),
-        lambda: one.reset(options={"brakes": BENCH.brake}),
+        lambda: one.reset(options={"brake": BENCH.brake}),
         lambda: many.reset(options={"brakes": [BENCH.brake]}),
         lambda: many.reset(options={"brakes": [BENCH.brake, tuple(BENCH.brake)]}),
         lambda: many.reset(seed=[1, 2, 3]),
@@ -362,7 +329,7 @@ def test_calls_that_do_not_fit_the_experiments_are_refused() -> None:
 
 
 def test_a_seed_may_be_an_integer_of_numpy() -> None:
-    one, many = EmbExcitationEnv(SHORT), EmbExcitationVectorEnv(2, SHORT)
+    one, many = EmbExcitationEnv(bench=SHORT), EmbExcitationVectorEnv(2, SHORT)
     np.testing.assert_array_equal(one.reset(seed=np.int64(4))[0], one.reset(seed=4)[0])  # type: ignore[arg-type]
     plain = many.reset(seed=4)[0]
     np.testing.assert_array_equal(many.reset(seed=np.int64(4))[0], plain)  # type: ignore[arg-type]
@@ -370,8 +337,8 @@ def test_a_seed_may_be_an_integer_of_numpy() -> None:
 
 
 def test_without_a_shield_an_action_is_clipped_and_leaving_the_limits_ends_the_experiment_with_the_penalty() -> None:
-    env = EmbExcitationEnv(BENCH, reward=PenalisedIncrement(scale=1.0), conditions=Conditions(shielded=False))
-    env.reset(seed=0, options={"brake": BENCH.brake})
+    env = EmbExcitationEnv(bench=BENCH, reward=penalised_increment, scale=1.0, conditions=Conditions(shielded=False))
+    env.reset(seed=0, options={"brakes": [BENCH.brake]})
     rewards, currents, terminated = [], [], False
     while not terminated:
         _, reward, terminated, truncated, info = env.step(np.full(1, 1.5, np.float32))
@@ -388,7 +355,7 @@ def test_without_a_shield_an_action_is_clipped_and_leaving_the_limits_ends_the_e
 
 
 def test_an_experiment_without_a_shield_may_have_a_horizon_of_its_own() -> None:
-    env = EmbExcitationEnv(BENCH, conditions=Conditions(shielded=False, horizon=300))
+    env = EmbExcitationEnv(bench=BENCH, conditions=Conditions(shielded=False, horizon=300))
     env.reset(seed=0)
     ends = [env.step(np.zeros(1, np.float32))[2:4] for _ in range(300)]
     assert ends == [(False, False)] * 299 + [(True, False)]
@@ -396,7 +363,7 @@ def test_an_experiment_without_a_shield_may_have_a_horizon_of_its_own() -> None:
 
 def test_an_actor_that_is_told_everything_sees_what_the_critic_sees_without_the_sensitivities() -> None:
     for parameters, size in ((("f_v",), 5), (("k_1", "f_v"), 8)):
-        env = EmbExcitationEnv(BENCH, parameters=parameters, reward=TraceReward(), conditions=OPEN)
+        env = EmbExcitationEnv(bench=BENCH, parameters=parameters, reward=trace_increment, conditions=OPEN)
         seen, _ = env.reset(seed=0)
         for _ in range(20):
             seen, _, _, _, info = env.step(np.full(1, 0.8, np.float32))
@@ -405,8 +372,10 @@ def test_an_actor_that_is_told_everything_sees_what_the_critic_sees_without_the_
 
 
 def test_the_information_may_be_the_physical_one() -> None:
-    env = EmbExcitationEnv(BENCH, parameters=PARAMETER_NAMES, reward=TraceReward(), plant="euler", conditions=OPEN)
-    env.reset(seed=2, options={"brake": BENCH.brake})
+    env = EmbExcitationEnv(
+        bench=BENCH, parameters=PARAMETER_NAMES, reward=trace_increment, plant="euler", conditions=OPEN
+    )
+    env.reset(seed=2, options={"brakes": [BENCH.brake]})
     currents = []
     for action in actions(1, 30):
         info = env.step(action)[4]
@@ -423,7 +392,7 @@ def test_a_brake_whose_parameters_are_fixed_is_the_nominal_one() -> None:
 
 
 def test_the_shield_of_a_training_may_hold_for_another_set_of_the_bench() -> None:
-    kind: dict[str, Any] = {"bench": BENCH, "ranges": "viscous-stiffness", "reward": InformationIncrement(1e-7)}
+    kind: dict[str, Any] = {"bench": BENCH, "ranges": "viscous-stiffness"}
     with pytest.raises(UsageError):
         EmbExcitationVectorEnv(2, **kind)
     env = EmbExcitationVectorEnv(40, **kind, conditions=Conditions(shield_ranges="viscous-stiffness"))
@@ -435,22 +404,9 @@ def test_the_shield_of_a_training_may_hold_for_another_set_of_the_bench() -> Non
     assert info["final_info"]["home"].all()
 
 
-def test_conditions_that_do_not_exist_are_refused() -> None:
-    cases: list[dict[str, Any]] = [
-        {"horizon": 300},
-        {"shielded": False, "horizon": -1},
-        {"observes": "nothing"},
-        {"information": "total"},
-    ]
-    for arguments in cases:
-        with pytest.raises(UsageError):
-            Conditions(**arguments)
-
-
 def test_the_environment_of_every_preset_can_be_made() -> None:
-    for preset in map(load_preset, preset_names()):
-        setting = (preset.ranges, preset.parameters, preset.reward, preset.plant, preset.conditions)
-        env = EmbExcitationVectorEnv(2, BENCH, *setting)
+    for preset in map(load_preset, preset_summaries()):
+        env = preset.environment(BENCH, 2)
         seen, _ = env.reset(seed=0)
-        assert seen.shape == (2, preset.observation_size)
+        assert seen.shape == (2, preset.conditions.observation_size(len(preset.parameters)))
         assert np.isfinite(env.step(np.ones((2, 1), np.float32))[1]).all()

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from emb_bench import api
-from emb_bench.compiled import compiled
 from emb_bench.sim.closed_loop import sent_current
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.safety.command_limits import LEFT
@@ -28,7 +27,7 @@ RESOLUTION = 0.0031  # Of a current on the bus [A]
 
 
 def begun(plant: str, seed: int, conditions: Conditions = BENCH_CONDITIONS) -> Batch:
-    batch = Batch(BENCH, BENCH.range_set("pm50"), PARAMETER_NAMES, 1, compiled, plant, conditions)
+    batch = Batch(BENCH, BENCH.range_set("pm50"), PARAMETER_NAMES, 1, plant, conditions)
     batch.begin(0, np.random.default_rng(seed), BENCH.brake)
     return batch
 

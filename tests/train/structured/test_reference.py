@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,13 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
-from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, UsageError
+from emb_runtime.errors import UsageError
 from emb_runtime.estimator.kalman import MISFIT, follow, make_model, start
 from emb_runtime.estimator.speed_loop import scale_of
-from emb_train.cli.tune import main, parser
+from emb_train.cli import parser
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import Conditions, Randomisation
 from emb_train.envs.play import Draw, fresh_draws, play
@@ -73,7 +71,7 @@ def test_a_trial_is_the_environments_experiment_with_the_runtimes_functions(plan
     draws, conditions = fresh_draws(PM50, 9, 3), Conditions(information="physical")
     (outcome,) = Trials(BENCH, PM50, PARAMETER_NAMES, draws, plant, conditions).play(SCALE, LEANING[None])
     model = make_model(BENCH, PM50, sticks=plant == "exact")
-    batch = Batch(BENCH, PM50, PARAMETER_NAMES, 3, compiled, plant, conditions)
+    batch = Batch(BENCH, PM50, PARAMETER_NAMES, 3, plant, conditions)
     for i, draw in enumerate(draws):
         batch.begin(i, np.random.default_rng(draw.seed), draw.brake)
     states, reference = [start(model)] * 3, np.zeros(5)
@@ -129,7 +127,7 @@ def test_ranges_in_which_the_inertia_varies_are_refused() -> None:
 def followed(kind: str, delay: int, count: int, plant: str = "exact") -> tuple[list[Floats], Floats]:
     """States of the estimator at some steps [N, STATE] under an excitation, and the true relative parameters [N, 4]."""
     conditions = Conditions(information="physical", randomised=Randomisation(command_delay=(delay, delay)))
-    batch = Batch(BENCH, PM50, PARAMETER_NAMES, count, compiled, plant, conditions)
+    batch = Batch(BENCH, PM50, PARAMETER_NAMES, count, plant, conditions)
     for i, draw in enumerate(fresh_draws(PM50, 11, count)):
         batch.begin(i, np.random.default_rng(draw.seed), draw.brake)
     rng, found = np.random.default_rng(4), []
@@ -181,43 +179,12 @@ def test_every_packaged_reference_is_made_by_a_command_that_exists_and_keeps_wha
     for name in reference_names():
         kept = stored(name)
         program, command, *options = shlex.split(kept.command)
-        assert (program, command) == ("emb-train", "tune")
-        asked = parser().parse_args(options)
+        assert (program, command) == ("emb-train", "reference")
+        asked = parser().parse_args([command, *options])
         assert (asked.task, asked.form, asked.plant, asked.gain) == (kept.task, kept.form, kept.plant, kept.gain), name
         assert (asked.shield, tuple(asked.command_delay), asked.seed) == (kept.shield, kept.command_delay, kept.seed)
         assert kept.draws == asked.steps * BATCH
-        assert asked.out.name == f"{name}.json"
-
-
-def test_a_search_keeps_the_delays_it_met_and_a_blind_one_depends_on_no_estimate(tmp_path: Path) -> None:
-    blind, found = tmp_path / "blind.json", tmp_path / "found.json"
-    options = ["--command-delay", "1", "2", "--gain", "0.3", "--steps", "2"]
-    assert main(["four-d", "--form", "blind", "--begin=1,-1,0,0.3,0.6", *options, "--out", str(blind)]) == EXIT_DONE
-    assert main(["four-d", "--start", str(blind), *options, "--out", str(found)]) == EXIT_DONE
-    assert not stored(str(blind)).array()[:, 1:].any()
-    kept = stored(str(found))
-    assert kept.asked().conditions.randomised.command_delay == kept.command_delay == (1, 2)
-    assert (kept.form, kept.draws) == ("quadratic", 2 * BATCH)
-
-
-def test_a_search_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
-    out = str(tmp_path / "a.json")
-    for options in (
-        ["--steps", "0"],
-        ["--seed", "-1"],
-        ["--gain", "0"],
-        ["--gain", "1.1"],
-        ["--begin=1,-1"],
-        ["--begin=1,nan,2"],
-        ["--begin=one"],
-        ["--start", "none"],
-        ["--start", "four-d-exact-quadratic", "--form", "blind"],
-        ["--plant", "none"],
-        ["--out", str(tmp_path)],
-        ["--out", str(tmp_path / "none" / "a.json")],
-    ):
-        assert main(["four-d", "--steps", "1", "--out", out, *options]) == EXIT_USAGE, options
-    assert not list(tmp_path.iterdir())
+        assert asked.out.name == name
 
 
 def test_a_kept_delay_that_is_none_is_refused() -> None:

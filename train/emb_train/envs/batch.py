@@ -13,12 +13,13 @@ its period, the node brakes by itself, and the last sample received stays. A cur
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats
 from emb_bench.sim.instruments import measure, settle
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
@@ -62,7 +63,6 @@ class Batch:
         ranges: Ranges,
         parameters: Sequence[str],
         count: int,
-        translate: Callable[[Callable[..., None]], Callable[..., None]] = lambda fn: fn,
         plant: str = DEFAULT_PLANT,
         conditions: Conditions = BENCH_CONDITIONS,
     ) -> None:
@@ -73,7 +73,6 @@ class Batch:
             ranges: where the parameters of each episode are drawn from.
             parameters: whose information is collected, in the order of ``PARAMETER_NAMES``.
             count: N.
-            translate: turns the plain functions into those that run: ``emb_bench.compiled.compiled`` or nothing.
             plant: which of the bench's plants.
             conditions: shield or none, how many steps, which information.
 
@@ -93,11 +92,13 @@ class Batch:
         self.parameters = tuple(parameters)
         self._ranges = ranges
         self._plant = bench.plant(plant)
-        self.setup = make_setup(bench, make_law(bench), self._plant, parameters, conditions.kind, conditions.shielded)
+        self.setup = make_setup(
+            bench, make_law(bench), self._plant, parameters, conditions.information, conditions.shielded
+        )
         require_possible(self._plant, conditions)
         self.scale = make_scale(bench, ranges, parameters, conditions.randomised)
         self._deviations = np.array([bench.noise.angle, bench.noise.velocity])
-        self._advance, self._describe = translate(advance), translate(describe)
+        self._advance, self._describe = compiled(advance), compiled(describe)
         e = self.experiments = no_experiments(count, len(parameters), self.setup.rules.horizon)
         self.brakes, self.x, self.y, self.m, self.k = e.brakes, e.x, e.y, e.m, e.k
         self.past, self.reasons, self.violated = e.past, e.reasons, e.violated

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, get_args
+from dataclasses import replace
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,15 +24,15 @@ from emb_runtime.config.bench import OLDEST_FRAME, Bench
 from emb_runtime.config.plants import Instruments, Mechanics
 from emb_runtime.errors import UsageError
 
-MEASURED, EVERYTHING = "measured", "everything"
+MEASURED: Literal["measured"] = "measured"
+EVERYTHING: Literal["everything"] = "everything"
 
 _LOWEST = {"encoder_offset": -10.0}
 _GREATEST = {"frame_loss": 0.5, "current_lag": 0.1, "encoder_offset": 10.0}
 """Limits of the values, those of the bench file for a plant; of the frames, at most half may be lost."""
 
 
-@dataclass(frozen=True)
-class Randomisation:
+class Randomisation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Ranges of what an experiment has of its own beside its brake: (least, most), drawn uniformly at its start.
 
     It comes on top of what the plant has of the same kind. The shield is widened to cover delay or lag, one at a time
@@ -55,7 +56,7 @@ class Randomisation:
         Raises:
             UsageError: a range is not (least, most) within what an experiment may have.
         """
-        for name, (least, most) in vars(self).items():
+        for name, (least, most) in msgspec.structs.asdict(self).items():
             lowest, greatest = _LOWEST.get(name, 0), _GREATEST.get(name, OLDEST_FRAME)
             if not lowest <= least <= most <= greatest:  # written so that NaN fails
                 raise UsageError(
@@ -68,48 +69,37 @@ class Randomisation:
         return self.command_delay[0] + self.measurement_delay[0], self.command_delay[1] + self.measurement_delay[1]
 
 
+NOTHING_RANDOM = Randomisation()
+
+
 def parse_randomisation(texts: Sequence[str]) -> Randomisation:
     """Randomisation given on a command line, each text like ``command_delay=0,2``.
 
     Raises:
         UsageError: there is nothing of that name, it comes twice, or it is not two numbers in their range.
     """
-    kinds: dict[str, type] = {f.name: type(getattr(NOTHING_RANDOM, f.name)[0]) for f in fields(Randomisation)}
     given: dict[str, Any] = {}
     for text in texts:
-        name, _, listed = text.partition("=")
-        if name not in kinds or name in given:
-            raise UsageError(f"expected NAME=LEAST,MOST with each of {', '.join(kinds)} at most once, got '{text}'")
-        try:
-            least, most = (kinds[name](word) for word in listed.split(","))
-        except ValueError:
-            kind = "whole numbers" if kinds[name] is int else "numbers"
-            raise UsageError(f"{name}: expected two {kind}, LEAST,MOST, got '{listed}'") from None
-        given[name] = (least, most)
-    return Randomisation(**given)
+        name, _, pair = text.partition("=")
+        if name not in OWN or name in given:
+            raise UsageError(f"expected NAME=LEAST,MOST with each of {', '.join(OWN)} at most once, got '{text}'")
+        given[name] = pair.split(",")
+    try:
+        return msgspec.convert(given, Randomisation, strict=False)  # a word becomes the number that it says
+    except msgspec.ValidationError as err:
+        raise UsageError(f"expected two numbers, LEAST,MOST: {err}") from err
 
 
-NOTHING_RANDOM = Randomisation()
-
-
-def randomisation_texts(randomised: Randomisation) -> list[str]:
-    """Texts from which :func:`parse_randomisation` reads it, without ranges that are 0 to 0."""
-    return [f"{n}={least!r},{most!r}" for n, (least, most) in vars(randomised).items() if (least, most) != (0, 0)]
-
-
-@dataclass(frozen=True)
-class Conditions:
+class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Conditions in which an experiment of the training may differ from one on the bench."""
 
-    shielded: bool = True
-    """True if the shield is between actor and brake; without it an action is clipped and nothing else."""
-    shield_ranges: str = ""
-    """The set of the bench that the shield holds the limits for; empty for the one that the bench names."""
+    shielded: bool = True  # True if the shield is between actor and brake; without it an action is clipped, no more
+    shield_ranges: str | None = None
+    """The set of the bench that the shield holds the limits for; None for the one that the bench names."""
     horizon: int = 0  # Steps in one experiment; 0 for the bench's
-    observes: str = MEASURED
+    observes: Literal["measured", "everything"] = MEASURED
     """Observation of the actor: ``measured`` angle, velocity and step, or ``everything`` (x₁, x₂, k, θ, the FIM)."""
-    information: str = "weighted"
-    """Kind of Fisher information that is collected: the thesis's ``weighted`` one, or the ``physical`` one."""
+    information: Kind = "weighted"  # Fisher information that is collected: the thesis's, or the physical one
     randomised: Randomisation = NOTHING_RANDOM  # Ranges of what an experiment has of its own beside its brake
 
     def __post_init__(self) -> None:
@@ -129,14 +119,6 @@ class Conditions:
             raise UsageError(f"horizon: expected steps, or 0 for the bench's, got {self.horizon}")
         if self.horizon and self.shielded:
             raise UsageError("horizon: the shield plans for the bench's; only an experiment without it has another")
-        for name, known in (("observes", (MEASURED, EVERYTHING)), ("information", get_args(Kind))):
-            if getattr(self, name) not in known:
-                raise UsageError(f"{name}: expected one of {', '.join(known)}, got {getattr(self, name)!r}")
-
-    @property
-    def kind(self) -> Kind:
-        """The information, as :mod:`emb_bench.information.fisher` calls it."""
-        return "physical" if self.information == "physical" else "weighted"
 
     def observation_size(self, count: int) -> int:
         """Length of the actor's observation if the information of this many parameters is collected."""
@@ -163,7 +145,7 @@ BENCH_CONDITIONS = Conditions()
 
 Bools = NDArray[np.bool_]
 
-OWN = tuple(f.name for f in fields(Randomisation))  # Names of the columns of an experiment's own row
+OWN = Randomisation.__struct_fields__  # Names of the columns of an experiment's own row
 COMMAND_DELAY, MEASUREMENT_DELAY, FRAME_LOSS, CURRENT_LAG, ENCODER_OFFSET = range(len(OWN))
 WHOLE = np.array([COMMAND_DELAY, MEASUREMENT_DELAY])
 

@@ -6,21 +6,17 @@ The requested current is not the one that acts: the shield has the last word ove
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import nn
 
 from emb_bench.excitation import reference
-from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy.inference import INPUT_NAME, NEXT_STATE_NAME, OUTPUT_NAME, STATE_NAME, open_session
 
 ANGLE, VELOCITY, STEP, APPLIED = range(4)
 """Columns of the observation: angle [rad], velocity [rad/s], step, current that acted in the period before [A]."""
-
-PLAIN = 3  # Columns of the observation of an actor that does not see the applied current
 
 Seen = NDArray[np.float32]
 Currents = NDArray[np.float64]
@@ -49,34 +45,18 @@ class Stateless:
         """Nothing is kept from one experiment to the next."""
 
 
-class Constant(Stateless):
-    """A constant current."""
-
-    def __init__(self, current: float) -> None:
-        """With this current [A]."""
-        self._current = current
-
-    def __call__(self, seen: Seen) -> Currents:
-        """See :class:`Excitation`."""
-        return np.full(len(seen), self._current)
-
-
 class Played(Stateless):
-    """A sequence of currents, whatever is measured."""
+    """Currents that are known beforehand, whatever is measured."""
 
     def __init__(self, currents: Sequence[float] | Currents) -> None:
-        """Play these currents [A], one for each step."""
+        """Play these currents [A], one for each step, shape [T]; of each experiment its own, shape [N, T]."""
         self._currents = np.array(currents, np.float64)
 
     def __call__(self, seen: Seen) -> Currents:
         """See :class:`Excitation`."""
-        wanted: Currents = self._currents[seen[:, STEP].astype(np.int64)]
+        step = seen[:, STEP].astype(np.int64)
+        wanted: Currents = self._currents[(np.arange(len(step)), step) if self._currents.ndim > 1 else step]
         return wanted
-
-
-def switch(current: float, step: int, horizon: int) -> Played:
-    """``current`` [A] until ``step``, then its negative."""
-    return Played(np.where(np.arange(horizon) < step, current, -current))
 
 
 class Law(Stateless):
@@ -94,41 +74,6 @@ class Law(Stateless):
 def reference_excitation(excited: reference.Excitation) -> Excitation:
     """One of :mod:`emb_bench.excitation.reference`, for many experiments."""
     return Law(excited.law) if excited.currents is None else Played(excited.currents)
-
-
-class Network(Stateless):
-    """A network without state: raw observations [N, 3] to currents [A], [N, 1]; no exploration."""
-
-    def __init__(self, module: nn.Module) -> None:
-        """Use this module, :class:`emb_train.ppo.networks.DeployedActor` for one."""
-        self._module = module
-
-    def __call__(self, seen: Seen) -> Currents:
-        """See :class:`Excitation`."""
-        with torch.no_grad():
-            currents = self._module(torch.from_numpy(np.ascontiguousarray(seen[:, :PLAIN])))
-        return _column(currents.numpy())
-
-
-class StatefulNetwork:
-    """A network with state: (obs [N, 3 or 4], state [N, S]) to (currents [A] [N, 1], next state, estimate)."""
-
-    def __init__(self, module: Any) -> None:
-        """Use this module; it has the attributes ``initial_state``, shape [S], and ``observation_size``."""
-        self._module = module
-        self._state = torch.zeros(0, 0, dtype=torch.float64)
-
-    def begin(self, count: int) -> None:
-        """Every experiment begins with the initial state."""
-        self._state = self._module.initial_state.detach().to(torch.float64).repeat(count, 1)
-
-    def __call__(self, seen: Seen) -> Currents:
-        """See :class:`Excitation`."""
-        observed = torch.from_numpy(np.ascontiguousarray(seen[:, : self._module.observation_size]))
-        with torch.no_grad():
-            currents, state, *_ = self._module(observed, self._state)
-        self._state = torch.where(observed[:, :1].isnan(), self._state, state)
-        return _column(currents.numpy())
 
 
 class OnnxFile:
@@ -173,9 +118,3 @@ class OnnxFile:
             if following:
                 self._state[i] = following[0][0]
         return wanted
-
-
-def _column(currents: Any) -> Currents:
-    if currents.ndim != 2 or currents.shape[1] != 1:
-        raise UsageError(f"expected an actor that gives one current for each experiment, got shape {currents.shape}")
-    return np.array(currents[:, 0], np.float64)

@@ -10,15 +10,13 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from emb_bench.information.criteria import Criterion, Name
 from emb_bench.information.fisher import Kind
 from emb_bench.numbers import LEVEL, Score
+from emb_train.rewards import PRIOR
 
 Floats = NDArray[np.float64]
-
-PRIOR = 12.0  # Information of a prior of ±50 %: one over the variance of a uniform distribution from 0.5 to 1.5
 
 
 @dataclass(frozen=True)
@@ -69,6 +67,8 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
 
 def mean_score(values: Floats) -> Score:
     """Mean of independent values with Student's 95 % interval for it; one value has no interval (NaN)."""
+    from scipy.stats import t as student  # takes a second to import
+
     centre, count = float(np.mean(values)), len(values)
     if count < 2:
         return Score(centre, math.nan, math.nan)

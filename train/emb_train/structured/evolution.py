@@ -11,6 +11,7 @@ them. Adam (Kingma and Ba, arXiv:1412.6980) climbs.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -44,6 +45,7 @@ class Tuned:
 
     table: Floats  # See :func:`emb_train.structured.law.set_reference`
     score: float  # Mean over the brakes that it was judged on
+    steps: int  # Steps that were made, fewer than asked for after a Ctrl-C
 
 
 class Progress(NamedTuple):
@@ -81,7 +83,8 @@ def evolve(
         show: called after each step.
 
     Returns:
-        The better one of the mean of the last references and what it began with, on brakes that no step had.
+        The better one of the mean of the last references and what it began with, on brakes that no step had. After a
+        Ctrl-C, the last reference where there is no mean yet.
     """
     rng = np.random.default_rng(seed)
     first = TUNING_SEED + seed * steps
@@ -90,31 +93,35 @@ def evolve(
     spread = np.full(len(begin), SWITCH_SPREAD)
     spread[:levels] = np.where(np.abs(begin[:levels, 0]) < SLOW, SLOW, 1.0) * LEVEL_SPREAD
     table, mean, square, summed, parts = begin.copy(), np.zeros_like(begin), np.zeros_like(begin), 0.0 * begin, 0
-    for k in range(steps):
-        begin_all(trials, task.draws(bench, first + k, batch))
-        done = k / steps
-        reach = spread * (1.0 - (1.0 - NARROWED) * done)
-        change = rng.standard_normal((batch, len(table)))
-        moved = np.zeros((batch, *table.shape))
-        moved[:, :, 0] = change * reach
-        up, down = trials.perturbed(scale, [table + moved, table - moved])
-        scores = task.score(up), task.score(down)
-        gain = 0.5 * (scores[0] - scores[1])
-        gain = np.clip(gain / max(float(gain.std()), 1e-12), -OUTLIER, OUTLIER)
-        slope = np.einsum("n,nr,nrc->rc", gain, change, 0.5 * (up.used + down.used)) / batch
-        if blind:
-            slope[:, 1:] = 0.0
-        mean += (1.0 - MOMENTS[0]) * (slope - mean)
-        square += (1.0 - MOMENTS[1]) * (slope * slope - square)
-        unbiased = mean / (1.0 - MOMENTS[0] ** (k + 1)), square / (1.0 - MOMENTS[1] ** (k + 1))
-        rate = RATE * 0.5 * (1.0 + np.cos(np.pi * done))
-        table = table + rate * spread[:, None] * unbiased[0] / (np.sqrt(unbiased[1]) + 1e-9)
-        if done >= 1.0 - AVERAGED:
-            summed, parts = summed + table, parts + 1
-        both = np.concatenate(scores)
-        show(Progress(k + 1, float(both.mean()), int(up.home.sum() + down.home.sum()), int(up.left.sum())))
+    made = 0
+    with contextlib.suppress(KeyboardInterrupt):  # what was found by then is judged and kept
+        for k in range(steps):
+            begin_all(trials, task.draws(bench, first + k, batch))
+            done = k / steps
+            reach = spread * (1.0 - (1.0 - NARROWED) * done)
+            change = rng.standard_normal((batch, len(table)))
+            moved = np.zeros((batch, *table.shape))
+            moved[:, :, 0] = change * reach
+            up, down = trials.perturbed(scale, [table + moved, table - moved])
+            scores = task.score(up), task.score(down)
+            gain = 0.5 * (scores[0] - scores[1])
+            gain = np.clip(gain / max(float(gain.std()), 1e-12), -OUTLIER, OUTLIER)
+            slope = np.einsum("n,nr,nrc->rc", gain, change, 0.5 * (up.used + down.used)) / batch
+            if blind:
+                slope[:, 1:] = 0.0
+            mean += (1.0 - MOMENTS[0]) * (slope - mean)
+            square += (1.0 - MOMENTS[1]) * (slope * slope - square)
+            unbiased = mean / (1.0 - MOMENTS[0] ** (k + 1)), square / (1.0 - MOMENTS[1] ** (k + 1))
+            rate = RATE * 0.5 * (1.0 + np.cos(np.pi * done))
+            table = table + rate * spread[:, None] * unbiased[0] / (np.sqrt(unbiased[1]) + 1e-9)
+            if done >= 1.0 - AVERAGED:
+                summed, parts = summed + table, parts + 1
+            both = np.concatenate(scores)
+            made = k + 1
+            show(Progress(made, float(both.mean()), int(up.home.sum() + down.home.sum()), int(up.left.sum())))
     fresh = task.trials(bench, task.draws(bench, first - 1, JUDGED))
-    found = summed / max(parts, 1)
+    found = summed / parts if parts else table
     values = [task.score(outcome) for outcome in fresh.play(scale, np.array([found, begin]))]
     better = float(mean_score(values[0]).value) > float(mean_score(values[1]).value)
-    return Tuned(found, float(values[0].mean())) if better else Tuned(begin, float(values[1].mean()))
+    best, scored = (found, values[0]) if better else (begin, values[1])
+    return Tuned(best, float(scored.mean()), made)

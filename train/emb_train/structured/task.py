@@ -20,8 +20,7 @@ from emb_train.structured.trial import ANY_PRECISION, ReportedOutcome, Trials
 class Task:
     """One task, as it is tuned for and as it is evaluated."""
 
-    name: str
-    summary: str
+    name: str  # One of :data:`emb_train.names.TASKS`, which says what it is
     parameters: tuple[str, ...]  # Parameters whose information counts
     ranges: str  # Set of the bench that the brakes are drawn from
     shield_ranges: str  # Set of the bench that the shield covers; it contains ``ranges``
@@ -69,7 +68,6 @@ class Task:
 
 _FOUR = Task(
     name="four-d",
-    summary="k_m, k_1, T_c, f_v within 50 %, D",
     parameters=PARAMETER_NAMES,
     ranges="pm50",
     shield_ranges="envelope",
@@ -82,7 +80,6 @@ TASKS: Mapping[str, Task] = {
     for task in (
         Task(
             name="viscous",
-            summary="f_v in 1e-5..5e-5, the others known, weighted",
             parameters=("f_v",),
             ranges="viscous",
             shield_ranges="viscous",
@@ -91,7 +88,6 @@ TASKS: Mapping[str, Task] = {
         ),
         Task(
             name="viscous-stiffness",
-            summary="k_1 and f_v of Table 6.1, the others known, weighted E",
             parameters=("k_1", "f_v"),
             ranges="viscous-stiffness",
             shield_ranges="viscous-stiffness",
@@ -99,12 +95,11 @@ TASKS: Mapping[str, Task] = {
             begin=(1.0, -1.0, -0.007, 0.336, 0.92),
         ),
         _FOUR,
-        replace(_FOUR, name="four-e", summary="k_m, k_1, T_c, f_v within 50 %, E", criterion="E", begin=_CREEP_FIRST),
-        replace(_FOUR, name="four-a", summary="k_m, k_1, T_c, f_v within 50 %, A", criterion="A", begin=_CREEP_FIRST),
+        replace(_FOUR, name="four-e", criterion="E", begin=_CREEP_FIRST),
+        replace(_FOUR, name="four-a", criterion="A", begin=_CREEP_FIRST),
         replace(
             _FOUR,
             name="four-time",
-            summary="k_m, k_1, T_c, f_v within 50 %, until 95 % of each are within 1.2 %",
             precision=(0.0065, 0.0065, 0.0065, 0.0065),
             begin=(-0.2, 1.0, -1.0, 0.032, 0.3),
         ),

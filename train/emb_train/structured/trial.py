@@ -82,7 +82,7 @@ class Trials(Batch):
             UsageError: J or γ vary in these ranges; see :class:`emb_train.envs.batch.Batch` and
                 :func:`emb_train.structured.learning.make_learning`.
         """
-        super().__init__(bench, ranges, parameters, len(draws), compiled, plant, conditions)
+        super().__init__(bench, ranges, parameters, len(draws), plant, conditions)
         self.learning = make_learning(self.bench, shield, self._plant, conditions.randomised)
         for name in ("J", "gamma"):
             if getattr(ranges.low, name) < getattr(ranges.high, name):

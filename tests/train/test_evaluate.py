@@ -1,0 +1,348 @@
+"""What an evaluation says, against numbers that are computed another way; and what the command does with it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.stats
+from numpy.typing import NDArray
+from torch import nn
+
+from emb_bench.design.problem import Problem, make_problem
+from emb_bench.excitation.reference import parse_excitation, run_excitation
+from emb_bench.information.criteria import Criterion
+from emb_bench.information.fisher import fisher
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.policy.policy import load_policy, shipped_actor_path
+from emb_train import optimum
+from emb_train.cli import main
+from emb_train.envs.batch import Batch
+from emb_train.envs.conditions import Conditions
+from emb_train.envs.excitations import OnnxFile, Played, reference_excitation
+from emb_train.envs.measure import MEASURES, mean_score
+from emb_train.envs.network import Network
+from emb_train.envs.play import Draw, fresh_draws, play
+from emb_train.evaluate import Settings, Subject, document, evaluate, open_subject, references, text
+from emb_train.optimum import followed, optima, searchable
+from emb_train.training import VALIDATION_STREAM
+from tests.commands import refused
+from tests.train.trainings import HORIZON
+
+BENCH = load_bench()
+SHORT = parse_bench(shipped_bench_text().replace("horizon     = 500", f"horizon     = {HORIZON}"), "short")
+WIDE = BENCH.range_set("pm50")
+PHYSICAL = Conditions(information="physical")
+
+
+def constant(current: float) -> Played:
+    return Played(np.full(BENCH.timing.horizon, current))
+
+
+def quiet(line: str) -> None:
+    assert "\n" not in line
+
+
+def run(*arguments: object) -> int:
+    return main(["evaluate", *map(str, arguments), "--optimum", "0", "--draws", "4", "--plant", "euler"])
+
+
+def test_what_was_played_has_the_information_that_plain_python_computes_from_the_same_currents() -> None:
+    draws = fresh_draws(WIDE, seed=5, count=3)
+    excited = parse_excitation("square:period=0.2,amplitude=3", BENCH)
+    for name in ("euler", "exact"):
+        outcome = play(BENCH, WIDE, PARAMETER_NAMES, reference_excitation(excited), draws, name, PHYSICAL)
+        plant = BENCH.plant(name)
+        for i, draw in enumerate(draws):
+            rng = np.random.default_rng(draw.seed)
+            rng.uniform(WIDE.low, WIDE.high)
+            noise = rng.standard_normal((501, 2)) * [BENCH.noise.angle, BENCH.noise.velocity]
+            played = run_excitation(BENCH, excited, plant.mechanics, draw.brake, shielded=True, noise=noise)
+            found = fisher(BENCH, draw.brake, played.currents, kind="physical", normalise_by="true", plant=plant)
+            np.testing.assert_allclose(outcome.matrices[i], found.matrix, rtol=1e-6)
+            assert outcome.home[i] == played.home
+            assert outcome.left[i] == (not played.kept)
+            assert (outcome.angle[i], outcome.velocity[i]) == pytest.approx(tuple(played.states[-1]), abs=1e-6)
+
+
+def test_no_evaluation_brake_is_one_of_a_training() -> None:
+    def drawn(seed: Any) -> tuple[float, ...]:
+        return tuple(np.random.default_rng(seed).uniform(WIDE.low, WIDE.high).tolist())
+
+    seen = {tuple(draw.brake) for seed in range(20) for draw in fresh_draws(WIDE, seed, 50)}
+    assert len(seen) == 1000
+    trained_on = {drawn(seed + i) for seed in range(20) for i in range(50)}
+    for seed in range(20):
+        for iteration in range(5):  # as emb_train.ppo draws its seeds
+            trained_on |= {
+                drawn(int(s)) for s in np.random.SeedSequence([seed, iteration]).generate_state(10, np.uint64)
+            }
+        stream = np.random.SeedSequence(seed, spawn_key=(VALIDATION_STREAM,))
+        trained_on |= {drawn(int(s)) for s in stream.generate_state(64, np.uint64)}
+    assert not trained_on & seen
+
+
+def test_a_draw_depends_on_the_seed_and_its_number_alone() -> None:
+    few, many = fresh_draws(WIDE, 3, 2), fresh_draws(WIDE, 3, 9)
+    assert [d.brake for d in few] == [d.brake for d in many[:2]]
+    short = SHORT.range_set("pm50")
+    first, second = (play(SHORT, short, ("k_1", "f_v"), constant(6.0), d) for d in (few, many))
+    np.testing.assert_array_equal(first.matrices, second.matrices[:2])
+
+
+def test_an_experiment_that_leaves_the_limits_keeps_what_it_had_and_is_not_home() -> None:
+    strong = Draw(0, BENCH.brake._replace(k_m=3.0 * BENCH.brake.k_m))  # far outside of what the shield covers
+    outcome = play(BENCH, WIDE, ("f_v",), constant(6.0), [strong])
+    batch = Batch(BENCH, WIDE, ("f_v",), 1)
+    batch.begin(0, np.random.default_rng(0), strong.brake)
+    before = 0.0
+    while not batch.violated[0]:
+        before = float(batch.m[0, 0])
+        batch.advance(np.array([6.0]))
+    assert (outcome.left[0], outcome.home[0], outcome.matrices[0, 0, 0]) == (True, False, before)
+    assert (outcome.angle[0], outcome.velocity[0]) == tuple(batch.x[0, :2])
+
+
+def test_policies_that_cannot_be_played_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(PolicyRefusedError):
+        play(SHORT, SHORT.range_set("pm50"), ("f_v",), Played([1.0] * 7 + [math.nan] * 60), fresh_draws(WIDE, 0, 1))
+    with pytest.raises(UsageError):
+        Network(nn.Linear(3, 2))(np.zeros((5, 4), np.float32))
+    with pytest.raises(PolicyRefusedError):
+        OnnxFile(b"no graph")
+    path = tmp_path / "empty.onnx"
+    path.touch()
+    with pytest.raises(PolicyRefusedError, match=str(path)):
+        open_subject(str(path), None)
+
+
+def test_the_measures_are_those_of_a_matrix_worked_out_by_hand_and_their_shares_nats_or_ratios() -> None:
+    m = np.array([[[88.0, 30.0], [30.0, 8.0]]])  # with the prior [[100, 30], [30, 20]]: eigenvalues 110 and 10
+    values = {name: float(measure.values(m)[0]) for name, measure in MEASURES.items()}
+    assert values["D"] == pytest.approx(math.log(1100.0))
+    assert values["E"] == pytest.approx(math.log(10.0))
+    assert values["A"] == pytest.approx(-math.log(1.0 / 110.0 + 1.0 / 10.0))
+    assert MEASURES["weighted"].values(np.array([[[3.0e7]]]))[0] == pytest.approx(3.0e7)
+    ours, best = np.array([101.0]), np.array([102.0])
+    for name, share in (("D", -1.0), ("A", math.exp(-1.0)), ("E", math.exp(-1.0)), ("weighted", 101.0 / 102.0)):
+        assert MEASURES[name].shares(ours, best)[0] == pytest.approx(share), name
+
+
+def test_the_interval_is_students_as_scipy_computes_it() -> None:
+    values = np.random.default_rng(0).normal(3.0, 2.0, 9)
+    theirs = scipy.stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    assert mean_score(values) == pytest.approx((values.mean(), theirs.low, theirs.high))
+    assert math.isnan(mean_score(values[:1]).low)
+
+
+def test_every_reference_asks_for_what_it_asks_for_in_the_runtime() -> None:
+    rng = np.random.default_rng(1)
+    for name, excitation in references(BENCH).items():
+        excitation.begin(3)
+        excited = parse_excitation(name, BENCH)
+        for k in (0, 17, 250, 499):
+            seen = rng.uniform([-5.0, -400.0, k, -6.0], [90.0, 400.0, k, 6.0], (3, 4)).astype(np.float32)
+            np.testing.assert_allclose(excitation(seen), [excited.law(a, v, int(s)) for a, v, s, _ in seen.tolist()])
+    own = Played(np.array([[1.0, 2.0], [3.0, 4.0]]))  # of each experiment its own
+    assert own(np.array([[0, 0, 1, 0], [0, 0, 0, 0]], np.float32)).tolist() == [2.0, 3.0]
+
+
+# Known-parameter optimum
+
+
+def problem(plant: str = "euler", **changes: float) -> Problem:
+    brake = BENCH.brake._replace(**changes)
+    goal = Criterion("E", (0,))
+    return make_problem(BENCH, goal, ("f_v",), model=plant, kind="weighted", brake=brake, returns=True)
+
+
+@pytest.fixture
+def searched(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[float]:
+    """f_v of the brakes that were searched for, without a search: a current that depends on the brake is found."""
+    brakes: list[float] = []
+
+    class Found:
+        def __init__(self, currents: NDArray[np.float64]) -> None:
+            self.best = self
+            self.currents = currents
+
+    def search(asked: Problem, **_: Any) -> Found:
+        brakes.append(asked.brake.f_v)
+        return Found(np.full(asked.horizon, 1e5 * asked.brake.f_v))
+
+    monkeypatch.setattr(optimum, "search", search)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return brakes
+
+
+def test_the_known_optimum_is_the_information_of_the_kept_currents_and_is_looked_for_once(
+    searched: list[float], tmp_path: Path
+) -> None:
+    brakes = [BENCH.brake._replace(f_v=v) for v in (3e-5, 1e-5, 4e-5)]
+
+    def found() -> NDArray[np.float64]:
+        return optima(BENCH, MEASURES["weighted"], ("f_v",), "euler", brakes, quiet)
+
+    first = found()
+    for brake, value in zip(brakes, first, strict=True):
+        currents, plant = np.full(500, 1e5 * brake.f_v), BENCH.plant("euler")
+        own = fisher(BENCH, brake, currents, kind="weighted", normalise_by="true", plant=plant, params=("f_v",))
+        assert value == pytest.approx(own.matrix[0, 0], rel=1e-9)
+    assert searched == [3e-5, 1e-5, 4e-5]
+    np.testing.assert_array_equal(found(), first)
+    assert len(searched) == 3
+    for path in (tmp_path / "cache").rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[:-1])  # as a full disk leaves it
+    np.testing.assert_array_equal(found(), first)
+    assert len(searched) == 6
+
+
+def test_an_optimum_is_kept_for_what_it_depends_on() -> None:
+    asked = [
+        optimum._place(problem(), ()),
+        optimum._place(problem("exact"), ()),
+        optimum._place(problem(f_v=3e-5), ()),
+        optimum._place(problem(), (1.0,) * 500),
+    ]
+    assert len(set(asked)) == 4
+    assert optimum._place(problem(), ()) == asked[0]
+
+
+def test_speeds_that_are_followed_are_reached_on_another_brake() -> None:
+    speeds = np.concatenate([np.linspace(0.0, 60.0, 100), np.linspace(60.0, -60.0, 200), np.linspace(-60.0, -5.0, 200)])
+    for plant in ("euler", "exact"):
+        asked = problem(plant, k_m=0.015, T_c=0.012)
+        design = asked.design(followed(asked, speeds.tolist()))
+        assert np.abs(design.states[21:, 1] - speeds[20:]).max() < 2.5  # T_c changes within a sample
+
+
+def test_the_optimum_of_a_plant_is_that_of_its_mechanics() -> None:
+    on = {name: searchable(plant) for name, plant in BENCH.plants.items()}
+    assert {name for name, model in on.items() if model == "euler"} == {"euler"}
+    assert {name for name, model in on.items() if model == "exact"} == {"exact", "late", "offset", "jitter", "observer"}
+
+
+# What is evaluated
+
+
+def test_the_shipped_actor_is_on_its_own_ranges_inside_the_limits_at_home_and_beats_pushing() -> None:
+    subject = open_subject("actor", None)
+    assert (subject.ranges, subject.parameters, subject.shield) == ("pm50", PARAMETER_NAMES, None)
+    asked = Settings(MEASURES["D"], PARAMETER_NAMES, "pm50", ("exact",), 12, 0, 0)
+    (plant,) = evaluate(BENCH, asked, [subject], quiet)
+    rows = {row.name: row for row in plant.rows}
+    actor = rows["actor"]
+    assert not actor.outcome.left.any()
+    assert actor.outcome.home.all()
+    assert np.abs(actor.outcome.angle).max() < 0.5
+    assert plant.ahead(rows["step:amplitude=6"]).low > 0.0
+    policy = load_policy(shipped_actor_path(), BENCH)
+    file, draws = OnnxFile(policy.data, policy.contract.initial_state), fresh_draws(BENCH.range_set("pm50"), 0, 12)
+    alone = play(BENCH, BENCH.range_set("pm50"), PARAMETER_NAMES, file, draws, "exact", PHYSICAL)
+    np.testing.assert_allclose(actor.values, MEASURES["D"].values(alone.matrices), rtol=1e-9)
+
+
+def test_table_and_document_say_the_same(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(finished, "--criterion", "weighted", "--json", "--out", tmp_path / "out") == 0
+    said = capsys.readouterr().out
+    assert said == (tmp_path / "out" / "evaluation.json").read_text()
+    plant = json.loads(said)["plants"]["euler"]
+    row = plant["rows"][0]
+    assert row["measure"]["value"] == pytest.approx(np.mean(row["values"]))
+    assert (row["left"], len(row["values"]), row["learned"]) == (0, 4, True)
+    assert (plant["optima"], row["against_optimum"]) == ([], None)
+    table = (tmp_path / "out" / "evaluation.txt").read_text()
+    line = next(x for x in table.splitlines() if x.startswith(str(finished)))
+    assert f"{row['measure']['value']:.3e}" in line
+    assert f"{max(map(abs, row['end_velocity'])):.2f}" in line
+
+
+def test_the_verdict_and_the_interval_over_policies_are_those_of_the_numbers() -> None:
+    """Pushing with +6 A is the best reference in so short an experiment, and one of those that are played."""
+    asked = Settings(MEASURES["D"], PARAMETER_NAMES, "pm50", ("exact",), 5, 0, 0)
+    for current, how in ((6.0, "not significantly different from"), (0.0, "behind"), (-6.0, "behind")):
+        subjects = [Subject("it", SHORT, constant(current)), Subject("twin", SHORT, constant(3.0))]
+        (plant,) = evaluate(SHORT, asked, subjects, quiet)
+        means = {row.name: row.score.value for row in plant.rows[2:]}
+        best = max(means, key=lambda name: means[name])
+        said = " ".join(text(asked, [plant]).split())
+        assert f"it is {how} the best reference on these draws, {best}, by" in said
+        assert "0 of 5 runs left the limits, and 0 did not end at the origin" in said
+        scores = [row.score.value for row in plant.rows[:2]]
+        theirs = scipy.stats.ttest_1samp(scores, 0.0).confidence_interval(0.95)
+        assert plant.over_policies == pytest.approx((np.mean(scores), theirs.low, theirs.high))
+        record = document(asked, [plant])["plants"]["exact"]
+        assert record["best_reference"] == best
+        assert record["over_policies"]["value"] == pytest.approx(np.mean(scores))
+
+
+def test_the_share_of_the_optimum_is_over_the_draws_that_have_one(searched: list[float]) -> None:
+    asked = Settings(MEASURES["weighted"], ("f_v",), "viscous", ("late", "exact"), 4, 0, 2)
+    found = evaluate(BENCH, asked, [open_subject("actor", None)], quiet)
+    assert len(searched) == 3  # the one in the middle and two draws, once for both plants
+    for plant in found:
+        row = plant.rows[0]
+        share = plant.share(row, asked.measure)
+        assert share is not None
+        assert share.value == pytest.approx(np.mean(row.values[:2] / plant.optima))
+
+
+def test_a_policy_is_evaluated_behind_the_shield_that_it_was_made_behind_unless_another_one_is_named(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    arguments = ("viscous-exact-quadratic", "--criterion", "weighted", "--json")
+    assert run(*arguments) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["ranges"], said["shield"]) == ("viscous", "viscous")
+    assert {row["left"] for row in said["plants"]["euler"]["rows"]} == {0}
+    assert run(*arguments, "--shield", "pm50") == 2  # which does not cover the brakes
+    assert run("actor", "viscous-exact-quadratic", "--ranges", "viscous", "--parameters", "f_v") == 2
+
+
+def test_what_is_randomised_changes_each_experiment_and_is_told(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = ("--randomise", "command_delay=0,2", "--randomise", "frame_loss=0,0.1", "--json")
+    documents = []
+    for options in (("--json",), own):
+        assert run(finished, *options) == 0
+        documents.append(json.loads(capsys.readouterr().out))
+    plain, random = documents
+    assert (plain["randomised"], random["randomised"]) == ({}, {"command_delay": [0, 2], "frame_loss": [0.0, 0.1]})
+    values = [d["plants"]["euler"]["rows"][0]["values"] for d in documents]
+    assert values[0] != values[1]
+
+
+def test_what_cannot_be_evaluated_is_one_line_and_exit_code_2(
+    finished: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for arguments in (
+        ["actor", "--shield", "viscous", "--ranges", "pm50"],
+        ["nothing"],
+        ["gone.onnx"],
+        ["actor", "actor"],
+        ["actor", "--parameters", "J"],
+        ["actor", "--ranges", "none"],
+        ["actor", "--plant", "none"],
+        ["actor", "--plant", "euler,euler"],
+        ["actor", "--draws", "1"],
+        ["actor", "--optimum", "-1"],
+        ["actor", "--seed", "1000000"],
+        ["actor", "--out", str(finished)],
+        ["actor", "--randomise", "wind=0,1"],
+        ["actor", "--randomise", "current_lag=0,0.002"],  # the thesis's brake knows none
+        [str(finished), "--bench", "any.toml"],
+    ):
+        assert refused(lambda: main(["evaluate", *arguments]), capsys), arguments  # noqa: B023  # called at once
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("emb_train.evaluate.evaluate", interrupted)
+    assert main(["evaluate", "actor"]) == 130

@@ -1,0 +1,317 @@
+"""``emb-train``: what a training writes, what is refused, and what is left when it is stopped."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from emb_runtime.config.bench import BrakeParameters, load_bench
+from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_USAGE, UsageError
+from emb_train import names
+from emb_train.cli import main, parser
+from emb_train.envs.conditions import Conditions, Randomisation
+from emb_train.presets import preset_summaries
+from emb_train.rewards import Transition, information_increment
+from emb_train.structured.evolution import Progress
+from emb_train.structured.stored import stored
+from emb_train.structured.task import TASKS
+from emb_train.training import (
+    ACTOR,
+    BENCH,
+    CONFIGURATION,
+    METRICS,
+    Validation,
+    load_preset,
+    load_training,
+    training_from,
+)
+from tests.commands import refused
+from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench, tiny
+
+FILES = [ACTOR, BENCH, METRICS, CONFIGURATION]
+
+
+def metrics_of(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / METRICS).read_text().splitlines()]
+
+
+def test_a_training_writes_all_that_its_result_depends_on_and_keeps_the_best_actor(finished: Path) -> None:
+    assert sorted(p.name for p in finished.iterdir()) == sorted(FILES)
+    trained, metrics = load_training(finished), metrics_of(finished)
+    assert trained.training == tiny()
+    assert trained.bench == load_bench(finished.parent / "short.toml")
+    assert [m["steps"] for m in metrics] == [ITERATION, 2 * ITERATION, 3 * ITERATION]
+    scores = [m["score"] for m in metrics]
+    best = scores.index(max(scores))
+    assert (trained.iteration, trained.score) == (best + 1, scores[best])
+    assert Validation(trained.training, trained.bench).score(trained.actor) == scores[best]
+    assert len({(finished / name).stat().st_mode for name in (CONFIGURATION, ACTOR)}) == 1
+
+
+def test_the_same_seed_gives_the_same_files(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_tiny(monkeypatch)
+    bench, other = finished.parent / "short.toml", tmp_path / "run"
+    assert main(["ppo", "single-viscous", "--bench", str(bench), "--out", str(other)]) == 0
+    for name in FILES:
+        assert (other / name).read_bytes() == (finished / name).read_bytes(), name
+    said = capsys.readouterr().out
+    for row in ("trained actor", "constant +6 A", "constant -6 A", "best blind switch"):
+        line = next(line for line in said.splitlines() if line.startswith(row))
+        assert line.split()[-2:] == ["0", "40/40"], row
+
+
+def test_ctrl_c_and_divergence_leave_the_best_actor_so_far(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_tiny(monkeypatch)
+    calls, stop = 0, True
+
+    def ending(t: Transition) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls <= 4 * HORIZON:  # two iterations, each with its validation
+            return information_increment(t)
+        if stop:
+            raise KeyboardInterrupt
+        return math.nan * t.after[:, 0]
+
+    monkeypatch.setitem(sys.modules["emb_train.rewards"].REWARDS, "information_increment", ending)
+    bench = finished.parent / "short.toml"
+    for code in (EXIT_INTERRUPTED, 1):
+        calls, stop, folder = 0, code == EXIT_INTERRUPTED, tmp_path / str(code)
+        assert main(["ppo", "single-viscous", "--bench", str(bench), "--out", str(folder)]) == code
+        scores = [m["score"] for m in metrics_of(folder)]
+        assert scores == [m["score"] for m in metrics_of(finished)][:2]
+        assert load_training(folder).score == max(scores)
+
+
+def test_the_validation_draws_other_brakes_than_any_iteration_of_the_training(finished: Path) -> None:
+    trained = load_training(finished)
+    validation, f_v = Validation(trained.training, trained.bench), BrakeParameters._fields.index("f_v")
+    validation.score(trained.actor)
+    drawn = set(validation._env.batch.brakes[:, f_v])
+    assert len(drawn) == 64
+    env = trained.training.environment(trained.bench, 8)
+    for iteration in range(3):
+        env.reset(seed=np.random.SeedSequence([0, iteration]).generate_state(9, np.uint64)[:8].tolist())
+        assert drawn.isdisjoint(env.batch.brakes[:, f_v])
+
+
+def test_a_reference_is_searched_for_and_a_ctrl_c_keeps_what_was_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for module, value in (("BATCH", 4), ("JUDGED", 4)):
+        monkeypatch.setattr(f"emb_train.structured.evolution.{module}", value)
+    command = ["reference", "viscous", "--bench", str(short_bench(tmp_path)), "--steps", "3", "--seed", "7"]
+    assert main([*command, "--out", str(tmp_path / "whole")]) == 0
+    assert sorted(p.name for p in (tmp_path / "whole").iterdir()) == ["bench.toml", "metrics.jsonl", "reference.json"]
+    kept = stored(str(tmp_path / "whole" / "reference.json"))
+    assert (kept.task, kept.form, kept.seed, kept.command.split()[:3]) == (
+        *("viscous", "quadratic", 7),
+        ["emb-train", "reference", "viscous"],
+    )
+    assert f"{kept.score:.6g} on brakes that no step had" in capsys.readouterr().out
+    blind, found = tmp_path / "blind", tmp_path / "found"
+    command[1], options = "four-d", ["--command-delay", "1", "2", "--gain", "0.3"]
+    assert main([*command, "--form", "blind", "--begin=1,-1,0,0.3,0.6", *options, "--out", str(blind)]) == 0
+    assert main([*command, "--start", str(blind / "reference.json"), *options, "--out", str(found)]) == 0
+    assert not stored(str(blind / "reference.json")).array()[:, 1:].any()
+    assert stored(str(found / "reference.json")).asked().conditions.randomised.command_delay == (1, 2)
+    done = Progress._asdict
+
+    def pressed(step: Progress) -> dict[str, Any]:
+        if step.steps == 2:
+            raise KeyboardInterrupt
+        return done(step)
+
+    monkeypatch.setattr(Progress, "_asdict", pressed)
+    assert main([*command, "--out", str(tmp_path / "part")]) == EXIT_INTERRUPTED
+    begun = stored(str(tmp_path / "part" / "reference.json"))
+    assert np.isfinite(begun.array()).all()
+
+
+def test_every_command_has_a_help_that_takes_no_torch_and_lists_what_there_is(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    said = {}
+    for name in ("reference", "ppo", "evaluate"):
+        with pytest.raises(SystemExit) as ended:
+            main([name, "--help"])
+        assert ended.value.code == 0
+        said[name] = " ".join(capsys.readouterr().out.split())
+    for name, summary in preset_summaries().items():
+        assert summary == load_preset(name).summary
+        assert f" {name} {summary} " in said["ppo"]
+    assert set(names.TASKS) == set(TASKS)
+    assert all(f" {name} {summary} " in said["reference"] for name, summary in names.TASKS.items())
+    code = (
+        "import contextlib, sys\n"
+        "from emb_train.cli import main\n"
+        "with contextlib.suppress(SystemExit):\n"
+        "    main(['--help'])\n"
+        "sys.exit(any(name in sys.modules for name in ('torch', 'gymnasium', 'scipy', 'numba')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert parser().parse_args(["reference", "four-d", "--out", "a"]).plant == "exact"
+
+
+def test_ctrl_c_in_the_imports_and_a_missing_extra_are_no_traceback(tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys\n"
+        "from emb_train.entry import emb_train\n"
+        "class Pressed:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'emb_train.cli': os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Pressed())\n"
+        "sys.exit(emb_train())"
+    )
+    done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from emb_train.cli import main\n"
+        f"sys.exit(main(['ppo', 'single-viscous', '--out', {str(tmp_path / 'run')!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (EXIT_USAGE, 1)
+    assert "emb-excite[train]" in done.stderr
+
+
+def test_a_command_that_cannot_be_done_is_refused_in_one_line_and_makes_nothing(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short_bench(tmp_path)
+    narrow = tmp_path / "narrow.toml"
+    narrow.write_text((tmp_path / "short.toml").read_text().replace('"envelope"', '"pm50"', 1))
+    (tmp_path / "long.toml").write_text((tmp_path / "short.toml").read_text().replace(f"= {HORIZON}", "= 120"))
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir()), {p.name: p.read_bytes() for p in finished.iterdir()}
+    viscous, task = ["ppo", "single-viscous", "--out", "x"], ["reference", "four-d", "--out", "x"]
+    for arguments in (
+        [],
+        ["train"],
+        viscous[:2],
+        ["ppo", "none", "--out", "x"],
+        [*viscous, "--plant", "rubber"],
+        [*viscous, "--steps", "0"],
+        [*viscous, "--steps", str(2**63)],
+        [*viscous, "--seed", "-1"],
+        [*viscous, "--seed", str(2**63)],
+        [*viscous, "--bench", "none.toml"],
+        [*viscous, "--bench", "narrow.toml"],
+        [*viscous, "--bench", "long.toml"],
+        [*viscous, "--randomise", "wind=0,1"],
+        [*viscous[:3], "short.toml"],
+        [*viscous[:3], str(finished)],
+        [*viscous[:3], "."],
+        ["reference", "none", "--out", "x"],
+        [*task[:3], str(finished)],
+        [*task, "--begin", "1,2"],
+        [*task, "--begin", "1,x,2"],
+        [*task, "--gain", "0"],
+        [*task, "--start", "none"],
+        [*task, "--start", "four-d-exact-quadratic", "--form", "blind"],
+        [*task, "--plant", "none"],
+        [*task, "--shield", "bounded", "--command-delay", "0", "2"],
+    ):
+        assert refused(lambda: main(arguments), capsys), arguments  # noqa: B023  # called at once
+    assert before == (sorted(tmp_path.iterdir()), {p.name: p.read_bytes() for p in finished.iterdir()})
+
+
+def test_a_damaged_folder_is_refused(finished: Path, tmp_path: Path) -> None:
+    def saved(folder: Path, metadata: dict[str, str] | None, **tensors: torch.Tensor) -> None:
+        save_file(load_file(folder / ACTOR) | tensors, folder / ACTOR, metadata)
+
+    def edited(folder: Path, name: str, old: str, new: str) -> None:
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new))
+
+    data = (finished / ACTOR).read_bytes()
+    good = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]
+    damages: list[Callable[[Path], object]] = [
+        lambda d: (d / ACTOR).unlink(),
+        lambda d: (d / ACTOR).write_bytes(data[:1000]),
+        lambda d: (d / ACTOR).write_bytes(b"junk" * 100),
+        lambda d: saved(d, None),
+        lambda d: saved(d, {"training": "[]"}),
+        lambda d: saved(d, {"training": good["training"].replace("iteration", "iterations")}),
+        lambda d: saved(d, good, more=torch.zeros(1)),
+        lambda d: saved(d, good, log_deviation=torch.full((1,), math.nan)),
+        lambda d: (d / CONFIGURATION).write_text("{"),
+        lambda d: (d / BENCH).unlink(),
+        lambda d: edited(d, CONFIGURATION, '"epochs"', '"epoch"'),
+        lambda d: edited(d, CONFIGURATION, '"seed": 0', '"seed": "0"'),
+        lambda d: edited(d, CONFIGURATION, "increment", "excrement"),
+        lambda d: edited(d, CONFIGURATION, '"clip": 0.2', '"clip": 0.3'),  # of another training
+        lambda d: edited(d, BENCH, "angle    = 1.0e-3", "angle    = 1.1e-3"),
+    ]
+    for i, damage in enumerate(damages):
+        folder = shutil.copytree(finished, tmp_path / str(i))
+        load_training(folder)
+        damage(folder)
+        with pytest.raises(UsageError):
+            load_training(folder)
+
+
+def test_every_configuration_survives_json_and_impossible_values_are_refused_by_their_key() -> None:
+    varied = Conditions(randomised=Randomisation(command_delay=(0, 2), encoder_offset=(-0.1, 0.1)))
+    for name in preset_summaries():
+        for training in (load_preset(name), load_preset(name, plant="exact", seed=3, conditions=varied)):
+            record = msgspec.json.decode(msgspec.json.encode(training))
+            assert training_from(record, "it") == training
+    record = msgspec.json.decode(msgspec.json.encode(tiny()))
+    cases: list[tuple[str, Any]] = [
+        ("reward", "none"),
+        ("reward", []),
+        ("scale", math.nan),
+        ("scale", 0.0),
+        ("seed", 2**63),
+        ("seed", -1),
+        ("memory", 0),
+        ("ppo.envs", 0),
+        ("ppo.total_steps", 10**400),
+        ("ppo.epochs", -1),
+        ("ppo.learning_rate", 0.0),
+        ("ppo.learning_rate", math.inf),
+        ("ppo.gamma", 1.1),
+        ("ppo.clip", math.nan),
+        ("ppo.noise_memory", 1.0),
+        ("ppo.hidden", [8, 0]),
+        ("ppo.initial_mean", math.nan),
+        ("ppo.memory", 0),
+        ("conditions.horizon", 300),
+        ("conditions.observes", "nothing"),
+        ("conditions.information", "total"),
+        ("conditions.randomised.frame_loss", ["x", 0.0]),
+        ("conditions.randomised.unknown", 1),
+    ]
+    for key, value in cases:
+        changed = json.loads(json.dumps(record))
+        *path, last = key.split(".")
+        table = changed
+        for part in path:
+            table = table[part]
+        table[last] = value
+        with pytest.raises(UsageError, match=last):
+            training_from(changed, "it")
+    documents: list[Any] = [[], {}, {"preset": "x"}]
+    for document in documents:
+        with pytest.raises(UsageError):
+            training_from(document, "it")

@@ -1,0 +1,470 @@
+"""``emb-train``: learn an excitation, and evaluate it.
+
+What needs torch is imported inside functions, so that ``--help`` is quick and a missing extra is one line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+from emb_bench.output import replacing
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.config.plants import DEFAULT_PLANT, EVERY
+from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
+from emb_runtime.system.terminal import as_json, complain, mention, show
+from emb_train.names import TASKS, listed, reference_names, wrapped
+from emb_train.presets import preset_summaries
+
+if TYPE_CHECKING:
+    from emb_bench.information.symmetric import Floats
+    from emb_runtime.config.bench import Bench
+    from emb_train.evaluate import Settings, Subject
+    from emb_train.structured.task import Task
+
+T = TypeVar("T")
+
+CRITERIA = ("D", "A", "E", "weighted")
+FORMS = ("blind", "quadratic")
+REFERENCE, BENCH, METRICS = "reference.json", "bench.toml", "metrics.jsonl"  # Files of a folder of results
+EPILOG = "exit codes: 0 done, 1 training diverged, 2 usage, 5 an ONNX file is refused, 130 interrupted (Ctrl-C)"
+REFERENCE_EPILOG = """\
+tasks:
+{tasks}
+
+DIR becomes reference.json, which emb-export takes, bench.toml and metrics.jsonl. The search begins with the task's
+blind reference, with another one (--begin) or with a kept one (--start). Ctrl-C ends it: the reference so far, or what
+it began with where that is better, is kept.
+"""
+PPO_EPILOG = """\
+presets:
+{presets}
+
+DIR becomes actor.safetensors, the actor that did best on brakes that no training draws; training.json; bench.toml;
+metrics.jsonl. Ctrl-C ends the training: the best actor so far is there.
+"""
+EVALUATE_EPILOG = """\
+POLICY: the folder of a training, an ONNX file, 'actor' for the shipped one, a reference's .json file, or one of
+{references}
+
+criteria: D, A and E of the physical information with the prior of +-50 %; 'weighted' is the smallest eigenvalue of the
+thesis's weighted information, for one parameter that information itself. All relative to the true parameters.
+
+The optimum is what the search of emb-design finds if the brake is known, on the thesis's brakes (euler, exact; a plant
+that differs from exact in its instruments alone is held against exact). It takes minutes for the first brake, a quarter
+of a minute for each other, and is kept in the user's cache.
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Refuses in one line, like the rest of a command."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(message)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = _Parser(
+        prog="emb-train", description="Learn an excitation for brakes whose parameters are unknown.", epilog=EPILOG
+    )
+    p.add_argument("--version", action="version", version=f"%(prog)s {version('emb-excite')}")
+    commands = p.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    def command(name: str, summary: str, epilog: str) -> argparse.ArgumentParser:
+        return commands.add_parser(
+            name,
+            help=summary,
+            description=f"{summary[0].upper()}{summary[1:]}.",
+            epilog=epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+
+    c = command(
+        "reference",
+        "learn the reference that a running estimate and a speed loop follow: the main way, in minutes",
+        REFERENCE_EPILOG.format(tasks=listed(TASKS)),
+    )
+    _add_reference(c)
+    c = command(
+        "ppo",
+        "train a network by proximal policy optimisation, the thesis's way",
+        PPO_EPILOG.format(presets=listed(preset_summaries())),
+    )
+    _add_ppo(c)
+    c = command(
+        "evaluate",
+        "play policies on fresh brakes, beside every reference excitation and the known-parameter optimum",
+        EVALUATE_EPILOG.format(references=wrapped(reference_names())),
+    )
+    _add_evaluate(c)
+    return p
+
+
+def _add_common(p: argparse.ArgumentParser, seed: str) -> None:
+    p.add_argument("--seed", type=_at_least(0), default=0, metavar="S", help=f"{seed} (default: %(default)s)")
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
+
+
+def _add_reference(p: argparse.ArgumentParser) -> None:
+    p.add_argument("task", metavar="TASK", choices=TASKS, help="what the reference is for: one of those below")
+    p.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the results")
+    p.add_argument(
+        "--form",
+        choices=FORMS,
+        default="quadratic",
+        help="levels and switches that are constant, or quadratic in the estimate (default: %(default)s)",
+    )
+    p.add_argument("--start", metavar="NAME|FILE", help="kept reference to begin with: a packaged one, or a JSON file")
+    p.add_argument(
+        "--begin", type=_blind, metavar="NUMBERS", help="levels, then switches, such as --begin=1,-1,-0.01,0.3,0.6"
+    )
+    p.add_argument("--steps", type=_at_least(1), default=400, metavar="N", help="of evolution (default: %(default)s)")
+    p.add_argument("--plant", default=DEFAULT_PLANT, metavar="NAME", help="of the bench (default: %(default)s)")
+    p.add_argument(
+        "--shield",
+        choices=("worst case", "bounded"),
+        default="worst case",
+        help="for the whole set (worst case), or for what has been learnt (bounded) (default: %(default)s)",
+    )
+    p.add_argument(
+        "--command-delay",
+        type=_at_least(0),
+        nargs=2,
+        metavar=("LEAST", "MOST"),
+        default=(0, 0),
+        help="drawn per brake, samples (default: 0 0)",
+    )
+    p.add_argument(
+        "--gain",
+        type=_gain,
+        default=1.0,
+        metavar="X",
+        help="of the speed loop; less than 1 where commands act late (default: %(default)s)",
+    )
+    _add_common(p, "of the search and of the brakes")
+
+
+def _add_ppo(p: argparse.ArgumentParser) -> None:
+    p.add_argument("preset", metavar="PRESET", help="what to learn: one of those below")
+    p.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the results")
+    p.add_argument(
+        "--steps",
+        type=_at_least(1),
+        metavar="N",
+        help="environment steps in total, rounded up to whole iterations (default: the preset's)",
+    )
+    p.add_argument("--plant", metavar="NAME", help="plant of the bench that the brakes are (default: the preset's)")
+    _add_randomise(p)
+    _add_common(p, "of everything random")
+
+
+def _add_evaluate(p: argparse.ArgumentParser) -> None:
+    p.add_argument("policies", nargs="+", metavar="POLICY", help="what is evaluated; several give an interval as well")
+    p.add_argument("--criterion", choices=CRITERIA, default="D", help="by what (default: %(default)s)")
+    p.add_argument("--parameters", metavar="NAMES", help="unknown ones, such as f_v,k_1 (default: the policy's)")
+    p.add_argument("--ranges", metavar="NAME", help="where brakes are drawn from, by name (default: the policy's)")
+    p.add_argument(
+        "--shield",
+        metavar="NAME",
+        help="ranges that the shield covers (default: those that it covered when the policy was made; of an ONNX file "
+        "those that the bench names)",
+    )
+    p.add_argument("--draws", type=_at_least(2), default=200, metavar="N", help="brakes (default: %(default)s)")
+    p.add_argument(
+        "--plant", default="euler,exact", metavar="NAMES", help="of the bench, or 'all' (default: %(default)s)"
+    )
+    p.add_argument(
+        "--optimum",
+        type=_at_least(0),
+        default=20,
+        metavar="N",
+        help="search the optimum for the first N brakes; 0 for none (default: %(default)s)",
+    )
+    p.add_argument("--json", action="store_true", help="print JSON, with the values of every draw")
+    p.add_argument("--out", type=Path, metavar="DIR", help="also write evaluation.txt and evaluation.json there")
+    _add_randomise(p)
+    _add_common(p, "of brakes and noise; never those of a training")
+
+
+def _add_randomise(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--randomise",
+        action="append",
+        default=[],
+        metavar="NAME=LEAST,MOST",
+        help="give each experiment its own command_delay or measurement_delay [samples], frame_loss [probability], "
+        "current_lag [s] or encoder_offset [rad], uniform from LEAST to MOST, on top of the plant's; repeatable. The "
+        "shield is widened to cover delay or lag",
+    )
+
+
+def _at_least(least: int) -> Callable[[str], int]:
+    def number(text: str) -> int:
+        if not text.isdecimal() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"expected a whole number from {least}, got '{text}'")
+        return int(text)
+
+    return number
+
+
+def _gain(text: str) -> float:
+    try:
+        if 0.0 < (value := float(text)) <= 1.0:
+            return value
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"expected more than 0 and at most 1, got '{text}'")
+
+
+def _blind(text: str) -> list[float]:
+    try:
+        numbers = [float(value) for value in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) % 2 == 0 or not all(math.isfinite(value) for value in numbers):
+        raise argparse.ArgumentTypeError(f"expected levels and then switches, one less, got '{text}'")
+    return numbers
+
+
+@contextmanager
+def progress(what: str, total: int) -> Iterator[Callable[[str], None]]:
+    """A bar on standard error; the function that it gives advances it by one, with a text beside it."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn(what),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[said]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("", total=total, said="")
+        yield lambda said: bar.update(task, advance=1, said=said)
+
+
+def reference(arguments: argparse.Namespace) -> int:
+    """``emb-train reference``.
+
+    Raises:
+        UsageError: the arguments do not go together, or a file cannot be read or written.
+        BenchFileError: the bench lacks a set or the plant.
+    """
+    from emb_runtime.estimator.speed_loop import scale_of
+    from emb_train.structured.evolution import BATCH, Progress, evolve
+    from emb_train.structured.stored import Stored
+    from emb_train.structured.task import TASKS
+
+    bench, (least, most) = load_bench(arguments.bench), arguments.command_delay
+    task = replace(TASKS[arguments.task], plant=arguments.plant, shield=arguments.shield, command_delay=(least, most))
+    begin, blind = _beginning(arguments, task), arguments.form == "blind"
+    task.trials(bench, task.draws(bench, 0, 1))  # what cannot be is refused before there is a folder
+    folder = _new_folder(arguments.out)
+    (folder / BENCH).write_text(bench.text, encoding="utf-8")
+    with (folder / METRICS).open("a", encoding="utf-8") as metrics, progress(task.name, arguments.steps) as advance:
+
+        def note(step: Progress) -> None:
+            metrics.write(as_json(step._asdict()) + "\n")
+            advance(f"score {step.score:.6g}, left {step.left}, home {step.home} of {2 * BATCH}")
+
+        scale = scale_of(bench, arguments.gain)
+        found = evolve(task, bench, scale, begin, steps=arguments.steps, seed=arguments.seed, blind=blind, show=note)
+    kept = Stored(
+        task=task.name,
+        form=arguments.form,
+        plant=task.plant,
+        gain=arguments.gain,
+        table=tuple(tuple(row) for row in found.table.tolist()),
+        seed=arguments.seed,
+        score=found.score,
+        draws=found.steps * BATCH,
+        command=f"emb-train {' '.join(arguments.given)}",
+        shield=task.shield,
+        command_delay=task.command_delay,
+    )
+    with replacing(folder / REFERENCE) as beside:
+        beside.write_text(kept.to_json(), encoding="utf-8")
+    show(f"{kept.task} {kept.form}: {kept.score:.6g} on brakes that no step had; {folder / REFERENCE}")
+    return EXIT_DONE if found.steps == arguments.steps else EXIT_INTERRUPTED
+
+
+def _beginning(arguments: argparse.Namespace, task: Task) -> Floats:
+    """The table that the search begins with, shape [2 n − 1, TERMS]."""
+    import numpy as np
+
+    from emb_train.structured.law import TERMS
+    from emb_train.structured.stored import stored
+
+    if arguments.start is not None:
+        table = stored(arguments.start).array()
+        if arguments.form == "blind" and table[:, 1:].any():
+            raise UsageError("--start: expected a blind reference for --form blind")
+        return table
+    numbers = arguments.begin or task.begin
+    table = np.zeros((len(numbers), TERMS))
+    table[:, 0] = numbers
+    return table
+
+
+def _new_folder(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise UsageError(f"--out {folder}: holds something already: choose a new folder")
+    except OSError as err:
+        raise UsageError(f"--out {folder}: cannot use this folder: {err.strerror}") from err
+    return folder
+
+
+def ppo(arguments: argparse.Namespace) -> int:
+    """``emb-train ppo``.
+
+    Raises:
+        EmbError: see :func:`emb_train.training.begin_training` and :func:`emb_train.training.run_training`.
+    """
+    import msgspec
+
+    from emb_train.bench_compatibility import unfit
+    from emb_train.envs.conditions import parse_randomisation
+    from emb_train.evaluate import grid_outcomes, grid_text
+    from emb_train.ppo import Metrics
+    from emb_train.training import begin_training, load_preset, load_training, run_training
+
+    bench, folder = load_bench(arguments.bench), arguments.out
+    changes = {"total_steps": arguments.steps, "plant": arguments.plant, "seed": arguments.seed}
+    training = load_preset(arguments.preset, **{k: v for k, v in changes.items() if v is not None})
+    conditions = training.conditions
+    if arguments.randomise:
+        conditions = msgspec.structs.replace(conditions, randomised=parse_randomisation(arguments.randomise))
+        training = msgspec.structs.replace(training, conditions=conditions)
+    begin_training(folder, training, bench)
+    if conditions.shielded and (said := unfit(bench, bench.range_set(training.ranges))):
+        mention(f"emb-train: this actor cannot be exported for this bench: {said}")
+    with progress(training.preset, training.ppo.iterations) as advance:
+
+        def note(m: Metrics) -> None:
+            advance(f"return {m.mean_return:.3f}, information {m.information:.3e}, left {m.violations}, home {m.home}")
+
+        try:
+            run_training(folder, training, bench, note)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"emb-train: interrupted; the best actor so far is in {folder}") from None
+    if not conditions.shielded:
+        show(f"{folder}: trained without a shield, which no bench runs; the study of the thesis shows what it does")
+        return EXIT_DONE
+    if len(training.parameters) == 1:  # the grid is for one
+        show(grid_text(grid_outcomes(load_training(folder))))
+    show(f"{folder}: export it with emb-export {folder}; emb-train evaluate {folder} compares it")
+    return EXIT_DONE
+
+
+def evaluate(arguments: argparse.Namespace) -> int:
+    """``emb-train evaluate``.
+
+    Raises:
+        EmbError: see :func:`prepare` and :func:`emb_train.evaluate.evaluate`.
+    """
+    from rich.console import Console
+
+    from emb_train.evaluate import document, evaluate, text
+
+    bench, settings, subjects = prepare(arguments)
+    if arguments.out is not None:
+        _new_folder(arguments.out)
+    with Console(stderr=True).status("") as status:
+        results = evaluate(bench, settings, subjects, status.update)
+    table, record = text(settings, results), as_json(document(settings, results))
+    if arguments.out is not None:
+        (arguments.out / "evaluation.txt").write_text(table + "\n", encoding="utf-8")
+        (arguments.out / "evaluation.json").write_text(record + "\n", encoding="utf-8")
+    show(record if arguments.json else table)
+    return EXIT_DONE
+
+
+def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subject]]:
+    """Arguments of ``emb-train evaluate``, checked.
+
+    Raises:
+        UsageError: an argument is out of its range, or the policies do not go together.
+        EmbError: a policy cannot be opened, or the bench has no such ranges or plant.
+    """
+    from emb_train.envs.batch import Batch
+    from emb_train.envs.conditions import parse_randomisation
+    from emb_train.envs.measure import MEASURES
+    from emb_train.evaluate import Settings, open_subject
+    from emb_train.structured.evolution import TUNING_SEED
+
+    if arguments.seed >= TUNING_SEED:
+        raise UsageError(f"--seed: expected less than {TUNING_SEED}, for references are tuned on what is from there on")
+    if len(set(arguments.policies)) < len(arguments.policies):
+        raise UsageError("a policy is named twice: expected each once")
+    subjects = [open_subject(given, arguments.bench) for given in arguments.policies]
+    bench = subjects[0].bench
+    if any(s.bench.contract_hash != bench.contract_hash for s in subjects):
+        raise UsageError("the policies are for different benches: evaluate them apart")
+    names = None if arguments.parameters is None else tuple(arguments.parameters.split(","))
+    parameters = _one("--parameters", names, [s.parameters for s in subjects])
+    if unknown := set(parameters) - set(PARAMETER_NAMES):
+        raise UsageError(f"--parameters: expected some of {', '.join(PARAMETER_NAMES)}, got '{min(unknown)}'")
+    plants = tuple(bench.plants) if arguments.plant == EVERY else tuple(arguments.plant.split(","))
+    if len(set(plants)) < len(plants):
+        raise UsageError(f"--plant: expected names of plants, each once, got '{arguments.plant}'")
+    if arguments.shield is None and any(s.shield != subjects[0].shield for s in subjects):
+        raise UsageError("--shield: the policies were made behind different ones: name the ranges that it covers")
+    settings = Settings(
+        measure=MEASURES[arguments.criterion],
+        parameters=tuple(name for name in PARAMETER_NAMES if name in parameters),
+        ranges=_one("--ranges", arguments.ranges, [s.ranges for s in subjects]),
+        plants=plants,
+        draws=arguments.draws,
+        seed=arguments.seed,
+        optimum=min(arguments.optimum, arguments.draws),
+        shield=arguments.shield or subjects[0].shield,
+        randomised=parse_randomisation(arguments.randomise),
+    )
+    ranges = bench.range_set(settings.ranges)
+    for name in plants:  # what no experiment can be made of is refused before anything is looked for
+        Batch(bench, ranges, settings.parameters, 1, name, settings.conditions)
+    return bench, settings, subjects
+
+
+def _one(option: str, given: T | None, of_policies: list[T]) -> T:
+    """The given value, or else the one that all policies share."""
+    if given:
+        return given
+    if not of_policies[0] or any(other != of_policies[0] for other in of_policies):
+        raise UsageError(f"{option}: the policies do not say which, or not the same: name it")
+    return of_policies[0]
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {"reference": reference, "ppo": ppo, "evaluate": evaluate}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    given = sys.argv[1:] if argv is None else argv
+    name = "emb-train"
+    try:
+        arguments: Any = parser().parse_args(given)
+        arguments.given, name = given, f"emb-train {arguments.command}"
+        return COMMANDS[arguments.command](arguments)
+    except ModuleNotFoundError as err:
+        return complain(name, UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'"))
+    except EmbError as err:
+        return complain(name, err)
+    except KeyboardInterrupt as err:
+        mention(str(err) or f"{name}: interrupted")
+        return EXIT_INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

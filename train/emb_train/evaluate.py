@@ -1,0 +1,361 @@
+"""Evaluation: policies and reference excitations on the same fresh brakes with the same noise, paired by brake."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch
+
+from emb_bench.excitation.reference import ACTOR, COMPARED, parse_excitation
+from emb_bench.numbers import Score
+from emb_bench.report.text import WIDTH, Table
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.config.plants import EULER
+from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.policy.policy import load_policy, shipped_actor_path
+from emb_runtime.policy.trial import admit_policy
+from emb_train.envs.conditions import EVERYTHING, NOTHING_RANDOM, Conditions, Randomisation
+from emb_train.envs.excitations import Excitation, OnnxFile, Played, reference_excitation
+from emb_train.envs.measure import Floats, Measure, mean_score
+from emb_train.envs.network import Network
+from emb_train.envs.play import Outcome, fresh_draws, grid_draws, middle_of, play
+from emb_train.names import reference_names
+from emb_train.optimum import optima, searchable
+from emb_train.ppo import DeployedActor
+from emb_train.structured.played import Following
+from emb_train.structured.stored import stored
+from emb_train.training import Trained, load_training
+
+Tell = Callable[[str], object]
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A policy, with what it was made for."""
+
+    name: str  # As it was given
+    bench: Bench
+    excitation: Excitation
+    ranges: str = ""  # Set of the bench that it was made for; empty if none of the bench's sets is that
+    parameters: tuple[str, ...] = ()  # Parameters that it was made for
+    shield: str | None = None  # Set of the bench that the shield covered then; None for the one that the bench names
+
+
+def open_subject(given: str, bench_file: Path | None) -> Subject:
+    """Opens a policy.
+
+    Args:
+        given: folder of a training, an ONNX file, ``actor`` for the shipped one, or the reference of a structured
+            actor: its name, or a ``.json`` file.
+        bench_file: bench of what has none of its own; the shipped one without.
+
+    Raises:
+        UsageError: there is nothing of that kind, or it sees what no bench measures, or is damaged.
+        PolicyRefusedError: the file is damaged or does not fit the bench.
+        BenchFileError: the bench file is not valid.
+    """
+    path = Path(given)
+    torch.set_num_threads(1)  # more would get into each other's way at this size, and change the last digits
+    if given == ACTOR or path.suffix == ".onnx":
+        return _file(given, shipped_actor_path() if given == ACTOR else path, load_bench(bench_file))
+    if path.suffix == ".json" or given in reference_names():
+        bench, kept = load_bench(bench_file), stored(given)
+        task = kept.asked()
+        sticks = bench.plant(kept.plant).mechanics.solver != EULER
+        following = Following(kept, bench, bench.range_set(task.ranges), sticks=sticks)
+        return Subject(given, bench, following, task.ranges, task.parameters, task.shield_ranges)
+    if not path.is_dir():
+        raise UsageError(
+            f"{given}: no such folder, and no reference of that name; there are: {ACTOR}, "
+            f"{', '.join(reference_names())}"
+        )
+    if bench_file is not None:
+        raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
+    trained = load_training(path)
+    training, conditions = trained.training, trained.training.conditions
+    if conditions.observes == EVERYTHING:
+        raise UsageError(f"{given}: sees the parameters and the information, which no bench measures: it cannot be run")
+    excitation = Network(DeployedActor(trained.actor, trained.bench.limits.current))
+    return Subject(given, trained.bench, excitation, training.ranges, training.parameters, conditions.shield_ranges)
+
+
+def _file(name: str, path: Path, bench: Bench) -> Subject:
+    try:
+        policy = load_policy(path, bench) if path == shipped_actor_path() else admit_policy(path, bench)
+    except PolicyRefusedError as err:
+        raise PolicyRefusedError(f"{path}: {err}") from err
+    made_for = policy.contract.ranges
+    sets = [
+        s.name
+        for s in bench.ranges.values()
+        if made_for == {n: (getattr(s.low, n), getattr(s.high, n)) for n in PARAMETER_NAMES}
+    ]
+    varied = tuple(n for n in PARAMETER_NAMES if made_for[n][0] < made_for[n][1])
+    excitation = OnnxFile(policy.data, policy.contract.initial_state)
+    return Subject(name, bench, excitation, sets[0] if sets else "", varied)
+
+
+def references(bench: Bench) -> dict[str, Excitation]:
+    """Every reference excitation by name, constant current of either sign among them."""
+    limit = bench.limits.current
+    names = [*COMPARED, *(f"step:amplitude={u:g}" for u in (limit, -limit))]
+    return {name: reference_excitation(parse_excitation(name, bench)) for name in names}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Measure, brakes and conditions of an evaluation."""
+
+    measure: Measure
+    parameters: tuple[str, ...]  # Unknown; others that vary in the ranges count as known
+    ranges: str  # Set of the bench that brakes are drawn from
+    plants: tuple[str, ...]  # Plants: mechanics and instruments
+    draws: int
+    seed: int  # Seed of brakes and noise
+    optimum: int  # Number of brakes, the first ones, whose optimum is searched for
+    shield: str | None = None  # Set of the bench that the shield covers; None for the one that the bench names
+    randomised: Randomisation = NOTHING_RANDOM  # Properties that are drawn for each experiment beside its brake
+
+    @property
+    def conditions(self) -> Conditions:
+        """Conditions in which all are played."""
+        return Conditions(information=self.measure.kind, shield_ranges=self.shield, randomised=self.randomised)
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One excitation on one plant."""
+
+    name: str
+    learned: bool  # False for a reference excitation
+    outcome: Outcome
+    values: Floats  # The measure of each draw, shape [draws]
+
+    @property
+    def score(self) -> Score:
+        """Mean of the measure over the draws."""
+        return mean_score(self.values)
+
+
+@dataclass(frozen=True, eq=False)
+class PlantResult:
+    """All rows on one plant."""
+
+    plant: str
+    rows: tuple[Row, ...]  # Policies first
+    optima: Floats = field(default_factory=lambda: np.empty(0))
+    """The measure of the optimum for the first draws, shape [optimum draws], or [0]."""
+
+    def share(self, row: Row, measure: Measure) -> Score | None:
+        """Mean share of the optimum over the draws that have one; None without. See :meth:`Measure.shares`."""
+        count = len(self.optima)
+        return mean_score(measure.shares(row.values[:count], self.optima)) if count else None
+
+    def ahead(self, row: Row) -> Score:
+        """Mean lead of the first policy over a row, paired by draw."""
+        return mean_score(self.rows[0].values - row.values)
+
+    @property
+    def over_policies(self) -> Score | None:
+        """Mean of the policies' scores with its interval over the policies; None unless there are several."""
+        own = [row.score.value for row in self.rows if row.learned]
+        return mean_score(np.array(own)) if len(own) > 1 else None
+
+    @property
+    def best_reference(self) -> Row:
+        """That with the largest mean on the draws of this evaluation, which favours it and not the policy."""
+        return max((row for row in self.rows if not row.learned), key=lambda row: row.score.value)
+
+
+def evaluate(bench: Bench, settings: Settings, subjects: Sequence[Subject], tell: Tell) -> list[PlantResult]:
+    """Play all on all plants.
+
+    Args:
+        bench: of all subjects.
+        settings: measure, brakes and conditions.
+        subjects: the policies.
+        tell: called with a line on the progress.
+
+    Raises:
+        EmbError: see :func:`emb_train.envs.play.play` and :func:`emb_train.optimum.optima`.
+    """
+    ranges, measure, names = bench.range_set(settings.ranges), settings.measure, settings.parameters
+    draws = fresh_draws(ranges, settings.seed, settings.draws)
+    brakes = [middle_of(ranges), *(draw.brake for draw in draws[: settings.optimum])]
+    excitations = [(s.name, True, s.excitation) for s in subjects]
+    excitations += [(name, False, excitation) for name, excitation in references(bench).items()]
+    found, known = [], {}
+    for plant in settings.plants:
+        rows = []
+        for name, learned, excitation in excitations:
+            tell(f"plant {plant}: {name}")
+            outcome = play(bench, ranges, names, excitation, draws, plant, settings.conditions)
+            rows.append(Row(name, learned, outcome, measure.values(outcome.matrices)))
+        model = searchable(bench.plant(plant))
+        if settings.optimum and model and model not in known:
+            known[model] = optima(bench, measure, names, model, brakes, tell)[1:]
+        found.append(PlantResult(plant, tuple(rows), known.get(model or "", np.empty(0))))
+    return found
+
+
+HEADER = ("excitation", "measure", "against optimum", "first ahead by", "left", "home", "end rad", "end rad/s")
+UNIT: Mapping[str, str] = {"difference": "nat", "log-ratio": "nat", "ratio": ""}
+
+
+def text(settings: Settings, results: Sequence[PlantResult]) -> str:
+    """The tables."""
+    lines = textwrap.wrap(_scene(settings), WIDTH)
+    for plant in results:
+        found = f"the optimum if the brake were known: of the first {len(plant.optima)} draws"
+        title = f"plant {plant.plant}; {found if len(plant.optima) else 'no optimum was searched for'}"
+        rows = [_cells(settings.measure, plant, row) for row in plant.rows]
+        lines += ["", *Table(title, HEADER, rows).text()[:-1]]
+        if plant.over_policies is not None:
+            lines.append(
+                f"mean of the policies, interval over them: {_interval(plant.over_policies, settings.measure)}"
+            )
+        lines += textwrap.wrap(_verdict(settings.measure, plant), WIDTH)
+    return "\n".join(lines)
+
+
+def _scene(a: Settings) -> str:
+    shield = f"shield, which covers '{a.shield}'" if a.shield else "shield"
+    own = ", ".join(f"{name} from {least:g} to {most:g}" for name, (least, most) in _varied(a).items())
+    own = f" Each experiment has its own {own}; the shield is widened to cover delay and lag." if own else ""
+    return (
+        f"{a.measure.label} of {', '.join(a.parameters)}, relative to the true values; {a.draws} brakes drawn from the "
+        f"ranges '{a.ranges}' for evaluation alone, seed {a.seed}; the same brakes and noise for all, all behind the "
+        f"same {shield}. Brackets are 95 % intervals over the draws. 'left': experiments that left the limits and were "
+        "stopped there; 'home': share that ended at the origin; 'end': the worst angle and speed at the end. 'ahead': "
+        f"the first policy's measure less that of the line, paired by draw.{own}"
+    )
+
+
+def _varied(a: Settings) -> dict[str, list[float]]:
+    """Least and most of each property that is drawn for each experiment, by name."""
+    return {name: list(pair) for name, pair in msgspec.structs.asdict(a.randomised).items() if any(pair)}
+
+
+def _cells(measure: Measure, plant: PlantResult, row: Row) -> tuple[str, ...]:
+    outcome, share, against = row.outcome, plant.share(row, measure), "-"
+    if share is not None and measure.against == "difference":
+        against = f"{_between(share, '+.3f')} nat"
+    elif share is not None:
+        against = f"{_between(Score(*(100.0 * value for value in share)), '.2f')} %"
+    return (
+        row.name,
+        _interval(row.score, measure),
+        against,
+        "" if row is plant.rows[0] else _interval(plant.ahead(row), measure),
+        f"{outcome.left.sum()}/{len(row.values)}",
+        f"{100.0 * outcome.home.mean():.4g} %",
+        f"{np.abs(outcome.angle).max():.3f}",
+        f"{np.abs(outcome.velocity).max():.2f}",
+    )
+
+
+def _interval(score: Score, measure: Measure) -> str:
+    return _between(score, ".3e" if measure.against == "ratio" else ".3f")
+
+
+def _between(score: Score, form: str) -> str:
+    """A mean and its interval; one value has none."""
+    interval = "" if math.isnan(score.low) else f" [{score.low:{form}}, {score.high:{form}}]"
+    return f"{score.value:{form}}{interval}"
+
+
+def _verdict(measure: Measure, plant: PlantResult) -> str:
+    """The first policy in a sentence."""
+    first, best = plant.rows[0], plant.best_reference
+    ahead, count = plant.ahead(best), len(first.values)
+    how = "ahead of" if ahead.low > 0.0 else "behind" if ahead.high < 0.0 else "not significantly different from"
+    left, away = int(first.outcome.left.sum()), int((~first.outcome.home).sum())
+    return (
+        f"{first.name} is {how} the best reference on these draws, {best.name}, by {_interval(ahead, measure)}; "
+        f"{left} of {count} runs left the limits, and {away} did not end at the origin"
+    )
+
+
+def document(settings: Settings, results: Sequence[PlantResult]) -> dict[str, Any]:
+    """The JSON document; what is not there is null."""
+    a = settings
+    return {
+        "measure": a.measure.name,
+        "measure_is": a.measure.label,
+        "unit": UNIT[a.measure.against],
+        "parameters": list(a.parameters),
+        "ranges": a.ranges,
+        "shield": a.shield,
+        "randomised": _varied(a),
+        "draws": a.draws,
+        "seed": a.seed,
+        "plants": {plant.plant: _on_plant(a.measure, plant) for plant in results},
+    }
+
+
+def _on_plant(measure: Measure, plant: PlantResult) -> dict[str, Any]:
+    over = plant.over_policies
+    return {
+        "optima": plant.optima.tolist(),
+        "best_reference": plant.best_reference.name,
+        "over_policies": None if over is None else over._asdict(),
+        "rows": [_row(measure, plant, row) for row in plant.rows],
+    }
+
+
+def _row(measure: Measure, plant: PlantResult, row: Row) -> dict[str, Any]:
+    share, outcome = plant.share(row, measure), row.outcome
+    return {
+        "name": row.name,
+        "learned": row.learned,
+        "measure": row.score._asdict(),
+        "against_optimum": None if share is None else share._asdict(),
+        "first_ahead_by": plant.ahead(row)._asdict(),
+        "left": int(outcome.left.sum()),
+        "home": int(outcome.home.sum()),
+        "values": row.values.tolist(),
+        "end_angle": outcome.angle.tolist(),
+        "end_velocity": outcome.velocity.tolist(),
+    }
+
+
+def grid_outcomes(trained: Trained) -> dict[str, Outcome]:
+    """A training for one parameter on the grid of 40 brakes, beside what needs no learning; all with the same noise.
+
+    Beside it: the largest current of either sign, and the best single switch between them that is found on this grid.
+    """
+    training, limit, horizon = trained.training, trained.bench.limits.current, trained.bench.timing.horizon
+    ranges = trained.bench.range_set(training.ranges)
+    draws = grid_draws(ranges, training.parameters[0], training.seed)
+
+    def on_grid(excitation: Excitation, times: int = 1) -> Outcome:
+        conditions = msgspec.structs.replace(training.conditions, randomised=NOTHING_RANDOM)
+        return play(trained.bench, ranges, training.parameters, excitation, draws * times, training.plant, conditions)
+
+    found = {"trained actor": on_grid(Network(DeployedActor(trained.actor, limit)))}
+    for u in (limit, -limit):
+        found[f"constant {u:+g} A"] = on_grid(Played(np.full(horizon, u)))
+    every = max(1, horizon // 100)
+    switches = [(u, t) for u in (limit, -limit) for t in range(every, horizon, every)]
+    blind = np.array([np.where(np.arange(horizon) < t, u, -u) for u, t in switches])
+    played = on_grid(Played(np.repeat(blind, len(draws), axis=0)), len(switches))
+    best = int(np.argmax(played.matrices[:, 0, 0].reshape(len(switches), -1).mean(axis=1)))
+    u, t = switches[best]
+    found[f"best blind switch: {u:+g} A, from step {t} {-u:+g} A"] = on_grid(Played(blind[best]))
+    return found
+
+
+def grid_text(outcomes: Mapping[str, Outcome]) -> str:
+    """Outcomes on the grid as a table."""
+    rows = [
+        (name, f"{o.matrices[:, 0, 0].mean():.4e}", f"{o.left.sum()}", f"{o.home.sum()}/{len(o.home)}")
+        for name, o in outcomes.items()
+    ]
+    return "\n".join(Table("on the grid, same shield", ("excitation", "information", "left", "home"), rows).lines())

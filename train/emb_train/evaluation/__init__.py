@@ -1,1 +1,0 @@
-"""Evaluation of actors on brakes that they never saw, beside baselines without learning and the known optimum."""

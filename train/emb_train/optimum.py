@@ -1,0 +1,128 @@
+"""Known-parameter optimum: the best currents for each brake if its parameters were known.
+
+A search takes a quarter of a minute for a brake, and minutes for the first one, in the middle of the ranges. The others
+start from the optimum of that one: its speeds are followed on the other brake, and the search goes on from there. The
+result is the best that was found, not proved to be the best there is. Each is kept in the user's cache.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Callable, Sequence
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from emb_bench.brake.euler import sign, stiffness
+from emb_bench.brake.motion import is_plain
+from emb_bench.design.problem import Problem, make_problem
+from emb_bench.design.search import search
+from emb_bench.output import replacing
+from emb_bench.sim.open_loop import feedback
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.plants import EULER, EXACT, Plant
+from emb_runtime.errors import UsageError
+from emb_train.envs.measure import Floats, Measure
+
+FIRST_STARTS = 24  # Coarse searches for the brake in the middle
+STARTS = 3  # Coarse searches for each other brake, besides the warm start
+SEED = 0  # Seed of the searches
+GENERATION = 5  # Number of the search itself: what an earlier one found is not taken for the best that is known
+
+
+def searchable(plant: Plant) -> str | None:
+    """The plant for the search: the same mechanics behind ideal instruments; None if not one of the thesis's.
+
+    With the parameters known and nothing to react to, instruments cost nothing: for a plant that has some, it is what
+    could be reached without them.
+    """
+    if plant.mechanics.solver == EULER:
+        return "euler"
+    return "exact" if plant.mechanics.solver == EXACT and is_plain(plant.mechanics) else None
+
+
+def optima(
+    bench: Bench,
+    measure: Measure,
+    parameters: tuple[str, ...],
+    plant: str,
+    brakes: Sequence[BrakeParameters],
+    tell: Callable[[str], object],
+) -> Floats:
+    """The measure of the best known currents for each brake.
+
+    Args:
+        bench: limits, noise, timing.
+        measure: what is optimised.
+        parameters: whose information counts.
+        plant: ``euler`` or ``exact``.
+        brakes: the first is searched for from many starts, and the others from its speeds.
+        tell: called with a line on the progress.
+
+    Returns:
+        Shape [len(brakes)].
+
+    Raises:
+        UsageError: nothing that was found for a brake keeps the limits.
+    """
+    speeds: Sequence[float] = ()
+    matrices = []
+    for number, brake in enumerate(brakes, 1):
+        tell(f"optimum on {plant}, brake {number} of {len(brakes)}")
+        goal = measure.goal(len(parameters))
+        problem = make_problem(bench, goal, parameters, model=plant, kind=measure.kind, brake=brake, returns=True)
+        design = problem.design(best_currents(problem, speeds))
+        speeds = speeds or design.states[1:, 1].tolist()
+        matrices.append(design.matrix)
+    return measure.values(np.array(matrices))
+
+
+def best_currents(problem: Problem, speeds: Sequence[float]) -> Floats:
+    """The best currents that are found for a brake, or were found before [A], shape [horizon].
+
+    Args:
+        problem: brake, criterion, limits.
+        speeds: of the middle brake's optimum at the end of each sample [rad/s]; none for that brake itself.
+    """
+    path = _place(problem, speeds)
+    if path is not None:
+        with contextlib.suppress(OSError, ValueError):
+            found: Floats = np.load(path, allow_pickle=False)
+            if found.shape == (problem.horizon,) and np.isfinite(found).all():
+                return found
+    warm = [followed(problem, speeds)] if speeds else []
+    currents = search(problem, starts=STARTS if speeds else FIRST_STARTS, seed=SEED, warm=warm).best.currents
+    if path is not None:
+        with contextlib.suppress(OSError, UsageError):  # what cannot be kept is searched for again
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(path) as beside, beside.open("wb") as file:
+                np.save(file, currents)
+    return currents
+
+
+def followed(problem: Problem, speeds: Sequence[float]) -> Floats:
+    """Currents with which a known brake has these speeds at the ends of the samples, as far as the limit lets it."""
+    p, t_s, limit = problem.brake, problem.sample_time, problem.box.current
+
+    def law(x1: float, x2: float, k: int) -> float:
+        torque = p.T_c * sign(x2 or speeds[k]) + p.f_v * x2 + stiffness(p, x1) * x1 + p.J * (speeds[k] - x2) / t_s
+        return min(max(torque / p.k_m, -limit), limit)
+
+    motion = feedback(problem.plant.mechanics, p, law, t_s)
+    return np.array([current for current, _, _ in islice(motion, len(speeds))])
+
+
+def _place(problem: Problem, speeds: Sequence[float]) -> Path | None:
+    """File for an optimum, named after all that it depends on; None for a user without a home."""
+    parts = (problem.plant.mechanics, problem.brake, problem.params, problem.goal, problem.weights, problem.box)
+    digest = hashlib.sha256(
+        repr((parts, problem.sample_time, problem.horizon, SEED, GENERATION, tuple(speeds))).encode()
+    )
+    try:
+        chosen = os.environ.get("XDG_CACHE_HOME")
+        return (Path(chosen) if chosen else Path.home() / ".cache") / "emb-excite" / "optima" / digest.hexdigest()
+    except RuntimeError:
+        return None

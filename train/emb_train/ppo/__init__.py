@@ -1,1 +1,0 @@
-"""Asymmetric proximal policy optimisation (thesis Algorithm 1)."""

@@ -1,1 +1,0 @@
-"""One training: its configuration, checkpoints, validation and progress."""
