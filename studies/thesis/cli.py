@@ -1,28 +1,45 @@
-"""``python -m studies.thesis``: what the thesis prints about its analysis figures, computed anew, with a verdict."""
+"""``python -m studies.thesis``: what the thesis prints about its figures and tables, computed anew, with a verdict."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
-from collections.abc import Callable
-from importlib import metadata
+from collections.abc import Callable, Mapping
+from pathlib import Path
 
 from emb_runtime.config.bench import Bench, load_bench
-from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
-from emb_runtime.system.terminal import complain, show
-from studies.thesis import determinant, oscillator, two_parameters
+from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
+from emb_runtime.system.terminal import complain, mention, show
 from studies.thesis.determinant_facts import protected_facts, unprotected_facts
 from studies.thesis.facts import Fact, facts_text
+from studies.thesis.oscillator import oscillator_facts
+from studies.thesis.two_parameters import two_parameter_facts
 
 PROGRAM = "python -m studies.thesis"
-EPILOG = """\
-Each statement of the thesis gets a verdict: 'agrees' or 'does not follow' (from its own equations), or 'only
-suggested' where the thesis says no more than that it is possible, with our number. The brake is the thesis's (Table
-4.1), under Euler, the Fisher information the weighted one. docs/studies/thesis.md explains what does not follow.
-python -m studies.thesis.training makes the thesis's trainings, their figures and tables.
+ANALYSIS: Mapping[str, Callable[[Bench], list[Fact]]] = {
+    "fig-4.2": unprotected_facts,
+    "fig-4.3": protected_facts,
+    "fig-5.1": oscillator_facts,
+    "sec-6.1": two_parameter_facts,
+}
+"""Statements about the thesis's equations, by figure or section; none needs a training."""
+TRAININGS = (
+    *("fig-5.2", "fig-5.3", "fig-5.4", "fig-5.5", "fig-5.6", "fig-5.7", "fig-5.8", "table-5.1", "fig-5.9"),
+    *("fig-6.1", "fig-6.2", "fig-6.3", "table-6.2"),
+)
+"""Figures and tables of trained agents; here so that they are known without importing torch."""
+SEEDS = 5  # Number of seeds of the thesis in Fig. 5.9
+EPILOG = f"""\
+analysis (seconds): {", ".join(ANALYSIS)}
+trainings: {", ".join(TRAININGS)}
 
-exit codes: 0 done, whatever the verdicts are; 2 usage
+Each statement of the thesis gets a verdict: 'agrees' or 'does not follow' (from its own equations, or in trainings made
+again), or 'only suggested' where the thesis says no more than that it is possible. docs/studies/ explains what does not
+follow. Trainings are kept in DIR: one that is there is not repeated. Table 5.1, Fig. 5.9 and Table 6.2 take all seeds,
+the others the first: 70 million environment steps, with --seeds 1 18 million. With --steps no verdict counts.
+
+exit codes: 0 done, whatever the verdicts are; 1 a training diverged; 2 usage; 130 interrupted
 """
 
 
@@ -30,27 +47,18 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = argparse.ArgumentParser(
         prog=PROGRAM,
-        description="Check what is printed about the analysis figures of Guo (TU Darmstadt, 2024).",
+        description="Check what is printed in Guo (TU Darmstadt, 2024).",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("--version", action="version", version=f"{PROGRAM} {metadata.version('emb-excite')}")
-    p.add_argument("figure", nargs="?", default="all", choices=(*_FIGURES, "all"), help="which (default: %(default)s)")
-    p.add_argument("--json", action="store_true", help="print the facts as JSON")
+    p.add_argument("figure", nargs="*", help="some of those below, 'analysis' (the default) or 'trainings'")
+    p.add_argument("--json", action="store_true", help="print JSON")
     p.add_argument(
-        "--amplitude",
-        type=float,
-        default=determinant.AMPLITUDE,
-        metavar="A",
-        help="constant current of Fig. 4.2 and 4.3, which the thesis does not state (default: %(default)g A)",
+        "--out", type=Path, metavar="DIR", default=Path("trainings"), help="trainings (default: %(default)s)"
     )
-    p.add_argument(
-        "--epsilon",
-        type=float,
-        default=determinant.EPSILON,
-        metavar="E",
-        help="start of the Fisher information in Fig. 4.3, not stated either (default: %(default)g)",
-    )
+    p.add_argument("--steps", type=int, metavar="N", help="most steps of a training (default: as its preset has)")
+    p.add_argument("--seeds", type=int, metavar="N", default=SEEDS, help="trainings of one kind (default: %(default)s)")
+    p.add_argument("--seed", type=int, metavar="S", default=0, help="the first seed (default: %(default)s)")
     return p
 
 
@@ -59,53 +67,41 @@ def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     try:
         show(_run(args))
+    except ModuleNotFoundError as err:
+        return complain(PROGRAM, UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'"))
     except EmbError as err:
         return complain(PROGRAM, err)
+    except KeyboardInterrupt:
+        mention(f"{PROGRAM}: interrupted; remove the training that it was making")
+        return EXIT_INTERRUPTED
     return EXIT_DONE
 
 
 def _run(args: argparse.Namespace) -> str:
+    groups = {"analysis": list(ANALYSIS), "trainings": list(TRAININGS)}
+    names = [name for asked in args.figure or ["analysis"] for name in groups.get(asked, [asked])]
+    for name in names:
+        if name not in ANALYSIS and name not in TRAININGS:
+            raise UsageError(f"no figure or table is called '{name}'; there are: {', '.join([*ANALYSIS, *TRAININGS])}")
+    if min(args.seeds, 1 if args.steps is None else args.steps) < 1 or args.seed < 0:
+        raise UsageError("expected --seeds and --steps of at least 1, and a --seed of at least 0")
     bench = load_bench()
-    limit = bench.limits.current
-    if not 0.0 < args.amplitude <= limit:
-        raise UsageError(f"--amplitude: expected a current in (0, {limit:g}] A, got {args.amplitude:g}")
-    if not 1e-12 <= args.epsilon <= 1.0:
-        raise UsageError(f"--epsilon: expected a number from 1e-12 to 1, got {args.epsilon:g}")
-    names = tuple(_FIGURES) if args.figure == "all" else (args.figure,)
-    facts = [fact for name in names for fact in _FIGURES[name](bench, args.amplitude, args.epsilon)]
+    facts = [fact for name in names if name in ANALYSIS for fact in ANALYSIS[name](bench)]
+    if trained := [name for name in names if name in TRAININGS]:
+        from studies.thesis.agents import agent_facts
+        from studies.thesis.trainings import Trainings
+
+        seeds = range(args.seed, args.seed + args.seeds)
+        trainings = Trainings(args.out, bench, seeds, args.steps, lambda what: mention(f"{PROGRAM}: {what}"))
+        facts += [fact for name in trained for fact in agent_facts(name, trainings)]
     if args.json:
         return json.dumps([fact.document() for fact in facts], indent=1, allow_nan=False)
     agreeing, differing = (sum(fact.agrees is said for fact in facts) for said in (True, False))
-    return (
-        f"{facts_text(facts)}\n\n{agreeing} of {len(facts)} statements agree with the thesis's equations, {differing} "
-        f"do not follow, {len(facts) - agreeing - differing} are only suggested there"
+    count = (
+        f"{agreeing} of {len(facts)} statements agree, {differing} do not follow, "
+        f"{len(facts) - agreeing - differing} are only suggested"
     )
-
-
-def _fig_4_2(bench: Bench, amplitude: float, _epsilon: float) -> list[Fact]:
-    strongest = determinant.unprotected(bench, bench.limits.current)
-    return unprotected_facts(determinant.unprotected(bench, amplitude), strongest)
-
-
-def _fig_4_3(bench: Bench, amplitude: float, epsilon: float) -> list[Fact]:
-    return protected_facts(determinant.unprotected(bench, amplitude), determinant.protected(bench, amplitude, epsilon))
-
-
-def _fig_5_1(bench: Bench, _amplitude: float, _epsilon: float) -> list[Fact]:
-    return oscillator.oscillator_facts(bench)
-
-
-def _sec_6_1(bench: Bench, _amplitude: float, _epsilon: float) -> list[Fact]:
-    runs = [two_parameters.excited(bench, name) for name in two_parameters.EXCITATIONS]
-    return two_parameters.two_parameter_facts(bench, runs)
-
-
-_FIGURES: dict[str, Callable[[Bench, float, float], list[Fact]]] = {
-    "fig-4.2": _fig_4_2,
-    "fig-4.3": _fig_4_3,
-    "fig-5.1": _fig_5_1,
-    "sec-6.1": _sec_6_1,
-}
+    return f"{facts_text(facts)}\n\n{count if args.steps is None else 'a rehearsal: no verdict of a training counts'}"
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 The same sums and the same elimination are carried out in three arithmetics: in single precision, which is what PyTorch
 computes in by default; in double precision; and exactly, in rational numbers. What differs is rounding.
 
-The thesis states neither the current of Fig. 4.2 nor ε. Here both are arguments. 0.7 A, for four parameters, shows in
+The thesis states neither the current of Fig. 4.2 nor ε. Here both are chosen. 0.7 A, for four parameters, shows in
 single precision what the text says that the figure shows: gaps at several intervals.
 """
 
@@ -25,10 +25,9 @@ from emb_bench.information.fisher import (
     information_over_time,
     thesis_weights,
 )
-from emb_bench.information.symmetric import Floats, information
+from emb_bench.information.symmetric import Floats, information, log_det, pack
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
-from studies.thesis.normalisation import NormalisedFisher, epsilon_identity
 
 AMPLITUDE = 0.7  # A
 EPSILON = 1e-6
@@ -111,22 +110,45 @@ def protected(bench: Bench, amplitude: float, epsilon: float) -> Protected:
     t_s = bench.timing.sample_time
     weights = thesis_weights(bench.noise, bench.limits)
     s = simulate(bench.plant("euler").mechanics, bench.brake, currents, t_s, PARAMETER_NAMES).sensitivities
-    running = NormalisedFisher.start(epsilon_identity(len(PARAMETER_NAMES), epsilon))
-    rewards, logs, alphas, conditions = [], [], [], []
-    for k in range(len(s)):
-        running, reward = running.add(information_over_time(s[k : k + 1], weights)[0])
-        rewards.append(reward)
-        logs.append(running.log_det)
-        alphas.append(running.log_alpha)
-        conditions.append(float(np.linalg.cond(running.matrix)))
+    increments = np.array([information_over_time(s[k : k + 1], weights)[0] for k in range(len(s))])
+    rewards, logs, alphas, matrices = normalised(increments, epsilon)
     return Protected(
         epsilon=epsilon,
-        rewards=np.array(rewards),
-        log_normalised=np.array(logs),
-        log_alpha=np.array(alphas),
-        conditions=np.array(conditions),
+        rewards=rewards,
+        log_normalised=logs,
+        log_alpha=alphas,
+        conditions=np.linalg.cond(matrices),
         failures_single=_failures_single(bench, currents, weights),
     )
+
+
+def normalised(increments: Floats, epsilon: float) -> tuple[Floats, Floats, Floats, Floats]:
+    """The running normalisation M̄_k = α_k M_k of a FIM that begins at ε I (eq. 4.28, 4.35-4.39).
+
+    α_k is chosen so that |α_k M_{k−1}| = |M_init|. Eq. 4.39 prints this with M̄_{k−1} and α_k; it has to be the ratio
+    α_k / α_{k−1} that equals (|M_init| / |M̄_{k−1}|)^{1/n}, else |M̄_k| grows as the square root of |M_k|. In eq. 4.36,
+    third line, α_k|M_k| is meant as |α_k M_k|.
+
+    Args:
+        increments: of the FIM itself, shape (T, n, n).
+        epsilon: ε, greater than 0.
+
+    Returns:
+        The step rewards r_k = log |M_k| − log |M_{k−1}| (eq. 4.13, 4.36), log |M̄_k| and log α_k, each of shape (T,),
+        and M̄_k, shape (T, n, n).
+    """
+    size = increments.shape[-1]
+    matrix, begun, log_alpha = epsilon * np.eye(size), size * math.log(epsilon), 0.0
+    last, rows, matrices = begun, [], []
+    for increment in increments:
+        log_ratio = (begun - last) / size
+        log_alpha += log_ratio
+        matrix = math.exp(log_ratio) * matrix + math.exp(log_alpha) * increment  # eq. 4.38
+        last = log_det(pack(matrix), np.empty(matrix.shape))
+        rows.append((last - begun, last, log_alpha))
+        matrices.append(matrix)
+    rewards, logs, alphas = np.array(rows).T
+    return rewards, logs, alphas, np.array(matrices)
 
 
 def determinant(matrix: Sequence[Sequence[Any]], number: Number) -> Any:

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import PARAMETER_NAMES
-from studies.thesis.determinant import SETTLED, SPIKE, Protected, Unprotected
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from studies.thesis.determinant import AMPLITUDE, EPSILON, SETTLED, SPIKE, protected, unprotected
 from studies.thesis.facts import Fact
-from studies.thesis.normalisation import epsilon_identity
 
 SIZE = len(PARAMETER_NAMES)
 LARGEST_SINGLE = math.log10(float(np.finfo(np.float32).max))
@@ -19,13 +18,9 @@ LARGEST_DOUBLE = math.log10(float(np.finfo(np.float64).max))
 ROUNDING = 1e-9  # Relative difference that rounding may leave between two ways to compute the same
 
 
-def unprotected_facts(f: Unprotected, strongest: Unprotected) -> list[Fact]:
-    """Fig. 4.2.
-
-    Args:
-        f: the figure.
-        strongest: the same with the largest current allowed.
-    """
+def unprotected_facts(bench: Bench) -> list[Fact]:
+    """Fig. 4.2, and the same with the largest current allowed."""
+    f, strongest = unprotected(bench, AMPLITUDE), unprotected(bench, bench.limits.current)
     figure = "fig-4.2"
     regular = f.ranks == SIZE
     negative = f.determinants_single < 0.0
@@ -44,7 +39,6 @@ def unprotected_facts(f: Unprotected, strongest: Unprotected) -> list[Fact]:
             f"at {f.amplitude:g} A in single precision, PyTorch's default, {len(late)} samples have |M| < 0 after |M| "
             f"has become regular ({_spans(late)}); in double precision {negative_double}",
             len(late) > 0,
-            {"negative_single": len(late), "negative_double": negative_double},
         ),
         Fact(
             figure,
@@ -52,7 +46,6 @@ def unprotected_facts(f: Unprotected, strongest: Unprotected) -> list[Fact]:
             "a determinant of a Fisher information cannot be negative: these come from rounding",
             f"computed in rational numbers, {negative_exact} of {len(f.signs_exact)} determinants are negative",
             negative_exact == 0,
-            {"negative_exact": negative_exact},
         ),
         Fact(
             figure,
@@ -62,7 +55,6 @@ def unprotected_facts(f: Unprotected, strongest: Unprotected) -> list[Fact]:
             f"next the condition number changes by up to {jump_single:.3g} times in single precision and by {jump:.3g} "
             f"in double; the two differ by up to {ratio:.3g} times (after sample {SETTLED})",
             bool(jump > SPIKE),
-            {"largest_change_single": jump_single, "largest_change_double": jump, "single_over_double": float(ratio)},
         ),
         Fact(
             figure,
@@ -70,7 +62,6 @@ def unprotected_facts(f: Unprotected, strongest: Unprotected) -> list[Fact]:
             "each sample updates the Fisher information by a matrix of rank one",
             f"there are two outputs: the rank of an increment is {f.increment_rank}",
             f.increment_rank == 1,
-            {"rank": f.increment_rank},
         ),
         Fact(
             figure,
@@ -79,7 +70,6 @@ def unprotected_facts(f: Unprotected, strongest: Unprotected) -> list[Fact]:
             f"from rest |M| is first regular at sample {first} of n = {SIZE}; not for the rank of the increments, but "
             "because each of the first samples tells one combination of parameters more",
             first >= SIZE,
-            {"first_regular_sample": first},
         ),
         Fact(
             figure,
@@ -88,22 +78,22 @@ def unprotected_facts(f: Unprotected, strongest: Unprotected) -> list[Fact]:
             f"{len(strongest.log_exact)} samples at {strongest.amplitude:g} A reach 1e{decades:.1f}; single precision "
             f"ends at 1e{LARGEST_SINGLE:.1f}, double at 1e{LARGEST_DOUBLE:.1f}",
             None,
-            {"log10_determinant": decades},
         ),
     ]
 
 
-def protected_facts(f: Unprotected, cured: Protected) -> list[Fact]:
+def protected_facts(bench: Bench) -> list[Fact]:
     """Fig. 4.3, and the equations behind it."""
+    f, cured = unprotected(bench, AMPLITUDE), protected(bench, AMPLITUDE, EPSILON)
     figure = "fig-4.3"
     start = SIZE * math.log(cured.epsilon)
     gaps = int((~np.isfinite(cured.log_normalised)).sum())
     failing = {epsilon: count for epsilon, count in cured.failures_single.items() if count}
-    raised = np.linalg.eigvalsh(f.fims + epsilon_identity(SIZE, cured.epsilon)) - np.linalg.eigvalsh(f.fims)
+    raised = np.linalg.eigvalsh(f.fims + cured.epsilon * np.eye(SIZE)) - np.linalg.eigvalsh(f.fims)
     scale = np.linalg.eigvalsh(f.fims)[:, -1:]
     shift = float(np.abs((raised - cured.epsilon) / scale).max())
     effect = float(cured.log_det[-1] - f.log_exact[-1])
-    direct = np.diff([start, *_log_dets(f.fims + epsilon_identity(SIZE, cured.epsilon))])
+    direct = np.diff([start, *_log_dets(f.fims + cured.epsilon * np.eye(SIZE))])
     unchanged = float(np.abs(cured.rewards - direct)[SETTLED:].max())
     printed = _printed_normalisation(cured.log_det, start)
     drift, drift_printed = float(np.abs(cured.log_normalised[-1] - start)), float(np.abs(printed[-1] - start))
@@ -118,7 +108,6 @@ def protected_facts(f: Unprotected, cured: Protected) -> list[Fact]:
             f"in double precision, with epsilon = {cured.epsilon:g}, {gaps} of {len(cured.rewards)} samples have no "
             "logarithm",
             gaps == 0,
-            {"gaps": gaps},
         ),
         Fact(
             figure,
@@ -128,7 +117,6 @@ def protected_facts(f: Unprotected, cured: Protected) -> list[Fact]:
             + "; ".join(f"{count} samples with {epsilon:g}" for epsilon, count in cured.failures_single.items())
             + ". It has to be larger than the rounding of the largest element; in double precision any serves",
             not failing,
-            {f"failures_single_{epsilon:g}": count for epsilon, count in cured.failures_single.items()},
         ),
         Fact(
             figure,
@@ -137,7 +125,6 @@ def protected_facts(f: Unprotected, cured: Protected) -> list[Fact]:
             f"it rises to {cured.conditions[peak]:.2g} at sample {peak + 1} and falls to {cured.conditions[-1]:.2g} at "
             "the end: every sample tells more of the worst-known direction",
             bool((np.diff(cured.conditions) > 0.0).all()),
-            {"peak_sample": peak + 1, "peak": float(cured.conditions[peak]), "end": float(cured.conditions[-1])},
         ),
         Fact(
             figure,
@@ -145,7 +132,6 @@ def protected_facts(f: Unprotected, cured: Protected) -> list[Fact]:
             "every eigenvalue of the sum grows by epsilon",
             f"to {shift:.1g} of the largest eigenvalue, which is rounding",
             shift < ROUNDING,
-            {"deviation": shift},
         ),
         Fact(
             figure,
@@ -153,7 +139,6 @@ def protected_facts(f: Unprotected, cured: Protected) -> list[Fact]:
             "the initialisation hardly changes the result",
             f"log |M| at the end grows by {effect:.1g}",
             abs(effect) < 1e-3,
-            {"log_det_change": effect},
         ),
         Fact(
             figure,
@@ -161,7 +146,6 @@ def protected_facts(f: Unprotected, cured: Protected) -> list[Fact]:
             "the normalisation leaves the step rewards unchanged",
             f"they differ from log |M_k| - log |M_(k-1)| by {unchanged:.1g} at most (after sample {SETTLED})",
             unchanged < 1e-6,
-            {"largest_difference": unchanged},
         ),
         Fact(
             figure,
@@ -169,7 +153,6 @@ def protected_facts(f: Unprotected, cured: Protected) -> list[Fact]:
             "alpha_k |M_k| stands for the normalised determinant",
             f"that is |alpha_k M_k| = alpha_k^n |M_k|: at the end their logarithms differ by {third:.3g}",
             abs(third) < ROUNDING,
-            {"log_difference": third},
         ),
         Fact(
             figure,
@@ -178,7 +161,6 @@ def protected_facts(f: Unprotected, cured: Protected) -> list[Fact]:
             f"its logarithm ends {drift_printed:.3g} away from it, half of what |M| has grown; with the ratio "
             f"alpha_k / alpha_(k-1) in place of alpha_k it ends {drift:.2g} away",
             drift_printed < 1.0,
-            {"drift_printed": drift_printed, "drift_corrected": drift},
         ),
         Fact(
             figure,
@@ -187,7 +169,6 @@ def protected_facts(f: Unprotected, cured: Protected) -> list[Fact]:
             f"they add up to {total:.4g}, log |M_n| is {final:.4g}: what they begin from, log |M_init| = {start:.4g}, "
             "is missing",
             abs(total - final) < 1e-6 * abs(final),
-            {"sum_of_rewards": total, "log_det": final, "log_det_initial": start},
         ),
     ]
 

@@ -1,10 +1,10 @@
-"""A statement of the thesis, what the equations give for it, and whether the two agree."""
+"""A statement of the thesis, what its equations or a training give for it, and whether the two agree."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from typing import Any
 
 AGREES = "agrees"
@@ -23,9 +23,8 @@ class Fact:
     figure: str  # The figure or section that it belongs to: ``fig-4.2``
     source: str  # Section, equation or table of the thesis
     claim: str  # Statement of the thesis, in our words
-    found: str  # Result from its equations
+    found: str  # Result
     agrees: bool | None  # None for what the thesis says to be possible, and no more
-    numbers: Mapping[str, float]  # Numbers behind the verdict
 
     @property
     def verdict(self) -> str:
@@ -33,19 +32,12 @@ class Fact:
         return SUGGESTED if self.agrees is None else AGREES if self.agrees else DIFFERS
 
     def document(self) -> dict[str, Any]:
-        """Returns the JSON document."""
-        return {
-            "figure": self.figure,
-            "source": self.source,
-            "claim": self.claim,
-            "found": self.found,
-            "verdict": self.verdict,
-            "numbers": dict(self.numbers),
-        }
+        """The JSON document."""
+        return {**asdict(self), "verdict": self.verdict}
 
 
 def facts_text(facts: Iterable[Fact]) -> str:
-    """Returns the facts as text by figure, the verdict first."""
+    """The facts as text by figure, the verdict first."""
     lines: list[str] = []
     figure = ""
     for fact in facts:

@@ -106,7 +106,6 @@ def _constant_facts(bench: Bench, first: Input) -> list[Fact]:
             "the damping ratio is 0.2407",
             f"{exact.damping:.4f}",
             abs(exact.damping - 0.2407) < 5e-5,
-            {"damping": exact.damping},
         ),
         Fact(
             FIGURE,
@@ -115,7 +114,6 @@ def _constant_facts(bench: Bench, first: Input) -> list[Fact]:
             f"Euler at {euler_peak:.3f} s, the closed form pi / (w0 sqrt(1 - zeta^2)) at {exact.peak_time:.4f} s: "
             f"0.33 s rounded; the peaks are {abs(first.s[peak, 0]):.2f} and {top:.2f} rad",
             abs(euler_peak - 0.34) <= 0.01 and abs(exact.peak_time - 0.34) <= 0.01,
-            {"peak_time_euler": euler_peak, "peak_time": exact.peak_time},
         ),
         Fact(
             FIGURE,
@@ -123,7 +121,6 @@ def _constant_facts(bench: Bench, first: Input) -> list[Fact]:
             "from the peak of a on, the increment falls as well",
             f"from {euler_highest:.4g} at {euler_peak:.3f} s to {after[-1]:.4g} at the end",
             bool((np.diff(first.increments[peak:]) < 0.0).all()),
-            {"increment_peak": euler_highest, "increment_end": float(after[-1])},
         ),
         Fact(
             FIGURE,
@@ -131,7 +128,6 @@ def _constant_facts(bench: Bench, first: Input) -> list[Fact]:
             "the largest increment within 500 ms at full speed is about 1.3e5",
             f"Euler {euler_highest:.4g}, closed form {highest:.4g}",
             abs(euler_highest - 1.3e5) <= 0.05e5 and abs(highest - 1.3e5) <= 0.05e5,
-            {"increment_peak_euler": euler_highest, "increment_peak": highest},
         ),
         Fact(
             FIGURE,
@@ -140,7 +136,6 @@ def _constant_facts(bench: Bench, first: Input) -> list[Fact]:
             f"of the sum, {100.0 * total:.5f} % come from a; b decides {int((share < 0.5).sum())} of {len(share)} "
             "samples, those in which a has not begun to move",
             total > 0.9,
-            {"angle_share": total, "samples_decided_by_velocity": int((share < 0.5).sum())},
         ),
         Fact(
             FIGURE,
@@ -150,7 +145,6 @@ def _constant_facts(bench: Bench, first: Input) -> list[Fact]:
             f"of the outputs by their limits {_normalisation_factor(bench):.3g}; with the noise alone b decides "
             f"{int((share_physical < 0.5).sum())} samples",
             _noise_factor(bench) > _normalisation_factor(bench),
-            {"noise_factor": _noise_factor(bench), "normalisation_factor": _normalisation_factor(bench)},
         ),
     ]
 
@@ -175,7 +169,6 @@ def _bound_facts(bench: Bench, first: Input) -> list[Fact]:
             f"sample by sample only until {later * bench.timing.sample_time:.3f} s: a velocity that changes its sign "
             f"half a swing before the end has there an increment {gain:.3g} times as large",
             gain < 1.01,
-            {"increment_ratio_at_end": gain},
         ),
         Fact(
             FIGURE,
@@ -184,7 +177,6 @@ def _bound_facts(bench: Bench, first: Input) -> list[Fact]:
             f"a search over switched velocities from {STARTS} beginnings ends at {best:.6f} of its sum at best; that "
             f"none reaches more than {ceiling:.3g} of it is certain",
             best < 1.0 + 1e-6,
-            {"best_found_over_constant": best, "bound_over_constant": ceiling},
         ),
     ]
 
@@ -207,7 +199,6 @@ def _stopped_facts(bench: Bench, second: Input) -> list[Fact]:
             f"its size goes on growing for {1e3 * (peak + 1 - stop) * t_s:.0f} ms, from {a[stop - 1]:.1f} to "
             f"{a[peak]:.1f} rad, since b is not zero; else the increment could not grow either",
             bool(a[peak] <= a[stop - 1]),
-            {"a_at_stop": float(a[stop - 1]), "a_peak": float(a[peak]), "peak_time": (peak + 1) * t_s},
         ),
         Fact(
             FIGURE,
@@ -215,7 +206,6 @@ def _stopped_facts(bench: Bench, second: Input) -> list[Fact]:
             "after the stop the increment grows for a while before it decays",
             f"from {increments[stop - 1]:.4g} to {increments[peak]:.4g} at {(peak + 1) * t_s:.3f} s",
             bool(increments[peak] > increments[stop - 1]),
-            {"increment_at_stop": float(increments[stop - 1]), "increment_peak": float(increments[peak])},
         ),
         Fact(
             FIGURE,
@@ -223,7 +213,6 @@ def _stopped_facts(bench: Bench, second: Input) -> list[Fact]:
             "a then swings about zero, less and less",
             f"each swing is {decayed:.3f} of the one before; the closed form says {expected:.3f}",
             all(ratio < 1.0 for ratio in decay) and abs(decayed - expected) < 0.01,
-            {"swing_ratio_euler": decayed, "swing_ratio": expected},
         ),
         Fact(
             FIGURE,
@@ -232,7 +221,6 @@ def _stopped_facts(bench: Bench, second: Input) -> list[Fact]:
             f"the last increment is {increments[-1]:.4g}, {100.0 * increments[-1] / increments[peak]:.2g} % of the "
             "largest",
             bool(increments[-1] > 0.01 * increments[peak]),
-            {"increment_end": float(increments[-1])},
         ),
     ]
 

@@ -1,0 +1,207 @@
+"""Statements about the thesis's agents, from a training to its sentence; short trainings."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emb_runtime.config.bench import load_bench
+from emb_train.cli import main as emb_train
+from emb_train.envs.play import Draw
+from emb_train.training import METRICS, Training, load_preset
+from studies.thesis import agents, trainings
+from studies.thesis.agents import (
+    FIGURES,
+    correlation,
+    drops_at_limits,
+    five,
+    number,
+    on_grid,
+    phases,
+    rises_early,
+    smoothed,
+    square_wave,
+    ways_home,
+)
+from studies.thesis.cli import TRAININGS, main
+from studies.thesis.trainings import Trainings
+from tests.commands import refused
+
+BENCH = load_bench()
+
+
+def small(name: str, **changes: Any) -> Training:
+    """A preset that trains in a moment."""
+    preset = load_preset(name, **changes)
+    horizon, steps = preset.conditions.applied(BENCH).timing.horizon, min(500, preset.ppo.total_steps)
+    ppo = {"total_steps": steps, "envs": 1, "rollout": horizon, "minibatch": 500, "epochs": 1, "hidden": [8, 8]}
+    return load_preset(name, **changes | {"ppo": ppo})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The trainings of all targets, once; small presets stay until the module's end."""
+    folder = tmp_path_factory.mktemp("trainings")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainings, "load_preset", small)
+        assert main(["trainings", "--seeds", "2", "--json", "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture
+def made(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Trainings:
+    """Finished trainings; none is made anew."""
+
+    def refuse(*_: Any) -> None:
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(trainings, "load_preset", small)
+    monkeypatch.setattr(trainings, "run_training", refuse)
+    return Trainings(folder, BENCH, (0, 1), None, lambda _: None)
+
+
+def test_every_target_has_statements_of_its_own_trainings_which_are_made_once(
+    folder: Path, made: Trainings, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert set(TRAININGS) == set(FIGURES)
+    facts = [fact for figure in FIGURES for fact in agents.agent_facts(figure, made)]
+    assert len(facts) == 37 + 7  # those of docs/studies/reproduction/, and Table 6.2
+    assert all(fact.found and fact.agrees in (True, False) for fact in facts)
+    both = ("e-optimal-hybrid", "e-optimal-trajectory", "trajectory-a", "trajectory-b")
+    once = ("adaptive", "d-optimal-1", "d-optimal-2", "fixed", "random")
+    names = [f"thesis-{n}-{s}" for n in both for s in (0, 1)] + [f"thesis-{n}-0" for n in once]
+    assert sorted(path.name for path in folder.iterdir()) == sorted(names)
+    assert main(["fig-5.2", "fig-4.2", "--out", str(folder)]) == 0
+    assert "of 8 statements agree" in capsys.readouterr().out
+
+
+def test_what_cannot_be_checked_is_refused_in_a_line(
+    folder: Path, made: Trainings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments in (["fig-1.1"], ["--seeds", "0"], ["--steps", "-5"], ["--seed", "-1"]):
+        refused(lambda: main([*arguments, "--out", str(tmp_path / "new")]), capsys)  # noqa: B023  # called at once
+    assert not (tmp_path / "new").exists()
+    refused(lambda: main(["fig-5.2", "--steps", "300", "--out", str(folder)]), capsys)  # of other trainings
+    for content in ("junk\n", '{"steps": 1}\n', "\xff", ""):
+        shutil.rmtree(tmp_path / "thesis-fixed-0", ignore_errors=True)
+        copy = shutil.copytree(folder / "thesis-fixed-0", tmp_path / "thesis-fixed-0")
+        (copy / METRICS).write_bytes(content.encode("latin-1"))
+        refused(lambda: main(["fig-5.3", "--out", str(tmp_path)]), capsys)
+
+
+def test_a_cut_training_makes_a_rehearsal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(trainings, "load_preset", small)
+    assert main(["fig-5.2", "--steps", "300", "--out", str(tmp_path)]) == 0
+    assert "no verdict of a training counts" in capsys.readouterr().out
+
+
+def test_agents_that_leave_the_limits_at_once_get_a_verdict_like_any_other(
+    made: Trainings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trainings.Training, "agent", lambda _, batch: np.full(len(batch.k), 6.0))
+    for figure in ("fig-5.3", "fig-5.4", "fig-5.6", "table-6.2"):
+        assert agents.agent_facts(figure, made)
+    assert [f.found for f in agents.agent_facts("table-6.2", made)][2] == "100 (2 seeds: 100 to 100)"  # violations
+    (way,), (home, *_) = (agents.agent_facts(figure, made) for figure in ("fig-5.7", "fig-5.8"))
+    assert (way.agrees, way.found) == (False, "none of 5 got to 300 ms")
+    assert (home.agrees, home.found[:6]) == (False, "0 of 5")
+
+
+def test_a_planned_way_home_is_the_polynomial_of_six_conditions(made: Trainings) -> None:
+    training = made.first("thesis-trajectory-b")
+    (planned, taken), runs = ways_home(training), five(training)
+    assert planned.shape == taken.shape == (201, 5, 2)
+    np.testing.assert_array_equal(taken, runs.x[300:])
+
+    def derivative(order: int, t: float) -> Any:
+        return np.array([math.perm(power, order) * t ** max(0, power - order) for power in range(6)])
+
+    conditions = [derivative(order, t) for t in (0.0, 0.2) for order in range(3)]
+    for i in range(5):
+        acceleration = (runs.x[300, i, 1] - runs.x[299, i, 1]) / 1e-3
+        ways = np.linalg.solve(conditions, [*runs.x[300, i], acceleration, 0.0, 0.0, 0.0])
+        for k in (0, 50, 137, 200):
+            np.testing.assert_allclose(planned[k, i, 0], derivative(0, 1e-3 * k) @ ways, atol=1e-6)
+            np.testing.assert_allclose(planned[k, i, 1], derivative(1, 1e-3 * k) @ ways, atol=1e-4)
+
+
+def test_a_way_home_agrees_if_it_keeps_the_limits_and_the_agent_takes_it(
+    made: Trainings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for fastest, apart, until, verdicts in (
+        (400.0, 4.0, 201, [True, True]),
+        (501.0, 4.0, 201, [False, True]),
+        (400.0, 6.0, 201, [True, False]),
+        (400.0, 4.0, 5, [True, False]),  # one leaves the limits soon after 300 ms
+    ):
+        way = np.zeros((201, 5, 2))
+        way[:, :, 0], way[100, 2, 1] = np.linspace(70.0, 0.0, 201)[:, None], -fastest
+        taken = way + np.array([apart, 0.0])
+        taken[until:, 0] = math.nan
+        monkeypatch.setattr(agents, "ways_home", lambda _, ways=(way, taken): ways)
+        assert [agrees for *_, agrees in agents.fig_5_7(made)] == verdicts
+
+
+def test_numbers_and_courses_agree_by_the_rules_that_the_page_states() -> None:
+    for printed, ours, agrees in (
+        (100.0, [119.0], True),
+        (100.0, [121.0], False),
+        (100.0, [60.0, 150.0], True),  # the mean decides, however far the seeds scatter
+        (-100.0, [100.0], False),
+        (0.0, [0.0, 0.0], True),
+        (0.0, [0.0, 40.0, 60.0], False),
+    ):
+        assert number(printed, ours, "x")[2] is agrees, (printed, ours)
+    assert number(3.0, [1.0, 3.0, 5.0], "x")[1] == "3 (3 seeds: 1 to 5)"
+    steady = np.linspace(0.0, 100.0, 101)
+    rising = np.minimum(4.0 * steady, 100.0)
+    assert [rises_early([curve])[2] for curve in (steady, rising, -rising)] == [False, True, False]
+    assert correlation(steady, np.zeros(101)) == 0.0
+    assert correlation(steady, -2.0 * steady) == pytest.approx(-1.0)
+    np.testing.assert_allclose(smoothed(np.arange(100.0))[10:90], np.arange(10.0, 90.0))
+    assert smoothed(np.arange(100.0))[0] == pytest.approx(1.0)  # of 0, 1, 2
+
+
+def test_a_return_drops_at_the_limits_if_an_experiment_left_them_in_most_of_the_later_drops() -> None:
+    for depth, left, agrees in (
+        (0.1, [50, 70, 90], True),
+        (0.1, [50, 70], True),
+        (0.1, [50], False),
+        (0.1, [40, 60, 80], False),  # where it does not drop
+        (0.1, [10], False),  # in the first part of the training
+        (0.01, [50, 70, 90], False),  # not a drop
+    ):
+        curve, violations = np.full(100, 100.0), np.zeros(100)
+        curve[[10, 50, 70, 90]] *= 1.0 - depth
+        violations[left] = 2.0
+        assert drops_at_limits(curve, violations)[2] is agrees, left
+
+
+def test_an_experiment_is_recorded_until_it_leaves_the_limits(made: Trainings) -> None:
+    fixed, draws = made.first("thesis-fixed"), [Draw(0, BENCH.brake), Draw(1, BENCH.brake)]
+    runs = fixed.run(draws, lambda batch: np.array([6.0, 0.0]))
+    assert runs.violated.tolist() == [True, False]
+    steps = int((~np.isnan(runs.current[:, 0])).sum())
+    assert abs(runs.x[steps, 0, 1]) > 500.0
+    assert np.isnan(runs.x[steps + 1 :, 0]).all()
+    assert not np.isnan(runs.x[:, 1]).any()
+    assert runs.last[0, 0] == runs.information[steps - 1, 0, 0]
+    assert runs.returns[0] == pytest.approx(runs.information[steps - 2, 0, 0] - 4e4)  # in its own unit
+    current = made.first("thesis-d-optimal-1").run([Draw(0, BENCH.brake)], square_wave).current[:, 0]
+    np.testing.assert_array_equal(current, np.tile(np.repeat([6.0, -6.0], 10), 15))  # a period of 20 ms
+    trajectory = made.first("thesis-trajectory-b")
+    assert phases(trajectory).sum() == pytest.approx(on_grid(trajectory).returns.mean())
+
+
+def test_a_training_without_a_shield_says_who_evaluates_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert emb_train(["ppo", "thesis-random", "--steps", "300", "--out", str(tmp_path / "a")]) == 0
+    assert "the study of the thesis shows what it does" in capsys.readouterr().out
+    assert json.loads((tmp_path / "a" / METRICS).read_text())["iteration"] == 1
