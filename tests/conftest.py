@@ -23,7 +23,7 @@ from emb_runtime.control.result import Outcome
 from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord, LineRecord, Record
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.safety.guard import Guard
-from emb_runtime.safety.heartbeat import Pulse, Unwatched
+from emb_runtime.safety.heartbeat import Heartbeat, Unwatched
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.clock import SteppedClock
 
@@ -149,7 +149,7 @@ def make_loop(
     now_ns: Callable[[], int],
     push: Callable[[Record], object],
     stop_requested: Callable[[], bool] = lambda: False,
-    pulse: Pulse | None = None,
+    pulse: Heartbeat | None = None,
     overheard: Sequence[Frame] = (),
     **core: Any,
 ) -> Loop:

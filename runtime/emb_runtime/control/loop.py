@@ -18,7 +18,7 @@ from emb_runtime.errors import BusError, PolicyRefusedError
 from emb_runtime.log.ring_buffer import Level, LineRecord, Record
 from emb_runtime.records import Frame, RunState
 from emb_runtime.safety.guard import GuardRejectedError
-from emb_runtime.safety.heartbeat import STOP_FRAMES, Pulse, Unwatched
+from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat, Unwatched
 from emb_runtime.safety.state_machine import Fault, StopError
 
 STOP_LISTEN_NS: Final = 1_500_000_000
@@ -37,7 +37,7 @@ class Loop:
     now_ns: Callable[[], int]  # Monotonic clock [ns]
     push: Callable[[Record], object]  # Records; never waits
     stop_requested: Callable[[], bool]
-    pulse: Pulse = field(default_factory=Unwatched)  # To the watchdog process
+    pulse: Heartbeat = field(default_factory=Unwatched)  # To the watchdog process
     overheard: Sequence[Frame] = ()  # Frames from just before the run that must not be missed
 
     def __post_init__(self) -> None:

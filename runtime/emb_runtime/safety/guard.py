@@ -21,7 +21,7 @@ from emb_runtime.errors import BusError, FrameError, SafetyStopError
 from emb_runtime.records import CurrentCommand, Frame, RunState, SensorSample
 from emb_runtime.safety.device_clock import DeviceClock
 from emb_runtime.safety.drive_monitor import DriveCheck
-from emb_runtime.safety.heartbeat import Pulse, Unwatched
+from emb_runtime.safety.heartbeat import Heartbeat, Unwatched
 from emb_runtime.safety.state_machine import Fault, StopError, may_enable, may_send
 
 RATE_WINDOW_PERIODS: Final = 20
@@ -49,7 +49,7 @@ class Guard:
         layout: Layout,
         bench: Bench,
         send: Callable[[Frame], None],
-        pulse: Pulse | None = None,
+        pulse: Heartbeat | None = None,
         limit: float = CEILING_CURRENT,
     ) -> None:
         self._message = layout.command

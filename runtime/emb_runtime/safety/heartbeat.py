@@ -1,7 +1,7 @@
 """The heartbeat: a few machine words in shared memory between the loop and its watchdog process.
 
-The loop says that it lives, whether a command may leave, and which counter the last one had; the watchdog says that it
-lives, and whether it has tripped. Each word has one writer, and is stored and loaded whole (see
+The loop reports that it lives, that it is armed, and the counter of the last command; the watchdog that it lives, and
+whether it has tripped. Each word has one writer, and is stored and loaded whole (see
 :mod:`emb_runtime.log.ring_buffer`). Nothing here waits, and nothing is a system call: it costs the loop a store.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 import mmap
 import os
 import struct
-from typing import Protocol
 
 from emb_runtime.can.e2e import COUNTER_MODULUS
 
@@ -29,63 +28,8 @@ _ARMED_AT, _BEAT_AT, _LAST_AT = 8, 9, 10  # the loop's, on a cache line of their
 _TRIPPED_AT, _SIGN_AT = 16, 17  # the watchdog's
 
 
-class Pulse(Protocol):
-    """Watchdog as the loop and the guard see it."""
-
-    @property
-    def tripped(self) -> bool:
-        """Returns True if the watchdog has tripped: from then on nothing may leave. Never taken back."""
-        ...
-
-    def arm(self, now_ns: int) -> None:
-        """Ask to be watched from now on, monotonic [ns]: before the first command that may leave."""
-        ...
-
-    def disarm(self) -> None:
-        """Ask to be watched no longer: after the last stop frame."""
-        ...
-
-    def beat(self, now_ns: int) -> None:
-        """Say that the loop lives, monotonic [ns], read just now."""
-        ...
-
-    def publish(self, counter: int, answers: int) -> None:
-        """Say which alive counter the next command has, and which sample it answers.
-
-        Before :attr:`tripped` is asked, for the last time before the command leaves. So whoever comes second of the
-        loop and the watchdog knows of the other, or they send the same counter, and the node takes the first.
-        """
-        ...
-
-    def watched(self, now_ns: int) -> bool:
-        """Returns True if the watchdog has given a sign of life lately; ``now_ns`` is monotonic [ns]."""
-        ...
-
-
-class Unwatched:
-    """The pulse of a run that no watchdog can follow: on a simulated bus, whose time stands still."""
-
-    tripped = False
-
-    def arm(self, now_ns: int) -> None:
-        """See :meth:`Pulse.arm`."""
-
-    def disarm(self) -> None:
-        """See :meth:`Pulse.disarm`."""
-
-    def beat(self, now_ns: int) -> None:
-        """See :meth:`Pulse.beat`."""
-
-    def publish(self, counter: int, answers: int) -> None:
-        """See :meth:`Pulse.publish`."""
-
-    def watched(self, now_ns: int) -> bool:
-        """See :meth:`Pulse.watched`."""
-        return True
-
-
 class Heartbeat:
-    """One end of the shared memory: the loop's, which is a :class:`Pulse`, or the watchdog's.
+    """One end of the shared memory: the loop's or the watchdog's.
 
     Args:
         fd: file descriptor of the shared memory, from :meth:`create` or inherited from the creator.
@@ -130,28 +74,32 @@ class Heartbeat:
 
     @property
     def tripped(self) -> bool:
-        """See :attr:`Pulse.tripped`."""
+        """Returns True if the watchdog has tripped: from then on nothing may leave. Never taken back."""
         return self._words[_TRIPPED_AT] != 0
 
     def arm(self, now_ns: int) -> None:
-        """See :meth:`Pulse.arm`."""
+        """Ask to be watched from now on, monotonic [ns]: before the first command that may leave."""
         self._words[_BEAT_AT] = now_ns
         self._words[_ARMED_AT] = 1
 
     def disarm(self) -> None:
-        """See :meth:`Pulse.disarm`."""
+        """Ask to be watched no longer: after the last stop frame."""
         self._words[_ARMED_AT] = 0
 
     def beat(self, now_ns: int) -> None:
-        """See :meth:`Pulse.beat`."""
+        """Report that the loop lives, monotonic [ns], read just now."""
         self._words[_BEAT_AT] = now_ns
 
     def publish(self, counter: int, answers: int) -> None:
-        """See :meth:`Pulse.publish`."""
+        """Report the alive counter of the next command, and that of the sample which it answers.
+
+        Call before the last check of :attr:`tripped`. Then one side sees the other, or both use the same counter and
+        the node drops the second frame.
+        """
         self._words[_LAST_AT] = counter << 4 | answers
 
     def watched(self, now_ns: int) -> bool:
-        """See :meth:`Pulse.watched`: it has given a sign of life within the last :data:`LOST_AFTER` heartbeats."""
+        """Returns True if the watchdog has reported within the last :data:`LOST_AFTER` heartbeats; monotonic [ns]."""
         return now_ns - self._words[_SIGN_AT] < LOST_AFTER * self.heartbeat_ns
 
     # --- the watchdog's side ----------------------------------------------------------------------------------------
@@ -179,8 +127,8 @@ class Heartbeat:
         """Take the permission to send anything from the loop, for good."""
         self._words[_TRIPPED_AT] = 1
 
-    def sign(self, now_ns: int) -> None:
-        """Say that the watchdog lives, monotonic [ns]."""
+    def mark_alive(self, now_ns: int) -> None:
+        """Report that the watchdog lives, monotonic [ns]."""
         self._words[_SIGN_AT] = now_ns
 
     def close(self) -> None:
@@ -188,3 +136,16 @@ class Heartbeat:
         self._words.release()
         self._memory.close()
         os.close(self.fd)
+
+
+class Unwatched(Heartbeat):
+    """A heartbeat that no watchdog reads: of a run on a simulated bus, whose time stands still."""
+
+    _words = memoryview(bytearray(_SIZE)).cast("Q")
+
+    def __init__(self) -> None:
+        pass
+
+    def watched(self, now_ns: int) -> bool:
+        """Returns True."""
+        return True

@@ -10,7 +10,6 @@ fault is reported and counted, and passes by itself.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, NamedTuple
 
@@ -178,13 +177,12 @@ class StopError(Exception):
         self.detail = detail
 
 
-@dataclass(frozen=True)
-class FaultInfo:
+class FaultInfo(NamedTuple):
     """Cause of a fault, advice to the operator, and exit code."""
 
     cause: str
     advice: str
-    exit_code: int
+    exit_code: int = EXIT_SAFETY_STOP
     latched: bool = True  # It ends the run; one that does not latch is reported and counted, and the run goes on
 
 
@@ -199,107 +197,80 @@ FAULTS: dict[Fault, FaultInfo] = {
     Fault.NODE_NOT_READY: FaultInfo(
         "the node is not ready for a run",
         "a brake that is elsewhere is brought to the origin by --home; else check the node, and its bench file",
-        EXIT_SAFETY_STOP,
     ),
     Fault.SENSOR_LOST: FaultInfo(
-        "the sensor frames stopped",
-        "check node, wiring and bus load; in a virtual machine the host may have been busy",
-        EXIT_SAFETY_STOP,
+        "the sensor frames stopped", "check node, wiring and bus load; in a virtual machine the host may have been busy"
     ),
     Fault.FRAMES_REJECTED: FaultInfo(
-        "too many invalid or implausible sensor frames",
-        "check DBC, wiring and sensor; the log lists each one",
-        EXIT_SAFETY_STOP,
+        "too many invalid or implausible sensor frames", "check DBC, wiring and sensor; the log lists each one"
     ),
     Fault.OUT_OF_LIMITS: FaultInfo(
-        "the brake left its limits", "the brake does not lie in the bench's shield ranges: widen them", EXIT_SAFETY_STOP
+        "the brake left its limits", "the brake does not lie in the bench's shield ranges: widen them"
     ),
     Fault.NODE_STOPPED: FaultInfo(
         "the node began its own safe stop",
         "its stop reason is below; WATCHDOG: this computer answered too late; LIMIT: the brake is none of those that "
         "the shield is for",
-        EXIT_SAFETY_STOP,
     ),
     Fault.NOT_OBEYED: FaultInfo(
         "the node obeyed no command for too long",
         "the computer answered too late, or the node ignores it: `emb-replay info` tells which",
-        EXIT_SAFETY_STOP,
     ),
     Fault.CURRENT_MISMATCH: FaultInfo(
         "the drive does not apply the current that it is commanded",
         "check the drive's current loop and its supply; a slow one needs a greater guard.current_error",
-        EXIT_SAFETY_STOP,
     ),
     Fault.FOREIGN_COMMAND: FaultInfo(
-        "somebody else sends commands to the node",
-        "stop the other commander; two on one bus is never safe",
-        EXIT_SAFETY_STOP,
+        "somebody else sends commands to the node", "stop the other commander; two on one bus is never safe"
     ),
     Fault.POLICY_NOT_FINITE: FaultInfo(
-        "the policy answered with a number that is not finite",
-        "the actor is broken: train or export it again",
-        EXIT_SAFETY_STOP,
+        "the policy answered with a number that is not finite", "the actor is broken: train or export it again"
     ),
     Fault.POLICY_BEYOND_CONTRACT: FaultInfo(
-        "the policy asked for more current than its contract allows",
-        "the actor is broken: export it again",
-        EXIT_SAFETY_STOP,
+        "the policy asked for more current than its contract allows", "the actor is broken: export it again"
     ),
     Fault.GUARD_REJECTED: FaultInfo(
-        "the guard refused a command",
-        "this is an error in the program: please report it with the log",
-        EXIT_SAFETY_STOP,
+        "the guard refused a command", "this is an error in the program: please report it with the log"
     ),
     Fault.WATCHDOG_TRIPPED: FaultInfo(
         "the loop stood still, and the watchdog process has stopped the run",
         "the computer is too busy or the policy too slow: `emb-replay timing` shows which",
-        EXIT_SAFETY_STOP,
     ),
     Fault.WATCHDOG_LOST: FaultInfo(
-        "the watchdog process is gone or stands still",
-        "see what ended it (out of memory?), and run again",
-        EXIT_SAFETY_STOP,
+        "the watchdog process is gone or stands still", "see what ended it (out of memory?), and run again"
     ),
     Fault.NOT_HOME: FaultInfo(
         "the brake did not come to rest at the origin in time",
         "turn it there by hand; the brake may lie outside the bench's shield ranges",
-        EXIT_SAFETY_STOP,
     ),
     Fault.SENSORS_CONTRADICT: FaultInfo(
         "angle and velocity contradict each other",
         "one of them drifts, is scaled, frozen or of another time: check sensor, its supply and its units",
-        EXIT_SAFETY_STOP,
     ),
     Fault.MOTION_OUTSIDE_SET: FaultInfo(
         "the brake moves as no brake of the set does",
         "it is stuck, loose or outside the bench's shield ranges, or sensor or drive are scaled, frozen or late",
-        EXIT_SAFETY_STOP,
     ),
     Fault.WRONG_POLARITY: FaultInfo(
         "the brake moves against the current",
         "motor or sensor is connected with the wrong sign: swap it, and begin again with --limit",
-        EXIT_SAFETY_STOP,
     ),
     Fault.DEVICE_TIME: FaultInfo(
         "the node's clock does not go like this computer's",
         "check the node's clock and what stamps its samples: their times cannot be used",
-        EXIT_SAFETY_STOP,
     ),
     Fault.INCOMPLETE: FaultInfo(
         "the experiment was not completed",
         "`emb-replay info` tells what was missed; check the load of computer and bus, or the brake if it is not home",
-        EXIT_SAFETY_STOP,
     ),
     Fault.NODE_CHANGED: FaultInfo(
         "the node is not what it was when the run began",
         "check its supply and who else sends: it has started anew, or another one speaks for it",
-        EXIT_SAFETY_STOP,
     ),
     Fault.SET_CONTRADICTED: FaultInfo(
         "no brake that the shield has left as possible explains the samples",
         "something that shield.learn takes for granted is not so (model, model_error, current_error, noise): correct "
         "it in the bench file, or turn learning off",
-        EXIT_SAFETY_STOP,
     ),
     Fault.MOTION_UNEXPLAINED: FaultInfo(
         "no one brake explains what the node reported",
@@ -310,15 +281,12 @@ FAULTS: dict[Fault, FaultInfo] = {
     Fault.NOT_AT_REST: FaultInfo(
         "the node did not say that it rests after the stop frames",
         "switch the drive off before anybody comes near; then check that it obeys its stop, a mapped one its disarming",
-        EXIT_SAFETY_STOP,
     ),
     Fault.BUS_LOST: FaultInfo("the bus was lost", "check the interface and its cable", EXIT_BUS),
     Fault.INTERRUPTED: FaultInfo(
-        "stopped by the operator",
-        "if the brake is not home, --home brings it there before the next run",
-        EXIT_SAFETY_STOP,
+        "stopped by the operator", "if the brake is not home, --home brings it there before the next run"
     ),
-    Fault.INTERNAL: FaultInfo("an error in the program", "please report it with the log", EXIT_SAFETY_STOP),
+    Fault.INTERNAL: FaultInfo("an error in the program", "please report it with the log"),
     Fault.SENSOR_LATE: _soft("several periods without a valid sensor pair", "check node, wiring and bus load"),
     Fault.SEND_QUEUE_FULL: _soft(
         "the interface had no room for a command, which is lost",

@@ -158,7 +158,7 @@ class Watchdog:
             gone = self.wait(due_ns)
             armed, self.beat_ns = heartbeat.armed, heartbeat.beat_ns
             self.time_ns = self.clock.now_ns()
-            heartbeat.sign(self.time_ns)
+            heartbeat.mark_alive(self.time_ns)
             self.lateness_ns = max(self.lateness_ns, self.time_ns - due_ns)
             status = watch.step(self.time_ns, self.beat_ns, armed, gone)
         return status

@@ -14,7 +14,7 @@ from emb_runtime.errors import BusError, FrameError, PolicyRefusedError, UsageEr
 from emb_runtime.learning.learner import Learner
 from emb_runtime.records import Frame
 from emb_runtime.safety.guard import Guard, GuardRejectedError
-from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat, Pulse, Unwatched
+from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat, Unwatched
 from emb_runtime.safety.sensor_monitor import SensorMonitor
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.clock import SteppedClock
@@ -102,7 +102,7 @@ At = Callable[[str], None]
 class PlantedPulse:
     """A pulse in which each call may raise."""
 
-    def __init__(self, at: At, pulse: Pulse) -> None:
+    def __init__(self, at: At, pulse: Heartbeat) -> None:
         self._at, self._pulse = at, pulse
 
     @property
@@ -165,7 +165,7 @@ class Planted:
             self.raised += 1
             raise self._kind("in the way")
 
-    def run(self, simulate: Simulate, layout: Layout, pulse: Pulse) -> Any:
+    def run(self, simulate: Simulate, layout: Layout, pulse: Heartbeat) -> Any:
         """The outcome; raises what the loop raises."""
         clock = PlantedClock(self.at)
 
@@ -196,7 +196,7 @@ class Planted:
 
 def ended(planted: Planted, simulate: Simulate, layout: Layout, watched: bool) -> Fault | type[BaseException] | None:
     """The fault of a run, or what it raised."""
-    pulse: Pulse = Heartbeat.create(1e9, SteppedClock(10**15).now_ns()) if watched else Unwatched()
+    pulse: Heartbeat = Heartbeat.create(1e9, SteppedClock(10**15).now_ns()) if watched else Unwatched()
     try:
         fault: Fault | type[BaseException] | None = planted.run(simulate, layout, pulse).fault
     except BaseException as err:

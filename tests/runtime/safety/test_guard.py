@@ -302,7 +302,7 @@ def test_the_watchdog_learns_of_a_command_before_it_is_asked(bench: Bench, layou
             order.append((counter, answers))
 
         @property
-        def tripped(self) -> bool:  # type: ignore[override]
+        def tripped(self) -> bool:
             order.append("asked")
             return False
 
@@ -353,8 +353,7 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
         ("can/python_can.py", "self._bus.send"),
         ("safety/guard.py", "self._send"),
         ("cli/session.py", "bus.transport.send"),  # handed to the guard, and kept by nobody else
-        ("control/loop.py", "self.guard.send"),
-        ("control/loop.py", "self._send"),  # the loop's own method, which hands the frame to the guard
+        ("control/loop.py", "core.guard.send"),
         ("safety/watchdog_process.py", "transport.send"),  # the watchdog process, which has stop frames only
         ("safety/watchdog_process.py", "self.send"),
         ("drives/wire_guard.py", "self._send"),  # the second guard

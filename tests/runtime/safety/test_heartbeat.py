@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_runtime.safety.heartbeat import Heartbeat, Pulse, Unwatched
+from emb_runtime.safety.heartbeat import Heartbeat, Unwatched
 
 MS = 1_000_000
 START = 7_000 * MS
@@ -72,7 +72,7 @@ def test_each_word_has_one_writer_and_the_two_sides_share_no_cache_line(heartbea
     heartbeat.publish(5, 6)
     loop_lines, before = changed(before), contents(heartbeat)
     heartbeat.trip()
-    heartbeat.sign(START + 3)
+    heartbeat.mark_alive(START + 3)
     assert loop_lines
     assert changed(before)
     assert loop_lines.isdisjoint(changed(before))
@@ -81,7 +81,7 @@ def test_each_word_has_one_writer_and_the_two_sides_share_no_cache_line(heartbea
 def test_the_watchdog_counts_as_lost_after_four_silent_heartbeats_and_not_before(heartbeat: Heartbeat) -> None:
     assert heartbeat.watched(START + 20 * MS - 1)
     assert not heartbeat.watched(START + 20 * MS)
-    heartbeat.sign(START + 1)
+    heartbeat.mark_alive(START + 1)
     assert heartbeat.watched(START + 20 * MS)
     assert not heartbeat.watched(START + 20 * MS + 1)
 
@@ -107,7 +107,7 @@ def test_memory_that_is_no_heartbeat_is_refused(memory: bytes) -> None:
 
 
 def test_a_run_without_a_watchdog_is_never_tripped_and_always_watched() -> None:
-    pulse: Pulse = Unwatched()
+    pulse: Heartbeat = Unwatched()
     pulse.arm(START)
     pulse.beat(START)
     pulse.publish(14, 14)

@@ -250,13 +250,13 @@ def test_it_looks_on_an_absolute_grid_and_gives_signs_of_life(rig: Rig) -> None:
     rig.gone_ns = START + 60 * MS
     rig.late_ns = {START + 3 * MS: 300_000, START + 10 * MS: 7 * MS + 200_000}
     signs: list[int] = []
-    sign = rig.heartbeat.sign
+    mark_alive = rig.heartbeat.mark_alive
 
     def record(now_ns: int) -> None:
         signs.append(now_ns - START)
-        sign(now_ns)
+        mark_alive(now_ns)
 
-    rig.heartbeat.sign = record  # type: ignore[method-assign]
+    rig.heartbeat.mark_alive = record  # type: ignore[method-assign]
     report = rig.watchdog.run()
     expected = [k * MS for k in range(1, 61) if not 11 <= k <= 17]
     expected[2] += 300_000
