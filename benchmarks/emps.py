@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.estimate.windows import predict_windows
@@ -126,7 +126,7 @@ def main() -> None:
     plant = bench.plant("recorded")
     for asked, published in ((SYMMETRIC, PUBLISHED), (DIRECTED, PUBLISHED_BY_DIRECTION)):
         begun = time.process_time()
-        e = run_method("windows", bench, plant, [whole], asked, starts=2)
+        e = method_of("windows")(bench, plant, asked, starts=2).fit([whole])
         fits = "fits" if e.validation.fits else "DOES NOT FIT"
         print(f"the model {fits}; {time.process_time() - begun:.1f} s of the processor")
         print("".join(f"  - {caveat}\n" for caveat in e.caveats), end="")
@@ -142,7 +142,9 @@ def main() -> None:
         print("held back: the other recording, predicted in windows of 0.5 s from the first")
     position = np.concatenate([[first.angle], first.samples[:, 0]]) * TRAVEL
     scipy = least_squares(position, np.append(first.currents, first.currents[-1]) / TRAVEL)
-    plain, directed = (run_method("windows", bench, plant, [first], asked, starts=2) for asked in (SYMMETRIC, DIRECTED))
+    plain, directed = (
+        method_of("windows")(bench, plant, asked, starts=2).fit([first]) for asked in (SYMMETRIC, DIRECTED)
+    )
     for name, asked, values in (
         ("ours, symmetric", plain.asked, plain.values),
         ("ours, by direction", directed.asked, directed.values),

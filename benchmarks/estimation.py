@@ -30,8 +30,8 @@ from scipy import stats
 from emb_bench.brake.motion import Floats
 from emb_bench.design.problem import make_problem
 from emb_bench.design.search import search
-from emb_bench.estimate.methods import run_method
-from emb_bench.estimate.records import STARTS, EstimationProblem
+from emb_bench.estimate.methods import method_of
+from emb_bench.estimate.records import STARTS
 from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
@@ -97,7 +97,7 @@ def work(job: Job) -> list[Drawn]:
     found = []
     for seed in job.seeds:
         record = drawn(bench, job.plant, job.currents, states, seed)
-        e = run_method("oem", bench, bench.plant("exact"), [record], EstimationProblem(), starts=1)
+        e = method_of("oem")(bench, bench.plant("exact"), starts=1).fit([record])
         found.append(Drawn(e.values, e.intervals(), not e.validation.fits, e.validation.ratio))
     return found
 
@@ -181,7 +181,7 @@ def main() -> None:
         states = simulate(plant.mechanics, brake_of(bench), currents, bench.timing.sample_time).states
         record = drawn(bench, "exact", currents, states, seed)
         begun = time.perf_counter()
-        run_method("oem", bench, plant, [record], EstimationProblem())
+        method_of("oem")(bench, plant).fit([record])
         times.append(time.perf_counter() - begun)
     median = 1e3 * float(np.median(times))
     print(f"\none estimate of 4 parameters from 500 samples, {STARTS} starts: median {median:.0f} ms")

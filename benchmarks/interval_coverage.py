@@ -35,7 +35,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # the simulator is a neighbo
 
 from benchmarks.independent_simulator import Brake, Floats, Losses, brake_of, simulate
 from benchmarks.intervals import share
-from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
@@ -217,7 +217,7 @@ def judge(drawn: Drawn, method: str, *, systematic: bool) -> Outcome:
     problem = EstimationProblem(drawn.params)
     problem = with_systematic(problem, drawn.bench, drawn.plant) if systematic else problem
     begin = time.perf_counter()
-    e = run_method(method, drawn.bench, drawn.plant, [drawn.record], problem)
+    e = method_of(method)(drawn.bench, drawn.plant, problem).fit([drawn.record])
     seconds = time.perf_counter() - begin
     b = drawn.brake
     true = {"k_m": b.k_m, "k_1": b.k_1, "T_c": b.t_c, "f_v": b.f_v}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
-from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.excitation.reference import parse_excitation, run_excitation
@@ -103,7 +103,7 @@ def fit(
 ) -> Estimate:
     """An estimate, unless said otherwise of the four parameters, by output error, and from one start."""
     model = bench.plant(plant) if isinstance(plant, str) else plant
-    return run_method(method, bench, model, records, asked or EstimationProblem(), starts=starts, seed=seed)
+    return method_of(method)(bench, model, asked or EstimationProblem(), starts=starts, seed=seed).fit(records)
 
 
 def problem_of(bench: Bench, names: tuple[str, ...], *records: Experiment, plant: str = "exact") -> Problem:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import special
 
 from emb_bench.brake.quantities import quantity
-from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.records import Estimate
 
 LEVEL = 0.001  # Chance that a parameter of one and the same brake is said to differ, for all parameters together
@@ -33,7 +33,7 @@ def apart(e: Estimate) -> tuple[Differing, ...]:
     """
     if len(e.records) < 2 or e.validation.fits:
         return ()
-    alone = [run_method(e.method, e.bench, e.plant, [record], e.asked, starts=1) for record in e.records]
+    alone = [method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit([record]) for record in e.records]
     if not all(one.validation.fits for one in alone):
         return ()
     found = []

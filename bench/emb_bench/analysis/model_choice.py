@@ -34,7 +34,7 @@ import numpy as np
 from scipy import optimize, special
 
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import REWEIGHTED, finished, most, search, settled
 from emb_bench.estimate.prediction import Problem, make_problem
 from emb_bench.estimate.records import (
@@ -176,7 +176,7 @@ def choose_model(
 
     trusting = problems(replace(asked, systematic={}))
     simplest = trusting[0]
-    first = run_method("oem", bench, ordered[0], simplest.records, simplest.asked, starts=starts, seed=seed)
+    first = method_of("oem")(bench, ordered[0], simplest.asked, starts=starts, seed=seed).fit(simplest.records)
     fits = _from_the_best([fit_from(problem, first) for problem in trusting])
     if asked.systematic:
         fits = _from_the_best([_fit(own, fit.known()) for own, fit in zip(problems(asked), fits, strict=True)])
@@ -258,11 +258,7 @@ def fit_from(problem: Problem, e: Estimate, *, follow: bool = False) -> Fit:
 
 
 def _fit(problem: Problem, known: Mapping[Unknown, float], follow: bool = False) -> Fit:
-    start = problem.nominal()
-    for i, unknown in enumerate(problem.unknowns):
-        if unknown in known:
-            start[i] = known[unknown] / problem.units[i]
-    start = np.clip(start, *problem.bounds)
+    start = problem.started(known)
     if follow:
         start, _ = released(problem, start)
     weights = problem.weights(start)

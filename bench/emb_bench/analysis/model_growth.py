@@ -21,7 +21,7 @@ import numpy as np
 
 from emb_bench.analysis.model_choice import Candidate, ModelChoice, candidate, fit_from, ranked
 from emb_bench.brake.parameters import PARAMETERS
-from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, EstimationProblem, check_model, with_systematic
 from emb_bench.experiment.experiment import Experiment
@@ -89,7 +89,7 @@ def grow_model(
     """
     if plant.mechanics.solver != EXACT:
         raise UsageError(f"plant '{plant.name}': expected one that is solved exactly: others have no features to add")
-    first = run_method("oem", bench, plant, records, asked, starts=starts, seed=seed)
+    first = method_of("oem")(bench, plant, asked, starts=starts, seed=seed).fit(records)
     now = _judged(plant, first, ())
     added: tuple[str, ...] = ()
     seen: dict[tuple[str, ...], Candidate] = {(): now}

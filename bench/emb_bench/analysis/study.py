@@ -21,7 +21,7 @@ from emb_bench.analysis.model_choice import ModelChoice, choose_model, fit_from
 from emb_bench.analysis.model_growth import ModelGrowth, grow_model, grow_with_errors
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.recommendation import Recommendation, advise
-from emb_bench.estimate.methods import GAPS, run_method
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import SAME
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import (
@@ -195,7 +195,7 @@ def make_study(
     notes: list[str] = []
     for log, shown in zip(all_logs, names, strict=True):
         experiment, said = _read(log, bench, shown)
-        said += [] if wanted.method in GAPS else _hidden(experiment)
+        said += [] if method_of(wanted.method).gaps else _hidden(experiment)
         experiments.append(experiment)
         of_which = f"{shown}: " if len(all_logs) > 1 else ""
         warnings += [of_which + warning for warning in said]
@@ -282,7 +282,7 @@ def _answer(
     if wanted.systematic:
         asked = with_systematic(asked, bench, plant)
     if choice is None:
-        return run_method(wanted.method, bench, plant, records, asked, starts=wanted.starts, seed=wanted.seed)
+        return method_of(wanted.method)(bench, plant, asked, starts=wanted.starts, seed=wanted.seed).fit(records)
     e = choice.best.estimate
     return e if asked == e.asked else fit_from(Problem(bench, plant, asked, e.records), e).finished()
 

@@ -86,13 +86,11 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
     yield _of_the_information(evaluation)
     if options.method == NONE:
         return
-    from emb_bench.estimate.methods import run_method
+    from emb_bench.estimate.methods import method_of
 
     asked = with_systematic(EstimationProblem(options.params, options.nuisances, prior), bench, plant)
-    estimate = run_method(
-        options.method, bench, plant, [experiment.seen_by(plant)], asked, starts=options.starts, seed=options.seed
-    )
-    yield _of_the_estimate(estimate, evaluation, log.truth)
+    method = method_of(options.method)(bench, plant, asked, starts=options.starts, seed=options.seed)
+    yield _of_the_estimate(method.fit([experiment.seen_by(plant)]), evaluation, log.truth)
 
 
 def _of_the_run(log: RunLog) -> dict[str, Any]:

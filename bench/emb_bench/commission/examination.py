@@ -15,7 +15,7 @@ from emb_bench.analysis.model_growth import grow_model
 from emb_bench.brake.parameters import FEATURES, SI
 from emb_bench.commission.noise import noise_at_rest, noise_in_motion
 from emb_bench.commission.records import CurrentCheck, FirstMove, Identification, Rest
-from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Booleans, Experiment, Floats
@@ -179,7 +179,7 @@ class _Fits:
         if any(own.x0() != (0.0, 0.0) for own in self.experiments):  # known by some samples at rest only
             lags = (*lags, "x1_0")
         asked = EstimationProblem(PARAMETER_NAMES, (*(features or {}), *lags), self.prior)
-        return run_method("oem", self.bench, plant, records, asked, starts=starts)
+        return method_of("oem")(self.bench, plant, asked, starts=starts).fit(records)
 
 
 def _best(fits: _Fits, before: Identification | None) -> Estimate:

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from emb_bench.brake.motion import Floats, is_plain
+from emb_bench.estimate.methods import Method
 from emb_bench.estimate.output_error import finished, sandwich
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End, Estimate
@@ -33,66 +34,62 @@ WIDE = 1e3  # Initial standard deviation of a parameter without a prior, over it
 ON_THE_GRID = 0.01  # Share of a period by which samples may be off the grid without a caveat
 
 
-def estimate(problem: Problem) -> Estimate:
-    """Estimate some of k_m, k_1, T_c and f_v; the others of them are nominal.
+class RecursiveLeastSquares(Method):
+    """Some of k_m, k_1, T_c and f_v from the equation of motion; the others of them are nominal."""
 
-    Args:
-        problem: records, unknowns, and a model of the thesis's equations, however they are solved.
-
-    Raises:
-        UsageError: another parameter is to be estimated, the model is another, or too few periods carry information.
-    """
-    others = [name for name in problem.asked.names if name not in PARAMETER_NAMES]
-    if others:
-        raise UsageError(
-            f"recursive least squares estimates {', '.join(PARAMETER_NAMES)}, not {', '.join(others)}: it follows no "
-            "motion from its start; another method does"
+    def solve(self, problem: Problem) -> Estimate:
+        """As :class:`Method`."""
+        others = [name for name in problem.asked.names if name not in PARAMETER_NAMES]
+        if others:
+            raise UsageError(
+                f"recursive least squares estimates {', '.join(PARAMETER_NAMES)}, not {', '.join(others)}: it follows "
+                "no motion from its start; another method does"
+            )
+        plant = problem.plant
+        if plant.mechanics.solver == EXACT and not is_plain(plant.mechanics):
+            raise UsageError(
+                f"plant '{plant.name}': recursive least squares knows the thesis's torques only, which are linear in "
+                "the parameters; another method takes this model"
+            )
+        parts = [regression(problem, record) for record in problem.records]
+        rows, errors = (np.concatenate(part) for part in zip(*parts, strict=True))
+        counts = np.any(rows != 0.0, axis=1)
+        used = int(counts.sum())
+        if used < len(problem.unknowns):
+            raise UsageError(
+                f"recursive least squares: the brake surely moves in {used} periods, too few for "
+                f"{len(problem.unknowns)} unknowns: excite it more"
+            )
+        z = recursion(rows[counts], errors[counts], *beginning(problem))
+        low, high = problem.bounds
+        belief_mean, belief = problem.belief
+        if (z < low).any() or (z > high).any():
+            stacked = np.concatenate([rows, np.diag(belief)]), np.concatenate([errors, belief * belief_mean])
+            z = np.clip(lsq_linear(*stacked, bounds=(low, high)).x, low, high)
+        left = errors - rows @ z
+        relative = rows * z
+        prior = np.diag((belief * z) ** 2)
+        information = relative.T @ relative + prior
+        paired = np.stack([relative, np.zeros_like(relative)], axis=1).reshape(-1, len(z))
+        known = (belief_mean - z) * belief
+        spread = sandwich(
+            information,
+            np.concatenate([paired, np.diag(belief * z)]),
+            np.concatenate([np.stack([left, np.zeros_like(left)], axis=1).ravel(), known]),
+            [len(part) for part, _ in parts],
         )
-    plant = problem.plant
-    if plant.mechanics.solver == EXACT and not is_plain(plant.mechanics):
-        raise UsageError(
-            f"plant '{plant.name}': recursive least squares knows the thesis's torques only, which are linear in the "
-            "parameters; another method takes this model"
+        cost = float(left @ left + known @ known)
+        values, nominal = tuple((z * problem.units).tolist()), tuple(problem.units.tolist())
+        return finished(
+            problem,
+            z,
+            problem.weights(z),
+            (End(cost, values, nominal, True, used),),
+            information=information,
+            sandwich=spread,
+            method="rls",
+            caveats=_caveats(problem, used, len(counts)),
         )
-    parts = [regression(problem, record) for record in problem.records]
-    rows, errors = (np.concatenate(part) for part in zip(*parts, strict=True))
-    counts = np.any(rows != 0.0, axis=1)
-    used = int(counts.sum())
-    if used < len(problem.unknowns):
-        raise UsageError(
-            f"recursive least squares: the brake surely moves in {used} periods, too few for {len(problem.unknowns)} "
-            "unknowns: excite it more"
-        )
-    z = recursion(rows[counts], errors[counts], *beginning(problem))
-    low, high = problem.bounds
-    belief_mean, belief = problem.belief
-    if (z < low).any() or (z > high).any():
-        stacked = np.concatenate([rows, np.diag(belief)]), np.concatenate([errors, belief * belief_mean])
-        z = np.clip(lsq_linear(*stacked, bounds=(low, high)).x, low, high)
-    left = errors - rows @ z
-    relative = rows * z
-    prior = np.diag((belief * z) ** 2)
-    information = relative.T @ relative + prior
-    paired = np.stack([relative, np.zeros_like(relative)], axis=1).reshape(-1, len(z))
-    known = (belief_mean - z) * belief
-    spread = sandwich(
-        information,
-        np.concatenate([paired, np.diag(belief * z)]),
-        np.concatenate([np.stack([left, np.zeros_like(left)], axis=1).ravel(), known]),
-        [len(part) for part, _ in parts],
-    )
-    cost = float(left @ left + known @ known)
-    values, nominal = tuple((z * problem.units).tolist()), tuple(problem.units.tolist())
-    return finished(
-        problem,
-        z,
-        problem.weights(z),
-        (End(cost, values, nominal, True, used),),
-        information=information,
-        sandwich=spread,
-        method="rls",
-        caveats=_caveats(problem, used, len(counts)),
-    )
 
 
 def regression(problem: Problem, record: Experiment) -> tuple[Floats, Floats]:

@@ -23,6 +23,7 @@ import numpy as np
 from scipy import special
 
 from emb_bench.brake.motion import Floats
+from emb_bench.estimate.methods import Method
 from emb_bench.estimate.model_validation import LEVEL, examine
 from emb_bench.estimate.outliers import APART, few, outliers
 from emb_bench.estimate.prediction import Problem
@@ -37,46 +38,41 @@ LEFT_OUT = 3  # Most times that outliers are looked for
 _NEAR_BOUND = 1e-6  # share of the width of what is searched
 
 
-def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
-    """Estimate parameters from one record, or from several of the same brake.
+class OutputError(Method):
+    """The simulation nearest to the samples, found from the nominal brake, from random starts, and along a filter."""
 
-    Args:
-        problem: records, model and unknowns.
-        starts: local searches; the first begins at the nominal brake, the others at random ones, and one more from
-            what follows the measured brake if they find no model that fits.
-        seed: of the random numbers.
+    systematic = True
 
-    Raises:
-        UsageError: ``starts`` is below 1.
-    """
-    ideal = replace(problem, asked=replace(problem.asked, systematic={}))
-    points = start_points(ideal, starts, seed)
-    weights = ideal.weights(points[0])
-    ideal, searches = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
-    searches = sorted(searches, key=lambda pair: pair[1].cost)
-    for _ in range(LEFT_OUT):
-        kept = _without_outliers(ideal, searches[0][0], weights)
-        if kept is ideal:
-            break
-        ideal, weights = kept, kept.weights(points[0])
+    def solve(self, problem: Problem) -> Estimate:
+        """As :class:`Method`."""
+        ideal = replace(problem, asked=replace(problem.asked, systematic={}))
+        points = start_points(ideal, self.starts, self.seed)
+        weights = ideal.weights(points[0])
         ideal, searches = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
-    problem = replace(problem, records=ideal.records)
-    ends = _with_systematic(problem, ideal, searches, weights)
-    if ends[0][1].cost > most(weights, len(problem.unknowns)):
-        near, before = released(ideal, points[0])
-        z, end = search(ideal, near, weights)
-        end = replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)
-        ideal, searches = _settled(ideal, [*searches, (z, end)], weights)
+        searches = sorted(searches, key=lambda pair: pair[1].cost)
+        for _ in range(LEFT_OUT):
+            kept = _without_outliers(ideal, searches[0][0], weights)
+            if kept is ideal:
+                break
+            ideal, weights = kept, kept.weights(points[0])
+            ideal, searches = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
         problem = replace(problem, records=ideal.records)
         ends = _with_systematic(problem, ideal, searches, weights)
-    problem, ends = _settled(problem, ends, weights)
-    best = ends[0][0]
-    if problem.plant.instruments.clock_jitter > 0.0:
-        for _ in range(REWEIGHTED):
-            weights = problem.weights(best)
-            best, end = search(problem, best, weights)
-        ends[0] = (best, replace(end, start=ends[0][1].start))
-    return finished(problem, best, weights, tuple(end for _, end in ends))
+        if ends[0][1].cost > most(weights, len(problem.unknowns)):
+            near, before = released(ideal, points[0])
+            z, end = search(ideal, near, weights)
+            end = replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)
+            ideal, searches = _settled(ideal, [*searches, (z, end)], weights)
+            problem = replace(problem, records=ideal.records)
+            ends = _with_systematic(problem, ideal, searches, weights)
+        problem, ends = _settled(problem, ends, weights)
+        best = ends[0][0]
+        if problem.plant.instruments.clock_jitter > 0.0:
+            for _ in range(REWEIGHTED):
+                weights = problem.weights(best)
+                best, end = search(problem, best, weights)
+            ends[0] = (best, replace(end, start=ends[0][1].start))
+        return finished(problem, best, weights, tuple(end for _, end in ends))
 
 
 def _without_outliers(problem: Problem, z: Floats, weights: Sequence[Floats]) -> Problem:

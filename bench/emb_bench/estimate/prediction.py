@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -141,6 +141,14 @@ class Problem:
             z[i] = known[unknown.name]
         low, high = self.bounds
         return np.clip(z, low, high)
+
+    def started(self, known: Mapping[Unknown, float]) -> Floats:
+        """The z to begin with where some unknowns are known [SI units]."""
+        z = self.nominal()
+        for i, unknown in enumerate(self.unknowns):
+            z[i] = known[unknown] / self.units[i] if unknown in known else z[i]
+        result: Floats = np.clip(z, *self.bounds)
+        return result
 
     def theta(self, z: Floats) -> BrakeParameters:
         """Parameters of the brake for a vector of scaled unknowns."""

@@ -22,6 +22,7 @@ from scipy.optimize import minimize_scalar
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.innovations import Filter, Followed
+from emb_bench.estimate.methods import Method
 from emb_bench.estimate.model_validation import Disturbance, examine
 from emb_bench.estimate.output_error import by_record, finished, of_losses, start_points
 from emb_bench.estimate.prediction import Problem
@@ -37,54 +38,50 @@ HYSTERESIS = (
 )
 
 
-def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
-    """Estimate parameters, and how much the brake was disturbed.
+class PredictionError(Method):
+    """The smallest innovations, and how much the brake was disturbed."""
 
-    Args:
-        problem: records, model and unknowns.
-        starts: local searches; the first begins at the nominal brake, the others at random ones.
-        seed: of the random numbers.
+    systematic = True
 
-    Raises:
-        UsageError: ``starts`` is below 1.
-    """
-    points = start_points(problem, starts, seed)
-    followed = [converge(Filter(problem, strong(problem)), point) for point in points]
-    first = int(np.argmin([end.cost for _, end in followed]))
-    found, near, ratio = likely(problem, followed[first][0])
-    searches = []
-    for i, (z, before) in enumerate(followed):
-        z, end = converge(found, near if i == first else z)
-        searches.append((z, replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)))
-    searches = [(z, replace(end, cost=found.deviance(z, problem.weights(z)))) for z, end in searches]
-    searches.sort(key=lambda pair: pair[1].cost)
-    best = searches[0][0]
-    weights = problem.weights(best)
-    gains = found.gains(best, weights)
-    errors, jacobian = found.jacobian(best, weights, gains)
+    def solve(self, problem: Problem) -> Estimate:
+        """As :class:`Method`."""
+        points = start_points(problem, self.starts, self.seed)
+        followed = [converge(Filter(problem, strong(problem)), point) for point in points]
+        first = int(np.argmin([end.cost for _, end in followed]))
+        found, near, ratio = likely(problem, followed[first][0])
+        searches = []
+        for i, (z, before) in enumerate(followed):
+            z, end = converge(found, near if i == first else z)
+            searches.append((z, replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)))
+        searches = [(z, replace(end, cost=found.deviance(z, problem.weights(z)))) for z, end in searches]
+        searches.sort(key=lambda pair: pair[1].cost)
+        best = searches[0][0]
+        weights = problem.weights(best)
+        gains = found.gains(best, weights)
+        errors, jacobian = found.jacobian(best, weights, gains)
 
-    shown = Followed(found, best, weights, gains)
-    disturbance, residuals = Disturbance(found.walk, found.load, ratio), by_record(errors, weights)
-    validation = examine(problem, best, weights, residuals, jacobian, disturbance, shown, errors)
-    return finished(
-        problem,
-        best,
-        weights,
-        tuple(end for _, end in searches),
-        (errors, jacobian),
-        validation,
-        method="pem",
-        process_noise=found.walk,
-        load_noise=found.load,
-        caveats=(
-            *of_losses(problem),
-            *(
-                (HYSTERESIS,)
-                if problem.plant.mechanics.hysteresis + problem.plant.mechanics.play > 0.0 and ratio > 0.0
-                else ()
+        shown = Followed(found, best, weights, gains)
+        disturbance, residuals = Disturbance(found.walk, found.load, ratio), by_record(errors, weights)
+        validation = examine(problem, best, weights, residuals, jacobian, disturbance, shown, errors)
+        return finished(
+            problem,
+            best,
+            weights,
+            tuple(end for _, end in searches),
+            (errors, jacobian),
+            validation,
+            method="pem",
+            process_noise=found.walk,
+            load_noise=found.load,
+            caveats=(
+                *of_losses(problem),
+                *(
+                    (HYSTERESIS,)
+                    if problem.plant.mechanics.hysteresis + problem.plant.mechanics.play > 0.0 and ratio > 0.0
+                    else ()
+                ),
             ),
-        ),
-    )
+        )
 
 
 def likely(problem: Problem, near: Floats) -> tuple[Filter, Floats, float]:

@@ -30,6 +30,7 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import OF_A_RECORD
+from emb_bench.estimate.methods import Method
 from emb_bench.estimate.model_validation import examine
 from emb_bench.estimate.output_error import by_record, estimate_at, start_points
 from emb_bench.estimate.prediction import Problem
@@ -68,32 +69,28 @@ ENOUGH = 20
 """Fewest windows for each unknown of the longest windows to choose from: the scatter of fewer is too uncertain."""
 
 
-def estimate(problem: Problem, *, starts: int, seed: int) -> Estimate:
-    """Estimates what all windows of the records share.
+class Windows(Method):
+    """What all windows of the records share."""
 
-    Args:
-        problem: records, model and unknowns, none of which belongs to a record.
-        starts: local searches.
-        seed: of where they begin.
+    gaps = False
 
-    Raises:
-        UsageError: an unknown belongs to a record, or there are too few windows for the unknowns.
-    """
-    shared = problem.unknowns
-    if any(unknown.record is not None for unknown in shared):
-        raise UsageError(f"method windows: each window has a start of its own: leave out {', '.join(OF_A_RECORD)}")
-    if window_of(problem) and course_of(problem):
-        cut = _enough(problem)
-        points = _points(cut, start_points(problem, starts, seed))
-        searches = sorted((search(*point) for point in points), key=lambda pair: pair[1].cost)
-        at, weights, ends = searches[0][0], points[0][2], tuple(end for _, end in searches)
-        return _finished(problem, cut, at, weights, ends, [_other(problem, at.shared) - at.shared], ())
-    problem, near, moved, said = _chosen(problem, starts, seed)
-    cut = windowed(problem)
-    begun = begun_at(cut, near)
-    weights = weights_of(cut, begun)
-    at, end = search(cut, begun, weights)
-    return _finished(problem, cut, at, weights, (end,), [_other(problem, at.shared) - at.shared, *moved], said)
+    def solve(self, problem: Problem) -> Estimate:
+        """As :class:`Method`."""
+        shared = problem.unknowns
+        if any(unknown.record is not None for unknown in shared):
+            raise UsageError(f"method windows: each window has a start of its own: leave out {', '.join(OF_A_RECORD)}")
+        if window_of(problem) and course_of(problem):
+            cut = _enough(problem)
+            points = _points(cut, start_points(problem, self.starts, self.seed))
+            searches = sorted((search(*point) for point in points), key=lambda pair: pair[1].cost)
+            at, weights, ends = searches[0][0], points[0][2], tuple(end for _, end in searches)
+            return _finished(problem, cut, at, weights, ends, [_other(problem, at.shared) - at.shared], ())
+        problem, near, moved, said = _chosen(problem, self.starts, self.seed)
+        cut = windowed(problem)
+        begun = begun_at(cut, near)
+        weights = weights_of(cut, begun)
+        at, end = search(cut, begun, weights)
+        return _finished(problem, cut, at, weights, (end,), [_other(problem, at.shared) - at.shared, *moved], said)
 
 
 def _enough(problem: Problem) -> list[Problem]:

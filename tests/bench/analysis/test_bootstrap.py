@@ -8,7 +8,7 @@ import pytest
 
 from emb_bench.analysis import bootstrap as module
 from emb_bench.analysis.bootstrap import bootstrap
-from emb_bench.estimate.methods import refit, run_method
+from emb_bench.estimate.methods import method_of, refit
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import Bench
@@ -72,9 +72,9 @@ def test_only_what_the_runs_share_is_drawn(bench: Bench) -> None:
 
 def test_every_draw_is_estimated_by_the_same_method(bench: Bench) -> None:
     plant, records = bench.plant("exact"), runs(bench, count=3)
-    e = run_method("rls", bench, plant, records, EstimationProblem(("k_m", "f_v")))
+    e = method_of("rls")(bench, plant, EstimationProblem(("k_m", "f_v"))).fit(records)
     found = bootstrap(e, draws=60, seed=0)
-    alone = [run_method("rls", bench, plant, [r] * 3, EstimationProblem(("k_m", "f_v"))).values for r in records]
+    alone = [method_of("rls")(bench, plant, EstimationProblem(("k_m", "f_v"))).fit([r] * 3).values for r in records]
     for values in alone:  # three times the same run is one draw in 27
         assert np.isclose(found.values, values, rtol=1e-9).all(axis=1).any()
 

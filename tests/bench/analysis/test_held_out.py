@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from emb_bench.analysis.held_out import held_out, leave_one_out
-from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.open_loop import simulate
@@ -117,9 +117,8 @@ def test_prediction_errors_of_a_disturbed_brake_are_those_of_its_filter(bench: B
         noise = rng.standard_normal((len(states), 2)) * [bench.noise.angle, bench.noise.velocity]
         return Experiment(f"{seed}", np.asarray(CURRENTS), np.array(states) + noise, 0.0, 0.0, 1e-4, True)
 
-    e = run_method(
-        "pem", bench, bench.plant("exact"), [disturbed(n) for n in range(3)], EstimationProblem(PARAMS), starts=1
-    )
+    method = method_of("pem")(bench, bench.plant("exact"), EstimationProblem(PARAMS), starts=1)
+    e = method.fit([disturbed(n) for n in range(3)])
     assert e.process_noise > 0.0
     assert held_out(e, disturbed(7)).fits
     assert not held_out(replace(e, method="oem"), disturbed(7)).fits

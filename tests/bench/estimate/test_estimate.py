@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from emb_bench.brake.motion import no_sensitivity, rest
-from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import search, start_points
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import METHODS, EstimationProblem
@@ -232,13 +232,13 @@ def test_every_method_answers_by_its_name_and_no_other(bench: Bench) -> None:
     plant, data, b = bench.plant("exact"), exactly(bench), bench.brake
     for name in METHODS:
         asked = EstimationProblem(("f_v",), window=0.1) if name == "windows" else EstimationProblem(("f_v",))
-        found = run_method(name, bench, plant, [data], asked, starts=1, seed=1)
+        found = method_of(name)(bench, plant, asked, starts=1, seed=1).fit([data])
         assert found.method == name
         assert found.values[0] == pytest.approx(b.f_v, rel=0.2)
         low, high = found.intervals()[0]
         assert low < found.values[0] < high
     with pytest.raises(UsageError, match="no method is called 'kalman'; expected one of oem, pem, rls, windows"):
-        run_method("kalman", bench, plant, [data], EstimationProblem())
+        method_of("kalman")
 
 
 def test_the_same_seed_begins_at_the_same_points_all_within_the_ranges(bench: Bench) -> None:

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from emb_bench.estimate.least_squares import SURE, recursion
-from emb_bench.estimate.methods import NOT_ALONG
+from emb_bench.estimate.methods import IDEAL_SENSORS
 from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
@@ -113,7 +113,7 @@ def test_its_own_error_counts_as_misfit_and_the_caveats_say_so(bench: Bench) -> 
 def test_it_says_that_it_estimates_no_systematic_errors_where_the_bench_cannot_exclude_them(bench: Bench) -> None:
     asked = with_systematic(EstimationProblem(), bench, bench.plant("exact"))
     trusted, found = (estimate(bench, "exact", [chirped(bench)], a) for a in (EstimationProblem(), asked))
-    assert found.caveats == (*trusted.caveats, NOT_ALONG)
+    assert found.caveats == (*trusted.caveats, IDEAL_SENSORS)
     assert (found.values == trusted.values).all()
     assert (found.deviations() == trusted.deviations()).all()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emb_bench.estimate.methods import run_method
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.estimate.shooting import begun_at, by_windows, linearised, weights_of, windowed
@@ -39,7 +39,7 @@ def made(found: Recording, text: str = MAP) -> tuple[Bench, Experiment]:
 
 def fitted(found: Recording, asked: EstimationProblem = ASKED, text: str = MAP) -> Estimate:
     bench, data = made(found, text)
-    return run_method("windows", bench, bench.plant("recorded"), [data], asked, starts=1)
+    return method_of("windows")(bench, bench.plant("recorded"), asked, starts=1).fit([data])
 
 
 def of_machine(e: Estimate) -> dict[str, tuple[float, float]]:
@@ -184,7 +184,7 @@ def test_too_few_windows_and_starts_that_are_asked_for_are_refused() -> None:
     bench, own = made(data)
     plant = bench.plant("recorded")
     with pytest.raises(UsageError, match="no other feature"):
-        run_method("windows", bench, plant, [own], EstimationProblem(("viscous_asymmetry",), ("break_away",)))
+        method_of("windows")(bench, plant, EstimationProblem(("viscous_asymmetry",), ("break_away",))).fit([own])
 
 
 def test_an_imported_recording_is_estimated_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
