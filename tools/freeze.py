@@ -72,6 +72,7 @@ EXPLAINED: dict[str, str] = {
     "info/aborted/says/*": REST,
     "estimate/emps windows/says/*": WINDOWS,
     "demo/run/numbers": "76c82d4: the summary has a line on the motion",
+    "design/D of two/*": "d35eddd: an annealing moves the Euler brake as every other, with a third of the variations",
 }
 """The same, of values that differ on purpose."""
 

@@ -17,6 +17,7 @@ from enum import StrEnum
 from emb_bench.analysis.drift import Drift
 from emb_bench.analysis.profile import Profile
 from emb_bench.analysis.recommendation import HELPS, PRECISE, Recommendation
+from emb_bench.estimate.intervals import interval as with_profile
 from emb_bench.estimate.records import Estimate, Unknown
 from emb_bench.information.identifiability import GROSS, Finding
 
@@ -97,10 +98,9 @@ def conclude(
     for unknown, shown, label, value, (low, high), deviation in zip(*columns, strict=True):
         finding, one = findings.get(label), of_profile.get(label)
         interval = (low, high)
-        # A profile is of output error and assumes the bench's noise: its interval is too narrow for a model that
-        # does not fit, and is not centred on the estimate of another method.
-        if one is not None and (one.shape != "closed" or (e.validation.fits and e.method == "oem")):
-            interval = (min(low, one.interval[0]), max(high, one.interval[1])) if e.open().any() else one.interval
+        if one is not None:
+            holds, biased = e.validation.fits and e.method == "oem", bool(e.open().any())
+            interval = with_profile(interval, one.interval, closed=one.shape == "closed", holds=holds, biased=biased)
         if unknown.name in e.asked.along:
             continue
         why_not = "; ".join(_doubts(e, unknown, label, deviation, interval, finding, one))

@@ -21,6 +21,7 @@ from emb_bench.analysis.model_choice import ModelChoice, choose_model, fit_from
 from emb_bench.analysis.model_growth import ModelGrowth, grow_model, grow_with_errors
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.recommendation import Recommendation, advise
+from emb_bench.estimate.intervals import union
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import SAME
 from emb_bench.estimate.prediction import Problem
@@ -294,10 +295,7 @@ def covering(
     if choice is None or len(choice.left_over) < 2:
         return tuple(conclusions)
     wide = [choice.interval(unknown) for unknown in unknowns]
-    return tuple(
-        replace(c, interval=(min(c.interval[0], low), max(c.interval[1], high)))
-        for c, (low, high) in zip(conclusions, wide, strict=True)
-    )
+    return tuple(replace(c, interval=union(c.interval, other)) for c, other in zip(conclusions, wide, strict=True))
 
 
 def _predicts(*found: Sequence[HeldOut]) -> bool:

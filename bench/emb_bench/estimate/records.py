@@ -12,6 +12,7 @@ import numpy as np
 from emb_bench.brake.motion import Floats, is_plain
 from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS, scale
 from emb_bench.brake.quantities import Quantity, quantity
+from emb_bench.estimate.intervals import deviations
 from emb_bench.experiment.evaluation import Question
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.model_evaluator import SystematicErrors
@@ -309,12 +310,8 @@ class Estimate:
         return deviations
 
     def deviations(self) -> Floats:
-        """Standard deviations to be used: the Cramér-Rao bound; at least ``robust`` for a wrong model.
-
-        They allow for the one suspect that may have moved an unknown most without being noticed (:meth:`open`).
-        """
-        wide: Floats = np.hypot(self.cramer_rao(), self.open())
-        return wide if self.validation.fits else np.maximum(wide, self.robust())
+        """Standard deviations by the rules of :mod:`emb_bench.estimate.intervals`."""
+        return deviations(self.cramer_rao(), self.open(), self.robust(), fits=self.validation.fits)
 
     def open(self) -> Floats:
         """Standard deviations of what the worst of the suspects may have moved each unknown by; 0 without any."""

@@ -1,0 +1,50 @@
+"""Rules by which an interval of an estimate is made, in the order in which they apply (docs/explanation/estimation.md).
+
+1. *The information*: a Gaussian interval with the Cramér-Rao bound as its deviation.
+2. *What may have gone unnoticed*: the largest bias that one unmodelled effect may have caused is added in quadrature.
+3. *A model that does not fit*: the deviation is at least that of the sandwich, which the residuals give.
+4. *The likelihood profile*, where one was made, takes the interval's place if it is not closed, or if its assumptions
+   hold: the model fits, and the method is output error. Beside a bias by rule 2 the union of both counts.
+5. *Several models* that the records do not tell apart: the union with the interval of their mixture.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from emb_bench.brake.motion import Floats
+
+Interval = tuple[float, float]
+
+
+def deviations(bound: Floats, unnoticed: Floats, sandwich: Floats, *, fits: bool) -> Floats:
+    """Standard deviations by rules 1 to 3, shape (unknowns,).
+
+    Args:
+        bound: Cramér-Rao bounds.
+        unnoticed: largest biases that one unmodelled effect may have caused without being noticed.
+        sandwich: deviations from the residuals.
+        fits: True if the model fits.
+    """
+    total: Floats = np.hypot(bound, unnoticed)
+    return total if fits else np.maximum(total, sandwich)
+
+
+def interval(gaussian: Interval, profile: Interval, *, closed: bool, holds: bool, biased: bool) -> Interval:
+    """Interval of one unknown by rule 4.
+
+    Args:
+        gaussian: by rules 1 to 3.
+        profile: of the likelihood.
+        closed: True if the profile rises beyond the level on both sides.
+        holds: True if its assumptions hold.
+        biased: True if rule 2 widened the Gaussian one.
+    """
+    if closed and not holds:
+        return gaussian
+    return union(gaussian, profile) if biased else profile
+
+
+def union(one: Interval, other: Interval) -> Interval:
+    """The smallest interval that holds both."""
+    return min(one[0], other[0]), max(one[1], other[1])
