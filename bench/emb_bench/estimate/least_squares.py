@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from emb_bench.brake.motion import Floats, is_plain
-from emb_bench.estimate.methods import Method
+from emb_bench.estimate.method import Method
 from emb_bench.estimate.output_error import finished, sandwich
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End, Estimate

@@ -23,7 +23,7 @@ import numpy as np
 from scipy import special
 
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.methods import Method
+from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import LEVEL, examine
 from emb_bench.estimate.outliers import APART, few, outliers
 from emb_bench.estimate.prediction import Problem

@@ -22,7 +22,7 @@ from scipy.optimize import minimize_scalar
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.innovations import Filter, Followed
-from emb_bench.estimate.methods import Method
+from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import Disturbance, examine
 from emb_bench.estimate.output_error import by_record, finished, of_losses, start_points
 from emb_bench.estimate.prediction import Problem

@@ -30,7 +30,7 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import OF_A_RECORD
-from emb_bench.estimate.methods import Method
+from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import examine
 from emb_bench.estimate.output_error import by_record, estimate_at, start_points
 from emb_bench.estimate.prediction import Problem

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from emb_bench.estimate.least_squares import SURE, recursion
-from emb_bench.estimate.methods import IDEAL_SENSORS
+from emb_bench.estimate.method import IDEAL_SENSORS
 from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
