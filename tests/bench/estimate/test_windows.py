@@ -10,8 +10,7 @@ import pytest
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import Estimate, EstimationProblem
-from emb_bench.estimate.shooting import begun_at, by_windows, linearised, weights_of, windowed
-from emb_bench.estimate.windows import predict_windows
+from emb_bench.estimate.windows import begun_at, by_windows, linearised, predict_windows, weights_of, windowed
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
