@@ -1,4 +1,4 @@
-"""What all estimation methods share: options in the constructor, ``fit`` gives the estimate."""
+"""Base of the estimation methods: options in the constructor, ``fit`` gives the estimate."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ ENOUGH = 20
 
 
 class Windows(Method):
-    """What all windows of the records share."""
+    """Output error of all windows: the parameters that they share."""
 
     gaps = False
 
