@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from emb_bench.logs.mcap_reader import MAGIC
+from emb_bench.logs.mcap_file import MAGIC
 from emb_runtime.records import CycleRecord
 from tests.bench.damaged import (
     CHUNK,

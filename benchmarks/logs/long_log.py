@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.logs.log import read_log
-from emb_bench.logs.mcap_reader import MAGIC
+from emb_bench.logs.mcap_file import MAGIC
 from emb_bench.sim.open_loop import held, march, trajectory
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, protect
 from emb_runtime.can.messages import Layout, Message
@@ -153,7 +153,7 @@ class Writer:
             },
         )
         path.write_bytes(head.getvalue())
-        self._channels = {c.topic: number for number, c in read_log(path).contents.channels.items()}
+        self._channels = {name: topic.channel for name, topic in read_log(path).topics.items()}
         names = {
             m.name: mcap_schema.message_topic(m.name, m.identifier, self._fields(m)) for m in layout.messages.values()
         }

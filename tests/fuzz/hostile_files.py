@@ -28,7 +28,7 @@ import zstandard
 from mcap.opcode import Opcode
 from onnx import helper
 
-from emb_bench.logs.mcap_reader import MAGIC
+from emb_bench.logs.mcap_file import MAGIC
 from emb_runtime.config.bench import load_bench, shipped_bench_text
 from emb_runtime.policy.contract import CONTRACT_KEY
 from emb_runtime.policy.operators import FIXED

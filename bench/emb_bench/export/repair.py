@@ -6,16 +6,15 @@ import argparse
 import hashlib
 import os
 from collections import Counter
-from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from mcap import records as mcap
 from mcap.writer import CompressionType, Writer
 
 from emb_bench.logs.log import REPAIR
-from emb_bench.logs.mcap_reader import RecordReader
+from emb_bench.logs.mcap_file import McapFile
 from emb_bench.output import new_file
 from emb_runtime.errors import EXIT_DONE, LogError, UsageError
 from emb_runtime.log.recorder_process import CHUNK
@@ -57,19 +56,15 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-@dataclass
-class Found:
+class Found(NamedTuple):
     """Content of a damaged log."""
 
-    missing: list[str] = field(default_factory=list)  # Descriptions of the missing parts
-    schemas: dict[int, mcap.Schema] = field(default_factory=dict)
-    channels: dict[int, mcap.Channel] = field(default_factory=dict)  # Those whose schema is left
-    kept: int = 0  # Messages of these channels
-    earlier: str = ""  # Missing parts that an earlier repair reported
+    missing: tuple[str, ...]  # Descriptions of the missing parts
+    kept: int  # Messages that are saved
 
 
 def repair(source: Path, target: Path) -> Found | None:
-    """Write what is left of a log as a finished one, in two passes, record by record.
+    """Write what is left of a log as a finished one, in two passes, chunk by chunk.
 
     Args:
         source: the log.
@@ -85,64 +80,51 @@ def repair(source: Path, target: Path) -> Found | None:
     try:
         with open_regular(source) as file:
             size = os.fstat(file.fileno()).st_size  # a log that is being recorded grows between the passes
-            found = _look(RecordReader(source, file, size))
-            if not found.missing:
+            whole, counts = McapFile(source, file, size), Counter[int]()
+            for _, _, chunk in whole.chunks():
+                counts.update(chunk.headers["channel"].tolist())
+            # The copy of a description in the summary will do if it is lost with the first chunk.
+            described = {n: c for n, c in whole.channels.items() if c.schema_id in whole.schemas}
+            kept = sum(counts[number] for number in described)
+            if lost := counts.total() - kept:
+                whole.name_missing(f"{lost} messages of a topic whose description is lost")
+            if not whole.missing:
                 return None
-            if not found.kept:
-                raise LogError(f"{source}: not one message is left in this log: {'; '.join(found.missing)}")
-            digest = _sha256(file, size)
+            if not kept:
+                raise LogError(f"{source}: not one message is left in this log: {'; '.join(whole.missing)}")
+            note = {
+                "missing": "; ".join(filter(None, (whole.metadata.get(REPAIR, {}).get("missing"), *whole.missing))),
+                "source_sha256": _sha256(file, size),
+                "repaired_by": f"emb-excite/{version('emb-excite')}",
+            }
             with new_file(target) as output:
-                _write(RecordReader(source, file, size), found, digest, output)
+                _write(McapFile(source, file, size), whole, described, note, output)
     except OSError as err:
         raise UsageError(f"{source}: cannot read the log: {err.strerror}") from err
-    return found
+    return Found(tuple(whole.missing), kept)
 
 
-def _look(reader: RecordReader) -> Found:
-    """The first pass: what there is, and what is missing."""
-    found = Found()
-    counts: Counter[int] = Counter()
-    for record in reader.one_by_one():
-        match record:
-            case mcap.Schema():
-                found.schemas.setdefault(record.id, record)
-            case mcap.Channel():  # if it is lost with the first chunk, the copy in the summary will do
-                found.channels.setdefault(record.id, record)
-            case mcap.Message():
-                counts[record.channel_id] += 1
-            case mcap.Metadata() if record.name == REPAIR:
-                found.earlier = record.metadata.get("missing", "")
-    found.missing = reader.missing
-    for number, channel in list(found.channels.items()):
-        if channel.schema_id not in found.schemas:
-            del found.channels[number]
-    found.kept = sum(counts[number] for number in found.channels)
-    if lost := counts.total() - found.kept:
-        found.missing.append(f"{lost} messages of a topic whose description is lost")
-    return found
-
-
-def _write(reader: RecordReader, found: Found, digest: str, output: BinaryIO) -> None:
-    """The second pass: copy what can be believed."""
+def _write(
+    again: McapFile, whole: McapFile, described: dict[int, mcap.Channel], note: dict[str, str], output: BinaryIO
+) -> None:
+    """Copy what can be trusted: ``again`` is read, ``whole`` has been."""
     writer = Writer(output, chunk_size=CHUNK, compression=CompressionType.ZSTD, enable_data_crcs=True)
-    writer.start(profile=reader.header.profile, library=reader.header.library)
-    missing = "; ".join(filter(None, (found.earlier, *found.missing)))
-    note = {"missing": missing, "source_sha256": digest, "repaired_by": f"emb-excite/{version('emb-excite')}"}
+    writer.start(profile=whole.header.profile, library=whole.header.library)
     writer.add_metadata(REPAIR, note)  # first: a file that is cut in its turn still has it
-    schemas = {n: writer.register_schema(s.name, s.encoding, s.data) for n, s in sorted(found.schemas.items())}
+    for name, metadata in whole.metadata.items():
+        if name != REPAIR:
+            writer.add_metadata(name, metadata)
+    for a in whole.attachments.values():
+        writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
+    schemas = {n: writer.register_schema(s.name, s.encoding, s.data) for n, s in sorted(whole.schemas.items())}
     channels = {
         number: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
-        for number, c in sorted(found.channels.items())
+        for number, c in sorted(described.items())
     }
-    for record in reader.one_by_one():
-        match record:
-            case mcap.Message() if record.channel_id in channels:
-                number = channels[record.channel_id]
-                writer.add_message(number, record.log_time, record.data, record.publish_time, record.sequence)
-            case mcap.Metadata() if record.name != REPAIR:
-                writer.add_metadata(record.name, record.metadata)
-            case mcap.Attachment():
-                writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+    for _, _, chunk in again.chunks():
+        for message in chunk.messages():
+            if (number := channels.get(message.channel_id)) is not None:
+                writer.add_message(number, message.log_time, message.data, message.publish_time, message.sequence)
     writer.finish()  # type: ignore[no-untyped-call]
 
 

@@ -13,8 +13,7 @@ from typing import BinaryIO, Protocol
 
 from mcap.opcode import Opcode
 
-from emb_bench.logs.chunks import DAMAGE, LARGEST, Chunk, unpack_chunk
-from emb_bench.logs.mcap_reader import MAGIC, MOST_CARRIED
+from emb_bench.logs.mcap_file import DAMAGE, LARGEST, MAGIC, MOST_CARRIED, Chunk, unpack_chunk
 from emb_runtime.errors import LogError
 from emb_runtime.system.input_file import open_regular
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from mcap import records as mcap
 
-from emb_bench.logs.chunks import Chunk
 from emb_bench.logs.columns import message_class
+from emb_bench.logs.mcap_file import Chunk
 from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.log.mcap_schema import CYCLE, ESTIMATE, SAFETY, deviation_of
 from emb_runtime.records import Reason, RunState

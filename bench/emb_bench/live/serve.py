@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mcap import records as mcap
 
-from emb_bench.logs.chunks import Chunk
+from emb_bench.logs.mcap_file import Chunk
 from emb_runtime.errors import UsageError
 
 if TYPE_CHECKING:

@@ -19,13 +19,13 @@ from google.protobuf.message import DecodeError
 from mcap import records as mcap
 
 from emb_bench.logs.log import reported_missing
-from emb_bench.logs.mcap_reader import RecordReader
+from emb_bench.logs.mcap_file import McapFile
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.log.mcap_schema import CAN_RX, CAN_TX
 from emb_runtime.log.recorder_process import RUN
 from emb_runtime.system.input_file import open_regular
 
-_FRAME = CAN_RX.factory
+_FRAME, _FRAMES = CAN_RX.factory, (CAN_RX.name, CAN_TX.name)
 _SECOND = 10**9  # [ns]
 
 
@@ -45,43 +45,32 @@ class McapReader(MessageReader):
 
     def __init__(self, file: StringPathLike, **kwargs: Any) -> None:
         self._path = Path(os.fspath(file))
+        self.missing: tuple[str, ...] = ()
+        """Descriptions of the missing parts; known when all of the log has been read."""
         try:
             self._file = open_regular(self._path)
             self._size = os.fstat(self._file.fileno()).st_size
         except OSError as err:
             raise UsageError(f"{self._path}: cannot read the log: {err.strerror}") from err
         try:
-            self._reader()
+            next(self._mcap().chunks(), None)
         except BaseException:
             self._file.close()
             raise
-        self.missing: tuple[str, ...] = ()
-        """Descriptions of the missing parts; known when all of the log has been read."""
 
     def __iter__(self) -> Iterator[Message]:
         """Messages; ``timestamp`` is Unix time [s], ``is_rx`` is False for what was sent."""
-        reader = self._reader()
-        channels: dict[int, mcap.Channel] = {}
-        metadata: dict[str, dict[str, str]] = {}
-        lost = 0
-        for record in reader.one_by_one():
-            match record:
-                case mcap.Channel():
-                    channels[record.id] = record
-                case mcap.Metadata():
-                    metadata[record.name] = record.metadata
-                case mcap.Message():
-                    channel = channels.get(record.channel_id)
-                    if channel is None:
-                        lost += 1
-                    elif channel.topic in (CAN_RX.name, CAN_TX.name):
-                        bus = _bus(metadata.get(RUN, {}).get("iface"))
-                        yield self._message(record, channel.topic == CAN_RX.name, bus)
+        log, lost = self._mcap(), 0
+        for _, _, chunk in log.chunks():
+            received = {number: c.topic == CAN_RX.name for number, c in log.channels.items() if c.topic in _FRAMES}
+            bus = _bus(log.metadata.get(RUN, {}).get("iface"))
+            for message in chunk.messages():
+                if message.channel_id in received:
+                    yield self._message(message, received[message.channel_id], bus)
+                lost += message.channel_id not in log.channels
         if lost:
-            reader.missing.append(
-                f"{lost} messages of a topic whose description is lost, or comes later: repair the log"
-            )
-        self.missing = (*reader.missing, *reported_missing(metadata))
+            log.name_missing(f"{lost} messages of a topic whose description is lost, or comes later: repair the log")
+        self.missing = (*log.missing, *reported_missing(log.metadata))
         for what in self.missing:
             logging.getLogger(__name__).warning("%s: %s", self._path, what)
 
@@ -89,8 +78,8 @@ class McapReader(MessageReader):
         """Close the file."""
         self._file.close()
 
-    def _reader(self) -> RecordReader:
-        return RecordReader(self._path, self._file, self._size)
+    def _mcap(self) -> McapFile:
+        return McapFile(self._path, self._file, self._size)
 
     def _message(self, record: mcap.Message, received: bool, bus: str | None) -> Message:
         try:

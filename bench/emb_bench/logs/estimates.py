@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import Iterator
 from typing import Any
 
-from emb_bench.logs.log import RunLog, Table
+from emb_bench.logs.log import RunLog
 from emb_runtime.errors import LogError
 from emb_runtime.estimator.estimate import Quantity, by_name
 from emb_runtime.log.mcap_schema import ESTIMATE, deviation_of, estimate_topic
-
-_STEP = "step"
 
 
 def quantities(log: RunLog) -> tuple[Quantity, ...]:
@@ -37,7 +36,7 @@ def by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
     Raises:
         LogError: see :func:`quantities`; or a message cannot be decoded.
     """
-    return {step: numbers for part, names in _parts(log) for step, numbers in _rows(part, names)}
+    return {step: tuple(numbers) for step, *numbers in _rows(log)}
 
 
 def last_estimate(log: RunLog) -> dict[str, dict[str, Any]]:
@@ -46,22 +45,10 @@ def last_estimate(log: RunLog) -> dict[str, dict[str, Any]]:
     Raises:
         LogError: see :func:`by_step`.
     """
-    numbers: tuple[float, ...] = ()
-    for part, names in _parts(log):
-        for _, row in [*_rows(part, names)][-1:]:
-            numbers = row
-    return by_name(quantities(log), numbers)
+    last = deque(_rows(log), maxlen=1)
+    return by_name(quantities(log), last[0][1:] if last else ())
 
 
-def _parts(log: RunLog) -> Iterator[tuple[Table, list[str]]]:
-    """The topic's messages, some at a time, and the names of its numbers."""
+def _rows(log: RunLog) -> Iterator[tuple[Any, ...]]:
     names = [quantity.name for quantity in quantities(log)]
-    names += [deviation_of(name) for name in names]
-    if names:
-        for part in log.batches({ESTIMATE: [_STEP, *names]}):
-            yield part[ESTIMATE], names
-
-
-def _rows(part: Mapping[str, Any], names: list[str]) -> Iterator[tuple[int, tuple[float, ...]]]:
-    rows = zip(*(part[name].tolist() for name in names), strict=True)
-    return zip(part[_STEP].tolist(), rows, strict=True)
+    return log.rows(ESTIMATE, "step", *names, *map(deviation_of, names))

@@ -13,9 +13,8 @@ import numpy as np
 from emb_bench.logs import learnt
 from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import RunLog
-from emb_bench.logs.timing import in_control
+from emb_bench.logs.timing import in_control, quantiles
 from emb_runtime.can.e2e import NO_COUNTER
-from emb_runtime.config.timing_budgets import QUANTILES
 from emb_runtime.records import CycleRecord, Reason
 
 _FIELDS = (
@@ -98,7 +97,7 @@ def cycle_summary(log: RunLog) -> CycleSummary:
     log.require("/cycle", CycleRecord._fields)
     counts: Counter[str] = Counter()
     low, high, speed, current = math.inf, -math.inf, 0.0, 0.0
-    delays = _Distribution()
+    delays = [np.empty(0, np.int64)]
     for part in log.batches({"/cycle": _FIELDS}):
         c = part["/cycle"]
         active = in_control(c)
@@ -115,13 +114,14 @@ def cycle_summary(log: RunLog) -> CycleSummary:
             low, high = float(np.minimum(low, angle.min())), float(np.maximum(high, angle.max()))
             speed = float(np.maximum(speed, np.abs(c["velocity"][active]).max()))
             current = float(np.maximum(current, np.abs(c["sent_current"][answered]).max(initial=0.0)))
-        delays.add(c["send_time_ns"][answered] - c["receive_time_ns"][answered])
+        delays.append(c["send_time_ns"][answered] - c["receive_time_ns"][answered])
     largest = None
     if counts["active"]:
         its_low, its_high, its_speed = (_counted(log, name) for name in ("angle_min", "angle_max", "top_speed"))
         largest = Largest(min(low, its_low), max(high, its_high), max(speed, its_speed), current)
-    quantiles = {f"p{q:g}": 1e-9 * delays.percentile(q) for q in QUANTILES} if counts["answered"] else {}
-    return CycleSummary(CycleCounts(**counts), largest, quantiles)
+    return CycleSummary(
+        CycleCounts(**counts), largest, quantiles(np.asarray(1e-9 * np.concatenate(delays), np.float64))
+    )
 
 
 def _counted(log: RunLog, name: str) -> float:
@@ -131,25 +131,3 @@ def _counted(log: RunLog, name: str) -> float:
     except ValueError:
         return 0.0
     return value if math.isfinite(value) else 0.0
-
-
-class _Distribution:
-    """Whole numbers and how often each came: exact percentiles of any number of them, if they are not too different."""
-
-    def __init__(self) -> None:
-        self._values, self._counts = np.empty(0, np.int64), np.empty(0, np.int64)
-
-    def add(self, values: Any) -> None:
-        """Count some more."""
-        new, counts = np.unique(values, return_counts=True)
-        every, place = np.unique(np.concatenate([self._values, new]), return_inverse=True)
-        total = np.zeros(len(every), np.int64)
-        np.add.at(total, place, np.concatenate([self._counts, counts]))
-        self._values, self._counts = every, total
-
-    def percentile(self, percent: float) -> float:
-        """The percentile as numpy computes it, linear between neighbours."""
-        ends = np.cumsum(self._counts)
-        at = (ends[-1] - 1) * percent / 100.0
-        below, above = (int(self._values[np.searchsorted(ends, f(at), side="right")]) for f in (math.floor, math.ceil))
-        return float(below + (at - math.floor(at)) * (above - below))

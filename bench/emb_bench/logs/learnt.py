@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ def by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
     Raises:
         LogError: the topic has other fields, or a message cannot be decoded.
     """
-    return dict(_rows(log))
+    return {step: tuple(numbers) for step, *numbers in log.rows(LEARNT.name, _STEP, *_NUMBERS)}
 
 
 def history(log: RunLog) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -29,9 +29,8 @@ def history(log: RunLog) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     Raises:
         LogError: see :func:`by_step`.
     """
-    rows = [*_rows(log)]
-    steps = np.array([step for step, _ in rows], np.int64)
-    return steps, np.array([numbers for _, numbers in rows]).reshape(len(rows), len(_NUMBERS))
+    found = by_step(log)
+    return np.array([*found], np.int64), np.array([*found.values()]).reshape(len(found), len(_NUMBERS))
 
 
 def last_ranges(numbers: NDArray[np.float64]) -> dict[str, list[float]]:
@@ -50,14 +49,5 @@ def document(log: RunLog) -> dict[str, Any]:
     Raises:
         LogError: see :func:`by_step`.
     """
-    return last_ranges(history(log)[1])
-
-
-def _rows(log: RunLog) -> Iterator[tuple[int, tuple[float, ...]]]:
-    if LEARNT.name not in log.topics:
-        return
-    log.require(LEARNT.name, [_STEP, *_NUMBERS])
-    for part in log.batches({LEARNT.name: [_STEP, *_NUMBERS]}):
-        table = part[LEARNT.name]
-        rows = zip(*(table[name].tolist() for name in _NUMBERS), strict=True)
-        yield from zip(table[_STEP].tolist(), rows, strict=True)
+    last = deque(log.rows(LEARNT.name, *_NUMBERS), maxlen=1)
+    return last_ranges(np.array(last).reshape(-1, len(_NUMBERS)))

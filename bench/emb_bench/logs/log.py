@@ -1,14 +1,16 @@
 """A log of a run: finished, cut by ``kill -9``, or damaged. All that is left is read; what is missing is named.
 
 The messages are decoded with the descriptors that the file itself carries, when they are requested: as whole
-tables, or of a long log in batches.
+tables, or of a long log in batches. Chunks are kept if they are few, and else read again.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -18,10 +20,8 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from emb_bench.logs.chunks import DAMAGE, HEADER, gathered
 from emb_bench.logs.columns import Column, columns, describe, message_class
-from emb_bench.logs.contents import Batch, Contents, read_contents
-from emb_bench.logs.mcap_reader import message_of
+from emb_bench.logs.mcap_file import DAMAGE, Chunk, McapFile, message_of, unpack_chunk
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.drives.mapping import PROPERTIES, MappingError
@@ -32,6 +32,7 @@ from emb_runtime.log.mcap_schema import FIXED_TOPICS, LEARNT
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.run_type import RunType
 from emb_runtime.system import terminal
+from emb_runtime.system.input_file import open_regular
 
 Table = Mapping[str, NDArray[Any]]
 """One topic: its fields as columns, ``publish_time`` and ``log_time`` [Unix ns], and ``order`` in the file."""
@@ -42,6 +43,8 @@ REPAIR = "emb.repair"
 IMPORT = "emb.import"
 """Metadata of a log that ``emb-replay import`` made: the recording's ``file`` and ``sha256``, and what it ``lacks``."""
 
+KEPT = 16 << 20  # Unpacked chunks are kept in memory if all of them take no more than this [bytes]
+BATCH = 4 << 20  # Unpacked bytes that are decoded at a time
 SMALL_TABLE = 64 << 20  # Size of a table that any log may have [bytes]
 TABLE = 16  # Times the size of the file by which it may be larger; the cycles of a log take about the size of its file
 LONGEST_REASON = 200  # Characters of the reason for a run's end
@@ -53,7 +56,6 @@ UNIX_TIME = Column("unix_time", "int64", "ns")
 
 _OURS = {topic.name: topic for topic in (*FIXED_TOPICS, LEARNT)}
 _UNREADABLE = (DecodeError, TypeError, KeyError, AttributeError, RecursionError, *DAMAGE)
-_LENGTH = HEADER.itemsize - 9  # Of a message's record without its payload
 
 
 class Event(NamedTuple):
@@ -73,6 +75,42 @@ class _Topic(NamedTuple):
     units: str  # SI units by field, as JSON
 
 
+class _Chunks:
+    """The chunks of a log, kept if all of them are small, and else read again."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._unpacked = 0  # size of all of them [bytes]
+        self._kept: list[Chunk] = []
+        self._places: list[tuple[int, int, int]] = []  # offset and length in the file, and count of messages
+
+    def add(self, at: int, length: int, chunk: Chunk) -> None:
+        """Take the next chunk."""
+        self._unpacked += len(chunk.data)
+        self._places.append((at, length, len(chunk.at)))
+        if self._unpacked <= KEPT:
+            self._kept.append(chunk)
+        else:
+            self._kept.clear()
+
+    def __iter__(self) -> Iterator[Chunk]:
+        if self._unpacked <= KEPT:
+            yield from self._kept
+            return
+        try:
+            with open_regular(self._path) as file:
+                for at, length, messages in self._places:
+                    file.seek(at)
+                    chunk = unpack_chunk(file.read(length))
+                    if len(chunk.at) != messages:
+                        raise ValueError("other messages than before")
+                    yield chunk
+        except OSError as err:
+            raise UsageError(f"{self._path}: cannot read the log: {err.strerror}") from err
+        except DAMAGE as err:
+            raise LogError(f"{self._path}: the log has changed while it was read: {message_of(err)}") from err
+
+
 class _Tables(Mapping[str, Table]):
     """All topics of a log, each decoded when it is requested."""
 
@@ -81,10 +119,7 @@ class _Tables(Mapping[str, Table]):
 
     def __getitem__(self, topic: str) -> Table:
         if topic not in self._decoded:
-            names = [column.name for column in describe(self._log.topics[topic].factory)]
-            self._log.require_room(topic, len(names))
-            parts = [part[topic] for part in self._log.batches({topic: names})]
-            self._decoded[topic] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            self._decoded[topic] = self._log.table(topic)
         return self._decoded[topic]
 
     def __iter__(self) -> Iterator[str]:
@@ -103,13 +138,30 @@ class RunLog:
     missing: str  # Description of the missing parts of an incomplete log; empty if it is complete
     metadata: Mapping[str, Mapping[str, str]]  # Metadata records by name
     attachments: Mapping[str, bytes]  # Attached files by name
-    contents: Contents = field(repr=False)  # The file's records
+    size: int  # Of the file [bytes]
+    span: tuple[int, int]  # First and last publish time of the messages [Unix ns]
+    chunks: Iterable[Chunk] = field(repr=False)  # Those of the file that are whole
     topics: Mapping[str, _Topic] = field(repr=False)  # The topics that can be decoded, by name
 
     @cached_property
     def tables(self) -> Mapping[str, Table]:
         """Messages by topic, each as a whole, which of a long log takes much memory."""
         return _Tables(self)
+
+    def table(self, topic: str) -> Table:
+        """All messages of a topic, which of a long log take much memory.
+
+        Raises:
+            KeyError: the log has no such topic.
+            LogError: a message cannot be decoded, or the table would take many times the memory of its log.
+        """
+        names = [column.name for column in describe(self.topics[topic].factory)]
+        size = 8 * len(names) * self.topics[topic].messages
+        if size > SMALL_TABLE + TABLE * self.size:
+            what = f"{topic} would take {size >> 20} MiB as a table, from {self.size} bytes"
+            raise LogError(f"{self.path}: {what}: no log of ours")
+        parts = [part[topic] for part in self.batches({topic: names})]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def batches(self, wanted: Mapping[str, Sequence[str]]) -> Iterator[dict[str, Table]]:
         """Messages by topic, some at a time and in the order of the file: for a log of any length.
@@ -120,38 +172,45 @@ class RunLog:
         Raises:
             LogError: a message cannot be decoded, or the file has changed meanwhile.
         """
-        for batch in self.contents.batches():
-            yield {topic: self.decoded(batch, topic, wanted[topic]) for topic in wanted if topic in self.topics}
+        held, size, order = list[Chunk](), 0, 0
+        for chunk in self.chunks:
+            held.append(chunk)
+            size += len(chunk.data)
+            if size >= BATCH:
+                yield self._decoded(held, order, wanted)
+                order += sum(len(own.at) for own in held)
+                held, size = [], 0
+        if held or not order:
+            yield self._decoded(held, order, wanted)
 
-    def decoded(self, batch: Batch, topic: str, wanted: Sequence[str]) -> Table:
-        """Some fields of the messages of one topic in a batch.
+    def _decoded(self, chunks: Sequence[Chunk], order: int, wanted: Mapping[str, Sequence[str]]) -> dict[str, Table]:
+        """Some fields of the messages in chunks, the first of which has this place among all messages of the log."""
+        found = dict[str, Table]()
+        for topic, names in wanted.items():
+            if topic not in self.topics:
+                continue
+            channel, _, factory, _ = self.topics[topic]
+            index = np.concatenate([chunk.headers["channel"] == channel for chunk in chunks])
+            times = [np.concatenate([chunk.headers[name] for chunk in chunks])[index] for name in ("publish", "log")]
+            try:
+                fields = columns(factory, [data for chunk in chunks for data in chunk.payloads(channel)], names)
+                found[topic] = _times(*times) | {"order": np.flatnonzero(index) + order} | fields
+            except _UNREADABLE as err:
+                raise LogError(f"{self.path}: the messages of {topic} are not readable: {message_of(err)}") from err
+        return found
+
+    def rows(self, topic: str, *names: str) -> Iterator[tuple[Any, ...]]:
+        """Some columns of a topic, message by message; nothing if the log does not have it.
 
         Raises:
-            LogError: a message cannot be decoded.
+            LogError: a field is missing or means something else, or a message cannot be decoded.
         """
-        index = np.flatnonzero(batch.headers["channel"] == self.topics[topic].channel)
-        headers, begin = gathered(batch.headers, index), batch.begin[index]
-        end = begin + headers["length"].astype(np.int64) - _LENGTH
-        try:
-            fields = columns(self.topics[topic].factory, batch.data, begin, end, wanted) if wanted else {}
-            return _times(headers) | {"order": index + batch.order} | fields
-        except _UNREADABLE as err:
-            raise self._unreadable(topic, err) from err
-
-    def require_room(self, topic: str, count: int) -> None:
-        """Refuse a table that would take many times the memory of its log.
-
-        Args:
-            topic: of the log.
-            count: of its columns.
-
-        Raises:
-            LogError: it would.
-        """
-        size, most = 8 * count * self.topics[topic].messages, SMALL_TABLE + TABLE * self.contents.size
-        if size > most:
-            what = f"{topic} would take {size >> 20} MiB as a table, from {self.contents.size} bytes"
-            raise LogError(f"{self.path}: {what}: no log of ours")
+        if topic not in self.topics:
+            return
+        if topic in _OURS:
+            self.require(topic, [name for name in names if name not in TIMES])
+        for part in self.batches({topic: names}):
+            yield from zip(*(part[topic][name].tolist() for name in names), strict=True)
 
     def describe(self, topic: str) -> tuple[Column, ...]:
         """The columns of a topic: two times, then every field.
@@ -172,11 +231,6 @@ class RunLog:
         if column is TIME:
             return (table["publish_time"] - self.span[0]) / 1e9
         return table["publish_time" if column is UNIX_TIME else column.name]
-
-    def _unreadable(self, topic: str, err: Exception) -> LogError:
-        if isinstance(err, LogError):
-            return err
-        return LogError(f"{self.path}: the messages of {topic} are not readable: {message_of(err)}")
 
     @property
     def run(self) -> Mapping[str, str]:
@@ -237,12 +291,6 @@ class RunLog:
         return {name: topic.messages for name, topic in self.topics.items()}
 
     @property
-    def span(self) -> tuple[int, int]:
-        """First and last publish time of the messages [Unix ns]."""
-        assert self.contents.span is not None  # a log without messages is refused
-        return self.contents.span
-
-    @property
     def cycles(self) -> Table:
         """The control cycles, one column per field of CycleRecord.
 
@@ -287,11 +335,8 @@ class RunLog:
         Raises:
             LogError: the log has no reading of the clocks.
         """
-        self.require("/clock", ("monotonic_ns",))
-        for part in self.batches({"/clock": ("monotonic_ns",)}):
-            clock = part["/clock"]
-            if len(clock["monotonic_ns"]):
-                return int(clock["publish_time"][0]) - int(clock["monotonic_ns"][0])
+        for publish_time, monotonic_ns in self.rows("/clock", "publish_time", "monotonic_ns"):
+            return int(publish_time) - int(monotonic_ns)
         raise LogError(f"{self.path}: no reading of the clocks is left")
 
     @cached_property
@@ -300,7 +345,7 @@ class RunLog:
         rows: list[tuple[int, Frame]] = []
         for topic, own in (("/can/rx", False), ("/can/tx", True)):
             names = ("order", "publish_time", "id", "data", "is_extended", "is_rtr", "is_error", "dropped")
-            for order, when, identifier, data, extended, remote, error, dropped in self._rows(topic, *names):
+            for order, when, identifier, data, extended, remote, error, dropped in self.rows(topic, *names):
                 time_ns = when - self.wall_offset_ns
                 rows.append((order, Frame(identifier, data, time_ns, extended, remote, error, own, dropped)))
         return tuple(frame for _, frame in sorted(rows))
@@ -308,15 +353,8 @@ class RunLog:
     @property
     def events(self) -> tuple[Event, ...]:
         """The safety events."""
-        rows = self._rows("/safety", "publish_time", "code", "text")
+        rows = self.rows("/safety", "publish_time", "code", "text")
         return tuple(Event(when, terminal.one_line(code), terminal.one_line(text)) for when, code, text in rows)
-
-    def _rows(self, topic: str, *columns: str) -> Iterator[tuple[Any, ...]]:
-        if topic not in self.topics:
-            return iter(())
-        self.require(topic, [name for name in columns if name not in TIMES])
-        table = self.tables[topic]
-        return zip(*(table[name].tolist() for name in columns), strict=True)
 
     @cached_property
     def bench(self) -> Bench:
@@ -384,19 +422,32 @@ def read_log(path: str | Path) -> RunLog:
         UsageError: it cannot be read.
     """
     path = Path(path)
-    contents = read_contents(path)
-    if not contents.counts:
+    chunks, counts, spans = _Chunks(path), Counter[int](), list[tuple[int, int]]()
+    try:
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            contents = McapFile(path, file, size)
+            for at, length, chunk in contents.chunks():
+                chunks.add(at, length, chunk)
+                if len(chunk.at):
+                    counts += Counter(dict(enumerate(np.bincount(chunk.headers["channel"]).tolist())))
+                    spans.append((int(chunk.headers["publish"].min()), int(chunk.headers["publish"].max())))
+    except OSError as err:
+        raise UsageError(f"{path}: cannot read the log: {err.strerror}") from err
+    if not counts:
         why = "; ".join(contents.missing) or "it holds none"
         raise LogError(f"{path}: not one message is left in this log: {why}")
-    topics = _topics(path, contents)
-    contents.missing += reported_missing(contents.metadata)
+    topics = _topics(path, contents, counts)
+    missing = [*contents.missing, *reported_missing(contents.metadata)]
     return RunLog(
         path=path,
-        complete=not contents.missing,
-        missing=terminal.one_line("; ".join(contents.missing)),
+        complete=not missing,
+        missing=terminal.one_line("; ".join(missing)),
         metadata=contents.metadata,
-        attachments=contents.attachments,
-        contents=contents,
+        attachments={name: attachment.data for name, attachment in contents.attachments.items()},
+        size=size,
+        span=(min(first for first, _ in spans), max(last for _, last in spans)),
+        chunks=chunks,
         topics=topics,
     )
 
@@ -422,11 +473,11 @@ def reported_missing(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
     return reported
 
 
-def _topics(path: Path, contents: Contents) -> dict[str, _Topic]:
+def _topics(path: Path, contents: McapFile, counts: Mapping[int, int]) -> dict[str, _Topic]:
     """Find how to decode each channel; one that cannot be decoded is named as missing."""
     topics: dict[str, _Topic] = {}
-    for number in sorted(contents.channels.keys() | contents.counts.keys()):
-        count = contents.counts.get(number, 0)
+    for number in sorted(contents.channels.keys() | counts.keys()):
+        count = counts.get(number, 0)
         channel = contents.channels.get(number)
         schema = contents.schemas.get(channel.schema_id) if channel else None
         if channel is None or schema is None:
@@ -453,12 +504,11 @@ def _kinds(factory: Any) -> dict[str, str]:
     return {column.name: words.get(column.kind, column.kind) for column in describe(factory)}
 
 
-def _times(headers: NDArray[Any]) -> dict[str, NDArray[Any]]:
+def _times(publish: NDArray[np.uint64], log: NDArray[np.uint64]) -> dict[str, NDArray[Any]]:
     """The times of messages; raises OverflowError for one beyond int64."""
-    stamps = {"publish_time": headers["publish"], "log_time": headers["log"]}
-    if any(len(column) and column.max() >= 1 << 63 for column in stamps.values()):
+    if max(publish.max(initial=0), log.max(initial=0)) >= 1 << 63:
         raise OverflowError("a time beyond 63 bits")
-    return {name: column.astype(np.int64) for name, column in stamps.items()}
+    return {"publish_time": publish.astype(np.int64), "log_time": log.astype(np.int64)}
 
 
 @lru_cache(maxsize=8)

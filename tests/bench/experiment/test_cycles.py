@@ -42,7 +42,7 @@ def taken(log: RunLog, layout: Layout, bench: Bench) -> list[SensorSample]:
 def test_the_samples_are_those_that_the_run_took_from_its_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Bench, layout: Layout, bus: str, seed: int, batch: int
 ) -> None:
-    monkeypatch.setattr("emb_bench.logs.contents.BATCH", batch)
+    monkeypatch.setattr("emb_bench.logs.log.BATCH", batch)
     run = drive(HostileBus(bench, layout, random.Random(seed), **BUSES[bus]), law, STEPS)
     path = tmp_path / "run.mcap"
     write_trace(path, run.journal.records, bench, layout, run.outcome, steps=STEPS, flush_every=150)

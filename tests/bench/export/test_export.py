@@ -194,7 +194,7 @@ def test_a_long_log_is_written_batch_by_batch(path: Path, tmp_path: Path, monkey
             batches.append(len(batch))
             yield batch
 
-    monkeypatch.setattr("emb_bench.logs.contents.BATCH", 1)  # as if each chunk were as much as one may hold
+    monkeypatch.setattr("emb_bench.logs.log.BATCH", 1)  # as if each chunk were as much as one may hold
     monkeypatch.setattr(RunLog, "batches", counted)
     assert export(path, "--to", "csv", "-o", tmp_path / "2.csv") == 0
     assert len(batches) > 3

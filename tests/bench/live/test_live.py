@@ -29,8 +29,8 @@ from emb_bench.cli.replay import main as emb_replay
 from emb_bench.live.follow import NewLogs, chunks, follow
 from emb_bench.live.lines import Lines
 from emb_bench.live.serve import Server
-from emb_bench.logs.chunks import HEADER, Chunk
 from emb_bench.logs.log import read_log
+from emb_bench.logs.mcap_file import HEADER, Chunk
 from emb_runtime.cli import main as emb_run
 from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, LogError, UsageError
 

@@ -22,7 +22,7 @@ from emb_bench.cli.replay import main
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import RunLog, read_log
-from emb_bench.logs.mcap_reader import MAGIC
+from emb_bench.logs.mcap_file import MAGIC
 from emb_runtime.errors import LogError
 from emb_runtime.records import CycleRecord
 
@@ -366,7 +366,7 @@ def test_a_huge_number_in_a_control_cycle_takes_no_memory_and_gives_no_wrong_num
 def test_an_experiment_that_begins_without_a_measurement_gives_no_number_without_a_warning(
     path: Path, run: SimRun, monkeypatch: pytest.MonkeyPatch, name: str, value: float, count: int
 ) -> None:
-    monkeypatch.setattr("emb_bench.logs.contents.BATCH", 1)
+    monkeypatch.setattr("emb_bench.logs.log.BATCH", 1)
     first = next(n for n, cycle in enumerate(run.journal.cycles) if cycle.step == 0)
 
     def values(topic: str, n: int, row: dict[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,347 @@
+"""The records of an MCAP file, which may be cut or damaged.
+
+A file is read from the front; its summary is never needed. Every checksum is checked. A damaged record is left out as a
+whole and named in ``missing``. Behind a record whose length is wrong nothing is read.
+
+Files are untrusted: sizes are bounded before anything is read or unpacked. One record and one unpacked chunk are in
+memory at a time, neither larger than ``LARGEST``, and descriptions, metadata and attachments have bounds.
+
+The ``mcap`` library parses single records. Its stream reader ends at the first damage, trusts the sizes in the file,
+and makes an object of each message, which takes four times as long as parting a chunk with numpy.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from bisect import bisect_left
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+import zstandard
+from mcap import records as mcap
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from emb_runtime.errors import LogError
+
+MAGIC = b"\x89MCAP0\r\n"
+OUR_SCHEMAS = "emb."  # Begin of the names of our schemas, by which a log is known, whoever copied it
+LARGEST = 8 << 20
+"""Largest record, and largest chunk once unpacked [bytes]; the chunks of a log have a quarter of a MiB."""
+MOST_PACKED = 32
+"""Times by which a chunk may be larger once unpacked, besides ``SMALL``; those of a log are larger by 4 times."""
+SMALL = 8 << 10  # Size of a chunk that may be packed as well as it can be [bytes]
+MOST_DESCRIBED = 500  # Schemas and channels of a log; one of ours has two times twenty
+LARGEST_DESCRIPTION = 32 << 10  # Largest schema or channel [bytes]
+MOST_CARRIED = 32 << 20  # Size of all attachments and metadata together [bytes]; a policy has 4 MiB at most
+MOST_NAMED = 8  # Kinds of damage that are named one by one
+PAD = 32  # Zeros behind the data of a chunk, so that a number may be read at its last byte
+
+RECORD = struct.Struct("<BQ")  # Begin of a record: its opcode, and the length of what follows
+CHUNK = struct.Struct("<QQQI")  # Begin of a chunk's record: first and last time, size once unpacked, checksum
+HEADER = np.dtype(
+    [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
+)
+"""Begin of a message's record; its payload follows."""
+DAMAGE = (
+    *(McapError, struct.error, UnicodeDecodeError, EOFError),
+    *(zstandard.ZstdError, MemoryError, OverflowError, ValueError),
+)
+"""Exceptions of a parser on bytes that passed, or have, no checksum."""
+
+_MESSAGE = int(Opcode.MESSAGE)
+_NAMES = {int(opcode): opcode.name.lower().replace("_", " ") for opcode in Opcode}
+_BLOCK = 1 << 20
+
+Integers = NDArray[np.int64]
+
+
+class Chunk(NamedTuple):
+    """One chunk, unpacked."""
+
+    data: bytes
+    at: Integers  # Offset in ``data`` of each message's record [bytes]
+    headers: NDArray[Any]  # Of type ``HEADER``, one for each message
+    described: tuple[mcap.Schema | mcap.Channel, ...]  # Schemas and channels
+
+    def payloads(self, channel: int) -> list[bytes]:
+        """The content of each message of a channel."""
+        mine = self.headers["channel"] == channel
+        begin = self.at[mine]
+        ends = begin + RECORD.size + self.headers["length"][mine].astype(np.int64)
+        return [self.data[a:b] for a, b in zip((begin + HEADER.itemsize).tolist(), ends.tolist(), strict=True)]
+
+    def messages(self) -> Iterator[mcap.Message]:
+        """The messages one by one, for copying or conversion."""
+        ends = self.at + RECORD.size + self.headers["length"].astype(np.int64)
+        for begin, end, header in zip(self.at.tolist(), ends.tolist(), self.headers.tolist(), strict=True):
+            _, _, channel, sequence, log_time, publish_time = header
+            yield mcap.Message(channel, log_time, self.data[begin + HEADER.itemsize : end], publish_time, sequence)
+
+
+class McapFile:
+    """An MCAP file that is read once.
+
+    Args:
+        path: name of the file, for messages.
+        file: the file.
+        size: bytes of it that count; what is appended meanwhile does not.
+
+    Raises:
+        LogError: the file is empty, or not MCAP.
+    """
+
+    def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
+        self._path, self._file, self._size = path, file, size
+        # What the chunks read so far, and the records between them, hold:
+        self.header = mcap.Header("", "")
+        self.schemas: dict[int, mcap.Schema] = {}
+        self.channels: dict[int, mcap.Channel] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: dict[str, mcap.Attachment] = {}
+        self.missing: list[str] = []
+        self._carried = 0  # bytes of attachments and metadata
+        self._crc: int | None = zlib.crc32(MAGIC)  # over the data, then the summary; None if some of it was left out
+        self._data_ended = False
+        if not size:
+            raise LogError(f"{path}: the file is empty")
+        file.seek(0)
+        if file.read(len(MAGIC)) != MAGIC:
+            raise LogError(f"{path}: not an MCAP file")
+
+    def chunks(self) -> Iterator[tuple[int, int, Chunk]]:
+        """Each chunk that is whole, with the offset and the length of its record's body in the file.
+
+        Raises:
+            LogError: not one of our schemas is in the file, or it carries more than any log of ours.
+        """
+        at, opcode = len(MAGIC), 0
+        while opcode != Opcode.FOOTER:
+            self._file.seek(at)
+            head = self._file.read(RECORD.size)
+            opcode, length = RECORD.unpack(head) if at + len(head) <= self._size and len(head) == 9 else (0, self._size)
+            body_at, end = at + RECORD.size, at + RECORD.size + length
+            if end > self._size:
+                self.name_missing(
+                    f"the file is cut at byte {self._size}, or damaged: the record at byte {at} is not whole"
+                )
+                break
+            name = f"the {_NAMES.get(opcode, 'record')} at byte {at}"
+            if length > LARGEST:
+                self.name_missing(f"{name} is left out: it has {length} bytes, more than any of ours")
+                self._crc = None
+            else:
+                body = self._file.read(length)
+                try:
+                    chunk = self._take(opcode, body)
+                except DAMAGE as err:
+                    self.name_missing(f"{name} is damaged ({message_of(err)}) and left out")
+                else:
+                    if chunk is not None:
+                        if self.schemas:  # else they may be lost, and come again in the summary
+                            self._require_ours()
+                        yield body_at, length, chunk
+                self._add_to_checksum(opcode, head, body)
+            at = end
+        else:
+            self._check_end(at)
+        self._require_ours()
+
+    def name_missing(self, what: str) -> None:
+        """Name something that is missing; of a file that is damaged all over, only what comes first."""
+        if len(self.missing) < MOST_NAMED:
+            self.missing.append(what)
+        elif len(self.missing) == MOST_NAMED:
+            self.missing.append("and more is damaged")
+
+    def _take(self, opcode: int, body: bytes) -> Chunk | None:
+        """Keep what a record holds; returns it if it is a chunk.
+
+        Raises:
+            DAMAGE: it is not what it should be.
+        """
+        chunk = None
+        match opcode:
+            case Opcode.HEADER:
+                self.header = mcap.Header.read(stream_of(body))
+            case Opcode.CHUNK:
+                chunk = unpack_chunk(body)
+                self._describe(*chunk.described)
+            case Opcode.SCHEMA | Opcode.CHANNEL:
+                self._describe(_parse_description(opcode, body))
+            case Opcode.METADATA:
+                metadata = mcap.Metadata.read(stream_of(body))
+                self._carry(len(body))
+                self.metadata[metadata.name] = metadata.metadata
+            case Opcode.ATTACHMENT:
+                _require(zlib.crc32(body[:-4]) == int.from_bytes(body[-4:], "little"), "its checksum is wrong")
+                attachment = mcap.Attachment.read(stream_of(body))
+                self._carry(len(body))
+                self.attachments[attachment.name] = attachment
+            case Opcode.DATA_END:
+                self._data_ended = True
+                expected = mcap.DataEnd.read(stream_of(body)).data_section_crc
+                _require(self._crc is None or expected in (0, self._crc), "the checksum over all data is wrong")
+            case Opcode.FOOTER:
+                expected = mcap.Footer.read(stream_of(body)).summary_crc
+                _require(self._data_ended, "the end of the data is missing")
+                covered = zlib.crc32(RECORD.pack(opcode, len(body)) + body[:16], self._crc or 0)
+                _require(self._crc is None or expected in (0, covered), "the checksum over the summary is wrong")
+            case Opcode.MESSAGE:
+                raise ValueError("it lies outside of a chunk, where it has no checksum")
+            case _:
+                _require(opcode in _NAMES or opcode >= 0x80, "no such record exists")
+        return chunk
+
+    def _describe(self, *records: mcap.Schema | mcap.Channel) -> None:
+        """Keep schemas and channels; a second one of the same number comes of damage, or of two logs in one file."""
+        for record in records:
+            known: dict[int, Any] = self.schemas if isinstance(record, mcap.Schema) else self.channels
+            if known.setdefault(record.id, record) != record:
+                kind = type(record).__name__.lower()
+                self.name_missing(f"{kind} {record.id} is described twice, differently; the first counts")
+        if len(self.schemas) + len(self.channels) > MOST_DESCRIBED:
+            raise LogError(f"{self._path}: expected at most {MOST_DESCRIBED} schemas and channels: no log of ours")
+
+    def _carry(self, size: int) -> None:
+        self._carried += size
+        if self._carried > MOST_CARRIED:
+            most = MOST_CARRIED >> 20
+            raise LogError(f"{self._path}: expected at most {most} MiB of attachments and metadata: no log of ours")
+
+    def _add_to_checksum(self, opcode: int, head: bytes, body: bytes) -> None:
+        """Take a record into the running checksum, which begins anew behind the data."""
+        if opcode == Opcode.DATA_END:
+            self._crc = 0
+        elif self._crc is not None:
+            self._crc = zlib.crc32(body, zlib.crc32(head, self._crc))
+
+    def _check_end(self, at: int) -> None:
+        """Name it if the file does not end as an MCAP file does."""
+        self._file.seek(at)
+        tail = self._file.read(min(self._size - at, len(MAGIC) + 1))
+        if tail != MAGIC and MAGIC.startswith(tail):
+            self.name_missing(f"the file is cut at byte {self._size}, before its end")
+        elif tail != MAGIC:
+            self.name_missing("the end of the file is not that of an MCAP file")
+
+    def _require_ours(self) -> None:
+        if any(schema.name.startswith(OUR_SCHEMAS) for schema in self.schemas.values()):
+            return
+        if self.schemas:
+            raise LogError(f"{self._path}: an MCAP file, but not a log of emb-run")
+        why = "; ".join(self.missing) or "it holds none"
+        raise LogError(f"{self._path}: not one message is left in this log: {why}")
+
+
+def unpack_chunk(body: bytes) -> Chunk:
+    """The content of a chunk's record.
+
+    Raises:
+        DAMAGE: it is not what it should be.
+    """
+    _, _, size, crc = CHUNK.unpack_from(body)
+    at = CHUNK.size
+    (name,) = struct.unpack_from("<I", body, at)
+    compression = body[at + 4 : at + 4 + name].decode()
+    at += 4 + name
+    (packed,) = struct.unpack_from("<Q", body, at)
+    at += 8
+    _require(at + packed == len(body), "its lengths contradict each other")
+    most = min(LARGEST, SMALL + MOST_PACKED * packed)
+    _require(size <= most or not compression, f"it claims to unpack from {packed} to {size} bytes, none of ours does")
+    data = _decompressed(memoryview(body)[at:], compression, size)
+    _require(len(data) == size, f"it unpacks to {len(data)} bytes, not to {size}")
+    _require(crc in (0, zlib.crc32(data)), "its checksum is wrong")
+    return _split(data)
+
+
+def _decompressed(packed: memoryview, compression: str, size: int) -> bytes:
+    if not compression:
+        return bytes(packed)
+    _require(compression == "zstd", f"expected zstd, got the compression {compression!r}")
+    # zstd takes the frame's own word for its size before the caller's.
+    claimed = zstandard.frame_content_size(packed)
+    _require(claimed in (-1, size), f"its frame claims to unpack to {claimed} bytes, not to {size}")
+    return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+
+
+def _split(packed: bytes) -> Chunk:
+    """Part a chunk into records, without a loop over the messages.
+
+    Where a message may begin is seen at its opcode and the length behind it, at all places at once. It does begin there
+    if the record before ends there: one leads to the next, from the first byte to the last.
+    """
+    data = np.frombuffer(packed + bytes(PAD), np.uint8)
+    found = [_places(data, begin, min(begin + _BLOCK, len(packed))) for begin in range(0, len(packed), _BLOCK)]
+    maybe, ends = (np.concatenate([pair[k] for pair in found] or [np.empty(0, np.int64)]) for k in range(2))
+    # A run of messages that follow each other ends where the next place is not where this one leads.
+    lasts, begins = [*np.flatnonzero(ends[:-1] != maybe[1:]).tolist(), len(maybe) - 1], maybe.tolist()
+    at, others, parts, described = 0, 0, [maybe[:0]], list[mcap.Schema | mcap.Channel]()
+    while at < len(packed):
+        k = bisect_left(begins, at)
+        if k < len(begins) and begins[k] == at:
+            last = lasts[bisect_left(lasts, k)]
+            parts.append(maybe[k : last + 1])
+            at = int(ends[last])
+        else:
+            opcode, length = RECORD.unpack_from(packed, at)
+            _require(opcode != _MESSAGE, "a message in it is not whole")
+            others += 1
+            _require(others <= MOST_DESCRIBED, f"more than {MOST_DESCRIBED} records in it are no messages")
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                described.append(_parse_description(opcode, packed[at + RECORD.size : at + RECORD.size + length]))
+            at += RECORD.size + length
+    _require(at == len(packed), "a record in it is not whole")
+    places = np.concatenate(parts)
+    # As plain bytes the headers are gathered five times as fast.
+    headers = _windows(data, f"V{HEADER.itemsize}")[places].view(HEADER)
+    return Chunk(packed, places, headers, tuple(described))
+
+
+def _places(data: NDArray[np.uint8], begin: int, end: int) -> tuple[Integers, Integers]:
+    """Places in a part of a chunk at which a message may begin, and where each of them would end."""
+    maybe = np.flatnonzero(data[begin:end] == _MESSAGE) + begin
+    lengths = _windows(data, "<u8")[maybe + 1]
+    fits = (lengths >= HEADER.itemsize - RECORD.size) & (lengths < len(data))
+    return maybe[fits], maybe[fits] + lengths[fits].astype(np.int64) + RECORD.size
+
+
+def _windows(data: NDArray[np.uint8], kind: str) -> NDArray[Any]:
+    """The bytes from each place on as a number or a record of one kind; a view."""
+    dtype = np.dtype(kind)
+    return np.ndarray((max(0, len(data) - dtype.itemsize + 1),), dtype, data, strides=(1,))
+
+
+@lru_cache(maxsize=256)
+def _parse_description(opcode: int, content: bytes) -> mcap.Schema | mcap.Channel:
+    """A schema or a channel, which every log of one version has alike, and twice."""
+    _require(
+        len(content) <= LARGEST_DESCRIPTION, f"a description in it has {len(content)} bytes, more than any of ours"
+    )
+    reads = {Opcode.SCHEMA: mcap.Schema.read, Opcode.CHANNEL: mcap.Channel.read}
+    found: mcap.Schema | mcap.Channel = reads[Opcode(opcode)](stream_of(content))
+    return found
+
+
+def stream_of(body: bytes) -> ReadDataStream:
+    """A record's body as what the ``mcap`` library reads from."""
+    return ReadDataStream(io.BytesIO(body))
+
+
+def _require(condition: bool, what: str) -> None:
+    """Raise a ``ValueError``, one of ``DAMAGE``, unless this holds."""
+    if not condition:
+        raise ValueError(what)
+
+
+def message_of(err: BaseException) -> str:
+    """An error's message in one line."""
+    return " ".join(str(err).split()) or type(err).__name__
