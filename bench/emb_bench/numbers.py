@@ -51,26 +51,31 @@ def around(value: float, half: float) -> str:
     """
     if not (math.isfinite(half) and half > 0.0 and math.isfinite(value)):
         return plain(value, 4)
-    largest = max(abs(value), half)
-    power = 0 if SMALL <= largest < LARGE else math.floor(math.log10(largest))
-    scaled, share = value / 10.0**power, half / 10.0**power
-    places = max(0, 1 - math.floor(math.log10(share)))
-    text = f"{round(scaled, places) + 0.0:.{places}f} ± {share:.{places}f}".replace("-", "−")  # no minus before a zero
-    return text if power == 0 else f"({text}) × 10{str(power).translate(_SUPERSCRIPT)}"
+    return _in_one_power("{} ± {}", (value, half), half)
 
 
 def between(low: float, high: float) -> str:
     """An interval, to two digits of its width."""
     if not (math.isfinite(low) and math.isfinite(high)):
         return f"{plain(low, 4)} to {plain(high, 4)}"
-    width = high - low
-    largest = max(abs(low), abs(high))
-    if width <= 0.0 or largest == 0.0:
+    if high <= low:
         return f"{plain(low, 4)} to {plain(high, 4)}"
+    return _in_one_power("{} to {}", (low, high), high - low)
+
+
+def _in_one_power(text: str, values: tuple[float, float], width: float) -> str:
+    """Values in a text, all to two digits of a width and in one power of ten."""
+    largest = max(map(abs, values))
     power = 0 if SMALL <= largest < LARGE else math.floor(math.log10(largest))
-    places = max(0, 1 - math.floor(math.log10(width / 10.0**power)))
-    text = f"{low / 10.0**power:.{places}f} to {high / 10.0**power:.{places}f}".replace("-", "−")
+    places = _places(width / 10.0**power)
+    shown = (round(value / 10.0**power, places) + 0.0 for value in values)  # no minus before a zero
+    text = text.format(*(f"{value:.{places}f}" for value in shown)).replace("-", "−")
     return text if power == 0 else f"({text}) × 10{str(power).translate(_SUPERSCRIPT)}"
+
+
+def _places(width: float) -> int:
+    """Decimal places that show two digits of a width."""
+    return max(0, 1 - math.floor(math.log10(width)))
 
 
 def amount(value: float, interval: tuple[float, float], unit: str) -> str:
@@ -119,7 +124,7 @@ def share_between(low: float, high: float) -> str:
     if not (math.isfinite(low) and math.isfinite(high)):
         return f"{plain(factor * low)} to {plain(factor * high)} {name}"
     width = factor * (high - low)
-    places = max(0, 1 - math.floor(math.log10(width))) if width > 0.0 else 3
+    places = _places(width) if width > 0.0 else 3
     return f"{signed(factor * low, f'+.{places}f')} to {signed(factor * high, f'+.{places}f')} {name}"
 
 

@@ -70,19 +70,21 @@ def samples_on_grid(log: RunLog, bench: Bench, planned: int) -> Samples:
     Raises:
         LogError: the log has no experiment, or none of which a whole period is left, or contradicts itself.
     """
-    found = [*control_cycles(log, bench, planned)]
-    steps = np.concatenate([step for step, _ in found])
-    if not len(steps) or steps[-1] < 1:
+    steps, buffers = bytearray(), [bytearray() for _ in LOST]  # thousands of small arrays would break up the memory
+    for step, samples in control_cycles(log, bench, planned):
+        steps += step.tobytes()
+        for buffer, values in zip(buffers, samples, strict=True):
+            buffer += np.asarray(values).tobytes()
+    step = np.frombuffer(steps, np.int64)
+    if not len(step) or step[-1] < 1:
         raise LogError(f"{log.path}: not one whole period of the experiment is left")
-    last = min(int(steps[-1]), planned)
-    chosen = steps <= last
-    columns = [[*samples] for _, samples in found]
-    del found
+    last = min(int(step[-1]), planned)
+    chosen = step <= last
     grid: list[Any] = []
-    for lost in LOST:  # one column after the other leaves the batches, so that a long log is not twice in memory
-        values = np.concatenate([own.pop(0) for own in columns])
-        column = np.full(last + 1, lost, values.dtype)
-        column[steps[chosen]] = values[chosen]  # of two samples of one step the later one counts
+    for lost in LOST:
+        column = np.full(last + 1, lost, np.int8 if lost == UNKNOWN else np.float64)
+        values = np.frombuffer(buffers.pop(0), column.dtype)
+        column[step[chosen]] = values[chosen]  # of two samples of one step the later one counts
         grid.append(column)
     return Samples(*grid)
 

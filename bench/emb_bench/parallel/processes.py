@@ -12,10 +12,9 @@ import multiprocessing
 import os
 import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from multiprocessing import connection, resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, TypeVar
@@ -93,7 +92,7 @@ class _Worker:
         self._process = _SPAWN.Process(target=_work, args=(theirs, work), daemon=True)
         if sys.platform != "win32":
             resource_tracker.ensure_running()  # started along with the first process, it would end the waiting
-        with _deferred(signal.SIGINT), _environment(ONE_THREAD):  # a Ctrl-C is for the command
+        with _start_settings():
             self._process.start()
         theirs.close()
 
@@ -140,30 +139,16 @@ def _work(pipe: Connection, work: Callable[[Any], Any]) -> None:
 
 
 @contextmanager
-def _deferred(number: signal.Signals) -> Iterator[None]:
-    """A signal is handled after this, and never reaches a process that is started inside.
-
-    To block it is not enough: another thread would take it, and Python then calls the handler in the main thread.
-    """
-    came: list[int] = []
-    with ExitStack() as undo:
-        undo.callback(lambda: [*map(signal.raise_signal, came)])
-        if threading.current_thread() is threading.main_thread():  # Python calls handlers nowhere else
-            undo.callback(signal.signal, number, signal.signal(number, lambda which, _frame: came.append(which)))
-        if hasattr(signal, "pthread_sigmask"):  # not on Windows
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, [number])
-            undo.callback(signal.pthread_sigmask, signal.SIG_SETMASK, before)
-        yield
-
-
-@contextmanager
-def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """The environment that processes started inside inherit."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
+def _start_settings() -> Iterator[None]:
+    """What a process that is started inside inherits: one thread for each library, and no SIGINT, as of a Ctrl-C."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]) if hasattr(signal, "pthread_sigmask") else None
     try:
         yield
     finally:
+        if mask is not None:  # it is not on Windows
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for name, value in before.items():
             if value is None:
                 del os.environ[name]

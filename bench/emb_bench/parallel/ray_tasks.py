@@ -48,28 +48,19 @@ def shared_out_on_ray(
         raise UsageError(f"{command} --ray needs ray: pip install 'emb-excite[ray]'") from err
     # The path of a socket may have 107 characters, and Ray's lie deep inside its folder.
     folder = tempfile.mkdtemp(prefix="ray-", dir="/tmp") if address == LOCAL else None
+    own: dict[str, Any] = {"num_cpus": jobs, "include_dashboard": False, "_temp_dir": folder} if folder else {}
+    environment = {"env_vars": dict(ONE_THREAD)}
     try:
-        _start(ray, address, jobs, folder)
+        try:
+            _knock(address)
+            ray.init(address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **own)
+        except (OSError, OverflowError, RuntimeError, ValueError) as err:
+            raise UsageError(f"--ray: Ray at '{address}' cannot be used: {err}") from err
         yield from _done(ray, work, pieces, jobs)
     finally:
         ray.shutdown()
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def _start(ray: Any, address: str, jobs: int | None, folder: str | None) -> None:
-    own: dict[str, Any] = {"num_cpus": jobs, "include_dashboard": False, "_temp_dir": folder} if folder else {}
-    try:
-        _knock(address)
-        ray.init(
-            address,
-            log_to_driver=False,
-            logging_level=logging.ERROR,
-            runtime_env={"env_vars": dict(ONE_THREAD)},
-            **own,
-        )
-    except (OSError, OverflowError, RuntimeError, ValueError) as err:
-        raise UsageError(f"--ray: Ray at '{address}' cannot be used: {err}") from err
 
 
 def _knock(address: str) -> None:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 
-from emb_bench.recordings.map_file import MachineMap
+from emb_bench.recordings.map_file import RecordingMap
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.plants import IMPORTED_PLANT
 from emb_runtime.config.systematic import Systematic
 
 
 def bench_text(
-    name: str,
-    machine: MachineMap,
+    wanted: RecordingMap,
     sample_time: float,
     horizon: int,
     noise: tuple[float, float],
@@ -22,8 +21,7 @@ def bench_text(
     """Text of the bench file.
 
     Args:
-        name: of the recording.
-        machine: what the map says.
+        wanted: the map.
         sample_time: [s].
         horizon: periods.
         noise: standard deviations of angle [rad] and velocity [rad/s].
@@ -32,22 +30,23 @@ def bench_text(
     """
     low, high, speed, current = reach
     slack = 0.5 * (high - low) + 1.0
-    own = {"J": 1.0, "gamma": 1.0, "k_m": 1.0, "k_1": 0.0, "T_c": 1.0, "f_v": 1.0} | dict(machine.parameters)
+    machine = wanted.machine
+    own = {"J": 1.0, "gamma": 1.0, "k_m": 1.0, "k_1": 0.0, "T_c": 1.0, "f_v": 1.0} | machine.parameters
     by_direction = [name for name in machine.unknown if name not in own]
     lines = [
         "# A machine for the analysis of recordings: nothing is driven with it.",
         "schema = 1",
-        f"name = {_text(name)}",
+        f"name = {_text(wanted.name)}",
         "",
         "[machine]",
         f"unknown = {_list(machine.unknown)}",
         f"nuisances = {_list(machine.nuisances)}",
         *([f"window = {machine.window!r}  # s"] if machine.window else []),
-        f"between = {_text(machine.between)}",
+        f"between = {_text(wanted.between)}",
         *([f"travel = {machine.travel!r}  # m/rad"] if machine.travel else []),
         "",
         "[machine.units]",
-        *(f"{key} = {_text(unit)}" for key, unit in machine.units.items()),
+        *(f"{key} = {_text(unit)}" for key, unit in wanted.shown.items()),
         "",
         "[brake]",
         *(f"{key} = {own[key]!r}" for key in ("J", "gamma", *PARAMETER_NAMES)),

@@ -31,30 +31,37 @@ class Column(NamedTuple):
     time: Floats | None  # Of each value [s], shape (n,); None where the format has no times of its own
 
 
-def read_columns(path: Path, source: Source, names: Sequence[str]) -> dict[str, Column]:
+def read_columns(path: Path, kind: str, source: Source, folder: Path, names: Sequence[str]) -> dict[str, Column]:
     """Named columns of a file.
 
     Args:
         path: of the file.
-        source: its kind and form.
+        kind: of the file, a key of ``KINDS``.
+        source: its form.
+        folder: that its DBC file is in.
         names: of columns; ``struct.field`` inside MATLAB structures, ``group/data`` in MATLAB 7.3, ``Message.Signal``
             in CAN logs.
 
     Raises:
         UsageError: the file cannot be read, is not of its kind, or lacks a column; or a library is missing.
     """
-    readers: Mapping[str, Callable[[Path, Source, Sequence[str]], dict[str, Column]]] = {
-        "csv": _csv,
-        "parquet": _parquet,
-        "matlab": _matlab,
-        "mdf": _mdf,
-        "can": _can,
+    names = list(dict.fromkeys(names))
+    readers: Mapping[str, tuple[str, str, Callable[[], Iterator[tuple[str, Any, Any]]]]] = {
+        "csv": ("CSV", "pyarrow", lambda: _csv(path, source, names)),
+        "parquet": ("Parquet", "pyarrow", lambda: _parquet(path, names)),
+        "matlab": ("MATLAB", "scipy and h5py", lambda: _matlab(path, names)),
+        "mdf": ("MDF", "asammdf", lambda: _mdf(path, names)),
+        "can": ("a CAN log", "python-can", lambda: _can(path, folder / source.dbc, names)),
     }
+    title, library, read = readers[kind]
+    found = {}
     try:
         open_regular(path).close()
     except OSError as err:
         raise UsageError(f"{path}: cannot read the recording: {err.strerror}") from err
-    found = readers[source.kind](path, source, list(dict.fromkeys(names)))
+    with _errors_in_one_line(path, title, library):
+        for name, values, time in read():
+            found[name] = Column(_numbers(path, name, values), None if time is None else _numbers(path, name, time))
     for name, column in found.items():
         if not 2 <= len(column.values) <= MOST:
             raise UsageError(f"{path}: {name}: expected 2 to {MOST} values, got {len(column.values)}")
@@ -62,8 +69,7 @@ def read_columns(path: Path, source: Source, names: Sequence[str]) -> dict[str, 
 
 
 @contextmanager
-def _of_kind(path: Path, kind: str, library: str) -> Iterator[None]:
-    """Turns what a library complains about into one line."""
+def _errors_in_one_line(path: Path, kind: str, library: str) -> Iterator[None]:
     try:
         yield
     except EmbError:
@@ -89,164 +95,135 @@ def _let_go(err: Exception) -> None:
         sys.unraisablehook = hook
 
 
-def _lacking(path: Path, name: str, known: Sequence[str]) -> UsageError:
-    others = ", ".join(known[:NAMED]) + (", ..." if len(known) > NAMED else "")
-    return UsageError(f"{path}: no column is called {name!r}; it has: {others or 'none'}")
+def _require_one(path: Path, name: str, places: Sequence[Any], known: Sequence[str]) -> None:
+    if not places:
+        others = ", ".join(known[:NAMED]) + (", ..." if len(known) > NAMED else "")
+        raise UsageError(f"{path}: no column is called {name!r}; it has: {others or 'none'}")
+    if len(places) > 1:
+        raise UsageError(f"{path}: {len(places)} columns are called {name!r}: expected one")
 
 
 def _numbers(path: Path, name: str, values: Any) -> Floats:
     try:
-        row: Floats = np.asarray(values, dtype=np.float64)
+        row: Floats = np.squeeze(np.asarray(values, dtype=np.float64))
     except (TypeError, ValueError) as err:
         raise UsageError(f"{path}: {name}: expected numbers") from err
-    if row.ndim == 2 and 1 in row.shape:
-        row = row.ravel()
     if row.ndim != 1:
-        raise UsageError(f"{path}: {name}: expected one row of numbers, got an array of shape {row.shape}")
+        raise UsageError(f"{path}: {name}: expected one row of numbers, got an array of shape {np.shape(values)}")
     return row
 
 
-def _csv(path: Path, source: Source, names: Sequence[str]) -> dict[str, Column]:
-    with _of_kind(path, "CSV", "pyarrow"):
-        from pyarrow import csv
+def _csv(path: Path, source: Source, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
+    from pyarrow import csv
 
-        table = csv.read_csv(
-            path,
-            csv.ReadOptions(skip_rows_after_names=source.skip),
-            csv.ParseOptions(delimiter=source.delimiter),
-            csv.ConvertOptions(decimal_point=source.decimal, null_values=["", "nan", "NaN", "NAN", "null"]),
-        )
-        return _arrow(path, table, names)
-
-
-def _parquet(path: Path, source: Source, names: Sequence[str]) -> dict[str, Column]:
-    with _of_kind(path, "Parquet", "pyarrow"):
-        from pyarrow import parquet
-
-        with parquet.ParquetFile(path) as file:
-            known = file.schema_arrow.names
-            for name in names:
-                if name not in known:
-                    raise _lacking(path, name, known)
-            return _arrow(path, file.read(columns=list(names)), names)
+    table = csv.read_csv(
+        path,
+        csv.ReadOptions(skip_rows_after_names=source.skip),
+        csv.ParseOptions(delimiter="\t" if source.delimiter == "tab" else source.delimiter),
+        csv.ConvertOptions(decimal_point=source.decimal, null_values=["", "nan", "NaN", "NAN", "null"]),
+    )
+    return _arrow(path, table, names)
 
 
-def _arrow(path: Path, table: Any, names: Sequence[str]) -> dict[str, Column]:
-    found = {}
+def _parquet(path: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
+    from pyarrow import parquet
+
+    with parquet.ParquetFile(path) as file:
+        known = file.schema_arrow.names
+        return _arrow(path, file.read(columns=[name for name in known if name.strip() in names]), names, known)
+
+
+def _arrow(
+    path: Path, table: Any, names: Sequence[str], known: Sequence[str] | None = None
+) -> Iterator[tuple[str, Any, Any]]:
     for name in names:
-        places = [i for i, known in enumerate(table.column_names) if known.strip() == name]
-        if not places:
-            raise _lacking(path, name, table.column_names)
-        if len(places) > 1:
-            raise UsageError(f"{path}: {len(places)} columns are called {name!r}: expected one")
+        places = [i for i, own in enumerate(table.column_names) if own.strip() == name]
+        _require_one(path, name, places, known or table.column_names)
         column = table.column(places[0])
         if str(column.type).startswith("timestamp"):
             column = column.cast("timestamp[ns]").cast("int64")
-            values = (column.to_numpy() - column[0].as_py()) * 1e-9
+            yield name, (column.to_numpy() - column[0].as_py()) * 1e-9, None
         else:
-            values = column.to_numpy()
-        found[name] = Column(_numbers(path, name, values), None)
-    return found
+            yield name, column.to_numpy(), None
 
 
-def _matlab(path: Path, source: Source, names: Sequence[str]) -> dict[str, Column]:
-    with _of_kind(path, "MATLAB", "scipy"):
-        from scipy import io
+def _matlab(path: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
+    from scipy import io
 
-        try:
-            content = io.loadmat(path, squeeze_me=True, struct_as_record=False, simplify_cells=True)
-        except NotImplementedError:  # version 7.3 is HDF5
-            return _hdf5(path, names)
-    found = {}
+    try:
+        content = io.loadmat(path, squeeze_me=True, struct_as_record=False, simplify_cells=True)
+    except NotImplementedError:  # version 7.3 is HDF5
+        yield from _hdf5(path, names)
+        return
     for name in names:
         value: Any = content
         for part in name.split("."):
-            if not isinstance(value, Mapping) or part not in value:
-                raise _lacking(path, name, [key for key in content if not key.startswith("__")])
-            value = value[part]
-        found[name] = Column(_numbers(path, name, value), None)
-    return found
+            found = [value[part]] if isinstance(value, Mapping) and part in value else []
+            _require_one(path, name, found, [key for key in content if not key.startswith("__")])
+            value = found[0]
+        yield name, value, None
 
 
-def _hdf5(path: Path, names: Sequence[str]) -> dict[str, Column]:
-    with _of_kind(path, "MATLAB 7.3", "h5py"):
-        import h5py
+def _hdf5(path: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
+    import h5py
 
-        found = {}
-        with h5py.File(path, "r") as file:
-            for name in names:
-                place = name.replace(".", "/")
-                if not isinstance(file.get(place), h5py.Dataset):
-                    raise _lacking(path, name, [key for key in file if not key.startswith("#")])
-                found[name] = Column(_numbers(path, name, file[place][()]), None)
-        return found
+    with h5py.File(path, "r") as file:
+        for name in names:
+            place = file.get(name.replace(".", "/"))
+            found = [place] if isinstance(place, h5py.Dataset) else []
+            _require_one(path, name, found, [key for key in file if not key.startswith("#")])
+            yield name, found[0][()], None
 
 
-def _mdf(path: Path, source: Source, names: Sequence[str]) -> dict[str, Column]:
-    with _of_kind(path, "MDF", "asammdf"):
-        from asammdf import MDF
+def _mdf(path: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
+    from asammdf import MDF
 
-        with MDF(path) as file:
-            known = sorted(name for name in file.channels_db if name not in ("time", "t"))
-            found = {}
-            for name in names:
-                if name not in file.channels_db:
-                    raise _lacking(path, name, known)
-                if len(places := file.channels_db[name]) > 1:
-                    raise UsageError(f"{path}: {len(places)} channels are called {name!r}: expected one")
-                signal = file.get(name)
-                found[name] = Column(_numbers(path, name, signal.samples), _numbers(path, name, signal.timestamps))
-            return found
+    with MDF(path) as file:
+        known = sorted(name for name in file.channels_db if name not in ("time", "t"))
+        for name in names:
+            _require_one(path, name, file.channels_db.get(name, ()), known)
+            signal = file.get(name)
+            yield name, signal.samples, signal.timestamps
 
 
-def _can(path: Path, source: Source, names: Sequence[str]) -> dict[str, Column]:
-    with _of_kind(path, "a DBC", "cantools"):
-        import cantools
+def _can(path: Path, dbc: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
+    import cantools
+    from can.io.player import MESSAGE_READERS
 
-        assert source.dbc is not None  # the map was refused
+    with _errors_in_one_line(dbc, "a DBC", "cantools"):
         try:
-            bus = cantools.database.load_file(str(source.dbc), strict=False)
+            bus: Any = cantools.database.load_file(str(dbc), strict=False)
         except OSError as err:
-            raise UsageError(f"{source.dbc}: cannot read the DBC: {err.strerror}") from err
-    wanted = _wanted(path, source, names, bus)
-    values: dict[str, list[float]] = {name: [] for name in names}
-    times: dict[str, list[float]] = {name: [] for name in names}
-    with _of_kind(path, "a CAN log", "python-can"):
-        from can.io.player import MESSAGE_READERS
-
-        reader: Any = MESSAGE_READERS[path.suffix.lower() if path.suffix.lower() in KINDS["can"] else ".log"]
-        with open_regular(path) as data:  # ours, and closed whatever a reader does
-            text = data if path.suffix.lower() == ".blf" else TextIOWrapper(data, "utf-8", "replace")
-            for frame in reader(text):
-                entry = wanted.get((frame.arbitration_id, frame.is_extended_id))
-                if entry is None or frame.is_error_frame or frame.is_remote_frame:
-                    continue
-                message, signals = entry
-                if len(frame.data) < message.length:
-                    continue
-                decoded = message.decode(bytes(frame.data), decode_choices=False)
-                for name, signal in signals:
-                    if signal in decoded:  # a multiplexed one is in some frames only
-                        values[name].append(float(decoded[signal]))
-                        times[name].append(float(frame.timestamp))
+            raise UsageError(f"{dbc}: cannot read the DBC: {err.strerror}") from err
+    wanted = _messages(dbc, names, bus)
+    rows: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
+    suffix = path.suffix.lower()
+    reader: Any = MESSAGE_READERS[suffix if suffix in KINDS["can"] else ".log"]
+    with open_regular(path) as data:  # ours, and closed whatever a reader does
+        for frame in reader(data if suffix == ".blf" else TextIOWrapper(data, "utf-8", "replace")):
+            message, signals = wanted.get((frame.arbitration_id, frame.is_extended_id), (None, ()))
+            if message is None or frame.is_error_frame or frame.is_remote_frame or len(frame.data) < message.length:
+                continue
+            decoded = message.decode(bytes(frame.data), decode_choices=False)
+            for name, signal in signals:
+                if signal in decoded:  # a multiplexed one is in some frames only
+                    rows[name].append((float(decoded[signal]), float(frame.timestamp)))
     for name in names:
-        if not values[name]:
+        if not rows[name]:
             raise UsageError(f"{path}: no frame has {name}: expected the DBC of this bus, and its log")
-    return {name: Column(np.array(values[name]), np.array(times[name])) for name in names}
+        values, times = zip(*rows[name], strict=True)
+        yield name, values, times
 
 
-def _wanted(
-    path: Path, source: Source, names: Sequence[str], bus: Any
-) -> dict[tuple[int, bool], tuple[Any, list[tuple[str, str]]]]:
-    """Messages by identifier, with the columns that they hold."""
-    by_name = {message.name: message for message in bus.messages}
+def _messages(dbc: Path, names: Sequence[str], bus: Any) -> dict[tuple[int, bool], tuple[Any, list[tuple[str, str]]]]:
+    """Messages by identifier, with the columns that they hold and the signals of these."""
+    by_name = {f"{message.name}.{signal.name}": message for message in bus.messages for signal in message.signals}
     found: dict[tuple[int, bool], tuple[Any, list[tuple[str, str]]]] = {}
     for name in names:
-        title, _, signal = name.partition(".")
-        message = by_name.get(title)
-        if message is None or signal not in (known := [s.name for s in message.signals]):
-            choices = sorted(by_name) if message is None else [f"{title}.{s}" for s in known]
-            raise UsageError(f"{source.dbc}: no signal is called {name!r}; it has: {', '.join(choices[:NAMED])}")
+        message = by_name.get(name)
+        if message is None:
+            choices = ", ".join(sorted(by_name)[:NAMED])
+            raise UsageError(f"{dbc}: no signal is called {name!r}; it has: {choices}")
         key = (message.frame_id, message.is_extended_frame)
-        found.setdefault(key, (message, []))[1].append((name, signal))
+        found.setdefault(key, (message, []))[1].append((name, name.partition(".")[2]))
     return found

@@ -41,15 +41,18 @@ def import_recording(path: Path, map_path: Path, out: Path) -> Recorded:
     Raises:
         UsageError: a file cannot be read or written, or the map does not fit the recording.
     """
-    wanted = read_map(map_path, path)
-    names = [signal.column for signal in wanted.signals.values()]
-    names += [] if wanted.time_column is None else [wanted.time_column]
-    found = recorded(read_columns(path, wanted.source, names), wanted, str(path))
+    wanted, map_text = read_map(map_path)
+    kind, timing = wanted.kind_of(path), wanted.timing
+    names = [signal.column for signal in wanted.signals.given.values()] + ([timing.column] if timing.column else [])
+    columns = read_columns(path, kind, wanted.file, map_path.parent, names)
+    found = recorded(columns, wanted, kind, str(path))
     text = bench_of(found, wanted)
     parse_bench(text, f"{map_path}: the bench file made of it", analysis=True)
     with open_regular(path) as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    write_run(found, wanted, text, {"file": path.name, "sha256": digest}, out)
+    write_run(
+        found, wanted.name, {"bench.toml": text, "map.toml": map_text}, {"file": path.name, "sha256": digest}, out
+    )
     return found
 
 
@@ -61,18 +64,16 @@ def bench_of(found: Recorded, wanted: RecordingMap) -> str:
         float(np.abs(found.velocity).max()),
         float(np.abs(found.applied).max()),
     )
-    return bench_text(
-        wanted.name, wanted.machine, found.sample_time, int(found.step[-1]), found.noise, reach, found.bandwidth
-    )
+    return bench_text(wanted, found.sample_time, int(found.step[-1]), found.noise, reach, found.bandwidth)
 
 
-def write_run(found: Recorded, wanted: RecordingMap, text: str, source: dict[str, str], out: Path) -> None:
+def write_run(found: Recorded, name: str, texts: dict[str, str], source: dict[str, str], out: Path) -> None:
     """Writes the log.
 
     Args:
         found: the samples.
-        wanted: the map.
-        text: of the bench file.
+        name: of the recording.
+        texts: the bench file and the map, by file name.
         source: name and digest of the recording.
         out: log to make.
 
@@ -91,14 +92,11 @@ def write_run(found: Recorded, wanted: RecordingMap, text: str, source: dict[str
                 "purpose": str(RunType.EXPERIMENT),
                 "iface": "imported",
                 "steps": steps,
-                "bench_name": wanted.name,
+                "bench_name": name,
             },
             IMPORT: {**source, "lacks": json.dumps(list(found.lacks), ensure_ascii=False)},
         },
-        "attachments": [
-            ("bench.toml", "application/toml", base64.b64encode(text.encode())),
-            ("map.toml", "application/toml", base64.b64encode(wanted.text.encode())),
-        ],
+        "attachments": [(file, "application/toml", base64.b64encode(text.encode())) for file, text in texts.items()],
     }
     with new_file(out) as file:
         writer = LogWriter(file, header)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.recordings.map_file import MEASURED_UNITS, RecordingMap, Signal
+from emb_bench.recordings.map_file import MEASURED_UNITS, OWN_TIMES, RecordingMap, Signal
 from emb_bench.recordings.readers import Column, Floats
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_runtime.config.plants import Instruments
@@ -38,21 +38,23 @@ class Recorded:
     lacks: tuple[str, ...]  # Descriptions of the parts of a log of ours that the recording does not have
 
 
-def recorded(columns: Mapping[str, Column], wanted: RecordingMap, source: str) -> Recorded:
+def recorded(columns: Mapping[str, Column], wanted: RecordingMap, kind: str, source: str) -> Recorded:
     """Puts columns on a grid.
 
     Args:
         columns: by their names.
         wanted: the map.
+        kind: of the file.
         source: what to call the file in messages.
 
     Raises:
         UsageError: times run backwards or columns differ in length; too few samples, or too many.
     """
-    clock = None if wanted.time_column is None else columns[wanted.time_column].values * wanted.time_unit
-    signals = {name: _signal(columns, signal, name, wanted, clock, source) for name, signal in wanted.signals.items()}
+    given, timing = wanted.signals.given, wanted.timing
+    clock = columns[timing.column].values * wanted.time_unit if timing.column else None
+    signals = {name: _signal(columns, signal, name, wanted, clock, source) for name, signal in given.items()}
     times, angles = signals["angle"]
-    t_s = wanted.sample_time or float(np.median(np.diff(times)))
+    t_s = timing.sample_time or float(np.median(np.diff(times)))
     if not 1e-4 <= t_s <= 0.1:
         raise UsageError(
             f"{source}: expected a sample time from 0.0001 to 0.1 s, got {t_s:g} s: see [timing] in the map"
@@ -66,15 +68,14 @@ def recorded(columns: Mapping[str, Column], wanted: RecordingMap, source: str) -
         )
     angle = angles[index]
     bandwidth = 0.0 if "velocity" in signals else min(max(SLOWEST, 0.5 / t_s), FASTEST)
-    angle_noise = wanted.signals["angle"].noise * _factor("angle", wanted.signals["angle"], wanted)
+    angle_noise = given["angle"].noise * _factor("angle", given["angle"], wanted)
     if bandwidth:
         velocity = _derived(step, angle, t_s, bandwidth)
         velocity_noise = observer_noise(bandwidth, t_s, angle_noise)
     else:
         velocity = _nearest(*signals["velocity"], origin + step * t_s, t_s)
-        own = wanted.signals["velocity"]
-        velocity_noise = own.noise * _factor("velocity", own, wanted)
-    held = "command" not in wanted.signals or wanted.signals["command"].between != "linear"
+        velocity_noise = given["velocity"].noise * _factor("velocity", given["velocity"], wanted)
+    held = "command" not in given or given["command"].between != "linear"
     applied, commanded = _currents(signals, origin, step, t_s, held)
     known = np.isfinite(velocity) & np.isfinite(applied)
     if int(known.sum()) < FEWEST:
@@ -93,7 +94,7 @@ def recorded(columns: Mapping[str, Column], wanted: RecordingMap, source: str) -
         commanded=commanded[chosen],
         noise=(angle_noise, velocity_noise),
         bandwidth=bandwidth,
-        lacks=_lacks(wanted, bandwidth, int(step[chosen][-1]) + 1 - len(chosen)),
+        lacks=_lacks(wanted, kind, bandwidth, int(step[chosen][-1]) + 1 - len(chosen)),
     )
 
 
@@ -115,8 +116,8 @@ def _signal(
 ) -> tuple[Floats, Floats]:
     """Times [s] and values in our units of what was recorded of a signal."""
     column = columns[signal.column]
-    values = (column.values - signal.offset) * signal.scale * _factor(name, signal, wanted)
-    rows = np.asarray(np.arange(len(values)) * wanted.sample_time, dtype=np.float64) if clock is None else clock
+    values = (column.values - signal.offset) * signal.scale * signal.sign * _factor(name, signal, wanted)
+    rows = np.asarray(np.arange(len(values)) * wanted.timing.sample_time, dtype=np.float64) if clock is None else clock
     time: Floats = rows if column.time is None else column.time
     if len(time) != len(values):
         raise UsageError(f"{source}: {signal.column}: {len(values)} values and {len(time)} times: expected as many")
@@ -192,20 +193,20 @@ def _derived(step: Integers, angle: Floats, t_s: float, bandwidth: float) -> Flo
     return result
 
 
-def _lacks(wanted: RecordingMap, bandwidth: float, lost: int) -> tuple[str, ...]:
+def _lacks(wanted: RecordingMap, kind: str, bandwidth: float, lost: int) -> tuple[str, ...]:
     said = ["the recording has no counters, answers or states: a repeated, late or lost command cannot be told"]
     if bandwidth:
         said.append(
             f"the recording has no velocity: an observer ({bandwidth:g} rad/s) derives one from the angles, which has "
             "no weight in an estimate"
         )
-    if "current" not in wanted.signals:
+    if wanted.signals.current is None:
         said.append("the recording has no measured current: what acted is taken to be what was commanded")
-    if "command" not in wanted.signals:
+    if wanted.signals.command is None:
         said.append("the recording has no commands: what acted is the mean of the measured current over each period")
-    if wanted.time_column is None and wanted.source.kind not in ("mdf", "can"):
+    if not wanted.timing.column and kind not in OWN_TIMES:
         said.append("the recording has no times: its rows are taken to be one sample time apart")
-    if wanted.source.kind == "can":
+    if kind == "can":
         said.append("the times are those of the receiver, jitter of the bus included")
     if not lost:
         return tuple(said)

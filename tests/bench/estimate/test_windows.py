@@ -28,9 +28,9 @@ ASKED = EstimationProblem(("T_c", "f_v", "J"), ("current_offset",))
 
 def made(found: Recording, text: str = MAP) -> tuple[Bench, Experiment]:
     """Bench and record of a recording, without a file between."""
-    wanted = parse_map(text, "map", Path("r.csv"), Path())
+    wanted = parse_map(text, "map")
     columns = {name: Column(c, None) for name, c in zip(("t", "x", "F"), found, strict=True)}
-    ours = recorded(columns, wanted, "r.csv")
+    ours = recorded(columns, wanted, "csv", "r.csv")
     bench = parse_bench(bench_of(ours, wanted), "made", analysis=True)
     samples = np.stack([ours.angle, ours.velocity], axis=1)[1:]
     return bench, Experiment("r", ours.applied[1:], samples, float(ours.angle[0]), float(ours.velocity[0]), 0.0, False)

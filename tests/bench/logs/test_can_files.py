@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -146,10 +145,3 @@ def test_can_logconvert_writes_every_frame_of_a_log(
         assert message.dlc == len(frame.data) or (frame.remote and form == "log")  # candump's R has no length
         if not frame.remote:
             assert bytes(message.data) == frame.data
-
-
-def test_python_cans_own_compression_is_refused_by_python_can(path: Path, tmp_path: Path) -> None:
-    packed = tmp_path / "run.mcap.gz"
-    packed.write_bytes(gzip.compress(path.read_bytes()))
-    with pytest.raises(ValueError, match="No read support"):
-        can.LogReader(packed)

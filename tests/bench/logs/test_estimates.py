@@ -134,30 +134,27 @@ def test_without_its_goal_the_run_goes_another_way(write: Write) -> None:
 
 
 STEP, VALUE, DEVIATION = Field("step", "int64"), Field("x", "double"), Field("x_deviation", "double")
+OTHERS = Field("y", "double"), Field("y_deviation", "double")
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        (STEP, DEVIATION, VALUE, Field("y", "double"), Field("y_deviation", "double")),
-        (STEP, VALUE, Field("y", "double"), DEVIATION, Field("y_deviation", "double")),
-        (STEP._replace(type="double"), VALUE, DEVIATION, Field("y", "double"), Field("y_deviation", "double")),
-        (STEP._replace(name="k"), VALUE, DEVIATION, Field("y", "double"), Field("y_deviation", "double")),
-        (STEP, VALUE, DEVIATION, Field("y", "double"), Field("z_deviation", "double")),
-    ],
-)
-def test_a_topic_with_other_fields_is_refused_in_one_line(
-    fields: tuple[Field, ...], write: Write, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    four = (*fields, *(Field(name, "double") for name in ("v", "v_deviation", "w", "w_deviation")))
-    with monkeypatch.context() as patch:
-        patch.setattr(mcap_schema, "estimate_topic", lambda _: Topic(mcap_schema.ESTIMATE, "emb.Estimate", four, {}))
-        path = write()
-    readers: tuple[Callable[[RunLog], object], ...] = (by_step, last_estimate, info_document)
-    for read in readers:
-        with pytest.raises(LogError, match="/estimate: expected a step, and values with a deviation") as caught:
-            read(read_log(path))
-        assert "\n" not in str(caught.value)
+def test_a_topic_with_other_fields_is_refused_in_one_line(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    for fields in (
+        (STEP, DEVIATION, VALUE, *OTHERS),
+        (STEP, VALUE, OTHERS[0], DEVIATION, OTHERS[1]),
+        (STEP._replace(type="double"), VALUE, DEVIATION, *OTHERS),
+        (STEP._replace(name="k"), VALUE, DEVIATION, *OTHERS),
+        (STEP, VALUE, DEVIATION, OTHERS[0], Field("z_deviation", "double")),
+    ):
+        four = (*fields, *(Field(name, "double") for name in ("v", "v_deviation", "w", "w_deviation")))
+        topic = Topic(mcap_schema.ESTIMATE, "emb.Estimate", four, {})
+        with monkeypatch.context() as patch:
+            patch.setattr(mcap_schema, "estimate_topic", lambda _, topic=topic: topic)
+            path = write()
+        readers: tuple[Callable[[RunLog], object], ...] = (by_step, last_estimate, info_document)
+        for read in readers:
+            with pytest.raises(LogError, match="/estimate: expected a step, and values with a deviation") as caught:
+                read(read_log(path))
+            assert "\n" not in str(caught.value)
 
 
 def test_a_log_without_estimates_has_no_such_topic(

@@ -121,35 +121,25 @@ READERS: tuple[Callable[[Path], object], ...] = (read_log, repaired, McapReader)
 
 
 @pytest.mark.parametrize("read", READERS)
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [
+def test_what_is_no_log_or_cannot_be_opened_is_refused_in_one_line(
+    tmp_path: Path, read: Callable[[Path], object]
+) -> None:
+    path = tmp_path / "x.mcap"
+    for content, reason in (
         (b"", "empty"),
         (b"hello", "not an MCAP"),
         (b"\x89MCAP0\r\n", "not one message"),
         (b"\x7fELF" * 99, "not an MCAP"),
-        (b"(0.0) can0 123#00\n", "not an MCAP"),
-    ],
-)
-def test_what_is_no_log_is_refused_in_one_line(
-    tmp_path: Path, read: Callable[[Path], object], content: bytes, reason: str
-) -> None:
-    path = tmp_path / "x.mcap"
-    path.write_bytes(content)
-    with pytest.raises(LogError, match=reason) as caught:
-        read(path)
-    assert "\n" not in str(caught.value)
-    assert caught.value.exit_code == 6
-    assert list(tmp_path.iterdir()) == [path]
-
-
-@pytest.mark.parametrize("read", READERS)
-@pytest.mark.parametrize(("name", "reason"), [("absent.mcap", "No such file"), (".", "directory")])
-def test_what_cannot_be_opened_is_refused_in_one_line(
-    tmp_path: Path, read: Callable[[Path], object], name: str, reason: str
-) -> None:
-    with pytest.raises(UsageError, match=reason):
-        read(tmp_path / name)
+    ):
+        path.write_bytes(content)
+        with pytest.raises(LogError, match=reason) as caught:
+            read(path)
+        assert "\n" not in str(caught.value)
+        assert caught.value.exit_code == 6
+        assert list(tmp_path.iterdir()) == [path]
+    for name, reason in (("absent.mcap", "No such file"), (".", "directory")):
+        with pytest.raises(UsageError, match=reason):
+            read(tmp_path / name)
 
 
 @pytest.mark.parametrize("read", READERS)
@@ -228,23 +218,19 @@ def test_a_log_whose_recorder_was_killed_is_read_up_to_the_last_flush(tmp_path: 
     assert log.events
 
 
-@pytest.mark.parametrize(
-    ("changes", "read", "reason"),
-    [
-        ({"attachments": []}, lambda log: log.bench, "carries no bench.toml"),
-        ({"attachments": [["bench.toml", "", "eHg="]]}, lambda log: log.bench, "not valid TOML"),
-        ({"attachments": [["bench.toml", "", "/w=="]]}, lambda log: log.bench, "not UTF-8"),
-        ({"metadata": {"emb.truth": {"f_v": "1"}}}, lambda log: log.truth, "true parameters"),
-        ({"metadata": {"emb.truth": dict.fromkeys(["J", "gamma", "k_m", "k_1", "T_c", "f_v"], "nan")}},
-         lambda log: log.truth, "not positive"),
-    ],
-)  # fmt: skip
-def test_what_a_log_should_carry_and_does_not_is_said(
-    tmp_path: Path, run: SimRun, changes: dict[str, Any], read: Any, reason: str
-) -> None:
-    log = read_log(write_log(tmp_path / "x.mcap", run, **changes))
-    with pytest.raises(LogError, match=reason):
-        read(log)
+def test_what_a_log_should_carry_and_does_not_is_said(tmp_path: Path, run: SimRun) -> None:
+    nan = dict.fromkeys(["J", "gamma", "k_m", "k_1", "T_c", "f_v"], "nan")
+    rows: tuple[tuple[dict[str, Any], str, str], ...] = (
+        ({"attachments": []}, "bench", "carries no bench.toml"),
+        ({"attachments": [["bench.toml", "", "eHg="]]}, "bench", "not valid TOML"),
+        ({"attachments": [["bench.toml", "", "/w=="]]}, "bench", "not UTF-8"),
+        ({"metadata": {"emb.truth": {"f_v": "1"}}}, "truth", "true parameters"),
+        ({"metadata": {"emb.truth": nan}}, "truth", "not positive"),
+    )
+    for changes, part, reason in rows:
+        log = read_log(write_log(tmp_path / "x.mcap", run, **changes))
+        with pytest.raises(LogError, match=reason):
+            getattr(log, part)
 
 
 def test_only_a_simulated_brake_has_known_parameters(tmp_path: Path, run: SimRun) -> None:

@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import signal
 import threading
-from multiprocessing.process import BaseProcess
 
 import pytest
 
@@ -40,34 +39,6 @@ def test_what_the_work_raises_is_raised_here_and_ends_the_other_processes() -> N
 
 def test_no_work_needs_no_process() -> None:
     assert list(shared_out(squared, [], jobs=3)) == []
-
-
-def test_a_ctrl_c_that_reaches_another_thread_comes_when_the_process_has_its_orders(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    done = threading.Event()
-    other = threading.Thread(target=done.wait)
-    other.start()
-    start, begun = BaseProcess.start, list[BaseProcess]()
-
-    def interrupted_start(process: BaseProcess) -> None:
-        assert other.ident is not None
-        signal.pthread_kill(other.ident, signal.SIGINT)
-        start(process)
-        begun.append(process)
-
-    monkeypatch.setattr(BaseProcess, "start", interrupted_start)
-    handler = signal.getsignal(signal.SIGINT)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            list(shared_out(squared, [1], jobs=1))
-    finally:
-        done.set()
-        other.join()
-    assert len(begun) == 1
-    begun[0].kill()
-    begun[0].join()
-    assert signal.getsignal(signal.SIGINT) is handler
 
 
 def test_elsewhere_than_in_the_main_thread_work_is_shared_out_too() -> None:

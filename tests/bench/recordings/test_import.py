@@ -74,46 +74,6 @@ def test_what_a_recording_lacks_is_said_by_the_import_and_by_whoever_reads_it(
         assert any(lack in line for line in experiment.missing)
 
 
-def test_every_format_gives_the_same_samples(tmp_path: Path) -> None:
-    h5py = pytest.importorskip("h5py")
-    import pyarrow as pa
-    from pyarrow import parquet
-    from scipy import io
-
-    columns = {"t": RECORDING.time, "x": RECORDING.position, "F": RECORDING.force}
-    io.savemat(tmp_path / "old.mat", {name: values[:, None] for name, values in columns.items()})
-    io.savemat(tmp_path / "inside.mat", {"data": columns})
-    with h5py.File(tmp_path / "new.mat", "w", userblock_size=512) as file:
-        for name, values in columns.items():
-            file[name] = values[None, :]
-    data = (tmp_path / "new.mat").read_bytes()
-    text = b"MATLAB 7.3 MAT-file".ljust(116) + bytes(8) + b"\x00\x02IM"
-    (tmp_path / "new.mat").write_bytes(text.ljust(512, b"\x00") + data[512:])
-    parquet.write_table(pa.table(columns), tmp_path / "r.parquet")
-    inside = MAP.replace('"t"', '"data.t"').replace('"x"', '"data.x"').replace('"F"', '"data.F"')
-    for name, wanted in (("old.mat", MAP), ("inside.mat", inside), ("new.mat", MAP), ("r.parquet", MAP)):
-        folder = tmp_path / name.replace(".", "-")
-        folder.mkdir()
-        check(imported(folder, tmp_path / name, wanted))
-    (tmp_path / "semicolons").mkdir()
-    with_semicolons = MAP + '\n[file]\ndelimiter = ";"\n'
-    check(imported(tmp_path / "semicolons", csv(tmp_path / "r.txt", RECORDING, ";"), with_semicolons))
-
-
-def test_an_mdf_file_brings_its_own_times(tmp_path: Path) -> None:
-    asammdf = pytest.importorskip("asammdf")
-    with asammdf.MDF() as file:
-        file.append(
-            [
-                asammdf.Signal(values, RECORDING.time, name=name)
-                for name, values in (("x", RECORDING.position), ("F", RECORDING.force))
-            ]
-        )
-        file.save(tmp_path / "r.mf4")
-    text = MAP.replace('column = "t"\nunit = "s"\n', "")
-    check(imported(tmp_path, tmp_path / "r.mf4", text))
-
-
 DBC = """\
 VERSION ""
 BU_: drive
@@ -196,34 +156,35 @@ def test_lost_and_shifted_samples_stay_where_their_times_are(tmp_path: Path) -> 
     assert any("3 samples" in line for line in experiment.missing)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        ('unit = "m"', 'unit = "inch"', "signals.angle.unit: expected one of rad"),
-        ('unit = "m"', 'units = "m"', "signals.angle.unit: missing"),
-        (f"travel = {TRAVEL}\n", "", "travel"),
-        ('column = "x"', 'column = "y"', "no column is called 'y'; it has: t, x, F"),
-        ('unit = "N"', 'unit = "A"', "needs [machine] k_m"),
-        ('unit = "N"', 'unit = "A"\nsign = 0', "sign: expected 1 or -1"),
-        ("mass = 70.0", "mass = 0.0", "machine.guess.mass: expected a positive number"),
-        ("mass = 70.0", "", "J is missing, or mass"),
-        ("mass = 70.0", "mass = 70.0\nJ = 1e-5", "J is given twice"),
-        ("mass = 70.0", "mass = 70.0\nweight = 2.0", "weight: not a parameter"),
-        ("window = 0.5", "window = 0.5\nspring = 1", "machine.spring: unknown key"),
-        ('["current_offset"]', '["wind"]', "machine.nuisances[0]: expected one of"),
-        ("schema = 1", "schema = 2", "schema: expected 1, got 2"),
-        ("schema = 1", "schema = ", "not valid TOML"),
-        (f"noise = {5e-8 / 12**0.5}", "", "signals.angle.noise: missing"),
-        (f"sample_time = {T_S}", "sample_time = 5", "sample_time: expected a time from 0.0001 to 0.1 s"),
-        ('column = "t"\nunit = "s"\nsample_time = 0.001', "", "[timing]"),
-    ],
+MAPS_REFUSED = (
+    ('unit = "m"', 'unit = "inch"', "signals.angle.unit: expected one of rad"),
+    ('unit = "m"', 'units = "m"', "signals.angle.units: unknown key"),
+    ('unit = "m"', "", "signals.angle.unit: missing"),
+    (f"travel = {TRAVEL}\n", "", "travel"),
+    ('column = "x"', 'column = "y"', "no column is called 'y'; it has: t, x, F"),
+    ('unit = "N"', 'unit = "A"', "needs [machine] k_m"),
+    ('unit = "N"', 'unit = "A"\nsign = 0', "signals.command.sign: expected one of -1, 1, got 0"),
+    ("mass = 70.0", "mass = 0.0", "machine.guess.mass: expected a positive number"),
+    ("mass = 70.0", "", "J is missing, or mass"),
+    ("mass = 70.0", "mass = 70.0\nJ = 1e-5", "J is given twice"),
+    ("mass = 70.0", "mass = 70.0\nweight = 2.0", "machine.guess.weight: unknown key"),
+    ("mass = 70.0", "mass = 70.0\ngamma = 1e-5", "k_1 and gamma go together"),
+    ("window = 0.5", "window = 0.5\nspring = 1", "machine.spring: unknown key"),
+    ('["current_offset"]', '["wind"]', "machine.nuisances[0]: expected one of"),
+    ("schema = 1", "schema = 2", "schema: expected one of 1, got 2"),
+    ("schema = 1", "schema = ", "not valid TOML"),
+    (f"noise = {5e-8 / 12**0.5}", "", "signals.angle.noise: missing"),
+    (f"sample_time = {T_S}", "sample_time = 5", "sample_time: expected a time from 0.0001 to 0.1 s"),
+    ('column = "t"\nunit = "s"\nsample_time = 0.001', "", "[timing]"),
+    ('unit = "N"', 'unit = "N"\n[signals.current]\ncolumn = "F"\nunit = "A"', "has no k_m and no current"),
 )
-def test_a_map_that_does_not_fit_is_refused_in_one_line(
-    old: str, new: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert old in MAP
-    said = refused(tmp_path, csv(tmp_path / "r.csv", RECORDING), MAP.replace(old, new, 1), capsys)
-    assert expected in said
+
+
+def test_a_map_that_does_not_fit_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = csv(tmp_path / "r.csv", RECORDING)
+    for old, new, expected in MAPS_REFUSED:
+        assert old in MAP
+        assert expected in refused(tmp_path, source, MAP.replace(old, new, 1), capsys)
 
 
 def test_k_m_and_inertia_without_a_known_load_are_only_a_ratio(
@@ -236,24 +197,19 @@ def test_k_m_and_inertia_without_a_known_load_are_only_a_ratio(
     assert read_log(imported(tmp_path, tmp_path / "r.csv", held)).bench.machine.unknown == ("k_m", "T_c", "f_v")  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("r.csv", b"t,x,F\n0,1\n"),
-        ("r.csv", b"t,x,F\n" + b"".join(b"%d,a,b\n" % k for k in range(40))),
-        ("r.csv", b""),
-        ("r.mat", b"no MATLAB file"),
-        ("r.parquet", b"PAR1 not at all PAR1"),
-        ("r.csv", b"t,x,F\n" + b"".join(b"%d,1.0,2.0\n" % (9 - k) for k in range(40))),
-        ("r.csv", b"t,x,F\n0.0,0.0,0.0\n0.001,0.0,0.0\n"),
-        ("r.xls", b"?"),
-    ],
+FILES_REFUSED = (
+    ("r.csv", b"t,x,F\n0,1\n"),
+    ("r.csv", b"t,x,F\n" + b"".join(b"%d,a,b\n" % k for k in range(40))),
+    ("r.csv", b"t,x,F\n" + b"".join(b"%d,1.0,2.0\n" % (9 - k) for k in range(40))),
+    ("r.csv", b"t,x,F\n0.0,0.0,0.0\n0.001,0.0,0.0\n"),
+    ("r.xls", b"?"),
 )
-def test_a_file_that_is_none_is_refused_in_one_line(
-    name: str, content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / name).write_bytes(content)
-    assert name in refused(tmp_path, tmp_path / name, MAP, capsys)
+
+
+def test_a_file_that_is_none_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, content in FILES_REFUSED:
+        (tmp_path / name).write_bytes(content)
+        assert name in refused(tmp_path, tmp_path / name, MAP, capsys)
 
 
 def test_nothing_is_driven_or_designed_with_the_machine_of_a_recording(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from emb_bench.brake.quantities import Quantity, angle, command, quantity, velocity
+from emb_bench.brake.quantities import angle, command, quantity, velocity
 from emb_bench.cli.replay import main
 from emb_bench.recordings.map_file import parse_map
 from emb_runtime.config.machine import Machine as Kind
@@ -112,9 +112,8 @@ def test_information_is_told_by_the_names_of_the_machine(run: str, capsys: pytes
     assert "braked by the node" not in said
 
 
-@pytest.mark.parametrize(
-    ("found", "name", "unit", "factor"),
-    [
+def test_quantities_follow_what_was_measured_and_commanded() -> None:
+    for found, name, unit, factor in (
         (angle(LINEAR), "position", "mm", 2.0),
         (velocity(LINEAR), "velocity", "mm/s", 2.0),
         (command(LINEAR), "force", "kN", 0.5),
@@ -126,24 +125,20 @@ def test_information_is_told_by_the_names_of_the_machine(run: str, capsys: pytes
         (quantity(TURNING, "current_offset"), "voltage_offset", "V", 1.0),
         (quantity(TURNING, "J"), "J", "kg·m²", 1.0),
         (quantity(None, "current_offset"), "current_offset", "A", 1.0),
-    ],
-)
-def test_quantities_follow_what_was_measured_and_commanded(
-    found: Quantity, name: str, unit: str, factor: float
-) -> None:
-    assert found[:2] == (name, unit)
-    assert found.factor == pytest.approx(factor)
+    ):
+        assert found[:2] == (name, unit)
+        assert found.factor == pytest.approx(factor)
 
 
 def test_a_map_may_ask_for_other_units_of_the_same_kind() -> None:
     text = MAP.replace("[machine.guess]", '[machine.units]\nangle = "mm"\ncommand = "kN"\n[machine.guess]')
-    assert parse_map(text, "map", Path("r.csv"), Path()).machine.units == {"angle": "mm", "command": "kN"}
-    assert parse_map(MAP, "map", Path("r.csv"), Path()).machine.units == {"angle": "m", "command": "N"}
-    assert parse_map(IN_VOLTS, "map", Path("r.csv"), Path()).machine.units == {"angle": "deg", "command": "V"}
+    assert parse_map(text, "map").shown == {"angle": "mm", "command": "kN"}
+    assert parse_map(MAP, "map").shown == {"angle": "m", "command": "N"}
+    assert parse_map(IN_VOLTS, "map").shown == {"angle": "deg", "command": "V"}
     for old, new, wrong in (
         ('"kN"', '"A"', "no conversion makes A of it"),
         ('"mm"', '"inch"', "expected one of rad"),
         ("angle =", "length =", "length: unknown key"),
     ):
         with pytest.raises(UsageError, match=wrong):
-            parse_map(text.replace(old, new, 1), "map", Path("r.csv"), Path())
+            parse_map(text.replace(old, new, 1), "map")
