@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import time
 from collections.abc import Callable
@@ -10,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from emb_bench.export.repair import repair
@@ -21,7 +19,7 @@ from emb_runtime.errors import LogError, UsageError
 from emb_runtime.log.recorder import LogHeader, Recorder
 from emb_runtime.records import CycleRecord
 
-from tests.bench.damaged import read_or_refuse  # isort: skip
+from tests.bench.damaged import rewritten  # isort: skip
 from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
 
@@ -59,6 +57,7 @@ def test_a_log_replays_alone(path: Path, run: SimRun) -> None:
     assert log.true_plant == "exact"
     assert log.bench.brake == log.truth._replace(f_v=log.bench.brake.f_v)
     assert log.layout == load_layout()
+    assert read_log(write_log(path, run, metadata={})).truth is None
 
 
 def test_decoded_signals_are_those_of_the_frames(path: Path, run: SimRun) -> None:
@@ -69,17 +68,6 @@ def test_decoded_signals_are_those_of_the_frames(path: Path, run: SimRun) -> Non
     assert commands["Answers"].tolist() == [command.answers for command in sent]
     with pytest.raises(LogError, match="EMB_Nothing"):
         read_log(path).signals("EMB_Nothing")
-
-
-def test_no_flipped_bit_goes_unnoticed(path: Path) -> None:
-    data = path.read_bytes()
-    generator = random.Random(1)
-    for at in [*range(120), *range(120, len(data) - 120, 211), *range(len(data) - 120, len(data))]:
-        damaged = bytearray(data)
-        damaged[at] ^= 1 << generator.randrange(8)
-        path.write_bytes(damaged)
-        log = read_or_refuse(path)
-        assert log is None or not log.complete, f"byte {at}"
 
 
 def test_a_damaged_chunk_is_left_out_and_the_others_are_kept(path: Path) -> None:
@@ -156,33 +144,15 @@ def test_a_log_of_another_program_is_refused(tmp_path: Path, read: Callable[[Pat
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_log_that_another_program_has_copied_is_read_as_ours(tmp_path: Path, simulate: Simulate) -> None:
-    path, copy = write_log(tmp_path / "run.mcap", simulate(square, steps=20), steps=20), tmp_path / "copy.mcap"
-    with path.open("rb") as source, copy.open("wb") as target:
-        reader, writer = make_reader(source), Writer(target)
-        writer.start(profile="", library="mcap go/v1.7.0")
-        channels = {}
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
-            if channel.id not in channels:
-                assert schema is not None
-                its = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, its, dict(channel.metadata)
-                )
-            writer.add_message(
-                channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
-            )
-        for attachment in reader.iter_attachments():
-            writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
-        for record in reader.iter_metadata():
-            writer.add_metadata(record.name, record.metadata)
-        writer.finish()  # type: ignore[no-untyped-call]
-    whole, found = read_log(path), read_log(copy)
+def test_a_log_that_another_program_has_copied_is_read_as_ours(path: Path) -> None:
+    whole = read_log(path)
+    rewritten(path, library="mcap go/v1.7.0")
+    found = read_log(path)
     assert found.complete
     assert found.exit_reason == whole.exit_reason == "DONE"
     assert found.counts == {topic: count for topic, count in whole.counts.items() if count}
     assert found.cycles["angle"].tolist() == whole.cycles["angle"].tolist()
-    with McapReader(copy) as frames:
+    with McapReader(path) as frames:
         assert len([*frames]) == whole.counts["/can/rx"] + whole.counts["/can/tx"]
 
 
@@ -231,7 +201,3 @@ def test_what_a_log_should_carry_and_does_not_is_said(tmp_path: Path, run: SimRu
         log = read_log(write_log(tmp_path / "x.mcap", run, **changes))
         with pytest.raises(LogError, match=reason):
             getattr(log, part)
-
-
-def test_only_a_simulated_brake_has_known_parameters(tmp_path: Path, run: SimRun) -> None:
-    assert read_log(write_log(tmp_path / "x.mcap", run, metadata={})).truth is None

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from emb_bench.logs.log import read_log
-from emb_bench.logs.timing import INTERVALS, Timing, document, quantiles, timing
+from emb_bench.logs.timing import INTERVALS, Timing, document, timing
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
@@ -116,12 +116,6 @@ def test_the_device_clock_s_drift_and_jitter_come_from_a_straight_line(measure: 
     np.testing.assert_allclose(t.clock.residuals, (arrivals - START) * 1e-9 - slope * n * 1e-3 - offset, atol=1e-11)
 
 
-def test_quantiles_are_those_of_the_sorted_values() -> None:
-    values = np.arange(1001.0)
-    np.random.default_rng(1).shuffle(values)
-    assert quantiles(values) == pytest.approx({"p50": 500, "p90": 900, "p99": 990, "p99.9": 999, "p100": 1000})
-
-
 def test_a_log_without_an_experiment_has_no_intervals_and_no_clock(measure: Measure) -> None:
     t = measure(cycle(-1, START))
     assert all(len(t.interval(name)) == 0 for name in INTERVALS)
@@ -139,19 +133,13 @@ def test_the_document_is_json_in_seconds(measure: Measure) -> None:
     assert read["clock_drift"] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_a_simulation_s_times_are_called_so_and_the_loop_s_own_counts_are_taken(
-    tmp_path: Path, simulate: Simulate
+def test_the_counts_are_the_loop_s_and_a_simulation_is_called_so(
+    tmp_path: Path, bench: Bench, layout: Layout, simulate: Simulate
 ) -> None:
-    run = simulate(steps=50)
-    t = timing(read_log(write_log(tmp_path / "run.mcap", run, steps=50)))
-    assert t.simulated
-    assert (t.missed, t.unanswered) == (run.outcome.counters.missed, run.outcome.counters.unanswered)
-
-
-def test_the_counts_are_the_loop_s(tmp_path: Path, bench: Bench, layout: Layout) -> None:
     run = drive(HostileBus(bench, layout, random.Random(0), slow=0.1, lost=0.02), square, 150)
     counters = run.outcome.counters
     assert min(counters.missed, counters.unanswered, counters.not_obeyed) > 0
     t = timing(read_log(write_trace(tmp_path / "r.mcap", run.journal.records, bench, layout, run.outcome, steps=150)))
     assert (t.missed, t.unanswered, t.not_obeyed) == (counters.missed, counters.unanswered, counters.not_obeyed)
     assert len(t.response) == counters.answered
+    assert timing(read_log(write_log(tmp_path / "s.mcap", simulate(steps=50), steps=50))).simulated

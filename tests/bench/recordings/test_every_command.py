@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -83,13 +82,6 @@ def test_a_row_of_a_campaign_has_no_counts_of_a_loop_and_no_date(
     assert row["error"] is None
     assert [row[name] for name in ("missed", "clipped", "limited", "returning", "start_time")] == [None] * 5
     assert "\ntime         no date\n" in capsys.readouterr().out
-
-
-def test_the_documents_are_json(run: str, capsys: pytest.CaptureFixture[str]) -> None:
-    for words in (("info", run), ("fim", run), ("estimate", run, "--starts", "1")):
-        capsys.readouterr()
-        assert main([*words, "--json"]) == 0
-        assert isinstance(json.loads(capsys.readouterr().out), dict)
 
 
 def test_the_page_has_every_command_and_there_is_no_other() -> None:
