@@ -72,7 +72,7 @@ def impair(interface: str, impairment: Impairment) -> None:
     _qdisc(_RTM_NEWQDISC, CREATE | REPLACE, interface, kind + attribute(_TCA_OPTIONS, head + options))
 
 
-def heal(interface: str) -> None:
+def clear_netem(interface: str) -> None:
     """Take the impairment away; frames that wait in it are lost.
 
     Raises:
@@ -120,7 +120,7 @@ def remove_route(route: Route) -> None:
     _route(_RTM_DELROUTE, route)
 
 
-def join(one: str, other: str, identifier: int, xor: bytes) -> list[Route]:
+def bridge(one: str, other: str, identifier: int, xor: bytes) -> list[Route]:
     """Make one bus of two, on which frames with ``identifier`` arrive corrupted on the other side.
 
     Returns:

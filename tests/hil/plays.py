@@ -148,7 +148,7 @@ PLAYS = (
         "silence", "all frames lost for 50 ms", STOPPED, (3,),
         (
             {"do": "impair", "interface": "vcan0", "by": {"loss": 1.0}, "after": WHEN},
-            {"do": "heal", "interface": "vcan0", "pause": 0.05},
+            {"do": "clear_netem", "interface": "vcan0", "pause": 0.05},
         ),
         node_lost=True, stop_frames=None,
     ),

@@ -280,14 +280,14 @@ class Stage:
     def do_impair(self, action: dict[str, Any]) -> None:
         bus_faults.impair(action["interface"], bus_faults.Impairment(**action["by"]))
 
-    def do_heal(self, action: dict[str, Any]) -> None:
-        bus_faults.heal(action["interface"])
+    def do_clear_netem(self, action: dict[str, Any]) -> None:
+        bus_faults.clear_netem(action["interface"])
 
     def do_corrupt(self, action: dict[str, Any]) -> None:
         """Join the two buses, with one message corrupted on the way; with nothing to lay over it, whole."""
         for route in self.routes:
             bus_faults.remove_route(route)
-        self.routes = bus_faults.join(
+        self.routes = bus_faults.bridge(
             self.bus, self.play["run_bus"], action["identifier"], bytes.fromhex(action.get("xor", ""))
         )
 
@@ -312,7 +312,7 @@ class Stage:
             bus_faults.remove_route(route)
         for interface in {self.bus, self.play["run_bus"]}:
             with contextlib.suppress(OSError):
-                bus_faults.heal(interface)
+                bus_faults.clear_netem(interface)
             link.set_up(interface)
         self.commands.close()
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.experiment.drive_steps import carried
+from emb_bench.experiment.drive_steps import quantised
 from emb_bench.experiment.experiment import Booleans, Floats, Integers
 from emb_bench.logs.log import RunLog, Table
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER
@@ -128,7 +128,7 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[tuple[In
             cycles["applied_current"],
             _counters(obeyed[chosen]),
             _counters(np.where(answered, cycles["command_counter"], UNKNOWN)),
-            np.where(answered, carried(cycles["sent_current"], log.drive), np.nan),
+            np.where(answered, quantised(cycles["sent_current"], log.drive), np.nan),
             charge[chosen],
         )
         yield steps[on_time], Samples(*(column[on_time] for column in samples))

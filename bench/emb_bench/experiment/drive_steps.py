@@ -1,7 +1,7 @@
-"""Steps of a mapped drive's signals: it may tell its current in steps of 0.1 A, and obey a command to 1 mA.
+"""Steps of a mapped drive's signals: it may report its current in steps of 0.1 A, and obey a command to 1 mA.
 
-The node tells the command where the two agree to a step, but does not know how late commands act: then it tells another
-one. Integrated twice, half a step for some milliseconds moves the brake by far more than the noise of its angle.
+The node reports the command where the two agree to a step, but does not know how late commands act: then it reports
+another one. Integrated twice, half a step for some milliseconds moves the brake by far more than the noise of its angle.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ def step_of(measured: Measured) -> float:
     return measured.field.step(0.0) * abs(measured.factor)
 
 
-def carried(currents: Floats, drive: Mapping | None) -> Floats:
+def quantised(currents: Floats, drive: Mapping | None) -> Floats:
     """Currents of commands as the drive's own message carries them; of our own node, as they are [A]."""
     if drive is None or drive.command.field.is_float:
         return currents
@@ -28,10 +28,10 @@ def carried(currents: Floats, drive: Mapping | None) -> Floats:
         return (steps * field.scale + field.offset) / factor
 
 
-def told_within(drive: Mapping | None, layout: Layout) -> float:
-    """Distance from what was told within which a command acted; 0 for our own node, which tells exactly [A].
+def match_tolerance(drive: Mapping | None, layout: Layout) -> float:
+    """Distance from the report within which a command acted; 0 for our own node, which reports exactly [A].
 
-    That is two steps: what the node tells may be one from what the drive tells, and that one from what acts.
+    Two quantisation steps: one between node and drive, one between drive and actuator.
     """
     if drive is None:
         return 0.0

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from emb_bench.experiment.cycles import UNKNOWN, Samples, samples_before, samples_on_grid
-from emb_bench.experiment.drive_steps import carried, told_within
+from emb_bench.experiment.drive_steps import match_tolerance, quantised
 from emb_bench.experiment.experiment import REST_SIGMAS, Experiment, Floats
 from emb_bench.logs.log import RunLog
 from emb_bench.numbers import in_samples
@@ -42,7 +42,7 @@ def read_experiment(log: RunLog, bench: Bench | None = None, name: str = "") -> 
     bench = log.bench if "bench.toml" in log.attachments or bench is None else bench
     planned = _planned(log, bench)
     samples = samples_on_grid(log, bench, planned)
-    received, within = samples.received, told_within(log.drive, log.layout)
+    received, within = samples.received, match_tolerance(log.drive, log.layout)
     counted = received[1:]
     by_charge = currents_by_charge(samples, bench, log.layout)
     wrong, squares = zip(*(_disagreements(log, bench, samples, delay, within) for delay in _DELAYS), strict=True)
@@ -88,7 +88,7 @@ def _commanded(log: RunLog, samples: Samples, delay: int) -> Floats:
 
     Before sample 0 a mapped drive has commands of 0 A, as its bus carries them.
     """
-    before = np.full(delay, math.nan) if log.drive_files is None else carried(np.zeros(delay), log.drive)
+    before = np.full(delay, math.nan) if log.drive_files is None else quantised(np.zeros(delay), log.drive)
     return np.concatenate([before, samples.sent])[: len(samples.sent) - 1]
 
 

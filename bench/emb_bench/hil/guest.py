@@ -138,7 +138,7 @@ def _run(job: dict[str, Any], state: int, out: int, err: int, status: int) -> in
                 os.unlink(SIGNAL_FILE.format(number), dir_fd=state)
                 os.killpg(child.pid, number)
 
-    signal.signal(signal.SIGINT, forward)  # Ctrl-Alt-Del, which is how the host knocks
+    signal.signal(signal.SIGINT, forward)  # Ctrl-Alt-Del, by which the host makes this process look
     os.write(status, RUNNING)
     forward(signal.SIGINT, None)  # what came during the start
     while True:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 from emb_bench.hil import link
 from emb_bench.hil.guest import INTERFACE, not_started
-from emb_bench.hil.supervise import Leash
+from emb_bench.hil.supervise import ParentDeathWatch
 from emb_runtime.errors import BusError
 from emb_runtime.system.terminal import mention
 
@@ -49,7 +49,7 @@ class HostCommand:
     grace = 10.0
 
     def __init__(self, command: list[str]) -> None:
-        self._started: tuple[subprocess.Popen[bytes], Leash] | None = None
+        self._started: tuple[subprocess.Popen[bytes], ParentDeathWatch] | None = None
         self._status = 0
         try:
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
@@ -57,7 +57,7 @@ class HostCommand:
             message, self._status = not_started(command[0], error)
             mention(message.removesuffix("\n"))
         else:
-            self._started = process, Leash(process.pid, "")
+            self._started = process, ParentDeathWatch(process.pid, "")
 
     def poll(self) -> int | None:
         """Its exit status as a shell has it, None while it runs."""

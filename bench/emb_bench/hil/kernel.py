@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from emb_bench.hil.guest import JOB_FILE, RUNNING, SIGNAL_FILE
-from emb_bench.hil.supervise import Leash
+from emb_bench.hil.supervise import ParentDeathWatch
 from emb_runtime.errors import BusError
 
 _CONSOLE_LINES = 40
@@ -41,9 +41,9 @@ class Kernel:
 
     arguments: Sequence[str]  # of the program that it runs in
     environment: Mapping[str, str]  # of that program
-    marks: Mapping[str, str]  # added to the environment of the command
-    says: str  # what its console must have before the command may run; empty for nothing
-    knock: Callable[[], None]  # makes its first process look for signals; it gets a SIGINT
+    extra_env: Mapping[str, str]  # added to the environment of the command
+    console_marker: str  # text that its console must have before the command may run; empty for none
+    send_signal: Callable[[], None]  # sends its first process a SIGINT, which makes it look for signals
 
 
 @contextlib.contextmanager
@@ -77,7 +77,7 @@ class KernelCommand:
                 start_new_session=True,
             )
         _put_first(self._process.pid)
-        self._leash = Leash(self._process.pid, str(state))
+        self._watch = ParentDeathWatch(self._process.pid, str(state))
         self._boot_until = time.monotonic() + _BOOT_LIMIT
 
     def _write_job(self, command: list[str], as_root: bool) -> None:
@@ -86,7 +86,7 @@ class KernelCommand:
         job: dict[str, Any] = {
             "command": command,
             "cwd": str(Path.cwd()),
-            "env": dict(os.environ) | dict(self._kernel.marks),
+            "env": dict(os.environ) | dict(self._kernel.extra_env),
             "umask": umask,
             "host": socket.gethostname(),
             "uid": 0 if as_root else os.getuid(),
@@ -128,11 +128,11 @@ class KernelCommand:
             if not status and time.monotonic() > self._boot_until:
                 raise BusError(self._obituary(f"the kernel did not come up within {_BOOT_LIMIT:.0f} s"))
             if (
-                self._kernel.says
+                self._kernel.console_marker
                 and status
-                and self._kernel.says not in (self._state / "console").read_text(errors="replace")
+                and self._kernel.console_marker not in (self._state / "console").read_text(errors="replace")
             ):
-                raise BusError(self._obituary(f"it did not say '{self._kernel.says}'"))
+                raise BusError(self._obituary(f"it did not say '{self._kernel.console_marker}'"))
             return None
         last = status.splitlines()[-1:]
         if not last or last[0] == RUNNING.strip():
@@ -155,14 +155,14 @@ class KernelCommand:
         (self._state / SIGNAL_FILE.format(number)).touch()
         if self._status().startswith(RUNNING):  # before that the guest looks by itself when it starts the command
             with contextlib.suppress(OSError):  # it ends at this moment
-                self._kernel.knock()
+                self._kernel.send_signal()
 
     def kill(self) -> None:
         """End the kernel with all its processes, and with them the command."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-        self._leash.release()
+        self._watch.release()
         with contextlib.suppress(BrokenPipeError):
             self._pump()
         for _, stream in self._streams:

@@ -77,7 +77,7 @@ def supervise(start: Callable[[], Child], timeout_s: float | None) -> int:
     return EXIT_TIMEOUT if late else status
 
 
-class Leash:
+class ParentDeathWatch:
     """A shell that waits for the death of this process, then ends the process group and removes the directory."""
 
     def __init__(self, group: int, directory: str) -> None:

@@ -183,7 +183,7 @@ def kernel(memory_mb: int, slow: int, state: Path) -> Kernel:
         arguments=[program, "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw", f"init={init_program(state)}",
                    f"mem={memory_mb}M", "con=null", "con0=null,fd:1", "ssl=null", f"uml_dir={state}", "umid=uml"],
         environment=environment,
-        marks={SLOW_MARK: str(slow)} if slow > 1 else {},
-        says=SLOW_TOLD if slow > 1 else "",
-        knock=press_ctrl_alt_del,
+        extra_env={SLOW_MARK: str(slow)} if slow > 1 else {},
+        console_marker=SLOW_TOLD if slow > 1 else "",
+        send_signal=press_ctrl_alt_del,
     )  # fmt: skip
