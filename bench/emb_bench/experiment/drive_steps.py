@@ -1,7 +1,7 @@
 """Steps of a mapped drive's signals: it may report its current in steps of 0.1 A, and obey a command to 1 mA.
 
 The node reports the command where the two agree to a step, but does not know how late commands act: then it reports
-another one. Integrated twice, half a step for some milliseconds moves the brake by far more than the noise of its angle.
+another one. Half a step for some milliseconds, integrated twice, moves the brake by more than the noise of its angle.
 """
 
 from __future__ import annotations
