@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,8 @@ from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Plant
 from emb_runtime.errors import LogError
-from emb_runtime.records import Frame
+from emb_runtime.log.ring_buffer import FrameRecord
+from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.system.clock import SteppedClock
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
@@ -254,9 +256,13 @@ def test_a_shorter_run_by_order_misses_nothing(tmp_path: Path, simulate: Simulat
 
 def test_a_report_that_contradicts_the_command_is_counted(tmp_path: Path, simulate: Simulate) -> None:
     run = simulate(square)
-    cycles = run.journal.cycles
-    cycles[100] = cycles[100]._replace(sent_current=cycles[100].sent_current + 0.0002)
-    cycles[200] = cycles[200]._replace(sent_current=math.nan, command_counter=NO_COUNTER)
+    records, cycles = run.journal.records, run.journal.cycles
+    for changed in (
+        cycles[100]._replace(sent_current=cycles[100].sent_current + 0.0002),
+        cycles[200]._replace(sent_current=math.nan, command_counter=NO_COUNTER),
+    ):
+        at = next(n for n, r in enumerate(records) if isinstance(r, CycleRecord) and r.step == changed.step)
+        records[at] = changed
     _, experiment = recorded(tmp_path, run)
     assert experiment.missing == ("in 2 periods the node reports another current than the command says",)
 
@@ -266,8 +272,10 @@ def test_a_log_without_an_experiment_its_frames_or_a_whole_period_is_refused(
 ) -> None:
     none = simulate(square, stop_requested=lambda: True)
     without_frames, without_period = simulate(square, steps=20), simulate(square, steps=20)
-    del without_frames.journal.frames[20:]
-    del without_period.journal.cycles[1:]
+    for run, kind, kept in ((without_frames, FrameRecord, 20), (without_period, CycleRecord, 1)):
+        numbers = count()
+        records = run.journal.records
+        records[:] = [record for record in records if not isinstance(record, kind) or next(numbers) < kept]
     for run, why in (
         (none, r"never became active \(INTERRUPTED\)"),
         (without_frames, "what acted is not known"),
