@@ -140,7 +140,7 @@ def _work(pipe: Connection, work: Callable[[Any], Any]) -> None:
 
 @contextmanager
 def _start_settings() -> Iterator[None]:
-    """What a process that is started inside inherits: one thread for each library, and no SIGINT, as of a Ctrl-C."""
+    """Start processes inside with one thread for each library, and without SIGINT, which is for the command alone."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]) if hasattr(signal, "pthread_sigmask") else None
