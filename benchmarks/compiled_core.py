@@ -193,7 +193,7 @@ def _successor(dice: random.Random) -> Iterator[Any]:
 def _decide(dice: random.Random) -> Iterator[Any]:
     laws, limits = _laws(), command_limits
     while True:
-        reach = limits.Reach(abs(_number(dice, 6.0)), abs(_number(dice, 12.0)))
+        reach = limits.CommandLimits(abs(_number(dice, 6.0)), abs(_number(dice, 12.0)))
         asked = _tried(limits.checked, _number(dice, 7.0), 6.0)
         wanted = asked if isinstance(asked, float) else 0.0
         state, past = (_number(dice, 110.0), _number(dice, 510.0)), _drawn_past(dice)
@@ -264,7 +264,7 @@ def _drive(dice: random.Random) -> Iterator[Any]:
             check.sent(counter, current)
             obeyed = counter if dice.random() < 0.8 else dice.randrange(16)
             applied = current + dice.uniform(-0.6, 0.6) if dice.random() < 0.8 else _number(dice, 6.0)
-            yield _tried(check.judge, obeyed, applied), check.errors
+            yield _tried(check.current_problem, obeyed, applied), check.errors
 
 
 def _sensors(dice: random.Random) -> Iterator[Any]:

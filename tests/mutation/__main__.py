@@ -35,6 +35,7 @@ RUNTIME = "tests/runtime/"
 TESTS = {
     "can.e2e": ("test_e2e.py", "test_messages.py"),
     "can.codec": ("test_messages.py", "test_codec.py"),
+    "can.generated": ("test_messages.py", "test_codec.py"),
     "can.messages": ("test_messages.py",),
     "safety.state_machine": ("test_state_machine.py",),
     "safety.guard": ("test_guard.py",),

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-from emb_runtime.learning.assumptions import not_covered
+from emb_runtime.learning.assumptions import unmet_assumption
 from tools.proof import exhaustive, extensions, safety, successors, windows
 from tools.proof.boxes import Covered
 from tools.proof.cases import Case
@@ -105,7 +105,7 @@ def lemmas(case: Case) -> tuple[Lemma, ...]:
         return COASTING
     if case.law.lag > 0.0:
         return LAGGING
-    return BRAKING if not_covered(case.bench) else (*BRAKING, *LEARNING)
+    return BRAKING if unmet_assumption(case.bench) else (*BRAKING, *LEARNING)
 
 
 def judge(lemma: Lemma, case: Case) -> Verdict:

@@ -34,7 +34,7 @@ from emb_runtime.learning.known import numbers
 from emb_runtime.learning.learner import Learner, words
 from emb_runtime.log.ring_buffer import Direction, EstimateRecord, EventRecord, FrameRecord, LearntRecord, Record
 from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, Reason, RunState, SensorSample
-from emb_runtime.safety.command_limits import Decision, Reach, checked, decide
+from emb_runtime.safety.command_limits import CommandLimits, Decision, checked, decide
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS, Guard
 from emb_runtime.safety.motion_balance import REST_SAMPLES, MotionBalance, steady_motion
 from emb_runtime.safety.sensor_monitor import SensorMonitor
@@ -105,7 +105,7 @@ class Core:
         self._bounds = Bounds(bench)
         self._start_conditions = StartConditions(bench, self.layout, self._bounds, anywhere=self.homing)
         limit = self.layout.current_within(min(self.limit, bench.limits.current))
-        self._reach = Reach(limit, bench.guard.slew * bench.timing.sample_time)
+        self._limits = CommandLimits(limit, bench.guard.slew * bench.timing.sample_time)
         self._monitor = SensorMonitor(self.law, sensor_thresholds(bench, self.law))
         self._balance = MotionBalance(bench)
         self._unexplained = NAN, math.inf  # unexplained velocity and what is allowed, at the end [rad/s]
@@ -444,7 +444,7 @@ class Core:
         self._monitor.begin(sample)
         with contextlib.suppress(StopError):
             self._monitor.check(self.law.sample_time, sample, True, 0.0)
-        reach = self._reach._replace(limit=self._monitor.largest_current(self._reach.limit))
+        self._monitor.largest_current(self._limits.current)
         self._balance.begin(sample)
         self._balance.take(sample, True)
         self._balance.judge()
@@ -453,7 +453,7 @@ class Core:
         self._estimator.begin()
         self._estimator.take(sample.angle, sample.velocity, 0, sample.applied_current)
         law, angle, velocity = self._learner.question(sample)
-        decide(law, reach, angle, velocity, 0.0, NO_PAST, 0.0, 0)
+        decide(law, self._limits, angle, velocity, 0.0, NO_PAST, 0.0, 0)
 
     # --- ACTIVE or HOMING: one cycle per sample ---------------------------------------------------------------------
 
@@ -553,17 +553,17 @@ class Core:
         follows = self._answered is not None and sample.counter == next_counter(self._answered)
         last = self._past[0] if follows else 0.0
         if self._reversed is not None:
-            slew = self._reach.slew
+            slew = self._limits.slew
             return Decision(0.0, min(max(0.0, last - slew), last + slew), Reason.LIMITED)
         if self.homing:
             step = self._late_step
         elif self._condition_met:
             step, wanted = max(step, self._late_step), 0.0
-        reach = self._reach
-        if (most := self._monitor.largest_current(reach.limit)) < reach.limit:
-            reach = reach._replace(limit=max(most, abs(last) - reach.slew))  # down to it as fast as may be
+        limits = self._limits
+        if (most := self._monitor.largest_current(limits.current)) < limits.current:
+            limits = limits._replace(current=max(most, abs(last) - limits.slew))  # down to it as fast as may be
         law, angle, velocity = self._learner.question(sample)
-        decision = decide(law, reach, angle, velocity, wanted, self._past, last, step)
+        decision = decide(law, limits, angle, velocity, wanted, self._past, last, step)
         return decision._replace(reasons=decision.reasons | Reason.RETURNING) if self._condition_met else decision
 
     def _may_answer(self, sample: SensorSample, decision: Decision, decide_ns: int) -> bool:

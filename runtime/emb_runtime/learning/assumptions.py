@@ -46,7 +46,7 @@ def make_assumptions(bench: Bench) -> Assumptions:
     Raises:
         BenchFileError: an assumption does not hold there; the message names it.
     """
-    if reason := not_covered(bench):
+    if reason := unmet_assumption(bench):
         raise BenchFileError(f"shield.learn: {reason}")
     return assumptions_of(bench)
 
@@ -75,8 +75,8 @@ def assumptions_of(bench: Bench) -> Assumptions:
     )
 
 
-def not_covered(bench: Bench) -> str:
-    """The first assumption of learning that does not hold on a bench, in words; empty if all do.
+def unmet_assumption(bench: Bench) -> str:
+    """The first assumption of learning that does not hold on a bench; "" if all do.
 
     Raises:
         BenchFileError: it has no shield at all.

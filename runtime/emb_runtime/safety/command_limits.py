@@ -1,4 +1,4 @@
-"""Decision on the current to send: the policy's, if finite, clipped, shielded, and within reach of the last command."""
+"""Current to send: the policy's request, clipped, shielded, and limited in its change."""
 
 from __future__ import annotations
 
@@ -16,60 +16,46 @@ LEFT: Final = int(Reason.LEFT)
 ROUNDING: Final = 1e-6  # Relative: single precision in the policy may pass its contract's limit by so much
 
 
-class Reach(NamedTuple):
+class CommandLimits(NamedTuple):
     """Limits of what may be sent, whatever the shield would need."""
 
-    limit: float  # Largest current: the bench's, or a narrower one that the operator asked for [A]
+    current: float  # Largest current: the bench's, or a narrower one that the operator asked for [A]
     slew: float  # Largest change from one command to the next [A]
 
 
 class Decision(NamedTuple):
-    """Command made of a policy's wish, and the reasons for a change."""
+    """Command made of a request, and the reasons for a change."""
 
-    clipped: float  # The wish within the limit [A]
+    clipped: float  # The request within the limit [A]
     current: float  # To be sent [A]; NaN: nothing is, and the node brakes in this period
     reasons: int  # :class:`~emb_runtime.records.Reason` bits
 
 
-def checked(wanted: float, contract_limit: float) -> float:
-    """A policy's wish, if it is one at all.
+def checked(requested: float, contract_limit: float) -> float:
+    """The policy's request [A], if it is finite and within its contract.
 
     Finite is asked first: NaN passes ``min``, ``max`` and every comparison written the wrong way round.
-
-    Args:
-        wanted: what the policy answered [A].
-        contract_limit: most that its contract allows it to ask for [A].
 
     Raises:
         StopError: it is not finite, or beyond the contract.
     """
-    if not math.isfinite(wanted):
-        raise StopError(Fault.POLICY_NOT_FINITE, f"it answered {wanted}")
-    if abs(wanted) > contract_limit * (1.0 + ROUNDING):
-        raise StopError(
-            Fault.POLICY_BEYOND_CONTRACT, f"it asked for {wanted:g} A, its contract allows {contract_limit:g} A"
-        )
-    return wanted
+    if not math.isfinite(requested):
+        raise StopError(Fault.POLICY_NOT_FINITE, f"it answered {requested}")
+    if abs(requested) > contract_limit * (1.0 + ROUNDING):
+        detail = f"it asked for {requested:g} A, its contract allows {contract_limit:g} A"
+        raise StopError(Fault.POLICY_BEYOND_CONTRACT, detail)
+    return requested
 
 
 def shielded(
     law: ShieldLaw, angle: float, velocity: float, clipped: float, past: Past, step: int, low: float, high: float
 ) -> tuple[float, int]:
-    """Current to send within given limits [A], NaN for none, and the :class:`~emb_runtime.records.Reason` bits.
+    """Current to send, NaN for none [A], and the :class:`~emb_runtime.records.Reason` bits.
 
-    The shield reckons with any current at once. Where it needs one that is beyond the limits, the nearest within them
-    is sent if it will do. Else nothing is: the node then brakes with all it has, which the shield's argument allows in
-    every period.
-
-    Args:
-        law: this and the next five as for :func:`emb_runtime.safety.shield.shield`.
-        angle: newest measurement [rad].
-        velocity: newest measurement [rad/s].
-        clipped: requested current [A].
-        past: the last own commands, newest first [A].
-        step: index of the sample in the experiment.
-        low: least that may be sent [A].
-        high: most that may be sent [A].
+    The shield reckons with any current at once. Where it needs one beyond ``low`` and ``high`` [A], the nearest within
+    them is sent if it lies in the shield's window. Else nothing is: the node then brakes with all it has, which the
+    shield's argument allows in every period. The other arguments are those of
+    :func:`emb_runtime.safety.shield.shield`.
     """
     current, bits = shield(law, angle, velocity, clipped, past, step)
     if low <= current <= high:
@@ -82,23 +68,30 @@ def shielded(
 
 
 def decide(
-    law: ShieldLaw, reach: Reach, angle: float, velocity: float, wanted: float, past: Past, last: float, step: int
+    law: ShieldLaw,
+    limits: CommandLimits,
+    angle: float,
+    velocity: float,
+    requested: float,
+    past: Past,
+    last: float,
+    step: int,
 ) -> Decision:
     """Decide what to send for a sample.
 
     Args:
         law: the shield's.
-        reach: what may be sent.
+        limits: of the command.
         angle: newest measurement [rad].
         velocity: newest measurement [rad/s].
-        wanted: from :func:`checked` [A].
+        requested: from :func:`checked` [A].
         past: the last own commands, newest first [A].
         last: the command of the period before, 0 if there was none [A].
         step: index of the sample in the experiment.
     """
-    clipped = min(max(wanted, -reach.limit), reach.limit)
-    low, high = max(-reach.limit, last - reach.slew), min(reach.limit, last + reach.slew)
+    clipped = min(max(requested, -limits.current), limits.current)
+    low, high = max(-limits.current, last - limits.slew), min(limits.current, last + limits.slew)
     current, bits = shielded(law, angle, velocity, clipped, past, step, low, high)
-    if clipped != wanted:
+    if clipped != requested:
         bits |= CLIPPED
     return tuple.__new__(Decision, (clipped, current, bits))

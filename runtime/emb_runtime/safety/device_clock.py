@@ -12,8 +12,8 @@ The reference follows the least offset of each window by at most :data:`QUARTZ`,
 by, so that what is beyond adds up: a clock that is off by a share r is noticed when (r - QUARTZ) t reaches the
 allowance, one that is slow up to two windows later. All that a device time can hide is therefore the allowance, once.
 
-Falsely blamed is a node only if each of the pairs that armed the run was late by more than the allowance, and a later
-one was not, or if a whole window was. Times are whole nanoseconds; nothing is read from a clock here.
+False alarm only if every arming sample was delayed beyond the allowance and a later one was not, or a whole window was.
+Times are whole nanoseconds; no clock is read here.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class DeviceClock:
         self._first_ns: int | None = None  # offset of the first pair of the reference
         self._window: list[int] = []  # offsets in the present one
         self._off_grid = LeakyCount(OFF_GRID)
-        self.wrong = ""
-        """Fault of the clock, in words; empty as long as nothing is. Never taken back."""
+        self.problem = ""
+        """Fault of the clock; "" as long as there is none. Never taken back."""
 
     def restart(self) -> None:
         """Forget the pairs before arming: the next one begins the reference."""
@@ -74,8 +74,8 @@ class DeviceClock:
         self._device_ns = device_ns
         return steady
 
-    def judge(self, device_ns: int, receive_ns: int, seen_ns: int) -> str:
-        """Take a sample after arming.
+    def time_problem(self, device_ns: int, receive_ns: int, seen_ns: int) -> str:
+        """Judge a sample after arming.
 
         Args:
             device_ns: its device time [ns].
@@ -83,27 +83,27 @@ class DeviceClock:
             seen_ns: when it was in hand, monotonic, read after it had arrived [ns].
 
         Returns:
-            What is wrong, see :attr:`wrong`.
+            :attr:`problem`.
         """
-        if not self.wrong:
+        if not self.problem:
             self._judge_grid(device_ns)
             self._judge_slow(receive_ns - device_ns)
             self._judge_fast(seen_ns - device_ns)
-        return self.wrong
+        return self.problem
 
     def _judge_grid(self, device_ns: int) -> None:
         """Hold the time since the last sample against whole sampling periods."""
         elapsed_ns, self._device_ns = device_ns - self._device_ns, device_ns
         quarter_ns = self._period_ns // 4
         if elapsed_ns <= 0:
-            self.wrong = f"it went from one sample to the next by {elapsed_ns / 1e6:.3f} ms"
+            self.problem = f"it went from one sample to the next by {elapsed_ns / 1e6:.3f} ms"
         elif elapsed_ns > quarter_ns and (elapsed_ns + quarter_ns) % self._period_ns <= 2 * quarter_ns:
             self._off_grid.forgive()
         else:
             self._off_grid.reject()
         if self._off_grid.exceeded:
             apart = f"its samples are {elapsed_ns / 1e6:.3f} ms apart"
-            self.wrong = f"{apart}, the bench's period is {self._period_ns / 1e6:g} ms"
+            self.problem = f"{apart}, the bench's period is {self._period_ns / 1e6:g} ms"
 
     def _judge_slow(self, offset_ns: int) -> None:
         """Hold the least offset of a window against the reference, which then follows it."""
@@ -113,10 +113,10 @@ class DeviceClock:
         behind_ns = min(self._window) - self._reference_ns
         self._window.clear()
         if behind_ns > self.allowance_ns:
-            self.wrong = f"it has lost {behind_ns / 1e6:.3f} ms on this computer's"
+            self.problem = f"it has lost {behind_ns / 1e6:.3f} ms on this computer's"
         self._reference_ns += min(max(behind_ns, -self._step_ns), self._step_ns)
 
     def _judge_fast(self, offset_ns: int) -> None:
         ahead_ns = self._reference_ns - offset_ns
         if ahead_ns > self.allowance_ns:
-            self.wrong = f"it has gained {ahead_ns / 1e6:.3f} ms on this computer's"
+            self.problem = f"it has gained {ahead_ns / 1e6:.3f} ms on this computer's"

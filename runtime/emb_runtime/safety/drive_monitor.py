@@ -31,10 +31,8 @@ class DriveCheck(LeakyCount):
         self._tolerance = tolerance
         self._limit = limit
         self._sent = [math.nan] * COUNTER_MODULUS
-        self._recent = [0.0] * COMMANDS
-        """The last commands obeyed, in no order; one may be there more than once."""
-        self._oldest = 0
-        """Place of the oldest of them."""
+        self._recent = [0.0] * COMMANDS  # the last commands obeyed, in no order; one may be there more than once
+        self._oldest = 0  # place of the oldest of them
 
     def sent(self, counter: int, current: float) -> None:
         """Remember a command.
@@ -45,15 +43,15 @@ class DriveCheck(LeakyCount):
         """
         self._sent[counter] = current
 
-    def judge(self, command_counter: int, applied: float) -> str:
-        """Take what a sample reports of the period before it.
+    def current_problem(self, command_counter: int, applied: float) -> str:
+        """Judge what a sample reports of the period before it.
 
         Args:
             command_counter: counter of the command that the node obeyed, 15 if none.
             applied: the current that it measured [A].
 
         Returns:
-            What is wrong, once it has been so too often; empty otherwise.
+            Fault of the drive, once there were too many reports out of place; "" otherwise.
         """
         if command_counter == NO_COUNTER:
             return self._judge_braking(applied)

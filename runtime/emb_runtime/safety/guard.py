@@ -120,8 +120,8 @@ class Guard:
         Raises:
             StopError: it does not apply what it is commanded.
         """
-        if wrong := self._drive.judge(sample.command_counter, sample.applied_current):
-            raise StopError(Fault.CURRENT_MISMATCH, wrong)
+        if problem := self._drive.current_problem(sample.command_counter, sample.applied_current):
+            raise StopError(Fault.CURRENT_MISMATCH, problem)
 
     def learn_time(self, sample: SensorSample, *, first: bool) -> bool:
         """Take a sample before arming as a reference of the two clocks.
@@ -147,8 +147,8 @@ class Guard:
         Raises:
             StopError: the node's clock is wrong; from then on no enabled command passes.
         """
-        if wrong := self._device_clock.judge(sample.device_time_ns, sample.receive_time_ns, seen_ns):
-            raise StopError(Fault.DEVICE_TIME, wrong)
+        if problem := self._device_clock.time_problem(sample.device_time_ns, sample.receive_time_ns, seen_ns):
+            raise StopError(Fault.DEVICE_TIME, problem)
 
     def _checked(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> CurrentCommand:
         if not may_send(state):
@@ -172,8 +172,8 @@ class Guard:
     def _check_enabled(self, command: CurrentCommand, state: RunState, sample_time_ns: int, now_ns: int) -> None:
         if not may_enable(state):
             raise _rejected(f"enabled in state {state.name}")
-        if self._device_clock.wrong:
-            raise _rejected(f"the device time of what it answers is wrong: {self._device_clock.wrong}")
+        if self._device_clock.problem:
+            raise _rejected(f"the device time of what it answers is wrong: {self._device_clock.problem}")
         # A stop frame is never too fast.
         if self.too_fast(now_ns):
             raise _rejected(f"more than {self._most} commands in {RATE_WINDOW_PERIODS} periods")
@@ -182,16 +182,13 @@ class Guard:
             raise _rejected(f"computed from a sample {(now_ns - sample_time_ns) / 1e6:.3f} ms old")
         # The counters alone say the same of the sample before and of the one 15 periods before that.
         recent = sample_time_ns - self._sample_ns < COUNTER_MODULUS // 2 * self._period_ns
-        change = command.current - follows_from(self._last if recent else None, command.answers)
+        change = command.current - slew_reference(self._last if recent else None, command.answers)
         if abs(change) > self._slew:
             raise _rejected(f"a change by {change:.4g} A in one period is beyond {self._slew:.4g} A")
 
 
-def follows_from(last: CurrentCommand | None, answers: int) -> float:
-    """The current that a command follows [A]: that of the command that answered the sample before.
-
-    Where that sample went without one, the node has braked by itself, and the next command begins at zero.
-    """
+def slew_reference(last: CurrentCommand | None, answers: int) -> float:
+    """Slew reference [A]: the command for the previous sample, else 0 A, as the node braked."""
     return last.current if last is not None and answers == next_counter(last.answers) else 0.0
 
 

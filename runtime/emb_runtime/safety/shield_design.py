@@ -200,7 +200,7 @@ def make_law(bench: Bench) -> ShieldLaw:
             f"{least:.0f} rad/s², got {inputs.model_error:g}: such a brake could not be relied on to rest"
         )
     law = law_of(inputs, brakes.low, brakes.high, whole(inputs))
-    if reason := gap(law, bench):
+    if reason := unmet_condition(law, bench):
         raise BenchFileError(f"the shield cannot guarantee the limits for the set '{bench.shield.ranges}': {reason}")
     return law
 
@@ -327,8 +327,8 @@ def _apex(friction: float, spring: float, stroke: float, speed: float) -> float:
     return (friction + math.sqrt(friction * friction + 2.0 * spring * left)) / spring if left > 0.0 else -1.0
 
 
-def gap(law: ShieldLaw, bench: Bench) -> str:
-    """The first step of the argument that does not hold for this law; empty if all do."""
+def unmet_condition(law: ShieldLaw, bench: Bench) -> str:
+    """The first step of the argument that does not hold for this law; "" if all do."""
     ts = law.sample_time
     speed, farthest = bench.limits.velocity, law.apex if law.coasting else bench.limits.angle[1]
     if (law.lag > 0.0) + law.coasting + (law.age_high > 0) > 1:

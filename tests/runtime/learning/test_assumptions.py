@@ -9,7 +9,7 @@ import pytest
 
 from emb_runtime.config.bench import Bench, BrakeParameters, Limits, Noise, Ranges, Timing, load_bench
 from emb_runtime.errors import BenchFileError
-from emb_runtime.learning.assumptions import Assumptions, assumptions_of, make_assumptions, not_covered
+from emb_runtime.learning.assumptions import Assumptions, assumptions_of, make_assumptions, unmet_assumption
 from emb_runtime.safety.shield_design import make_law
 
 BENCH = load_bench()
@@ -56,7 +56,7 @@ def test_each_number_is_the_benchs() -> None:
 
 def test_the_shipped_bench_grants_everything() -> None:
     bench = with_shield(learn=True)
-    assert not_covered(bench) == ""
+    assert unmet_assumption(bench) == ""
     assert make_assumptions(bench) == assumptions_of(bench)
 
 

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 
 from emb_runtime.config.bench import load_bench
 from emb_runtime.records import Reason
-from emb_runtime.safety.command_limits import Reach, checked, decide
+from emb_runtime.safety.command_limits import CommandLimits, checked, decide
 from emb_runtime.safety.shield import NO_PAST, shield, window
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import Fault, StopError
 
 BENCH = load_bench()
 LAW = make_law(BENCH)
-FULL = Reach(6.0, 12.0)
+FULL = CommandLimits(6.0, 12.0)
 
 angles = st.floats(-10, 100)
 velocities = st.floats(-500, 500)
@@ -61,7 +61,7 @@ def test_what_is_sent_is_in_reach_and_in_the_shield_s_window_or_it_is_not_sent(
     angle: float, velocity: float, wanted: float, last: float, limit: float, slew: float, step: int
 ) -> None:
     last = min(max(last, -limit), limit)
-    decision = decide(LAW, Reach(limit, slew), angle, velocity, wanted, NO_PAST, last, step)
+    decision = decide(LAW, CommandLimits(limit, slew), angle, velocity, wanted, NO_PAST, last, step)
     lowest, highest = window(LAW, angle, velocity, NO_PAST)
     if math.isnan(decision.current):
         assert decision.reasons & Reason.LEFT
@@ -75,13 +75,13 @@ def test_what_is_sent_is_in_reach_and_in_the_shield_s_window_or_it_is_not_sent(
 
 
 def test_a_narrow_slew_holds_a_step_back_and_says_so() -> None:
-    decision = decide(LAW, Reach(6.0, 2.0), 10.0, 0.0, 6.0, NO_PAST, 1.0, 10)
+    decision = decide(LAW, CommandLimits(6.0, 2.0), 10.0, 0.0, 6.0, NO_PAST, 1.0, 10)
     assert decision == (6.0, 3.0, Reason.LIMITED)
-    assert decide(LAW, Reach(6.0, 2.0), 10.0, 0.0, -6.0, NO_PAST, 1.0, 10).current == -1.0
+    assert decide(LAW, CommandLimits(6.0, 2.0), 10.0, 0.0, -6.0, NO_PAST, 1.0, 10).current == -1.0
 
 
 def test_where_the_shield_needs_more_than_is_in_reach_the_node_is_left_to_brake() -> None:
-    fast = decide(LAW, Reach(6.0, 2.0), 95.0, 400.0, 6.0, NO_PAST, 6.0, 10)
+    fast = decide(LAW, CommandLimits(6.0, 2.0), 95.0, 400.0, 6.0, NO_PAST, 6.0, 10)
     assert math.isnan(fast.current)
     assert fast.reasons & Reason.LEFT
 
@@ -91,7 +91,7 @@ def test_where_the_shield_needs_more_than_is_in_reach_the_node_is_left_to_brake(
 def test_what_the_shield_needs_beyond_the_operator_s_limit_is_left_to_the_node(
     angle: float, velocity: float, limit: float
 ) -> None:
-    decision = decide(LAW, Reach(limit, 12.0), angle, velocity, 0.0, NO_PAST, 0.0, 100)
+    decision = decide(LAW, CommandLimits(limit, 12.0), angle, velocity, 0.0, NO_PAST, 0.0, 100)
     if limit < 6.0:
         assert math.isnan(decision.current)
     else:
@@ -108,22 +108,22 @@ def test_a_command_held_back_by_the_slew_may_lie_on_the_end_of_the_window(up: bo
         last = end + (1.0 if up else -1.0)
         if abs(end) < 4.0 and (last - 1.0 if up else last + 1.0) == end:
             break
-    decision = decide(LAW, Reach(6.0, 1.0), 40.0, velocity, -6.0 if up else 6.0, NO_PAST, last, 20)
+    decision = decide(LAW, CommandLimits(6.0, 1.0), 40.0, velocity, -6.0 if up else 6.0, NO_PAST, last, 20)
     assert decision.current == end
 
 
 def test_a_limit_of_nothing_sends_nothing_but_zero() -> None:
     for angle, velocity in [(0.0, 0.0), (0.3, 3.0), (60.0, 100.0)]:
-        decision = decide(LAW, Reach(0.0, 12.0), angle, velocity, 5.0, NO_PAST, 0.0, 0)
+        decision = decide(LAW, CommandLimits(0.0, 12.0), angle, velocity, 5.0, NO_PAST, 0.0, 0)
         assert decision.current == 0.0 or math.isnan(decision.current)
         assert decision.reasons & Reason.CLIPPED
 
 
 def test_a_narrower_limit_clips_the_wish() -> None:
-    decision = decide(LAW, Reach(1.5, 12.0), 0.0, 0.0, -4.0, NO_PAST, 0.0, 0)
+    decision = decide(LAW, CommandLimits(1.5, 12.0), 0.0, 0.0, -4.0, NO_PAST, 0.0, 0)
     assert (decision.clipped, decision.current, decision.reasons) == (-1.5, -1.5, Reason.CLIPPED)
 
 
 def test_the_bench_s_own_limit_is_the_shield_s() -> None:
     narrow = replace(BENCH, limits=replace(BENCH.limits, current=5.0), shield=BENCH.shield._replace(ranges="viscous"))
-    assert decide(make_law(narrow), Reach(5.0, 12.0), 0.0, 0.0, 6.0, NO_PAST, 0.0, 0).current == 5.0
+    assert decide(make_law(narrow), CommandLimits(5.0, 12.0), 0.0, 0.0, 6.0, NO_PAST, 0.0, 0).current == 5.0

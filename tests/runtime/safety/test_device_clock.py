@@ -25,7 +25,7 @@ def learned(period_ns: int = MS, latencies: tuple[int, ...] = (0,) * 10) -> tupl
 
 def judge(clock: DeviceClock, device_ns: int, late_ns: int = 0, seen_after_ns: int = 0) -> str:
     arrival_ns = BASE + device_ns + late_ns
-    return clock.judge(device_ns, arrival_ns, arrival_ns + seen_after_ns)
+    return clock.time_problem(device_ns, arrival_ns, arrival_ns + seen_after_ns)
 
 
 # --- fast -----------------------------------------------------------------------------------------------------------
@@ -58,7 +58,7 @@ def test_a_jump_of_13_ms_is_told_at_once_and_for_good() -> None:
     assert judge(clock, device_ns + 14 * MS, -13 * MS) == "it has gained 13.000 ms on this computer's"
     assert judge(clock, device_ns + 15 * MS) == "it has gained 13.000 ms on this computer's"
     assert judge(clock, device_ns + 16 * MS, -20 * MS) == "it has gained 13.000 ms on this computer's"
-    assert clock.wrong == "it has gained 13.000 ms on this computer's"
+    assert clock.problem == "it has gained 13.000 ms on this computer's"
 
 
 def test_what_came_earlier_than_the_first_pair_by_more_than_the_allowance_begins_the_reference_anew() -> None:
@@ -117,7 +117,7 @@ def drifting(clock: DeviceClock, device_ns: int, ppm: int, samples: int) -> int 
     for n in range(1, samples + 1):
         said_ns = device_ns + n * MS + n * ppm
         arrival_ns = BASE + device_ns + n * MS
-        if clock.judge(said_ns, arrival_ns, arrival_ns):
+        if clock.time_problem(said_ns, arrival_ns, arrival_ns):
             return n
     return None
 
@@ -160,7 +160,7 @@ def test_latencies_below_the_allowance_never_blame_a_quartz(latencies: list[int]
     for n, late_ns in enumerate(latencies[10:], start=1):
         said_ns = device_ns + n * MS + n * ppm
         arrival_ns = BASE + device_ns + n * MS + late_ns
-        assert clock.judge(said_ns, arrival_ns, arrival_ns) == ""
+        assert clock.time_problem(said_ns, arrival_ns, arrival_ns) == ""
 
 
 # --- the grid -------------------------------------------------------------------------------------------------------
@@ -170,7 +170,7 @@ def test_latencies_below_the_allowance_never_blame_a_quartz(latencies: list[int]
 def test_a_device_time_that_does_not_go_on_is_wrong_at_once(elapsed_ns: int) -> None:
     clock, device_ns = learned()
     expected = f"it went from one sample to the next by {elapsed_ns / 1e6:.3f} ms"
-    assert clock.judge(device_ns + elapsed_ns, BASE + device_ns + MS, BASE + device_ns + MS) == expected
+    assert clock.time_problem(device_ns + elapsed_ns, BASE + device_ns + MS, BASE + device_ns + MS) == expected
 
 
 def test_five_samples_off_the_grid_by_more_than_a_quarter_period_are_too_many() -> None:
@@ -182,7 +182,7 @@ def test_five_samples_off_the_grid_by_more_than_a_quarter_period_are_too_many() 
         for _ in range(5):
             device_ns += periods * MS + off_ns
             arrival_ns = BASE + device_ns + 100 * MS  # late, so that nothing else is wrong with it
-            said.append(clock.judge(device_ns, arrival_ns, arrival_ns))
+            said.append(clock.time_problem(device_ns, arrival_ns, arrival_ns))
         assert said[:4] == [""] * 4
         apart = (periods * MS + off_ns) / 1e6
         assert said[4] == (f"its samples are {apart:.3f} ms apart, the bench's period is 1 ms" if wrong else "")
@@ -193,7 +193,7 @@ def test_samples_on_the_grid_forgive_those_off_it() -> None:
     for n in range(50):
         device_ns += MS + (300_000 if n % 5 == 0 else 0)
         arrival_ns = BASE + device_ns
-        assert clock.judge(device_ns, arrival_ns, arrival_ns) == ""
+        assert clock.time_problem(device_ns, arrival_ns, arrival_ns) == ""
 
 
 @pytest.mark.parametrize("step_ns", [1, 200_000, 250_000, 400_000, 749_999])
@@ -201,7 +201,7 @@ def test_samples_closer_than_three_quarters_of_a_period_are_off_the_grid(step_ns
     clock, device_ns = learned()
     for n in range(1, 6):
         device_ns += step_ns
-        said = clock.judge(device_ns, BASE + device_ns, BASE + device_ns)
+        said = clock.time_problem(device_ns, BASE + device_ns, BASE + device_ns)
         assert bool(said) == (n == 5)
 
 

@@ -17,7 +17,7 @@ LIMIT = 6.0
 
 def obeyed(check: DriveCheck, commanded: float, applied: float, counter: int = 0) -> str:
     check.sent(counter, commanded)
-    return check.judge(counter, applied)
+    return check.current_problem(counter, applied)
 
 
 @given(st.lists(st.floats(-6, 6), min_size=1, max_size=40), st.floats(-0.5, 0.5))
@@ -47,7 +47,7 @@ def test_a_drive_that_ignores_its_commands_is_blamed_at_the_fifth_report() -> No
 
 def test_a_command_that_was_never_sent_takes_no_place_among_those_obeyed() -> None:
     check = DriveCheck(TOLERANCE, LIMIT)
-    assert check.judge(9, 0.0) == ""
+    assert check.current_problem(9, 0.0) == ""
     before = check.errors
     assert before > 0
     assert obeyed(check, 0.0, 0.0, 1) == ""
@@ -66,11 +66,11 @@ def test_six_commands_excuse_a_current_and_five_currents_out_of_place_are_too_ma
     drive = DriveCheck(0.1, LIMIT)
     for current in (5.0, 0.0, 0.0, 0.0, 0.0, 0.0):
         drive.sent(0, current)
-        drive.judge(0, current)
+        drive.current_problem(0, current)
     assert drive.errors == 0
-    drive.judge(0, 5.0)  # 5 A is the seventh last
+    drive.current_problem(0, 5.0)  # 5 A is the seventh last
     assert drive.errors == 4
-    assert [drive.judge(0, 5.0) != "" for _ in range(4)] == [False, False, False, True]
+    assert [drive.current_problem(0, 5.0) != "" for _ in range(4)] == [False, False, False, True]
 
 
 def test_what_flowed_before_the_first_command_is_no_current_and_counts_as_one_of_the_six() -> None:
@@ -98,7 +98,7 @@ def test_four_reports_in_place_forgive_one_out_of_place_and_the_count_saturates(
 def test_the_node_s_own_braking_is_judged_by_the_limit_alone_and_is_where_the_next_command_begins() -> None:
     check = DriveCheck(TOLERANCE, LIMIT)
     obeyed(check, 6.0, 6.0)
-    assert check.judge(NO_COUNTER, -6.0) == ""
+    assert check.current_problem(NO_COUNTER, -6.0) == ""
     assert obeyed(check, 1.0, -5.0) == ""  # on its way from -6 A
     assert check.errors == 0
     obeyed(check, 1.0, 5.9)  # 6 A is forgotten
@@ -114,14 +114,14 @@ def test_a_report_that_is_no_number_is_out_of_place(applied: float) -> None:
 
 def test_a_command_that_was_never_sent_cannot_have_been_obeyed() -> None:
     check = DriveCheck(TOLERANCE, LIMIT)
-    said = [check.judge(3, 0.0) for _ in range(TOLERATED)]
+    said = [check.current_problem(3, 0.0) for _ in range(TOLERATED)]
     assert "command 3, which was never sent" in said[-1]
 
 
 @pytest.mark.parametrize(("applied", "possible"), [(6.5, True), (-6.5, True), (6.5 + 1e-9, False), (-20.0, False)])
 def test_the_node_brakes_with_its_limit_at_most(applied: float, possible: bool) -> None:
     check = DriveCheck(TOLERANCE, LIMIT)
-    said = [check.judge(NO_COUNTER, applied) for _ in range(TOLERATED)]
+    said = [check.current_problem(NO_COUNTER, applied) for _ in range(TOLERATED)]
     assert said[:-1] == [""] * (TOLERATED - 1)
     assert (said[-1] == "") == possible
     assert check.errors == (0 if possible else 4 * TOLERATED)
@@ -132,7 +132,7 @@ def test_the_node_brakes_with_its_limit_at_most(applied: float, possible: bool) 
 def test_an_impossible_braking_current_excuses_no_later_one(applied: float) -> None:
     check = DriveCheck(TOLERANCE, LIMIT)
     obeyed(check, 6.0, 6.0)
-    check.judge(NO_COUNTER, applied)
+    check.current_problem(NO_COUNTER, applied)
     assert check.errors == 4
     obeyed(check, 1.0, 6.0)  # neither the command before it nor what it reported
     assert check.errors == 8
@@ -144,14 +144,14 @@ def test_20_ampere_of_own_braking_in_every_second_report_are_too_many() -> None:
     check = DriveCheck(TOLERANCE, LIMIT)
     said = []
     for n in range(7):
-        said += [check.judge(NO_COUNTER, 20.0), obeyed(check, 1.0, 1.0, n)]
+        said += [check.current_problem(NO_COUNTER, 20.0), obeyed(check, 1.0, 1.0, n)]
     assert [bool(text) for text in said].index(True) == 12
 
 
 def test_a_possible_braking_current_forgives_nothing() -> None:
     check = DriveCheck(TOLERANCE, LIMIT)
-    check.judge(NO_COUNTER, 20.0)
-    check.judge(NO_COUNTER, 6.0)
+    check.current_problem(NO_COUNTER, 20.0)
+    check.current_problem(NO_COUNTER, 6.0)
     assert check.errors == 4
 
 
@@ -161,7 +161,7 @@ def test_before_the_first_command_and_after_an_impossible_braking_current_there_
         check = DriveCheck(TOLERANCE, LIMIT)
         before = 4 if after_braking else 0
         if after_braking:
-            check.judge(NO_COUNTER, 20.0)
+            check.current_problem(NO_COUNTER, 20.0)
         obeyed(check, side * 3.0, side * -0.5)
         assert check.errors == max(before - 1, 0)
         obeyed(check, side * 3.0, side * -0.5 - side * 1e-9)

@@ -121,7 +121,7 @@ def _grows(facts: Facts, case: Case) -> None:
     least, most = law.viscous_low, law.viscous_high
     beside = law.friction_low + least * case.bench.limits.velocity
     facts.at_least(2.0 * COVERED * VELOCITY_PAD, squared * least * (slowing + beside))
-    facts.at_least(2.0 * EXACT * VELOCITY_PAD, squared * most * (slowing - law.friction_high))  # see not_covered
+    facts.at_least(2.0 * EXACT * VELOCITY_PAD, squared * most * (slowing - law.friction_high))  # see unmet_assumption
     share = facts.real("share", 0.0, 1.0)
     # A path per branch, so that on each the line is straight in the sample time.
     begun = facts.constant(0.0) + facts.lift(fastest_next, max=max)(law._replace(sample_time=ts * share), vl, vh, drive)
