@@ -5,7 +5,7 @@
 Plays honest experiments with every plant of the bench, with brakes of the shield's set, noise, lost samples and
 commands, jitter and delays, as benchmarks/sensor_monitor.py draws them; policies are the shipped actor, that of
 ``--quick``, and those drawn there; an experiment has 500, 250 or 100 samples. For each plant: alarms, and the largest
-unexplained velocity as a share of what is allowed.
+unexplained velocity and distance of the spring's origin as shares of what is allowed.
 """
 
 from __future__ import annotations
@@ -47,6 +47,9 @@ from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current, shield, window
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
+from emb_runtime.safety.spring_origin import MEMORY as SPRING_MEMORY
+from emb_runtime.safety.spring_origin import begin as begin_spring
+from emb_runtime.safety.spring_origin import origin
 from emb_train.structured.law import Box, box_of, wanted_current
 from emb_train.structured.stored import stored
 
@@ -56,7 +59,7 @@ CHUNK = 1000
 ACTORS = ("four-d-exact-quadratic", "four-time-exact-quadratic")
 LENGTHS = (500, 500, 250, 100)
 PLANTS = {**COVERED, "play": {}}
-LARGEST, JUDGED = range(2)  # Columns of a row of results
+LARGEST, JUDGED, ORIGIN = range(3)  # Columns of a row of results
 
 
 def fly(
@@ -76,6 +79,7 @@ def fly(
     """Play each experiment of a script to its end, whatever the monitor or the balance says."""
     ts = law.sample_time
     memory, sums, instrument = np.zeros(MEMORY), np.zeros(BALANCE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
+    spring = np.zeros(SPRING_MEMORY)
     x, reference = np.zeros(STATES), np.zeros(table.shape[0])
     no_unknowns, no_sensitivity = np.zeros(0, np.int64), np.zeros((0, SENSITIVE))
     for m in range(out.shape[0]):
@@ -86,6 +90,7 @@ def fly(
         angle, velocity = script.errors[m, 0, 0] + instruments.encoder_offset, script.errors[m, 0, 1]
         begin_monitor(memory, angle, velocity)
         begin(sums, angle, velocity)
+        begin_spring(spring)
         past, periods, obeyed, sent, felt, wanted = NO_PAST, 0, False, 0.0, 0.0, 0.0
         for k in range(law.steps):
             if scripted:
@@ -124,12 +129,14 @@ def fly(
             if script.losses[m, k] == SAMPLE_LOST and k < law.steps - 1:
                 continue
             judge(law, limits, memory, periods * ts, angle, velocity, obeyed and periods == 1, sent, felt)
-            if take(balance, sums, obeyed and periods == 1, angle, velocity, felt):
+            if take(balance, sums, spring, obeyed and periods == 1, angle, velocity, felt):
                 out[m, LARGEST] = max(out[m, LARGEST], unexplained(balance, sums) / allowance(balance, sums))
             periods = 0
         last = unexplained(balance, sums) / allowance(balance, sums)
         out[m, LARGEST] = max(out[m, LARGEST], last)
         out[m, JUDGED] = last > 0.0
+        place, most = origin(spring, balance.deviation, balance.travel)
+        out[m, ORIGIN] = abs(place) / most if last > 0.0 else 0.0
 
 
 def results(bench: Bench, plant: str, count: int, rng: np.random.Generator) -> Floats:
@@ -143,7 +150,7 @@ def results(bench: Bench, plant: str, count: int, rng: np.random.Generator) -> F
         script = draw(rng, case, min(CHUNK, count - turn), plant)
         script.errors[:, :, 2] = chosen.instruments.clock_jitter * rng.standard_normal(script.errors.shape[:2])
         actor = stored(ACTORS[int(rng.integers(len(ACTORS)))])
-        out = np.zeros((len(script.brakes), 2))
+        out = np.zeros((len(script.brakes), 3))
         arguments: tuple[Any, ...] = (
             law._replace(steps=int(rng.choice(LENGTHS))),
             sensor_thresholds(case, law),
@@ -171,14 +178,20 @@ def main() -> None:
     arguments = p.parse_args()
     bench, rng = load_bench(), np.random.default_rng(arguments.seed)
     each, alarms, judged, total = max(arguments.experiments // len(PLANTS), 1), 0, 0, 0
-    print("| plant | experiments | judged | alarms | largest share of what is allowed | level of 1e-6 |")
-    print("|---|---|---|---|---|---|", flush=True)
+    print(
+        "| plant | experiments | judged | alarms | largest share of the allowed | level of 1e-6 | of the origin | level |"
+    )
+    print("|---|---|---|---|---|---|---|---|", flush=True)
     for plant in PLANTS:
         r = results(bench, plant, each, rng)
-        share = r[:, LARGEST]
-        found, used = int(np.count_nonzero(share > 1.0)), int(np.count_nonzero(r[:, JUDGED]))
+        share, origins = r[:, LARGEST], r[:, ORIGIN]
+        found, used = int(np.count_nonzero((share > 1.0) | (origins > 1.0))), int(np.count_nonzero(r[:, JUDGED]))
         alarms, judged, total = alarms + found, judged + used, total + len(r)
-        print(f"| {plant} | {len(r)} | {used} | {found} | {share.max():.2f} | {tail(share):.2f} |", flush=True)
+        print(
+            f"| {plant} | {len(r)} | {used} | {found} | {share.max():.2f} | {tail(share):.2f} | "
+            f"{origins.max():.2f} | {tail(origins):.2f} |",
+            flush=True,
+        )
     low, high = stats.binomtest(alarms, total).proportion_ci(method="exact")
     print(f"\n{alarms} of {total} ({judged} judged): {low:.1e} to {high:.1e} at 95 % (Clopper and Pearson)")
 

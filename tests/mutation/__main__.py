@@ -47,6 +47,7 @@ TESTS = {
     "safety.sensor_thresholds": ("test_sensor_monitor_reference.py",),
     "safety.sensor_monitor": ("test_sensor_monitor.py", "test_sensor_monitor_reference.py"),
     "safety.motion_balance": ("test_motion_balance.py",),
+    "safety.spring_origin": ("test_spring_origin.py", "test_motion_balance.py"),
     "learning.known": ("test_known.py",),
     "learning.assumptions": ("test_assumptions.py",),
     "learning.law": ("test_law.py", "test_known.py"),

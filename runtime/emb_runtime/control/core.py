@@ -108,6 +108,9 @@ class Core:
         self._limits = CommandLimits(limit, bench.guard.slew * bench.timing.sample_time)
         self._monitor = SensorMonitor(self.law, sensor_thresholds(bench, self.law))
         self._balance = MotionBalance(bench)
+        self._unbalanced: tuple[SensorSample, bool] | None = (
+            None  # the newest sample, not yet in it; it follows the last
+        )
         self._unexplained = NAN, math.inf  # unexplained velocity and what is allowed, at the end [rad/s]
         # The way home may begin anywhere, and is not worth learning for.
         self._learner = Learner(bench, self.law, active=not self.homing)
@@ -236,7 +239,7 @@ class Core:
         in_time = now_ns - sample.receive_time_ns <= self._latest_answer_ns
         left = decision.reasons & Reason.LEFT if in_time else Reason.NONE
         self._leave_unanswered(sample, self._missed, now_ns, left)
-        self._record_numbers(sample, step)
+        self._end_cycle(sample, step)
         return None
 
     def sent(self, proposal: Proposal, now_ns: int, lost: str = "") -> None:
@@ -263,7 +266,7 @@ class Core:
             self.counters.count_answer(decision.reasons, current)
             answer = Answer(counter, wanted, decision.clipped, current, self._decide_ns, now_ns)
             self._record(sample, step, decision.reasons, self._missed, answer)
-        self._record_numbers(sample, step)
+        self._end_cycle(sample, step)
 
     def timeout(self, now_ns: int) -> None:
         """Count that no frame came until :attr:`deadline_ns`."""
@@ -497,7 +500,9 @@ class Core:
         else:
             if why := self._incomplete(sample, min(step, self.steps)):
                 raise StopError(Fault.INCOMPLETE, why)
+            self._judge_motion()
             self._unexplained = self._balance.judge()
+            self._balance.judge_zero()
         self._machine.handle_event(Event.FINISHED, self._now_ns)
 
     def _incomplete(self, end: SensorSample, periods: int) -> str:
@@ -589,13 +594,17 @@ class Core:
         answer = Answer(decide_ns=decide_ns) if decide_ns else NO_ANSWER
         self._record(sample, self._step_of(sample), reasons or Reason.MISSED, missed, answer)
 
-    def _record_numbers(self, sample: SensorSample, step: int) -> None:
-        """Record what is known at a sample, after its cycle."""
+    def _end_cycle(self, sample: SensorSample, step: int) -> None:
+        """Record what is known at a sample, and judge the motion so far."""
         if not self.homing and (estimate := self._estimator.estimate):
             self._keep_estimate(estimate, sample, step)
         if self._learner.known is not None:
             learnt = numbers(self._learner.known, self._learner.age)
             self.records.append(LearntRecord(sample.receive_time_ns, step, learnt))
+        try:
+            self._judge_motion()
+        except StopError as stop:
+            self._fail(stop.fault, stop.detail)
 
     def _keep_estimate(self, estimate: tuple[float, ...], sample: SensorSample, step: int) -> None:
         """Record the estimate; once it meets the stop condition, all that is left is the way home."""
@@ -616,6 +625,7 @@ class Core:
 
     def _follow(self, before: SensorSample, sample: SensorSample) -> None:
         """Count the periods between two samples, and check that the node obeyed and that the sensors can be right."""
+        self._judge_motion()
         elapsed_ns = sample.device_time_ns - before.device_time_ns
         gap = round(elapsed_ns / self._period_ns)
         self._missed = max(0, gap - 1)
@@ -637,8 +647,14 @@ class Core:
         self._sent_counter = None
         self._judge_sensors(elapsed_ns * 1e-9, sample, sent and obeyed, self._past[0] if sent else 0.0)
         if not self.homing and self._reversed is None:
-            self._balance.take(sample, sent and obeyed and gap == 1)
+            self._unbalanced = sample, sent and obeyed and gap == 1
         self._learn(sample, gap)
+
+    def _judge_motion(self) -> None:
+        """Take the newest sample into the balance, which no command depends on: once its own has left."""
+        if self._unbalanced is not None:
+            (sample, follows), self._unbalanced = self._unbalanced, None
+            self._balance.take(sample, follows)
 
     def _judge_sensors(self, elapsed: float, sample: SensorSample, obeyed: bool, command: float) -> None:
         """End the run if the sensors cannot be right.

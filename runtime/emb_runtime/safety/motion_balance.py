@@ -19,6 +19,8 @@ from typing import Any, Final, NamedTuple
 
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import SensorSample
+from emb_runtime.safety import spring_origin
+from emb_runtime.safety.spring_origin import add, eliminate, end_stretch, origin
 from emb_runtime.safety.state_machine import Fault, StopError
 
 SLIDES: Final = 12.0  # Speed above which the direction of friction is certain, in standard deviations of the velocity
@@ -66,6 +68,8 @@ class BalanceModel(NamedTuple):
     coulomb: float  # By Coulomb friction [rad/s]
     viscous: float  # By 1 rad/s
     curved: float  # By 1 rad², where the stiffness doubles over the whole travel [1/(rad·s)]
+    deviation: float  # Standard deviation of a velocity [rad/s]
+    travel: float  # Largest angle [rad]
     slides: float  # Speed above which a period counts [rad/s]
     prior: float  # Weight of the nominal brake in the normal equations [rad²/s²]
     allowed: float  # Unexplained velocity of an honest run; infinite where nothing is judged [rad/s]
@@ -85,6 +89,8 @@ def balance_model(bench: Bench) -> BalanceModel:
         coulomb=t * brake.T_c / brake.J,
         viscous=t * brake.f_v / brake.J,
         curved=t * brake.gamma * brake.k_1 / brake.J / bench.limits.angle[1],
+        deviation=deviation,
+        travel=bench.limits.angle[1],
         slides=SLIDES * deviation,
         prior=2.0 * deviation * deviation,
         allowed=max(NOISE * deviation, MISFIT * fastest) if covered else math.inf,
@@ -107,12 +113,15 @@ def begin(memory: Any, angle: float, velocity: float) -> None:
     memory[ANGLE], memory[VELOCITY], memory[SPACING] = angle, velocity, STRIDE
 
 
-def take(model: BalanceModel, memory: Any, follows: bool, angle: float, velocity: float, current: float) -> bool:
+def take(
+    model: BalanceModel, memory: Any, spring: Any, follows: bool, angle: float, velocity: float, current: float
+) -> bool:
     """Take in one more sample.
 
     Args:
         model: from :func:`balance_model`.
         memory: row of the run, changed.
+        spring: row of :mod:`emb_runtime.safety.spring_origin`, changed.
         follows: it is the next sample, and the command acted between the two; else nothing is summed up.
         angle: measured [rad].
         velocity: measured [rad/s].
@@ -139,10 +148,12 @@ def take(model: BalanceModel, memory: Any, follows: bool, angle: float, velocity
             -model.spring * pressed * sign,
         )
         _add(memory, row, velocity - v)
+        add(spring, row, -model.spring * model.travel if pressed > 0.0 else 0.0, velocity - v)
         memory[STRETCHES] += 1.0 - memory[SLID]
         memory[SLID] = 1.0
     else:
         memory[SLID] = 0.0
+        end_stretch(spring)
     memory[SAMPLES] += 1.0
     if memory[SAMPLES] < memory[SPACING]:
         return False
@@ -220,18 +231,7 @@ def solve(model: BalanceModel, memory: Any, count: int) -> None:
         nominal = 1.0 if i < PHYSICAL else 0.0
         memory[WORK + i * WIDTH + i] += model.prior
         memory[WORK + i * WIDTH + COEFFICIENTS] = memory[RIGHT + i] + model.prior * nominal
-    for i in range(count):
-        top = WORK + i * WIDTH
-        for j in range(i + 1, count):
-            factor = memory[top + j] / memory[top + i]
-            for k in range(j, WIDTH):
-                memory[WORK + j * WIDTH + k] -= factor * memory[top + k]
-    for i in range(count - 1, -1, -1):
-        top = WORK + i * WIDTH
-        value = memory[top + COEFFICIENTS]
-        for j in range(i + 1, count):
-            value -= memory[top + j] * memory[SOLUTION + j]
-        memory[SOLUTION + i] = value / memory[top + i]
+    eliminate(memory, WORK, SOLUTION, count, WIDTH)
 
 
 def steady_motion(velocities: Sequence[float], deviation: float) -> float:
@@ -259,15 +259,16 @@ class MotionBalance:
         bench: brake, noise, and what its shield declares.
     """
 
-    __slots__ = ("_memory", "_model")
+    __slots__ = ("_memory", "_model", "_spring")
 
     def __init__(self, bench: Bench) -> None:
         self._model = balance_model(bench)
-        self._memory = [0.0] * MEMORY
+        self._memory, self._spring = [0.0] * MEMORY, [0.0] * spring_origin.MEMORY
 
     def begin(self, sample: SensorSample) -> None:
         """Begin a run with its first sample."""
         begin(self._memory, sample.angle, sample.velocity)
+        spring_origin.begin(self._spring)
 
     def take(self, sample: SensorSample, follows: bool) -> None:
         """Take in one more sample; arguments are as for :func:`take`.
@@ -275,7 +276,8 @@ class MotionBalance:
         Raises:
             StopError: the motion so far has no explanation.
         """
-        if take(self._model, self._memory, follows, sample.angle, sample.velocity, sample.applied_current):
+        measured = sample.angle, sample.velocity, sample.applied_current
+        if take(self._model, self._memory, self._spring, follows, *measured):
             self.judge()
 
     def judge(self) -> tuple[float, float]:
@@ -292,3 +294,17 @@ class MotionBalance:
                 f"{found:.0f} rad/s of the motion are not those of any one brake (at most {most:.0f} rad/s are)",
             )
         return found, most
+
+    def judge_zero(self) -> None:
+        """Judge at the end of a run whether the spring begins at the zero of the angle.
+
+        Raises:
+            StopError: it does not.
+        """
+        place, most = origin(self._spring, self._model.deviation, self._model.travel)
+        if abs(place) > most and allowance(self._model, self._memory) < math.inf:
+            raise StopError(
+                Fault.MOTION_UNEXPLAINED,
+                f"the spring begins at {place:.1f} rad, at most {most:.1f} rad from 0 is expected: the angle's zero is "
+                "wrong, or a current acts that is not reported",
+            )
