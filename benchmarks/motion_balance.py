@@ -178,9 +178,7 @@ def main() -> None:
     arguments = p.parse_args()
     bench, rng = load_bench(), np.random.default_rng(arguments.seed)
     each, alarms, judged, total = max(arguments.experiments // len(PLANTS), 1), 0, 0, 0
-    print(
-        "| plant | experiments | judged | alarms | largest share of the allowed | level of 1e-6 | of the origin | level |"
-    )
+    print("| plant | experiments | judged | alarms | share allowed | level of 1e-6 | of the origin | level |")
     print("|---|---|---|---|---|---|---|---|", flush=True)
     for plant in PLANTS:
         r = results(bench, plant, each, rng)

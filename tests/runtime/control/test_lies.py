@@ -374,6 +374,8 @@ UNEXPLAINED: dict[str, Lie] = {
     "scale slides by -0.5/s": Lie(slide=-0.5, blind=True, begin=0.0),
     "scale swings": Lie(wave=0.1, blind=True, begin=0.0),
     "angle curved": Lie(curve=0.001, blind=True, begin=0.0),
+    "zero at 5 rad": Lie(zero=5.0, blind=True),
+    "zero at -5 rad": Lie(zero=-5.0, blind=True),
     "zero at 10 rad": Lie(zero=10.0, blind=True),
     "zero at 20 rad": Lie(zero=20.0, blind=True),
     "both drift by 5 rad/s": Lie(both=5.0, blind=True),
@@ -386,9 +388,12 @@ UNEXPLAINED: dict[str, Lie] = {
     "current swings": Lie(gain_wave=0.1, begin=0.0),
     "reported current +0.4 A": Lie(reported=0.4, begin=0.0),
     "reported current -0.4 A": Lie(reported=-0.4, begin=0.0),
+    "reported current +0.1 A": Lie(reported=0.1, begin=0.0),
     "unreported current 0.4 A": Lie(offset_current=0.4, begin=0.0),
     "dead band of 1 A": Lie(dead=1.0, begin=0.0),
     "friction grows threefold": Lie(friction_rate=3.0, begin=0.0),
+    "friction doubles": Lie(friction_rate=1.0, begin=0.0),
+    "stiffness halves": Lie(stiffness=0.5, begin=0.25),
 }
 """All of these were called done with exit code 0; the shipped actor drives."""
 
@@ -413,9 +418,9 @@ def test_an_honest_node_under_the_shipped_actor_is_explained_with_and_without_lo
         assert 0.0 < outcome.unexplained < 0.5 * outcome.allowed < 20.0
 
 
-@pytest.mark.parametrize("lie", [Lie(zero=5.0), Lie(zero=-5.0), Lie(slide=0.2, begin=0.0), Lie(gain_rate=0.2)], ids=str)
+@pytest.mark.parametrize("lie", [Lie(zero=2.0), Lie(zero=-2.0), Lie(slide=0.2, begin=0.0), Lie(gain_rate=0.2)], ids=str)
 def test_what_stays_unseen_keeps_within_what_the_page_says(lie: Lie) -> None:
     seen = run(replace(lie, blind=True), actor=load_policy(shipped_actor_path(), BENCH))
-    assert seen.node.lowest >= -5.5
+    assert seen.node.lowest >= -3.5
     assert seen.node.highest <= 80.0
     assert seen.node.fastest <= 522.0
