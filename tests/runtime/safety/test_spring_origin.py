@@ -103,7 +103,7 @@ def test_a_zero_that_is_wrong_by_6_rad_is_found_and_one_by_less_than_is_allowed_
 
 
 def test_what_is_not_judged_by_the_balance_has_no_origin_to_judge(bench: Bench) -> None:
-    lagging = replace(bench, shield=replace(bench.shield, current_lag=0.0005))
+    lagging = replace(bench, shield=bench.shield._replace(current_lag=0.0005))
     run(lagging, 6.0).judge_zero()
     few = MotionBalance(bench)
     few.begin(sample(Row(True, 0.0, 0.0, 0.0)))
