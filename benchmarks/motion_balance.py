@@ -39,6 +39,7 @@ from emb_runtime.safety.motion_balance import (
     allowance,
     balance_model,
     begin,
+    origin,
     take,
     unexplained,
 )
@@ -47,9 +48,6 @@ from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current, shield, window
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
-from emb_runtime.safety.spring_origin import MEMORY as SPRING_MEMORY
-from emb_runtime.safety.spring_origin import begin as begin_spring
-from emb_runtime.safety.spring_origin import origin
 from emb_train.structured.law import Box, box_of, wanted_current
 from emb_train.structured.stored import stored
 
@@ -79,7 +77,6 @@ def fly(
     """Play each experiment of a script to its end, whatever the monitor or the balance says."""
     ts = law.sample_time
     memory, sums, instrument = np.zeros(MEMORY), np.zeros(BALANCE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
-    spring = np.zeros(SPRING_MEMORY)
     x, reference = np.zeros(STATES), np.zeros(table.shape[0])
     no_unknowns, no_sensitivity = np.zeros(0, np.int64), np.zeros((0, SENSITIVE))
     for m in range(out.shape[0]):
@@ -90,7 +87,6 @@ def fly(
         angle, velocity = script.errors[m, 0, 0] + instruments.encoder_offset, script.errors[m, 0, 1]
         begin_monitor(memory, angle, velocity)
         begin(sums, angle, velocity)
-        begin_spring(spring)
         past, periods, obeyed, sent, felt, wanted = NO_PAST, 0, False, 0.0, 0.0, 0.0
         for k in range(law.steps):
             if scripted:
@@ -129,13 +125,13 @@ def fly(
             if script.losses[m, k] == SAMPLE_LOST and k < law.steps - 1:
                 continue
             judge(law, limits, memory, periods * ts, angle, velocity, obeyed and periods == 1, sent, felt)
-            if take(balance, sums, spring, obeyed and periods == 1, angle, velocity, felt):
+            if take(balance, sums, obeyed and periods == 1, angle, velocity, felt):
                 out[m, LARGEST] = max(out[m, LARGEST], unexplained(balance, sums) / allowance(balance, sums))
             periods = 0
         last = unexplained(balance, sums) / allowance(balance, sums)
         out[m, LARGEST] = max(out[m, LARGEST], last)
         out[m, JUDGED] = last > 0.0
-        place, most = origin(spring, balance.deviation, balance.travel)
+        place, most = origin(balance, sums)
         out[m, ORIGIN] = abs(place) / most if last > 0.0 else 0.0
 
 

@@ -7,6 +7,11 @@ take up most of it. Sensors or a current whose scale changes, a zero or a curren
 the unexplained velocity is the range of that sum (a CUSUM of least-squares residuals: Ploberger and Krämer, The CUSUM
 test with OLS residuals, Econometrica 60, 1992).
 
+A zero of the angle that is wrong by z adds the torque γ k_1 z wherever the spring presses, whatever the angle; a
+current that is not reported adds one as well. This torque is one more regressor, at the end of a run, of least squares
+on the velocities less their mean in each stretch of sliding: the errors of velocities are independent, those of their
+changes are not.
+
 Plain scalar functions on one row of numbers, so that the runtime and a compiled batch run the same code. What it sees
 and what it cannot: ``docs/explanation/sensor-monitor.md``.
 """
@@ -19,8 +24,6 @@ from typing import Any, Final, NamedTuple
 
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import SensorSample
-from emb_runtime.safety import spring_origin
-from emb_runtime.safety.spring_origin import add, eliminate, end_stretch, origin
 from emb_runtime.safety.state_machine import Fault, StopError
 
 SLIDES: Final = 12.0  # Speed above which the direction of friction is certain, in standard deviations of the velocity
@@ -37,6 +40,11 @@ LOAD: Final = 0.03  # May be explained by friction that grows with the load, lik
 BREAK: Final = 0.6  # Allowed beside that for each stretch, whose ends noise decides, in standard deviations
 REST_SAMPLES: Final = 20  # Last samples of a node at rest that are looked at; even
 MOVING: Final = 2.0  # Mean velocity that no brake at rest has, in standard deviations of a measurement
+TERMS: Final = COEFFICIENTS + 1  # And the spring's origin, as a share of the travel
+ORIGIN_ALLOWED: Final = 2.2  # Distance of the origin from 0 that an honest run may show, beside what follows [rad]
+ORIGIN_ERRORS: Final = 6.0  # Errors of the origin that are allowed, in standard deviations
+ORIGIN_LATE: Final = 20.0  # Allowed where all of the current acts late, or the velocity lags [rad]
+PRODUCTS: Final = TERMS * (TERMS + 3) // 2
 EQUATIONS: Final = COEFFICIENTS * (COEFFICIENTS + 1) // 2
 WIDTH: Final = COEFFICIENTS + 1
 
@@ -57,7 +65,14 @@ SUMS: Final = RIGHT + COEFFICIENTS  # Sums of each regressor so far, and of the 
 TABLE: Final = SUMS + WIDTH  # Entries: these sums, as they were
 WORK: Final = TABLE + ENTRIES * WIDTH  # Equations during elimination
 SOLUTION: Final = WORK + COEFFICIENTS * WIDTH  # Coefficients, as :func:`solve` left them
-MEMORY: Final = SOLUTION + COEFFICIENTS  # Length of the row
+COUNT: Final = SOLUTION + COEFFICIENTS  # Velocities in the present stretch
+SUM: Final = COUNT + 1  # Sums of the regressors since its begin, and the change of the velocity
+FIRST: Final = SUM + TERMS + 1  # Sums of these over its velocities
+SECOND: Final = FIRST + TERMS + 1  # Sums of their products: upper triangle by rows
+CENTRED: Final = SECOND + PRODUCTS  # The same of earlier stretches, less the means
+ORIGIN_WORK: Final = CENTRED + PRODUCTS  # Equations during elimination
+ORIGIN: Final = ORIGIN_WORK + TERMS * (TERMS + 1)  # Coefficients, as :func:`origin` left them
+MEMORY: Final = ORIGIN + TERMS  # Length of the row
 
 
 class BalanceModel(NamedTuple):
@@ -113,15 +128,12 @@ def begin(memory: Any, angle: float, velocity: float) -> None:
     memory[ANGLE], memory[VELOCITY], memory[SPACING] = angle, velocity, STRIDE
 
 
-def take(
-    model: BalanceModel, memory: Any, spring: Any, follows: bool, angle: float, velocity: float, current: float
-) -> bool:
+def take(model: BalanceModel, memory: Any, follows: bool, angle: float, velocity: float, current: float) -> bool:
     """Take in one more sample.
 
     Args:
         model: from :func:`balance_model`.
         memory: row of the run, changed.
-        spring: row of :mod:`emb_runtime.safety.spring_origin`, changed.
         follows: it is the next sample, and the command acted between the two; else nothing is summed up.
         angle: measured [rad].
         velocity: measured [rad/s].
@@ -148,12 +160,12 @@ def take(
             -model.spring * pressed * sign,
         )
         _add(memory, row, velocity - v)
-        add(spring, row, -model.spring * model.travel if pressed > 0.0 else 0.0, velocity - v)
+        _add_to_stretch(memory, row, -model.spring * model.travel if pressed > 0.0 else 0.0, velocity - v)
         memory[STRETCHES] += 1.0 - memory[SLID]
         memory[SLID] = 1.0
     else:
         memory[SLID] = 0.0
-        end_stretch(spring)
+        _end_stretch(memory)
     memory[SAMPLES] += 1.0
     if memory[SAMPLES] < memory[SPACING]:
         return False
@@ -231,7 +243,79 @@ def solve(model: BalanceModel, memory: Any, count: int) -> None:
         nominal = 1.0 if i < PHYSICAL else 0.0
         memory[WORK + i * WIDTH + i] += model.prior
         memory[WORK + i * WIDTH + COEFFICIENTS] = memory[RIGHT + i] + model.prior * nominal
-    eliminate(memory, WORK, SOLUTION, count, WIDTH)
+    _eliminate(memory, WORK, SOLUTION, count, WIDTH)
+
+
+def origin(model: BalanceModel, memory: Any) -> tuple[float, float]:
+    """Angle at which the spring of the nominal brake begins, and how far from 0 that may be [rad]."""
+    _end_stretch(memory)
+    prior, width = model.deviation * model.deviation, TERMS + 1
+    place = CENTRED
+    for i in range(TERMS):
+        for j in range(i, width):
+            memory[ORIGIN_WORK + i * width + j] = memory[place]
+            place += 1
+        memory[ORIGIN_WORK + i * width + i] += prior
+        memory[ORIGIN_WORK + i * width + TERMS] += prior if i < PHYSICAL else 0.0
+    _eliminate(memory, ORIGIN_WORK, ORIGIN, TERMS, width)
+    pivot = memory[ORIGIN_WORK + (TERMS - 1) * width + TERMS - 1]  # the last is the inverse of a variance
+    error = model.travel * model.deviation / math.sqrt(pivot)
+    late = abs(memory[ORIGIN + PHYSICAL]) + abs(memory[ORIGIN + PHYSICAL + 1])
+    allowed = ORIGIN_ALLOWED + ORIGIN_ERRORS * error + ORIGIN_LATE * late
+    return -model.travel * float(memory[ORIGIN + TERMS - 1]), float(allowed)
+
+
+def _add_to_stretch(memory: Any, row: tuple[float, ...], torque: float, change: float) -> None:
+    memory[COUNT] = max(memory[COUNT], 1.0) + 1.0  # with the velocity at its begin, where all sums are 0
+    for i in range(COEFFICIENTS):
+        memory[SUM + i] += row[i]
+    memory[SUM + COEFFICIENTS] += torque
+    memory[SUM + TERMS] += change
+    place = SECOND
+    for i in range(TERMS):
+        left = memory[SUM + i]
+        memory[FIRST + i] += left
+        for j in range(i, TERMS + 1):
+            memory[place] += left * memory[SUM + j]
+            place += 1
+    memory[FIRST + TERMS] += memory[SUM + TERMS]
+
+
+def _end_stretch(memory: Any) -> None:
+    count = memory[COUNT]
+    if count == 0.0:
+        return
+    place = 0
+    for i in range(TERMS):
+        for j in range(i, TERMS + 1):
+            memory[CENTRED + place] += memory[SECOND + place] - memory[FIRST + i] * memory[FIRST + j] / count
+            place += 1
+    for at in range(COUNT, CENTRED):
+        memory[at] = 0.0
+
+
+def _eliminate(memory: Any, work: int, solution: int, count: int, width: int) -> None:
+    """Solve symmetric equations by Gauss's elimination, in the row.
+
+    Args:
+        memory: row, changed.
+        work: place of the equations: upper triangle of ``count`` rows of ``width``, with the right side at the end.
+        solution: place of what solves them.
+        count: of the equations.
+        width: of a row.
+    """
+    for i in range(count):
+        top = work + i * width
+        for j in range(i + 1, count):
+            factor = memory[top + j] / memory[top + i]
+            for k in range(j, width):
+                memory[work + j * width + k] -= factor * memory[top + k]
+    for i in range(count - 1, -1, -1):
+        top = work + i * width
+        value = memory[top + width - 1]
+        for j in range(i + 1, count):
+            value -= memory[top + j] * memory[solution + j]
+        memory[solution + i] = value / memory[top + i]
 
 
 def steady_motion(velocities: Sequence[float], deviation: float) -> float:
@@ -259,16 +343,15 @@ class MotionBalance:
         bench: brake, noise, and what its shield declares.
     """
 
-    __slots__ = ("_memory", "_model", "_spring")
+    __slots__ = ("_memory", "_model")
 
     def __init__(self, bench: Bench) -> None:
         self._model = balance_model(bench)
-        self._memory, self._spring = [0.0] * MEMORY, [0.0] * spring_origin.MEMORY
+        self._memory = [0.0] * MEMORY
 
     def begin(self, sample: SensorSample) -> None:
         """Begin a run with its first sample."""
         begin(self._memory, sample.angle, sample.velocity)
-        spring_origin.begin(self._spring)
 
     def take(self, sample: SensorSample, follows: bool) -> None:
         """Take in one more sample; arguments are as for :func:`take`.
@@ -276,8 +359,7 @@ class MotionBalance:
         Raises:
             StopError: the motion so far has no explanation.
         """
-        measured = sample.angle, sample.velocity, sample.applied_current
-        if take(self._model, self._memory, self._spring, follows, *measured):
+        if take(self._model, self._memory, follows, sample.angle, sample.velocity, sample.applied_current):
             self.judge()
 
     def judge(self) -> tuple[float, float]:
@@ -301,7 +383,7 @@ class MotionBalance:
         Raises:
             StopError: it does not.
         """
-        place, most = origin(self._spring, self._model.deviation, self._model.travel)
+        place, most = origin(self._model, self._memory)
         if abs(place) > most and allowance(self._model, self._memory) < math.inf:
             raise StopError(
                 Fault.MOTION_UNEXPLAINED,

@@ -14,7 +14,6 @@ import pytest
 
 from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.records import NodeState, SensorSample
-from emb_runtime.safety import spring_origin
 from emb_runtime.safety.motion_balance import (
     COEFFICIENTS,
     MEMORY,
@@ -119,8 +118,7 @@ def taken(bench: Bench, rows: list[Row]) -> tuple[list[float], list[int]]:
     """The memory after all rows, and the samples with which an entry was stored."""
     model, memory = balance_model(bench), [7.0] * MEMORY
     begin(memory, rows[0].angle, rows[0].velocity)
-    spring = [0.0] * spring_origin.MEMORY
-    stored = [take(model, memory, spring, *row) for row in rows[1:]]
+    stored = [take(model, memory, *row) for row in rows[1:]]
     assert set(stored) <= {False, True}
     return memory, [k for k, new in enumerate(stored, 1) if new]
 
@@ -192,12 +190,12 @@ EDGES = {
 def test_the_edges_of_a_period_that_counts() -> None:
     model = balance_model(BENCH)
     for velocities, counts in EDGES.items():
-        memory, spring = [0.0] * MEMORY, [0.0] * spring_origin.MEMORY
+        memory = [0.0] * MEMORY
         begin(memory, 0.0, velocities[0])
         for _ in range(2):
-            take(model, memory, spring, True, 0.0, velocities[0], 1.0)
+            take(model, memory, True, 0.0, velocities[0], 1.0)
         memory[PERIODS] = 0.0
-        take(model, memory, spring, True, 0.0, velocities[1], 1.0)
+        take(model, memory, True, 0.0, velocities[1], 1.0)
         assert memory[PERIODS] == counts, velocities
 
 
