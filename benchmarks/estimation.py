@@ -127,7 +127,7 @@ def matched(bench: Bench, name: str, currents: Floats, found: list[Drawn]) -> No
     brake, n = brake_of(bench), len(found)
     true = np.array([getattr(brake, p) for p in PARAMETER_NAMES])
     plant = bench.plant("exact")
-    bounds = fisher(bench, brake, currents, kind="physical", normalise_by="true", plant=plant).cramer_rao()
+    bounds = fisher(bench, brake, currents, kind="physical", plant=plant).cramer_rao()
     errors = (np.array([d.values for d in found]) / true - 1.0) / list(bounds.values())
     ratios, biases = errors.var(axis=0, ddof=1), errors.mean(axis=0)
     high, low = (n - 1) / stats.chi2.ppf([0.025, 0.975], n - 1)

@@ -62,7 +62,7 @@ RENAMED: dict[str, str] = {}
 """Keys of JSON documents: the new name, and the frozen one. ``{"identified": "told"}``."""
 RENAMED_FROZEN = {"told": "identified"}
 """Frozen keys and their new names, where other frozen documents have the new name already."""
-GONE: dict[str, str] = {}
+GONE: dict[str, str] = {"fim/*/normalise_by": "the parameters of an information are always relative to theta"}
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, each with the commit that says why."""
 REST = "0abcadc: a run is watched until the node is at rest, and recorded so far"
 WINDOWS = "8dba46e: windows begin at a state whose squares fell"

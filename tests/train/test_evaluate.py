@@ -63,7 +63,7 @@ def test_what_was_played_has_the_information_that_plain_python_computes_from_the
             rng.uniform(WIDE.low, WIDE.high)
             noise = rng.standard_normal((501, 2)) * [BENCH.noise.angle, BENCH.noise.velocity]
             played = run_excitation(BENCH, excited, plant.mechanics, draw.brake, shielded=True, noise=noise)
-            found = fisher(BENCH, draw.brake, played.currents, kind="physical", normalise_by="true", plant=plant)
+            found = fisher(BENCH, draw.brake, played.currents, kind="physical", plant=plant)
             np.testing.assert_allclose(outcome.matrices[i], found.matrix, rtol=1e-6)
             assert outcome.home[i] == played.home
             assert outcome.left[i] == (not played.kept)
@@ -191,7 +191,7 @@ def test_the_known_optimum_is_the_information_of_the_kept_currents_and_is_looked
     first = found()
     for brake, value in zip(brakes, first, strict=True):
         currents, plant = np.full(500, 1e5 * brake.f_v), BENCH.plant("euler")
-        own = fisher(BENCH, brake, currents, kind="weighted", normalise_by="true", plant=plant, params=("f_v",))
+        own = fisher(BENCH, brake, currents, kind="weighted", plant=plant, params=("f_v",))
         assert value == pytest.approx(own.matrix[0, 0], rel=1e-9)
     assert searched == [3e-5, 1e-5, 4e-5]
     np.testing.assert_array_equal(found(), first)

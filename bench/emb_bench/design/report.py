@@ -68,7 +68,7 @@ def check(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, curr
     parts = PARTS if m.solver == EXACT else 1
     states = simulate(m, p, np.repeat(currents, parts), t_s / parts).states
     matrix = fisher(
-        bench, p, currents, kind=kind, normalise_by="true", plant=plant, params=problem.params
+        bench, p, currents, kind=kind, plant=plant, params=problem.params
     ).matrix  # relative to the parameters of the problem, which are known
     found = criteria(matrix, problem.params)
     limits, home = bench.limits, bench.shield

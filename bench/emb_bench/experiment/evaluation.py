@@ -91,7 +91,7 @@ class Evaluation:
         asked = self.question
         prior = asked.start(self.theta) if kind == "physical" else None
         matrix = self.histories[kind][-1]
-        return Fisher(kind, "true", asked.names, self.theta, matrix, prior, self.plant.name, asked.nuisances)
+        return Fisher(kind, asked.names, self.theta, matrix, prior, self.plant.name, asked.nuisances)
 
     def verdict(self) -> Identifiability:
         """Parameters that can be identified from the record, and those that cannot."""

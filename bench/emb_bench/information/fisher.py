@@ -6,9 +6,8 @@ Two of them live here and are never mixed:
 - ``weighted``: the thesis's (eq. 4.18-4.21, 5.12): outputs divided by 100 rad and 500 rad/s, R left as it is. A reward,
   and comparable with the thesis.
 
-Parameters are relative (eq. 4.17), to their true values θ or to the nominal ones; each result says which. Unknowns that
-are not the brake's parameters have units (:data:`emb_bench.brake.parameters.UNITS`). Everything here is numpy and plain
-Python and runs on the base install.
+Parameters are relative to their values θ (eq. 4.17). Unknowns that are not the brake's parameters have units
+(:data:`emb_bench.brake.parameters.UNITS`). Everything here is numpy and plain Python and runs on the base install.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ from emb_runtime.config.plants import Instruments, Plant
 from emb_runtime.errors import UsageError
 
 Kind = Literal["physical", "weighted"]
-NormaliseBy = Literal["true", "nominal"]
 
 
 class Weights(NamedTuple):
@@ -79,15 +77,6 @@ def weights_along(bench: Bench, kind: Kind, instruments: Instruments, states: Fl
     if kind == "physical" and instruments.observer_bandwidth > 0.0:
         result[:, 1] = 0.0
     return result
-
-
-def relative_to(p: BrakeParameters, reference: BrakeParameters, params: Sequence[str]) -> Floats:
-    """Factors that turn sensitivities relative to ``p`` into ones relative to ``reference`` (eq. 4.17).
-
-    Returns:
-        Shape (len(params),): θ_ref,i / θ_i; 1 for an unknown that is no parameter of the brake.
-    """
-    return np.array([getattr(reference, n) / getattr(p, n) if n in BrakeParameters._fields else 1.0 for n in params])
 
 
 def information_over_time(s: Floats, weights: Weights | Floats, start: Any = None, measured: Any = None) -> Floats:
@@ -143,7 +132,6 @@ class Fisher:
     """Fisher information matrix with its parameters, scaling, brake and prior."""
 
     kind: Kind
-    normalise_by: NormaliseBy
     params: tuple[str, ...]
     theta: BrakeParameters  # The brake at which it was computed
     matrix: Floats  # Shape (len(params), len(params)), prior included; dimensionless if physical
@@ -163,7 +151,7 @@ class Fisher:
     def cramer_rao(self) -> dict[str, float]:
         """Least standard deviation of an unbiased estimate of each unknown when all the others are unknown too.
 
-        Relative to what ``normalise_by`` names, or in the unknown's unit; inf if the data do not identify it. With a
+        Relative, or in the unknown's unit; inf if the data do not identify it. With a
         prior it is the spread after a Gaussian one of the same variance, to first order, and no bound.
 
         Raises:
@@ -182,22 +170,17 @@ class Fisher:
         self._physical()
         return Spectrum(self.matrix).correlation()
 
-    def verdict(self, ranges: Ranges | None = None, reference: BrakeParameters | None = None) -> Identifiability:
-        """Identifiability of each parameter, in words.
+    def verdict(self, ranges: Ranges | None = None) -> Identifiability:
+        """Identifiability of each parameter.
 
         Args:
             ranges: where each parameter is known to lie; without, none is at a border.
-            reference: the nominal brake, if parameters are relative to its values.
 
         Raises:
-            UsageError: this is the weighted FIM, which bounds nothing; or the nominal brake is missing.
+            UsageError: this is the weighted FIM, which bounds nothing.
         """
         self._physical()
-        if self.normalise_by == "nominal" and reference is None:
-            raise UsageError("this Fisher information is relative to the nominal brake: pass it as reference")
-        unit = self.theta if reference is None or self.normalise_by == "true" else reference
-        borders = {} if ranges is None else _borders(self.params, self.theta, unit, ranges)
-        return judge(self.matrix, self.params, self.prior, borders)
+        return judge(self.matrix, self.params, self.prior, _borders(self.params, self.theta, ranges))
 
     def _physical(self) -> None:
         if self.kind != "physical":
@@ -206,18 +189,17 @@ class Fisher:
             )
 
 
-def _borders(
-    params: Sequence[str], theta: BrakeParameters, unit: BrakeParameters, ranges: Ranges
-) -> dict[str, tuple[float, float]]:
-    """Distances of each parameter to its lowest and its highest value, relative to ``unit``."""
-    varied = [name for name in params if getattr(ranges.low, name, 0.0) < getattr(ranges.high, name, 0.0)]
-    return {
-        name: (
-            (getattr(theta, name) - getattr(ranges.low, name)) / getattr(unit, name),
-            (getattr(ranges.high, name) - getattr(theta, name)) / getattr(unit, name),
-        )
-        for name in varied
-    }
+def _borders(params: Sequence[str], theta: BrakeParameters, ranges: Ranges | None) -> dict[str, tuple[float, float]]:
+    """Relative distances of each parameter that varies to its lowest and its highest value."""
+    found: dict[str, tuple[float, float]] = {}
+    if ranges is None:
+        return found
+    for name in params:
+        low, high = getattr(ranges.low, name, 0.0), getattr(ranges.high, name, 0.0)
+        if low < high:
+            own = getattr(theta, name)
+            found[name] = (own - low) / own, (high - own) / own
+    return found
 
 
 def fisher(
@@ -226,7 +208,6 @@ def fisher(
     currents: Sequence[float] | Floats,
     *,
     kind: Kind,
-    normalise_by: NormaliseBy,
     plant: Plant,
     params: Sequence[str] = PARAMETER_NAMES,
     nuisances: Sequence[str] = (),
@@ -237,16 +218,15 @@ def fisher(
     """The Fisher information that a sequence of currents draws from a brake.
 
     Args:
-        bench: its noise, limits, sample time and nominal brake.
+        bench: its noise, limits and sample time.
         p: the brake, whose parameters are the true ones.
         currents: what acts in each period [A], length n; samples y_1..y_n count.
         kind: ``physical`` or ``weighted``.
-        normalise_by: parameters relative to their ``true`` or ``nominal`` values.
         plant: how the brake moves, and what the instruments cost.
         params: names of the unknown parameters that the experiment is for; what is not named is known.
         nuisances: names of what is unknown besides; its rows come after those of ``params``.
         x0: angle [rad] and velocity [rad/s] at the start.
-        prior: FIM before the first sample, of all unknowns, normalised in the same way.
+        prior: FIM before the first sample, of all unknowns.
         measured: n booleans, False for a lost sample.
 
     Raises:
@@ -256,11 +236,8 @@ def fisher(
         raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
     names = (*params, *nuisances)
     run = simulate(plant.mechanics, p, currents, bench.timing.sample_time, names, x0)
-    s = run.sensitivities
-    if normalise_by == "nominal":
-        s *= relative_to(p, bench.brake, names)[:, None]
     weights = weights_along(bench, kind, plant.instruments, run.states)
-    history = information_over_time(s, weights, prior, measured)
+    history = information_over_time(run.sensitivities, weights, prior, measured)
     before = np.zeros((len(names), len(names))) if prior is None else np.asarray(prior, dtype=np.float64)
     matrix = history[-1] if len(history) else before
-    return Fisher(kind, normalise_by, names, p, matrix, prior, plant.name, tuple(nuisances))
+    return Fisher(kind, names, p, matrix, prior, plant.name, tuple(nuisances))

@@ -47,7 +47,6 @@ def document(evaluation: Evaluation) -> dict[str, Any]:
         "model": e.plant.name,
         "theta": {"name": e.theta_name, **e.theta._asdict()},
         "systematic": e.errors._asdict(),
-        "normalise_by": e.fisher("physical").normalise_by,  # each parameter by its value in theta
         "params": list(e.question.params),
         "nuisances": list(e.question.nuisances),
         "prior": e.question.prior.name if e.question.prior else None,

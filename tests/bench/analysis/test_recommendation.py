@@ -87,9 +87,7 @@ def test_information_adds_up(bench: Bench) -> None:
     inside = e.theta
     for one in advise(e):
         played = run_excitation(bench, parse_excitation(one.excitation, bench), plant.mechanics, inside, shielded=True)
-        more = fisher(
-            bench, inside, played.currents, kind="physical", normalise_by="true", plant=plant, params=params
-        ).matrix
+        more = fisher(bench, inside, played.currents, kind="physical", plant=plant, params=params).matrix
         expected = np.sqrt(np.diag(np.linalg.inv(e.information + more)))
         assert list(one.after.values()) == pytest.approx(expected, rel=1e-3)
 

@@ -41,7 +41,7 @@ def test_both_informations_are_those_of_the_currents_that_were_sent(
     commands = [layout.decode_command(frame) for frame in run.sent]
     currents = [command.current for command in commands if command.enable]
     for kind in ("physical", "weighted"):
-        expected = fisher(bench, theta, currents, kind=kind, normalise_by="true", plant=bench.plant("exact"))
+        expected = fisher(bench, theta, currents, kind=kind, plant=bench.plant("exact"))
         np.testing.assert_allclose(got[kind]["matrix"], expected.matrix, rtol=1e-12)
         assert got[kind]["log_det"] == pytest.approx(np.linalg.slogdet(expected.matrix)[1], rel=1e-6)
         eigenvalues = np.linalg.eigvalsh(expected.matrix)

@@ -45,7 +45,7 @@ def exactly(
 def test_the_estimate_is_unbiased_and_as_good_as_the_bound_allows_and_its_intervals_cover(bench: Bench) -> None:
     plant, brake = bench.plant("exact"), brake_of(bench, k_m=1.1, T_c=0.8, f_v=1.3)
     currents = currents_of(bench, "chirp", brake)
-    bounds = fisher(bench, brake, currents, kind="physical", normalise_by="true", plant=plant).cramer_rao()
+    bounds = fisher(bench, brake, currents, kind="physical", plant=plant).cramer_rao()
     true = np.array([getattr(brake, name) for name in PARAMETER_NAMES])
     found = [fit(bench, plant, [record(bench, plant, currents, brake=brake, seed=seed)]) for seed in range(DRAWS)]
     errors = np.array([(e.values - true) / true for e in found]) / list(bounds.values())

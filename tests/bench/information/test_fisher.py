@@ -13,11 +13,9 @@ from emb_bench.information.criteria import criteria
 from emb_bench.information.fisher import (
     Fisher,
     Kind,
-    NormaliseBy,
     fisher,
     information_over_time,
     physical_weights,
-    relative_to,
     thesis_weights,
     uniform_prior,
     weights_along,
@@ -43,13 +41,10 @@ def of(
     *,
     p: BrakeParameters = BRAKE,
     kind: Kind = "physical",
-    normalise_by: NormaliseBy = "true",
     **more: Any,
 ) -> Fisher:
-    """Physical information on the nominal brake, relative to its own values, unless another is asked for."""
-    return fisher(
-        BENCH, p, currents, kind=kind, normalise_by=normalise_by, params=params, plant=BENCH.plant(plant), **more
-    )
+    """Physical information on the nominal brake unless another is asked for."""
+    return fisher(BENCH, p, currents, kind=kind, params=params, plant=BENCH.plant(plant), **more)
 
 
 def physical(currents: Floats) -> Floats:
@@ -86,17 +81,6 @@ def test_information_over_time_ends_at_the_whole_and_never_shrinks() -> None:
     assert history.shape == (500, 4, 4)
     np.testing.assert_array_equal(history[-1], physical(square(20, 4.0)))
     assert (np.diff(history.diagonal(axis1=1, axis2=2), axis=0) >= 0.0).all()
-
-
-@pytest.mark.parametrize("normalise_by", ["true", "nominal"])
-def test_information_is_relative_to_the_values_it_says(normalise_by: NormaliseBy) -> None:
-    p = BRAKE._replace(k_1=2.0 * BRAKE.k_1, f_v=0.5 * BRAKE.f_v)
-    found = of(square(20, 4.0), normalise_by=normalise_by, plant="euler", p=p)
-    ratio = np.array([1.0, 0.5, 1.0, 2.0]) if normalise_by == "nominal" else np.ones(4)
-    expected = of(square(20, 4.0), plant="euler", p=p).matrix * np.outer(ratio, ratio)
-    np.testing.assert_allclose(found.matrix, expected, rtol=1e-12)
-    assert found.normalise_by == normalise_by
-    assert relative_to(p, BRAKE, PARAMETER_NAMES).tolist() == [1.0, 0.5, 1.0, 2.0]
 
 
 def test_a_lost_sample_tells_nothing_but_the_brake_moves_on() -> None:
@@ -147,20 +131,21 @@ def test_no_samples_leave_what_was_known_before() -> None:
 def test_knowing_a_range_of_fifty_percent_is_worth_twelve_and_bounds_what_a_resting_brake_does_not() -> None:
     prior = uniform_prior(BENCH.range_set("pm50"), PARAMETER_NAMES, BRAKE)
     np.testing.assert_allclose(prior, 12.0 * np.eye(4), rtol=1e-12, atol=0.0)
-    found = of(np.zeros(500), normalise_by="nominal", plant="euler", prior=prior)
+    found = of(np.zeros(500), plant="euler", prior=prior)
     assert list(found.cramer_rao().values()) == pytest.approx([1.0 / math.sqrt(12.0)] * 4, rel=1e-12)
     np.testing.assert_array_equal(found.prior, prior)
 
 
 def test_a_parameter_that_does_not_vary_has_no_prior() -> None:
-    with pytest.raises(UsageError, match="k_m does not vary in the ranges 'viscous'"):
+    with pytest.raises(UsageError):
         uniform_prior(BENCH.range_set("viscous"), ("k_m",), BRAKE)
 
 
 def test_the_weighted_information_gives_no_bound() -> None:
     found = of(square(20, 4.0), kind="weighted", plant="euler")
-    with pytest.raises(UsageError, match="needs the physical Fisher information"):
-        found.cramer_rao()
+    for answer in (found.cramer_rao, found.correlation, found.verdict):
+        with pytest.raises(UsageError):
+            answer()
 
 
 def test_the_spread_of_estimates_is_the_bound_of_the_physical_information_and_not_the_inverse_of_the_weighted() -> None:
@@ -327,34 +312,17 @@ def test_two_estimates_that_replace_each_other_are_called_traded_off() -> None:
     assert "identified; traded off with f_v (correlation -0.9998)" in friction.text()
 
 
-@pytest.mark.parametrize(
-    ("k_1", "expected"),
-    [
+def test_a_value_that_cannot_be_told_from_the_end_of_its_range_is_at_a_border() -> None:
+    for k_1, expected in (
         (24.0, "outside its range, beyond the lower border"),
         (25.0, "at the lower border of its range"),
         (30.0, ""),
         (50.0, "at the upper border of its range"),
-    ],
-)
-@pytest.mark.parametrize("normalise_by", ["true", "nominal"])
-def test_a_value_that_cannot_be_told_from_the_end_of_its_range_is_at_a_border(
-    k_1: float, expected: str, normalise_by: NormaliseBy
-) -> None:
-    p = BRAKE._replace(k_1=k_1)
-    found = of(chirp(), normalise_by=normalise_by, p=p)
-    verdict = found.verdict(BENCH.range_set("viscous-stiffness"), BRAKE)
-    assert {f.name: f.border for f in verdict.findings} == {"k_m": "", "k_1": expected, "T_c": "", "f_v": ""}
-
-
-def test_a_verdict_relative_to_the_nominal_brake_needs_it() -> None:
-    found = of(chirp(), normalise_by="nominal")
-    with pytest.raises(UsageError, match="pass it as reference"):
-        found.verdict()
-    weighted = of(chirp(), kind="weighted")
-    with pytest.raises(UsageError, match="needs the physical Fisher information"):
-        weighted.verdict()
+    ):
+        verdict = of(chirp(), p=BRAKE._replace(k_1=k_1)).verdict(BENCH.range_set("viscous-stiffness"))
+        assert {f.name: f.border for f in verdict.findings} == {"k_m": "", "k_1": expected, "T_c": "", "f_v": ""}
 
 
 def test_no_parameter_is_no_experiment() -> None:
-    with pytest.raises(UsageError, match="at least one parameter"):
+    with pytest.raises(UsageError):
         of(chirp(), ())

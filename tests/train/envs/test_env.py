@@ -145,9 +145,7 @@ def test_the_information_and_the_return_are_those_of_the_applied_currents() -> N
         _, reward, terminated, _, info = env.step(action)
         currents.append(info["current"])
         total += reward
-    independent = fisher(
-        BENCH, brake, currents, params=("f_v",), kind="weighted", normalise_by="true", plant=BENCH.plant("euler")
-    )
+    independent = fisher(BENCH, brake, currents, params=("f_v",), kind="weighted", plant=BENCH.plant("euler"))
     assert info["fim"][0] == pytest.approx(float(independent.matrix[0, 0]), rel=1e-9)
     assert total == pytest.approx(1e-7 * info["fim"][0], rel=1e-9)
     assert terminated
@@ -196,9 +194,7 @@ def test_the_information_of_a_plant_is_that_of_its_own_motion() -> None:
         info = env.step(action)[4]
         currents.append(info["current"])
     for name, same in (("exact", True), ("euler", False)):
-        alone = fisher(
-            BENCH, BENCH.brake, currents, params=("f_v",), kind="weighted", normalise_by="true", plant=BENCH.plant(name)
-        )
+        alone = fisher(BENCH, BENCH.brake, currents, params=("f_v",), kind="weighted", plant=BENCH.plant(name))
         assert (abs(info["fim"][0] / alone.matrix[0, 0] - 1.0) < 1e-9) == same
 
 
@@ -380,7 +376,7 @@ def test_the_information_may_be_the_physical_one() -> None:
     for action in actions(1, 30):
         info = env.step(action)[4]
         currents.append(info["current"])
-    independent = fisher(BENCH, BENCH.brake, currents, kind="physical", normalise_by="true", plant=BENCH.plant("euler"))
+    independent = fisher(BENCH, BENCH.brake, currents, kind="physical", plant=BENCH.plant("euler"))
     np.testing.assert_allclose(unpack(info["fim"], 4), independent.matrix, rtol=1e-8, atol=1e-6)
 
 
