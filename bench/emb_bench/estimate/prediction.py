@@ -191,13 +191,36 @@ class Problem:
         """The unknowns that a record depends on, in the order of ``columns``."""
         return tuple(self.unknowns[i].name for i in self.columns(record))
 
-    def predict(self, z: Floats, record: int, besides: tuple[str, ...] = ()) -> Prediction:
-        """Predicts a record, with sensitivities to its unknowns and to those ``besides``, which come last."""
-        at = self.opening(z, record, (*self.names(record), *besides))
-        data, delay, t_s = self.records[record], self.plant.instruments.measurement_delay, self.bench.timing.sample_time
-        whole, moved = self._through(
-            record, at, self.mechanics(z), data.currents + at.current_offset, data.gap_unknowns
+    def predict(
+        self,
+        z: Floats,
+        record: int,
+        besides: tuple[str, ...] = (),
+        *,
+        mechanics: Mechanics | None = None,
+        added: Floats | float = 0.0,
+    ) -> Prediction:
+        """Predicts a record, with sensitivities to its unknowns and to those ``besides``, which come last.
+
+        Args:
+            z: the unknowns.
+            record: number of the record.
+            besides: names of further unknowns.
+            mechanics: how another brake moves; without, that of ``z``.
+            added: current that acts besides [A].
+        """
+        data, instruments, t_s = self.records[record], self.plant.instruments, self.bench.timing.sample_time
+        at, delay = self.opening(z, record, (*self.names(record), *besides)), instruments.measurement_delay
+        acting = Input(
+            data.currents + at.current_offset + added,
+            t_s,
+            max(at.late, 0.0),
+            data.gaps[0],
+            self.breaks(record),
+            self.places(record) - [at.contact, 0.0],
         )
+        moves = self.mechanics(z) if mechanics is None else mechanics
+        whole, moved = trajectory(compiled(march), moves, at.p, acting, at.chosen, at.x, at.s, data.gap_unknowns)
         late, count = max(at.late, 0.0), len(at.chosen)
         chosen = np.concatenate([at.chosen, np.full(data.gap_unknowns, COMMAND)])
         states, shifts = whole[:, :2].copy(), moved[:, :, :2].copy()
@@ -217,20 +240,6 @@ class Problem:
         shown[:, 1] *= 1.0 + at.velocity_gain
         return Prediction(shown, sensitivities[:, :count], states, sensitivities[:, count:])
 
-    def _through(
-        self, record: int, at: Opening, mechanics: Mechanics, currents: Floats, unknowns: int
-    ) -> tuple[Floats, Floats]:
-        """States and sensitivities at all instants of a record, those to ``unknowns`` of its gaps last."""
-        acting = Input(
-            currents,
-            self.bench.timing.sample_time,
-            max(at.late, 0.0),
-            self.records[record].gaps[0],
-            self.breaks(record),
-            self.places(record) - [at.contact, 0.0],
-        )
-        return trajectory(compiled(march), mechanics, at.p, acting, at.chosen, at.x, at.s, unknowns)
-
     def breaks(self, record: int) -> Integers:
         """Periods at whose ends the brake is found again after a longer gap: those of the first sample that shows it.
 
@@ -247,17 +256,6 @@ class Problem:
             return data.places
         after = np.minimum(self.breaks(record) + instruments.measurement_delay, len(data.samples) - 1)
         return np.nan_to_num(data.samples[after]) - [instruments.encoder_offset, 0.0]
-
-    def shown(self, z: Floats, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
-        """Samples of another brake under the same currents, and some more [A], shape (n, 2)."""
-        at = self.opening(z, record, ())
-        data, delay, t_s = self.records[record], self.plant.instruments.measurement_delay, self.bench.timing.sample_time
-        states, none = self._through(record, at, mechanics, data.currents + at.current_offset + added, 0)
-        shown = later(states[1:, :2] + [at.contact + at.offset, 0.0], delay, states[:1, :2])
-        if data.late is not None:
-            _at_the_stamps(data.late, states[0, 1], t_s, shown, none[1:, :, :2])
-        shown[:, 1] *= 1.0 + at.velocity_gain
-        return shown
 
     def weights(self, z: Floats) -> list[Floats]:
         """Inverse standard deviations of each record's samples at ``z``, zero where they do not count, shape (n, 2)."""

@@ -78,7 +78,7 @@ class Simulated:
 
     def shown(self, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
         """As :class:`Shown`."""
-        return self.problem.shown(self.z, record, mechanics, added) * self.weights[record]
+        return self.problem.predict(self.z, record, mechanics=mechanics, added=added).shown * self.weights[record]
 
     def whitened(self, record: int, shift: Floats) -> Floats:
         """As :class:`Shown`."""
@@ -86,7 +86,7 @@ class Simulated:
 
     def motion(self, record: int) -> Floats:
         """As :class:`Shown`."""
-        return self.problem.shown(self.z, record, self.problem.mechanics(self.z))
+        return self.problem.predict(self.z, record).shown
 
 
 DRIFTS = tuple(f"{name}_drift" for name in PARAMETER_NAMES)

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
 from emb_bench.brake.motion import Floats, no_sensitivity, rest
-from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.brake.parameters import FEATURES, PARAMETERS
 from emb_bench.brake.runge_kutta import current
 from emb_bench.compiled import compiled
 from emb_runtime.config.bench import BrakeParameters, load_bench
@@ -42,7 +42,6 @@ PLANTS = {
     ),
 }
 OF_THE_BRAKE = ("k_m", "k_1", "T_c", "f_v", "J")
-OF_THE_FEATURES = ("break_away", "stribeck_velocity", "f_l", "quadratic", "cubic", "hysteresis", "current_lag", "play")
 OF_THE_START = ("contact", "delay", "current_offset", "x1_0", "x2_0")
 DIFFERENCE = 3e-5  # Step of the finite differences, relative or in the unknown's unit
 
@@ -57,7 +56,7 @@ def run(
 
 def meaningful(m: Mechanics, x0: tuple[float, float]) -> list[str]:
     """Unknowns whose derivative is two-sided there: no feature that is absent, no velocity of a brake at rest."""
-    names = [*OF_THE_BRAKE, *(n for n in OF_THE_FEATURES if getattr(m, n) != getattr(PLAIN, n)), *OF_THE_START]
+    names = [*OF_THE_BRAKE, *(n for n in FEATURES if getattr(m, n) != getattr(PLAIN, n)), *OF_THE_START]
     return [n for n in names if n != "x2_0" or x0[1] != 0.0]
 
 
