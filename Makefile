@@ -71,10 +71,10 @@ night: $(VENV)/.dev
 	$(PYTEST) $(PARALLEL) -m slow
 	$(HIL)
 	$(BIN)/python .ci/hil_ran.py build/hil.xml
-	$(BIN)/python benchmarks/shield.py --episodes 20000
-	$(BIN)/python benchmarks/sensor_monitor.py --experiments 100000
-	$(BIN)/python benchmarks/fuzz.py
-	$(BIN)/python benchmarks/hostile_files.py --count 2000
+	$(BIN)/python -m tests.searches.shield --episodes 20000
+	$(BIN)/python -m tests.searches.sensor_monitor --experiments 100000
+	$(BIN)/python -m tests.searches.fuzz
+	$(BIN)/python -m tests.searches.hostile_files --count 2000
 	$(BIN)/python benchmarks/compiled_core.py
 	$(BIN)/python -m tests.mutation
 
@@ -129,10 +129,10 @@ docs: $(VENV)/.dev
 .PHONY: study-thesis study-reproduce proof
 
 study-thesis: $(VENV)/.dev
-	$(BIN)/python -m studies.thesis --out build/thesis
+	$(BIN)/python -m studies.thesis
 
 study-reproduce: $(VENV)/.dev
-	$(BIN)/python -m studies.thesis.training --out build/reproduction
+	$(BIN)/python -m studies.thesis trainings --out build/trainings
 
 proof: $(VENV)/.dev
 	$(BIN)/python -m tools.proof

@@ -1,12 +1,12 @@
-"""Speed of reading logs, memory for a long one, and outcomes of damaged ones.
+"""Speed of reading logs, and memory for a long one.
 
     python benchmarks/replaying.py [--minutes 4] [--logs 300]
 
 First, logs per second on one core: read, experiment and both informations with the exact plant. Second, ``fim`` and
-``estimate`` on a log of 0.5 s, in a process of their own once its modules are loaded, against their limits. Third, what
-becomes of damaged logs, by damage. Fourth, a log of ``--minutes`` at 1 kHz and one of a quarter of that: time and peak
-memory of ``emb-replay fim`` and ``info``, and how much more memory the longer one takes. These logs are of a simulated
-brake, sample by sample, and are written record for record as the recorder writes them, only many at a time.
+``estimate`` on a log of 0.5 s, in a process of their own once its modules are loaded, against their limits. Third, a
+log of ``--minutes`` at 1 kHz and one of a quarter of that: time and peak memory of ``emb-replay fim`` and ``info``, and
+how much more memory the longer one takes. These logs are of a simulated brake, sample by sample, and are written record
+for record as the recorder writes them, only many at a time.
 """
 
 from __future__ import annotations
@@ -25,13 +25,12 @@ from pathlib import Path
 
 # A core is what is counted; numpy and the compiled functions read this when they are loaded.
 os.environ |= {f"{library}_NUM_THREADS": "1" for library in ("NUMBA", "OMP", "OPENBLAS", "MKL")}
-sys.path.insert(0, str(Path(__file__).parents[1]))  # what makes logs damaged lives with the tests
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the writer of long logs lives beside
 
 import numba  # noqa: F401  # what is loaded is used
 import numpy as np
 
-from benchmarks.logs.damage import OUTCOMES, WRONG, outcomes
-from benchmarks.logs.long_log import BEFORE, Writer
+from benchmarks.long_log import BEFORE, Writer
 from emb_bench.experiment.evaluation import Question, evaluate
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
@@ -114,16 +113,6 @@ def rate(path: Path, logs: int) -> bool:
     return 1.0 / best >= RATE
 
 
-def damaged(path: Path) -> bool:
-    """Print what becomes of damaged logs; True if none gives a wrong number without a word, or a traceback."""
-    print(f"{'damage':56}" + "".join(f"{outcome:>18}" for outcome in OUTCOMES))
-    wrong = 0
-    for kind, counts in outcomes(path):
-        print(f"{kind:56}" + "".join(f"{counts[outcome]:18}" for outcome in OUTCOMES))
-        wrong += counts[WRONG]
-    return not wrong
-
-
 COMMANDS = """
 import contextlib, io, sys, time
 import cantools.database.can
@@ -167,12 +156,10 @@ def main() -> None:
     parser.add_argument("--logs", type=int, default=300, help="times that the short log is evaluated (%(default)s)")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        path, shorter = Path(folder) / "short.mcap", Path(folder) / "shorter.mcap"
-        for log, options in ((path, []), (shorter, ["--duration", "0.04"])):
-            with contextlib.redirect_stdout(io.StringIO()):
-                code = emb_run(["--iface", "sim:plant=exact,seed=1", "--log", str(log), *options])
-            assert code == EXIT_DONE
-        met = [rate(path, args.logs), commands(path), damaged(shorter), long_logs(Path(folder), args.minutes)]
+        path = Path(folder) / "short.mcap"
+        with contextlib.redirect_stdout(io.StringIO()):
+            assert emb_run(["--iface", "sim:plant=exact,seed=1", "--log", str(path)]) == EXIT_DONE
+        met = [rate(path, args.logs), commands(path), long_logs(Path(folder), args.minutes)]
     if not all(met):
         raise SystemExit("a limit is not met")
 

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.interrupt import interrupted
+from tests.searches.interrupt import interrupted
 
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("seed", [0, 5_000_000])
 def test_hostile_files_end_no_command_badly_and_take_little_time_and_memory(seed: int) -> None:
-    """A part of what ``benchmarks/hostile_files.py`` does."""
-    command = [sys.executable, "-m", "benchmarks.hostile_files", "--count", "40", "--seed", str(seed)]
+    """A part of what ``tests/searches/hostile_files.py`` does."""
+    command = [sys.executable, "-m", "tests.searches.hostile_files", "--count", "40", "--seed", str(seed)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=500)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "40 files, 0 faults" in done.stdout
@@ -29,7 +29,7 @@ def test_hostile_files_end_no_command_badly_and_take_little_time_and_memory(seed
 def test_emb_run_ends_cleanly_at_any_moment_and_leaves_nothing(
     tmp_path: Path, part: float, number: signal.Signals
 ) -> None:
-    """Some of the moments of ``benchmarks/interrupt.py``, which measures how long it takes, too."""
+    """Some of the moments of ``tests/searches/interrupt.py``, which measures how long it takes, too."""
     moment = part + random.Random(f"{part} {number}").uniform(0.0, 0.3)
     ended = interrupted(tmp_path, moment, number)
     assert ended.code in (0, 3, -ended.number)  # by the signal itself while nothing was open

@@ -1,4 +1,4 @@
-"""The fuzz targets in small numbers, ``benchmarks/fuzz.py`` plays the million; and the faults that they must find."""
+"""The fuzz targets in small numbers, a million in ``tests/searches/fuzz.py``; and the faults that they must find."""
 
 from __future__ import annotations
 

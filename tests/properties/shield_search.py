@@ -4,7 +4,7 @@ Everything random is drawn beforehand (what the policy wants, noise, lost comman
 adds what depends on the state. Three brakes are driven: the thesis's (forward Euler, 1 ms), the bench's plants, and one
 written here, in 25 µs pieces of constant acceleration with an exact standstill, that shares no line with the shield or
 with the project's own brakes. ``test_shield_envelope.py`` and ``test_shield_extensions.py`` run some thousands of them,
-``benchmarks/shield.py`` as many as it is told. One file, as only functions of one module are compiled together.
+``tests/searches/shield.py`` as many as it is told. One file, as only functions of one module are compiled together.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Guarantee and cost of the envelope shield: the figures of docs/explanation/shield.md.
 
-    python benchmarks/shield.py [--episodes 20000] [--seed 0]
+    python -m tests.searches.shield [--episodes 20000] [--seed 0]
 
 Searches for violations with adversarial episodes on three brakes (forward Euler, a finer one with an exact standstill,
 the bench's plants) and by hill climbing, breaks each assumption in turn to show that the search can fail, samples the
@@ -10,15 +10,11 @@ induction steps, measures what a freewheeling node would do, and what each envel
 from __future__ import annotations
 
 import argparse
-import sys
 import timeit
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # the search lives with the tests
 
 from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.compiled import compiled

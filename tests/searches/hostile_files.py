@@ -1,6 +1,6 @@
 """Outcome of commands on hostile files: policies, contracts, bench files and logs, each drawn from a seed.
 
-    python benchmarks/hostile_files.py [--count N] [--seed S] [--json FILE]
+    python -m tests.searches.hostile_files [--count N] [--seed S] [--json FILE]
 
 A file is refused, or read as far as it can be. Counted are those that end a command by a signal, in a traceback, with a
 control character on the terminal, or that take more than 5 s of processor time or 512 MiB in the largest process. Each
@@ -16,8 +16,6 @@ import tempfile
 import warnings
 from collections import Counter
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # what draws the files lives with the tests
 
 from emb_bench import api
 from tests.fuzz.hostile_files import LONGEST, MOST_MEMORY, draw, judge

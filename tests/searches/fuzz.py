@@ -1,6 +1,6 @@
 """Fuzz: random, mutated and forged frames and sequences of events, judged by accounts that share no code with ours.
 
-    python benchmarks/fuzz.py [--seed 0] [--scale 1.0] [--target guard [--sequence 17]] [--no-guided]
+    python -m tests.searches.fuzz [--seed 0] [--scale 1.0] [--target guard [--sequence 17]] [--no-guided]
 
 Each sequence is drawn by a generator seeded with its target, the seed and its number, so that any of them can be played
 again alone: ``--target NAME --sequence NUMBER`` shows its traceback. "hangs" are sequences that took more than a
@@ -26,8 +26,6 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # the targets live with the tests
-
 from emb_runtime.can.messages import FrameRejectedError, load_layout
 from emb_runtime.records import Frame
 from tests.fuzz import runs
@@ -35,7 +33,7 @@ from tests.fuzz.draws import Draw, RandomDraw
 from tests.fuzz.runs import HangError
 from tests.fuzz.targets import TARGETS, Played, ViolationError, valid_frame
 
-GUIDE = Path(__file__).parents[1] / "tests" / "fuzz" / "guided.py"
+GUIDE = Path(__file__).parents[1] / "fuzz" / "guided.py"
 LONGEST = 60.0  # Time for one sequence [s]; the slowest takes a tenth of a second
 
 

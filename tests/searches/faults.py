@@ -1,6 +1,6 @@
 """Every fault that can be played against emb-run and emb-node, on a real bus, with the time-outs as shipped.
 
-    python benchmarks/faults.py [NAME ...] [--keep DIR]
+    python -m tests.searches.faults [NAME ...] [--keep DIR]
 
 In User-Mode Linux, 1000 times slower than this computer, so that a busy machine changes nothing. Prints for each:
 emb-run's report, device time from the last obeyed command to the node's safe stop (limit: the node's watchdog and two
@@ -17,11 +17,10 @@ import tempfile
 import time
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "examples" / "drives")]
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "drives"))
 
-from tests.hil.judge import WATCHDOG_MS, Verdict, judge, seen  # noqa: E402
-from tests.hil.plays import PLAYS, perform  # noqa: E402
+from tests.hil.judge import WATCHDOG_MS, Verdict, judge, seen
+from tests.hil.plays import PLAYS, perform
 
 
 def main() -> int:

@@ -1,6 +1,6 @@
 """False alarms and detection of the sensor monitor: the figures of docs/explanation/sensor-monitor.md.
 
-    python benchmarks/sensor_monitor.py [--experiments 1000000] [--faulty 400] [--seed 0]
+    python -m tests.searches.sensor_monitor [--experiments 1000000] [--faulty 400] [--seed 0]
 
 Flies honest brakes of the set through the shield and the monitor, by each plant that the shield covers, and counts the
 alarms; then brakes whose sensors or motor are at fault, and prints how far they get until the run and their motion end.
@@ -11,16 +11,12 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # the drawing of policies and brakes lives with the tests
 
 from emb_bench.brake.motion import SENSITIVE, STATES
 from emb_bench.compiled import compiled

@@ -1,6 +1,6 @@
 """The second guard of mapped drives: random mappings and commands, and what their bytes say.
 
-    python benchmarks/mapped_drives.py [--mappings 2000] [--commands 50] [--seed 0]
+    python -m tests.searches.mapped_drives [--mappings 2000] [--commands 50] [--seed 0]
 
 Each mapping has a command of random place, size, order, scale, unit, sign and protection. Half of the frames have a
 random bit flipped between encoder and guard, and one command in ten is NaN, infinite or too large. What reached the bus
@@ -14,9 +14,6 @@ import math
 import random
 import sys
 import time
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # the drawing of mappings lives with the tests
 
 from emb_runtime.drives.mapping_file import parse_mapping
 from emb_runtime.drives.wire import Encoder

@@ -1,14 +1,20 @@
-"""Outcomes of reading damaged logs, counted by damage."""
+"""Outcomes of reading damaged logs, counted by damage; fails if one gives a wrong number without a word.
+
+python -m tests.searches.damaged_logs
+"""
 
 from __future__ import annotations
 
 import random
+import sys
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from emb_bench import api
 from emb_bench.logs.mcap_file import MAGIC
 from emb_runtime.records import CycleRecord
 from tests.bench.damaged import (
@@ -95,3 +101,20 @@ def _flips(data: bytes) -> list[Damage]:
             flipped[rng.randrange(len(data))] ^= rng.randint(1, 255)
         damages.append(_put(bytes(flipped)))
     return damages
+
+
+def main() -> int:
+    """Print the outcomes."""
+    wrong = 0
+    print(f"{'damage':56}" + "".join(f"{outcome:>18}" for outcome in OUTCOMES))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "short.mcap"
+        api.simulate(path, seed=1, duration=0.04)
+        for kind, counts in outcomes(path):
+            print(f"{kind:56}" + "".join(f"{counts[outcome]:18}" for outcome in OUTCOMES))
+            wrong += counts[WRONG]
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,6 +1,6 @@
 """Time in which ``emb-run`` ends after Ctrl-C or SIGTERM, at random moments from its start to its end.
 
-    python benchmarks/interrupt.py [--count N] [--seed S] [--json FILE]
+    python -m tests.searches.interrupt [--count N] [--seed S] [--json FILE]
 
 Each time the command is started anew, on the simulated bus with a policy and a bench file that it has to load, and
 gets one of the two signals at a moment drawn from the call of its first function to its usual end. Counted are those

@@ -1,6 +1,6 @@
 """Lies of a node that no single sample shows: what becomes of an experiment, and where the true brake has been.
 
-    python benchmarks/lies.py [--quick] [KIND ...]
+    python -m tests.searches.lies [--quick] [KIND ...]
 
 A table: kind and size of a lie, result and exit code, the largest true angles and speed until the brake rests. The
 shipped actor drives; the node is that of the tests, with a codec and a brake of its own. To see what an older version
@@ -10,11 +10,7 @@ made of the same lies, run this file with that version's Python.
 from __future__ import annotations
 
 import argparse
-import sys
-from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # the node lives with the tests
 
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import load_bench

@@ -1,8 +1,8 @@
 """Search for a brake, a policy and noise that break the learning shield: docs/explanation/learning-shield.md.
 
-    python benchmarks/learning_shield.py [--episodes 100000] [--seed 0] [--found FILE]    # both brakes
-    python benchmarks/learning_shield.py --broken                                         # assumptions that do not hold
-    python benchmarks/learning_shield.py --break NAME | all                               # pads left out: must be found
+    python -m tests.searches.learning_shield [--episodes 100000] [--seed 0] [--found FILE]  # both brakes
+    python -m tests.searches.learning_shield --broken                     # assumptions that do not hold
+    python -m tests.searches.learning_shield --break NAME | all           # pads left out: must be found
 
 The search goes on where it was interrupted: what is done is a line of JSON in FILE, by case and seed.
 """
@@ -19,8 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # the search lives with the tests
 
 from emb_runtime.config.bench import Bench, Noise, load_bench
 from tests.properties.learning_mutants import MUTANTS, broken

@@ -1,9 +1,9 @@
 """False alarms of the motion balance: the figures of docs/explanation/sensor-monitor.md.
 
-    python benchmarks/motion_balance.py [--experiments 300000] [--seed 1]
+    python -m tests.searches.motion_balance [--experiments 300000] [--seed 1]
 
 Plays honest experiments with every plant of the bench, with brakes of the shield's set, noise, lost samples and
-commands, jitter and delays, as benchmarks/sensor_monitor.py draws them; policies are the shipped actor, that of
+commands, jitter and delays, as tests/searches/sensor_monitor.py draws them; policies are the shipped actor, that of
 ``--quick``, and those drawn there; an experiment has 500, 250 or 100 samples. For each plant: alarms, and the largest
 unexplained velocity and distance of the spring's origin as shares of what is allowed.
 """
@@ -12,18 +12,12 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # the drawing of policies and brakes lives with the tests
-
 from scipy import stats
 
-from benchmarks.sensor_monitor import COMMAND_LOST, COVERED, SAMPLE_LOST, Script, covered, draw, tail
 from emb_bench.brake.motion import SENSITIVE, STATES
 from emb_bench.compiled import compiled
 from emb_bench.sim.closed_loop import pass_period
@@ -50,6 +44,7 @@ from emb_runtime.safety.shield import NO_PAST, damped_current, shield, window
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from emb_train.structured.law import Box, box_of, wanted_current
 from emb_train.structured.stored import stored
+from tests.searches.sensor_monitor import COMMAND_LOST, COVERED, SAMPLE_LOST, Script, covered, draw, tail
 
 Floats = NDArray[np.float64]
 
