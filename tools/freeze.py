@@ -71,6 +71,7 @@ EXPLAINED: dict[str, str] = {
     "logs/aborted/*": REST,
     "info/aborted/says/*": REST,
     "estimate/emps windows/says/*": WINDOWS,
+    "demo/fim/numbers": "the text of fim has half of the 95 % interval in place of standard deviations",
     "demo/run/numbers": "76c82d4: the summary has a line on the motion",
     "design/D of two/*": "d35eddd: an annealing moves the Euler brake as every other, with a third of the variations",
 }
@@ -549,7 +550,7 @@ def of_actor(checkout: Checkout) -> Mapping[str, Any]:
 def of_demo(checkout: Checkout) -> Mapping[str, Any]:
     """Numbers that ``make demo`` prints, as they are printed."""
     run = checkout.type("run", "--iface", "sim", "--log", "experiment.mcap")
-    told = checkout.type("fim", "experiment.mcap")
+    told = checkout.type("fim", "experiment.mcap", "--theta", "nominal")
     number = re.compile(r"(?<![\w.])[+−-]?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
     kept = [line for line in run.out.splitlines() if "bytes" not in line and "log" not in line.split()[:1]]
     return {
@@ -562,7 +563,7 @@ SECTIONS: dict[str, Section] = {
     "can": of_can,
     "runs": of_runs,
     "logs": of_logs,
-    "fim": each("fim"),
+    "fim": each("fim", "--theta", "nominal"),
     "info": each("info"),
     "timing": each("timing"),
     "rerun": each("rerun"),

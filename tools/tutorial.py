@@ -47,7 +47,7 @@ def outputs(page: str, folder: Path) -> dict[str, str]:
             command,
             shell=True,
             cwd=folder,
-            env={**os.environ, "PATH": path, "COLUMNS": "110", "LC_ALL": "C.UTF-8"},
+            env={**os.environ, "PATH": path, "COLUMNS": "80", "LC_ALL": "C.UTF-8"},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -1,47 +1,55 @@
-"""The main path in Python: run in simulation, open a log, Fisher information, estimate, design.
+"""What the commands do, from Python: run in simulation, open a log, information, estimate, report, campaign, design.
 
-Each function does what the command of that name does with the same options, and returns the record that the command
-prints: :func:`simulate` is ``emb-run --iface sim``, :func:`fisher_information` is ``emb-replay fim``, :func:`estimate`
-is ``emb-replay estimate``, :func:`design` is ``emb-design``, :func:`topic` and :func:`draw` are
-``emb-replay export``. All values are in SI units.
+Each function is the command of that name, and its arguments are the command's options: :func:`simulate` is ``emb-run
+--iface sim``, :func:`fisher_information` is ``emb-replay fim``, :func:`design` is ``emb-design``, the others are
+``emb-replay``'s. A run is an opened log, or the path of one. Parameters are given as a sequence of names, or as one
+name. All values are in SI units.
 
     from emb_bench import api
 
     run = api.simulate("run.mcap", parameters={"f_v": 3e-5})
-    print(api.fisher_information(run).fisher("physical").cramer_rao())
+    print(api.estimate(run, params="f_v"))
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import inspect
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
-from emb_bench.design.problem import COARSE_SEARCHES, make_problem
-from emb_bench.estimate.records import STARTS, EstimationProblem
-from emb_bench.experiment.evaluation import Evaluation, Question, bench_for, default_model, evaluate
-from emb_bench.experiment.from_log import read_experiment
-from emb_bench.export.picture import draw_on
-from emb_bench.export.tables import arrow_batches
-from emb_bench.information.criteria import Name, criterion
-from emb_bench.information.fisher import Kind
+from emb_bench.design.problem import COARSE_SEARCHES
+from emb_bench.estimate.records import STARTS
+from emb_bench.figures import require_place
 from emb_bench.logs.log import RunLog, read_log, require_driven
-from emb_bench.sim.plant_spec import true_parameters
-from emb_runtime.cli.options import parser, prepare
-from emb_runtime.cli.repeat import experiment
-from emb_runtime.cli.session import Console
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
-from emb_runtime.config.plants import DEFAULT_PLANT
-from emb_runtime.errors import UsageError
+from emb_bench.output import replacing, say_if_compiling
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.config.plants import DEFAULT_PLANT, EVERY
+from emb_runtime.errors import LogError, UsageError
+from emb_runtime.system.terminal import as_json, mention
 
-if TYPE_CHECKING:  # scipy and numba come with the extra [bench]
+if TYPE_CHECKING:  # scipy, numba, matplotlib and pyarrow come with the extra [bench]
     from matplotlib.axes import Axes
     from pyarrow import Table
 
-    from emb_bench.analysis.study import Study
+    from emb_bench.analysis.drift import Earlier
+    from emb_bench.analysis.study import Study, StudyOptions
+    from emb_bench.batch.summary import Campaign
     from emb_bench.design.report import Report
+    from emb_bench.experiment.evaluation import Evaluation
+    from emb_bench.report.content import Content
 
-Run = RunLog  # An opened log
+__all__ = [
+    *("Run", "campaign", "compare_models", "design", "draw", "estimate", "fisher_information", "open_run", "report"),
+    *("simulate", "topic"),
+]
+
+Run = RunLog
+Source = RunLog | str | Path
+Names = str | Sequence[str]
+PAGES = (".html", ".htm")  # Endings of a report's page
 
 
 def simulate(
@@ -60,12 +68,12 @@ def simulate(
     Args:
         log: MCAP file to write; must not exist.
         plant: name of one of the bench's plants.
-        parameters: true parameters by name [SI]; those that are not named are nominal.
+        parameters: true parameters by name; the others are nominal.
         seed: of the sensors' noise.
-        policy: ONNX file; without, the shipped actor.
+        policy: ONNX file (default: the shipped actor).
         quick: the shipped actor for a short experiment, until all four parameters are known to about 1 %.
-        bench: bench file; without, the shipped one.
-        duration: of the experiment [s]; without, the policy's horizon.
+        bench: bench file (default: the shipped one).
+        duration: of the experiment [s] (default: the policy's horizon).
 
     Returns:
         The run, opened; :attr:`~emb_bench.logs.log.RunLog.exit_reason` says how it ended.
@@ -73,6 +81,10 @@ def simulate(
     Raises:
         EmbError: an argument is wrong, the policy does not fit the bench, or the log cannot be written.
     """
+    from emb_runtime.cli.options import parser, prepare
+    from emb_runtime.cli.repeat import experiment
+    from emb_runtime.cli.session import Console
+
     options = {"plant": plant, "seed": seed, **(parameters or {})}
     iface = "sim:" + ",".join(f"{name}={value}" for name, value in options.items())
     arguments = ["--iface", iface, "--log", str(log)]
@@ -97,7 +109,7 @@ def open_run(log: str | Path) -> Run:
     return read_log(log)
 
 
-def topic(run: Run, name: str) -> Table:
+def topic(run: Source, name: str) -> Table:
     """One topic of a run as an Arrow table; enumerated values are names, a value that does not exist is null.
 
     ``.to_pandas()`` makes a pandas frame of it, ``polars.from_arrow(...)`` one of polars, ``.column(name).to_numpy()``
@@ -111,14 +123,16 @@ def topic(run: Run, name: str) -> Table:
         UsageError: the run has no such topic, or pyarrow is missing.
         LogError: the topic cannot be decoded.
     """
-    schema, tables = arrow_batches(run, name)
+    from emb_bench.export.tables import arrow_batches
+
+    schema, tables = arrow_batches(_opened(run), name)
     import pyarrow as pa
 
     parts = list(tables)
     return cast("Table", pa.concat_tables(parts) if parts else schema.empty_table())
 
 
-def draw(run: Run, axes: Sequence[Axes]) -> None:
+def draw(run: Source, axes: Sequence[Axes]) -> None:
     """Draw a run on five axes of matplotlib: angle, velocity, currents, why currents were changed, states.
 
     Args:
@@ -129,29 +143,34 @@ def draw(run: Run, axes: Sequence[Axes]) -> None:
         UsageError: there are not five.
         LogError: the run has no control cycles.
     """
-    draw_on(run, axes)
+    from emb_bench.export.picture import draw_on
+
+    draw_on(_opened(run), axes)
 
 
 def fisher_information(
-    run: Run,
+    run: Source,
     *,
     model: str | None = None,
-    params: Sequence[str] = PARAMETER_NAMES,
-    nuisances: Sequence[str] = (),
+    params: Names | None = None,
+    nuisance: Names | None = None,
     prior: str | None = None,
-    theta: Mapping[str, float] | None = None,
+    theta: str | Path | Mapping[str, float] | None = None,
     bench: str | Path | None = None,
 ) -> Evaluation:
-    """Both Fisher informations of a run.
+    """Fisher information of a run: how precisely its parameters can be known at best.
 
     Args:
-        run: the run.
-        model: name of the plant to evaluate with; without, the one that was simulated, else ``exact``.
-        params: unknown parameters that count; what is not named is known.
-        nuisances: what is unknown besides.
-        prior: name of the ranges in which the parameters were known to lie beforehand.
-        theta: where to evaluate, by name [SI]; those that are not named are nominal.
-        bench: bench file; without, the one inside the log.
+        run: MCAP file of emb-run.
+        model: plant of the bench to evaluate with, or 'all' for all of them side by side (default: the one that was
+            simulated; exact where the log does not say).
+        params: parameters to evaluate; all others are taken as known (default: the four of the brake).
+        nuisance: unknowns besides (default: none).
+        prior: name of ranges in the bench file in which the parameters are known to lie (default: none).
+        theta: where to evaluate: 'log' for the running estimate in the log, 'nominal', 'true' of a
+            simulated brake, 'name=value,...', a TOML file, or the JSON of an estimate or report (default: log, and
+            nominal where it has no estimate).
+        bench: bench file (default: the one in the log).
 
     Returns:
         The evaluation: ``fisher("physical")`` and ``fisher("weighted")``, the fit of the model, and warnings.
@@ -160,50 +179,86 @@ def fisher_information(
         UsageError: a name is unknown, or the run only listened.
         LogError: the log says too little.
     """
-    require_driven(run)
-    its = bench_for(run, bench)
-    question = Question(tuple(params), tuple(nuisances), None if prior is None else its.range_set(prior))
-    plant = its.plant(default_model(run)[0] if model is None else model)
-    given = {name: str(value) for name, value in (theta or {}).items()}
-    name = ",".join(f"{n}={value}" for n, value in given.items()) or "nominal"
-    brake = true_parameters(its, given) if given else its.brake
-    return evaluate(run, read_experiment(run, its), its, plant, question, name, brake)
+    if model == EVERY:
+        raise UsageError(f"--model {EVERY}: expected the name of a plant")
+    return _evaluations(run, model, params, nuisance, prior, theta, bench)[0]
+
+
+def compare_models(run: Source, **options: Any) -> list[Evaluation]:
+    """Fisher information of a run by each plant of the bench; options of :func:`fisher_information` but ``model``.
+
+    Raises:
+        UsageError: a name is unknown, or the run only listened.
+        LogError: the log says too little.
+    """
+    names = ("params", "nuisance", "prior", "theta", "bench")
+    return _evaluations(run, EVERY, *(options.get(name) for name in names))
+
+
+def _evaluations(
+    run: Source,
+    model: str | None,
+    params: Names | None,
+    nuisance: Names | None,
+    prior: str | None,
+    theta: str | Path | Mapping[str, float] | None,
+    bench: str | Path | None,
+) -> list[Evaluation]:
+    from emb_bench.experiment.evaluation import Question, bench_for, default_model, evaluate_all
+    from emb_bench.experiment.from_log import read_experiment
+    from emb_bench.experiment.theta import read_theta
+
+    Question(*_unknowns(params, nuisance, None))  # a wrong name needs no log to be refused
+    log = _driven(run)
+    its = bench_for(log, bench)
+    question = Question(*_unknowns(params, nuisance, its), None if prior is None else its.range_set(prior))
+    plants = list(its.plants.values()) if model == EVERY else [its.plant(model or default_model(log)[0])]
+    name, brake, errors = read_theta(_text_of(theta), log, its)
+    return evaluate_all(log, read_experiment(log, its), its, plants, question, name, brake, errors)
 
 
 def estimate(
-    runs: Run | Sequence[Run],
+    runs: Source | Sequence[Source],
     *,
-    params: Sequence[str] = PARAMETER_NAMES,
-    nuisances: Sequence[str] = (),
+    params: Names | None = None,
+    nuisance: Names | None = None,
+    method: Literal["oem", "pem", "rls", "windows"] | None = None,
+    model: str | None = None,
+    grow: bool = False,
+    systematic: Literal["bench", "none"] = "bench",
     prior: str | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
-    model: str | None = None,
-    method: str = "oem",
+    window: float = 0.0,
     starts: int = STARTS,
     seed: int = 0,
     profile: bool = False,
     bootstrap: int = 0,
-    hold_out: Sequence[Run] = (),
+    hold_out: Source | Sequence[Source] = (),
+    last: str | Path | None = None,
     bench: str | Path | None = None,
-    systematic: bool = True,
 ) -> Study:
-    """Parameters of a brake from its runs, with uncertainties, and whether the model explains them.
+    """Parameters of a brake from its runs, with total and repeatability, and whether the model explains them.
 
     Args:
-        runs: one run, or several of the same brake, which are taken together.
-        params: parameters of interest; what is not named is known.
-        nuisances: what is estimated besides.
-        prior: name of ranges that were known beforehand.
-        bounds: lowest and highest value to search, by name [SI].
-        model: name of the plant; without, the one that was simulated, else ``exact``.
-        method: ``oem``, ``pem`` or ``rls``.
-        starts: local searches.
-        seed: of the searches and the bootstrap.
-        profile: add the likelihood profile of every parameter.
-        bootstrap: draws of the bootstrap over runs.
-        hold_out: runs that are predicted, not estimated from.
-        bench: bench file; without, the one inside the first log.
-        systematic: estimate the systematic errors along that the bench file does not exclude.
+        runs: MCAP files of emb-run, of one brake, which are taken together.
+        params: parameters to estimate (default: the four of the brake; what the map of a recording guesses).
+        nuisance: unknowns to estimate besides (default: none, or what the map of a recording says).
+        method: see above (default: oem; windows for a recording).
+        model: plant of the bench to estimate with, or 'all': each is fitted, and the best answers (default: the one
+            that was simulated; exact where a log does not say).
+        grow: begin with the model, or exact, and add the features that the logs ask for.
+        systematic: 'bench' also estimates sensor offsets, gain and delay, with priors from [systematic] of the bench
+            file; 'none' assumes ideal sensors (default: bench).
+        prior: name of ranges in the bench file in which the parameters are known to lie (default: none).
+        bounds: where to search, as k_m=0.01:0.1 (default: nominal/10 to nominal*10).
+        window: length of the windows [s], with method windows (default: what the map says, or 0.5).
+        starts: local searches (default: 8).
+        seed: of where they begin, and of draws (default: 0).
+        profile: likelihood profiles of all parameters (default: of those that are identified badly).
+        bootstrap: draw the logs so many times again, from 3 logs (default: 0).
+        hold_out: log that is predicted, not estimated from; may be given more than once.
+        last: JSON of an earlier estimate or report, to say what has changed since.
+        bench: bench file (default: the one in the first log).
 
     Returns:
         The study; ``study.estimate.theta`` has the values, ``study.conclusions`` what is known of each parameter.
@@ -212,52 +267,160 @@ def estimate(
         UsageError: an argument is wrong, the runs do not go together, or scipy and numba are missing.
         LogError: a log says too little.
     """
-    try:
-        from emb_bench.analysis.study import StudyOptions, make_study
-    except ImportError as err:
-        raise UsageError("estimate needs scipy and numba: pip install 'emb-excite[bench]'") from err
-    runs = [runs] if isinstance(runs, RunLog) else list(runs)
-    if not runs:
+    given = locals()
+    options_of, before = _study_options(given), _last(last)
+    from emb_bench.analysis.study import make_study
+
+    logs, unseen = [_driven(run) for run in _listed(runs)], [_driven(run) for run in _listed(hold_out)]
+    if not logs:
         raise UsageError("expected at least one run")
-    for run in (*runs, *hold_out):
-        require_driven(run)
-    its = runs[0].bench if bench is None else load_bench(bench, analysis=True)
-    known = None if prior is None else its.range_set(prior)
-    asked = EstimationProblem(tuple(params), tuple(nuisances), known, dict(bounds or {}))
-    return make_study(
-        its,
-        runs,
-        StudyOptions(asked, method, model, starts, seed, profile, bootstrap, systematic=systematic),
-        held_out=hold_out,
-    )
+    its = logs[0].bench if bench is None else load_bench(bench, analysis=True)
+    say_if_compiling()
+    _say(f"estimates from {', '.join(log.path.name for log in logs)}")
+    return make_study(its, logs, options_of(its), held_out=unseen, last=before)
+
+
+def report(
+    runs: Source | Sequence[Source], output: str | Path, *, acceptance: str | Path | None = None, **options: Any
+) -> Content:
+    """One page about runs of one brake, to hand over, and a JSON file beside it; both are replaced if they exist.
+
+    Args:
+        runs: MCAP files of emb-run, of one brake. What cannot be used is named on the page and left out.
+        output: page to write, .html or .htm.
+        acceptance: TOML file with an [acceptance] table: tolerances, drift, budgets; each is passed, failed, or not
+            decided.
+        options: of :func:`estimate`; ``profile`` is on.
+
+    Returns:
+        What the page shows: the runs, the study, the acceptance.
+
+    Raises:
+        UsageError: an argument is wrong, the runs do not go together, a file cannot be written, or scipy, numba or
+            matplotlib is missing.
+        LogError: not one log can be used, or one that is held out cannot.
+    """
+    page = Path(output)
+    beside = page.with_suffix(".json")
+    bound = inspect.signature(estimate).bind(runs, **options | {"profile": True})
+    bound.apply_defaults()
+    given = bound.arguments
+    files = [*_listed(runs), *_listed(given["hold_out"]), given["last"], acceptance]
+    _check_page(page, beside, [entry.path if isinstance(entry, RunLog) else Path(entry) for entry in files if entry])
+    options_of = _study_options(given)
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as err:
+        raise UsageError("a report needs matplotlib: pip install 'emb-excite[bench]'") from err
+    from emb_bench.analysis.acceptance import read_criteria
+    from emb_bench.report.content import document, gather
+    from emb_bench.report.page import report_page
+
+    before = _last(given["last"])
+    criteria = None if acceptance is None else read_criteria(Path(acceptance))
+    say_if_compiling()
+    with replacing(page) as new_page, replacing(beside) as new_numbers:
+        logs, left_out = _usable(_listed(runs))
+        unseen = [_opened(run) for run in _listed(given["hold_out"])]
+        _say(f"estimates from {', '.join(log.path.name for log in logs)}, and writes {page.name}")
+        own = next((log for log in logs if "bench.toml" in log.attachments), logs[-1])
+        its = own.bench if given["bench"] is None else load_bench(given["bench"], analysis=True)
+        made_by = f"emb-excite {metadata.version('emb-excite')}"
+        content = gather(its, logs, left_out, options_of(its), made_by, held_out=unseen, last=before, criteria=criteria)
+        new_numbers.write_text(as_json(document(content)) + "\n", encoding="utf-8")
+        new_page.write_text(report_page(content), encoding="utf-8")
+    return content
+
+
+def campaign(
+    paths: str | Path | Sequence[str | Path],
+    output: str | Path,
+    *,
+    method: Literal["none", "oem", "pem", "rls", "windows"] = "oem",
+    model: str | None = None,
+    params: Names | None = None,
+    nuisance: Names | None = None,
+    prior: str | None = None,
+    starts: int = STARTS,
+    seed: int = 0,
+    bench: str | Path | None = None,
+    jobs: int | None = None,
+    time_limit: float = 600.0,
+    ray: str | None = None,
+    plot: str | Path | None = None,
+) -> Campaign:
+    """Many logs in parallel: one row each in a Parquet or CSV file, and what they say together.
+
+    Args:
+        paths: logs, or folders to search for *.mcap.
+        output: file to write, Parquet or CSV by its ending; replaced if it exists.
+        method: see above, or 'none' for information alone (default: oem).
+        model: plant to estimate with (default: the one that was simulated; exact where a log does not say).
+        params: parameters to estimate (default: the four of the brake).
+        nuisance: unknowns to estimate besides (default: none).
+        prior: name of ranges in the bench file in which the parameters are known to lie (default: none).
+        starts: local searches (default: 8).
+        seed: of where they begin (default: 0).
+        bench: bench file (default: the one in each log).
+        jobs: logs at a time (default: one for each processor).
+        time_limit: longest time for one log [s]; one that takes longer has failed (default: 600).
+        ray: address of a Ray cluster, or 'local' for a Ray of this machine (default: processes of this machine).
+        plot: figure to write, of the parameters over time.
+
+    Returns:
+        The summary; the rows are in the file.
+
+    Raises:
+        UsageError: an argument is wrong, there is no log, a library is missing, or a file cannot be written.
+    """
+    from emb_bench.batch.campaign import run_campaign
+    from emb_bench.batch.row import Options
+    from emb_bench.estimate.records import EstimationProblem
+    from emb_bench.experiment.evaluation import Question
+
+    _check({"--starts": (starts, 1), "--seed": (seed, 0), "--jobs": (1 if jobs is None else jobs, 1)})
+    if not 1e-3 <= time_limit <= 1e6:
+        raise UsageError(f"--time-limit: expected 0.001 to 1e6 s, got {time_limit:g}")
+    names = _unknowns(params, nuisance, None)
+    if method != "none":
+        EstimationProblem(*names)
+    Question(*names)
+    its = None if bench is None else load_bench(bench, analysis=True)
+    if its is not None:
+        its.plant(model or DEFAULT_PLANT)
+        Question(*names, None if prior is None else its.range_set(prior))
+    options = Options(method, *names, model, prior, None if its is None else its.text, starts, seed)
+    places = [Path(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
+    figure = None if plot is None else Path(plot)
+    return run_campaign(places, Path(output), options, jobs=jobs, time_limit=time_limit, ray=ray, plot=figure)
 
 
 def design(
-    name: Name = "D",
+    criterion: Literal["D", "A", "E", "Ds"] = "D",
     *,
-    params: Sequence[str] = PARAMETER_NAMES,
-    of: Sequence[str] = (),
-    theta: Mapping[str, float] | None = None,
+    params: Names = PARAMETER_NAMES,
+    of: Names = (),
+    theta: str | Path | Mapping[str, float] | None = None,
     model: str = DEFAULT_PLANT,
-    kind: Kind = "physical",
-    returns: bool = True,
+    kind: Literal["physical", "weighted"] = "physical",
+    return_home: bool = True,
     starts: int = COARSE_SEARCHES,
     seed: int = 0,
     bench: str | Path | None = None,
 ) -> Report:
-    """The current sequence that is optimal for known parameters, under the limits of the bench.
+    """The current sequence with most information about parameters that are known, under the limits of the bench.
 
     Args:
-        name: criterion: ``D``, ``A``, ``E`` or ``Ds``.
-        params: unknown parameters.
-        of: for ``Ds``, those of ``params`` that are wanted.
-        theta: the brake's parameters by name [SI]; those that are not named are nominal.
-        model: name of the plant.
-        kind: which Fisher information.
-        returns: whether the brake has to come home.
-        starts: coarse searches.
-        seed: of the random starts.
-        bench: bench file; without, the shipped one.
+        criterion: what is optimised (default: D).
+        params: unknown parameters (default: the four of the brake).
+        of: with Ds, those of the parameters that are wanted.
+        theta: the brake's parameters, as name=value,...; the others are nominal.
+        model: plant of the bench (default: exact).
+        kind: which Fisher information (default: physical).
+        return_home: whether the brake has to come home; else it may end anywhere within the limits.
+        starts: coarse searches (default: 18).
+        seed: of the random starts (default: 0).
+        bench: bench file (default: the shipped one).
 
     Returns:
         The report; ``report.found.best.currents`` are the currents [A], one per sample period.
@@ -265,12 +428,152 @@ def design(
     Raises:
         UsageError: an argument is wrong, no design was found, or scipy and numba are missing.
     """
+    from emb_bench.design.problem import make_problem
+    from emb_bench.information.criteria import criterion as criterion_of
+    from emb_bench.sim.plant_spec import parse_assignments, true_parameters
+
+    _check({"--starts": (starts, 1), "--seed": (seed, 0)})
+    its, names = load_bench(bench), _names(params)
+    goal = criterion_of(criterion, names, _names(of))
+    given = parse_assignments(_text_of(theta).replace("nominal", ""), "--theta: ")
+    brake = true_parameters(its, given, option="--theta: ")
+    problem = make_problem(its, goal, names, model=model, kind=kind, brake=brake, returns=return_home)
     try:
         from emb_bench.design.report import make_report
     except ImportError as err:
         raise UsageError("design needs scipy and numba: pip install 'emb-excite[bench]'") from err
-    its = load_bench(bench)
-    goal = criterion(name, tuple(params), tuple(of))
-    brake = true_parameters(its, {n: str(value) for n, value in (theta or {}).items()})
-    problem = make_problem(its, goal, tuple(params), model=model, kind=kind, brake=brake, returns=returns)
+    _say("searches for a design: a minute or two")
     return make_report(its, problem, goal, kind, starts=starts, seed=seed)
+
+
+def _say(text: str) -> None:
+    """Tell who waits at a terminal what takes the time."""
+    if sys.stderr is not None and sys.stderr.isatty():
+        mention(f"{text} ...")
+
+
+def _opened(run: Source) -> Run:
+    return run if isinstance(run, RunLog) else read_log(run)
+
+
+def _driven(run: Source) -> Run:
+    log = _opened(run)
+    require_driven(log)
+    return log
+
+
+def _listed(runs: Source | Sequence[Source]) -> list[Source]:
+    return [runs] if isinstance(runs, RunLog | str | Path) else list(runs)
+
+
+def _names(names: Names) -> tuple[str, ...]:
+    """Names, or a text with commas between them."""
+    listed = names.split(",") if isinstance(names, str) else names
+    return tuple(name for entry in listed if (name := entry.strip()))
+
+
+def _unknowns(
+    params: Names | None, nuisance: Names | None, bench: Bench | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Parameters and nuisances; those that are not given are the machine's of the bench, if it has one."""
+    machine = None if bench is None else bench.machine
+    default = (PARAMETER_NAMES, ()) if machine is None else (machine.unknown, machine.nuisances)
+    return default[0] if params is None else _names(params), default[1] if nuisance is None else _names(nuisance)
+
+
+def _text_of(theta: str | Path | Mapping[str, float] | None) -> str:
+    """Parameters as the option ``--theta`` has them."""
+    if isinstance(theta, Mapping):
+        return ",".join(f"{name}={value!r}" for name, value in theta.items()) or "nominal"
+    return "" if theta is None else str(theta)
+
+
+def _check(options: Mapping[str, tuple[int, int]]) -> None:
+    """Check numbers against the least that each may be.
+
+    Raises:
+        UsageError: one is smaller.
+    """
+    for option, (value, least) in options.items():
+        if value < least:
+            raise UsageError(f"{option}: expected a number from {least}, got {value}")
+
+
+def _study_options(given: Mapping[str, Any]) -> Callable[[Bench], StudyOptions]:
+    """Options of a study, but for what the bench says; wrong ones are refused before any log is read.
+
+    Raises:
+        UsageError: an option is wrong, or scipy and numba are missing.
+    """
+    _check({f"--{name}": (given[name], least) for name, least in (("starts", 1), ("seed", 0), ("bootstrap", 0))})
+    if not (given["window"] == 0.0 or 1e-3 <= given["window"] <= 3600.0):
+        raise UsageError(f"--window: expected a time from 0.001 to 3600 s, got {given['window']:g}")
+    from emb_bench.estimate.records import EstimationProblem
+
+    unknowns, bounds = (given["params"], given["nuisance"]), dict(given["bounds"] or {})
+    EstimationProblem(*_unknowns(*unknowns, None), None, bounds, window=given["window"])
+    try:
+        import numba  # noqa: F401
+
+        from emb_bench.analysis.study import StudyOptions
+    except ImportError as err:
+        raise UsageError("an estimate needs scipy and numba: pip install 'emb-excite[bench]'") from err
+
+    def of(bench: Bench) -> StudyOptions:
+        prior = None if given["prior"] is None else bench.range_set(given["prior"])
+        return StudyOptions(
+            EstimationProblem(*_unknowns(*unknowns, bench), prior, bounds, window=given["window"]),
+            given["method"] or ("oem" if bench.machine is None else "windows"),
+            given["model"],
+            given["starts"],
+            given["seed"],
+            given["profile"],
+            given["bootstrap"],
+            given["grow"],
+            given["systematic"] == "bench",
+        )
+
+    return of
+
+
+def _last(path: str | Path | None) -> Earlier | None:
+    """An earlier estimate."""
+    if path is None:
+        return None
+    from emb_bench.analysis.drift import read_last
+
+    return read_last(Path(path))
+
+
+def _check_page(page: Path, beside: Path, inputs: Sequence[Path]) -> None:
+    """Refuse what would write over a log or over the last campaign's numbers.
+
+    Raises:
+        UsageError: it would, or there is no such folder.
+    """
+    require_place("--output", page, PAGES)
+    for path in inputs:
+        for made in (page, beside):
+            if path.resolve() == made.resolve():
+                raise UsageError(f"--output {page}: would write over {path}, which is read: choose another name")
+
+
+def _usable(runs: Sequence[Source]) -> tuple[list[RunLog], list[tuple[Path, str]]]:
+    """The logs that can be read, and why the others cannot.
+
+    Raises:
+        UsageError: a file is not there or not readable.
+        LogError: there is one path, and it is not a log; or none is.
+    """
+    logs, left_out = [], []
+    for run in runs:
+        try:
+            logs.append(_opened(run))
+        except LogError as err:
+            if len(runs) == 1:
+                raise
+            path = run.path if isinstance(run, RunLog) else Path(run)
+            left_out.append((path, str(err).removeprefix(f"{path}: ")))
+    if not logs:
+        raise LogError("not one of these logs can be used: " + "; ".join(f"{path}: {why}" for path, why in left_out))
+    return logs, left_out

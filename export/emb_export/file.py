@@ -87,7 +87,7 @@ def read_sequence(text: str, bench: Bench) -> tuple[Floats, str]:
     """The currents that a text or a file names [A], shape (horizon,), and what they are in words.
 
     Args:
-        text: as :func:`emb_bench.excitation.reference.parse_excitation` reads it, or a file of ``emb-design --out``,
+        text: as :func:`emb_bench.excitation.reference.parse_excitation` reads it, or a file of ``emb-design -o``,
         ``.npz``.
         bench: its sample time, horizon and limits.
 

@@ -45,7 +45,7 @@ def test_fisher_information_is_that_of_emb_replay_fim(log: Path, capsys: pytest.
     command += ["--prior", "pm50", "--theta", "f_v=3e-5"]
     found = printed(capsys, replay.main(command))
     e = api.fisher_information(
-        api.open_run(log), model="lag", params=("k_1", "f_v"), nuisances=["delay"], prior="pm50", theta={"f_v": 3e-5}
+        api.open_run(log), model="lag", params=("k_1", "f_v"), nuisance=["delay"], prior="pm50", theta={"f_v": 3e-5}
     )
     assert e.plant.name == found["model"] == "lag"
     assert [e.fit.angle, e.fit.velocity] == [found["fit_sigmas"]["angle"], found["fit_sigmas"]["velocity"]]
@@ -66,8 +66,10 @@ def test_an_estimate_is_that_of_emb_replay_estimate(log: Path, capsys: pytest.Ca
 
 def test_a_design_is_that_of_emb_design(capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--criterion", "E", "--params", "k_1,f_v", "--theta", "f_v=3e-5", "--starts", "1", "--seed", "3"]
-    found = printed(capsys, design.main([*options, "--model", "euler", "--no-return", "--json"]))
-    report = api.design("E", params=("k_1", "f_v"), theta={"f_v": 3e-5}, starts=1, seed=3, model="euler", returns=False)
+    found = printed(capsys, design.main([*options, "--model", "euler", "--no-return-home", "--json"]))
+    report = api.design(
+        "E", params=("k_1", "f_v"), theta={"f_v": 3e-5}, starts=1, seed=3, model="euler", return_home=False
+    )
     assert json.loads(report.json()) == found
 
 
@@ -82,6 +84,17 @@ def test_a_log_s_bench_is_replaced_by_one_of_the_same_sample_time_only(log: Path
     )
     with pytest.raises(UsageError, match="sample time"):
         api.fisher_information(run, bench=slower)
+
+
+def test_paths_and_single_names_do_and_results_are_short_in_a_notebook(log: Path) -> None:
+    run = api.open_run(log)
+    study, information = api.estimate(log, params="f_v", starts=1), api.fisher_information(str(log), params="f_v")
+    assert study["f_v"].value == study.conclusions[0].value
+    assert study.to_dataframe().loc["f_v", "value"] == study["f_v"].value
+    assert study._repr_html_().count("<tr>") == 2
+    for result in (run, study, information, api.design("D", params="k_m", starts=1, model="euler")):
+        assert len(repr(result)) < 300
+        assert "\n" not in repr(result)
 
 
 def test_no_runs_are_refused() -> None:

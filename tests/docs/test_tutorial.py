@@ -33,7 +33,7 @@ def test_its_estimates_are_as_it_says(folder: Path) -> None:
         low, high = concluded.interval
         assert study.model_fits == fits
         assert low <= 3e-5 <= high  # of the wrong model too, whose interval allows for what it lacks
-        ideal = api.estimate(run, params=("f_v",), model=model, starts=1, systematic=False).conclusions[0].interval
+        ideal = api.estimate(run, params=("f_v",), model=model, starts=1, systematic="none").conclusions[0].interval
         assert (ideal[0] <= 3e-5 <= ideal[1]) == fits
 
 

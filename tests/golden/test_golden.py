@@ -16,6 +16,7 @@ import pytest
 
 from emb_bench.cli.design import main as design
 from emb_bench.cli.replay import main as replay
+from emb_bench.report.text import WIDTH
 from emb_runtime.config.bench import shipped_bench_text
 
 from tests.bench.report_pages import read  # isort: skip
@@ -30,6 +31,8 @@ UNIQUE = re.compile(
 )
 """Hashes, dates and the version."""
 RELATIVE, ABSOLUTE = 0.02, 1e-9
+SHORT = {"fim": 14, "estimate-good": 16, "estimate-aborted": 16, "info": 14, "timing": 14, "campaign": 24, "design": 14}
+"""Pages without ``-v``: as wide as a terminal, and at most so many lines."""
 HOUR = 3_600_000_000_000  # [ns]
 
 
@@ -74,6 +77,9 @@ def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
     """Compares a text with the page of that name, or writes the page."""
 
     def same(name: str, text: str) -> None:
+        if not name.startswith("report"):
+            assert max(map(len, text.splitlines())) <= (WIDTH if name in SHORT else 110)
+            assert text.count("\n") <= SHORT.get(name, 120)
         path, text = PAGES / f"{name}.txt", UNIQUE.sub("…", text).replace("… to …", "…")
         if request.config.getoption("--update-golden"):
             path.write_text(text, encoding="utf-8")
@@ -99,12 +105,15 @@ def alike(expected: str, text: str) -> bool:
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        ("fim", ["fim", "good.mcap", "--nuisance", "x1_0"]),
+        ("fim", ["fim", "good.mcap", "--theta", "true"]),
+        ("fim-nominal", ["fim", "good.mcap", "--theta", "nominal", "--nuisance", "x1_0"]),
+        ("fim-verbose", ["fim", "good.mcap", "--theta", "true", "-v"]),
         ("fim-models", ["fim", "good.mcap", "--model", "all"]),
         ("estimate-good", ["estimate", "good.mcap", "--starts", "2"]),
+        ("estimate-verbose", ["estimate", "other.mcap", "--model", "exact", "--starts", "2", "-v"]),
         ("estimate-misfit", ["estimate", "other.mcap", "--model", "exact", "--starts", "2"]),
         ("estimate-aborted", ["estimate", "aborted.mcap", "--starts", "2"]),
-        ("estimate-still", ["estimate", "still.mcap", "--starts", "1", "--profile"]),
+        ("estimate-still", ["estimate", "still.mcap", "--starts", "1"]),
         ("estimate-rls", ["estimate", "good.mcap", "--method", "rls"]),
     ],
 )
@@ -118,7 +127,18 @@ def test_several_runs_are_compared_with_an_earlier_estimate_and_with_each_other(
     (folder / "last.json").write_text(say("estimate", "good.mcap", "--starts", "1", "--json"))
     worn = ["estimate", "worn.mcap", "--last", "last.json", "--starts", "1", "--hold-out", "good.mcap"]
     golden("estimate-worn", say(*worn))
-    three = ["estimate", "good.mcap", "again.mcap", "third.mcap", "--bootstrap", "10", "--profile", "--starts", "1"]
+    three = [
+        "estimate",
+        "good.mcap",
+        "again.mcap",
+        "third.mcap",
+        "--bootstrap",
+        "10",
+        "--profile",
+        "--starts",
+        "1",
+        "-v",
+    ]
     golden("estimate-three", say(*three))
 
 

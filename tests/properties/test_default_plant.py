@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from emb_bench import api
-from emb_bench.cli import design, node, replay
+from emb_bench.cli import node, replay
 from emb_bench.design.problem import make_problem
 from emb_bench.sim.transport import open_sim
 from emb_runtime.cli import options
@@ -35,7 +35,6 @@ def test_whatever_is_told_no_plant_takes_the_same(bench: Bench) -> None:
     defaults = [
         open_sim("", bench)[0].truth["plant"],
         node.parser().parse_args(["--iface", "vcan0"]).plant,
-        design.parser().parse_args([]).model,
         train.parser().parse_args(["reference", "four-d", "--out", "a"]).plant,
         *(inspect.signature(call).parameters["plant"].default for call in (api.simulate, Batch)),
         *(inspect.signature(call).parameters["model"].default for call in (api.design, make_problem)),

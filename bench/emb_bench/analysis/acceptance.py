@@ -9,24 +9,27 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from emb_bench.analysis.drift import Drift, comparable
+import msgspec
+
+from emb_bench.analysis.drift import Drift, Earlier, comparable
 from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import OF_A_RECORD, PARAMETERS, SI, UNITS
 from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.numbers import amount, between, plain, share, share_between
-from emb_runtime.config.validation import Rules, Table, shown
+from emb_runtime.config.typed import FieldError, read
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
 
 LONGEST = 2**20  # Size limit of the file [bytes]
-RULES = Rules(UsageError, 200, 1e-30)
 SHARED = tuple(name for name in PARAMETERS if name not in OF_A_RECORD)  # Unknowns that a tolerance can be stated for
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
 
 class Result(StrEnum):
@@ -37,29 +40,49 @@ class Result(StrEnum):
     CANNOT_TELL = "cannot tell"
 
 
-@dataclass(frozen=True)
-class Tolerance:
-    """Limits of one parameter."""
+class Tolerance(msgspec.Struct, frozen=True):
+    """Limits of one parameter: an interval, or a share of a reference."""
 
-    name: str
-    interval: tuple[float, float] | None = None
-    """Lowest and highest allowed value, SI units; None where ``relative`` is given."""
-    relative: float = 0.0  # Largest allowed deviation from the reference, as a share of it
-    reference: float | None = None  # SI units; None for the bench file's nominal value
+    interval: tuple[float, float] | None = None  # Lowest and highest allowed value, SI units
+    relative: Positive | None = None  # Largest allowed deviation from the reference, as a share of it
+    reference: Positive | None = None  # SI units; None for the bench file's nominal value
+
+    def __post_init__(self) -> None:
+        """Refuse both forms, neither, and an interval upside down."""
+        if (self.interval is None) == (self.relative is None):
+            raise FieldError("interval", "expected either interval = [low, high] or relative")
+        if self.interval is not None and not self.interval[0] < self.interval[1]:
+            raise FieldError("interval", f"expected the lower end first, got {list(self.interval)}")
+        if self.interval is not None and self.reference is not None:
+            raise FieldError("reference", "expected it with relative only")
 
 
-@dataclass(frozen=True)
-class Criteria:
+class Budgets(msgspec.Struct, frozen=True):
+    """Largest allowed shares of each run; None where there is no budget."""
+
+    missed: Share | None = None  # Of periods without a sample in time
+    lost: Share | None = None  # Of samples that are not in the log
+
+
+class Criteria(msgspec.Struct, frozen=True):
     """Content of an acceptance file."""
 
-    source: str  # Name of the file
-    text: str  # The file as it was read
     model_fit: bool = True  # The model has to fit the records, and to predict what it was not fitted to
-    parameters: tuple[Tolerance, ...] = ()
-    drift: Mapping[str, float] = field(default_factory=dict)
+    parameters: dict[str, Tolerance] = {}
+    drift: dict[str, Positive] = {}
     """Largest allowed change since an earlier estimate, by parameter: relative, or in the parameter's unit."""
-    missed: float | None = None  # Largest allowed share of periods without a sample in time, of each run
-    lost: float | None = None  # Largest allowed share of samples that are not in the log, of each run
+    budgets: Budgets = Budgets()
+    source: str = ""  # Name of the file
+
+    def __post_init__(self) -> None:
+        """Refuse unknowns that are no brake's, and a share of what has no size."""
+        for place, names in (("parameters", self.parameters), ("drift", self.drift)):
+            for name in names:
+                if name not in SHARED:
+                    raise FieldError(place, f"'{name}': expected some of {', '.join(SHARED)}")
+        for name, one in self.parameters.items():
+            if one.interval is None and name in UNITS:
+                raise FieldError(f"parameters.{name}", "expected interval = [low, high]: it has no size to share")
 
 
 @dataclass(frozen=True)
@@ -104,20 +127,11 @@ class Acceptance:
 
     def document(self) -> dict[str, Any]:
         """JSON document."""
-        return {
-            "file": self.criteria.source,
-            "result": self.result.value,
-            "criteria": [
-                {
-                    "name": one.name,
-                    "required": one.required,
-                    "found": one.found,
-                    "result": one.result.value,
-                    "why": one.why,
-                }
-                for one in self.results
-            ],
-        }
+        return {"file": self.criteria.source, "result": self.result, "criteria": self.results}
+
+
+class _File(msgspec.Struct, frozen=True):
+    acceptance: Criteria
 
 
 def read_criteria(path: Path) -> Criteria:
@@ -128,60 +142,13 @@ def read_criteria(path: Path) -> Criteria:
     """
     source = f"--acceptance {path}"
     try:
-        text = read_text(path, LONGEST)
-        content = tomllib.loads(text)
+        content = tomllib.loads(read_text(path, LONGEST))
     except OSError as err:
         raise UsageError(f"{source}: {err.strerror}") from err
     except (ValueError, RecursionError) as err:
         raise UsageError(f"{source}: expected TOML: {err}") from err
-    document = Table(source, "", content, RULES)
-    table = document.table("acceptance")
-    document.nothing_else()
-    names = table.names()
-    model_fit = table.get("model_fit") if "model_fit" in names else True
-    if not isinstance(model_fit, bool):
-        raise table.fail("model_fit", f"expected true or false, got {shown(model_fit)}")
-    tolerances = _tolerances(table.table("parameters")) if "parameters" in names else ()
-    drift = _drift(table.table("drift")) if "drift" in names else {}
-    missed = lost = None
-    if "budgets" in names:
-        budgets = table.table("budgets")
-        missed, lost = (
-            budgets.number(name, lambda x: 0.0 <= x <= 1.0, "a share from 0 to 1") if name in budgets.names() else None
-            for name in ("missed", "lost")
-        )
-        budgets.nothing_else(("missed", "lost"))
-    table.nothing_else(("model_fit", "parameters", "drift", "budgets"))
-    return Criteria(path.name, text, model_fit, tolerances, drift, missed, lost)
-
-
-def _tolerances(table: Table) -> tuple[Tolerance, ...]:
-    found = []
-    for name in table.names():
-        if name not in SHARED:
-            raise table.fail(name, f"expected one of {', '.join(SHARED)}")
-        entry = table.table(name)
-        keys = entry.names()
-        if ("interval" in keys) == ("relative" in keys):
-            raise table.fail(name, "expected either interval = [low, high] or relative")
-        if "interval" in keys:
-            found.append(Tolerance(name, entry.number_pair("interval")))
-        elif name in UNITS:
-            raise table.fail(name, "expected interval = [low, high]: it has no size that could be shared")
-        else:
-            relative = entry.number("relative", lambda x: x > 0.0, "a positive share")
-            positive = "a positive number"
-            reference = entry.number("reference", lambda x: x > 0.0, positive) if "reference" in keys else None
-            found.append(Tolerance(name, None, relative, reference))
-        entry.nothing_else(("interval", "relative", "reference"))
-    return tuple(found)
-
-
-def _drift(table: Table) -> dict[str, float]:
-    for name in table.names():
-        if name not in SHARED:
-            raise table.fail(name, f"expected one of {', '.join(SHARED)}")
-    return {name: table.number(name, lambda x: x > 0.0, "a positive number") for name in table.names()}
+    found = read(_File, content, source, UsageError, smallest=1e-30).acceptance
+    return msgspec.structs.replace(found, source=path.name)
 
 
 def judge(
@@ -190,7 +157,7 @@ def judge(
     left_out: Sequence[str],
     study: Study | None,
     why_no_study: str = "",
-    last: Mapping[str, Any] | None = None,
+    last: Earlier | None = None,
 ) -> Acceptance:
     """Results of all criteria. That each run came to its end and its log is whole is always one of them.
 
@@ -200,24 +167,24 @@ def judge(
         left_out: reason for each log that takes no part, beginning with its name.
         study: the estimate; None if there is none.
         why_no_study: reason for that.
-        last: document of an earlier estimate.
+        last: an earlier estimate.
     """
     results = [_completed(run, len(runs) > 1) for run in runs]
     results += [Criterion("all logs used", "yes", "no", Result.FAIL, words) for words in left_out]
     doubt = _doubt(study, why_no_study)
     if criteria.model_fit:
         results.append(_model_fit(study, doubt))
-    results += [_tolerated(one, study, doubt) for one in criteria.parameters]
+    results += [_tolerated(name, one, study, doubt) for name, one in criteria.parameters.items()]
     drifts = {} if study is None else {drift.name: drift for drift in study.drifts}
     earlier = "" if study is None or last is None else comparable(study.estimate, last)
     for name, most in criteria.drift.items():
         results.append(_drifted(name, most, drifts.get(name), doubt or earlier, given=last is not None))
     for run in runs:
         of = f", {run.name}" if len(runs) > 1 else ""
-        if criteria.missed is not None:
-            results.append(_counted(f"missed periods{of}", criteria.missed, run.missed))
-        if criteria.lost is not None:
-            results.append(_counted(f"lost samples{of}", criteria.lost, run.lost))
+        if criteria.budgets.missed is not None:
+            results.append(_counted(f"missed periods{of}", criteria.budgets.missed, run.missed))
+        if criteria.budgets.lost is not None:
+            results.append(_counted(f"lost samples{of}", criteria.budgets.lost, run.lost))
     return Acceptance(criteria, tuple(results))
 
 
@@ -250,8 +217,8 @@ def _model_fit(study: Study | None, doubt: str) -> Criterion:
     return Criterion(name, required, found, Result.FAIL if doubt else Result.PASS, doubt)
 
 
-def _tolerated(tolerance: Tolerance, study: Study | None, doubt: str) -> Criterion:
-    name, unit = tolerance.name, SI[tolerance.name]
+def _tolerated(name: str, tolerance: Tolerance, study: Study | None, doubt: str) -> Criterion:
+    unit, relative = SI[name], tolerance.relative or 0.0
     if tolerance.interval is not None:
         low, high = tolerance.interval
         required = f"{plain(low, 6)} to {plain(high, 6)} {unit}"
@@ -261,8 +228,8 @@ def _tolerated(tolerance: Tolerance, study: Study | None, doubt: str) -> Criteri
         if reference is None and study is not None:
             reference = float(getattr(study.estimate.bench.brake, name))
         about = nominal if reference is None else f"{nominal} {plain(reference, 6)} {unit}"
-        required = f"{about} ± {share(tolerance.relative, 3)}"
-        low, high = (math.nan if reference is None else reference * (1.0 + s * tolerance.relative) for s in (-1.0, 1.0))
+        required = f"{about} ± {share(relative, 3)}"
+        low, high = (math.nan if reference is None else reference * (1.0 + s * relative) for s in (-1.0, 1.0))
     found = None if study is None else next((c for c in study.conclusions if c.label == name), None)
     if found is None:
         return Criterion(name, required, "not estimated", Result.CANNOT_TELL, doubt or "it was not estimated")

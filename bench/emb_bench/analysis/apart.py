@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
 
+from emb_bench.analysis.constancy import constancy
 from emb_bench.brake.quantities import quantity
 from emb_bench.estimate.methods import method_of
-from emb_bench.estimate.records import Estimate
+from emb_bench.estimate.records import NORMAL_95, Estimate
 
 LEVEL = 0.001  # Chance that a parameter of one and the same brake is said to differ, for all parameters together
 
@@ -39,14 +39,12 @@ def apart(e: Estimate) -> tuple[Differing, ...]:
     found = []
     for name in e.asked.params:
         at = [next(i for i, u in enumerate(one.unknowns) if u.name == name) for one in alone]
-        values = np.array([one.values[i] for one, i in zip(alone, at, strict=True)])
-        deviations = np.array([0.5 * np.ptp(one.intervals()[i]) / 1.96 for one, i in zip(alone, at, strict=True)])
+        values = [float(one.values[i]) for one, i in zip(alone, at, strict=True)]
+        deviations = [0.5 * np.ptp(one.intervals()[i]) / NORMAL_95 for one, i in zip(alone, at, strict=True)]
         if not np.isfinite(deviations).all():
             continue
-        weights = deviations**-2.0
-        statistic = float(weights @ (values - weights @ values / weights.sum()) ** 2)
-        p_value = float(special.chdtrc(len(values) - 1, statistic))
+        p_value = constancy(values, deviations).p_value
         if p_value < LEVEL / len(e.asked.params):
             shown = quantity(e.bench.machine, name)
-            found.append(Differing(shown.name, tuple((values * shown.factor).tolist()), p_value))
+            found.append(Differing(shown.name, tuple(value * shown.factor for value in values), p_value))
     return tuple(sorted(found, key=lambda one: one.p_value))

@@ -14,12 +14,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
+
 from emb_bench.analysis.drift import Drift
 from emb_bench.analysis.profile import Profile
 from emb_bench.analysis.recommendation import HELPS, PRECISE, Recommendation
 from emb_bench.estimate.intervals import interval as with_profile
-from emb_bench.estimate.records import Estimate, Unknown
-from emb_bench.information.identifiability import GROSS, Finding
+from emb_bench.estimate.records import NORMAL_95, Estimate, Unknown
+from emb_bench.information.identifiability import GROSS, Finding, Spectrum
 
 
 class Standing(StrEnum):
@@ -27,7 +29,7 @@ class Standing(StrEnum):
 
     IDENTIFIED = "identified"
     BIASED = "identified, but biased"
-    IF_MODEL_RIGHT = "identified if the model were right"
+    IF_MODEL_RIGHT = "identified if the model is right"
     NOT_IDENTIFIED = "NOT identified"
 
 
@@ -48,6 +50,8 @@ class Conclusion:
     unit: str  # SI, or of the machine that is no brake (:func:`emb_bench.brake.quantities.quantity`)
     interval: tuple[float, float]
     """95 %: of the profile if output error has one and fits, else of the estimate; infinite where open. In ``unit``."""
+    repeatability: float
+    """Half of the 95 % interval that the sensors' noise alone would leave: scatter of further runs. In ``unit``."""
     of_interest: bool  # True if it is a parameter of interest, not a nuisance
     standing: Standing
     why_not: str  # Reason that it is not identified; empty if it is
@@ -95,7 +99,8 @@ def conclude(
         certain = Standing.BIASED if e.method == "rls" else Standing.IF_MODEL_RIGHT
     found = []
     columns = (e.unknowns, e.shown, e.labels, e.values.tolist(), e.intervals().tolist(), e.deviations().tolist())
-    for unknown, shown, label, value, (low, high), deviation in zip(*columns, strict=True):
+    noise = noise_deviations(e).tolist()
+    for unknown, shown, label, value, (low, high), deviation, own in zip(*columns, noise, strict=True):
         finding, one = findings.get(label), of_profile.get(label)
         interval = (low, high)
         if one is not None:
@@ -113,6 +118,7 @@ def conclude(
                 value=value * shown.factor,
                 unit=shown.unit,
                 interval=(interval[0] * shown.factor, interval[1] * shown.factor),
+                repeatability=NORMAL_95 * own * shown.factor * (abs(value) if unknown.relative else 1.0),
                 of_interest=of_interest,
                 standing=Standing.NOT_IDENTIFIED if why_not else certain,
                 why_not=why_not,
@@ -125,6 +131,21 @@ def conclude(
             )
         )
     return tuple(found)
+
+
+def noise_deviations(e: Estimate) -> Floats:
+    """Standard deviations by the sensors' noise alone, relative or in the unknown's unit; inf if not identified.
+
+    With the information M of samples and prior, of which P is the prior's, noise moves the estimate by the covariance
+    M⁻¹ (M − P) M⁻¹: what the prior is about is the same in every run.
+    """
+    spectrum = Spectrum(e.information)
+    inverse = spectrum.inverse()
+    inverse[spectrum.lost, spectrum.lost] = 0.0
+    covariance = inverse if e.prior is None else inverse - inverse @ e.prior @ inverse
+    deviations: Floats = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    deviations[spectrum.lost] = math.inf
+    return deviations
 
 
 def _doubts(

@@ -8,26 +8,61 @@ then the change is reported as one that may be the model's.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
+import msgspec
 from scipy import special
 
 from emb_bench.estimate.records import Estimate
 from emb_bench.experiment.theta import MAX_JSON_BYTES
-from emb_runtime.config.validation import Rules, Table, shown
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
 
 LEVEL = 0.05  # Chance that anything at all is called a drift where there is none
 SMALLEST = 1e-200  # Smallest value that another one is compared with relatively
 LONG = 80  # Most characters shown of a text in the document
-RULES = Rules(UsageError, LONG, remedy="write it with emb-replay estimate --json")
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """One parameter of an earlier estimate."""
+
+    value: float
+    deviation_relative: bool
+    deviation: Annotated[float, msgspec.Meta(ge=0.0)] | None = None  # Relative or in the value's unit; None: unknown
+
+    def __post_init__(self) -> None:
+        """Refuse a share of nothing."""
+        if self.deviation_relative and abs(self.value) < SMALLEST:
+            raise ValueError("expected a deviation that is relative only to a value not zero")
+
+    @property
+    def absolute(self) -> float:
+        """Standard deviation in the value's unit; inf if it was not identified."""
+        spread = math.inf if self.deviation is None else self.deviation
+        return spread * abs(self.value) if self.deviation_relative else spread
+
+
+class Named(msgspec.Struct, frozen=True):
+    """One record of an earlier estimate."""
+
+    name: str
+
+
+class Earlier(msgspec.Struct, frozen=True):
+    """What is compared of an earlier estimate's JSON document."""
+
+    parameters: Annotated[dict[str, Entry], msgspec.Meta(min_length=1)]
+    model: str = ""
+    model_fits: bool = False
+    records: tuple[Named, ...] = ()
+
+
+class _Report(msgspec.Struct, frozen=True):
+    estimate: Earlier | None = None
 
 
 class Doubt(StrEnum):
@@ -59,35 +94,32 @@ class Drift:
     last_model: str  # Model of the earlier estimate
 
 
-def read_last(path: Path) -> dict[str, Any]:
-    """Document of an earlier estimate, as written by ``emb-replay estimate --json`` or ``emb-replay report``.
+def read_last(path: Path) -> Earlier:
+    """An earlier estimate, as written by ``emb-replay estimate --json`` or, in a report, by ``emb-replay report``.
 
     Raises:
         UsageError: the file cannot be read, or is no such document.
     """
     try:
-        found = json.loads(read_text(path, MAX_JSON_BYTES))
+        text = read_text(path, MAX_JSON_BYTES).encode()
+        return msgspec.json.decode(text, type=_Report).estimate or msgspec.json.decode(text, type=Earlier)
     except OSError as err:
         raise UsageError(f"--last {path}: {err.strerror}") from err
-    except (ValueError, RecursionError) as err:  # JSONDecodeError, UnicodeDecodeError, a number of 5,000 digits
-        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate, and it is none") from err
-    if isinstance(found, dict) and isinstance(found.get("estimate"), dict):
-        found = found["estimate"]  # a report has more around it
-    _values(found, f"--last {path}")
-    return dict(found)
+    except (ValueError, msgspec.MsgspecError, RecursionError) as err:  # also UnicodeDecodeError
+        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: {_printable(str(err))}") from err
 
 
-def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
+def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
     """Compare what all records share with an earlier estimate, as far as both have it.
 
     Args:
         now: the estimate.
-        last: document of an earlier one.
+        last: an earlier one.
 
     Raises:
-        UsageError: it is no such document, or has no parameter in common with this one.
+        UsageError: it has no parameter in common with this one.
     """
-    then = _values(last)
+    then = last.parameters
     common = [i for i in now.shared() if i in now.wanted() and now.labels[i] in then]
     if not common:
         raise UsageError(
@@ -95,14 +127,15 @@ def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
             f"{', '.join(now.labels)}"
         )
     limit = float(special.ndtri(1.0 - 0.5 * LEVEL / len(common)))
-    since, doubts, model = _since(last), _doubts(now, last), _printable(str(last.get("model")))
+    since = tuple(_printable(record.name) for record in last.records)
+    doubts, model = _doubts(now, last), _printable(last.model)
     deviations = now.deviations()
     found = []
     for i in common:
         name, relative, (_, unit, factor) = now.labels[i], now.unknowns[i].relative, now.shown[i]
         value = float(now.values[i]) * factor
         deviation = float(deviations[i]) * (abs(value) if relative else factor)
-        before, deviation_before = then[name]
+        before, deviation_before = then[name].value, then[name].absolute
         both, change = math.hypot(deviation_before, deviation), value - before
         size = abs(before) if relative else 1.0
         sigmas = change / both if 0.0 < both < math.inf else 0.0
@@ -128,15 +161,9 @@ def drifts(now: Estimate, last: Mapping[str, Any]) -> tuple[Drift, ...]:
     return tuple(found)
 
 
-def comparable(now: Estimate, last: Mapping[str, Any]) -> str:
+def comparable(now: Estimate, last: Earlier) -> str:
     """Reasons why a change since an earlier estimate may be one of the model; empty if there is none."""
     return "; ".join(_doubts(now, last))
-
-
-def _since(last: Mapping[str, Any]) -> tuple[str, ...]:
-    records = last.get("records")
-    entries = records if isinstance(records, list) else []
-    return tuple(_printable(r["name"]) for r in entries if isinstance(r, dict) and isinstance(r.get("name"), str))
 
 
 def _printable(text: str) -> str:
@@ -144,31 +171,10 @@ def _printable(text: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in text[-LONG:])
 
 
-def _doubts(now: Estimate, last: Mapping[str, Any]) -> tuple[Doubt, ...]:
+def _doubts(now: Estimate, last: Earlier) -> tuple[Doubt, ...]:
     reasons = {
-        Doubt.DID_NOT_FIT: last.get("model_fits") is not True,
+        Doubt.DID_NOT_FIT: not last.model_fits,
         Doubt.DOES_NOT_FIT: not now.validation.fits,
-        Doubt.OTHER_MODEL: last.get("model") != now.plant.name,
+        Doubt.OTHER_MODEL: last.model != now.plant.name,
     }
     return tuple(doubt for doubt, holds in reasons.items() if holds)
-
-
-def _values(last: object, source: str = "the earlier estimate") -> dict[str, tuple[float, float]]:
-    """Values and standard deviations by name; a deviation that is null is infinite."""
-    document = Table(source, "", last, RULES)
-    parameters = document.table("parameters")
-    if not parameters.names():
-        raise document.fail("parameters", "expected what was estimated, and there is nothing")
-    found = {}
-    for name in parameters.names():
-        entry = parameters.table(name)
-        value, relative = entry.number("value"), entry.get("deviation_relative", "true or false")
-        if not isinstance(relative, bool):
-            raise entry.fail("deviation_relative", f"expected true or false, got {shown(relative)}")
-        if relative and abs(value) < SMALLEST:
-            raise entry.fail("deviation", "expected one that is relative only to a value not zero")
-        spread = math.inf
-        if entry.get("deviation") is not None:
-            spread = entry.number("deviation", lambda d: d >= 0.0, "a number that is not negative")
-        found[name] = (value, spread * abs(value) if relative else spread)
-    return found

@@ -39,23 +39,23 @@ class Growth:
     shown: Floats = field(repr=False)  # Angle [rad] and velocity [rad/s] that the model predicts, shape (n, 2)
 
     def document(self) -> dict[str, Any]:
-        """JSON document of everything but the prediction."""
+        """Everything but the prediction, by unknown where it is of one."""
+        by_label = zip(self.labels, self.outputs.tolist(), strict=True)
         return {
-            "unknowns": list(self.labels),
-            "time": self.time.tolist(),
-            "log_det": self.log_det.tolist(),
-            "lambda_min": self.lambda_min.tolist(),
-            "cramer_rao": {label: self.deviations[:, i].tolist() for i, label in enumerate(self.labels)},
+            "unknowns": self.labels,
+            "time": self.time,
+            "log_det": self.log_det,
+            "lambda_min": self.lambda_min,
+            "cramer_rao": dict(zip(self.labels, self.deviations.T, strict=True)),
             "share_of_outputs": {
-                label: {"angle": angle, "velocity": velocity}
-                for label, (angle, velocity) in zip(self.labels, self.outputs.tolist(), strict=True)
+                label: {"angle": angle, "velocity": velocity} for label, (angle, velocity) in by_label
             },
             "parts": {
-                "borders": self.borders.tolist(),
-                "log_det_gain": self.gains.tolist(),
-                "share": {label: self.parts[:, i].tolist() for i, label in enumerate(self.labels)},
+                "borders": self.borders,
+                "log_det_gain": self.gains,
+                "share": dict(zip(self.labels, self.parts.T, strict=True)),
             },
-            "information_of_samples": self.samples.tolist(),
+            "information_of_samples": self.samples,
         }
 
 

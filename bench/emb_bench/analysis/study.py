@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from emb_bench.analysis.apart import Differing, apart
 from emb_bench.analysis.bootstrap import Bootstrap, bootstrap
 from emb_bench.analysis.conclusion import Conclusion, conclude
-from emb_bench.analysis.drift import Drift, drifts
+from emb_bench.analysis.drift import Drift, Earlier, drifts
 from emb_bench.analysis.held_out import HeldOut, leave_one_out
 from emb_bench.analysis.held_out import held_out as predict
 from emb_bench.analysis.model_choice import ModelChoice, choose_model, fit_from
@@ -39,6 +40,7 @@ from emb_bench.experiment.evaluation import default_model, other_sample_time
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import RunLog
+from emb_bench.numbers import amount
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import DEFAULT_PLANT, EVERY, Plant
 from emb_runtime.errors import UsageError
@@ -77,7 +79,7 @@ class StudyOptions:
         return with_systematic(self.asked, bench, plant) if self.systematic else self.asked
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Study:
     """Result of a study: the estimate from logs of one brake, its checks and the conclusions."""
 
@@ -102,6 +104,41 @@ class Study:
     choice: ModelChoice | None = None  # Models that were compared; None if one was given
     growth: ModelGrowth | None = None  # The path to the model; None if it was not grown
     apart: tuple[Differing, ...] = ()  # Parameters in which logs differ that each fit alone; empty if they fit together
+
+    def __repr__(self) -> str:
+        """Verdict and values in one line."""
+        values = ", ".join(f"{c.label} = {amount(c.value, c.interval, c.unit)}" for c in self.conclusions)
+        logs, model = ", ".join(file_names(self.logs)), self.estimate.plant.name
+        return f"<Study of {logs}: model '{model}' {self.standing}; {values}>"
+
+    def _repr_html_(self) -> str:
+        """Verdict and values as a table of a notebook."""
+        cells = ((c.label, amount(c.value, c.interval, c.unit), c.standing) for c in self.conclusions)
+        rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in cells)
+        head = "<tr><th></th><th>value &pm; total (95 %, k=2)</th><th></th></tr>"
+        verdict = f"model '{self.estimate.plant.name}' {self.standing}"
+        return f"<p>{escape(verdict)}</p><table>{head}{rows}</table>"
+
+    def __getitem__(self, label: str) -> Conclusion:
+        """Conclusion on a parameter, by its label."""
+        return {c.label: c for c in self.conclusions}[label]
+
+    def to_dataframe(self) -> Any:
+        """A pandas frame with a row for each parameter; ends of intervals and repeatability in the unit of the value.
+
+        Raises:
+            UsageError: pandas is missing.
+        """
+        try:
+            import pandas as pd
+        except ImportError as err:
+            raise UsageError("a data frame needs pandas: pip install pandas") from err
+        rows = [
+            {"value": c.value, "low": c.interval[0], "high": c.interval[1], "repeatability": c.repeatability,
+             "unit": c.unit, "identified": c.identified}
+            for c in self.conclusions
+        ]  # fmt: skip
+        return pd.DataFrame(rows, index=[c.label for c in self.conclusions])
 
     @property
     def model_fits(self) -> bool:
@@ -165,7 +202,7 @@ def make_study(
     wanted: StudyOptions,
     *,
     held_out: Sequence[RunLog] = (),
-    last: Mapping[str, Any] | None = None,
+    last: Earlier | None = None,
 ) -> Study:
     """Estimates from logs, checks the model and draws the conclusions.
 
@@ -174,7 +211,7 @@ def make_study(
         logs: of one brake, at least one.
         wanted: method and extent.
         held_out: logs of the same brake that are predicted, not estimated from.
-        last: document of an earlier estimate, from :func:`emb_bench.analysis.drift.read_last`.
+        last: an earlier estimate.
 
     Raises:
         UsageError: logs do not go together, one run is given twice, or they are too few for the options.

@@ -176,12 +176,12 @@ def _of_the_estimate(e: Estimate, evaluation: Evaluation, truth: BrakeParameters
     conclusions = conclude(e, profiles(e, of_all=False), (), ())
     for i, said, deviation in zip(e.wanted(), conclusions, deviations, strict=True):
         name, factor = e.unknowns[i].name, e.shown[i].factor  # the columns of all rows are in SI units
-        value, low, high = (shown / factor for shown in (said.value, *said.interval))
+        value, low, high, noise = (shown / factor for shown in (said.value, *said.interval, said.repeatability))
         true = _true(truth, name)
         scale = deviation * (abs(value) if is_relative(name) else 1.0)
         error = None if true is None or not 0.0 < scale < math.inf else (value - true) / scale
         parameters.append(
-            Parameter(name, said.identified, bounds[name], value, low, high, deviation, true, error_sigmas=error)
+            Parameter(name, said.identified, bounds[name], value, low, high, deviation, noise, true, error)
         )
     return {
         "fits": e.validation.fits,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -13,8 +13,9 @@ from emb_bench.analysis.constancy import Constancy, constancy
 from emb_bench.analysis.random_walk import RandomWalk, random_walk
 from emb_bench.batch.row import NONE, Options, Parameter, Row, is_relative, unit_of
 from emb_bench.estimate.records import DONE, NORMAL_95
-from emb_bench.numbers import NOTHING
-from emb_bench.report.text import Table
+from emb_bench.numbers import NOTHING, plain
+from emb_bench.report.sentences import INTERVALS, p_value
+from emb_bench.report.text import Table, listed, wrapped
 
 SHOWN = 20  # Most failed logs, and most campaigns, in the text; the file has them all
 
@@ -35,6 +36,8 @@ class ParameterEstimates:
     runs: int
     median: float
     spread: float  # Half the distance between the quantiles that one standard deviation of a Gaussian reaches
+    total: float  # Median of half the 95 % intervals, of noise, systematic errors and what the records cannot exclude
+    repeatability: float  # The same, of the sensors' noise alone
     constancy: Constancy
     rms_error_sigmas: float | None  # Root mean square error in standard deviations; None if no run was simulated
     covered: float | None  # Share of the simulated runs whose 95 % interval holds the true value
@@ -224,6 +227,8 @@ def _estimates(used: Sequence[Parameter]) -> ParameterEstimates | None:
         runs=len(used),
         median=float(np.median(values)),
         spread=0.5 * float(high - low),
+        total=float(np.median([0.5 * ((p.high or 0.0) - (p.low or 0.0)) for p in used])),
+        repeatability=float(np.median([p.repeatability or 0.0 for p in used])),
         constancy=_constancy(used),
         rms_error_sigmas=float(np.sqrt(np.mean(errors**2))) if len(errors) else None,
         covered=float(np.mean(np.abs(errors) <= NORMAL_95)) if len(errors) else None,
@@ -263,32 +268,99 @@ def _folders(rows: Sequence[Row], options: Options) -> tuple[Folder, ...]:
     return tuple(sorted(found, key=lambda one: (one.start_time or 0, one.root, one.campaign)))
 
 
-def text(c: Campaign) -> str:
-    """The summary for a person; what went wrong comes first."""
-    from emb_bench.report.render import text as rendered
+def text(c: Campaign, *, verbose: bool = False) -> str:
+    """What failed, the parameters over all runs, and whether the runs agree; with ``verbose`` details of each."""
+    lines = []
+    if c.failed:
+        lines += [f"{len(c.failed)} of {c.logs} logs FAILED", *listed("  ", (str(r.error) for r in c.failed[:SHOWN]))]
+        lines += _more(c.failed, "error")
+    if not c.evaluated:
+        return "\n".join(lines)
+    lines += wrapped(
+        f"{c.result}: {c.evaluated} of {c.logs} logs evaluated, {c.incomplete} incomplete, {c.violating} beyond a "
+        f"limit of the bench, {len(c.misfit)} not explained by the model ({', '.join(c.models)})"
+    )
+    lines += ["", *parameter_table(c).lines()]
+    if c.method != NONE:
+        lines += wrapped("Medians of all runs; mean: weighted by information. " + INTERVALS, 0)
+    lines += ["", *listed("", filter(None, (_agreement(name, p) for name, p in c.parameters.items())))]
+    lines += [*listed("NOTE: ", _notes(c)), *_more(c.misfit, "fits")]
+    return "\n".join([*lines, *(_trends(c) if verbose else ()), *(_means(c) if verbose else ())]).rstrip()
 
-    return rendered("campaign.txt.j2", c=c, parameters=parameter_table(c) if c.evaluated else None, shown=SHOWN)
+
+def _more(rows: Sequence[Row], column: str) -> list[str]:
+    left = len(rows) - SHOWN
+    return [f"  and {left} more: column '{column}' of the result"] if left > 0 else []
+
+
+def _agreement(name: str, p: ParameterSummary) -> str:
+    """Whether the runs agree on a parameter; empty where there is one run or no estimate was asked for."""
+    if p.estimate is None:
+        return ""
+    found = p.estimate.constancy
+    if found.runs < 2:
+        return ""
+    if found.constant:
+        return f"{name}: the runs agree ({p_value(found.p_value)})"
+    return (
+        f"{name}: the runs do NOT agree ({p_value(found.p_value)}): they scatter {found.scatter:.3g} times as much as "
+        "their uncertainties allow"
+    )
+
+
+def _notes(c: Campaign) -> Iterator[str]:
+    yield from (f"{row.log} is a copy of {row.copy_of}: the run counts once" for row in c.copies)
+    unused = "" if c.method == NONE else ", and it is not in the means"
+    yield from (f"{row.log}: the model '{row.model}' does not fit{unused}" for row in c.misfit[:SHOWN])
+    yield from (
+        f"{row.log} was stopped ({row.exit_reason}); it counts where it identifies a parameter" for row in c.stopped
+    )
+    if len(c.models) > 1:
+        yield "the runs are of different models: use --model, or name the logs of one"
+
+
+def _trends(c: Campaign) -> Iterator[str]:
+    """Parameters over time."""
+    found = {name: p for name, p in c.parameters.items() if p.trend is not None}
+    if found:
+        yield from ("", "in the last run, if a parameter walks at random between the runs")
+    for name, p in found.items():
+        if p.trend is not None:
+            (value, half), q = p.trend.last, p.trend.walk.walk
+            walk = f"walk of {q:.2g} {p.unit} per root of an hour" if q > 0.0 else "no drift found"
+            yield f"  {name}  {value:.6g} ± {half:.2g} {p.unit}; {walk}"
+
+
+def _means(c: Campaign) -> Iterator[str]:
+    """Means by folder, where there are several."""
+    found = [one for one in c.campaigns if one.means]
+    if len(found) > 1:
+        yield from ("", "weighted means ± 95 % by folder, the earliest first")
+        for one in found[-SHOWN:]:
+            means = (f"{name} {m.mean:.6g} ± {NORMAL_95 * m.deviation:.2g}" for name, m in one.means.items())
+            yield from wrapped(f"  {one.campaign} ({one.logs}): {', '.join(means)}")
 
 
 def parameter_table(c: Campaign) -> Table:
     """Table of the parameters, over all runs."""
-    header = ["parameter", "identified", "bound"]
     estimated = c.method != NONE
-    header += ["runs", "median", "spread", "mean", "± 95 %", "chi2/n", "covered"] if estimated else []
+    header = ["parameter", "identified"] + (["mean", "total", "repeatability", "chi2/n"] if estimated else ["bound"])
     rows = []
     for name, p in c.parameters.items():
-        bound = math.nan if p.cramer_rao is None else p.cramer_rao.median
-        row = [f"{name} [{p.unit}]", str(p.identified), f"{100.0 * bound:.3g} %" if p.relative else f"{bound:.3g}"]
-        if estimated and (e := p.estimate) is None:
-            row += ["0", *[NOTHING] * 6]
-        elif estimated and e is not None:
-            mean, runs = e.constancy, e.constancy.runs
-            row += [str(e.runs), f"{e.median:.6g}", f"{e.spread:.2g}", f"{mean.mean:.7g}"]
-            row += [f"{NORMAL_95 * mean.deviation:.2g}", f"{mean.scatter**2:.3g}" if runs > 1 else NOTHING]
-            row.append(NOTHING if e.covered is None else f"{100.0 * e.covered:.0f} %")
-        rows.append(row)
-    title = (
-        "identified: in so many logs; runs: those that the model fits and that identify the parameter; "
-        "mean: weighted by the information of each"
-    )
-    return Table(title if estimated else "", header, rows)
+        row = [f"{name} [{p.unit}]", f"{p.identified} of {c.evaluated}"]
+        if not estimated:
+            bound = math.nan if p.cramer_rao is None else p.cramer_rao.median
+            rows.append([*row, _share(bound, 1.0 if p.relative else 0.0)])
+            continue
+        if p.estimate is None:
+            rows.append([*row, *[NOTHING] * 4])
+            continue
+        mean, size = p.estimate.constancy, p.estimate.median if p.relative else 0.0
+        row += [f"{mean.mean:.7g}", *(_share(half, size) for half in (p.estimate.total, p.estimate.repeatability))]
+        rows.append([*row, f"{mean.scatter**2:.3g}" if mean.runs > 1 else NOTHING])
+    return Table("", header, rows)
+
+
+def _share(half: float, size: float) -> str:
+    """Half an interval: in percent of a size, or as it is where the size is 0."""
+    return f"{plain(100.0 * half / abs(size), 2)} %" if size else plain(half, 2)

@@ -26,7 +26,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
     p.add_argument("recording", type=Path, metavar="FILE", help="the recording")
     p.add_argument("--map", type=Path, required=True, metavar="FILE", help="map file")
-    p.add_argument("-o", "--out", type=Path, required=True, metavar="RUN", help="log to make; never overwritten")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="log to make; never overwritten")
     p.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -38,13 +38,13 @@ def run(args: argparse.Namespace) -> int:
     """
     from emb_bench.recordings.run_file import import_recording
 
-    found = import_recording(args.recording, args.map, args.out)
+    found = import_recording(args.recording, args.map, args.output)
     periods, t_s = int(found.step[-1]), found.sample_time
     if args.json:
-        document = {"log": str(args.out), "samples": len(found.step), "periods": periods, "sample_time": t_s}
+        document = {"log": str(args.output), "samples": len(found.step), "periods": periods, "sample_time": t_s}
         show(as_json({**document, "lacks": list(found.lacks)}))
         return EXIT_DONE
-    show(f"{args.out}: {len(found.step)} samples, {periods * t_s:g} s at {t_s:g} s")
+    show(f"{args.output}: {len(found.step)} samples, {periods * t_s:g} s at {t_s:g} s")
     for lack in found.lacks:
         show(f"  - {lack}")
     return EXIT_DONE

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from importlib import metadata
 from typing import NamedTuple
 
-from emb_runtime.errors import EmbError, UsageError
+from emb_runtime.errors import EmbError
 from emb_runtime.system.terminal import complain
 
 ANY = {0: "done", 2: "usage: wrong argument, a file that cannot be read or written, a missing library", 130: "Ctrl-C"}
@@ -122,18 +122,16 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         module.add_arguments(command)
-        command.set_defaults(run=module.run)
+        command.set_defaults(start=module.run)
     return p
 
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of ``emb-replay``."""
     argv = sys.argv[1:] if argv is None else argv
-    if argv[:1] == ["compare"]:  # this message is for version 0.2 only
-        return complain("emb-replay", UsageError("compare is a study now: in a clone, python -m studies.comparison"))
-    args = parser(argv[0] if argv and argv[0] in COMMANDS else None).parse_args(argv)
     try:
-        return int(args.run(args))
+        args = parser(argv[0] if argv and argv[0] in COMMANDS else None).parse_args(argv)
+        return int(args.start(args))
     except EmbError as err:
         return complain("emb-replay", err)
 

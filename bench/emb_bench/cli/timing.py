@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from emb_bench.cli.answer import add_output_options, answer
 from emb_bench.figures import COLOURS, ENDINGS, GREY, drawn, require_place
 from emb_bench.logs.log import read_log
 from emb_bench.logs.timing import INTERVALS, Timing
 from emb_bench.report.timing import SHOWN, document, run_timing, text
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE
-from emb_runtime.system.terminal import as_json, show
 
 HELP = "how punctual runs were, judged by the bench's budgets"
 DESCRIPTION = """\
@@ -25,8 +25,8 @@ deciding, sending, sensor to command, and the time to spare until the answer wou
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
     p.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="MCAP files of emb-run")
-    p.add_argument("--json", action="store_true", help="print JSON, a list of logs; times in seconds")
-    p.add_argument("--figure", type=Path, metavar="FILE", help="histograms of all runs together; .png, .svg or .pdf")
+    add_output_options(p)
+    p.add_argument("--plot", type=Path, metavar="FILE", help="histograms of all runs together; .png, .svg or .pdf")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -36,14 +36,15 @@ def run(args: argparse.Namespace) -> int:
         UsageError: a file cannot be read, or the figure cannot be written.
         LogError: a log is none, or too damaged.
     """
-    require_place("--figure", args.figure, ENDINGS)
+    require_place("--plot", args.plot, ENDINGS)
     found = [run_timing(read_log(path)) for path in args.logs]
-    if args.figure is not None:
-        _draw(args.figure, [entry.timing for entry in found])
-    if args.json:
-        show(as_json({"logs": [document(entry) for entry in found]}))
-    else:
-        show("\n\n".join(text(entry) for entry in found))
+    if args.plot is not None:
+        _draw(args.plot, [entry.timing for entry in found])
+    answer(
+        args,
+        lambda: {"logs": [document(entry) for entry in found]},
+        lambda all_of_it: "\n\n".join(text(entry, verbose=all_of_it) for entry in found),
+    )
     codes = {entry.exit_code for entry in found}
     return next(code for code in (EXIT_CHECK_FAILED, EXIT_USAGE, EXIT_DONE) if code in codes)
 

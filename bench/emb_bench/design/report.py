@@ -94,7 +94,7 @@ def check(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, curr
     )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Report:
     """A search and what came out."""
 
@@ -107,6 +107,11 @@ class Report:
     version: str
     found: Found
     checks: tuple[Check, ...]  # Its own brake first
+
+    def __repr__(self) -> str:
+        """Criterion and value in one line."""
+        value = self.criterion.value(self.found.best.phi)
+        return f"<Report of a {self.criterion.name}-optimal design: {self.criterion.label} {value:.6g}>"
 
     def bounds(self) -> dict[str, float] | None:
         """Cramér-Rao bounds of the unknowns, if the information is physical."""
@@ -236,7 +241,7 @@ def read_design(path: Path, bench: Bench) -> tuple[Floats, str]:
             metadata = json.loads(str(file["metadata"]))
             made_for, label = str(metadata["contract_hash"]), f"{metadata['criterion']}-optimal design"
     except _UNREADABLE as err:
-        raise UsageError(f"{path}: expected a design that emb-design --out wrote as .npz, and it is none") from err
+        raise UsageError(f"{path}: expected a design that emb-design wrote as .npz, and it is none") from err
     if made_for != bench.contract_hash:
         raise UsageError(f"{path}: made for another bench: pass it with --bench, or search the design again")
     if current.shape != (bench.timing.horizon + 1,) or not np.isfinite(current).all():

@@ -68,7 +68,7 @@ class Question:
         return start
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Evaluation:
     """The Fisher information of one recorded experiment, and how well the model fits."""
 
@@ -85,6 +85,11 @@ class Evaluation:
     """Periods after which the information was kept, the last one among them; all of them if they are not too many."""
     histories: Mapping[Kind, Floats]
     """The FIM after each of them, shape (instants, p, p), by kind; the physical one begins at the prior."""
+
+    def __repr__(self) -> str:
+        """Log, model and bounds in one line."""
+        bounds = ", ".join(f"{name} {bound:.3g}" for name, bound in self.fisher("physical").cramer_rao().items())
+        return f"<Evaluation of {self.log.path.name}: model '{self.plant.name}'; least deviations {bounds}>"
 
     def fisher(self, kind: Kind) -> Fisher:
         """The Fisher information of the whole experiment."""

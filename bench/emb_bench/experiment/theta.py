@@ -10,14 +10,16 @@ from typing import Any
 from emb_bench.brake.parameters import SI
 from emb_bench.brake.quantities import Quantity, quantity
 from emb_bench.experiment.model_evaluator import NO_ERRORS, SystematicErrors
+from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import RunLog
 from emb_bench.sim.plant_spec import check_near_nominal, parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
 from emb_runtime.config.validation import shown
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import LogError, UsageError
 from emb_runtime.system.input_file import read_text
 
+LOG = "log"  # Name of the last running estimate in the log
 MAX_JSON_BYTES = 64 * 2**20  # Size limit of the JSON of an estimate or a report
 
 
@@ -25,8 +27,9 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
     """The name of the parameters to evaluate at, the parameters, and the systematic errors estimated with them.
 
     Args:
-        choice: ``nominal``, ``true``, ``name=value,name=value``, a TOML file with the same, or the JSON of an estimate
-            or a report; the others are nominal.
+        choice: ``log`` for the last running estimate in the log, empty for that or nominal where there is none,
+            ``nominal``, ``true``, ``name=value,name=value``, a TOML file with the same, or the JSON of an estimate or
+            a report; the others are nominal.
         log: may contain the true ones.
         bench: contains the nominal ones.
 
@@ -34,8 +37,14 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
         UsageError: the file cannot be read, or has other contents; a value is far from nominal; or the log does not
             know the true parameters.
     """
-    if choice == "nominal":
-        return choice, bench.brake, NO_ERRORS
+    if choice in ("", LOG):
+        values = _running(log, bench)
+        if values:
+            return LOG, bench.brake._replace(**values), NO_ERRORS
+        if choice:
+            raise UsageError("--theta log: expected a running estimate in the log, and there is none")
+    if choice in ("", "nominal"):
+        return "nominal", bench.brake, NO_ERRORS
     if choice == "true":
         if log.truth is None:
             raise UsageError("--theta true: this log does not know the brake's true parameters, only a simulated one's")
@@ -49,6 +58,17 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
     for name, value in values.items():
         check_near_nominal(bench, name, value, f"{choice}: ")
     return Path(choice).name, bench.brake._replace(**values), errors
+
+
+def _running(log: RunLog, bench: Bench) -> dict[str, float]:
+    """The last running estimate in a log; empty without one, or where a value can be no brake's."""
+    try:
+        values = {name: float(entry["value"]) for name, entry in last_estimate(log).items() if name in PARAMETER_NAMES}
+        for name, value in values.items():
+            check_near_nominal(bench, name, value)
+    except (LogError, UsageError):
+        return {}
+    return values
 
 
 def _from_file(path: str, log: RunLog, bench: Bench) -> tuple[dict[str, float], SystematicErrors]:

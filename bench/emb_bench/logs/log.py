@@ -129,7 +129,7 @@ class _Tables(Mapping[str, Table]):
         return len(self._log.topics)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RunLog:
     """The content of one log. A message that cannot be decoded is refused when it is requested."""
 
@@ -142,6 +142,10 @@ class RunLog:
     span: tuple[int, int]  # First and last publish time of the messages [Unix ns]
     chunks: Iterable[Chunk] = field(repr=False)  # Those of the file that are whole
     topics: Mapping[str, _Topic] = field(repr=False)  # The topics that can be decoded, by name
+
+    def __repr__(self) -> str:
+        """Path, end and completeness in one line."""
+        return f"<RunLog {self.path}: {self.exit_reason}, {'complete' if self.complete else self.missing}>"
 
     @cached_property
     def tables(self) -> Mapping[str, Table]:

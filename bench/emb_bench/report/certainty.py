@@ -1,18 +1,16 @@
-"""Figures of an estimate: its uncertainty, and the minima of the local searches."""
+"""Figures of the uncertainty of an estimate."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from emb_bench.analysis.bootstrap import Bootstrap
 from emb_bench.analysis.profile import LEVEL, Profile
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.records import End, Estimate
+from emb_bench.estimate.records import Estimate
 from emb_bench.figures import COLOURS, DASHED, svg
 from emb_bench.report.figures import WIDE
 from emb_runtime.config.bench import BrakeParameters
@@ -21,7 +19,6 @@ ELLIPSES = 6  # Most unknowns whose ellipses are drawn; more would be too small 
 JOINT_95 = math.sqrt(-2.0 * math.log(0.05))
 """Standard deviations of the ellipse that holds 95 % of a Gaussian in the plane: χ² with two degrees of freedom."""
 ACROSS = 4  # Most panels side by side
-Deviated = Callable[[Floats], Floats]
 _POWERS = (-1, 4)  # of ten, beyond which the axis has a common one: its numbers would touch
 
 
@@ -95,91 +92,26 @@ def ellipses(e: Estimate, truth: BrakeParameters | None) -> bytes:
 
 
 def profiles(found: Sequence[Profile], e: Estimate) -> bytes:
-    """Rise of χ² over each unknown, beside the parabola that the Fisher information stands for."""
-
-    def draw(axis: Any, n: int, values: Deviated, sigma: float) -> None:
-        x = values(found[n].values)
-        axis.axhline(LEVEL, **DASHED)
-        if 0.0 < sigma < math.inf:
-            along = np.linspace(float(x.min()), float(x.max()), 120)
-            axis.plot(along, (along / sigma) ** 2, color=COLOURS[4], linewidth=1.0)
-        axis.plot(x, found[n].rise, ".-", color=COLOURS[0], markersize=4)
-        axis.set_ylim(-0.4, max(8.0, 1.2 * LEVEL))
-        if n % ACROSS == 0:
-            axis.set_ylabel("rise of chi2")
-
-    return _of_each(e, e.cramer_rao(), [p.label for p in found], 2.3, draw)
-
-
-def waterfall(ends: Sequence[End]) -> bytes:
-    """χ² where each local search ended, best first."""
-    cost = np.array([end.cost for end in ends])
-    converged = np.array([end.converged for end in ends])
+    """Rise of χ² over the distance from the estimate, beside the parabola that the Fisher information stands for."""
+    columns, rows = min(len(found), ACROSS), -(-len(found) // ACROSS)
 
     def draw(axes: Any) -> None:
-        axis, number = axes[0, 0], np.arange(1, len(cost) + 1)
-        axis.plot(number, cost, color="#cccccc", zorder=1)
-        axis.plot(number[converged], cost[converged], "o", color=COLOURS[0], markersize=5, label="converged")
-        if not converged.all():
-            axis.plot(number[~converged], cost[~converged], "x", color=COLOURS[1], markersize=6, label="gave up")
-        if cost.min() > 0.0 and cost.max() > 2.0 * cost.min():
-            axis.set_yscale("log")
-        else:
-            middle, half = 0.5 * (cost.max() + cost.min()), 0.6 * (cost.max() - cost.min())
-            axis.set_ylim(middle - max(half, 5.0), middle + max(half, 5.0))
-            axis.ticklabel_format(useOffset=False)
-        axis.set_xlabel("local search, best first")
-        axis.set_ylabel("chi2")
-        axis.set_xticks(number)
-        axis.legend(loc="upper left")
-
-    return svg(draw, 1, 1, (WIDE, 2.0))
-
-
-def bootstrap(found: Bootstrap, e: Estimate) -> bytes:
-    """Histograms of the bootstrap estimates, and the Gaussian of the estimate's standard deviations."""
-
-    def draw(axis: Any, n: int, values: Deviated, sigma: float) -> None:
-        x = values(found.values[:, n])
-        counts, _, _ = axis.hist(x, bins="auto", color=COLOURS[4], density=True)
-        if 0.0 < sigma < math.inf and counts.size:
-            along = np.linspace(min(-4.0 * sigma, x.min()), max(4.0 * sigma, x.max()), 160)
-            density = np.exp(-0.5 * (along / sigma) ** 2) / (sigma * math.sqrt(2.0 * math.pi))
-            axis.plot(along, density, color=COLOURS[0], linewidth=1.1)
-        axis.set_yticks([])
-
-    return _of_each(e, e.deviations(), found.labels, 2.0, draw)
-
-
-def _of_each(
-    e: Estimate,
-    deviations: Floats,
-    labels: Sequence[str],
-    height: float,
-    draw: Callable[[Any, int, Deviated, float], None],
-) -> bytes:
-    """Panels of some unknowns, each over the distance from its estimate; ``height`` of each [inch].
-
-    ``draw`` gets the axis, the number of the unknown, a function from its values to that distance, and its entry of
-    ``deviations`` in the same unit.
-    """
-    columns, rows = min(len(labels), ACROSS), -(-len(labels) // ACROSS)
-
-    def panels(axes: Any) -> None:
-        for axis in axes.flat[len(labels) :]:
+        for axis in axes.flat[len(found) :]:
             axis.set_visible(False)
-        for n, (axis, label) in enumerate(zip(axes.flat, labels, strict=False)):
-            i = e.labels.index(label)
-            sigma = float(deviations[i]) * (100.0 if e.unknowns[i].relative else e.shown[i].factor)
-            draw(axis, n, partial(_distance, e, i), sigma)
-            axis.set_xlabel(f"{label} [{unit(e, i)}]")
+        for n, (axis, profile) in enumerate(zip(axes.flat, found, strict=False)):
+            i = e.labels.index(profile.label)
+            sigma = float(e.cramer_rao()[i]) * (100.0 if e.unknowns[i].relative else e.shown[i].factor)
+            x = (profile.values - e.values[i]) * scales(e)[i]
+            axis.axhline(LEVEL, **DASHED)
+            if 0.0 < sigma < math.inf:
+                along = np.linspace(float(x.min()), float(x.max()), 120)
+                axis.plot(along, (along / sigma) ** 2, color=COLOURS[4], linewidth=1.0)
+            axis.plot(x, profile.rise, ".-", color=COLOURS[0], markersize=4)
+            axis.set_ylim(-0.4, max(8.0, 1.2 * LEVEL))
+            if n % ACROSS == 0:
+                axis.set_ylabel("rise of chi2")
+            axis.set_xlabel(f"{profile.label} [{unit(e, i)}]")
             axis.locator_params(axis="x", nbins=3)
             axis.ticklabel_format(axis="x", style="sci", scilimits=_POWERS)
 
-    return svg(panels, rows, columns, (WIDE, height * rows))
-
-
-def _distance(e: Estimate, i: int, values: Floats) -> Floats:
-    """Values of an unknown less its estimate, in the unit shown."""
-    result: Floats = (values - e.values[i]) * scales(e)[i]
-    return result
+    return svg(draw, rows, columns, (WIDE, 2.3 * rows))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.analysis.acceptance import Acceptance, Criteria, Result, RunFacts, judge
+from emb_bench.analysis.drift import Earlier
 from emb_bench.analysis.growth import Growth, growth
 from emb_bench.analysis.study import Study, StudyOptions, begun_with, make_study, was_stopped
+from emb_bench.documents import to_json
 from emb_bench.estimate.prediction import too_few
 from emb_bench.estimate.records import DONE
 from emb_bench.experiment.experiment import Experiment
@@ -179,7 +181,7 @@ def gather(
     made_by: str,
     *,
     held_out: Sequence[RunLog] = (),
-    last: Mapping[str, Any] | None = None,
+    last: Earlier | None = None,
     criteria: Criteria | None = None,
 ) -> Content:
     """Estimates from the logs that have an experiment, and states for each other log why it is not used.
@@ -191,7 +193,7 @@ def gather(
         wanted: method and extent of the study.
         made_by: name and version of the tool.
         held_out: logs that are predicted, not estimated from.
-        last: document of an earlier estimate.
+        last: an earlier estimate.
         criteria: of an acceptance test.
 
     Raises:
@@ -324,20 +326,23 @@ class ActiveCycles:
 def document(content: Content) -> dict[str, Any]:
     """JSON document with the content of the page; numbers may be infinite."""
     study = content.study
-    return {
-        "made_by": content.made_by,
-        "acceptance": None if content.acceptance is None else content.acceptance.document(),
-        "model_fits": None if study is None else study.model_fits,
-        "predicts": None if study is None else study.predicts,
-        "why_no_estimate": content.why_not,
-        "left_out": [{"log": str(entry.path), "why": entry.words} for entry in content.left_out],
-        "estimate": None if study is None else estimate_report.document(study),
-        "runs": [_run_document(run, study) for run in content.runs],
-    }
+    found: dict[str, Any] = to_json(
+        {
+            "made_by": content.made_by,
+            "acceptance": None if content.acceptance is None else content.acceptance.document(),
+            "model_fits": None if study is None else study.model_fits,
+            "predicts": None if study is None else study.predicts,
+            "why_no_estimate": content.why_not,
+            "left_out": [{"log": entry.path, "why": entry.words} for entry in content.left_out],
+            "estimate": None if study is None else estimate_report.document(study),
+            "runs": [_run_document(run, study) for run in content.runs],
+        }
+    )
+    return found
 
 
 def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
-    said: dict[str, Any] = {
+    found: dict[str, Any] = {
         "began": run.began,
         "simulated": run.simulated,
         "why_not_estimated": run.why_not,
@@ -345,33 +350,25 @@ def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
         "info": info_document(run.log),
         "timing": None if run.timing is None else timing.document(run.timing),
     }
-    if run.experiment is not None:
-        said["experiment"] = {
-            "planned": run.experiment.planned,
-            "periods": len(run.experiment.currents),
-            "measured": int(run.experiment.measured.sum()),
-            "braked_periods": run.experiment.braked,
-            "command_delay": run.experiment.command_delay,
-            "missing": list(run.experiment.missing),
-            "notes": list(run.experiment.notes),
-            "applied_current": run.experiment.currents.tolist(),
-            "angle": run.experiment.all_samples[:, 0].tolist(),
-            "velocity": run.experiment.all_samples[:, 1].tolist(),
+    x, alone = run.experiment, run.alone
+    if x is not None:
+        named = ("planned", "command_delay", "missing", "notes")
+        found["experiment"] = {name: getattr(x, name) for name in named} | {
+            "periods": len(x.currents),
+            "measured": x.measured.sum(),
+            "braked_periods": x.braked,
+            "applied_current": x.currents,
+            "angle": x.all_samples[:, 0],
+            "velocity": x.all_samples[:, 1],
         }
-    if run.alone is not None:
-        said["alone"] = {
-            "model_fits": run.alone.model_fits,
-            "conclusions": [
-                {"label": c.label, "value": c.value, "interval_95": list(c.interval), "identified": c.identified}
-                for c in run.alone.conclusions
-            ],
-        }
+    if alone is not None:
+        found["alone"] = {"model_fits": alone.model_fits, "conclusions": alone.conclusions}
     if run.residuals is not None:
-        said["residuals"] = {"angle": run.residuals[:, 0].tolist(), "velocity": run.residuals[:, 1].tolist()}
+        found["residuals"] = {"angle": run.residuals[:, 0], "velocity": run.residuals[:, 1]}
     if run.growth is not None and study is not None:
         final = criteria(run.growth.samples, run.growth.labels, run.growth.params)
-        said["information"] = {
+        found["information"] = {
             **run.growth.document(),
-            "of_samples": {"log_det": final.log_det, "lambda_min": final.lambda_min, "verdict": final.verdict()},
+            "of_samples": {"log_det": final.log_det, "lambda_min": final.lambda_min},
         }
-    return said
+    return found

@@ -2,157 +2,217 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from emb_bench.analysis.study import Study, file_names
-from emb_bench.estimate.records import METHODS
-from emb_bench.estimate.suspects import explained
+from emb_bench.documents import to_json
+from emb_bench.estimate.records import METHODS, Estimate
+from emb_bench.estimate.suspects import explained, shown_as
 from emb_bench.information.identifiability import schur_complement
-from emb_bench.report import render, tables
-from emb_bench.report.render import phrase
+from emb_bench.numbers import signed
+from emb_bench.report import sentences as say
+from emb_bench.report import tables
+from emb_bench.report.text import Table, facts, listed, wrapped
+
+NOTICED = 2.0  # Standard deviations from which on an effect that is no alarm is named
+
+
+def text(study: Study, *, verbose: bool = False) -> str:
+    """Verdict, parameters, what limits them, next step; with ``verbose`` the evidence, too."""
+    lines = [
+        *listed("WARNING: ", study.warnings),
+        *wrapped(say.headline(study)),
+        *listed("  - ", _against(study)),
+        *listed("NOTE: ", _notes(study)),
+        "",
+        *tables.parameters(study, brief=True).lines(),
+        *listed("  - ", _remarks(study)),
+        *wrapped(say.INTERVALS, 0),
+        "",
+        *listed("", _limits(study)),
+        *_next(study),
+    ]
+    return "\n".join([*lines, *(_evidence(study) if verbose else ())])
+
+
+def _against(study: Study) -> Iterator[str]:
+    """Reasons against the model."""
+    if not study.biased:
+        yield from study.estimate.validation.alarms
+    yield from (f"{h.name}: {say.held_out(h)}" for h in (*study.held_out, *study.left_out) if not h.fits)
+
+
+def _notes(study: Study) -> list[str]:
+    """What qualifies the values."""
+    apart = [say.apart(study)] if study.apart else []
+    return [*study.notes, *apart, say.models(study), *study.estimate.caveats]
+
+
+def _remarks(study: Study) -> Iterator[str]:
+    """What the table does not say: doubts of parameters, trade-offs and changes, each for all that it holds for."""
+    said: dict[str, list[str]] = {}
+    for c in study.conclusions:
+        remarks = [c.why_not, f"trades off with {', '.join(c.traded_with)}" if c.traded_with else ""]
+        remarks += [say.drift(c.drift)] if c.drift is not None else []
+        if text := "; ".join(filter(None, remarks)):
+            said.setdefault(text, []).append(c.label)
+    yield from (f"{', '.join(labels)}: {text}" for text, labels in said.items())
+
+
+def _limits(study: Study) -> Iterator[str]:
+    """What the intervals are limited by, and effects that the residuals hint at."""
+    e = study.estimate
+    by: dict[str, list[str]] = {}
+    for i in e.wanted():
+        if (suspect := e.left_open_by(i)) is not None and e.open()[i] > e.cramer_rao()[i]:
+            by.setdefault(shown_as(suspect, e.bench.machine).name, []).append(e.labels[i])
+    if by:
+        yield "limited by  " + ", ".join(f"{name} ({', '.join(labels)})" for name, labels in by.items())
+    if tested := e.validation.suspects:
+        hints = [f"{s.name} {signed(s.sigmas, '+.1f')}" for s in tested if abs(s.sigmas) >= NOTICED and s.p_value < 0.5]
+        if not hints:
+            yield f"effects     {len(tested)} tested, none above {NOTICED:g} sigma"
+        elif not e.validation.suspected:
+            yield f"effects     {', '.join(hints[:4])} sigma, below the level of an alarm"
+
+
+def _next(study: Study) -> list[str]:
+    """The next step, or several to choose from."""
+    found = [*say.remedies(study), *(say.recommendation(r) for r in study.advice[:1])]
+    if study.stopped:
+        found = [say.warned(study)]
+    logs = " ".join(file_names(study.logs)[:3]) + (" ..." if len(study.logs) > 3 else "")
+    found = found or [f"emb-replay report {logs} -o report.html   (-v: the evidence)"]
+    return listed("next: ", found) if len(found) == 1 else ["next", *listed("  - ", found)]
+
+
+def _evidence(study: Study) -> Iterator[str]:
+    """Tests and tables behind the answer."""
+    e, m = study.estimate, study.estimate.validation
+    measured = (
+        f"{name}: {record.measured.sum()} of {len(record.currents)} samples"
+        for name, record in zip(file_names(study.logs), e.records, strict=True)
+    )
+    expected = f"{m.ratio:.4g} of {m.freedom}, {m.expected[0]:.3f} to {m.expected[1]:.3f} expected"
+    yield ""
+    yield from facts(
+        *(("record", said) for said in measured),
+        ("method", f"{METHODS[e.method]}, model {e.plant.name} ({study.model_reason})"),
+        ("prior", say.prior(e)),
+        ("chi2/n", f"{expected} ({say.p_value(m.chi2_p)})"),
+    )
+    yield from listed("NOTE: ", () if study.biased else m.notes)
+    yield ""
+    correlation, pairs = tables.correlation(e)
+    found: list[Table | None] = [
+        *(tables.growth_path(study), tables.models(study), tables.errors(study), tables.deviations(study)),
+        *(tables.residual_tests(study), tables.suspects(e), tables.systematic(e), tables.predicted(study)),
+        *(correlation, tables.bootstrap(study), tables.minima(study)),
+    ]
+    for table in found:
+        yield from [] if table is None else table.text("  ")
+    yield from listed("NOTE: ", [say.pairs(pairs) if pairs else "", say.once(study)])
+    yield from listed("", say.directions(e.verdict()))
+    profiles = (p.scaled(e.factor(p.label)) for p in study.profiles)
+    yield from listed("", (f"profile of {p.label}: {say.profile(p, e)}" for p in profiles))
+    yield from listed("also: ", map(say.recommendation, study.advice[1:]))
 
 
 def document(study: Study) -> dict[str, Any]:
     """Everything about a study; numbers may be infinite."""
-    e, m, verdict, b = study.estimate, study.estimate.validation, study.estimate.verdict(), study.bootstrap
-    drifts, wanted = {d.name: phrase("drift", d) for d in study.drifts}, e.wanted()
-    factors = np.array([quantity.factor for quantity in e.shown])
-    shared = np.array([e.factor(label) for label in b.labels]) if b is not None else factors
-    return {
+    e, choice = study.estimate, study.choice
+    wanted, validation = e.wanted(), e.validation
+    found = {
         "method": METHODS[e.method],
         "method_name": e.method,
-        "caveats": list(e.caveats),
-        "process_noise": e.process_noise,
-        "load_noise": e.load_noise,
         "model": e.plant.name,
-        "model_reason": study.model_reason,
-        "model_fits": study.model_fits,
-        "predicts": study.predicts,
-        "warnings": list(study.warnings),
-        "notes": list(study.notes),
         "records": [
-            {"name": str(path), "periods": len(r.currents), "measured": int(r.measured.sum())}
+            {"name": path, "periods": len(r.currents), "measured": r.measured.sum()}
             for path, r in zip(study.logs, e.records, strict=True)
         ],
-        "params": list(e.asked.params),
-        "nuisances": list(e.asked.nuisances),
-        "systematic": {
-            e.labels[i]: {
-                "value": float(e.values[i]),
-                "deviation": float(e.deviations()[i]),
-                "deviation_before": e.asked.systematic[unknown.name],
-            }
-            for i, unknown in enumerate(e.unknowns)
-            if unknown.name in e.asked.systematic
-        },
+        "params": e.asked.params,
+        "nuisances": e.asked.nuisances,
+        "systematic": _systematic(e),
         "prior": e.asked.prior.name if e.asked.prior else None,
-        "bounds": {name: list(pair) for name, pair in e.asked.bounds.items()},
+        "bounds": e.asked.bounds,
         "misfit": {
-            "chi2": m.chi2,
-            "freedom": m.freedom,
-            "chi2_per_freedom": m.ratio,
-            "expected": list(m.expected),
-            "p_value": m.chi2_p,
-            "whiteness": {name: asdict(test) for name, test in m.whiteness.items()},
-            "independence": {name: asdict(test) for name, test in m.independence.items()},
-            "suspects": [_fields(s, "name", "value", "sigmas", "p_value") for s in m.suspects],
+            **_fields(validation, "chi2", "freedom", "expected", "whiteness", "independence", "alarms", "notes"),
+            "chi2_per_freedom": validation.ratio,
+            "p_value": validation.chi2_p,
+            "suspects": [_fields(s, "name", "value", "sigmas", "p_value") for s in validation.suspects],
             "suspected": [
                 _fields(s, "name", "value", "sigmas", "p_value") | {"words": explained(s, e.bench.machine)}
-                for s in m.suspected
+                for s in validation.suspected
             ],
-            "suspects_together": None if m.together is None else _fields(m.together, "statistic", "p_value"),
-            "alarms": list(m.alarms),
-            "notes": list(m.notes),
+            "suspects_together": validation.together and _fields(validation.together, "statistic", "p_value"),
         },
-        "held_out": [asdict(h) | {"words": phrase("held_out", h)} for h in study.held_out],
-        "left_out": [asdict(h) | {"words": phrase("held_out", h)} for h in study.left_out],
-        "theta": e.theta._asdict(),
         "parameters": _parameters(study),
-        "conclusions": [
-            _fields(c, "label", "value", "unit")
-            | {"interval": list(c.interval)}
-            | {"of_interest": c.of_interest, "identified": c.identified, "why_not": c.why_not}
-            | {"words": phrase("conclusion", c)}
-            for c in study.conclusions
+        "models": [
+            _fields(c, "fits", "deviance", "aic", "bic", "weight")
+            | {"model": c.name, "held_out_log_density": c.held_out, "changes": choice.changes(c)}
+            | {"chi2_per_freedom": c.estimate.validation.ratio}
+            for c in (choice.candidates if choice is not None else ())
+            if choice is not None
         ],
-        "apart": [asdict(one) for one in study.apart],
-        "models": _models(study),
-        "models_left_out": list(study.choice.same) if study.choice is not None else [],
-        "not_told_apart": None
-        if study.choice is None or len(study.choice.left_over) < 2
-        else {"models": [c.name for c in study.choice.left_over], "words": phrase("models", study)},
-        "growth": [asdict(one) for one in study.growth.rounds] if study.growth is not None else [],
+        "models_left_out": choice.same if choice is not None else (),
+        "not_told_apart": [c.name for c in choice.left_over] if choice and len(choice.left_over) > 1 else None,
+        "growth": study.growth.rounds if study.growth is not None else (),
         "correlation": {
             "names": [e.labels[i] for i in wanted],
-            "matrix": e.correlation()[np.ix_(wanted, wanted)].tolist(),
+            "matrix": e.correlation()[np.ix_(wanted, wanted)],
         },
-        "information": schur_complement(e.information, wanted).tolist(),
-        "identified": study.identified,
-        "directions": [asdict(direction) for direction in verdict.directions],
-        "left_to_prior": [dict(shares) for shares in verdict.left_to_prior],
-        "advice": [
-            _fields(r, "excitation", "direction", "before", "after") | {"words": phrase("recommendation", r)}
-            for r in study.advice
-        ],
-        "drifts": [
-            _fields(d, "name", "last", "last_deviation", "now", "deviation", "relative_change", "sigmas", "drifted")
-            | {"words": drifts[d.name]}
-            for d in study.drifts
-        ],
+        "information": schur_complement(e.information, wanted),
+        "directions": e.verdict().directions,
+        "left_to_prior": e.verdict().left_to_prior,
         "profiles": [
-            {
-                "label": p.label,
-                "values": p.values.tolist(),
-                "rise": p.rise.tolist(),
-                "interval_95": list(p.interval),
-                "shape": p.shape,
-                "words": phrase("profile", p, e),
-            }
+            _fields(p, "label", "values", "rise", "shape") | {"interval_95": p.interval}
             for p in (own.scaled(e.factor(own.label)) for own in study.profiles)
         ],
-        "bootstrap": None
-        if b is None
-        else {
-            "labels": list(b.labels),
-            "draws": len(b.values) + b.failed,
-            "failed": b.failed,
-            "intervals_95": dict(zip(b.labels, (b.intervals * shared[:, None]).tolist(), strict=True)),
-            "deviations": dict(zip(b.labels, (b.deviations * shared).tolist(), strict=True)),
-        },
+        "bootstrap": _bootstrap(study),
         "starts": [
-            {
-                "cost": end.cost,
-                "values": dict(zip(e.labels, np.multiply(end.values, factors).tolist(), strict=True)),
-                "from": dict(zip(e.labels, np.multiply(end.start, factors).tolist(), strict=True)),
-                "converged": end.converged,
-                "evaluations": end.evaluations,
-            }
+            _fields(end, "cost", "converged", "evaluations")
+            | {"values": _shown(e, end.values), "from": _shown(e, end.start)}
             for end in e.ends
         ],
     }
+    of_study = ("warnings", "notes", "model_reason", "model_fits", "predicts", "identified", "conclusions", "drifts")
+    found |= _fields(study, *of_study, "held_out", "left_out", "apart", "advice")
+    document: dict[str, Any] = to_json(found | _fields(e, "caveats", "process_noise", "load_noise", "theta"))
+    return document
 
 
-def _models(study: Study) -> list[dict[str, Any]]:
-    """Models that were compared, best first; empty if one was given."""
-    choice = study.choice
-    return [
-        {
-            "model": c.name,
-            "fits": c.fits,
-            "chi2_per_freedom": c.estimate.validation.ratio,
-            "deviance": c.deviance,
-            "aic": c.aic,
-            "bic": c.bic,
-            "held_out_log_density": c.held_out,
-            "weight": c.weight,
-            "changes": [asdict(change) for change in choice.changes(c)],
-        }
-        for c in (choice.candidates if choice is not None else ())
-        if choice is not None
-    ]
+def _fields(record: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(record, name) for name in names}
+
+
+def _shown(e: Estimate, values: tuple[float, ...]) -> dict[str, float]:
+    """Values of the unknowns by label, in the units that they are shown in."""
+    return {label: value * shown.factor for label, value, shown in zip(e.labels, values, e.shown, strict=True)}
+
+
+def _systematic(e: Estimate) -> dict[str, Any]:
+    """Systematic errors that were estimated with the parameters."""
+    return {
+        label: {"value": value, "deviation": deviation, "deviation_before": e.asked.systematic[unknown.name]}
+        for unknown, label, value, deviation in zip(e.unknowns, e.labels, e.values, e.deviations(), strict=True)
+        if unknown.name in e.asked.systematic
+    }
+
+
+def _bootstrap(study: Study) -> dict[str, Any] | None:
+    b = study.bootstrap
+    if b is None:
+        return None
+    factors = np.array([study.estimate.factor(label) for label in b.labels])
+    return {
+        **_fields(b, "labels", "failed"),
+        "draws": len(b.values) + b.failed,
+        "intervals_95": dict(zip(b.labels, b.intervals * factors[:, None], strict=True)),
+        "deviations": dict(zip(b.labels, b.deviations * factors, strict=True)),
+    }
 
 
 def _parameters(study: Study) -> dict[str, dict[str, Any]]:
@@ -162,56 +222,20 @@ def _parameters(study: Study) -> dict[str, dict[str, Any]]:
     for i, c in zip(e.wanted(), study.conclusions, strict=True):
         unknown = e.unknowns[i]
         factor = 1.0 if unknown.relative else e.shown[i].factor
-        used, bound, robust, left_open = (factor * column[i] for column in columns)
-        finding = findings.get(c.label)
+        used, bound, robust, model = (factor * column[i] for column in columns)
+        suspect = e.left_open_by(i)
         found[c.label] = {
-            "value": c.value,
-            "unit": c.unit,
-            "interval_95": list(c.interval),
-            "deviation": float(used),
+            **_fields(c, "value", "unit", "repeatability", "identified", "why_not"),
+            "interval_95": c.interval,
+            "deviation": used,
             "deviation_relative": unknown.relative,
-            "cramer_rao": float(bound),
-            "sandwich": float(robust),
-            "left_open": float(left_open),
-            "left_open_by": None if (suspect := e.left_open_by(i)) is None else suspect.name,
-            "identified": c.identified,
-            "why_not": c.why_not,
-            "traded_with": {} if finding is None else dict(finding.traded_with),
+            "cramer_rao": bound,
+            "sandwich": robust,
+            "left_open": model,
+            "left_open_by": None if suspect is None else suspect.name,
+            "traded_with": findings[c.label].traded_with if c.label in findings else {},
             "at_bound": c.label in e.at_bound,
         }
         if study.truth is not None and hasattr(study.truth, unknown.name):
             found[c.label]["true"] = getattr(study.truth, unknown.name)
     return found
-
-
-def _fields(record: object, *names: str) -> dict[str, Any]:
-    return {name: getattr(record, name) for name in names}
-
-
-def text(study: Study) -> str:
-    """Text of a study: warnings, conclusions, recommended runs, and then their evidence."""
-    e = study.estimate
-    correlation, pairs = tables.correlation(e)
-    shared = {e.labels[i] for i in e.shared()}
-    said = [c for c in study.conclusions if c.label in shared or not c.identified]
-    return render.text(
-        "estimate.txt.j2",
-        study=study,
-        e=e,
-        records=list(zip(file_names(study.logs), e.records, strict=True)),
-        said=said,
-        width=max(9, *(len(c.label) + 2 for c in said)),
-        values=tables.values(study),
-        deviations=tables.deviations(study),
-        tests=tables.residual_tests(study),
-        suspects=tables.suspects(e),
-        systematic=tables.systematic(e),
-        predicted=tables.predicted(study),
-        models=tables.models(study),
-        growth=tables.growth_path(study),
-        bootstrap=tables.bootstrap(study),
-        correlation=correlation,
-        pairs=pairs,
-        minima=tables.minima(study),
-        verdict=e.verdict(),
-    )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from emb_bench.analysis.growth import Growth
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.quantities import angle, command, velocity
-from emb_bench.estimate.model_validation import LAGS, NEIGHBOURS, OUTPUTS
+from emb_bench.estimate.model_validation import OUTPUTS
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.figures import COLOURS, DASHED, GREY, log_scale, svg
 from emb_bench.logs.timing import Timing
@@ -208,79 +208,13 @@ def residuals(run: Run, errors: Floats) -> Panel:
     return Panel(svg(draw, 1, 1, (PANEL, 2.6)), shows)
 
 
-def residual_correlations(run: Run, errors: Floats) -> list[Panel]:
-    """Correlation of the residuals with each other and with the current, of each output.
-
-    Args:
-        run: with its experiment.
-        errors: NaN where lost, shape (n, 2).
-    """
-    assert run.experiment is not None
-    currents, panels = run.experiment.currents, []
-    for i, name in _measured(errors):
-
-        def draw(axes: Any, i: int = i, name: str = name) -> None:
-            axes[0, 0].set_title(f"residuals of the {name}")
-            _bars(axes[0, 0], autocorrelation(errors[:, i], NEIGHBOURS), "residuals this many periods apart", i, 1)
-            _bars(axes[1, 0], crosscorrelation(errors[:, i], currents, LAGS), "current this many periods before", i, 0)
-            for axis in axes[:, 0]:
-                axis.set_ylabel("correlation")
-
-        shows = f"Correlation of the residuals of the {name} with each other and with the current"
-        panels.append(Panel(svg(draw, 2, 1, (PANEL, 3.6)), shows))
-    return panels
-
-
 def _measured(errors: Floats) -> list[tuple[int, str]]:
     """Numbers and names of the outputs with any residuals: a velocity that an observer derives has none."""
     return [(i, name) for i, name in enumerate(OUTPUTS) if np.isfinite(errors[:, i]).any()]
 
 
-def _bars(axis: Any, values: tuple[Floats, float], label: str, colour: int, first: int) -> None:
-    correlations, bound = values
-    axis.axhspan(-bound, bound, color=_BAND, zorder=0)
-    axis.axhline(0.0, **FAINT)
-    axis.vlines(np.arange(first, first + len(correlations)), 0.0, correlations, color=COLOURS[colour], linewidth=3)
-    top = max(0.3, 1.15 * float(np.abs(correlations).max(initial=0.0)), 1.3 * bound)
-    axis.set_ylim(-top, top)
-    axis.set_xlabel(label)
-    axis.locator_params(axis="x", integer=True)
-
-
-def autocorrelation(errors: Floats, lags: int) -> tuple[Floats, float]:
-    """Correlation of residuals 1, 2, ... lags apart, pairs with a lost sample left out, and its 95 % bound at chance.
-
-    Args:
-        errors: NaN where lost, shape (n,).
-        lags: at most n - 1 of them.
-    """
-    e, seen = np.nan_to_num(errors), np.isfinite(errors)
-    total = float(e @ e)
-    kept = range(1, min(lags, len(e) - 1) + 1)
-    found = np.array([float(e[lag:] @ e[:-lag]) / total if total > 0.0 else 0.0 for lag in kept])
-    return found, 1.96 / max(int(seen.sum()), 1) ** 0.5
-
-
-def crosscorrelation(errors: Floats, currents: Floats, lags: int) -> tuple[Floats, float]:
-    """Correlation of the residuals with the current 0, 1, ... periods before, and its 95 % bound at chance.
-
-    Args:
-        errors: NaN where lost, shape (n,).
-        currents: shape (n,).
-        lags: how many.
-    """
-    seen = np.isfinite(errors)
-    found = []
-    for lag in range(min(lags, len(errors))):
-        a, b = errors[lag:][seen[lag:]], currents[: len(currents) - lag][seen[lag:]]
-        a, b = a - a.mean() if len(a) else a, b - b.mean() if len(b) else b
-        size = float(np.linalg.norm(a) * np.linalg.norm(b))
-        found.append(float(a @ b) / size if size > 0.0 else 0.0)
-    return np.array(found), 1.96 / max(int(seen.sum()), 1) ** 0.5
-
-
 def information(growth: Growth) -> list[Panel]:
-    """Log det, smallest eigenvalue and Cramér-Rao bounds over time, and the share of each part of the run."""
+    """Log det and Cramér-Rao bounds over time, and the share of each part of the run."""
     time = 1e3 * growth.time
 
     def over_time(axis: Any) -> None:
@@ -290,14 +224,6 @@ def information(growth: Growth) -> list[Panel]:
     def log_det(axes: Any) -> None:
         axes[0, 0].plot(time, np.where(np.isfinite(growth.log_det), growth.log_det, np.nan), color=COLOURS[0])
         axes[0, 0].set_title("log det of the physical information")
-        over_time(axes[0, 0])
-
-    def smallest(axes: Any) -> None:
-        least = np.where(growth.lambda_min > 0.0, growth.lambda_min, np.nan)
-        axes[0, 0].plot(time, least, color=COLOURS[2])
-        axes[0, 0].set_title("its smallest eigenvalue")
-        if np.isfinite(least).any():
-            log_scale(axes[0, 0].yaxis)
         over_time(axes[0, 0])
 
     def deviations(axes: Any) -> None:
@@ -318,7 +244,6 @@ def information(growth: Growth) -> list[Panel]:
 
     return [
         Panel(svg(log_det, 1, 1, (PANEL, 2.5)), "Growth over time of the log det of the information"),
-        Panel(svg(smallest, 1, 1, (PANEL, 2.5)), "Growth over time of the smallest eigenvalue of the information"),
         Panel(svg(deviations, 1, 1, (PANEL, 2.5)), "Cramér-Rao bounds of all unknowns over time"),
         Panel(
             svg(lambda axes: _parts(axes[0, 0], growth), 1, 1, (PANEL, 2.5)),
@@ -328,7 +253,7 @@ def information(growth: Growth) -> list[Panel]:
 
 
 def learnt(run: Run, steps: NDArray[np.int64], numbers: Floats) -> list[Panel]:
-    """Ranges of the parameters that the shield left as possible over time, and those of angle and velocity.
+    """Ranges of the parameters that the shield left as possible over time.
 
     Args:
         run: its bench gives the sample time.
@@ -337,11 +262,7 @@ def learnt(run: Run, steps: NDArray[np.int64], numbers: Floats) -> list[Panel]:
     """
     time = 1e3 * run.bench.timing.sample_time * steps
 
-    def over_time(axis: Any) -> None:
-        axis.set_xlim(0.0, float(time[-1]) or 1.0)
-        axis.set_xlabel("time [ms]")
-
-    def parameters(axes: Any) -> None:
+    def draw(axes: Any) -> None:
         axis = axes[0, 0]
         for i, name in enumerate(PARAMETER_NAMES):
             low, high = numbers[:, 2 * i], numbers[:, 2 * i + 1]
@@ -350,25 +271,11 @@ def learnt(run: Run, steps: NDArray[np.int64], numbers: Floats) -> list[Panel]:
                 axis.plot(time, end, color=COLOURS[i], linewidth=1.0, label=label)
         axis.set_title("possible parameters, relative to nominal")
         axis.legend(ncols=4, loc="upper right", columnspacing=0.8, handlelength=1.2)
-        over_time(axis)
+        axis.set_xlim(0.0, float(time[-1]) or 1.0)
+        axis.set_xlabel("time [ms]")
 
-    def states(axes: Any) -> None:
-        axis = axes[0, 0]
-        for colour, (at, label) in enumerate(((8, "angle [mrad]"), (10, "velocity [rad/s]"))):
-            half = 0.5 * (numbers[:, at + 1] - numbers[:, at]) * (1e3 if at == 8 else 1.0)
-            axis.plot(time, half, color=COLOURS[colour], label=label)
-        axis.set_title("half width of the possible states")
-        axis.set_ylim(0.0, None)
-        axis.legend(loc="upper right")
-        over_time(axis)
-
-    return [
-        Panel(
-            svg(parameters, 1, 1, (PANEL, 2.7)),
-            "Ranges of the four parameters that the shield left as possible, over time",
-        ),
-        Panel(svg(states, 1, 1, (PANEL, 2.7)), "Half widths of the possible angles and velocities over time"),
-    ]
+    shows = "Ranges of the four parameters that the shield left as possible, over time"
+    return [Panel(svg(draw, 1, 1, (PANEL, 2.7)), shows)]
 
 
 def _parts(axis: Any, growth: Growth) -> None:
@@ -390,15 +297,9 @@ def _parts(axis: Any, growth: Growth) -> None:
 
 
 def times(t: Timing) -> list[Panel]:
-    """Time from sample to command over the run and as a histogram, and a histogram of that from sample to sample."""
-    response, period = 1e6 * t.response, 1e6 * t.period
+    """Histograms of the times from sample to command and from sample to sample."""
+    period = 1e6 * t.period
     middle = float(np.median(period)) if len(period) else 0.0
-
-    def over_time(axes: Any) -> None:
-        axes[0, 0].plot(1e3 * t.times, response, ".", color=COLOURS[0], markersize=3)
-        axes[0, 0].set_xlabel("time [ms]")
-        axes[0, 0].set_ylabel("sensor to command [µs]")
-        axes[0, 0].set_ylim(0.0, 1.08 * float(response.max()) or 1.0)
 
     def histogram(axes: Any, values: Floats, label: str, colour: str) -> None:
         axis = axes[0, 0]
@@ -408,10 +309,10 @@ def times(t: Timing) -> list[Panel]:
         axis.set_xlabel(label)
         axis.set_ylabel("count")
 
-    panels = [Panel(svg(over_time, 1, 1, (PANEL, 2.4)), "Time from a sensor sample to its command over the run")]
+    panels = []
     for values, label, colour in (
-        (response, "sensor to command [µs]", COLOURS[0]),
-        (period - middle, f"sample to sample less {middle:.0f} µs [µs]", COLOURS[2]),
+        (1e6 * t.response, "sensor to command [µs]", COLOURS[0]),
+        (period - middle, f"sample to sample, minus {middle:.0f} µs [µs]", COLOURS[2]),
     ):
         if len(values):
             drawn = svg(partial(histogram, values=values, label=label, colour=colour), 1, 1, (PANEL, 2.4))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -14,10 +15,13 @@ from emb_bench.brake.quantities import quantity
 from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evenly
 from emb_bench.experiment.model_evaluator import KINDS, Fit
 from emb_bench.information.criteria import Criteria, criteria_series
-from emb_bench.numbers import in_samples
-from emb_bench.report.text import Table, facts
+from emb_bench.information.identifiability import Finding, combination
+from emb_bench.numbers import NOTHING, in_samples, plain
+from emb_bench.report import sentences as say
+from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.units import CURRENT
+from emb_runtime.estimator.estimate import NORMAL_95
 
 INSTANTS = 10  # Rows of the table over time; the document has more
 CRITERIA = {
@@ -83,29 +87,46 @@ def _numbers(c: Criteria) -> dict[str, Any]:
     }
 
 
-def text(e: Evaluation, why_this_model: str) -> str:
-    """The information for a person; what is missing comes before any number."""
-    fit = f"angle {e.fit.angle:.3g} sigma, velocity {e.fit.velocity:.3g} sigma"
-    lines = [
-        *(f"WARNING: {warning}" for warning in e.warnings),
-        *(f"NOTE: {note}" for note in e.notes),
-        *_heading(e),
-        *facts(
-            ("model", f"{e.plant.name} ({why_this_model})"),
-            ("model fit", f"{fit} (1 if it fits, {e.fit.expected:.2f} at most)"),
-        ),
-        *_unknowns(e.question),
-        "",
-    ]
+def text(e: Evaluation, *, verbose: bool = False) -> str:
+    """The best possible intervals; what is missing comes before any number. With ``verbose`` the criteria over time."""
+    doubts, lines = [*listed("WARNING: ", e.warnings), *listed("NOTE: ", e.notes)], _heading(e)
+    fit = f"angle {e.fit.angle:.3g}, velocity {e.fit.velocity:.3g} sigma; at most {e.fit.expected:.2f} if it fits"
+    lines += [*facts(("model", f"{e.plant.name} ({_why(e)}); {fit}")), *_unknowns(e.question)]
     if not e.fisher("weighted").matrix.any():  # which has no prior
-        return "\n".join([*lines, "nothing was excited: the record does not depend on any of these parameters"])
+        return "\n".join([*doubts, "no information: the record does not depend on any of these parameters", *lines])
+    verdict = e.verdict().shown(e.bench.machine)
+    bound = "best possible repeatability" if e.question.prior is None else "best possible, with the prior"
+    head = wrapped(f"{bound}: half of the 95 % interval (k=2), by sensor noise alone")
+    rows = [[f.name, _half(f), say.finding(f)] for f in verdict.findings]
+    head += [*(row.rstrip() for row in Table("", ("", "", ""), rows, words=(0, 2)).lines("  ")[1:])]
+    head += listed("  ", say.directions(verdict))
+    final = e.fisher("physical").criteria().shown(e.bench.machine)
+    shown = f"log det {final.log_det:.6g}, smallest eigenvalue {final.lambda_min:.4g}, condition {final.condition:.4g}"
+    lines = [*head, "", *lines, *facts(("information", shown))]
+    return "\n".join([*doubts, *lines, *(_details(e) if verbose else ())])
+
+
+def _why(e: Evaluation) -> str:
+    """Reason for the model."""
+    name, why = default_model(e.log)
+    return why if name == e.plant.name else "asked for"
+
+
+def _half(f: Finding) -> str:
+    """Half of the 95 % interval that a bound allows."""
+    if math.isinf(f.deviation):
+        return NOTHING
+    half = NORMAL_95 * f.deviation
+    return f"{plain(half)} {f.unit}" if f.unit else f"{plain(100.0 * half)} %"
+
+
+def _details(e: Evaluation) -> list[str]:
+    """Criteria of both informations, and how they grew."""
     final = {kind: e.fisher(kind).criteria().shown(e.bench.machine) for kind in KINDS}
     rows = [[label, *(f"{getattr(final[kind], name):.6g}" for kind in KINDS)] for label, name in CRITERIA.items()]
-    lines += [*Table("", ("Fisher information", *KINDS), rows).lines(), f"  {final['physical'].verdict()}", ""]
-    bound = "Cramer-Rao bound" if e.question.prior is None else "with the prior, to first order"
-    lines.append(f"{bound}: smallest standard deviation, and what the record identifies")
-    lines += [f"  {line}" for line in e.verdict().shown(e.bench.machine).text().splitlines()]
-    return "\n".join([*lines, "", *_over_time(e).lines()])
+    table = Table("", ("Fisher information", *KINDS), rows).lines()
+    weakest = f"least is known of {combination(final['physical'].weakest)}"
+    return ["", *table, *wrapped(f"  {weakest}"), "", *_over_time(e).lines()]
 
 
 def _over_time(e: Evaluation) -> Table:
@@ -122,37 +143,37 @@ def _over_time(e: Evaluation) -> Table:
         ]
         for k, det, least, trace, w in zip(steps, *physical, weighted.log_det, strict=True)
     ]
-    return Table("", ("time [ms]", "log det physical", "lambda_min", "tr M^-1", "log det weighted"), rows, words=())
+    return Table("", ("time [ms]", "log det", "lambda_min", "tr M^-1", "log det weighted"), rows, words=())
 
 
 def models_text(evaluations: Sequence[Evaluation]) -> str:
     """Fisher information of one record for every model of the brake, side by side, as text."""
     first = evaluations[0]
-    lines = [f"WARNING: {missing}" for missing in (first.log.missing, *first.experiment.missing) if missing]
+    lines = listed("WARNING: ", (first.log.missing, *first.experiment.missing))
     if not any(e.fit.fits for e in evaluations):
-        lines.append(f"WARNING: no model fits at {first.theta_name} parameters: they are not this brake's")
+        lines += wrapped(f"WARNING: no model fits at {first.theta_name} parameters: they are not this brake's")
     names = first.question.names
     shown = {name: quantity(first.bench.machine, name) for name in names}
-    lines += [
-        f"NOTE: {name} is zero in {', '.join(lacking)}: there it neither shows nor costs the others"
-        for name in names
-        if (lacking := [e.plant.name for e in evaluations if name in e.absent])
-    ]
+    lines += listed(
+        "NOTE: ",
+        (
+            f"{name} is zero in {', '.join(lacking)}: the data say nothing about it there"
+            for name in names
+            if (lacking := [e.plant.name for e in evaluations if name in e.absent])
+        ),
+    )
     rows = []
     for e in evaluations:
         fisher = e.fisher("physical")
-        c, bounds = fisher.criteria(), fisher.cramer_rao()
-        rows.append(
-            [
-                *(e.plant.name, f"{e.fit.angle:.3g}", f"{e.fit.velocity:.3g}", _fits(e.fit)),
-                *(f"{c.log_det:.3f}", f"{c.lambda_min:.4g}", f"{c.trace_inverse:.4g}"),
-                *(f"{bounds[name] * (shown[name].factor if name in UNITS else 100.0):.4g}" for name in names),
-            ]
-        )
-    header = ["model", "angle", "velocity", "fits", "log det", "lambda_min", "tr M^-1"]
+        bounds = fisher.cramer_rao()
+        halves = (NORMAL_95 * bounds[name] * (shown[name].factor if name in UNITS else 100.0) for name in names)
+        sizes = (f"{e.fit.angle:.3g}", f"{e.fit.velocity:.3g}", f"{fisher.criteria().log_det:.3f}")
+        rows.append([e.plant.name, _fits(e.fit), *sizes, *(f"{half:.4g}" for half in halves)])
+    header = ["model", "fits", "angle", "velocity", "log det"]
     header += [f"{shown[name].name} [{shown[name].unit if name in UNITS else '%'}]" for name in names]
-    title = "physical Fisher information, fit in sigmas, and the smallest standard deviation of each estimate"
-    lines += [*_heading(first), *_unknowns(first.question), "", title, *Table("", header, rows).lines()]
+    title = "residuals in sigma; best possible repeatability (half of the 95 % interval, k=2, by sensor noise alone)"
+    lines += [*_heading(first), *_unknowns(first.question), "", *wrapped(title, 0)]
+    lines += Table("", header, rows, words=(0, 1)).lines()
     if any(e.fit.loose for e in evaluations):
         lines.append("loose: the model expects more noise than there is, and its bounds are too large")
     if first.log.truth:
@@ -168,9 +189,10 @@ def _fits(fit: Fit) -> str:
 
 def _heading(e: Evaluation) -> list[str]:
     x, late, machine = e.experiment, e.experiment.command_delay, e.bench.machine
-    periods = f"{x.periods} of {x.planned} periods, {int(x.measured.sum())} samples"
-    if not e.log.imported:
-        periods += f", {x.braked} periods braked by the node"
+    run = "recording" if e.log.imported else e.log.exit_reason
+    run += f", {x.periods} of {x.planned} periods, {x.measured.sum()} samples"
+    run += f", {x.braked} braked by the node" if x.braked else ""
+    run += f"; commands acted {in_samples(late)} late" if late else ""
     if machine is None:
         theta = ", ".join(f"{name} = {getattr(e.theta, name):.4g}" for name in PARAMETER_NAMES)
     else:
@@ -179,14 +201,12 @@ def _heading(e: Evaluation) -> list[str]:
         known = ((quantity(machine, name), values[name]) for name in names)
         theta = ", ".join(f"{shown.name} = {value * shown.factor:.4g} {shown.unit}" for shown, value in known)
     return facts(
-        ("log", str(e.log.path)),
-        ("run", "a recording that was imported" if e.log.imported else e.log.exit_reason),
-        ("experiment", periods + (f"; commands acted {in_samples(late)} late" if late else "")),
+        ("log", f"{e.log.path}: {run}"),
         ("theta", f"{e.theta_name}: {theta}"),
     )
 
 
 def _unknowns(q: Question) -> list[str]:
-    also = f"{', '.join(q.nuisances)}; the criteria are those of the others (Ds)" if q.nuisances else ""
-    prior = f"the ranges '{q.prior.name}'; the physical information begins there" if q.prior is not None else ""
+    also = f"{', '.join(q.nuisances)}; log det is of the others (Ds)" if q.nuisances else ""
+    prior = f"the ranges '{q.prior.name}', in the physical information" if q.prior is not None else ""
     return facts(("unknown too", also), ("prior", prior))

@@ -6,39 +6,54 @@ from collections.abc import Mapping
 from typing import Any
 
 from emb_bench.logs.log import IMPORT
-from emb_bench.report.text import facts
-from emb_runtime.estimator.estimate import words
+from emb_bench.numbers import around
+from emb_bench.report.text import facts, listed, wrapped
+from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.system.terminal import one_line
 
 
-def text(d: Mapping[str, Any]) -> str:
-    """A :func:`emb_bench.logs.info.info_document` for a person; what is missing comes first."""
+def text(d: Mapping[str, Any], *, verbose: bool = False) -> str:
+    """A :func:`emb_bench.logs.info.info_document` for a person; with ``verbose`` all metadata and events."""
     d = _lines(d)
-    c, learnt, imported = d["cycles"], d.get("learnt", {}), IMPORT in d["metadata"]
-    lines = [f"WARNING: {d['missing']}"] if d["missing"] else []
+    learnt, imported = d.get("learnt", {}), IMPORT in d["metadata"]
+    lines = listed("WARNING: ", [d["missing"]])
+    lines += wrapped(
+        f"{d['log']}: {d['exit_reason']}{_why(d['metadata'].get('emb.end', {}))}, {d['duration']:.3f} s, log "
+        f"{'complete' if d['complete'] else 'NOT complete'}"
+    )
     lines += facts(
-        ("log", f"{d['log']} ({'complete' if d['complete'] else 'NOT complete'})"),
-        ("exit", f"{d['exit_reason']}{_why(d['metadata'].get('emb.end', {}))}"),
-        ("duration", f"{d['duration']:.3f} s"),
-        *(
-            (("samples", f"{c['active']}, of a recording that was imported"), *(("lacks", lack) for lack in d["lacks"]))
-            if imported
-            else _loop(c)
-        ),
+        *(_recording(d) if imported else _loop(d["cycles"])),
         ("largest", _largest(d.get("largest")) + (", in coordinates of the motor" if imported else "")),
         *(("drive lacks", f"{name}: {lost}") for name, lost in d.get("drive_lacks", {}).items()),
-        *(("estimate", line) for line in words(d.get("estimate", {}))),
-        *(("learnt", f"{name} {low:.4f} to {high:.4f} of nominal") for name, (low, high) in learnt.items()),
+        ("response", _delays(d)),
     )
-    if delays := d.get("sensor_to_command"):
-        simulated = " (simulated time)" if "emb.truth" in d["metadata"] else ""
-        quantiles = ", ".join(f"{name} {1e6 * value:.0f} us" for name, value in delays.items())
-        lines.append(f"sensor to command  {quantiles}{simulated}")
+    if estimate := d.get("estimate"):
+        lines += ["", *wrapped("estimated while running; ± is half of the 95 % interval, if the model is right", 0)]
+        lines += [
+            f"  {name}  {around(q['value'], NORMAL_95 * q['deviation'])} {q['unit']}" for name, q in estimate.items()
+        ]
+    lines += facts(*(("learnt", f"{name} {low:.4f} to {high:.4f} of nominal") for name, (low, high) in learnt.items()))
+    if not verbose:
+        return "\n".join(lines)
     lines += _listed("messages", {topic: f"{count:9}" for topic, count in d["messages"].items()})
     lines += _listed("attachments", {name: f"{size:9} bytes" for name, size in d["attachments"].items()})
     for name, record in d["metadata"].items():
         lines += _listed(name, record)
     return "\n".join([*lines, "", "events", *(f"  {event['code']:24} {event['text']}" for event in d["events"])])
+
+
+def _recording(d: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What an imported recording has and lacks."""
+    return [("samples", f"{d['cycles']['active']}, of a recording"), *(("lacks", lack) for lack in d.get("lacks", ()))]
+
+
+def _delays(d: Mapping[str, Any]) -> str:
+    """Time from a sample to the command that answers it."""
+    delays = d.get("sensor_to_command", {})
+    simulated = " (simulated time)" if "emb.truth" in d["metadata"] else ""
+    return (
+        ", ".join(f"{name} {1e6 * value:.0f}" for name, value in delays.items()) + f" µs{simulated}" if delays else ""
+    )
 
 
 def _loop(c: Mapping[str, int]) -> tuple[tuple[str, str], ...]:

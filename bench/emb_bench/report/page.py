@@ -17,7 +17,7 @@ from emb_bench.logs.timing import INTERVALS, Timing, quantiles
 from emb_bench.numbers import percent, plain, seconds, signed
 from emb_bench.report import certainty, figures, tables
 from emb_bench.report.content import REASONS, ActiveCycles, Content, Run, stop_samples
-from emb_bench.report.render import html, phrase, section
+from emb_bench.report.render import html, section
 from emb_bench.report.text import Table
 from emb_bench.report.trend import panels as trend_panels
 from emb_bench.report.trend import table as run_table
@@ -145,7 +145,7 @@ def _of_several_runs(content: Content) -> Iterator[Part]:
 
 def _next(study: Study) -> Iterator[Part]:
     """Recommended next step, where there is something to do."""
-    if study.advice or not study.holds or phrase("warned", study):
+    if study.advice or not study.holds or study.stopped:
         gains = [tables.gain(r) for r in study.advice]
         yield Part("next", "What to do next", section("estimate.html.j2", "next", study, gains))
 
@@ -174,7 +174,7 @@ def _of_all_runs(content: Content, study: Study) -> Iterator[Part]:
     checks = (tables.residual_tests(study), tables.suspects(e), tables.systematic(e), tables.predicted(study))
     yield part("model", "Does the model fit", "model", study, *checks, models)
     if study.drifts:
-        drifts = tables.drifts(study, [phrase("drift", d) for d in study.drifts])
+        drifts = tables.drifts(study)
         yield part("drift", "Since the last campaign", "one_table", drifts)
     runs = [(run.name, run.growth) for run in content.estimated if run.growth is not None]
     if len(runs) > 1:
@@ -183,11 +183,9 @@ def _of_all_runs(content: Content, study: Study) -> Iterator[Part]:
     drawn = {
         "ellipses": certainty.ellipses(e, study.truth) if len(drawable) > 1 else None,
         "profiles": certainty.profiles(study.profiles, e) if study.profiles else None,
-        "bootstrap": certainty.bootstrap(study.bootstrap, e) if study.bootstrap is not None else None,
-        "waterfall": certainty.waterfall(e.ends) if len(e.ends) > 1 else None,
     }
     labels = [e.labels[i] for i in drawable]
-    found = (*tables.correlation(e), tables.minima(study))
+    found = (*tables.correlation(e), tables.minima(study), tables.bootstrap(study))
     yield part("uncertainty", "Uncertainty", "certainty", study, labels, drawn, tables.deviations(study), *found)
 
 
@@ -203,9 +201,8 @@ def _of_a_run(run: Run, content: Content, prefix: str) -> Iterator[Part]:
         steps, numbers = history(run.log)
         drawn = figures.learnt(run, steps, numbers)
         yield part("learnt", "What the shield learnt", drawn, last_ranges(numbers), run.log.run)
-    if run.residuals is not None and run.experiment is not None and study is not None:
-        panels = figures.residual_correlations(run, run.residuals)
-        yield part("residuals", "Residuals", panels, _residuals(run.residuals), study.estimate.method)
+    if run.residuals is not None and study is not None:
+        yield part("residuals", "Residuals", _residuals(run.residuals), study.estimate.method)
     if run.growth is not None and study is not None:
         panels = figures.information(run.growth)
         yield part("information", "Information", panels, *_information(run.growth), study.estimate)

@@ -1,10 +1,9 @@
-"""Tables of an estimate, the same in the text and on the page; and that of a design."""
+"""Tables of an estimate, the same in the text and on the page."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,11 +17,8 @@ from emb_bench.estimate.suspects import shown_as
 from emb_bench.information.criteria import criteria
 from emb_bench.information.identifiability import TRADED_OFF
 from emb_bench.numbers import NOTHING, amount, around, chance, percent, plain, share, signed, spread
-from emb_bench.report.render import deviation
+from emb_bench.report.sentences import deviation, drift
 from emb_bench.report.text import Cell, Table
-
-if TYPE_CHECKING:  # a search for designs takes a second to import
-    from emb_bench.design.report import Report
 
 TONES = {Result.PASS: "good", Result.FAIL: "bad", Result.CANNOT_TELL: "care"}  # Colours of results
 
@@ -45,51 +41,60 @@ def acceptance_table(acceptance: Acceptance | None) -> Table | None:
     return Table(f"Acceptance criteria of {acceptance.criteria.source}", header, rows, words=range(len(header)))
 
 
-def parameters(study: Study) -> Table:
-    """Values with their 95 % intervals in the parameter's unit and as a share, and beside the nominal value."""
+def parameters(study: Study, *, brief: bool = False) -> Table:
+    """Values with total and repeatability, and whether each is identified.
+
+    Args:
+        study: the study.
+        brief: leave out the distance from the nominal value, and what was simulated.
+    """
     e = study.estimate
-    header = ["parameter", "estimate ± 95 %", "± 95 %", "from nominal", "identified"]
-    header += ["simulated", "error in sigma"] if study.truth is not None else []
-    yes = Cell("yes", "good") if study.holds else Cell("biased" if study.biased else "if the model were right", "care")
+    header = ["" if brief else "parameter", "value ± total", "total", "repeatability", "identified"]
+    header += [] if brief else ["from nominal"]
+    header += ["simulated", "error in sigma"] if study.truth is not None and not brief else []
+    yes = Cell("yes", "good") if study.holds else Cell("biased" if study.biased else "(yes)", "care")
     rows = []
     for i, c in zip(e.wanted(), study.conclusions, strict=True):
-        unknown, own = e.unknowns[i], float(e.deviations()[i])
+        unknown = e.unknowns[i]
+        size = c.value if unknown.relative else 0.0
         row: list[str] = [c.label, amount(c.value, c.interval, c.unit)]
-        half = 0.5 * (c.interval[1] - c.interval[0])
-        relative = unknown.relative and math.isfinite(half) and c.value != 0.0
-        row.append(share(half / abs(c.value)) if relative else NOTHING)
-        nominal = getattr(e.bench.brake, unknown.name, None)
-        row.append(_from_nominal(float(e.values[i]) / nominal - 1.0) if nominal and unknown.relative else NOTHING)
+        row += [_half(0.5 * (c.interval[1] - c.interval[0]), size)]
+        row += [_half(c.repeatability, size) if study.holds else NOTHING]
         row.append(yes if c.identified else Cell("NO", "bad"))
-        if study.truth is not None:
-            true = getattr(study.truth, unknown.name, math.nan)
-            scale = own * (abs(c.value) if unknown.relative else 1.0)
-            row += [plain(true, 6), signed((c.value - true) / scale if math.isfinite(scale) else math.nan, "+.2f")]
+        if not brief:
+            nominal = getattr(e.bench.brake, unknown.name, None)
+            change = float(e.values[i]) / nominal - 1.0 if nominal and unknown.relative else math.nan
+            row += [NOTHING if math.isnan(change) else f"{signed(100.0 * change)} %"]
         rows.append(row)
-    return Table("Estimates with their 95 % intervals", header, rows, words=(0, 4))
+    if study.truth is not None and not brief:
+        rows = [[*row, *true] for row, true in zip(rows, _errors(study), strict=True)]
+    return Table("Estimates; ± is half of the 95 % interval (k=2)", header, rows, words=(0, 4))
 
 
-def _from_nominal(change: float) -> str:
-    """A relative change, in ppm where it is small."""
-    return share(change, 3) if change < 0.0 else f"+{share(change, 3)}"
+def _half(half: float, size: float) -> str:
+    """Half an interval: in percent of a size, or as it is where the size is 0."""
+    if not math.isfinite(half):
+        return NOTHING
+    return f"{plain(100.0 * half / abs(size), 2)} %" if size else plain(half, 2)
 
 
-def values(study: Study) -> Table:
-    """Values with their intervals, and the error of each where the truth is known."""
-    e = study.estimate
-    header = ["parameter", "estimate ± 95 %", "identified"]
-    header += ["simulated", "error in sigma"] if study.truth is not None else []
-    yes = Cell("yes" if study.holds else "biased" if study.biased else "if the model were right")
-    rows = []
+def _errors(study: Study) -> list[list[str]]:
+    """Of each parameter the value that was simulated, and the error in standard deviations."""
+    e, rows = study.estimate, []
     for i, c in zip(e.wanted(), study.conclusions, strict=True):
-        unknown, own = e.unknowns[i], float(e.deviations()[i])
-        row: list[str] = [c.label, amount(c.value, c.interval, c.unit), yes if c.identified else Cell("NO", "bad")]
-        if study.truth is not None:
-            true = getattr(study.truth, unknown.name, math.nan)
-            scale = own * (abs(c.value) if unknown.relative else 1.0)
-            row += [plain(true, 6), signed((c.value - true) / scale if math.isfinite(scale) else math.nan, "+.2f")]
-        rows.append(row)
-    return Table("What was estimated", header, rows, words=(0, 2))
+        unknown, true = e.unknowns[i], getattr(study.truth, e.unknowns[i].name, math.nan)
+        scale = float(e.deviations()[i]) * (abs(c.value) if unknown.relative else 1.0)
+        error = (c.value - true) / scale if math.isfinite(scale) else math.nan
+        rows.append([plain(true, 6), signed(error, "+.2f")])
+    return rows
+
+
+def errors(study: Study) -> Table | None:
+    """Values that were simulated, and the errors; None where they are not known."""
+    if study.truth is None:
+        return None
+    rows = [[c.label, *row] for c, row in zip(study.conclusions, _errors(study), strict=True)]
+    return Table("Errors of the estimates", ["parameter", "simulated", "error in sigma"], rows)
 
 
 def models(study: Study) -> Table | None:
@@ -106,11 +111,9 @@ def models(study: Study) -> Table | None:
             [c.name, answer(c.fits), plain(c.estimate.validation.ratio), *differences, percent(c.weight), *cells]
         )
     header = ["model", "fits", "chi2/n", "BIC", "AIC", "held-out", "weight", *names]
-    along = ", each with the systematic errors estimated along" if best.estimate.asked.systematic else ""
     title = (
-        f"Models fitted, best first{along}. BIC, AIC, and logarithm of the density of what was held out: difference "
-        "from the first model. Parameters: change from the first model's values, and in brackets that in its standard "
-        "deviations"
+        "Models, best first. BIC, AIC and held-out log density: difference from the first model. Parameters: change "
+        "from the first model's values, and (in its standard deviations)"
     )
     return Table(title, header, rows, words=(0, 1))
 
@@ -132,9 +135,7 @@ def growth_path(study: Study) -> Table | None:
             cells = [f"{value:+.1f}" for value in (trial.sigmas, trial.bic, trial.held_out)]
             rows.append([*begin, trial.name, *cells, said])
     header = ["model", "chi2/n", "the residuals ask for", "sigma", "BIC", "held-out", "added"]
-    return Table(
-        "Growth of the model; change of BIC and of the held-out density by each", header, rows, words=(0, 2, 6)
-    )
+    return Table("Growth of the model; changes of BIC and of the held-out log density", header, rows, words=(0, 2, 6))
 
 
 def deviations(study: Study) -> Table:
@@ -142,11 +143,11 @@ def deviations(study: Study) -> Table:
     e, boot = study.estimate, study.bootstrap
     names = [e.labels[i] for i in e.shared() if e.unknowns[i].name in e.asked.params]
     weak = dict(criteria(e.information, e.labels, names).weakest) if len(names) > 1 else {}
-    header = ["parameter", "used", "by Fisher", "by residuals"]
+    header = ["parameter", "total", "by Fisher", "by residuals"]
     moved = e.open()
-    header += ["left open by the model"] if moved.any() else []
-    header += ["by bootstrap"] if boot is not None else []
-    header += ["weakest direction"] if weak else []
+    header += ["model"] if moved.any() else []
+    header += ["bootstrap"] if boot is not None else []
+    header += ["weakest"] if weak else []
     rows = []
     columns = (e.unknowns, e.shown, e.labels, e.values.tolist(), e.deviations(), e.cramer_rao(), e.robust())
     for unknown, shown, label, value, *found in zip(*columns, *([moved] if moved.any() else []), strict=True):
@@ -165,8 +166,8 @@ def deviations(study: Study) -> Table:
             row.append(percent(weak[label] ** 2) if label in weak else NOTHING)
         rows.append(row)
     title = "Standard deviations"
-    title += "; left open: by the effect in brackets, as far as the record does not exclude it" if moved.any() else ""
-    title += "; weakest direction: share of each in the combination with the largest uncertainty" if weak else ""
+    title += "; model: largest undetected effect (named)" if moved.any() else ""
+    title += "; weakest: share in the worst-determined combination" if weak else ""
     return Table(title, header, rows)
 
 
@@ -185,7 +186,7 @@ def residual_tests(study: Study) -> Table:
         for name, test in m.independence.items()
     ]
     header = ["residuals of", "F, from the current", "p", "largest correlation", "Ljung-Box", "p"]
-    return Table("Residuals: dependence on the current, and on each other", header, rows)
+    return Table("Tests of the residuals: independence of the current (F), whiteness (Ljung-Box)", header, rows)
 
 
 def systematic(e: Estimate) -> Table | None:
@@ -197,7 +198,7 @@ def systematic(e: Estimate) -> Table | None:
             before = e.asked.systematic[unknown.name]
             estimated = around(float(value), NORMAL_95 * float(own))
             rows.append([label, f"{estimated} {unit}".strip(), f"{plain(before)} {unit}".strip()])
-    title = "Systematic errors that were estimated along; ± is half the 95 % interval"
+    title = "Systematic errors, estimated with the parameters; ± is half of the 95 % interval"
     return Table(title, ["error", "estimate", "sigma in [systematic]"], rows) if rows else None
 
 
@@ -208,10 +209,7 @@ def suspects(e: Estimate) -> Table | None:
         name, unit, factor = shown_as(s, e.bench.machine)
         suggested = f"{plain(s.value * factor)} {unit}" if unit else share(s.value, 3)
         rows.append([name, suggested, signed(s.sigmas, "+.1f"), chance(s.p_value)])
-    title = (
-        "Effects that were not estimated, and how much of each the residuals suggest, to first order; p is near 1 "
-        "where an effect cannot have that sign"
-    )
+    title = "Score tests for effects that the model lacks: first-order amount; one-sided p if the effect is positive"
     return Table(title, ["effect", "amount", "sigma", "p"], rows) if rows else None
 
 
@@ -222,7 +220,7 @@ def predicted(study: Study) -> Table | None:
         for h in (*study.held_out, *study.left_out)
     ]
     header = ["record", "chi2/n", "samples", "p", "predicted"]
-    return Table("Records predicted from the others, or held out", header, rows, words=(0, 4)) if rows else None
+    return Table("Predictions of records that were held out", header, rows, words=(0, 4)) if rows else None
 
 
 def correlation(e: Estimate) -> tuple[Table | None, list[str]]:
@@ -252,7 +250,7 @@ def minima(study: Study) -> Table | None:
         for group in study.minima
     ]
     header = ["searches", "chi2", "not converged", *(study.estimate.labels[i] for i in study.estimate.wanted())]
-    return Table("Minima where the local searches ended, best first", header, rows) if rows else None
+    return Table("Local minima, best first", header, rows) if rows else None
 
 
 def bootstrap(study: Study) -> Table | None:
@@ -277,25 +275,10 @@ def gain(r: Recommendation) -> Table:
     return Table("Standard deviations", ["parameter", "now", "with one such run more"], rows)
 
 
-def design_checks(report: Report) -> Table:
-    """A design simulated again, on its own brake first."""
-    rows = [
-        [
-            *(c.plant, f"{c.log_det:.4f}", f"{c.lambda_min:.5g}", f"{c.trace_inverse:.5g}"),
-            *(f"{c.lowest_angle:.4f} to {c.highest_angle:.4f}", f"{c.largest_speed:.4f}"),
-            *(f"{c.end_angle:.3f}", f"{c.end_velocity:.3f}"),
-            *("limits held" if c.limits_held else "LIMITS LEFT", "home" if c.home else "not home"),
-        ]
-        for c in report.checks
-    ]
-    header = ["simulated again", "log det", "lambda_min", "tr M^-1", "angle [rad]", "speed", "end [rad]", "[rad/s]"]
-    return Table("", [*header, "", ""], rows, words=(0, 8, 9))
-
-
-def drifts(study: Study, words: Sequence[str]) -> Table:
-    """Values of an earlier estimate and of this one; ``words`` describe the change of each."""
+def drifts(study: Study) -> Table:
+    """Values of an earlier estimate and of this one."""
     rows = []
-    for d, said in zip(study.drifts, words, strict=True):
+    for d in study.drifts:
         change = f"{signed(100.0 * d.relative_change)} %" if d.relative else f"{signed(d.relative_change)} {d.unit}"
         rows.append(
             [
@@ -305,7 +288,7 @@ def drifts(study: Study, words: Sequence[str]) -> Table:
                 change,
                 signed(d.sigmas, "+.1f"),
                 answer(d.drifted, good=False),
-                said,
+                drift(d),
             ]
         )
     header = ["parameter", "last", "now", "change", "sigma", "drifted", ""]
@@ -326,5 +309,5 @@ def contributions(study: Study, runs: Sequence[tuple[str, Growth]]) -> Table:
         joint = criteria(e.information, e.labels, asked)
         rows.append(["all together", plain(joint.log_det, 5), plain(joint.lambda_min), *("" for _ in names)])
     header = ["run", "log det", "smallest eigenvalue", *(f"share of {name}" for name in names)]
-    title = "Physical information of each run by itself, and its share in what is known of each unknown alone"
+    title = "Fisher information of each run alone, and its share in the information on each unknown"
     return Table(title, header, rows)

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from emb_runtime.system import terminal
 
-WIDTH = 110  # Columns of a text
-BAD = r"(?P<bad>^WARNING:.*|NOT [a-z]+|DOES NOT [A-Z]+|LIMITS LEFT|FAILED|\bNO\b|AT THE BORDER)"
-CARE = r"(?P<care>^NOTE:|if the model were right|identified, but biased)"
-GOOD = r"(?P<good>; identified\b(?! if|, but)|limits held|\bfits:)"  # Words that stand out in colour
+WIDTH = 80  # Columns of a text
+BAD = r"(?P<bad>^WARNING:.*|^STOPPED:.*|^.*DOES NOT [A-Z]+|NOT [a-z]+|LIMITS LEFT|FAILED|\bNO\b|AT THE BORDER)"
+CARE = r"(?P<care>^NOTE:|if the model is right|identified, but biased)"
+GOOD = r"(?P<good>^The model '[^']*' fits\b|limits held|\byes$)"  # Words that stand out in colour
 
 
 class Cell(str):
@@ -39,7 +39,19 @@ class Cell(str):
 
 def facts(*rows: tuple[str, str]) -> list[str]:
     """Lines of a name and its text; those with an empty text are left out."""
-    return [f"{name:12} {said}" for name, said in rows if said]
+    return [line for name, said in rows if said for line in wrapped(f"{name:12} {said}", 13)]
+
+
+def wrapped(text: str, indent: int = 4) -> list[str]:
+    """A text in lines of at most ``WIDTH`` columns; all but the first begin ``indent`` columns further to the right."""
+    left = len(text) - len(text.lstrip())
+    later = " " * (left + indent)
+    return textwrap.wrap(text, WIDTH, subsequent_indent=later, break_long_words=False, break_on_hyphens=False) or [""]
+
+
+def listed(mark: str, texts: Iterable[str]) -> list[str]:
+    """Lines of several texts, each behind a mark."""
+    return [line for text in texts if text for line in wrapped(f"{mark}{text}")]
 
 
 @dataclass(frozen=True)
@@ -61,9 +73,9 @@ class Table:
             for row in cells
         ]
 
-    def text(self) -> list[str]:
+    def text(self, indent: str = "") -> list[str]:
         """Title and aligned lines."""
-        return [*textwrap.wrap(self.title, WIDTH), *self.lines(), ""]
+        return [*textwrap.wrap(self.title, WIDTH), *self.lines(indent), ""]
 
     def markdown(self) -> list[str]:
         """Title and rows as Markdown."""

@@ -11,8 +11,8 @@ import numpy as np
 from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import INTERVALS, BudgetCheck, Floats, Timing, judge, quantiles, timing
 from emb_bench.logs.timing import document as timing_document
-from emb_bench.numbers import percent, seconds
-from emb_bench.report.text import Table, facts
+from emb_bench.numbers import NOTHING, percent, seconds
+from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.config.timing_budgets import COUNTED, QUANTILE_NAMES
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE, LogError
 
@@ -22,7 +22,8 @@ BINS = 12
 FEWEST = 10  # Fewest values of a histogram
 INNER = (0.1, 99.9)
 """Quantiles between which a histogram's bins divide evenly [%]; its first and last row have what lies beyond, too."""
-WIDTH = 50  # Characters of the longest bar
+WIDTH = 40  # Characters of the longest bar
+UNITS = ((1.0, "s"), (1e3, "ms"), (1e6, "µs"))  # Of times, with their factors
 
 
 class RunTiming(NamedTuple):
@@ -73,29 +74,49 @@ def document(entry: RunTiming) -> dict[str, Any]:
     }
 
 
-def text(entry: RunTiming) -> str:
-    """The quantiles, the histograms and the budgets of one run, for a person."""
-    t = entry.timing
+def text(entry: RunTiming, *, verbose: bool = False) -> str:
+    """Whether a run kept to its budgets, and what it took; with ``verbose`` the histograms."""
+    t, missed = entry.timing, [check for check in entry.checks if not check.met]
+    if entry.why_not:
+        verdict = f"not judged: {entry.why_not}"
+    elif missed:
+        verdict = f"NOT MET: {len(missed)} of {len(entry.checks)} budgets ({', '.join(one.name for one in missed)})"
+    else:
+        verdict = f"met: all {len(entry.checks)} budgets"
     obeyed = "commands not obeyed: not known" if t.not_obeyed is None else f"{t.not_obeyed} commands not obeyed"
     answers = f"{len(t.response)} answered, {t.unanswered} unanswered, {t.missed} periods missed, {obeyed}"
-    lines = [f"WARNING: {entry.log.missing}"] if entry.log.missing else []
-    lines += [*facts(("log", str(entry.log.path)), ("samples", f"{t.samples}, {answers}")), ""]
+    lines = listed("WARNING: ", [entry.log.missing])
+    lines += [*wrapped(f"{entry.log.path}: {verdict}"), *facts(("samples", f"{t.samples}, {answers}"))]
     if t.simulated:
-        return "\n".join([*lines, f"not judged: {entry.why_not}"])
-    found = {said: [*map(seconds, quantiles(t.interval(name)).values())] for name, said in INTERVALS.items()}
-    rows = [[said, *(values or ["nothing"] * len(QUANTILE_NAMES))] for said, values in found.items()]
-    lines += Table("", ("", *QUANTILE_NAMES), rows).lines()
-    for name in SHOWN:
+        return "\n".join(lines)
+    rows = [_row(said, list(quantiles(t.interval(name)).values())) for name, said in INTERVALS.items()]
+    lines += ["", *Table("", ("", *QUANTILE_NAMES, "unit"), rows, words=(0, len(QUANTILE_NAMES) + 1)).lines()]
+    shown = entry.checks if verbose else missed
+    rows = [[check.name, _check(check, check.budget), _check(check, check.measured), _met(check)] for check in shown]
+    if rows:
+        lines += ["", *Table("", ("budget", "at most", "measured", ""), rows, words=(0, 3)).lines()]
+    for name in SHOWN if verbose else ():
         if len(values := t.interval(name)) >= FEWEST:
             lines += ["", INTERVALS[name], *_bars(values)]
-    if entry.why_not:
-        return "\n".join([*lines, "", f"not judged: {entry.why_not}"])
-    rows = []
-    for check in entry.checks:
-        say = percent if check.name in COUNTED else seconds
-        measured = "nothing" if check.measured is None else say(check.measured)
-        rows.append([check.name, say(check.budget), measured, "met" if check.met else "NOT MET"])
-    return "\n".join([*lines, "", *Table("", ("budget", "at most", "measured", ""), rows, words=(0, 3)).lines()])
+    return "\n".join(lines)
+
+
+def _met(check: BudgetCheck) -> str:
+    return "met" if check.met else "NOT MET"
+
+
+def _check(check: BudgetCheck, value: float | None) -> str:
+    if value is None:
+        return "nothing"
+    return percent(value) if check.name in COUNTED else seconds(value)
+
+
+def _row(said: str, values: list[float]) -> list[str]:
+    """Quantiles of an interval, all in the unit that suits the largest."""
+    if not values:
+        return [said, *[NOTHING] * len(QUANTILE_NAMES), ""]
+    factor, unit = next(((f, u) for f, u in UNITS if max(map(abs, values)) * f >= 1.0), UNITS[-1])
+    return [said, *(f"{factor * value:.4g}" for value in values), unit]
 
 
 def _bars(values: Floats) -> Iterator[str]:
@@ -106,4 +127,4 @@ def _bars(values: Floats) -> Iterator[str]:
         counts, edges = np.array([len(values)]), np.array([low, low])
     for k, count in enumerate(counts.tolist()):
         bar = "#" * math.ceil(WIDTH * count / max(counts))
-        yield f"  {seconds(edges[k]):>10} to {seconds(edges[k + 1]):<10}{count:>8}  {bar}".rstrip()
+        yield f"  {1e6 * edges[k]:8.1f} to {1e6 * edges[k + 1]:8.1f} µs {count:8}  {bar}".rstrip()

@@ -64,7 +64,7 @@ def _trend(studies: Sequence[Study], label: str) -> Trend:
     counted = usable & np.isfinite(half) & (half > 0.0)
     several = int(counted.sum()) > 1
     agreement = constancy(values[counted].tolist(), (half[counted] / NORMAL_95).tolist()) if several else None
-    less = f"{label} less {plain(reference, 6)} {found[0].unit}" if reference else ""
+    less = f"{label} minus {plain(reference, 6)} {found[0].unit}" if reference else ""
     return Trend(label, less, unit, factor * (values - reference), factor * (ends - reference), usable, agreement)
 
 

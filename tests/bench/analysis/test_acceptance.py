@@ -7,9 +7,11 @@ import math
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from emb_bench.analysis.acceptance import Result, RunFacts, judge, read_criteria
+from emb_bench.analysis.drift import Earlier
 from emb_bench.analysis.study import Study, StudyOptions, make_study
 from emb_bench.cli.replay import main
 from emb_bench.estimate.records import EstimationProblem
@@ -88,14 +90,16 @@ def test_a_relative_tolerance_is_of_nominal_or_of_its_reference(tmp_path: Path, 
 def test_drift_is_judged_against_an_earlier_estimate_and_not_without_one(
     tmp_path: Path, folder: Path, study: Study
 ) -> None:
-    last = document(study)
-    changed = json.loads(json.dumps(last))
-    changed["parameters"]["k_1"]["value"] *= 0.9
+    last = msgspec.convert(document(study), Earlier)
+    k_1 = last.parameters["k_1"]
+    moved = {**last.parameters, "k_1": msgspec.structs.replace(k_1, value=0.9 * k_1.value)}
+    changed = msgspec.structs.replace(last, parameters=moved)
     for earlier, expected in ((last, Result.PASS), (changed, Result.FAIL)):
         now = study_of(folder / "good.mcap", last=earlier)
         assert results(tmp_path, "drift.k_1 = 0.01", now, last=earlier)["drift of k_1"] is expected
-    now = study_of(folder / "good.mcap", last=changed | {"model_fits": False})
-    doubtful = results(tmp_path, "drift.k_1 = 0.01", now, last=changed | {"model_fits": False})
+    doubted = msgspec.structs.replace(changed, model_fits=False)
+    now = study_of(folder / "good.mcap", last=doubted)
+    doubtful = results(tmp_path, "drift.k_1 = 0.01", now, last=doubted)
     assert doubtful["drift of k_1"] is Result.CANNOT_TELL
     assert results(tmp_path, "drift.k_1 = 0.01", study)["drift of k_1"] is Result.CANNOT_TELL
 
@@ -127,29 +131,26 @@ def test_a_stopped_run_or_a_log_that_is_not_whole_fails_whatever_the_model_says(
     assert left_out.result is Result.FAIL
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("parameters.mass.relative = 0.1", "acceptance.parameters.mass: expected one of k_m"),
-        ("parameters.k_m = {}", "expected either interval = [low, high] or relative"),
-        ("parameters.k_m = {relative = 0.1, interval = [0, 1]}", "expected either interval"),
-        ("parameters.k_m.relative = -0.1", "expected a positive share"),
-        ("parameters.delay.relative = 0.1", "expected interval"),
-        ("parameters.k_m = {interval = [0, 1], reference = 2}", "unknown key"),
-        ("parameters.k_m.interval = [2, 1]", "the lower value 2 is above the upper 1"),
-        ("drift.mass = 0.1", "acceptance.drift.mass: expected one of"),
-        ("drift.k_m = 0", "expected a positive number"),
-        ("budgets.missed = 2", "expected a share from 0 to 1"),
-        ("budgets.late = 0.1", "unknown key"),
-        ("model_fit = 1", "expected true or false, got 1"),
-        ("modelfit = true", "unknown key"),
-        ("x = [", "expected TOML"),
-    ],
-)
-def test_a_wrong_file_is_refused_by_its_key(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.raises(UsageError, match="--acceptance") as caught:
-        read_criteria(written(tmp_path, text))
-    assert said in str(caught.value)
+def test_a_wrong_file_is_refused_by_its_key(tmp_path: Path) -> None:
+    for text, key in {
+        "parameters.mass.relative = 0.1": "acceptance.parameters",
+        "parameters.k_m = {}": "acceptance.parameters.k_m",
+        "parameters.k_m = {relative = 0.1, interval = [0, 1]}": "acceptance.parameters.k_m",
+        "parameters.k_m.relative = -0.1": "acceptance.parameters.k_m.relative",
+        "parameters.delay.relative = 0.1": "acceptance.parameters.delay",
+        "parameters.k_m = {interval = [0, 1], reference = 2}": "acceptance.parameters.k_m.reference",
+        "parameters.k_m.interval = [2, 1]": "acceptance.parameters.k_m.interval",
+        "drift.mass = 0.1": "acceptance.drift",
+        "drift.k_m = 0": "acceptance.drift.k_m",
+        "budgets.missed = 2": "acceptance.budgets.missed",
+        "budgets.late = 0.1": "acceptance.budgets.late",
+        "model_fit = 1": "acceptance.model_fit",
+        "modelfit = true": "acceptance.modelfit",
+        "x = [": "TOML",
+    }.items():
+        with pytest.raises(UsageError, match="--acceptance") as caught:
+            read_criteria(written(tmp_path, text))
+        assert key in str(caught.value)
 
 
 def test_the_command_says_the_result_first_and_has_an_exit_code_for_each(
@@ -173,7 +174,5 @@ def test_the_command_says_the_result_first_and_has_an_exit_code_for_each(
     assert '"result": "fail"' in said("good.mcap", "parameters.f_v.relative = 0.1", 0)
     said("aborted.mcap", "model_fit = false", 1, "--strict")
     assert 'class="banner bad" role="alert">NOT ACCEPTED. STOPPED: ' in page.read_text(encoding="utf-8")
-    absent = replay.refused("report", folder / "good.mcap", "-o", page, "--acceptance", tmp_path / "no.toml")
-    assert "No such file" in absent
-    over = replay.refused("report", folder / "good.mcap", "-o", page, "--acceptance", page)
-    assert "would write over" in over
+    for file in (tmp_path / "no.toml", page):  # which is not there, or would be written over
+        assert str(file) in replay.refused("report", folder / "good.mcap", "-o", page, "--acceptance", file)

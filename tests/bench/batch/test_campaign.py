@@ -119,7 +119,7 @@ def test_broken_logs_fail_with_the_words_of_the_command_for_one_log(folder: Path
 
 def test_rows_say_what_fim_says_of_the_log_alone(folder: Path, said: Said, replay: Replay) -> None:
     for log in GOOD:
-        row, its = said.rows[log], replay.document("fim", folder / log)
+        row, its = said.rows[log], replay.document("fim", folder / log, "--theta", "nominal")
         assert (row["model"], row["exit_reason"], row["complete"]) == (
             its["model"],
             its["exit_reason"],
@@ -234,7 +234,10 @@ def test_information_alone_estimates_nothing(
     found = campaign(monkeypatch, folder / "tuesday", path, *asked)
     assert found.code == 0
     assert found.document["misfit"] == 2
-    row, its = found.rows["c.mcap"], replay.document("fim", folder / "tuesday/c.mcap", "--params", "k_m,f_v")
+    row, its = (
+        found.rows["c.mcap"],
+        replay.document("fim", folder / "tuesday/c.mcap", "--theta", "nominal", "--params", "k_m,f_v"),
+    )
     assert row["campaign"] == "."
     assert {name: row[f"{name}_cramer_rao"] for name in ("k_m", "f_v")} == its["physical"]["cramer_rao"]
     assert (row["fits"], row["f_v_estimate"], row["f_v_true"]) == (None, None, 3e-5)

@@ -6,7 +6,6 @@ import csv
 import io
 import math
 import os
-import re
 import socket
 import subprocess
 import sys
@@ -222,8 +221,7 @@ def test_a_ray_that_is_not_there_is_refused_at_once(tmp_path: Path, replay: Repl
         nobody.bind(("127.0.0.1", 0))  # taken, and nobody listens
         address = f"127.0.0.1:{nobody.getsockname()[1]}"
         said = replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet", "--ray", address)
-    assert said.startswith(f"emb-replay: --ray: Ray at '{address}' cannot be used: ")
-    assert "Connection refused" in said
+    assert address in said
     assert [entry.name for entry in tmp_path.iterdir()] == ["1.mcap"]
 
 
@@ -232,11 +230,9 @@ def test_a_missing_library_is_named_with_what_to_install(
 ) -> None:
     (tmp_path / "1.mcap").touch()
     monkeypatch.setitem(sys.modules, "ray", None)
-    said = replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet", "--ray")
-    assert said == "emb-replay: emb-replay campaign --ray needs ray: pip install 'emb-excite[ray]'\n"
+    assert "emb-excite[ray]" in replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet", "--ray", "local")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    said = replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet")
-    assert said == "emb-replay: emb-replay campaign needs pyarrow: pip install 'emb-excite[bench]'\n"
+    assert "emb-excite[bench]" in replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet")
 
 
 def test_the_help_needs_neither_pyarrow_nor_ray() -> None:
@@ -251,40 +247,29 @@ def test_every_unknown_has_units_for_its_columns() -> None:
     assert (unit_of("contact", "SI"), unit_of("contact", RELATIVE)) == ("rad", "rad")
 
 
-def test_a_run_counts_once_and_the_log_that_holds_most_of_it_is_the_one() -> None:
-    def row(log: str, beginning: str | None, measured: int, error: str | None = None) -> Row:
-        return Row(".", ".", log, error, beginning=beginning, measured=measured)
+def test_a_run_counts_once_and_the_whole_log_or_the_one_that_holds_most_of_it_is_the_one() -> None:
+    def row(log: str, beginning: str | None, measured: int, error: str | None = None, complete: bool = True) -> Row:
+        return Row(".", ".", log, error, beginning=beginning, measured=measured, complete=complete)
 
     rows = [row("a", "x", 60), row("b", "x", 500), row("c", "x", 500), row("d", "y", 9), row("e", None, 3)]
-    rows += [row("f", None, 3), row("g", "x", 900, "it failed")]
-    assert [r.copy_of for r in mark_copies(rows)] == ["b", None, "b", None, None, None, None]
+    rows += [row("f", None, 3), row("g", "x", 900, "it failed"), row("damaged", "x", 600, complete=False)]
+    assert [r.copy_of for r in mark_copies(rows)] == ["b", None, "b", None, None, None, None, "b"]
 
 
-def test_a_damaged_copy_never_counts_in_place_of_the_whole_log() -> None:
-    rows = [
-        Row(".", ".", name, None, beginning="x", measured=measured, complete=complete)
-        for name, measured, complete in (("damaged", 500, False), ("whole", 500, True), ("longer", 600, False))
-    ]
-    assert [r.copy_of for r in mark_copies(rows)] == ["whole", None, "whole"]
-
-
-def test_the_text_names_misfits_and_keeps_its_columns_apart() -> None:
-    numbers = [2.987704123e-5, 2.994231456e-5, 3.1e-5]
+def test_a_misfit_is_named_and_has_no_part_in_the_mean() -> None:
     rows = [
         Row(".", ".", f"{n}.mcap", None, start_time=n, fits=n < 3, model="exact", complete=True, exit_reason="DONE",
-            log_det=76.9, weighted_log_det=39.9, parameters=(
-                Parameter("f_v", True, 2.3e-3, value, 0.9 * value, 1.1 * value, 1e-6, value, 0.1),))
-        for n, value in enumerate([*numbers, 5e-5])
+            parameters=(Parameter("f_v", True, 2.3e-3, value, 0.9 * value, 1.1 * value, 1e-6),))
+        for n, value in enumerate([2.98e-5, 2.99e-5, 3.1e-5, 5e-5])
     ]  # fmt: skip
-    said = text(summarise(rows, Options(params=("f_v",)), "r.parquet"))
-    assert "NOTE: 3.mcap: the model 'exact' does not fit: it has no part in the means" in said
-    assert "f_v is NOT the same in all runs (p < 1e-6)" in said
-    lines = said.splitlines()
-    header = next(line for line in lines if line.startswith("parameter"))
-    row = lines[lines.index(header) + 1]
-    assert len(header) <= 110
-    assert len(row) <= 110
-    assert len(re.split(r"\s{2,}", row)) == len(re.split(r"\s{2,}", header)) == 10
+    found = summarise(rows, Options(params=("f_v",)), "r.parquet")
+    assert [row.log for row in found.misfit] == ["3.mcap"]
+    estimate = found.parameters["f_v"].estimate
+    assert estimate is not None
+    assert (estimate.runs, estimate.constancy.constant) == (3, False)
+    assert estimate.constancy.mean == pytest.approx(3.02e-5, rel=0.01)
+    assert estimate.total == pytest.approx(0.1 * 2.99e-5)
+    assert "3.mcap" in text(found)
 
 
 def test_the_rows_are_a_csv_file_where_the_name_says_so(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def test_ctrl_c_ends_every_process_leaves_no_half_result_and_exits_with_130(fold
 @pytest.mark.slow
 def test_ray_gives_the_same_bytes_and_the_same_words(folder: Path, tmp_path: Path) -> None:
     said, files = [], []
-    for name, chosen in (("here", ("--jobs", "1")), ("ray", ("--jobs", "2", "--ray"))):
+    for name, chosen in (("here", ("--jobs", "1")), ("ray", ("--jobs", "2", "--ray", "local"))):
         result = tmp_path / name / "r.parquet"
         result.parent.mkdir()
         done = subprocess.run(

@@ -68,8 +68,7 @@ def test_runs_that_do_not_fit_and_few_runs_have_no_part_in_it() -> None:
 def test_it_is_in_the_text_the_document_and_the_figure(tmp_path: Path) -> None:
     _, seen = drifting(2e-5)
     found = campaign(seen)
-    assert "k_m: 0.02" in text(found)
-    assert "(95 %) in the last run; likely walk" in text(found)
+    assert "walk of" in text(found, verbose=True)
     runs = document(found)["parameters"]["k_m"]["trend"]["runs"]
     assert [one["start_time"] for one in runs] == [FIRST + n * HOUR for n in range(40)]
     assert all(one["interval"][0] < one["value"] < one["interval"][1] for one in runs)

@@ -53,7 +53,6 @@ def test_a_model_that_does_not_fit_says_what_it_may_lack(log: Log, replay: Repla
     misfit = replay.document(path, "--model", "exact", "--systematic", "none")["misfit"]
     first = misfit["suspected"][0]
     assert (first["name"] in ("contact", "offset"), first["value"] > 0.0) == (True, True)
-    assert first["words"] in misfit["alarms"][-1]
     along = replay.document(path, "--model", "exact")
     assert along["model_fits"]
     offset = along["systematic"]["offset"]
@@ -81,28 +80,29 @@ def test_two_logs_of_one_brake_tell_more_than_one(path: Path, log: Log, replay: 
 
 def test_what_is_not_identified_has_no_interval_and_is_named_with_its_combination(path: Path, replay: Replay) -> None:
     """Torques and inertia scale together."""
-    text = replay.text(path, "--nuisance", "J", "--starts", "2")
-    assert text.count("NOT identified: only in combination with others") == 5
-    assert text.count("no reference excitation identifies it") == 4
-    assert "flat: +0.447 k_m +0.447 k_1 +0.447 T_c +0.447 f_v +0.447 J leaves no trace in the data" in text
     got = replay.document(path, "--nuisance", "J", "--starts", "2")
     assert not got["identified"]
     assert all(found["interval_95"] == [None, None] for found in got["parameters"].values())
+    assert [c["help"] for c in got["conclusions"]] == ["none"] * 4 + ["not needed"]
+    (flat,) = got["directions"]
+    assert flat["deviation"] is None
+    assert [flat["shares"][name] for name in (*PARAMETER_NAMES, "J")] == pytest.approx([5**-0.5] * 5, rel=1e-3)
 
 
 def test_an_unknown_beside_the_parameters_is_concluded_with_them(path: Path, replay: Replay) -> None:
-    text = replay.text(path, "--params", "f_v,T_c", "--nuisance", "J", "--starts", "1")
-    said = text.partition("parameters; ±")[2].partition("\n\n")[0].splitlines()[1:]
-    assert [line.split()[0] for line in said] == ["f_v", "T_c", "J"]
-    assert said[2].endswith("kg·m²; identified")
+    got = replay.document(path, "--params", "f_v,T_c", "--nuisance", "J", "--starts", "1")
+    assert [(c["label"], c["unit"]) for c in got["conclusions"]][2] == ("J", "kg·m²")
 
 
-def test_suspects_are_said_in_a_unit_or_as_a_share(path: Path, replay: Replay) -> None:
-    text = replay.text(path, "--params", "f_v", "--starts", "1")
-    rows = text.partition("Effects that were not estimated")[2].partition("\n\n")[0].splitlines()
-    shares = [row for row in rows if row.split()[0] in ("k_m", "k_1", "T_c", "J", "hysteresis", "k_m_drift")]
-    assert len(shares) == 6
-    assert all(" % " in row or " ppm " in row for row in shares)
+def test_repeatability_is_the_scatter_of_further_runs_and_less_than_the_total(path: Path, replay: Replay) -> None:
+    """By noise alone, so with systematic errors excluded it is all of the Cramér-Rao bound."""
+    got = replay.document(path, "--starts", "1")["parameters"]
+    ideal = replay.document(path, "--starts", "1", "--systematic", "none")["parameters"]
+    for name, found in got.items():
+        total = 0.5 * (found["interval_95"][1] - found["interval_95"][0])
+        assert 0.0 < found["repeatability"] < 1.96 * found["cramer_rao"] * found["value"] <= total
+        bound = 1.96 * ideal[name]["cramer_rao"] * ideal[name]["value"]
+        assert ideal[name]["repeatability"] == pytest.approx(bound, rel=1e-4)
 
 
 def test_lost_samples_are_said_first_and_left_out(
@@ -125,17 +125,13 @@ def test_a_gap_that_hides_what_acted_is_said(tmp_path: Path, simulate: Simulate,
     path = write_log(tmp_path / "gap.mcap", run)
     got = replay.document(path)
     assert got["model_fits"]
-    single, several = got["caveats"]
-    assert single.startswith("what acted in 1 single periods was not reported")
-    assert several.startswith("of 1 gaps of several periods nothing was reported")
-    assert len(got["warnings"]) == 1
-    assumed = replay.document(path, "--method", "windows", "--window", "0.02")["warnings"][1]
-    assert assumed.startswith("what acted in 4 periods is assumed, for this method does not estimate it")
+    assert (len(got["caveats"]), len(got["warnings"])) == (2, 1)  # of single periods, and of gaps
+    assumed = replay.document(path, "--method", "windows", "--window", "0.02")["warnings"]
+    assert "4 periods" in assumed[1]
     assert len(replay.document(path, "--method", "rls")["warnings"]) == 1
 
 
 def test_a_prior_is_named_and_counts(path: Path, replay: Replay) -> None:
-    assert "prior        the ranges 'pm50'" in replay.text(path, "--prior", "pm50", "--starts", "1")
     free, held = replay.document(path), replay.document(path, "--prior", "pm50")
     assert (free["prior"], held["prior"]) == (None, "pm50")
     for name, found in free["parameters"].items():
@@ -143,35 +139,32 @@ def test_a_prior_is_named_and_counts(path: Path, replay: Replay) -> None:
         assert 0.0 < shift < 0.1 * found["deviation"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--params", "mass"], "'mass' is no parameter"),
-        (["--params", ""], "at least one parameter"),
-        (["--nuisance", "stribeck_exponent"], "'stribeck_exponent' is no parameter"),
-        (["--bounds", "k_m"], "expected name=value"),
-        (["--bounds", "k_m=0.01"], "--bounds: k_m: expected two numbers as in 0.01:0.1, got '0.01'"),
-        (["--bounds", "k_m=0.1:0.01"], "bounds of k_m: expected two finite numbers, the lower first"),
-        (["--bounds", "J=1e-6:1e-5"], "bounds of J, which is not estimated"),
-        (["--bootstrap", "-1"], "--bootstrap: expected a number from 0, got -1"),
-        (["--bootstrap", "10"], "at least 3 records, got 1"),
-        (["--last", "/nowhere.json"], "--last /nowhere.json: No such file"),
-        (["--hold-out", "/nowhere.mcap"], "/nowhere.mcap"),
-        (["--starts", "0"], "--starts: expected a number from 1, got 0"),
-        (["--seed", "-1"], "--seed: expected a number from 0, got -1"),
-        (["--model", "rubber"], "no plant is called 'rubber'"),
-        (["--prior", "none"], "no set of ranges is called 'none'"),
-        (["--model", "euler", "--nuisance", "delay"], "a delay is estimated with"),
-    ],
-)
-def test_a_wrong_argument_is_one_line(path: Path, arguments: list[str], message: str, replay: Replay) -> None:
-    assert message in replay.refused(path, *arguments)
+def test_a_wrong_argument_is_one_line_that_names_it(path: Path, replay: Replay) -> None:
+    for arguments, name in {
+        ("--params", "mass"): "'mass'",
+        ("--params", ""): "parameter",
+        ("--nuisance", "stribeck_exponent"): "stribeck_exponent",
+        ("--bounds", "k_m"): "--bounds",
+        ("--bounds", "k_m=0.01"): "0.01:0.1",
+        ("--bounds", "k_m=0.1:0.01"): "bounds of k_m",
+        ("--bounds", "J=1e-6:1e-5"): "bounds of J",
+        ("--bootstrap", "-1"): "--bootstrap",
+        ("--bootstrap", "10"): "at least 3",
+        ("--last", "/nowhere.json"): "/nowhere.json",
+        ("--hold-out", "/nowhere.mcap"): "/nowhere.mcap",
+        ("--starts", "0"): "--starts",
+        ("--seed", "-1"): "--seed",
+        ("--model", "rubber"): "rubber",
+        ("--prior", "none"): "'none'",
+        ("--model", "euler", "--nuisance", "delay"): "delay",
+    }.items():
+        assert name in replay.refused(path, *arguments)
 
 
 def test_logs_of_different_brakes_need_a_model_that_is_said(path: Path, log: Log, replay: Replay) -> None:
     other = log("other.mcap", "plant=stribeck")
-    assert "(exact, stribeck): say which model to use" in replay.refused(path, other)
-    assert "DOES NOT FIT" in replay.text(path, other, "--model", "exact", "--starts", "1")
+    assert "exact, stribeck" in replay.refused(path, other)
+    assert not replay.document(path, other, "--model", "exact", "--starts", "1")["model_fits"]
 
 
 @pytest.fixture
@@ -200,7 +193,7 @@ def test_bounds_are_kept_and_a_value_at_one_is_named(path: Path, replay: Replay)
     assert got["bounds"] == {"f_v": [1e-5, 2e-5]}
     assert got["parameters"]["f_v"]["at_bound"]
     assert got["parameters"]["f_v"]["value"] <= 2e-5
-    assert "AT THE BORDER of the search" in got["parameters"]["f_v"]["why_not"]
+    assert not got["parameters"]["f_v"]["identified"]
 
 
 def test_of_several_logs_each_is_predicted_from_the_others(three: list[Path], replay: Replay) -> None:
@@ -218,20 +211,17 @@ def test_a_log_that_is_held_out_is_not_estimated_from_and_decides_on_the_model(
     assert held["parameters"] == alone["parameters"]
     assert [one["fits"] for one in held["held_out"]] == [True, True]
     other = log("worn.mcap", "plant=exact,f_v=4e-5,T_c=1.2e-2")
-    text = replay.text(three[0], "--hold-out", other)
-    assert text.startswith("WARNING: THE MODEL 'exact' DOES NOT PREDICT what it was not fitted to")
-    assert f"{other.name}: NOT predicted" in " ".join(text[: text.index("parameters;")].split())
+    wrong = replay.document(three[0], "--hold-out", other)
+    assert (wrong["model_fits"], wrong["predicts"], wrong["held_out"][0]["fits"]) == (True, False, False)
 
 
 def test_strict_fails_where_the_model_does_not_fit_or_predict_or_something_is_not_identified(
     path: Path, log: Log, replay: Replay
 ) -> None:
     replay.text(path, "--strict")
-    assert "DOES NOT FIT" in replay.text(path, "--strict", "--model", "lag", "--starts", "1", code=1)
-    assert "NOT identified" in replay.text(path, "--strict", "--nuisance", "J", "--starts", "1", code=1)
     worn = log("worn.mcap", "plant=exact,f_v=4e-5,T_c=1.2e-2")
-    assert "DOES NOT PREDICT" in replay.text(path, "--strict", "--hold-out", worn, code=1)
-    assert replay.document(path)["identified"]
+    for arguments in (("--model", "lag"), ("--nuisance", "J"), ("--hold-out", worn)):
+        replay.text(path, "--strict", "--starts", "1", *arguments, code=1)
 
 
 def test_the_drift_since_an_earlier_estimate_is_said_of_each_parameter(
@@ -243,7 +233,6 @@ def test_the_drift_since_an_earlier_estimate_is_said_of_each_parameter(
     got = {drift["name"]: drift for drift in replay.document(worn, "--last", last)["drifts"]}
     assert [drift["drifted"] for drift in got.values()] == [False, False, False, True]
     assert got["f_v"]["relative_change"] == pytest.approx(0.1, abs=0.01)
-    assert [drift["words"].split()[0] for drift in got.values()] == ["no", "no", "no", "rose"]
     assert replay.document(worn)["drifts"] == []
 
 
@@ -273,21 +262,16 @@ def test_a_record_that_tells_little_says_which_run_would_tell_it(
     assert not got["identified"]
     first = got["advice"][0]
     assert all(value < 0.01 for value in first["after"].values())
-    assert all(f"one more run of {first['excitation']} would" in found["words"] for found in got["conclusions"])
+    assert {found["run"] for found in got["conclusions"]} == {first["excitation"]}
 
 
-def test_lines_are_no_longer_than_a_terminal_is_wide(
-    tmp_path: Path, three: list[Path], monkeypatch: pytest.MonkeyPatch, log: Log, replay: Replay
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    stribeck = log("stribeck.mcap", "plant=stribeck")
-    last = tmp_path / "last.json"
-    last.write_text(replay.text(stribeck, "--json"))
-    for arguments in (
-        [*(path.name for path in three[:2]), "--nuisance", "x1_0", "--profile", "--params", "k_m,f_v"],
-        [stribeck.name, "--model", "exact", "--nuisance", "J", "--last", "last.json", "--hold-out", three[0].name],
-    ):
-        assert max(len(line) for line in replay.text(*arguments, "--starts", "1").splitlines()) <= WIDTH
+def test_the_answer_is_short_unless_it_is_asked_for_more(path: Path, replay: Replay) -> None:
+    short, verbose, quiet = (replay.text(path, "--starts", "1", *flag) for flag in ((), ("-v",), ("-q",)))
+    assert verbose.startswith(short.removesuffix("\n"))
+    assert short.startswith(quiet)
+    assert quiet.count("\n") == 1
+    assert short.count("\n") <= 16
+    assert max(map(len, short.splitlines())) <= WIDTH
 
 
 def test_without_scipy_and_numba_the_other_commands_work_and_this_one_says_what_to_install(path: Path) -> None:
@@ -301,4 +285,5 @@ def test_without_scipy_and_numba_the_other_commands_work_and_this_one_says_what_
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
-    assert done.stderr == "emb-replay: emb-replay estimate needs scipy and numba: pip install 'emb-excite[bench]'\n"
+    assert done.stderr.count("\n") == 1
+    assert "emb-excite[bench]" in done.stderr

@@ -196,7 +196,7 @@ def test_an_imported_recording_is_estimated_by_the_command(tmp_path: Path, capsy
     run = str(tmp_path / "run.mcap")
     assert main(["import", str(tmp_path / "r.csv"), "--map", str(tmp_path / "map.toml"), "-o", run]) == 0
     capsys.readouterr()
-    assert main(["estimate", run, "--starts", "1"]) == 0
+    assert main(["estimate", run, "--starts", "1", "-v"]) == 0
     said = capsys.readouterr().out
     assert "output error over windows" in said
     assert "no velocity" in said

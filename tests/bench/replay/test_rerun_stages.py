@@ -114,7 +114,7 @@ def test_of_a_run_with_no_current_it_is_said_in_one_line_that_nothing_was_excite
     run: Run, prior: list[str], replay: Replay
 ) -> None:
     out = replay.text("fim", run("--zero"), *prior)
-    assert out.endswith("\n\nnothing was excited: the record does not depend on any of these parameters\n")
+    assert "no information" in out
     assert "-inf" not in out
     assert "inf %" not in out
 

@@ -8,7 +8,7 @@ import pytest
 
 from emb_bench.report.text import show
 
-TEXT = "WARNING: THE MODEL 'x' DOES NOT FIT.\n  k_m  1 ± 2 N·m/A; identified\n  f_v  3; NOT identified: [b]flat[/b]"
+TEXT = "WARNING: THE MODEL 'x' DOES NOT FIT.\n  k_m  1 ± 2 N·m/A  yes\n  f_v  3; NOT identified: [b]flat[/b]"
 
 
 class Terminal(io.StringIO):
@@ -26,7 +26,7 @@ def test_a_terminal_shows_verdicts_in_colour_unless_it_is_asked_not_to(
     monkeypatch.setenv("TERM", "xterm-256color")
     show(TEXT)
     shown = out.getvalue()
-    assert ("\x1b[1;31mWARNING: THE MODEL" in shown, "\x1b[32m; identified" in shown) == (not no_color, not no_color)
+    assert ("\x1b[1;31mWARNING: THE MODEL" in shown, "\x1b[32myes" in shown) == (not no_color, not no_color)
     assert "[b]flat[/b]" in shown
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ from scipy import stats
 from emb_bench.figures import svg
 from emb_bench.numbers import around, between, chance, percent, plain, seconds, share, share_between
 from emb_bench.report.certainty import ellipse
-from emb_bench.report.figures import autocorrelation, crosscorrelation
 from emb_bench.report.page import Part
 from emb_bench.report.render import html, section
 from emb_bench.report.text import Cell, Table
@@ -57,14 +57,6 @@ def test_a_table_is_aligned_text_and_markdown_too() -> None:
     assert table.markdown()[2:] == ["| name | n | what |", "|---|---:|---|", "| a | 1 | x |", "| bcdef | 22 | yz |", ""]
 
 
-def test_the_contents_are_one_line_of_links_to_the_main_sections() -> None:
-    inner = Part("other", "Inner")
-    reader = read(page_of("t", Part("first", "First: of all"), Part("second", "Second", parts=(inner,))))
-    assert reader.values("href") == ["#first", "#second"]
-    assert reader.values("id") == ["first", "second", "other"]
-    assert reader.headings == ["First: of all", "Second", "Inner"]
-
-
 def test_the_page_forbids_scripts_and_the_network() -> None:
     reader = read(page_of("t", Part("a", "A")))
     policy = dict(part.strip().split(" ", 1) for part in reader.values("content")[0].split(";"))
@@ -93,37 +85,25 @@ def test_a_plain_number_keeps_three_digits(value: float) -> None:
     assert _number(plain(value)) == pytest.approx(value, rel=0.0051)
 
 
-def test_what_is_no_number_is_said() -> None:
-    assert (plain(np.nan), plain(np.inf), plain(-np.inf)) == ("–", "∞", "−∞")
-    assert around(2.5e-5, np.inf) == "2.5 × 10⁻⁵"
-
-
-def test_what_is_far_smaller_than_its_interval_is_written_to_the_interval_s_digits() -> None:
-    assert around(-6e-7, 0.48) == "0.00 ± 0.48"
-    assert around(2e-9, 4e-7) == "(0.0 ± 4.0) × 10⁻⁷"
-
-
-def test_both_ends_of_an_interval_are_in_one_power_of_ten() -> None:
-    assert between(-np.inf, 2.0) == "−∞ to 2"
-    assert between(2.1586e-5, 2.1598e-5) == "(2.1586 to 2.1598) × 10⁻⁵"
-    assert [percent(x) for x in (0.0, 1e-5, 0.034, 0.51, 0.996, 1.0)] == [
-        "0 %",
-        "< 0.1 %",
-        "3.4 %",
-        "51 %",
-        "99.6 %",
-        "100 %",
-    ]
-    assert (chance(1e-58), chance(0.056)) == ("< 10⁻⁶", "0.056")
-    assert [seconds(x) for x in (2.0, 3.4e-3, 5.6e-5, 0.0)] == ["2 s", "3.4 ms", "56 µs", "0 µs"]
-
-
-def test_a_small_share_is_in_ppm_and_an_interval_has_one_unit() -> None:
-    shares = {0.0: "0 %", 5.4e-6: "5.4 ppm", 5.13e-4: "513 ppm", -2.5e-6: "−2.5 ppm", 0.0139: "1.4 %", 2.5: "250 %"}
-    assert {value: share(value) for value in shares} == shares
-    assert share_between(-8e-6, 7.9e-6) == "−8 to +8 ppm"
-    assert share_between(-8e-6, 0.02) == "−0.0 to +2.0 %"
-    assert share_between(-np.inf, 2e-2) == "−∞ to 2 %"
+def test_numbers_are_written_for_people() -> None:
+    table: dict[Callable[[float], str], list[tuple[float, str]]] = {
+        plain: [(np.nan, "–"), (np.inf, "∞"), (-np.inf, "−∞")],
+        percent: [(0.0, "0 %"), (1e-5, "< 0.1 %"), (0.034, "3.4 %"), (0.51, "51 %"), (0.996, "99.6 %"), (1.0, "100 %")],
+        chance: [(1e-58, "< 10⁻⁶"), (0.056, "0.056")],
+        seconds: [(2.0, "2 s"), (3.4e-3, "3.4 ms"), (5.6e-5, "56 µs"), (0.0, "0 µs")],
+        share: [(5.4e-6, "5.4 ppm"), (5.13e-4, "513 ppm"), (-2.5e-6, "−2.5 ppm"), (0.0139, "1.4 %"), (2.5, "250 %")],
+    }
+    for form, cases in table.items():
+        for value, text in cases:
+            assert form(value) == text
+    of_two: dict[Callable[[float, float], str], list[tuple[float, float, str]]] = {
+        around: [(2.5e-5, np.inf, "2.5 × 10⁻⁵"), (-6e-7, 0.48, "0.00 ± 0.48"), (2e-9, 4e-7, "(0.0 ± 4.0) × 10⁻⁷")],
+        between: [(-np.inf, 2.0, "−∞ to 2"), (2.1586e-5, 2.1598e-5, "(2.1586 to 2.1598) × 10⁻⁵")],
+        share_between: [(-8e-6, 7.9e-6, "−8 to +8 ppm"), (-8e-6, 0.02, "−0.0 to +2.0 %"), (-np.inf, 0.02, "−∞ to 2 %")],
+    }
+    for both, pairs in of_two.items():
+        for first, second, text in pairs:
+            assert both(first, second) == text
 
 
 def test_an_ellipse_holds_95_percent_of_a_gaussian() -> None:
@@ -131,21 +111,6 @@ def test_an_ellipse_holds_95_percent_of_a_gaussian() -> None:
     border = ellipse(covariance)
     squares = np.einsum("ni,ij,nj->n", border, np.linalg.inv(covariance), border)
     assert squares == pytest.approx(stats.chi2.ppf(0.95, 2))
-
-
-def test_correlations_leave_lost_samples_out() -> None:
-    rng = np.random.default_rng(1)
-    errors, currents = rng.normal(size=300), rng.normal(size=300)
-    errors[[5, 6, 100]] = np.nan
-    own, bound = autocorrelation(errors, 4)
-    filled = np.where(np.isnan(errors), 0.0, errors)
-    assert own == pytest.approx([np.correlate(filled[k:], filled[:-k])[0] / (filled @ filled) for k in (1, 2, 3, 4)])
-    assert bound == pytest.approx(1.96 / 297**0.5)
-    cross, _ = crosscorrelation(errors, currents, 3)
-    for lag, value in enumerate(cross):
-        a, b = errors[lag:], currents[: 300 - lag]
-        assert value == pytest.approx(np.corrcoef(a[np.isfinite(a)], b[np.isfinite(a)])[0, 1])
-    assert autocorrelation(np.full(4, np.nan), 20)[0].tolist() == [0.0] * 3
 
 
 def test_a_figure_is_the_same_bytes_each_time_and_its_text_is_text() -> None:

@@ -1,0 +1,102 @@
+"""Options of a command from the function behind it: names, types and defaults by its signature, help by its docstring.
+
+An argument without a default stands by itself, one with a default is an option ``--name``. An option that is not typed
+is not passed on, so that each default stands in the signature only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+from emb_bench.sim.plant_spec import parse_assignments
+from emb_runtime.errors import UsageError
+
+Function = Callable[..., Any]
+METAVARS = {"bench": "FILE", "last": "FILE", "acceptance": "FILE", "plot": "FILE", "output": "FILE", "ray": "ADDRESS"}
+"""Words of ``--help`` for the values of options; without, those of the type."""
+LISTS = ("runs", "paths", "hold_out")  # Arguments that may be given several times
+
+
+def summary(function: Function) -> str:
+    """First sentence of a function's docstring, as a line of ``--help``."""
+    text = inspect.getdoc(function) or ""
+    return text.partition("\n\n")[0].replace("\n", " ").rstrip(".")
+
+
+def add(p: argparse.ArgumentParser, function: Function, leave_out: Sequence[str] = ()) -> None:
+    """Add the arguments of a function to a command line."""
+    described = _described(function)
+    for name, parameter in inspect.signature(function).parameters.items():
+        if name in leave_out or parameter.kind is parameter.VAR_KEYWORD:
+            continue
+        kind = eval(parameter.annotation, vars(sys.modules[function.__module__]))  # our own source
+        p.add_argument(*_flags(name, parameter), help=described[name], **_form(name, parameter, kind))
+
+
+def given(args: argparse.Namespace, function: Function, leave_out: Sequence[str] = ()) -> dict[str, Any]:
+    """The arguments of a function that were typed."""
+    names = set(inspect.signature(function).parameters) - set(leave_out)
+    return {name: value for name, value in vars(args).items() if name in names}
+
+
+def _flags(name: str, parameter: inspect.Parameter) -> list[str]:
+    if name == "output":
+        return ["-o", "--output"]
+    if parameter.default is parameter.empty:
+        return [name]
+    return [f"--{'no-' if parameter.default is True else ''}{name.replace('_', '-')}"]
+
+
+def _form(name: str, parameter: inspect.Parameter, kind: Any) -> dict[str, Any]:
+    """Keywords of ``add_argument`` for one argument."""
+    option = parameter.default is not parameter.empty
+    form: dict[str, Any] = {"default": argparse.SUPPRESS, "dest": name} if option else {}
+    if name == "output":
+        return {"required": True, "type": Path, "metavar": "FILE"}
+    if isinstance(parameter.default, bool):
+        return {**form, "action": "store_false" if parameter.default else "store_true"}
+    parts = (kind,) if get_origin(kind) is Literal else get_args(kind) or (kind,)
+    literal = next((part for part in parts if get_origin(part) is Literal), None)
+    if literal is not None:
+        return {**form, "choices": get_args(literal)}
+    if name in LISTS:
+        many = {"action": "append"} if option else {"nargs": "+"}
+        return {**form, **many, "type": Path, "metavar": "PATH" if name == "paths" else "RUN"}
+    for number, word in ((int, "N"), (float, "X")):
+        if number in parts:
+            return {**form, "type": number, "metavar": word}
+    if name == "bounds":
+        return {**form, "type": bounds_of, "metavar": "NAME=LOW:HIGH,..."}
+    if Path in parts and Mapping[str, float] not in parts:
+        return {**form, "type": Path, "metavar": METAVARS.get(name, "RUN")}
+    names = "NAMES" if Sequence[str] in parts else METAVARS.get(name, name.upper())
+    return {**form, "metavar": names}
+
+
+def bounds_of(text: str) -> dict[str, tuple[float, float]]:
+    """``k_m=0.01:0.1,f_v=1e-6:1e-4`` as a mapping to two numbers.
+
+    Raises:
+        UsageError: the text is not of that form.
+    """
+    found = {}
+    for name, pair in parse_assignments(text, "--bounds: ").items():
+        low, _, high = pair.partition(":")
+        try:
+            found[name] = (float(low), float(high))
+        except ValueError:
+            raise UsageError(f"--bounds: {name}: expected two numbers as in 0.01:0.1, got '{pair}'") from None
+    return found
+
+
+def _described(function: Function) -> dict[str, str]:
+    """Descriptions of arguments by name, from the part ``Args:`` of the docstring; as argparse takes them."""
+    section = (inspect.getdoc(function) or "").partition("Args:\n")[2].partition("\n\n")[0]
+    entries = re.findall(r"^    (\w+): ((?:.|\n(?!    \w+: ))*)", section, re.MULTILINE)
+    return {name: " ".join(text.split()).replace("%", "%%").rstrip(".") for name, text in entries}

@@ -1,0 +1,55 @@
+"""A design as text for a person."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from emb_bench.report.sentences import deviation
+from emb_bench.report.text import Table, facts
+
+if TYPE_CHECKING:  # a search for designs takes a second to import
+    from emb_bench.design.report import Check, Report
+
+
+def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
+    """Value of the criterion, the limits on the design's own brake, and what the design would tell.
+
+    Args:
+        report: the design.
+        written: name of the file that it is in; empty where it was not written.
+        verbose: add the other brakes that it was simulated on, and all local optima.
+    """
+    d, own = report.metadata(), report.checks[0]
+    nuisances = [name for name in d["params"] if name not in d["of"]]
+    brake = f"{d['model']}, {d['kind']} information, {'returns home' if d['returns'] else 'ends anywhere'}"
+    optima = ", ".join(f"{value:.6g}" for value in d["local_optima"][: None if verbose else 4])
+    bounds = d["cramer_rao"] or {}
+    lines = facts(
+        (d["value_is"], f"{d['value']:.7g}; {_verdict(own)}"),
+        (
+            "criterion",
+            f"{d['criterion']} of {', '.join(d['of'])}{' with nuisances ' if nuisances else ''}" + ", ".join(nuisances),
+        ),
+        ("brake", brake),
+        ("bounds", ", ".join(f"{name} {deviation(bound, name)}" for name, bound in bounds.items())),
+        ("optima", f"{optima} ({d['starts']} starts, seed {d['seed']})"),
+        ("currents", written or "not written: use -o design.npz or design.csv"),
+    )
+    return "\n".join([*lines, *(["", *_checks(report).lines()] if verbose else [])])
+
+
+def _verdict(check: Check) -> str:
+    return f"{'limits held' if check.limits_held else 'LIMITS LEFT'}, {'home' if check.home else 'not home'}"
+
+
+def _checks(report: Report) -> Table:
+    """The design simulated again, on its own brake first."""
+    rows = [
+        [
+            *(c.plant, f"{c.log_det:.4f}", f"{c.lowest_angle:.3f} to {c.highest_angle:.3f}", f"{c.largest_speed:.2f}"),
+            *(f"{c.end_angle:.3f}", f"{c.end_velocity:.3f}", _verdict(c)),
+        ]
+        for c in report.checks
+    ]
+    header = ["simulated on", "log det", "angle [rad]", "rad/s", "end [rad]", "[rad/s]", ""]
+    return Table("", header, rows, words=(0, 6))

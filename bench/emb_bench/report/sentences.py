@@ -1,0 +1,284 @@
+"""The sentences that texts and pages share: one function each, from a record to English."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from emb_bench.brake.parameters import UNITS
+from emb_bench.information.identifiability import combination
+from emb_bench.numbers import amount, between, percent, plain, spread
+
+if TYPE_CHECKING:  # scipy comes with the extra [bench]
+    from emb_bench.analysis.conclusion import Conclusion
+    from emb_bench.analysis.drift import Drift
+    from emb_bench.analysis.held_out import HeldOut
+    from emb_bench.analysis.model_choice import Candidate
+    from emb_bench.analysis.profile import OpenSide, Profile
+    from emb_bench.analysis.recommendation import Recommendation
+    from emb_bench.analysis.study import Study
+    from emb_bench.estimate.records import Estimate
+    from emb_bench.information.identifiability import Direction, Finding, Identifiability
+    from emb_bench.report.content import Content, Run
+
+INTERVALS = (
+    "95 % intervals (k=2). Repeatability: sensor noise alone. Total: also systematic errors and what the record "
+    "cannot exclude."
+)
+
+
+def p_value(value: float) -> str:
+    """A p value behind its letter."""
+    return "p < 1e-6" if value < 1e-6 else f"p = {value:.2g}"
+
+
+def deviation(value: float, name: str, digits: int = 3) -> str:
+    """A standard deviation of an unknown: in percent, or in its unit if it has no scale."""
+    found = spread(value, name not in UNITS, digits)
+    unit = UNITS.get(name, "").removesuffix("1")  # of a share
+    return f"{found} {unit}" if unit and found[0].isdigit() else found
+
+
+# ---- the verdict on a study ----
+
+
+def headline(study: Study) -> str:
+    """Whether the model explains the records, and what its values are worth."""
+    name, e = study.estimate.plant.name, study.estimate
+    if study.biased:
+        return (
+            f"NOT JUDGED: recursive least squares does not reproduce the record (chi2/n {plain(e.validation.ratio)}). "
+            "Noise biases its values; that says nothing about the model. Use --method oem."
+        )
+    if not study.model_fits:
+        return (
+            f"THE MODEL '{name}' DOES NOT FIT: the values are its best, and their intervals do not include its error."
+        )
+    if not study.predicts:
+        return f"THE MODEL '{name}' DOES NOT PREDICT other records: the values hold only for the records they are from."
+    if study.identified:
+        return f"The model '{name}' fits. All parameters are identified: the values may be used."
+    others = len(study.unidentified) < len(e.asked.params)
+    end = "; the values of the others may be used" if others else ""
+    return f"The model '{name}' fits. NOT identified: {', '.join(study.unidentified)}{end}."
+
+
+def verdict(content: Content) -> str:
+    """A report in one line: why a run was stopped, whether the brake was accepted, or whether the model fits."""
+    acceptance = content.acceptance
+    if content.stopped:
+        more = f", and {len(content.stopped) - 1} more" if len(content.stopped) > 1 else ""
+        return f"{'NOT ACCEPTED. ' if acceptance else ''}STOPPED: {stopped(content.stopped[0])}{more}"
+    if acceptance is not None:
+        count, result = len(acceptance.results), acceptance.result
+        names = ", ".join(one.name for one in acceptance.of(result))
+        found = len(acceptance.of(result))
+        if result == "fail":
+            return f"NOT ACCEPTED: {found} of {count} criteria failed: {names}"
+        if result == "cannot tell":
+            return f"CANNOT TELL: {found} of {count} criteria not decided: {names}"
+        return f"ACCEPTED: {'the one criterion' if count == 1 else f'all {count} criteria'} passed"
+    if content.only_alone:
+        return ONLY_ALONE
+    return f"NO ESTIMATE: {content.why_not}" if content.study is None else headline(content.study)
+
+
+ONLY_ALONE = (
+    "EACH RUN FITS ALONE, but not all of them together: they are of different brakes, or the brake changed between "
+    "them. Use the values of each run, not the common ones"
+)
+
+
+def stopped(run: Run) -> str:
+    """That a run did not come to its planned end, and why."""
+    return f"{run.name}: the run was stopped: {run.why_stopped}"
+
+
+def apart(study: Study) -> str:
+    """Parameters in which logs differ that each fit alone."""
+    values = "; ".join(f"{d.name}: {', '.join(plain(value, 5) for value in d.values)}" for d in study.apart)
+    return f"each log fits alone, but not with the others: two brakes, or one that changed. By each log: {values}."
+
+
+def models(study: Study) -> str:
+    """Models that the records do not tell apart; empty if one is left."""
+    found: Sequence[Candidate] = study.choice.left_over if study.choice is not None else ()
+    if study.choice is None or len(found) < 2:
+        return ""
+    names = ", ".join(c.name for c in found[:-1])
+    weights = ", ".join(percent(c.weight) for c in found)
+    every = "both" if len(found) == 2 else "all"
+    fit = f"{every} fit" if study.choice.best.fits else "do not fit"
+    return (
+        f"{names} and {found[-1].name} {fit}, and the records do not tell them apart (weights {weights}): the "
+        f"intervals cover {every}"
+    )
+
+
+# ---- parameters ----
+
+
+def conclusion(c: Conclusion) -> str:
+    """Value, interval and standing of a parameter, and what would help."""
+    said = [amount(c.value, c.interval, c.unit), c.standing.value + (f": {c.why_not}" if c.why_not else "")]
+    return "; ".join([*said, *details(c)])
+
+
+def details(c: Conclusion) -> list[str]:
+    """What else there is to say of a parameter."""
+    said = ["any other value fits as well"] if c.arbitrary else []
+    if c.traded_with:
+        said.append(f"trades off with {', '.join(c.traded_with)}")
+    if c.help == "one run":
+        said.append(f"one more run of {c.run} would reduce its deviation to {deviation(c.deviation_after, c.label, 2)}")
+    if c.help == "none":
+        said.append("no reference excitation identifies it")
+    return [*said, drift(c.drift)] if c.drift is not None else said
+
+
+def drift(d: Drift) -> str:
+    """Change of a parameter since an earlier estimate."""
+    since = "the last estimate" if not d.since else d.since[0]
+    since += f" and {len(d.since) - 1} more" if len(d.since) > 1 else ""
+    if math.isinf(d.detectable):
+        return f"cannot be compared with {since}: not identified {'then' if math.isinf(d.last_deviation) else 'now'}"
+
+    def size(change: float) -> str:
+        return f"{100.0 * change:.2g} %" if d.relative else f"{change:.2g}"
+
+    if not d.drifted:
+        return f"no significant change since {since} (detection limit {size(d.detectable)})"
+    doubts = [f"the model was {d.last_model} then" if x.name == "OTHER_MODEL" else x.value for x in d.doubts]
+    perhaps = f", perhaps because {' and '.join(doubts)}" if doubts else ""
+    way = "rose" if d.sigmas > 0 else "fell"
+    return f"{way} by {size(abs(d.relative_change))} ({abs(d.sigmas):.2g} sigma) since {since}{perhaps}"
+
+
+def held_out(h: HeldOut) -> str:
+    """Whether a record was predicted."""
+    return f"{'predicted' if h.fits else 'NOT predicted'}, chi2/n {h.ratio:.4g} of {h.freedom}, {p_value(h.p_value)}"
+
+
+def profile(p: Profile, e: Estimate) -> str:
+    """Interval of a likelihood profile beside that of the Fisher information; in the units that are shown."""
+    (low, high), fisher = p.interval, p.fisher
+    if math.isinf(low) and math.isinf(high):
+        said = "flat: the records exclude no value within the search"
+    elif math.isinf(low):
+        said = f"only values above {plain(high, 4)} are excluded"
+    elif math.isinf(high):
+        said = f"only values below {plain(low, 4)} are excluded"
+    elif math.isinf(fisher[1]):
+        said = f"{between(low, high)}; the Fisher information gives no bound"
+    elif p.agrees:
+        said = f"{between(low, high)}, as the Fisher information says"
+    else:
+        said = f"{between(low, high)}; the Fisher information says {between(*fisher)}"
+    found = [said, *(_open_side(side) for side in p.open_sides)]
+    if e.method != "oem":
+        found.append(f"of output error, whose minimum is at {plain(p.minimum, 6)}")
+    if p.fell:
+        found.append(f"chi2 fell by {p.fell:.3g} at {plain(p.minimum, 6)}: the estimate is a local minimum only")
+    if not e.validation.fits:
+        found.append("too narrow, because the model does not fit")
+    return "; ".join(found)
+
+
+def _open_side(side: OpenSide) -> str:
+    where = "another unknown reaches its bound" if side.by_other else "the search ends"
+    rise, way = side.rise if abs(side.rise) > 1e-6 else 0.0, "above" if side.above else "below"
+    return f"{way} the estimate chi2 rises by {rise:.2g} to {plain(side.at, 4)}, where {where}"
+
+
+def prior(e: Estimate) -> str:
+    """What was known beforehand."""
+    ranges = e.asked.prior
+    return "" if ranges is None else f"the ranges '{ranges.name}', as a Gaussian of their mean and variance"
+
+
+def once(study: Study) -> str:
+    """A warning where the best minimum was found by one search of several; else empty."""
+    found = study.minima
+    lonely = len(study.estimate.ends) > 1 and bool(found) and len(found[0]) == 1
+    return "the best minimum was found by one search only: use more --starts" if lonely else ""
+
+
+def pairs(found: Sequence[str]) -> str:
+    """Pairs of parameters that are strongly correlated."""
+    return f"strongly correlated: {'; '.join(found)}"
+
+
+# ---- what to do next ----
+
+
+def recommendation(r: Recommendation) -> str:
+    """A run that would help, and what it would bring."""
+    brings = ", ".join(f"{n} from {deviation(r.before[n], n, 2)} to {deviation(r.after[n], n, 2)}" for n in r.wanting)
+    return f"one more run of {r.excitation} would bring {brings} (standard deviation{'s' * (len(r.wanting) > 1)})"
+
+
+def remedies(study: Study) -> list[str]:
+    """What to do where the model does not fit or predict; empty where nothing is wrong."""
+    from emb_bench.estimate.suspects import shown_as
+
+    e = study.estimate
+    if study.biased:
+        return ["use another method: --method oem"]
+    if study.model_fits and not study.predicts:
+        return ["find out what differs between the runs: the brake, its homing (--nuisance offset), or use --model"]
+    if study.apart:
+        return ["estimate from each log alone: emb-replay campaign LOGS -o FILE"]
+    if study.model_fits:
+        return []
+    if e.bench.machine is None:
+        found = ["find a model that explains the record: --model all, or --grow"]
+    elif "viscous_asymmetry" not in e.asked.names:
+        found = ["let friction depend on the direction: --params with viscous_asymmetry, or by_direction in the map"]
+    else:
+        found = ["keep to the intervals, which come from the scatter of the windows, not from a model that is right"]
+    if study.suspects:
+        found.append(f"or correct what the residuals point to: {shown_as(study.suspects[0], e.bench.machine).name}")
+    if e.method == "oem":
+        found.append("if no model explains the record, something may disturb the brake: --method pem")
+    return found
+
+
+def warned(study: Study) -> str:
+    """A warning not to drive again before the cause of a stop is found; empty where no run was stopped."""
+    return f"a run was stopped ({', '.join(study.stopped)}): find out why before the next one" if study.stopped else ""
+
+
+def impact(run: Run, speed: float | None, why_not: str) -> str:
+    """What a loss of all commands would do, for any brake of the shield's set."""
+    if why_not or speed is None:
+        return f"unknown: {why_not}"
+    how = "the node brakes" if run.bench.node.stop == "damped" else "the node lets go"
+    if speed == 0.0:
+        return f"{how}, and no brake of the set '{run.bench.shield.ranges}' reaches an end stop"
+    return f"{how}, and a brake of the set may hit an end stop with {plain(speed, 3)} rad/s"
+
+
+# ---- identifiability ----
+
+
+def finding(f: Finding) -> str:
+    """Whether the data identify one parameter."""
+    said = ["identified" if f.identified else f"NOT identified: {f.why_not}"]
+    said += [f"trades off with {', '.join(f'{name} ({value:+.4f})' for name, value in f.traded_with.items())}"] * bool(
+        f.traded_with
+    )
+    return "; ".join([*said, f.border] if f.border else said)
+
+
+def direction(d: Direction) -> str:
+    """A combination of parameters that the data do not identify."""
+    if math.isinf(d.deviation):
+        return f"no information on {combination(d.shares)}"
+    return f"hardly any information on {combination(d.shares)}: known to {d.deviation:.3g} times its size"
+
+
+def directions(found: Identifiability) -> list[str]:
+    """Combinations that are not identified, or by the prior alone."""
+    lines = [direction(d) for d in found.directions]
+    return lines + [f"from the prior alone: {combination(shares)}" for shares in found.left_to_prior]
