@@ -1,4 +1,4 @@
-"""What the commands do, from Python: run in simulation, open a log, information, estimate, report, campaign, design.
+"""The commands from Python: simulation, logs, information, estimate, report, campaign, design.
 
 Each function is the command of that name, and its arguments are the command's options: :func:`simulate` is ``emb-run
 --iface sim``, :func:`fisher_information` is ``emb-replay fim``, :func:`design` is ``emb-design``, the others are
@@ -313,7 +313,8 @@ def report(
     except ImportError as err:
         raise UsageError("a report needs matplotlib: pip install 'emb-excite[bench]'") from err
     from emb_bench.analysis.acceptance import read_criteria
-    from emb_bench.report.content import document, gather
+    from emb_bench.report.content import gather
+    from emb_bench.report.document import document
     from emb_bench.report.page import report_page
 
     before = _last(given["last"])

@@ -19,6 +19,7 @@ import numpy as np
 from emb_bench.analysis.drift import Drift
 from emb_bench.analysis.profile import Profile
 from emb_bench.analysis.recommendation import HELPS, PRECISE, Recommendation
+from emb_bench.brake.motion import Floats
 from emb_bench.estimate.intervals import interval as with_profile
 from emb_bench.estimate.records import NORMAL_95, Estimate, Unknown
 from emb_bench.information.identifiability import GROSS, Finding, Spectrum

@@ -53,7 +53,7 @@ class Named(msgspec.Struct, frozen=True):
 
 
 class Earlier(msgspec.Struct, frozen=True):
-    """What is compared of an earlier estimate's JSON document."""
+    """An earlier estimate, as far as it is compared."""
 
     parameters: Annotated[dict[str, Entry], msgspec.Meta(min_length=1)]
     model: str = ""

@@ -127,18 +127,19 @@ class Study:
         """A pandas frame with a row for each parameter; ends of intervals and repeatability in the unit of the value.
 
         Raises:
-            UsageError: pandas is missing.
+            UsageError: pyarrow or pandas is missing.
         """
-        try:
-            import pandas as pd
-        except ImportError as err:
-            raise UsageError("a data frame needs pandas: pip install pandas") from err
         rows = [
-            {"value": c.value, "low": c.interval[0], "high": c.interval[1], "repeatability": c.repeatability,
-             "unit": c.unit, "identified": c.identified}
+            {"name": c.label, "value": c.value, "low": c.interval[0], "high": c.interval[1], "unit": c.unit,
+             "repeatability": c.repeatability, "identified": c.identified}
             for c in self.conclusions
         ]  # fmt: skip
-        return pd.DataFrame(rows, index=[c.label for c in self.conclusions])
+        try:
+            import pyarrow as pa
+
+            return pa.Table.from_pylist(rows).to_pandas().set_index("name")
+        except ImportError as err:
+            raise UsageError("a data frame needs pyarrow and pandas: pip install pyarrow pandas") from err
 
     @property
     def model_fits(self) -> bool:

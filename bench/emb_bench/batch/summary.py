@@ -269,7 +269,7 @@ def _folders(rows: Sequence[Row], options: Options) -> tuple[Folder, ...]:
 
 
 def text(c: Campaign, *, verbose: bool = False) -> str:
-    """What failed, the parameters over all runs, and whether the runs agree; with ``verbose`` details of each."""
+    """Failures, the parameters over all runs, and agreement of the runs; with ``verbose`` trends and folders."""
     lines = []
     if c.failed:
         lines += [f"{len(c.failed)} of {c.logs} logs FAILED", *listed("  ", (str(r.error) for r in c.failed[:SHOWN]))]
@@ -294,7 +294,7 @@ def _more(rows: Sequence[Row], column: str) -> list[str]:
 
 
 def _agreement(name: str, p: ParameterSummary) -> str:
-    """Whether the runs agree on a parameter; empty where there is one run or no estimate was asked for."""
+    """Agreement of the runs on a parameter; empty for a single run, and without estimates."""
     if p.estimate is None:
         return ""
     found = p.estimate.constancy

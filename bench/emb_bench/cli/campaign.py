@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 
 from emb_bench import api
-from emb_bench.cli.answer import add_output_options, answer
 from emb_bench.cli.estimate import METHODS
-from emb_bench.cli.options import add, given, summary
+from emb_bench.cli.options import add, add_output_options, answer, given, summary
 from emb_bench.output import reported_if_interrupted
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG
 

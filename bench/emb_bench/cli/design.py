@@ -8,8 +8,7 @@ from importlib import metadata
 from pathlib import Path
 
 from emb_bench import api
-from emb_bench.cli.answer import add_output_options, answer
-from emb_bench.cli.options import add, given, summary
+from emb_bench.cli.options import add, add_output_options, answer, given, summary
 from emb_bench.figures import ENDINGS, require_place
 from emb_runtime.errors import EXIT_DONE, EmbError
 from emb_runtime.system.terminal import complain

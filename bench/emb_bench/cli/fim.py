@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 
 from emb_bench import api
-from emb_bench.cli.answer import add_output_options, answer
-from emb_bench.cli.options import add, given, summary
+from emb_bench.cli.options import add, add_output_options, answer, given, summary
 from emb_bench.report.fim import document, models_text, text
 from emb_runtime.config.plants import EVERY
 from emb_runtime.errors import EXIT_DONE

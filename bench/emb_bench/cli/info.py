@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from emb_bench.cli.answer import add_output_options, answer
+from emb_bench.cli.options import add_output_options, answer
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import read_log
 from emb_bench.report.info import text

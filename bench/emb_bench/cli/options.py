@@ -1,7 +1,8 @@
 """Options of a command from the function behind it: names, types and defaults by its signature, help by its docstring.
 
 An argument without a default stands by itself, one with a default is an option ``--name``. An option that is not typed
-is not passed on, so that each default stands in the signature only.
+is not passed on, so that each default stands in the signature only. Every command that answers has the same options
+for the form of its answer.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
+from emb_bench.report.text import show
 from emb_bench.sim.plant_spec import parse_assignments
 from emb_runtime.errors import UsageError
+from emb_runtime.system.terminal import as_json
 
 Function = Callable[..., Any]
 METAVARS = {"bench": "FILE", "last": "FILE", "acceptance": "FILE", "plot": "FILE", "output": "FILE", "ray": "ADDRESS"}
@@ -100,3 +103,39 @@ def _described(function: Function) -> dict[str, str]:
     section = (inspect.getdoc(function) or "").partition("Args:\n")[2].partition("\n\n")[0]
     entries = re.findall(r"^    (\w+): ((?:.|\n(?!    \w+: ))*)", section, re.MULTILINE)
     return {name: " ".join(text.split()).replace("%", "%%").rstrip(".") for name, text in entries}
+
+
+def add_output_options(p: argparse.ArgumentParser) -> None:
+    """Add ``--json``, ``--verbose`` and ``--quiet``."""
+    group = p.add_mutually_exclusive_group()
+    group.add_argument("--json", action="store_true", help="print JSON; a number that is not finite is null")
+    group.add_argument("-v", "--verbose", action="store_true", help="print the details behind the answer, too")
+    group.add_argument("-q", "--quiet", action="store_true", help="print the verdict only")
+
+
+def answer(args: argparse.Namespace, document: Callable[[], Any], text: Callable[[bool], str]) -> None:
+    """Print a result as the options ask for it.
+
+    Args:
+        args: with the options of :func:`add_output_options`.
+        document: gives the JSON document.
+        text: gives the text; its argument is True if it is to be verbose.
+    """
+    if args.json:
+        show(as_json(document()))
+        return
+    said = text(args.verbose)
+    show(_verdict(said) if args.quiet else said)
+
+
+def _verdict(text: str) -> str:
+    """Warnings and the first line behind them, each in one line."""
+    lines: list[str] = []
+    for line in text.splitlines():
+        if line.startswith("    ") and lines:
+            lines[-1] += f" {line.strip()}"
+        elif lines and not lines[-1].startswith(("WARNING", "NOTE")):
+            break
+        else:
+            lines.append(line)
+    return "\n".join(lines)

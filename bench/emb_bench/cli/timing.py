@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emb_bench.cli.answer import add_output_options, answer
+from emb_bench.cli.options import add_output_options, answer
 from emb_bench.figures import COLOURS, ENDINGS, GREY, drawn, require_place
 from emb_bench.logs.log import read_log
 from emb_bench.logs.timing import INTERVALS, Timing

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,17 +16,14 @@ from emb_bench.analysis.acceptance import Acceptance, Criteria, Result, RunFacts
 from emb_bench.analysis.drift import Earlier
 from emb_bench.analysis.growth import Growth, growth
 from emb_bench.analysis.study import Study, StudyOptions, begun_with, make_study, was_stopped
-from emb_bench.documents import to_json
 from emb_bench.estimate.prediction import too_few
 from emb_bench.estimate.records import DONE
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
-from emb_bench.information.criteria import criteria
 from emb_bench.logs import timing
-from emb_bench.logs.info import cycle_summary, info_document
+from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import Timing
-from emb_bench.report import estimate as estimate_report
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import LogError
 from emb_runtime.records import Reason
@@ -321,54 +317,3 @@ class ActiveCycles:
         """Mask of the cycles in which each reason held."""
         self.largest = cycle_summary(run.log).largest
         """Extremes of angle, speed and current, as the command ``info`` gives them."""
-
-
-def document(content: Content) -> dict[str, Any]:
-    """JSON document with the content of the page; numbers may be infinite."""
-    study = content.study
-    found: dict[str, Any] = to_json(
-        {
-            "made_by": content.made_by,
-            "acceptance": None if content.acceptance is None else content.acceptance.document(),
-            "model_fits": None if study is None else study.model_fits,
-            "predicts": None if study is None else study.predicts,
-            "why_no_estimate": content.why_not,
-            "left_out": [{"log": entry.path, "why": entry.words} for entry in content.left_out],
-            "estimate": None if study is None else estimate_report.document(study),
-            "runs": [_run_document(run, study) for run in content.runs],
-        }
-    )
-    return found
-
-
-def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
-    found: dict[str, Any] = {
-        "began": run.began,
-        "simulated": run.simulated,
-        "why_not_estimated": run.why_not,
-        "sha256": run.log_sha256,
-        "info": info_document(run.log),
-        "timing": None if run.timing is None else timing.document(run.timing),
-    }
-    x, alone = run.experiment, run.alone
-    if x is not None:
-        named = ("planned", "command_delay", "missing", "notes")
-        found["experiment"] = {name: getattr(x, name) for name in named} | {
-            "periods": len(x.currents),
-            "measured": x.measured.sum(),
-            "braked_periods": x.braked,
-            "applied_current": x.currents,
-            "angle": x.all_samples[:, 0],
-            "velocity": x.all_samples[:, 1],
-        }
-    if alone is not None:
-        found["alone"] = {"model_fits": alone.model_fits, "conclusions": alone.conclusions}
-    if run.residuals is not None:
-        found["residuals"] = {"angle": run.residuals[:, 0], "velocity": run.residuals[:, 1]}
-    if run.growth is not None and study is not None:
-        final = criteria(run.growth.samples, run.growth.labels, run.growth.params)
-        found["information"] = {
-            **run.growth.document(),
-            "of_samples": {"log_det": final.log_det, "lambda_min": final.lambda_min},
-        }
-    return found

@@ -46,13 +46,13 @@ def _against(study: Study) -> Iterator[str]:
 
 
 def _notes(study: Study) -> list[str]:
-    """What qualifies the values."""
+    """Qualifications of the values."""
     apart = [say.apart(study)] if study.apart else []
     return [*study.notes, *apart, say.models(study), *study.estimate.caveats]
 
 
 def _remarks(study: Study) -> Iterator[str]:
-    """What the table does not say: doubts of parameters, trade-offs and changes, each for all that it holds for."""
+    """Doubts, trade-offs and changes of parameters, each with all parameters that it holds for."""
     said: dict[str, list[str]] = {}
     for c in study.conclusions:
         remarks = [c.why_not, f"trades off with {', '.join(c.traded_with)}" if c.traded_with else ""]
@@ -63,7 +63,7 @@ def _remarks(study: Study) -> Iterator[str]:
 
 
 def _limits(study: Study) -> Iterator[str]:
-    """What the intervals are limited by, and effects that the residuals hint at."""
+    """Effects that limit the intervals, and effects that the residuals hint at."""
     e = study.estimate
     by: dict[str, list[str]] = {}
     for i in e.wanted():

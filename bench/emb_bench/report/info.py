@@ -43,7 +43,7 @@ def text(d: Mapping[str, Any], *, verbose: bool = False) -> str:
 
 
 def _recording(d: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What an imported recording has and lacks."""
+    """Samples of an imported recording, and the signals that it lacks."""
     return [("samples", f"{d['cycles']['active']}, of a recording"), *(("lacks", lack) for lack in d.get("lacks", ()))]
 
 

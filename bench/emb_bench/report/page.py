@@ -1,23 +1,33 @@
-"""The page of a report: its figures and tables, in the order in which they are read."""
+"""The page of a report: its figures and tables, for one template.
+
+The content of a log is not trusted: its metadata and events may contain anything. HTML is escaped wherever a value is
+put into it, and the page forbids its reader's browser to load or to run anything whatever it contains.
+"""
 
 from __future__ import annotations
 
+import base64
+import functools
 import hashlib
-from collections.abc import Iterator
-from typing import NamedTuple
+import re
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any, NamedTuple
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from emb_bench import numbers
 from emb_bench.analysis.growth import Growth
 from emb_bench.analysis.study import Study
-from emb_bench.estimate.records import TERMS
+from emb_bench.estimate.records import METHODS, TERMS
 from emb_bench.logs.learnt import history, last_ranges
 from emb_bench.logs.timing import INTERVALS, Timing, quantiles
 from emb_bench.numbers import percent, plain, seconds, signed
-from emb_bench.report import certainty, figures, tables
-from emb_bench.report.content import REASONS, ActiveCycles, Content, Run, stop_samples
-from emb_bench.report.render import html, section
+from emb_bench.report import certainty, figures, sentences, tables
+from emb_bench.report.content import REASONS, ActiveCycles, Content, Run, StopSamples, stop_samples
+from emb_bench.report.figures import Panel
 from emb_bench.report.text import Table
 from emb_bench.report.trend import panels as trend_panels
 from emb_bench.report.trend import table as run_table
@@ -30,17 +40,38 @@ from emb_runtime.safety.end_stop import end_stop_speed
 EVENTS = 200  # Most safety events that are shown; report.json has them all
 LONGEST = 2000  # Characters of an event that are shown; report.json has them all
 SHORT_HASH = 16  # Digits of a hash that are shown where there is no room for all
+_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
 SETTING = "rt_"  # Prefix of the real-time settings among the entries of a run's outcome
 
 
-class Part(NamedTuple):
-    """A section of the page."""
+@dataclass(frozen=True)
+class View:
+    """Tables and figures of one run, by their names in the template."""
 
-    name: str  # HTML identifier, the target of links
-    title: str
-    body: Markup = Markup()
-    parts: tuple[Part, ...] = ()  # Sections inside it
-    folded: bool = False  # True if it is closed until the reader opens it, and printed only if it is open
+    run: Run
+    prefix: str  # Of the HTML identifiers of its sections; empty if it is the only run
+    cycles: ActiveCycles | None
+    after: StopSamples | None
+    motion: list[Panel]
+    obeyed: bool
+    learnt: tuple[list[Panel], dict[str, list[float]]] | None
+    residuals: Table | None
+    information: tuple[list[Panel], Table, Table] | None
+    timing: tuple[Table, list[Panel]] | None
+    safety: Safety | None
+    counts: Table
+    settings: list[tuple[str, str]]
+    outcome: list[tuple[str, str]]
+    files: Table
+
+
+class Safety(NamedTuple):
+    """Events of the safety chain, and what a loss of all commands would do."""
+
+    speed: float | None  # At an end stop, at worst [rad/s]; None if unknown
+    why_not: str
+    events: Table
+    more: int  # Events that are not shown
 
 
 def report_page(content: Content) -> str:
@@ -50,66 +81,91 @@ def report_page(content: Content) -> str:
         UsageError: matplotlib is missing.
         LogError: a log cannot be read any more.
     """
-    study, several = content.study, len(content.runs) > 1
-    parts = [
-        Part(
-            "verdict",
-            "Verdict",
-            section("verdict.html.j2", "verdict", content, tables.acceptance_table(content.acceptance)),
+    several = len(content.runs) > 1
+    views = [view(run, f"run-{n}-" if several else "") for n, run in enumerate(content.runs, 1)]
+    found = trends(content.estimated) if len(content.estimated) > 1 else []
+    return (
+        environment()
+        .get_template("page.html.j2")
+        .render(
+            content=content,
+            study=content.study,
+            views=views,
+            acceptance=tables.acceptance_table(content.acceptance),
+            runs=run_table(content.runs, found) if several else None,
+            trends=found,
+            trend_panels=trend_panels(found),
+            tested=_tested(content),
+            reasons=REASONS,
+            terms=TERMS,
+            **({} if content.study is None else _of_study(content, content.study)),
         )
-    ]
-    if several:
-        parts += _of_several_runs(content)
-    if study is not None:
-        shown = tables.parameters(study)
-        parts.append(Part("parameters", "Parameters", section("estimate.html.j2", "parameters", study, shown)))
-        parts += _next(study)
-    if several:
-        folded = [
-            Part(
-                f"run-{n}",
-                f"Run {n}: {run.name}",
-                parts=(*_seen(run, f"run-{n}-"), *_of_a_run(run, content, f"run-{n}-")),
-            )
-            for n, run in enumerate(content.runs, 1)
-        ]
-    else:
-        run = content.runs[0]
-        parts += [*_seen(run, ""), _tested(content)]
-        folded = [*_of_a_run(run, content, "")]
-    if several:
-        parts.append(_tested(content))
-    evidence = [] if study is None else [*_of_all_runs(content, study)]
-    folded = [*evidence, *folded, Part("words", "What the words mean", section("run.html.j2", "words", TERMS))]
-    parts += [part._replace(folded=True) for part in folded]
-    names = ", ".join(run.name for run in content.reported)
-    return html(
-        "page.html.j2",
-        title=f"Report of {names}",
-        opening=section("verdict.html.j2", "opening", content),
-        parts=parts,
-        closing=f"Made by {content.made_by} from {names}. The JSON file beside this page has the same as numbers.",
     )
 
 
-def _tested(content: Content) -> Part:
-    """Device, bench, operator, versions and hashes, as the logs have them; and the place for a signature."""
+def _of_study(content: Content, study: Study) -> dict[str, Any]:
+    """Tables and figures of the estimate, by their names in the template."""
+    e = study.estimate
+    correlation, pairs = tables.correlation(e)
+    runs = [(run.name, run.growth) for run in content.estimated if run.growth is not None]
+    checks = (tables.residual_tests(study), tables.suspects(e), tables.systematic(e), tables.predicted(study))
+    return {
+        "parameters": tables.parameters(study),
+        "gains": [tables.gain(r) for r in study.advice],
+        "checks": (*checks, tables.models(study), tables.growth_path(study)),
+        "drifts": tables.drifts(study) if study.drifts else None,
+        "contributions": tables.contributions(study, runs) if len(runs) > 1 else None,
+        "deviations": tables.deviations(study),
+        "ellipses": certainty.ellipses(e, study.truth) if len(certainty.drawable(e)) > 1 else None,
+        "correlation": correlation,
+        "pairs": pairs,
+        "profiles": certainty.profiles(study.profiles, e) if study.profiles else None,
+        "bootstrap": tables.bootstrap(study),
+        "minima": tables.minima(study),
+    }
+
+
+def view(run: Run, prefix: str = "") -> View:
+    """Tables and figures of one run."""
+    log, growth = run.log, run.growth
+    cycles, after = _cycles(run), stop_samples(run)
+    end, driven = log.end, not log.imported
+    attached = [[n, str(len(data)), hashlib.sha256(data).hexdigest()] for n, data in log.attachments.items()]
+    return View(
+        run=run,
+        prefix=prefix,
+        cycles=cycles if driven else None,
+        after=after,
+        motion=_motion(run, cycles, after),
+        obeyed=cycles is not None and figures.applied_as_sent(run, cycles),
+        learnt=_learnt(run) if log.counts.get(LEARNT.name) else None,
+        residuals=None if run.residuals is None else _residuals(run.residuals),
+        information=None if growth is None else (figures.information(growth), *_information(growth)),
+        timing=_timing(run) if driven else None,
+        safety=_safety(run) if driven else None,
+        counts=Table("Messages in the file", ["topic", "messages"], [[t, str(n)] for t, n in log.counts.items()]),
+        settings=[(key.removeprefix(SETTING), value) for key, value in end.items() if key.startswith(SETTING)],
+        outcome=[(key, value) for key, value in end.items() if not key.startswith(SETTING)],
+        files=Table("Files inside the log", ["attached file", "bytes", "SHA-256"], attached, words=(0, 2)),
+    )
+
+
+def _tested(content: Content) -> list[tuple[str, str]] | Table:
+    """Device, bench, operator, versions and hashes, as the logs have them."""
     names = ["device serial", "operator", "bench", "recorded", "recorded by", "policy SHA-256", "log SHA-256"]
     columns = [_identity(run) for run in content.runs]
     if any(run.log.drive_files is not None for run in content.runs):
         names = [*names, "drive", "which lacks, accepted by name"]
         columns = [[*own, *_drive(run)] for own, run in zip(columns, content.runs, strict=True)]
     if len(columns) == 1:
-        one = [*zip(names, columns[0], strict=True), ("evaluated by", content.made_by)]
-        return Part("tested", "What was tested", section("verdict.html.j2", "tested", one, None))
+        return [*zip(names, columns[0], strict=True), ("evaluated by", content.made_by)]
     cut = [SHORT_HASH if "SHA" in name else LONGEST for name in names]
     rows = [
         [run.name, *(value[:most] for value, most in zip(own, cut, strict=True))]
         for run, own in zip(content.runs, columns, strict=True)
     ]
     title = f"Evaluated by {content.made_by}. Of each SHA-256 the first {SHORT_HASH} digits; the evidence has all"
-    found = Table(title, ["run", *names], rows, words=range(len(names) + 1))
-    return Part("tested", "What was tested", section("verdict.html.j2", "tested", [], found))
+    return Table(title, ["run", *names], rows, words=range(len(names) + 1))
 
 
 def _identity(run: Run) -> list[str]:
@@ -136,88 +192,19 @@ def _drive(run: Run) -> list[str]:
     return [value[:LONGEST] or "none" for value in (drive, lacks)]
 
 
-def _of_several_runs(content: Content) -> Iterator[Part]:
-    of = content.estimated
-    found = trends(of) if len(of) > 1 else []
-    drawn = trend_panels(found) if found else []
-    yield Part("runs", "Runs", section("estimate.html.j2", "runs", run_table(content.runs, found), drawn, found))
-
-
-def _next(study: Study) -> Iterator[Part]:
-    """Recommended next step, where there is something to do."""
-    if study.advice or not study.holds or study.stopped:
-        gains = [tables.gain(r) for r in study.advice]
-        yield Part("next", "What to do next", section("estimate.html.j2", "next", study, gains))
-
-
-def _seen(run: Run, prefix: str) -> Iterator[Part]:
+def _motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) -> list[Panel]:
     """Figures of what the brake did."""
-    cycles, after = _cycles(run), stop_samples(run)
     drawn = [] if cycles is None and run.experiment is None else figures.motion(run, cycles, after)
     if run.log.imported:
         drawn += [] if run.experiment is None else [figures.applied(run, run.experiment)]
     elif cycles is not None:
         drawn.append(figures.excitation(run, cycles, after))
-    if run.residuals is not None:
-        drawn.append(figures.residuals(run, run.residuals))
-    if drawn:
-        title = "Measured" if run.growth is None else "Measured against predicted"
-        yield Part(f"{prefix}motion", title, section("run.html.j2", "motion", run, drawn, after))
+    return drawn if run.residuals is None else [*drawn, figures.residuals(run, run.residuals)]
 
 
-def _of_all_runs(content: Content, study: Study) -> Iterator[Part]:
-    def part(name: str, title: str, macro: str, *values: object) -> Part:
-        return Part(name, title, section("estimate.html.j2", macro, *values))
-
-    e = study.estimate
-    models = [tables.models(study), tables.growth_path(study)]
-    checks = (tables.residual_tests(study), tables.suspects(e), tables.systematic(e), tables.predicted(study))
-    yield part("model", "Does the model fit", "model", study, *checks, models)
-    if study.drifts:
-        drifts = tables.drifts(study)
-        yield part("drift", "Since the last campaign", "one_table", drifts)
-    runs = [(run.name, run.growth) for run in content.estimated if run.growth is not None]
-    if len(runs) > 1:
-        yield part("contributions", "Information of each run", "one_table", tables.contributions(study, runs))
-    drawable = certainty.drawable(e)
-    drawn = {
-        "ellipses": certainty.ellipses(e, study.truth) if len(drawable) > 1 else None,
-        "profiles": certainty.profiles(study.profiles, e) if study.profiles else None,
-    }
-    labels = [e.labels[i] for i in drawable]
-    found = (*tables.correlation(e), tables.minima(study), tables.bootstrap(study))
-    yield part("uncertainty", "Uncertainty", "certainty", study, labels, drawn, tables.deviations(study), *found)
-
-
-def _of_a_run(run: Run, content: Content, prefix: str) -> Iterator[Part]:
-    def part(name: str, title: str, *values: object) -> Part:
-        return Part(f"{prefix}{name}", title, section("run.html.j2", name, *values))
-
-    cycles, study = None if run.log.imported else _cycles(run), content.study
-    if cycles is not None:
-        reasons = [f"{str(reason.name).lower()}: {words}" for reason, words in REASONS.items()]
-        yield part("excitation", "Excitation", run, figures.applied_as_sent(run, cycles), reasons)
-    if run.log.counts.get(LEARNT.name):
-        steps, numbers = history(run.log)
-        drawn = figures.learnt(run, steps, numbers)
-        yield part("learnt", "What the shield learnt", drawn, last_ranges(numbers), run.log.run)
-    if run.residuals is not None and study is not None:
-        yield part("residuals", "Residuals", _residuals(run.residuals), study.estimate.method)
-    if run.growth is not None and study is not None:
-        panels = figures.information(run.growth)
-        yield part("information", "Information", panels, *_information(run.growth), study.estimate)
-    if not run.log.imported:  # nothing was driven: no loop was punctual, and no limit was held
-        if (found := timing_part(run, prefix)) is not None:
-            yield found
-        yield _safety(run, cycles, prefix)
-    counts = [[topic, str(count)] for topic, count in run.log.counts.items()]
-    messages = Table("Messages in the file", ["topic", "messages"], counts)
-    yield part("completeness", "Completeness of the log", run, messages)
-    settings = [(key.removeprefix(SETTING), value) for key, value in run.log.end.items() if key.startswith(SETTING)]
-    outcome = [(key, value) for key, value in run.log.end.items() if not key.startswith(SETTING)]
-    attached = [[n, str(len(data)), hashlib.sha256(data).hexdigest()] for n, data in run.log.attachments.items()]
-    files = Table("Files inside the log", ["attached file", "bytes", "SHA-256"], attached, words=(0, 2))
-    yield part("identity", "Identity", run, settings, outcome, files)
+def _learnt(run: Run) -> tuple[list[Panel], dict[str, list[float]]]:
+    steps, numbers = history(run.log)
+    return figures.learnt(run, steps, numbers), last_ranges(numbers)
 
 
 def _cycles(run: Run) -> ActiveCycles | None:
@@ -256,13 +243,12 @@ def _information(g: Growth) -> tuple[Table, Table]:
     )
 
 
-def timing_part(run: Run, prefix: str) -> Part | None:
-    """Intervals of the loop, missed periods, the node's clock; None if no sample was answered."""
+def _timing(run: Run) -> tuple[Table, list[Panel]] | None:
+    """Intervals of the loop and their figures; None if no sample was answered."""
     t = run.timing
     if t is None or not len(t.response):
         return None
-    drawn = [] if t.simulated else figures.times(t)
-    return Part(f"{prefix}timing", "Timing", section("run.html.j2", "timing", t, _intervals(t), drawn))
+    return _intervals(t), [] if t.simulated else figures.times(t)
 
 
 def _intervals(t: Timing) -> Table:
@@ -276,7 +262,7 @@ def _intervals(t: Timing) -> Table:
     return Table("Times of the loop, by the stamps in the log", header, rows)
 
 
-def _safety(run: Run, cycles: ActiveCycles | None, prefix: str) -> Part:
+def _safety(run: Run) -> Safety:
     events = run.log.events
     active = [event.time_ns for event in events if event.code == "ACTIVE"]
     begin = min(active) if active else events[0].time_ns if events else 0
@@ -286,11 +272,46 @@ def _safety(run: Run, cycles: ActiveCycles | None, prefix: str) -> Part:
     ]
     zero = "the experiment's begin" if active else "the first event"
     shown = Table(f"Events of the safety chain, since {zero}", ["time [ms]", "event", "what"], rows, words=(1, 2))
-    speed, why_not = None, ""
-    try:
-        speed = end_stop_speed(run.bench)
-    except BenchFileError as err:
-        why_not = str(err)
     more = len(events) - len(rows)
-    body = section("run.html.j2", "safety", run, cycles, REASONS, speed, why_not, shown, more)
-    return Part(f"{prefix}safety", "Safety", body)
+    try:
+        return Safety(end_stop_speed(run.bench), "", shown, more)
+    except BenchFileError as err:
+        return Safety(None, str(err), shown, more)
+
+
+@functools.cache
+def environment() -> Environment:
+    """The templates of this folder; values are escaped."""
+    made = Environment(
+        loader=PackageLoader("emb_bench.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_printable,
+    )
+    made.filters |= {
+        "plain": numbers.plain,
+        "signed": numbers.signed,
+        "seconds": numbers.seconds,
+        "p_value": sentences.p_value,
+        "data_uri": _data_uri,
+        "capitalize_first": lambda words: words[:1].upper() + words[1:],
+    }
+    made.globals |= {
+        "METHODS": METHODS,
+        "say": sentences,
+        "css": Markup(resources.files("emb_bench.report").joinpath("page.css").read_text(encoding="utf-8")),
+    }
+    return made
+
+
+def _printable(value: Any) -> Any:
+    """Control characters have no place in HTML; they are shown as a replacement."""
+    if isinstance(value, Markup):
+        return Markup(_CONTROL.sub("\ufffd", value))
+    return _CONTROL.sub("\ufffd", value) if isinstance(value, str) else value
+
+
+def _data_uri(svg: bytes) -> str:
+    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode("ascii")

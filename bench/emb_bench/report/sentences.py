@@ -44,7 +44,7 @@ def deviation(value: float, name: str, digits: int = 3) -> str:
 
 
 def headline(study: Study) -> str:
-    """Whether the model explains the records, and what its values are worth."""
+    """Verdict on the model, and the worth of its values."""
     name, e = study.estimate.plant.name, study.estimate
     if study.biased:
         return (
@@ -126,7 +126,7 @@ def conclusion(c: Conclusion) -> str:
 
 
 def details(c: Conclusion) -> list[str]:
-    """What else there is to say of a parameter."""
+    """Remarks on a parameter beside its value."""
     said = ["any other value fits as well"] if c.arbitrary else []
     if c.traded_with:
         said.append(f"trades off with {', '.join(c.traded_with)}")
@@ -156,7 +156,7 @@ def drift(d: Drift) -> str:
 
 
 def held_out(h: HeldOut) -> str:
-    """Whether a record was predicted."""
+    """Prediction of one record."""
     return f"{'predicted' if h.fits else 'NOT predicted'}, chi2/n {h.ratio:.4g} of {h.freedom}, {p_value(h.p_value)}"
 
 
@@ -192,7 +192,7 @@ def _open_side(side: OpenSide) -> str:
 
 
 def prior(e: Estimate) -> str:
-    """What was known beforehand."""
+    """Prior knowledge; empty without any."""
     ranges = e.asked.prior
     return "" if ranges is None else f"the ranges '{ranges.name}', as a Gaussian of their mean and variance"
 
@@ -219,7 +219,7 @@ def recommendation(r: Recommendation) -> str:
 
 
 def remedies(study: Study) -> list[str]:
-    """What to do where the model does not fit or predict; empty where nothing is wrong."""
+    """Remedies for a model that does not fit or predict; empty where nothing is wrong."""
     from emb_bench.estimate.suspects import shown_as
 
     e = study.estimate
@@ -250,7 +250,7 @@ def warned(study: Study) -> str:
 
 
 def impact(run: Run, speed: float | None, why_not: str) -> str:
-    """What a loss of all commands would do, for any brake of the shield's set."""
+    """Effect of a loss of all commands, for any brake of the shield's set."""
     if why_not or speed is None:
         return f"unknown: {why_not}"
     how = "the node brakes" if run.bench.node.stop == "damped" else "the node lets go"
@@ -263,7 +263,7 @@ def impact(run: Run, speed: float | None, why_not: str) -> str:
 
 
 def finding(f: Finding) -> str:
-    """Whether the data identify one parameter."""
+    """Identifiability of one parameter."""
     said = ["identified" if f.identified else f"NOT identified: {f.why_not}"]
     said += [f"trades off with {', '.join(f'{name} ({value:+.4f})' for name, value in f.traded_with.items())}"] * bool(
         f.traded_with

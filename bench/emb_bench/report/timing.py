@@ -75,7 +75,7 @@ def document(entry: RunTiming) -> dict[str, Any]:
 
 
 def text(entry: RunTiming, *, verbose: bool = False) -> str:
-    """Whether a run kept to its budgets, and what it took; with ``verbose`` the histograms."""
+    """Verdict on the budgets of a run, and its intervals; with ``verbose`` the histograms."""
     t, missed = entry.timing, [check for check in entry.checks if not check.met]
     if entry.why_not:
         verdict = f"not judged: {entry.why_not}"

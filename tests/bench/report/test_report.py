@@ -29,10 +29,10 @@ from emb_bench.figures import COLOURS
 from emb_bench.logs.log import read_log
 from emb_bench.numbers import amount
 from emb_bench.report import certainty
-from emb_bench.report.content import ActiveCycles, Content, document, gather
+from emb_bench.report.content import ActiveCycles, Content, gather
+from emb_bench.report.document import document
 from emb_bench.report.figures import applied_as_sent
-from emb_bench.report.page import timing_part
-from emb_bench.report.render import section
+from emb_bench.report.page import report_page, view
 from emb_bench.report.sentences import drift
 from emb_runtime.config.bench import Bench, shipped_bench_text
 from emb_runtime.log.ring_buffer import EventRecord, Level, LineRecord
@@ -133,6 +133,9 @@ def test_the_page_needs_nothing_but_itself(report: Report, joint: Report) -> Non
         assert all(source.startswith("data:image/svg+xml;base64,") for source in made.reader.values("src"))
         assert not re.search(r"url\(|@import", made.html)
         assert not [name for _, name, _ in made.reader.attributes if name.startswith("on")]
+        policy = dict(part.strip().split(" ", 1) for part in made.reader.values("content")[0].split(";"))
+        assert (policy["default-src"], policy["img-src"]) == ("'none'", "data:")
+        assert set(policy) == {"default-src", "style-src", "img-src", "base-uri", "form-action"}
 
 
 def test_every_figure_says_what_it_shows(report: Report) -> None:
@@ -266,21 +269,12 @@ def gathered(bench: Bench, *paths: Path, last: Earlier | None = None) -> Content
     return gather(bench, [read_log(path) for path in paths], [], options, "x", last=last)
 
 
-def text_of(*markup: str) -> str:
-    return read(f"<html><body>{''.join(markup)}</body></html>").text
-
-
-def first_of(content: Content) -> str:
-    """Opening and verdict of the page."""
-    return text_of(section("verdict.html.j2", "opening", content), section("verdict.html.j2", "verdict", content, None))
-
-
 def test_a_run_that_a_fault_ended_says_so(folder: Path, bench: Bench, simulate: Simulate) -> None:
     run = simulate(lambda a, v, k: math.nan if k >= 120 else square(a, v, k), options="plant=exact,seed=5")
     content = gathered(bench, write_log(folder / "fault.mcap", run))
     assert run.outcome.fault is not None
     reason = run.outcome.fault.name
-    said = first_of(content)
+    said = read(report_page(content)).text
     assert f"fault.mcap: the run was stopped: {reason}" in said
     experiment = content.runs[0].experiment
     assert experiment is not None
@@ -341,17 +335,17 @@ def test_simulated_time_is_said_to_mean_nothing_and_real_time_is_drawn(
     paths = [write_log(folder / "sim.mcap", run, steps=60)]
     paths.append(write_log(folder / "real.mcap", run, steps=60, metadata=metadata))
     simulated, real = gathered(bench, paths[0]), gathered(bench, paths[1])
-    pages = []
+    found = []
     for content in (simulated, real):
-        part = timing_part(content.runs[0], "")
-        assert part is not None
-        pages.append(part.body)
-    warning = "Time was simulated: these times say nothing about any computer or bus."
-    assert warning in pages[0]
-    assert warning not in pages[1]
-    assert [markup.count("<img") for markup in pages] == [0, 2]
-    assert "343 µs" in text_of(pages[1])
-    assert "bench on can0" in first_of(real)
+        timing = view(content.runs[0]).timing
+        assert timing is not None
+        found.append(timing)
+    assert [len(panels) for _, panels in found] == [0, 2]
+    assert "343 µs" in [cell for row in found[1][0].rows for cell in row]
+    page = report_page(real)
+    assert "bench on can0" in page
+    assert "Time was simulated" in report_page(simulated)
+    assert "Time was simulated" not in page
     assert document(real)["runs"][0]["timing"]["intervals"]["response"]["p100"] == pytest.approx(343.001e-6)
 
 
