@@ -29,10 +29,11 @@ from emb_runtime.can import e2e, receiver
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.control import result, start_conditions
+from emb_runtime.estimator import kalman, speed_loop
+from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.learning import assumptions, bounded
 from emb_runtime.learning import known as estimate_set
 from emb_runtime.learning.law import law_for
-from emb_runtime.policy import scalar_operations
 from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState, SensorSample
 from emb_runtime.safety import (
     command_limits,
@@ -352,23 +353,24 @@ def _bounds(dice: random.Random) -> Iterator[Any]:
         )
 
 
-def _scalars(dice: random.Random) -> Iterator[Any]:
-    """Every operation, each of numbers and of results of others."""
-    of = scalar_operations
-    unary = of.Absolute, of.Sign, of.SquareRoot, of.Exponential, of.Logarithm, of.HyperbolicTangent
-    comparing = of.Greater, of.GreaterOrEqual, of.Equal
-    binary = of.Add, of.Subtract, of.Multiply, of.Divide, of.Maximum, of.Minimum, *comparing
-    seen = [of.Number() for _ in range(4)]
-    results: list[scalar_operations.Operation] = [kind(a) for kind in unary for a in seen[:2]]
-    results += [kind(*pair) for kind in binary for pair in (seen[:2], seen[2:], results[:2])]
-    results += [kind(seen[0], *results[:2]) for kind in (of.Where, of.AddProduct, of.SubtractProduct)]
-    results += [of.AddProducts(*seen, *results[-3:])]
+def _estimator(dice: random.Random) -> Iterator[Any]:
+    """Estimates of a brake that moves about as it should, and the currents that follow a reference."""
     while True:
-        for number in seen:
-            number.value = _number(dice, dice.choice((1.0, 30.0, 1e3)))
-        for operation in results:
-            operation.run()
-        yield [operation.value for operation in results]
+        model = Estimator(_bench()).model._replace(sticks=dice.random() < 0.7)
+        state, scale = kalman.start(model), speed_loop.scale_of(_bench(), dice.choice((1.0, 0.4)))
+        angle, velocity, current, step = dice.uniform(-1.0, 40.0), dice.uniform(-200.0, 200.0), 0.0, 0
+        for _ in range(30):
+            step += dice.choice((1, 1, 1, 1, 2, 4))
+            seen = angle + dice.gauss(0.0, 1e-3), velocity + dice.gauss(0.0, 1.0)
+            state = kalman.follow(model, state, *seen, float(step), current)
+            levels = [dice.uniform(-1.0, 1.0) for _ in range(3)]
+            switches = [dice.uniform(0.0, 0.1) for _ in range(2)]
+            wanted = speed_loop.follow_reference(model, state, scale, levels, switches, float(step))
+            yield state, kalman.believed(model, state), kalman.deviations(model, state), wanted
+            current = dice.uniform(-6.0, 6.0)
+            push = model.motor * current - model.spring * max(angle, 0.0) - model.viscous * velocity
+            angle += 1e-3 * velocity
+            velocity += 1e-3 * (push - math.copysign(model.coulomb, velocity))
 
 
 COMPARISONS: dict[str, Callable[[random.Random], Iterator[Any]]] = {
@@ -384,7 +386,7 @@ COMPARISONS: dict[str, Callable[[random.Random], Iterator[Any]]] = {
     "learning": _learning,
     "state machine": _states,
     "bounds and counters": _bounds,
-    "scalar operations": _scalars,
+    "estimator": _estimator,
 }
 """Answers without end to inputs drawn from the dice, by what they compare."""
 

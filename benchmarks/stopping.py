@@ -24,7 +24,7 @@ import numpy as np
 
 from emb_bench.logs.estimates import by_step
 from emb_bench.logs.log import read_log
-from emb_export.export import export_structured
+from emb_export.reference import reference_file
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 
@@ -74,7 +74,7 @@ def goals(brakes: np.ndarray, folder: Path) -> None:
     )
     for name in ACTORS:
         path = folder / f"{name}.onnx"
-        path.write_bytes(export_structured(name, bench).data)
+        path.write_bytes(reference_file(name, bench)[0])
         for plant in PLANTS:
             early, seconds, z, worst = 0, [], [], np.zeros(len(GOAL))
             for i, brake in enumerate(brakes):

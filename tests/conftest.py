@@ -20,6 +20,7 @@ from emb_runtime.control.core import Core
 from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
+from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord, LineRecord, Record
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.safety.guard import Guard
@@ -129,13 +130,10 @@ class Journal:
 class FunctionActor:
     """An actor made of a function of (angle, velocity, step)."""
 
-    def begin(self) -> None:
-        pass
-
     def __init__(self, law: Callable[[float, float, float], float]) -> None:
         self.law = law
 
-    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         return self.law(angle, velocity, step)
 
 

@@ -525,7 +525,7 @@ import json, sys
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train.envs.conditions import Conditions
-from emb_train.envs.excitations import OnnxFile
+from emb_train.structured.played import PolicyFile
 from emb_train.envs.measure import MEASURES
 from emb_train.envs.play import fresh_draws, play
 bench = load_bench()
@@ -533,7 +533,7 @@ ranges, out = bench.range_set("pm50"), {}
 draws = fresh_draws(ranges, 0, int(sys.argv[1]))
 for name in ("shipped", "quick"):
     policy = load_policy(shipped_actor_path(name == "quick"), bench)
-    actor = OnnxFile(policy.data, policy.contract.initial_state)
+    actor = PolicyFile(policy, bench)
     p = play(bench, ranges, PARAMETER_NAMES, actor, draws, "exact", Conditions(information="physical"))
     out[name] = {"left": int(p.left.sum()), "home": int(p.home.sum())}
     out[name] |= {m: MEASURES[m].values(p.matrices).round(4).tolist() for m in ("D", "E")}

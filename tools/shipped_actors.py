@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from emb_export.export import export_structured
+from emb_export.reference import reference_file
 from emb_runtime.config.bench import load_bench
 from emb_runtime.policy.policy import shipped_actor_path
 from emb_runtime.system.terminal import show
@@ -17,9 +17,9 @@ def main() -> int:
     """Write both files."""
     bench = load_bench()
     for quick, name in REFERENCES.items():
-        exported, path = export_structured(name, bench), shipped_actor_path(quick)
-        path.write_bytes(exported.data)
-        show(f"{path.name}: {name}, {len(exported.data)} bytes, within {exported.difference:.1e} of the actor in torch")
+        (data, difference), path = reference_file(name, bench), shipped_actor_path(quick)
+        path.write_bytes(data)
+        show(f"{path.name}: {name}, {len(data)} bytes, within {difference:.1e} of the reference")
     return 0
 
 

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-import onnx
-
-from emb_export.file import add_contract
 from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
-from emb_runtime.policy.contract import CONTRACT_KEY, Contract
 from emb_runtime.policy.policy import shipped_actor_path
 
 PATIENCE = {
@@ -37,18 +32,10 @@ def long_bench(samples: int) -> Bench:
     return parse_bench(text, "benchmark")
 
 
-def actor_for(bench: Bench, path: Path) -> bytes:
-    """An actor, its graph as it is, with a contract for this bench; its content is of no matter."""
-    model = onnx.load(str(path))
-    (text,) = (entry.value for entry in model.metadata_props if entry.key == CONTRACT_KEY)
-    contract = replace(Contract.from_json(text), horizon=bench.timing.horizon, bench_hash=bench.contract_hash)
-    return add_contract(model, contract)
-
-
 def write_both(folder: Path, samples: int, actor: Path | None = None) -> tuple[Path, Path]:
     """``bench.toml`` and ``actor.onnx``, the shipped one or another, in a folder; gives their paths."""
     bench = long_bench(samples)
     paths = folder / "bench.toml", folder / "actor.onnx"
     paths[0].write_text(bench.text)
-    paths[1].write_bytes(actor_for(bench, actor or shipped_actor_path()))
+    paths[1].write_bytes((actor or shipped_actor_path()).read_bytes())
     return paths

@@ -1,130 +1,115 @@
-"""A trained network as an ONNX file: its graph, its test vectors, and the proof that the file computes the same."""
+"""The actor of a training as a policy file, by torch's exporter."""
 
 from __future__ import annotations
 
+import json
 import logging
 import warnings
-from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from emb_export.file import OPSET, VECTORS
-from emb_runtime.config.bench import Bench, Ranges
-from emb_runtime.errors import PolicyRefusedError
-from emb_runtime.policy.contract import VECTOR_TOLERANCE, Vector
-from emb_runtime.policy.policy import Policy
-from emb_train.envs.batch import Batch
-from emb_train.envs.excitations import Excitation
-from emb_train.envs.network import PLAIN, Network
-from emb_train.envs.play import followed
+from emb_export.file import OPSET, policy_file, versions
+from emb_runtime.config.bench import Bench
+from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.policy.contract import SAMPLE
+from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
+from emb_train.envs.conditions import EVERYTHING
 from emb_train.ppo import DeployedActor
+from emb_train.training import load_training
 
-Floats = NDArray[np.float32]
-
-EPISODES = 8
-RANDOM_OBSERVATIONS = 2000
+OBSERVATIONS = 2000
 
 
-def graph_of(module: nn.Module, examples: tuple[Tensor, ...], inputs: list[str], outputs: list[str]) -> onnx.ModelProto:
-    """The graph of a module."""
+class InSeconds(nn.Module):
+    """An actor of angle, velocity and step, asked with the time [s]."""
+
+    def __init__(self, actor: nn.Module, sample_time: float) -> None:
+        super().__init__()
+        self.actor, self.sample_time = actor, sample_time
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Currents [A], shape [N, 1], for inputs of shape [N, 3]."""
+        sample, time = inputs[:, :2], inputs[:, 2:]
+        currents: Tensor = self.actor(torch.cat([sample, time / self.sample_time], 1))
+        return currents
+
+
+def network_file(directory: Path) -> tuple[bytes, float, str]:
+    """The file of a training, its largest difference from the network as a part of the limit, and its origin.
+
+    Args:
+        directory: of the training.
+
+    Raises:
+        UsageError: the directory holds no usable training.
+        PolicyRefusedError: the network's answers are not finite, or the file would differ from it.
+    """
+    trained = load_training(directory)
+    training, bench = trained.training, trained.bench
+    if training.conditions.observes == EVERYTHING:
+        raise UsageError(f"{directory}: observes the parameters and the information, which no bench measures")
+    torch.set_num_threads(1)
+    actor = InSeconds(DeployedActor(trained.actor, bench.limits.current), bench.timing.sample_time).eval()
+    seen = observations(bench)
+    with torch.no_grad():
+        wanted = actor(torch.from_numpy(seen)).numpy().astype(np.float64)
+    if not np.isfinite(wanted).all():
+        raise PolicyRefusedError("the trained network's answers are not finite: there is nothing to export")
+    parts = json.loads(msgspec.json.encode(training))
+    provenance = {
+        **{k: json.dumps(v, separators=(",", ":")) if isinstance(v, dict | list) else v for k, v in parts.items()},
+        "steps": trained.iteration * training.ppo.batch,
+        "score": trained.score,
+        **versions("torch", "onnxscript"),
+    }
+    ranges = bench.range_set(training.ranges)
+    data, difference = policy_file(_graph(actor), bench, "current", SAMPLE, seen, wanted, provenance, ranges)
+    origin = f"iteration {trained.iteration} of {training.ppo.iterations}, which returned {trained.score:.6g}"
+    return data, difference, f"of {origin} on brakes that no training draws"
+
+
+def observations(bench: Bench) -> NDArray[np.float32]:
+    """Inputs all over the limits, beyond them, and near the origin, shape [OBSERVATIONS, 3]."""
+    rng = np.random.default_rng(0)
+    low, high = bench.limits.angle
+    reach = np.array([2.0 * (high - low), 3.0 * bench.limits.velocity]) * 10.0 ** -rng.uniform(
+        0.0, 4.0, (OBSERVATIONS, 1)
+    )
+    time = rng.integers(0, bench.timing.horizon, (OBSERVATIONS, 1)) * bench.timing.sample_time
+    return np.hstack([rng.uniform(-reach, reach), time]).astype(np.float32)
+
+
+def _graph(module: nn.Module) -> onnx.ModelProto:
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # its chatter is nothing that a user can act on
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter's, about itself
         program = torch.onnx.export(
-            module.eval(),
-            examples,
+            module,
+            (torch.zeros(1, len(SAMPLE)),),
             dynamo=True,
             opset_version=OPSET,
-            input_names=inputs,
-            output_names=outputs,
+            input_names=[INPUT_NAME],
+            output_names=[OUTPUT_NAME],
             verbose=False,
         )
     assert program is not None  # it is None only for the old exporter
     model = program.model_proto
     _strip(model)
-    onnx.checker.check_model(model, full_check=True)
     return model
 
 
-def vectors_of(actor: DeployedActor, observations: Floats) -> tuple[tuple[Vector], ...]:
-    """Test vectors: some of the observations, shape [M, 3], each with the network's answer.
-
-    Raises:
-        PolicyRefusedError: an answer is not finite.
-    """
-    chosen = observations[np.linspace(0, len(observations) - 1, VECTORS).astype(int)]
-    with torch.no_grad():
-        answers = actor(torch.from_numpy(chosen))[:, 0]
-    if not bool(torch.isfinite(answers).all()):
-        raise PolicyRefusedError("the trained network's answers are not finite: there is nothing to export")
-    rows = zip(chosen.tolist(), answers.tolist(), strict=True)
-    return tuple((Vector(tuple(row), action),) for row, action in rows)
-
-
-def recorded(excitation: Excitation, bench: Bench, ranges: Ranges, parameters: Sequence[str]) -> Floats:
-    """Observations of an excitation in a few experiments on random brakes, shape [horizon, EPISODES, 4]."""
-    batch = Batch(bench, ranges, parameters, EPISODES)
-    for i in range(EPISODES):
-        batch.begin(i, np.random.default_rng(i))
-    return np.stack(list(followed(batch, excitation)))
-
-
-def recorded_observations(actor: DeployedActor, bench: Bench, ranges: Ranges, parameters: tuple[str, ...]) -> Floats:
-    """Observations of the actor in a few experiments on random brakes, shape [EPISODES · horizon, 3]."""
-    return recorded(Network(actor), bench, ranges, parameters)[:, :, :PLAIN].reshape(-1, PLAIN)
-
-
-def random_observations(bench: Bench) -> Floats:
-    """Observations all over the limits and well beyond them, shape [RANDOM_OBSERVATIONS, 3]."""
-    rng = np.random.default_rng(0)
-    low, high = bench.limits.angle
-    width = high - low
-    size = RANDOM_OBSERVATIONS
-    return np.stack(
-        [
-            rng.uniform(low - width, high + width, size),
-            rng.uniform(-3.0, 3.0, size) * bench.limits.velocity,
-            rng.uniform(0.0, bench.timing.horizon, size),
-        ],
-        axis=1,
-    ).astype(np.float32)
-
-
-def require_parity(actor: DeployedActor, policy: Policy, observations: Floats) -> float:
-    """Compare the network with the file, through the runtime's own policy.
-
-    Returns:
-        The largest difference as a part of the current limit.
-
-    Raises:
-        PolicyRefusedError: it is above 1e-5, or an answer is not finite.
-    """
-    with torch.no_grad():
-        wanted = actor(torch.from_numpy(observations))[:, 0].numpy().astype(np.float64)
-    got = np.array([policy.act(float(a), float(v), float(k), 0.0) for a, v, k in observations])
-    worst = float(np.max(np.abs(got - wanted))) / actor.limit
-    if not worst <= VECTOR_TOLERANCE:  # written so that NaN fails
-        raise PolicyRefusedError(
-            f"the exported graph differs from the trained network by {worst:.3g} of the limit, at most "
-            f"{VECTOR_TOLERANCE:g} is allowed: nothing was written"
-        )
-    return worst
-
-
 def _strip(model: onnx.ModelProto) -> None:
-    """Remove what the exporter notes down beside the graph: stack traces, with paths of this machine."""
-    model.doc_string = ""
-    del model.metadata_props[:]
+    """Remove the exporter's notes beside the graph: stack traces, with paths of this machine."""
     graph = model.graph
-    graph.doc_string = ""
-    del graph.metadata_props[:]
     del graph.value_info[:]
-    parts: list[Any] = [*graph.node, *graph.initializer, *graph.input, *graph.output]
+    parts: list[Any] = [model, graph, *graph.node, *graph.initializer, *graph.input, *graph.output]
     for part in parts:
         part.doc_string = ""
         del part.metadata_props[:]

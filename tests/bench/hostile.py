@@ -16,7 +16,7 @@ from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError
-from emb_runtime.estimator.estimator import estimated
+from emb_runtime.estimator.estimator import Estimator, estimated
 from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.log.ring_buffer import (
     EventRecord,
@@ -175,9 +175,9 @@ class Thoughtful(FunctionActor):
         super().__init__(law)
         self._think = think
 
-    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         self._think()
-        return super().act(angle, velocity, step, applied_current)
+        return super().act(angle, velocity, step, estimator)
 
 
 def drive(bus: HostileBus, law: Callable[[float, float, float], float], steps: int) -> Driven:

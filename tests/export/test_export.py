@@ -1,4 +1,4 @@
-"""The exported file: one file, nothing of the machine in it, and the same function as the network."""
+"""The exported file: one file, nothing of the machine in it, and the same function as what it was made of."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -18,19 +19,28 @@ import pytest
 import torch
 
 from emb_bench.excitation.reference import excitation
+from emb_export import file
 from emb_export.entry import emb_export
-from emb_export.export import export, main
-from emb_export.network import random_observations, recorded_observations, require_parity
-from emb_runtime.config.bench import Bench, load_bench, shipped_bench_text
+from emb_export.export import main
+from emb_export.file import answers
+from emb_export.network import network_file, observations
+from emb_export.reference import reference_file
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError
-from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, Contract
-from emb_runtime.policy.policy import Policy, load_policy
+from emb_runtime.estimator.estimator import Estimator
+from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, Contract, read_contract
+from emb_runtime.policy.policy import load_policy
 from emb_train.cli import main as train_main
+from emb_train.names import reference_names
 from emb_train.ppo import DeployedActor
+from emb_train.structured.law import box_of, features, of_features
 from emb_train.structured.stored import stored
-from emb_train.training import ACTOR, BENCH, CONFIGURATION, load_training, save_actor
+from emb_train.training import BENCH as BENCH_FILE
+from emb_train.training import CONFIGURATION, load_training, save_actor
 from tests.commands import refused
 from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench
+
+BENCH = load_bench()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -50,7 +60,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def exported(run: Path) -> bytes:
-    return export(run)[0]
+    return network_file(run)[0]
 
 
 def deployed(run: Path) -> tuple[DeployedActor, Bench]:
@@ -58,164 +68,161 @@ def deployed(run: Path) -> tuple[DeployedActor, Bench]:
     return DeployedActor(trained.actor, trained.bench.limits.current), trained.bench
 
 
-def policy_of(run: Path, data: bytes) -> Policy:
-    return load_policy(data, deployed(run)[1])
-
-
-def test_the_runtime_takes_the_file_and_says_what_the_network_says(run: Path, exported: bytes) -> None:
-    actor, bench = deployed(run)
-    policy = load_policy(exported, bench)
-    for seen in random_observations(bench)[:200]:
-        with torch.no_grad():
-            wanted = actor(torch.from_numpy(seen[None])).item()
-        angle, velocity, step = map(float, seen)
-        assert policy.act(angle, velocity, step, 0.0) == pytest.approx(wanted, abs=1e-5 * bench.limits.current)
-
-
-def test_the_contract_says_what_the_actor_was_trained_for(run: Path, exported: bytes) -> None:
-    _, bench = deployed(run)
-    contract = policy_of(run, exported).contract
-    assert contract.bench_hash == bench.contract_hash
-    assert (contract.sample_time, contract.horizon, contract.action_limit) == (1e-3, HORIZON, 6.0)
-    assert contract.ranges["f_v"] == (1e-5, 5e-5)
-    assert contract.ranges["k_m"] == (bench.brake.k_m, bench.brake.k_m)
-    config = json.loads((run / CONFIGURATION).read_text())
-    for name, value in config.items():
-        told = contract.provenance[name]
-        assert (json.loads(str(told)) if isinstance(value, dict | list) else told) == value
-    assert contract.provenance["seed"] == 5
-    best = load_training(run)
-    assert contract.provenance["steps"] == best.iteration * ITERATION
-    assert contract.provenance["score"] == best.score
-    assert len(contract.vectors) >= MIN_VECTORS
-    assert contract.vectors[0].observation[2] == 0.0
-
-
-def test_an_actor_is_exported_for_another_bench_whose_shield_differs_and_nothing_else_that_it_knows(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text, path = (run / "bench.toml").read_text(), tmp_path / "bench.toml"
-    path.write_text(text.replace('ranges        = "envelope"', 'ranges        = "viscous"'))
-    assert main([str(run), "--bench", str(path), "--out", str(tmp_path / "a.onnx")]) == 0
-    assert "behind another shield (ranges envelope, here viscous)" in capsys.readouterr().out
-    load_policy(tmp_path / "a.onnx", load_bench(path))
-    for old, new in (
-        ("velocity = 500.0", "velocity = 400.0"),
-        ("velocity = 1.0 ", "velocity = 2.0 "),
-        (f"horizon     = {HORIZON}", "horizon     = 90"),
-        ("J     = 4.624e-6", "J     = 5e-6"),
-    ):
-        assert old in text
-        path.write_text(text.replace(old, new))
-        refused(lambda: main([str(run), "--bench", str(path), "--out", str(tmp_path / "b.onnx")]), capsys)
-    assert not (tmp_path / "b.onnx").exists()
-
-
-def test_a_file_for_another_bench_does_not_take_the_place_of_the_training_s_own(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    other = tmp_path / "run"
-    shutil.copytree(run, other)
-    (other / "actor.onnx").write_bytes(b"the training's own")
-    assert "--bench: expected --out FILE" in refused(
-        lambda: main([str(other), "--bench", str(other / "bench.toml")]), capsys
-    )
-    assert (other / "actor.onnx").read_bytes() == b"the training's own"
-
-
-def test_an_actor_for_brakes_that_the_shield_does_not_cover_is_exported_for_a_bench_whose_shield_does(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    kept = dataclasses.replace(stored("viscous-exact-quadratic"), task="viscous-stiffness", shield="bounded")
-    source, path, bench = tmp_path / "own.json", tmp_path / "a.onnx", tmp_path / "my.toml"
-    source.write_text(kept.to_json())
-    monkeypatch.setattr("emb_export.stateful.export_stateful", lambda *_: (b"data", 0.0))
-    refused(lambda: main([str(source), "--out", str(path)]), capsys)
-    text = shipped_bench_text().replace("k_1   = 2.304e1 ", "k_1   = 37.5 ")
-    bench.write_text(text.replace('ranges        = "envelope"', 'ranges        = "viscous-stiffness"'))
-    assert main([str(source), "--bench", str(bench), "--out", str(path)]) == 0
-    assert "another shield (bounded, here worst case)" in capsys.readouterr().out  # worth something else behind it
-    assert path.read_bytes() == b"data"
-
-
-def test_the_checkpoints_may_be_read_by_whoever_may_read_the_rest_of_a_training(run: Path) -> None:
-    modes = {name: (run / name).stat().st_mode for name in (CONFIGURATION, ACTOR)}
-    assert len(set(modes.values())) == 1
-
-
-def test_the_same_training_gives_the_same_bytes(run: Path, exported: bytes) -> None:
-    assert export(run)[0] == exported
-
-
-def test_nothing_of_this_machine_is_in_the_file(run: Path, exported: bytes) -> None:
-    for trace in (str(run), str(Path.home()), str(Path.cwd()), socket.gethostname(), "site-packages", ".py", "stack"):
-        assert trace.encode() not in exported
-
-
-def test_the_graph_stands_alone_in_a_version_that_the_runtime_s_oldest_library_reads(exported: bytes) -> None:
-    model = onnx.load_from_string(exported)
-    onnx.checker.check_model(model, full_check=True)
-    assert [(o.domain, o.version) for o in model.opset_import] == [("", 20)]
-    assert model.ir_version <= 10
-    assert [p.key for p in model.metadata_props] == [CONTRACT_KEY]
-    assert not model.functions
-    assert all(not n.metadata_props and not n.doc_string for n in model.graph.node)
-    assert all(t.data_location == onnx.TensorProto.DEFAULT for t in model.graph.initializer)
-
-
-def test_the_reference_evaluator_of_onnx_agrees(run: Path, exported: bytes) -> None:
-    _, bench = deployed(run)
-    reference = onnx.reference.ReferenceEvaluator(onnx.load_from_string(exported))
-    policy = policy_of(run, exported)
-    for seen in random_observations(bench)[:50]:
-        (wanted,) = reference.run(None, {"obs": seen[None]})
-        angle, velocity, step = map(float, seen)
-        assert policy.act(angle, velocity, step, 0.0) == pytest.approx(np.asarray(wanted).item(), abs=6e-5)
-
-
-def test_the_clip_is_in_the_graph(run: Path) -> None:
-    actor, bench = deployed(run)
-    with torch.no_grad():
-        actor.actor.layers[-1].bias.fill_(50.0)  # type: ignore[operator]  # the last layer is Linear
-    policy = policy_of(run, export(saved_beside(run, actor, "clip"))[0])
-    assert policy.act(0.0, 0.0, 0, 0.0) == bench.limits.current
+def contract_of(data: bytes) -> Contract:
+    (entry,) = onnx.load_from_string(data).metadata_props
+    assert entry.key == CONTRACT_KEY
+    return read_contract(entry.value)
 
 
 def saved_beside(run: Path, actor: DeployedActor, name: str) -> Path:
-    """A directory as that of the training, with another actor."""
+    """A folder as that of the training, with another actor."""
     other = run.parent / name
     other.mkdir()
-    for part in (CONFIGURATION, BENCH):
-        (other / part).write_bytes((run / part).read_bytes())
+    for part in (CONFIGURATION, BENCH_FILE):
+        shutil.copy(run / part, other / part)
     save_actor(other, actor.actor, 3, 0.0)
     return other
 
 
-def test_a_network_that_is_not_finite_is_not_exported(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    actor, _ = deployed(run)
+# A network ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_runtime_takes_the_file_and_gives_what_the_network_gives(run: Path, exported: bytes) -> None:
+    actor, bench = deployed(run)
+    policy, reference = load_policy(exported, bench), onnx.reference.ReferenceEvaluator(onnx.load_from_string(exported))
+    for seen in observations(bench)[:200]:
+        angle, velocity, time = map(float, seen)
+        step = round(time / bench.timing.sample_time)
+        with torch.no_grad():
+            wanted = actor(torch.tensor([[angle, velocity, float(step)]])).item()
+        found = policy.act(angle, velocity, step, Estimator(bench))
+        assert found == pytest.approx(wanted, abs=1e-5 * bench.limits.current)
+        (again,) = reference.run(None, {"inputs": seen[None]})
+        assert np.asarray(again).item() == pytest.approx(found, abs=6e-5)
+
+
+def test_the_contract_has_what_the_actor_was_trained_for(run: Path, exported: bytes) -> None:
+    _, bench = deployed(run)
+    contract = contract_of(exported)
+    ranges: dict[Any, Any] = contract.ranges
+    assert (contract.kind, contract.inputs) == ("current", ("angle", "velocity", "time"))
+    assert (contract.sample_time, contract.horizon, contract.limits.current) == (1e-3, HORIZON, 6.0)
+    assert ranges["f_v"] == (1e-5, 5e-5)
+    assert ranges["k_m"] == (bench.brake.k_m, bench.brake.k_m)
+    for name, value in json.loads((run / CONFIGURATION).read_text()).items():
+        found = contract.provenance[name]
+        assert (json.loads(str(found)) if isinstance(value, dict | list) else found) == value
+    best = load_training(run)
+    assert contract.provenance["steps"] == best.iteration * ITERATION
+    assert contract.provenance["score"] == best.score
+    assert len(contract.vectors) >= MIN_VECTORS
+
+
+def test_the_clip_is_in_the_graph_and_a_network_that_is_not_finite_is_not_exported(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    actor, bench = deployed(run)
+    with torch.no_grad():
+        actor.actor.layers[-1].bias.fill_(50.0)  # type: ignore[operator]  # the last layer is Linear
+    data, *_ = network_file(saved_beside(run, actor, "clip"))
+    assert load_policy(data, bench).act(0.0, 0.0, 0, Estimator(bench)) == bench.limits.current
     actor.actor.span.zero_()  # every weight is finite, and no answer is
     other = saved_beside(run, actor, "infinite")
     assert "not finite" in refused(lambda: main([str(other)]), capsys, code=5)
     assert not (other / "actor.onnx").exists()
 
 
-@pytest.mark.parametrize("difference", [2e-5, 1.0, math.nan])
-def test_a_file_that_computes_something_else_fails_the_proof(run: Path, exported: bytes, difference: float) -> None:
-    actor, bench = deployed(run)
-    observations = random_observations(bench)[:100]
-    assert require_parity(actor, policy_of(run, exported), observations) < 1e-5
-    with torch.no_grad():
-        actor.actor.layers[-1].bias.add_(difference)  # type: ignore[operator]  # the last layer is Linear
-    with pytest.raises(PolicyRefusedError):
-        require_parity(actor, policy_of(run, exported), observations)
+def test_nothing_of_this_machine_is_in_the_file_and_it_is_the_same_each_time(run: Path, exported: bytes) -> None:
+    assert network_file(run)[0] == exported
+    for trace in (str(run), str(Path.home()), str(Path.cwd()), socket.gethostname(), "site-packages", ".py", "stack"):
+        assert trace.encode() not in exported
 
 
-def test_the_proof_uses_observations_that_the_actor_meets(run: Path) -> None:
-    actor, bench = deployed(run)
-    recorded = recorded_observations(actor, bench, bench.range_set("viscous"), ("f_v",))
-    assert sorted(set(recorded[:, 2])) == list(range(HORIZON))
-    assert np.ptp(recorded[:, 1]) > 50.0
-    assert recorded.dtype == np.float32
+# A reference ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_reference_file_gives_its_levels_and_switches_for_every_estimate() -> None:
+    low, high = BENCH.range_set("pm50").low, BENCH.range_set("pm50").high
+    nominal = np.array([getattr(BENCH.brake, name) for name in PARAMETER_NAMES])
+    for name in reference_names():
+        kept = stored(name)
+        if kept.task.startswith("viscous"):
+            continue
+        data, difference = reference_file(name, BENCH)
+        contract = contract_of(data)
+        assert (contract.kind, contract.gain, len(data) < 40_000) == ("reference", kept.gain, True)
+        assert contract.ranges == {n: (getattr(low, n), getattr(high, n)) for n in PARAMETER_NAMES}
+        assert difference < 1e-9
+        relative = np.random.default_rng(1).uniform(0.3, 1.7, (50, 4))
+        found = answers(data, contract, relative * nominal)
+        box = box_of(BENCH, BENCH.range_set("pm50"))
+        levels = (len(kept.table) + 1) // 2
+        for row, numbers in zip(relative.tolist(), found, strict=True):
+            values = [of_features(terms, features(box, tuple(row))) for terms in kept.array()]
+            wanted = [*np.clip(values[:levels], -1.0, 1.0), *values[levels:]]
+            assert numbers == pytest.approx(wanted, abs=1e-12)
+
+
+def test_a_parameter_that_is_known_has_no_part_in_a_reference() -> None:
+    data, _ = reference_file("viscous-exact-quadratic", BENCH)
+    contract = contract_of(data)
+    nominal = [getattr(BENCH.brake, name) for name in PARAMETER_NAMES]
+    several = np.array([nominal, [2.0 * nominal[0], *nominal[1:]], [*nominal[:3], 1.5 * nominal[3]]])
+    first, other_k_m, other_f_v = answers(data, contract, several)
+    assert first.tolist() == other_k_m.tolist() != other_f_v.tolist()
+
+
+def test_a_file_that_computes_something_else_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    right = file.answers
+    for difference in (2e-5, 1.0, math.nan):
+        monkeypatch.setattr(file, "answers", lambda *a, d=difference: right(*a) + d)
+        with pytest.raises(PolicyRefusedError):
+            reference_file("four-d-exact-blind", BENCH)
+
+
+# A sequence -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_sequence_is_exported_as_a_policy_that_gives_it(tmp_path: Path) -> None:
+    path, estimator = tmp_path / "ramp.onnx", Estimator(BENCH)
+    assert main(["ramp:amplitude=-5", "--out", str(path)]) == 0
+    policy, wanted = load_policy(path, BENCH), excitation("ramp", BENCH, amplitude=-5.0).currents
+    assert wanted is not None
+    found = [policy.act(17.0, -3.0, float(k), estimator) for k in range(len(wanted))]
+    assert found == pytest.approx(wanted, abs=1e-5 * BENCH.limits.current)
+    assert policy.act(0.0, 0.0, -1.0, estimator) == found[0]
+    assert policy.act(0.0, 0.0, 1e9, estimator) == found[-1]
+    assert policy.contract.provenance["sequence"] == "ramp:amplitude=-5.0,start=0.0"
+    assert policy.contract.ranges == {}
+
+
+def test_a_design_is_exported_as_a_policy(tmp_path: Path) -> None:
+    design, path = tmp_path / "best.npz", tmp_path / "best.onnx"
+    current = np.linspace(-6.0, 6.0, BENCH.timing.horizon + 1)
+    metadata = json.dumps({"contract_hash": BENCH.contract_hash, "criterion": "D"})
+    np.savez(design, current=current, metadata=metadata)
+    assert main([str(design), "--out", str(path)]) == 0
+    policy = load_policy(path, BENCH)
+    found = [policy.act(0.0, 0.0, float(k), Estimator(BENCH)) for k in range(BENCH.timing.horizon)]
+    assert found == pytest.approx(current[:-1], abs=1e-5 * BENCH.limits.current)
+
+
+# The command ----------------------------------------------------------------------------------------------------------
+
+
+def test_each_graph_stands_alone_in_a_version_that_the_runtimes_oldest_library_reads(
+    exported: bytes, tmp_path: Path
+) -> None:
+    assert main(["step", "--out", str(tmp_path / "step.onnx")]) == 0
+    for data in (exported, reference_file("four-d-exact-quadratic", BENCH)[0], (tmp_path / "step.onnx").read_bytes()):
+        model = onnx.load_from_string(data)
+        onnx.checker.check_model(model, full_check=True)
+        assert [(o.domain, o.version) for o in model.opset_import] == [("", 20)]
+        assert model.ir_version <= 10
+        assert [p.key for p in model.metadata_props] == [CONTRACT_KEY]
+        assert not model.functions
+        assert all(not n.metadata_props and not n.doc_string for n in model.graph.node)
+        assert all(t.data_location == onnx.TensorProto.DEFAULT for t in model.graph.initializer)
 
 
 def test_the_command_writes_one_file_and_nothing_beside_it(
@@ -233,56 +240,28 @@ def test_ctrl_c_is_no_traceback_and_an_output_that_fails_leaves_nothing(
 ) -> None:
     (tmp_path / "x.onnx.part").mkdir()
     assert main(["step", "--out", str(tmp_path / "x.onnx")]) == 2
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
     monkeypatch.setattr(Path, "replace", interrupt)
     monkeypatch.setattr(sys, "argv", ["emb-export", "step", "--out", str(tmp_path / "y.onnx")])
     assert emb_export() == 130
 
 
-def interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
-
-
-def test_a_contract_of_an_exported_file_is_refused_by_a_bench_with_another_sample_time(
-    run: Path, exported: bytes
-) -> None:
-    _, bench = deployed(run)
-    other = dataclasses.replace(bench, timing=dataclasses.replace(bench.timing, sample_time=2e-3))
-    with pytest.raises(PolicyRefusedError):
-        load_policy(exported, other)
-    assert isinstance(policy_of(run, exported).contract, Contract)
-
-
-def test_no_actor_is_made_for_a_bench_that_no_shield_can_be_made_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bench, path = tmp_path / "my.toml", tmp_path / "ramp.onnx"
+def test_a_file_is_for_the_limits_and_the_sample_time_of_the_bench_that_is_named(tmp_path: Path) -> None:
+    bench, path = tmp_path / "my.toml", tmp_path / "x.onnx"
+    bench.write_text(shipped_bench_text().replace("velocity = 500.0", "velocity = 400.0"))
+    for source in ("ramp:amplitude=-3", "four-d-exact-quadratic"):
+        assert main([source, "--bench", str(bench), "--out", str(path)]) == 0
+        load_policy(path, load_bench(bench))
+        for other in (BENCH, dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, sample_time=2e-3))):
+            with pytest.raises(PolicyRefusedError):
+                load_policy(path, other)
     bench.write_text(shipped_bench_text().replace('envelope      = "braking"', 'envelope      = "coasting"'))
-    assert main(["ramp:amplitude=-5", "--bench", str(bench), "--out", str(path)]) == 2
-    assert "shield.angle_margin" in capsys.readouterr().err
+    path.unlink()
+    assert main(["ramp:amplitude=-5", "--bench", str(bench), "--out", str(path)]) == 2  # no shield can be made for it
     assert not path.exists()
-
-
-def test_a_reference_excitation_is_exported_as_an_actor_that_says_what_it_says(tmp_path: Path) -> None:
-    bench, path = load_bench(), tmp_path / "ramp.onnx"
-    assert main(["ramp:amplitude=-5", "--out", str(path)]) == 0
-    policy, wanted = load_policy(path, bench), excitation("ramp", bench, amplitude=-5.0).currents
-    assert wanted is not None
-    said = [policy.act(17.0, -3.0, float(k), 0.0) for k in range(len(wanted))]
-    assert said == pytest.approx(wanted, abs=1e-5 * bench.limits.current)
-    assert policy.act(0.0, 0.0, -1.0, 0.0) == said[0]
-    assert policy.act(0.0, 0.0, 1e9, 0.0) == said[-1]
-    assert policy.contract.provenance["sequence"] == "ramp:amplitude=-5.0,start=0.0"
-
-
-def test_a_design_is_exported_as_an_actor(tmp_path: Path) -> None:
-    bench, design, path = load_bench(), tmp_path / "best.npz", tmp_path / "best.onnx"
-    current = np.linspace(-6.0, 6.0, bench.timing.horizon + 1)
-    metadata = json.dumps({"contract_hash": bench.contract_hash, "criterion": "D"})
-    np.savez(design, current=current, metadata=metadata)
-    assert main([str(design), "--out", str(path)]) == 0
-    policy = load_policy(path, bench)
-    said = [policy.act(0.0, 0.0, float(k), 0.0) for k in range(bench.timing.horizon)]
-    assert said == pytest.approx(current[:-1], abs=1e-5 * bench.limits.current)
 
 
 def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(
@@ -305,15 +284,22 @@ def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(
         ["nowhere", "--out", "x.onnx"],
         ["10:30"],
         [str(run), "--out", "none/actor.onnx"],
+        [str(run), "--bench", str(run / BENCH_FILE)],
     ):
         assert refused(lambda: main(arguments), capsys), arguments  # noqa: B023  # called at once
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_a_sequence_is_exported_without_torch(tmp_path: Path) -> None:
-    code = (
-        "import sys; sys.modules['torch'] = None\n"
-        "from emb_export.export import main\n"
-        f"sys.exit(main(['step', '--out', {str(tmp_path / 'step.onnx')!r}]))"
-    )
-    assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0
+def test_a_reference_and_a_sequence_are_exported_without_torch(tmp_path: Path) -> None:
+    for source in ("step", "four-d-exact-quadratic"):
+        code = (
+            "import sys\n"
+            "class NoTorch:\n"
+            "    def find_spec(self, name, *_):\n"
+            "        if name.partition('.')[0] == 'torch':\n"
+            "            raise ModuleNotFoundError(name=name)\n"
+            "sys.meta_path.insert(0, NoTorch())\n"
+            "from emb_export.export import main\n"
+            f"sys.exit(main([{source!r}, '--out', {str(tmp_path / 'x.onnx')!r}]))"
+        )
+        assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0

@@ -17,6 +17,7 @@ from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import load_bench
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError
+from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.records import Frame
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.state_machine import Fault
@@ -191,12 +192,7 @@ class Actor:
         self._constant = pick(draw, [6.0, -6.0, 0.0, None])
         self._slow, self._broken = pick(draw, [0, 0, 2]), chance(draw, 10)
 
-    estimate: tuple[float, ...] = ()
-
-    def begin(self) -> None:
-        """There is nothing to forget."""
-
-    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         """A current, or what is none."""
         if chance(self._draw, self._slow):  # it thinks for longer than it may
             self._bus.spend(pick(self._draw, [MS // 2, MS, 3 * MS, 12 * MS]))

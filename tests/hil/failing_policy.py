@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 
+from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.policy.policy import Policy
 
 FIRST = 100  # Beyond the steps of the test vectors that the policy is tried on before the run
@@ -31,11 +32,11 @@ def hang(how: str) -> None:
 def make_it_hang(how: str) -> None:
     act, calls = Policy.act, 0
 
-    def failing(self: Policy, angle: float, velocity: float, step: float, applied_current: float) -> float:
+    def failing(self: Policy, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         nonlocal calls
         calls += step >= FIRST
         if calls > CALLS:
             hang(how)
-        return act(self, angle, velocity, step, applied_current)
+        return act(self, angle, velocity, step, estimator)
 
     Policy.act = failing  # type: ignore[method-assign]

@@ -52,6 +52,10 @@ TESTS = {
     "learning.law": ("test_law.py", "test_known.py"),
     "learning.learner": ("test_learner.py",),
     "learning.bounded": ("test_bounded_reference.py",),
+    "estimator.kalman": ("test_frozen.py", "test_kalman.py"),
+    "estimator.stick_slip": ("test_frozen.py", "test_stick_slip.py"),
+    "estimator.speed_loop": ("test_frozen.py", "test_speed_loop.py"),
+    "estimator.estimator": ("test_estimator.py",),
     "drives.wire_guard": ("test_wire_guard.py",),
     "drives.time_out_proof": ("test_time_out_proof.py",),
 }

@@ -28,7 +28,7 @@ ROOMS = {
     "logs recordings experiment export hil replay estimate analysis commission report live batch api cli",
     "train/emb_train": "names presets rewards envs bench_compatibility ppo training structured optimum "
     "evaluate cli entry",
-    "export/emb_export": "file network stateful export entry",
+    "export/emb_export": "file network reference export entry",
 }
 """Sub-packages and single modules of each package, lowest first: each imports from those before it only."""
 SIDE_BY_SIDE = 14  # The most modules in one room

@@ -24,12 +24,13 @@ from emb_train import optimum
 from emb_train.cli import main
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import Conditions
-from emb_train.envs.excitations import OnnxFile, Played, reference_excitation
+from emb_train.envs.excitations import Played, reference_excitation
 from emb_train.envs.measure import MEASURES, mean_score
 from emb_train.envs.network import Network
 from emb_train.envs.play import Draw, fresh_draws, play
 from emb_train.evaluate import Settings, Subject, document, evaluate, open_subject, references, text
 from emb_train.optimum import followed, optima, searchable
+from emb_train.structured.played import PolicyFile
 from emb_train.training import VALIDATION_STREAM
 from tests.commands import refused
 from tests.train.trainings import HORIZON
@@ -113,8 +114,6 @@ def test_policies_that_cannot_be_played_are_refused(tmp_path: Path) -> None:
         play(SHORT, SHORT.range_set("pm50"), ("f_v",), Played([1.0] * 7 + [math.nan] * 60), fresh_draws(WIDE, 0, 1))
     with pytest.raises(UsageError):
         Network(nn.Linear(3, 2))(np.zeros((5, 4), np.float32))
-    with pytest.raises(PolicyRefusedError):
-        OnnxFile(b"no graph")
     path = tmp_path / "empty.onnx"
     path.touch()
     with pytest.raises(PolicyRefusedError, match=str(path)):
@@ -243,7 +242,7 @@ def test_the_shipped_actor_is_on_its_own_ranges_inside_the_limits_at_home_and_be
     assert np.abs(actor.outcome.angle).max() < 0.5
     assert plant.ahead(rows["step:amplitude=6"]).low > 0.0
     policy = load_policy(shipped_actor_path(), BENCH)
-    file, draws = OnnxFile(policy.data, policy.contract.initial_state), fresh_draws(BENCH.range_set("pm50"), 0, 12)
+    file, draws = PolicyFile(policy, BENCH), fresh_draws(BENCH.range_set("pm50"), 0, 12)
     alone = play(BENCH, BENCH.range_set("pm50"), PARAMETER_NAMES, file, draws, "exact", PHYSICAL)
     np.testing.assert_allclose(actor.values, MEASURES["D"].values(alone.matrices), rtol=1e-9)
 

@@ -6,11 +6,7 @@ the bench's shield does not cover. Its actor is then for a bench file that names
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict
-
 from emb_runtime.config.bench import Bench, Ranges
-from emb_runtime.errors import UsageError
 
 
 def unfit(bench: Bench, ranges: Ranges) -> str:
@@ -28,48 +24,3 @@ def unfit(bench: Bench, ranges: Ranges) -> str:
         f"it is for brakes with {', '.join(names)}, and the bench's shield covers {', '.join(covers)}: make a bench "
         f"file with emb-run --write-bench FILE, write {lines}, and give it to emb-export and emb-run with --bench FILE"
     )
-
-
-def require_fit(bench: Bench, ranges: Ranges, what: str) -> None:
-    """Check that the bench's shield covers the brakes that an actor is for.
-
-    Raises:
-        UsageError: it does not.
-    """
-    if said := unfit(bench, ranges):
-        raise UsageError(f"{what}: {said}")
-
-
-def require_alike(trained: Bench, bench: Bench, what: str) -> None:
-    """Check that a bench is one that an actor was trained for; its shield may be another.
-
-    Raises:
-        UsageError: limits, noise, timing, inertia or gear ratio differ.
-    """
-    for name in ("limits", "noise", "timing"):
-        before, now = asdict(getattr(trained, name)), asdict(getattr(bench, name))
-        for key in before:
-            if before[key] != now[key]:
-                _differ(what, f"{name}.{key}", before[key], now[key])
-    for key in ("J", "gamma"):
-        if getattr(trained.brake, key) != getattr(bench.brake, key):
-            _differ(what, f"brake.{key}", getattr(trained.brake, key), getattr(bench.brake, key))
-
-
-def _differ(what: str, key: str, trained: object, bench: object) -> None:
-    raise UsageError(f"{what}: it was trained with {key} = {trained}, the bench has {bench}: train it for this bench")
-
-
-def shield_changes(trained: Bench, bench: Bench) -> str:
-    """Differences of the bench's shield from that of the training; empty if there are none."""
-    return ", ".join(_changes(trained, bench))
-
-
-def _changes(trained: Bench, bench: Bench) -> Iterator[str]:
-    before, now = trained.shield._asdict(), bench.shield._asdict()
-    boxes = [b.range_set(b.shield.ranges) for b in (trained, bench)]
-    if (boxes[0].low, boxes[0].high) == (boxes[1].low, boxes[1].high):  # whatever they are called
-        before["ranges"] = now["ranges"]
-    for key, value in before.items():
-        if value != now[key]:
-            yield f"{key} {value}, here {now[key]}"

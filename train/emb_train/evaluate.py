@@ -22,14 +22,14 @@ from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
 from emb_train.envs.conditions import EVERYTHING, NOTHING_RANDOM, Conditions, Randomisation
-from emb_train.envs.excitations import Excitation, OnnxFile, Played, reference_excitation
+from emb_train.envs.excitations import Excitation, Played, reference_excitation
 from emb_train.envs.measure import Floats, Measure, mean_score
 from emb_train.envs.network import Network
 from emb_train.envs.play import Outcome, fresh_draws, grid_draws, middle_of, play
 from emb_train.names import reference_names
 from emb_train.optimum import optima, searchable
 from emb_train.ppo import DeployedActor
-from emb_train.structured.played import Following
+from emb_train.structured.played import Following, PolicyFile
 from emb_train.structured.stored import stored
 from emb_train.training import Trained, load_training
 
@@ -52,8 +52,8 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
     """Opens a policy.
 
     Args:
-        given: folder of a training, an ONNX file, ``actor`` for the shipped one, or the reference of a structured
-            actor: its name, or a ``.json`` file.
+        given: folder of a training, an ONNX file, ``actor`` for the shipped one, or a reference: its name,
+            or a ``.json`` file.
         bench_file: bench of what has none of its own; the shipped one without.
 
     Raises:
@@ -91,15 +91,14 @@ def _file(name: str, path: Path, bench: Bench) -> Subject:
         policy = load_policy(path, bench) if path == shipped_actor_path() else admit_policy(path, bench)
     except PolicyRefusedError as err:
         raise PolicyRefusedError(f"{path}: {err}") from err
-    made_for = policy.contract.ranges
+    made_for = {str(name): pair for name, pair in policy.contract.ranges.items()}
     sets = [
         s.name
         for s in bench.ranges.values()
         if made_for == {n: (getattr(s.low, n), getattr(s.high, n)) for n in PARAMETER_NAMES}
     ]
-    varied = tuple(n for n in PARAMETER_NAMES if made_for[n][0] < made_for[n][1])
-    excitation = OnnxFile(policy.data, policy.contract.initial_state)
-    return Subject(name, bench, excitation, sets[0] if sets else "", varied)
+    varied = tuple(n for n in PARAMETER_NAMES if n in made_for and made_for[n][0] < made_for[n][1])
+    return Subject(name, bench, PolicyFile(policy, bench), sets[0] if sets else "", varied)
 
 
 def references(bench: Bench) -> dict[str, Excitation]:

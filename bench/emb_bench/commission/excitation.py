@@ -8,22 +8,24 @@ import numpy as np
 import onnx
 
 from emb_bench.commission.records import Step
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.policy.contract import ACTION, CONTRACT_KEY, MIN_VECTORS, OBSERVATION, Contract, Vector
+from emb_runtime.config.bench import Bench
+from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, SAMPLE, Contract, PolicyLimits, Vector
 
 GRAPH = """
 <ir_version: 10, opset_import: ["" : 20]>
-commissioning (float[1, 3] obs) => (float[1, 1] action)
+commissioning (float[1, 3] inputs) => (float[1, 1] outputs)
 <
   float[1] lowest = {{{lowest}}}, float[1] highest = {{{highest}}}, float[1] fastest = {{{speed}}},
   float[1] slowest = {{-{speed}}}, float[1] least = {{{least}}}, float[1] most = {{{most}}}, float[1] zero = {{0}},
+  float[1] rate = {{{rate}}},
   float[{count}] currents = {{{currents}}},
   int64[1] first = {{0}}, int64[1] second = {{1}}, int64[1] third = {{2}}, int64 begin = {{0}}, int64 last = {{{last}}}
 >
 {{
-  angle = Gather <axis = 1> (obs, first)
-  velocity = Gather <axis = 1> (obs, second)
-  step = Gather <axis = 1> (obs, third)
+  angle = Gather <axis = 1> (inputs, first)
+  velocity = Gather <axis = 1> (inputs, second)
+  time = Gather <axis = 1> (inputs, third)
+  step = Mul (time, rate)
   whole = Round (step)
   number = Cast <to = 7> (whole)
   place = Clip (number, begin, last)
@@ -37,7 +39,7 @@ commissioning (float[1, 3] obs) => (float[1, 1] action)
   no_more_down = Or (below, fast_down)
   lower = Where (no_more_down, zero, least)
   raised = Max (wanted, lower)
-  action = Min (raised, upper)
+  outputs = Min (raised, upper)
 }}
 """
 """The current of the step, cut to zero on the side that leads out of the window."""
@@ -51,6 +53,7 @@ def policy_file(step: Step, bench: Bench) -> bytes:
         lowest=window.lowest,
         highest=window.highest,
         speed=window.speed,
+        rate=1.0 / bench.timing.sample_time,
         least=-limit,
         most=limit,
         count=len(currents),
@@ -69,13 +72,11 @@ def _numbers(values: Iterable[float]) -> str:
 def _contract(currents: list[float], step: Step, bench: Bench) -> Contract:
     places = [k * (len(currents) - 1) // (MIN_VECTORS - 1) for k in range(MIN_VECTORS)]
     return Contract(
-        observation=OBSERVATION,
-        action=ACTION,
-        action_limit=bench.limits.current,
+        kind="current",
+        inputs=SAMPLE,
+        limits=PolicyLimits(bench.limits.current, bench.limits.angle, bench.limits.velocity),
         sample_time=bench.timing.sample_time,
         horizon=bench.timing.horizon,
-        bench_hash=bench.contract_hash,
-        ranges={name: (getattr(bench.brake, name), getattr(bench.brake, name)) for name in PARAMETER_NAMES},
-        sequences=tuple((Vector((0.0, 0.0, float(k)), currents[k]),) for k in places),
+        vectors=tuple(Vector((0.0, 0.0, k * bench.timing.sample_time), (currents[k],)) for k in places),
         provenance={"commissioning": step.name},
     )

@@ -39,6 +39,7 @@ from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Mechanics
 from emb_runtime.control.interfaces import Actor
 from emb_runtime.errors import UsageError
+from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.safety.sensor_monitor import CONFIRMED, MEMORY, begin, judge, largest_current
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current
@@ -84,16 +85,8 @@ class Excitation:
         """Text for :func:`parse_excitation`, defaults included."""
         return f"{self.name}:{','.join(f'{name}={value!r}' for name, value in self.parameters.items())}"
 
-    @property
-    def estimate(self) -> tuple[float, ...]:
-        """Estimate of the actor: empty."""
-        return ()
-
-    def begin(self) -> None:
-        """Does nothing: an excitation has no state."""
-
-    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
-        """Current for a measurement at a step of the experiment [A]; ``applied_current`` is not used."""
+    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
+        """Current for a measurement at a step of the experiment [A]; the estimator is not used."""
         return self.law(angle, velocity, int(step))
 
 
@@ -223,12 +216,13 @@ def run_excitation(
     states = np.zeros((count + 1, 2))
     wanted, currents = np.empty(count), np.empty(count)
     reasons, obeyed = np.zeros(count, np.int64), np.ones(count, np.bool_)
-    past = NO_PAST
+    past, estimator = NO_PAST, Estimator(bench)
 
     def answer(x1: float, x2: float, k: int) -> float:
         nonlocal past
         y1, y2 = x1 + float(errors[k, 0]), x2 + float(errors[k, 1])
-        wanted[k] = excited.act(y1, y2, k, past[0])
+        estimator.take(y1, y2, k, float(currents[k - 1]) if k else 0.0)
+        wanted[k] = excited.act(y1, y2, k, estimator)
         if law is None or thresholds is None:
             u = clipped(float(wanted[k]), limit)
         else:
@@ -242,7 +236,6 @@ def run_excitation(
         past = (u if obeyed[k] else 0.0, *past[:4])
         return u if obeyed[k] else damped_current(x2, limit, bench.node.damping_velocity)
 
-    excited.begin()
     for k, (u, x1, x2) in enumerate(islice(feedback(mechanics, p, answer, t_s), count)):
         currents[k], states[k + 1] = u, (x1, x2)
     low, high = bench.limits.angle

@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
         carried: dict[str, str] = {}
     else:
         policy = carried_policy(log)
-        again = rerun(log, policy, policy.contract.action_limit, _stop_condition(log))
+        again = rerun(log, policy, policy.contract.limits.current, _stop_condition(log))
         carried = {"policy_sha256": policy.sha256}
     again = replace(again, differences=(*_identity(log, carried), *again.differences))
     show(as_json(document(log, again)) if args.json else text(log, again))
@@ -109,11 +109,9 @@ def carried_policy(log: RunLog) -> Policy:
     """
     if "policy.onnx" not in log.attachments:
         raise LogError(f"{log.path}: the log carries no policy.onnx, so its decisions cannot be made again")
-    from emb_runtime.policy.policy import ONNX_RUNTIME  # takes its time, and no other command needs it
-    from emb_runtime.policy.trial import admit_policy
+    from emb_runtime.policy.trial import admit_policy  # takes its time, and no other command needs it
 
-    evaluated_by = log.run.get("policy_evaluated_by", ONNX_RUNTIME)
-    return admit_policy(log.attachments["policy.onnx"], log.bench, evaluated_by)
+    return admit_policy(log.attachments["policy.onnx"], log.bench)
 
 
 def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopCondition | None = None) -> Rerun:

@@ -382,9 +382,7 @@ def _stop_condition(args: argparse.Namespace, bench: Bench) -> StopCondition | N
 
 def _policy(path: Path | None, quick: bool, bench: Bench) -> Policy:
     try:
-        if path is None:  # tests load it in full
-            return load_policy(shipped_actor_path(quick), bench, compared=True)
-        return admit_policy(path, bench)
+        return load_policy(shipped_actor_path(quick), bench) if path is None else admit_policy(path, bench)
     except PolicyRefusedError as err:
         raise err if path is None else PolicyRefusedError(f"--policy {path}: {err}") from err
 

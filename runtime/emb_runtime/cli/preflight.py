@@ -284,9 +284,9 @@ def _policy(f: Findings) -> CheckResult:
     if f.policy is None:
         return CheckResult("policy", "none decides", "none")
     made = f", {f.policy['provenance']}" if f.policy["provenance"] else ""
-    by = f"evaluated by {f.policy['evaluated by']}"
-    found = f"sha256 {f.policy['sha256'][:12]}, horizon {f.policy['horizon']} samples, {by}{made}"
-    return CheckResult("policy", found, "made for this bench, its test vectors reproduced")
+    beyond = f.policy["beyond"]
+    found = f"{f.policy['kind']}, sha256 {f.policy['sha256'][:12]}{made}{beyond and f'; {beyond}'}"
+    return _line("policy", found, "made for such a bench, its test vectors reproduced", not beyond)
 
 
 def _watchdog(f: Findings) -> CheckResult:

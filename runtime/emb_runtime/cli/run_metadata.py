@@ -82,7 +82,7 @@ def header(
         assert policy is not None
         records["emb.run"] |= {
             "policy_sha256": policy.sha256,
-            "policy_evaluated_by": policy.evaluated_by,
+            "policy_kind": policy.contract.kind,
             "policy_provenance": json.dumps(dict(policy.contract.provenance), sort_keys=True),
         }
         if plan.stop_condition is not None:

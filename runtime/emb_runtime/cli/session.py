@@ -121,7 +121,7 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
                 layout=plan.layout,
                 law=plan.law,
                 actor=actor,
-                current_limit=plan.policy.contract.action_limit,
+                current_limit=plan.policy.contract.limits.current,
                 steps=steps,
                 guard=Guard(plan.layout, plan.bench, bus.transport.send, pulse, plan.limit),
                 limit=plan.limit,
@@ -262,8 +262,8 @@ def _about(policy: Policy) -> dict[str, str]:
     provenance = ", ".join(f"{name} {value}" for name, value in policy.contract.provenance.items())
     return {
         "sha256": policy.sha256,
-        "horizon": str(policy.contract.horizon),
-        "evaluated by": policy.evaluated_by,
+        "kind": policy.contract.kind,
+        "beyond": "; ".join(policy.warnings),
         "provenance": shorten(provenance, 80, placeholder=" …"),
     }
 

@@ -477,7 +477,7 @@ class Core:
         self._check_sample(sample)
         self._remember(*NO_PAST[: self._missed])
         self._estimator.take(sample.angle, sample.velocity, step, sample.applied_current)
-        asked = self.actor.act(sample.angle, sample.velocity, step, sample.applied_current)
+        asked = self.actor.act(sample.angle, sample.velocity, step, self._estimator)
         wanted = checked(asked, self.current_limit)
         return Proposal(sample, step, wanted, self._decide(sample, wanted, step))
 
@@ -489,7 +489,6 @@ class Core:
         self._learner.begin(sample)
         self._estimator.begin()
         self.counters.pairs = 1
-        self.actor.begin()
 
     def _finish(self, sample: SensorSample, step: int) -> None:
         """Judge the whole run at its last sample."""

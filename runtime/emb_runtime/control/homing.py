@@ -5,6 +5,7 @@ from __future__ import annotations
 from emb_runtime.can.messages import StopReason
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.result import Outcome
+from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.safety.state_machine import Fault
 
 LONGEST_WAY = 3.0  # Time for a way home; from anywhere inside the limits it takes well below one [s]
@@ -13,10 +14,7 @@ LONGEST_WAY = 3.0  # Time for a way home; from anywhere inside the limits it tak
 class Still:
     """An actor that wants 0 A."""
 
-    def begin(self) -> None:
-        """Do nothing: there is no memory."""
-
-    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         """Return 0 A."""
         return 0.0
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from emb_runtime.estimator.estimator import Estimator
+
 
 class Actor(Protocol):
     """Source of the wanted currents: a policy, or the way home."""
 
-    def begin(self) -> None:
-        """Reset the actor's memory: a run begins."""
-        ...
-
-    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
-        """Current wanted for the period that begins at this sample [A]; the last argument acted in the one before."""
+    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
+        """Current wanted for the period that begins at this sample, which the estimator has taken in [A]."""
         ...

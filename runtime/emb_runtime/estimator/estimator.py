@@ -6,7 +6,7 @@ import math
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.estimator.estimate import Quantity
-from emb_runtime.estimator.kalman import State, believed, deviations, follow, make_model, start
+from emb_runtime.estimator.kalman import Four, State, believed, deviations, follow, make_model, start
 
 UNITS = {"k_m": "N·m/A", "k_1": "N/rad", "T_c": "N·m", "f_v": "N·m·s/rad"}  # Of the parameters
 
@@ -37,11 +37,14 @@ class Estimator:
         self.state = follow(self.model, self.state, angle, velocity, step, applied)
 
     @property
+    def values(self) -> Four:
+        """k_m, k_1, T_c and f_v in SI units."""
+        return _in_si(believed(self.model, self.state), self.model.nominal)
+
+    @property
     def parameters(self) -> tuple[float, ...]:
         """k_m, k_1, T_c and f_v in SI units, then their standard deviations."""
-        model, state = self.model, self.state
-        numbers = believed(model, state), deviations(model, state)
-        return tuple(value * unit for four in numbers for value, unit in zip(four, model.nominal, strict=True))
+        return self.values + _in_si(deviations(self.model, self.state), self.model.nominal)
 
     @property
     def estimate(self) -> tuple[float, ...]:
@@ -49,3 +52,8 @@ class Estimator:
         numbers = self.parameters
         chosen = tuple(numbers[i + offset] for offset in (0, len(PARAMETER_NAMES)) for i in self._varied)
         return chosen if all(map(math.isfinite, chosen)) else ()
+
+
+def _in_si(relative: Four, nominal: Four) -> Four:
+    k_m, k_1, t_c, f_v = relative
+    return k_m * nominal[0], k_1 * nominal[1], t_c * nominal[2], f_v * nominal[3]

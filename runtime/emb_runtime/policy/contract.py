@@ -1,177 +1,133 @@
-"""The contract of a policy: what an actor was trained to see, to say, and on which bench.
+"""The contract of a policy: what its graph computes from what, and the benches that it was made for.
 
-It travels as JSON with full precision in the ONNX metadata under :data:`CONTRACT_KEY`. What is read from a file is
-not trusted: every key, type and value is checked, and the first thing wrong is said in one line.
+It travels as JSON with full precision in the ONNX metadata under :data:`CONTRACT_KEY`. A file is of unknown origin:
+every key, type and value is checked, and the first error is one line.
 """
 
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple, NoReturn, TypedDict
+from typing import Annotated, Any, Literal, NoReturn
+
+import msgspec
+from msgspec import Meta
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.config.validation import Rules, Table, shown
+from emb_runtime.config.typed import FieldError, read, shown
 from emb_runtime.errors import PolicyRefusedError
-from emb_runtime.estimator.estimate import Quantity
 
 CONTRACT_KEY = "emb.contract"  # Key of the contract in the ONNX ``metadata_props``
-
-SCHEMA = 3
-"""Of what is written. Older ones are still read: in schema 2 test vectors say nothing of state and estimate; actors of
-schema 1 had neither, and each test vector stood for itself."""
-
+SCHEMA: Literal[4] = 4
 MAX_JSON_CHARACTERS = 1_000_000
-MAX_TEXT_CHARACTERS = 500
-_RULES = Rules(PolicyRefusedError, MAX_TEXT_CHARACTERS, remedy="export the actor anew with emb-export")
 MIN_VECTORS = 32
 MAX_VECTORS = 4096
-MAX_STATE = 1024  # Numbers that an actor may carry from one sample to the next
-MAX_ESTIMATES = 12  # Quantities that an actor may estimate: with their deviations they fit into one record of the log
-MAX_ESTIMATE_NAME = 32
-MAX_PROVENANCE_NAME = 120
-
+MAX_WIDTH = 64  # Numbers that a graph takes or gives
 VECTOR_TOLERANCE = 1e-5
-"""Largest difference of a replayed test vector from the recorded action, as a part of the action limit."""
+"""Largest difference of a replayed test vector from the recorded one: of a current as a part of its limit."""
+
+SAMPLE = ("angle", "velocity", "time")  # Measured [rad, rad/s], and since the experiment began [s]
+DEVIATIONS = tuple(f"{name}_deviation" for name in PARAMETER_NAMES)
+INPUTS = {"current": (SAMPLE, (*SAMPLE, *PARAMETER_NAMES, *DEVIATIONS)), "reference": (PARAMETER_NAMES,)}
+"""Inputs that a graph of each kind may have. Parameters are the running estimate, in SI units."""
+
+Positive = Annotated[float, Meta(gt=0.0)]
+Name = Annotated[str, Meta(pattern="^[ -~]{1,120}$", description="a name of at most 120 printable ASCII characters")]
+Numbers = Annotated[tuple[float, ...], Meta(min_length=1, max_length=MAX_WIDTH)]
 
 
-OBSERVATION = (Quantity("angle", "rad"), Quantity("velocity", "rad/s"), Quantity("step", "1"))
-"""Inputs of the actor in order, raw (thesis Table 4.2): the normaliser is part of the graph."""
+class Vector(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Numbers of one evaluation, in the order of the graph."""
 
-APPLIED_CURRENT = Quantity("applied_current", "A")
-"""Optional further input: the current that acted in the period that ends at the sample."""
-
-ACTION = Quantity("current", "A")  # Output of the actor, scaled and clipped in the graph
+    inputs: Numbers
+    outputs: Numbers
 
 
-class Vector(NamedTuple):
-    """One observation with the action that the trained network gave for it, after those before it in its sequence."""
+class PolicyLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Limits of the bench that a policy was made for."""
 
-    observation: tuple[float, ...]  # Values in the order of the contract's observation
-    action: float  # [A]
-    state: tuple[float, ...] = ()  # State afterwards; empty if not recorded
-    estimate: tuple[float, ...] = ()  # Estimate afterwards, values and standard deviations; empty if not recorded
+    current: Positive  # Both signs [A]; the largest current that the policy may ask for
+    angle: tuple[float, float]  # Lowest and highest [rad]
+    velocity: Positive  # Both signs [rad/s]
 
 
-@dataclass(frozen=True)
-class Contract:
-    """Everything that must agree between training and the bench before a policy may drive it."""
+class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Everything that must fit before a policy may drive a bench.
 
-    observation: tuple[Quantity, ...]  # Inputs of the actor, in order
-    action: Quantity  # Output of the actor
-    action_limit: float  # Largest action, both signs, in the action's unit
-    sample_time: float  # [s]
-    horizon: int  # Samples in one experiment
-    bench_hash: str  # :attr:`emb_runtime.config.bench.Bench.contract_hash` of the bench it was trained for
-    ranges: Mapping[str, tuple[float, float]]
-    """Lowest and highest value that it was trained on, for every parameter of
-    :data:`emb_runtime.config.bench.PARAMETER_NAMES`, in SI units."""
-    sequences: tuple[tuple[Vector, ...], ...]
-    """Test vectors, replayed before the policy may arm: each sequence from the initial state. The last one of each
-    tells state and estimate, if there are any; in a contract of schema 2 none does."""
-    initial_state: tuple[float, ...] = ()  # State that the graph is given at the first sample; empty if it has none
-    estimates: tuple[Quantity, ...] = ()
-    """Estimated quantities in order; the standard deviation of each is in the same unit."""
-    provenance: Mapping[str, str | int | float] = field(default_factory=dict)
-    """Provenance: preset, seed, steps, versions, command."""
+    A graph of the kind ``current`` gives a current [A]. One of the kind ``reference`` gives n levels of speed, as parts
+    of the limit, then n − 1 switches between them, as parts of the horizon, which the runtime's speed loop follows.
+    """
 
-    @property
-    def vectors(self) -> tuple[Vector, ...]:
-        """The test vectors of all sequences."""
-        return tuple(vector for sequence in self.sequences for vector in sequence)
+    schema: Literal[4] = SCHEMA
+    kind: Literal["current", "reference"]
+    inputs: Annotated[tuple[str, ...], Meta(max_length=MAX_WIDTH)]
+    limits: PolicyLimits
+    sample_time: Positive  # [s]
+    horizon: Annotated[int, Meta(ge=1, le=1_000_000)]  # Samples in one experiment
+    vectors: Annotated[tuple[Vector, ...], Meta(min_length=MIN_VECTORS, max_length=MAX_VECTORS)]
+    ranges: dict[Literal["k_m", "k_1", "T_c", "f_v"], tuple[Positive, Positive]] = {}
+    """Lowest and highest value of each parameter that it was made for, SI units; empty for any."""
+    gain: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0  # Of the speed loop
+    provenance: dict[Name, str | int | float] = {}
+
+    def __post_init__(self) -> None:
+        if self.inputs not in INPUTS[self.kind]:
+            wanted = " or ".join(f"[{', '.join(names)}]" for names in INPUTS[self.kind])
+            raise FieldError("inputs", f"expected {wanted}, got {shown(self.inputs)}")
+        for name, low, high in (("limits.angle", *self.limits.angle), *((n, *pair) for n, pair in self.ranges.items())):
+            if not low <= high:
+                raise FieldError("ranges" if name in self.ranges else name, f"{name}: expected a lower bound first")
+        width = len(self.vectors[0].outputs)
+        for i, vector in enumerate(self.vectors):
+            if (len(vector.inputs), len(vector.outputs)) != (len(self.inputs), width):
+                raise FieldError(f"vectors[{i}]", f"expected {len(self.inputs)} inputs and {width} outputs")
+        if width % 2 == 0 or (self.kind == "current" and width > 1):
+            raise FieldError("vectors", f"expected one current, or an odd number of levels and switches, got {width}")
 
     def to_json(self) -> str:
         """The contract as JSON; floats keep their full precision."""
-        record = {
-            "schema": SCHEMA,
-            "observation": [q._asdict() for q in self.observation],
-            "action": {**self.action._asdict(), "limit": self.action_limit},
-            "sample_time": self.sample_time,
-            "horizon": self.horizon,
-            "initial_state": list(self.initial_state),
-            "estimates": [q._asdict() for q in self.estimates],
-            "bench_hash": self.bench_hash,
-            "ranges": {name: list(pair) for name, pair in self.ranges.items()},
-            "provenance": dict(self.provenance),
-            "sequences": [
-                [{name: value for name, value in v._asdict().items() if value != ()} for v in sequence]
-                for sequence in self.sequences
-            ],
-        }
-        return json.dumps(record, sort_keys=True, allow_nan=False)
+        return msgspec.json.encode(self, order="sorted").decode()
 
-    @classmethod
-    def from_json(cls, text: str) -> Contract:
-        """Read a contract that nobody vouches for.
-
-        Raises:
-            PolicyRefusedError: it is not JSON, has another schema, lacks a key, has one too many, or a value of the
-                wrong type or range.
-        """
-        if len(text) > MAX_JSON_CHARACTERS:
-            raise PolicyRefusedError(f"contract: expected at most {MAX_JSON_CHARACTERS} characters, got {len(text)}")
-        try:
-            document = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique_keys)
-        except (ValueError, RecursionError) as err:
-            raise PolicyRefusedError(f"contract: not valid JSON: {shown(str(err))}") from err
-        top = Table("contract", "", document, _RULES)
-        if not 1 <= (schema := top.integer("schema", 0, 2**31)) <= SCHEMA:
-            raise top.fail("schema", f"this runtime reads 1 to {SCHEMA}, got {schema}: export it again")
-        observation = tuple(_quantity(item) for item in top.tables("observation", 1, 64))
-        action, limit = _action(top.table("action"))
-        contract = cls(
-            observation=observation,
-            action=action,
-            action_limit=limit,
-            sample_time=_positive(top, "sample_time"),
-            horizon=top.integer("horizon", 1, 1_000_000),
-            bench_hash=top.text("bench_hash"),
-            ranges=_ranges(top.table("ranges")),
-            provenance=_provenance(top.table("provenance")),
-            **(_without_memory if schema == 1 else _with_memory)(top, schema, _Shape(len(observation), limit)),
-        )
-        top.nothing_else()
-        return contract
-
-    def require_bench(self, bench: Bench) -> None:
-        """Check that this policy was trained for this bench; the most telling difference is named first.
-
-        Raises:
-            PolicyRefusedError: sample time, horizon, signals, units, limit or bench hash differ, or it was trained for
-                brakes that the bench's shield does not cover.
-        """
-        if self.observation not in (OBSERVATION, (*OBSERVATION, APPLIED_CURRENT)):
-            needed = f"{_names(OBSERVATION)}, at most with {APPLIED_CURRENT.name} {APPLIED_CURRENT.unit} behind it"
-            _differ("observation (order and units)", needed, _names(self.observation))
-        if self.action != ACTION:
-            _differ("action", _names((ACTION,)), _names((self.action,)))
+    def bench_problem(self, bench: Bench) -> str:
+        """Key of a bench that a policy cannot drive, and both values; "" if it can."""
+        of_bench, limits = bench.limits, self.limits
         if self.sample_time != bench.timing.sample_time:
-            _differ("sample time", f"{bench.timing.sample_time!r} s", f"{self.sample_time!r} s")
+            return f"timing.sample_time is {bench.timing.sample_time!r} s, the policy has {self.sample_time!r} s"
+        # A narrower bench is what shield and clip hold; a wider one would be driven as it never was before.
+        if not of_bench.current <= limits.current:
+            return f"limits.current is {of_bench.current!r} A, the policy has {limits.current!r} A at most"
+        if not limits.angle[0] <= of_bench.angle[0] < of_bench.angle[1] <= limits.angle[1]:
+            return f"limits.angle is {list(of_bench.angle)} rad, the policy has {list(limits.angle)} rad at most"
+        if not of_bench.velocity <= limits.velocity:
+            return f"limits.velocity is {of_bench.velocity!r} rad/s, the policy has {limits.velocity!r} rad/s at most"
+        return ""
+
+    def warnings(self, bench: Bench) -> list[str]:
+        """What of a bench goes beyond what the policy was made for, without keeping it from driving it."""
+        found = []
         if self.horizon != bench.timing.horizon:
-            _differ("horizon", f"{bench.timing.horizon} samples", f"{self.horizon}")
-        # A bench may be narrower than the policy, for the runtime clips; a wider one is not the bench it knows.
-        if self.action_limit < bench.limits.current:
-            _differ("action limit", f"at least {bench.limits.current!r} A", f"{self.action_limit!r} A")
-        if self.bench_hash != bench.contract_hash:
-            _differ("bench hash", bench.contract_hash, self.bench_hash)
-        box = bench.range_set(bench.shield.ranges)
+            found.append(f"horizon of {bench.timing.horizon} samples, made for {self.horizon}")
+        box = bench.range_set(bench.prior)
         for name, (low, high) in self.ranges.items():
-            covered = getattr(box.low, name), getattr(box.high, name)
-            if low < covered[0] or high > covered[1]:
-                _differ(f"range of {name}", f"{covered[0]:g} to {covered[1]:g} at most", f"{low:g} to {high:g}")
+            lowest, highest = getattr(box.low, name), getattr(box.high, name)
+            if lowest < low or highest > high:
+                found.append(f"{name} in {lowest:g} to {highest:g}, made for {low:g} to {high:g}")
+        return found
 
 
-def _differ(what: str, bench: str, policy: str) -> NoReturn:
-    raise PolicyRefusedError(
-        f"the policy does not fit this bench: {what}: the bench needs {bench}, the policy has {policy}; "
-        "export one for this bench file: emb-export four-d-exact-quadratic --bench FILE --out actor.onnx"
-    )
+def read_contract(text: str) -> Contract:
+    """Read a contract of unknown origin.
 
-
-def _names(quantities: tuple[Quantity, ...]) -> str:
-    return "[" + ", ".join(f"{q.name} {q.unit}" for q in quantities) + "]"
+    Raises:
+        PolicyRefusedError: it is not JSON, has another schema, lacks a key, has one too many, or a value of the wrong
+            type or out of bounds.
+    """
+    if len(text) > MAX_JSON_CHARACTERS:
+        raise PolicyRefusedError(f"contract: expected at most {MAX_JSON_CHARACTERS} characters, got {len(text)}")
+    try:
+        document = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique_keys)
+    except (ValueError, RecursionError) as err:
+        raise PolicyRefusedError(f"contract: not valid JSON: {shown(str(err))}") from err
+    return read(Contract, document, "contract", PolicyRefusedError, remedy="export the policy anew", longest_text=500)
 
 
 def _refuse_constant(name: str) -> NoReturn:
@@ -183,106 +139,3 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(record) != len(pairs):
         raise ValueError("a key occurs twice")
     return record
-
-
-def _quantity(table: Table) -> Quantity:
-    quantity = Quantity(table.text("name"), table.text("unit"))
-    table.nothing_else()
-    return quantity
-
-
-def _action(table: Table) -> tuple[Quantity, float]:
-    result = Quantity(table.text("name"), table.text("unit")), _positive(table, "limit")
-    table.nothing_else()
-    return result
-
-
-def _positive(table: Table, name: str) -> float:
-    return table.number(name, lambda value: value > 0.0, "a positive number")
-
-
-def _ranges(table: Table) -> dict[str, tuple[float, float]]:
-    pairs = {}
-    for name in PARAMETER_NAMES:
-        low, high = table.number_pair(name)
-        if low <= 0.0:
-            raise table.fail(name, f"expected positive bounds, got {low:g}")
-        pairs[name] = (low, high)
-    table.nothing_else()
-    return pairs
-
-
-class _Memory(TypedDict):
-    """Fields of a contract that schema 1 writes otherwise."""
-
-    sequences: tuple[tuple[Vector, ...], ...]
-    initial_state: tuple[float, ...]
-    estimates: tuple[Quantity, ...]
-
-
-class _Shape(NamedTuple):
-    """Sizes that a test vector must have."""
-
-    width: int  # Numbers in an observation
-    limit: float  # Largest action
-    optional: Mapping[str, int] = {}  # Numbers in each further entry that it may have
-
-
-def _without_memory(top: Table, _: int, shape: _Shape) -> _Memory:
-    """Reads schema 1: no state, no estimates, and each vector is a sequence of its own."""
-    top.tables("recurrent", 0, 0)
-    vectors = [_vector(item, shape) for item in top.tables("vectors", MIN_VECTORS, MAX_VECTORS)]
-    return {"sequences": tuple((vector,) for vector in vectors), "initial_state": (), "estimates": ()}
-
-
-def _with_memory(top: Table, schema: int, shape: _Shape) -> _Memory:
-    """Reads schema 2, and 3, where the last vector of each sequence has state and estimate."""
-    state = top.numbers("initial_state", 0, MAX_STATE)
-    estimates = _estimates(top.tables("estimates", 0, MAX_ESTIMATES))
-    optional = {} if schema == 2 else {"state": len(state), "estimate": 2 * len(estimates)}
-    shape = shape._replace(optional=optional)
-    items = top.table_lists("sequences", 1, MAX_VECTORS)
-    if not MIN_VECTORS <= sum(map(len, items)) <= MAX_VECTORS:
-        raise top.fail("sequences", f"expected {MIN_VECTORS} to {MAX_VECTORS} test vectors in all")
-    sequences = tuple(tuple(_vector(each, shape) for each in sequence) for sequence in items)
-    for i, vectors in enumerate(sequences):
-        if any(len(getattr(vectors[-1], name)) != size for name, size in optional.items()):
-            raise top.fail(f"sequences[{i}]", "expected state and estimate in the last vector of a sequence")
-    return {"sequences": sequences, "initial_state": state, "estimates": estimates}
-
-
-_NAME = re.compile(rf"[A-Za-z][A-Za-z0-9_]{{0,{MAX_ESTIMATE_NAME - 1}}}")
-_TAKEN = frozenset({"step", "order", "time", "unixtime", "logtime", "publishtime"})
-"""Field names that the log's table of estimates has already, without underscores, in lower case."""
-
-
-def _estimates(tables: list[Table]) -> tuple[Quantity, ...]:
-    """Names and units; each name becomes a field of the log, beside one for its deviation."""
-    estimates, taken = [], set(_TAKEN)
-    for table in tables:
-        quantity = _quantity(table)
-        key = quantity.name.replace("_", "").lower()
-        if not _NAME.fullmatch(quantity.name) or key in taken or key.endswith("deviation"):
-            wanted = "a name of letters, digits and underscores that is not taken, and does not end in 'deviation'"
-            raise table.fail("name", f"expected {wanted}, got {shown(quantity.name)}")
-        taken.add(key)
-        estimates.append(quantity)
-    return tuple(estimates)
-
-
-def _vector(table: Table, shape: _Shape) -> Vector:
-    observation = table.numbers("observation", shape.width, shape.width)
-    bound = shape.limit * (1.0 + VECTOR_TOLERANCE)
-    action = table.number("action", lambda value: abs(value) <= bound, f"an action within ±{shape.limit:g}")
-    there = [(name, size) for name, size in shape.optional.items() if name in table.names()]
-    further = {name: table.numbers(name, size, size) for name, size in there}
-    table.nothing_else()
-    return Vector(observation, action, **further)
-
-
-def _provenance(table: Table) -> dict[str, str | int | float]:
-    """Entries by name. The names are the file's own, and the pre-flight shows them on the terminal."""
-    for name in table.names():
-        if len(name) > MAX_PROVENANCE_NAME or not (name.isascii() and name.isprintable()):
-            raise table.fail(name, f"expected a name of at most {MAX_PROVENANCE_NAME} printable ASCII characters")
-    return {name: table.text_or_number(name) for name in table.names()}

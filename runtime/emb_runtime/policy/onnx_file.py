@@ -5,34 +5,16 @@ The ``onnx`` package is not part of the base install, and needs more than what s
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
-from numpy.typing import NDArray
 
 from emb_runtime.errors import PolicyRefusedError
 
-Floats = NDArray[np.float32 | np.float64]
-
-_FLOATS = {1: ("<f4", "float_data"), 11: ("<f8", "double_data")}
-_NUMBERS = {**_FLOATS, 6: ("<i4", "int32_data"), 7: ("<i8", "int64_data")}
-"""By TensorProto.DataType: what is in ``raw_data``, and the field that is used instead."""
-MAX_SIZES = 64  # Numbers of a tensor whose values may be sizes, axes or places; no tensor has more axes
-
 MAX_PARTS = 10_000
-"""Nodes, attributes, tensors and texts, each. An actor has hundreds; an empty node takes two bytes of a file and a
+"""Nodes, attributes, tensors and texts, each. A policy has tens; an empty node takes two bytes of a file and a
 thousand times as much to read and judge."""
-
-
-class Tensor(NamedTuple):
-    """A tensor that is part of the file."""
-
-    shape: tuple[int, ...]
-    values: tuple[float, ...] | None = None  # Its numbers, where they are few enough to be sizes; None of others
 
 
 class Node(NamedTuple):
@@ -41,23 +23,18 @@ class Node(NamedTuple):
     operator: str  # Its type, of the default domain; with the domain in front if it is of another
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    attributes: dict[str, float]  # Those that are numbers
-    lists: Mapping[str, tuple[int, ...]] = {}  # Those that are lists of whole numbers
-    value: Tensor | None = None  # The one that is a tensor
 
 
 class Graph(NamedTuple):
     """A graph without control flow and functions that needs no other file."""
 
     nodes: tuple[Node, ...]  # Each after those whose outputs it takes
-    constants: dict[str, Floats]  # The graph's own tensors of single or double precision
-    tensors: Mapping[str, Tensor]
-    """All tensors that are part of the file, by name: the graph's own, and the results of its Constant nodes."""
+    tensors: frozenset[str]  # Names of the numbers in the file: tensors, and the results of Constant nodes
     texts: tuple[tuple[str, str], ...]  # The file's metadata
 
 
 def read_graph(data: bytes) -> Graph:
-    """Read an ONNX file that nobody vouches for.
+    """Read an ONNX file of unknown origin.
 
     Given bytes with external data, ONNX Runtime would open files beside the working directory; given a Loop, it could
     run for ever; given functions that call functions, it would write out each call. None of that is let through.
@@ -79,16 +56,15 @@ def read_graph(data: bytes) -> Graph:
         )
         if parts > MAX_PARTS:
             raise PolicyRefusedError(
-                f"the policy has {parts} nodes, attributes or tensors, expected at most {MAX_PARTS}: not an actor of "
+                f"the policy has {parts} nodes, attributes or tensors, expected at most {MAX_PARTS}: not a policy of "
                 "ours"
             )
         _require_plain(model)
         nodes = tuple(_node(node) for node in graph.node)
-        constants = {n.outputs[0]: n.value for n in nodes if n.operator == "Constant" and n.outputs and n.value}
+        constants = (name for node in nodes if node.operator == "Constant" for name in node.outputs)
         return Graph(
             nodes=nodes,
-            constants={t.name: _floats(t) for t in graph.initializer if t.data_type in _FLOATS},
-            tensors={t.name: _tensor(t) for t in graph.initializer} | constants,
+            tensors=frozenset((*(tensor.name for tensor in graph.initializer), *constants)),
             texts=tuple((entry.key, entry.value) for entry in model.metadata_props),
         )
     except (DecodeError, UnicodeDecodeError) as err:
@@ -96,7 +72,7 @@ def read_graph(data: bytes) -> Graph:
 
 
 def _require_plain(model: Any) -> None:
-    """Refuse what no actor needs: graphs inside nodes, functions, sparse tensors, lists of tensors, other files."""
+    """Refuse what no policy needs: graphs inside nodes, functions, sparse tensors, lists of tensors, other files."""
     attributes = [attribute for node in model.graph.node for attribute in node.attribute]
     if any(a.HasField("g") or a.graphs for a in attributes):
         raise PolicyRefusedError("the policy has control flow (a graph inside a node): its run time has no bound")
@@ -115,49 +91,7 @@ def _node(node: Any) -> Node:
         operator=node.op_type if node.domain in ("", "ai.onnx") else f"{node.domain}.{node.op_type}",  # one domain
         inputs=tuple(node.input),
         outputs=tuple(node.output),
-        attributes={
-            a.name: a.f if a.HasField("f") else a.i for a in node.attribute if a.HasField("f") or a.HasField("i")
-        },
-        lists={a.name: tuple(a.ints) for a in node.attribute if a.ints},
-        value=next((_value(a) for a in node.attribute if a.HasField("t") or a.name in _VALUES), None),
     )
-
-
-_VALUES = {"value_int": (), "value_float": (), "value_ints": ("ints",), "value_floats": ("floats",)}
-"""Attributes of a Constant that are a tensor in short; one number, or those in a list."""
-
-
-def _value(attribute: Any) -> Tensor:
-    """The tensor in an attribute."""
-    if attribute.HasField("t"):
-        return _tensor(attribute.t)
-    if lists := _VALUES[attribute.name]:
-        numbers = tuple(getattr(attribute, lists[0]))
-        return Tensor((len(numbers),), numbers)
-    return Tensor((), (attribute.f if attribute.HasField("f") else attribute.i,))
-
-
-def _tensor(tensor: Any) -> Tensor:
-    shape = tuple(tensor.dims)
-    if min(shape, default=0) < 0:
-        raise PolicyRefusedError("the policy has a tensor with a negative size: the file is damaged")
-    kind, name = _NUMBERS.get(tensor.data_type, ("", ""))
-    if not kind or math.prod(shape) > MAX_SIZES:
-        return Tensor(shape)
-    raw = tensor.raw_data
-    numbers = np.frombuffer(raw, kind).tolist() if raw and len(raw) % int(kind[2]) == 0 else getattr(tensor, name)
-    return Tensor(shape, tuple(numbers) if len(numbers) == math.prod(shape) else None)
-
-
-def _floats(tensor: Any) -> Floats:
-    """A tensor's numbers; of one whose shape they do not fill, none: ONNX Runtime says what is wrong with it."""
-    kind, name = _FLOATS[tensor.data_type]
-    raw = tensor.raw_data if len(tensor.raw_data) % int(kind[2]) == 0 else b""
-    numbers = np.frombuffer(raw, kind) if raw else np.array(getattr(tensor, name), kind)
-    shape = tuple(tensor.dims)
-    if any(n < 0 for n in shape) or int(np.prod(shape, dtype=object)) != numbers.size:
-        return np.empty(0, kind)
-    return numbers.astype(kind[1:]).reshape(shape)
 
 
 # The part of onnx.proto3 that is read, as (field, number, type): a type with a star repeats, a type that names a row of
@@ -176,26 +110,15 @@ _ONNX_PART: dict[str, tuple[tuple[str, int, str], ...]] = {
     ),
     "Attribute": (
         ("name", 1, "string"),
-        ("f", 2, "float"),
-        ("i", 3, "int64"),
         ("t", 5, "Tensor"),
         ("g", 6, "bytes"),
-        ("floats", 7, "*float"),
-        ("ints", 8, "*int64"),
         ("tensors", 10, "*bytes"),
         ("graphs", 11, "*bytes"),
         ("sparse_tensor", 22, "bytes"),
         ("sparse_tensors", 23, "*bytes"),
     ),
     "Tensor": (
-        ("dims", 1, "*int64"),
-        ("data_type", 2, "int32"),
-        ("float_data", 4, "*float"),
-        ("int32_data", 5, "*int32"),
-        ("int64_data", 7, "*int64"),
         ("name", 8, "string"),
-        ("raw_data", 9, "bytes"),
-        ("double_data", 10, "*double"),
         ("external_data", 13, "*bytes"),
         ("data_location", 14, "int32"),
     ),
@@ -205,10 +128,7 @@ _ONNX_PART: dict[str, tuple[tuple[str, int, str], ...]] = {
 def _build_reader() -> Any:
     """A message class that reads :data:`_ONNX_PART`."""
     field_type = descriptor_pb2.FieldDescriptorProto
-    scalars = {
-        name: getattr(field_type, f"TYPE_{name.upper()}")
-        for name in ("string", "bytes", "int32", "int64", "float", "double")
-    }
+    scalars = {name: getattr(field_type, f"TYPE_{name.upper()}") for name in ("string", "bytes", "int32")}
     # Syntax proto2, for only there a number that is absent is told from zero.
     file = descriptor_pb2.FileDescriptorProto(name="emb_onnx_part.proto", package="emb_onnx_part", syntax="proto2")
     for name, fields in _ONNX_PART.items():

@@ -1,9 +1,8 @@
-"""The operators that an actor may be made of: those whose work is the same for every sample.
+"""The operators that a policy may be made of: those whose work is the same for every sample.
 
-The shape of each result follows from the shapes of the inputs and from numbers in the file, never from what is measured
-or remembered; and so does the number of steps of a GRU or LSTM. So the work of a graph is what it was when its
-test vectors were replayed: there is no observation at which it loops, or an array grows. How long that work takes is
-not decided here; that is measured, and watched.
+The shape of each result follows from the shapes of the inputs and from numbers in the file, never from what is
+measured. So the work of a graph is what it was when its test vectors were replayed: there are no inputs for which it
+loops, or an array grows. How long that work takes is measured and watched elsewhere.
 """
 
 from __future__ import annotations
@@ -26,9 +25,8 @@ FIXED: Mapping[str, slice] = MappingProxyType(
     | _of("Mul Neg Not Or Pow Reciprocal Relu Round Selu Sigmoid Sign Sin Softmax Softplus Softsign", slice(0, 0))
     | _of("Sqrt Sub Tanh Transpose Where", slice(0, 0))
     | _of("Expand ReduceMax ReduceMean ReduceMin ReduceSum Reshape Slice Split Squeeze Unsqueeze", slice(1, None))
-    | _of("GRU LSTM", slice(4, 5))
 )
-"""By operator: which of its inputs must be numbers in the file: none, all behind the first, the number of steps."""
+"""By operator: which of its inputs must be numbers in the file: none, or all but the first."""
 
 
 def require_bounded(graph: Graph) -> None:
@@ -37,8 +35,7 @@ def require_bounded(graph: Graph) -> None:
     Raises:
         PolicyRefusedError: it has another operator, or one that takes a size from a computation; the message names it.
     """
-    computed = {name for node in graph.nodes if node.operator != "Constant" for name in node.outputs}
-    fixed = graph.tensors.keys() - computed
+    fixed = graph.tensors - {name for node in graph.nodes if node.operator != "Constant" for name in node.outputs}
     for node in graph.nodes:
         inputs = FIXED.get(node.operator)
         if inputs is None:
@@ -48,12 +45,12 @@ def require_bounded(graph: Graph) -> None:
             )
         if _unknown(node.inputs[inputs], fixed):
             raise PolicyRefusedError(
-                f"the policy's operator {node.operator} takes a size, a place or a number of steps from a computation, "
+                f"the policy's operator {node.operator} takes a size or a place from a computation, "
                 "so its work could grow with what is measured: make that a constant of the file"
             )
 
 
-def _unknown(names: Iterable[str], fixed: set[str]) -> bool:
+def _unknown(names: Iterable[str], fixed: frozenset[str]) -> bool:
     """Returns True if one of these inputs is computed; an empty name is an input that is left out."""
     return any(name and name not in fixed for name in names)
 

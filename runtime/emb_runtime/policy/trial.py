@@ -28,15 +28,14 @@ TIMEOUT = 300.0
 """Longest wait for the process to start, and for its verdict on a computer that has other things to do [s]."""
 
 
-def admit_policy(source: str | Path | bytes, bench: Bench, evaluated_by: str = "") -> Policy:
-    """A policy that nobody vouches for, tried and then loaded.
+def admit_policy(source: str | Path | bytes, bench: Bench) -> Policy:
+    """A policy of unknown origin, tried and then loaded.
 
     Where there are no processes of our own there is no brake either, only a simulated one: it is loaded untried.
 
     Args:
         source: path of the ONNX file, or its bytes.
         bench: what it is to drive.
-        evaluated_by: see :func:`emb_runtime.policy.policy.load_policy`.
 
     Raises:
         UsageError: the file cannot be read, or no process can be started to try it.
@@ -44,17 +43,20 @@ def admit_policy(source: str | Path | bytes, bench: Bench, evaluated_by: str = "
             memory, or ended the process.
     """
     data = source if isinstance(source, bytes) else read_policy(Path(source))
-    if not HAS_CHILD_PROCESSES:
-        return load_policy(data, bench, evaluated_by)
-    return load_policy(data, bench, _try(data, bench, evaluated_by), compared=True)
+    if HAS_CHILD_PROCESSES:
+        _try(data, bench)
+    return load_policy(data, bench)
 
 
-def _try(data: bytes, bench: Bench, evaluated_by: str) -> str:
-    """Name of what evaluates a policy, by the process that tried it."""
+def _try(data: bytes, bench: Bench) -> None:
+    """Load a policy in a confined process.
+
+    Raises:
+        UsageError, PolicyRefusedError: see :func:`admit_policy`.
+    """
     document = {
         "policy": base64.b64encode(data).decode(),
         "bench": base64.b64encode(pickle.dumps(bench)).decode(),
-        "evaluated_by": evaluated_by,
         "parent": os.getpid(),
         "memory": MEMORY,
         "multiple": MULTIPLE,
@@ -72,10 +74,10 @@ def _try(data: bytes, bench: Bench, evaluated_by: str) -> str:
         exit_code = child.exit_code
     finally:
         child.kill()
-    if isinstance(accepted := answer.get("accepted"), str):
-        return accepted
+    if "accepted" in answer:
+        return
     if exit_code == -signal.SIGKILL:
-        reason = f"loading and asking it takes more than {seconds:.1f} s of processor time: not an actor of ours"
+        reason = f"loading and asking it takes more than {seconds:.1f} s of processor time: not a policy of ours"
     else:
         reason = str(answer.get("refused") or f"it could not be tried: {answer.get('error')}")
     raise PolicyRefusedError(reason)

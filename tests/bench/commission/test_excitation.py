@@ -8,9 +8,12 @@ import pytest
 from emb_bench.commission.excitation import policy_file
 from emb_bench.commission.records import Kind, Step, Window
 from emb_runtime.config.bench import load_bench
+from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.policy.policy import Policy, load_policy
 
 STEP = Step("try", Kind.EXPERIMENT, "", "", 2.0, 0.5, Window(-1.0, 2.0, 30.0), (1.0, 1.0, -1.5, 0.25))
+
+ESTIMATOR = Estimator(load_bench())
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +28,7 @@ def test_the_file_is_onnx_by_the_reference_checker() -> None:
 
 
 def test_inside_of_the_window_the_sequence_is_played_and_its_end_stays(policy: Policy) -> None:
-    assert [policy.act(0.5, 1.0, k, 0.0) for k in range(6)] == [1.0, 1.0, -1.5, 0.25, 0.25, 0.25]
+    assert [policy.act(0.5, 1.0, k, ESTIMATOR) for k in range(6)] == [1.0, 1.0, -1.5, 0.25, 0.25, 0.25]
 
 
 @pytest.mark.parametrize(
@@ -46,4 +49,4 @@ def test_inside_of_the_window_the_sequence_is_played_and_its_end_stays(policy: P
 def test_outside_of_it_no_current_drives_farther_out(
     policy: Policy, angle: float, velocity: float, step: int, wanted: float
 ) -> None:
-    assert policy.act(angle, velocity, step, 0.0) == wanted
+    assert policy.act(angle, velocity, step, ESTIMATOR) == wanted

@@ -27,6 +27,7 @@ from emb_bench.information.symmetric import Floats
 from emb_bench.sim.open_loop import simulate as simulate_brake
 from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
 from emb_runtime.errors import UsageError
+from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.records import Reason
 from tests.conftest import Simulate
 
@@ -79,7 +80,7 @@ def test_a_sequence_has_one_current_within_the_limit_for_each_step_of_any_bench(
         assert sequence.shape == (bench.timing.horizon,), name
         assert np.isfinite(sequence).all(), name
         assert np.abs(sequence).max() <= bench.limits.current, name
-        assert excitation(name, bench).act(50.0, -300.0, 17.0, 0.0) == sequence[17], name
+        assert excitation(name, bench).act(50.0, -300.0, 17.0, Estimator(bench)) == sequence[17], name
 
 
 def test_the_default_square_wave_is_the_thesis_s() -> None:
@@ -182,7 +183,8 @@ def test_the_text_of_an_excitation_reads_back_as_the_same() -> None:
         first = excitation(name, BENCH)
         again = parse_excitation(first.text, BENCH)
         assert (again.text, again.parameters) == (first.text, first.parameters)
-        assert again.act(12.0, 340.0, 499.0, 0.0) == first.act(12.0, 340.0, 499.0, 0.0)
+        seen = 12.0, 340.0, 499.0, Estimator(BENCH)
+        assert again.act(*seen) == first.act(*seen)
 
 
 def test_a_text_changes_what_it_names_and_nothing_else() -> None:

@@ -113,11 +113,10 @@ def test_every_decision_of_the_shipped_actor_is_reproduced_on_every_brake(
         run.outcome,
         steps=500,
         policy=actor.data,
-        policy_evaluated_by=actor.evaluated_by,
     )
     log = read_log(path)
     carried = carried_policy(log)
-    assert_reproduced(rerun(log, carried, carried.contract.action_limit), run)
+    assert_reproduced(rerun(log, carried, carried.contract.limits.current), run)
 
 
 @pytest.mark.parametrize("later", [math.nan, 1e9])

@@ -11,17 +11,15 @@ import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, shipped_bench_text
 from emb_runtime.errors import EXIT_LOG
-from emb_runtime.estimator.estimate import Quantity
 from emb_runtime.log.recorder import Recorder, RecorderResult
-from emb_runtime.policy.contract import MIN_VECTORS, Vector
-from tests.actors import alone, constant_actor
+from emb_runtime.policy.contract import MIN_VECTORS, PolicyLimits, Vector
+from tests.actors import constant_actor
 from tests.runtime.operating import Edited, EmbRun, Sim
 
 pytestmark = pytest.mark.usefixtures("handlers")
@@ -71,25 +69,15 @@ def test_the_same_seed_gives_the_same_decisions(emb_run: EmbRun, tmp_path: Path)
     assert cycles[0] == cycles[1]
 
 
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"sample_time": 2e-3}, "sample time"),
-        ({"horizon": 300}, "horizon"),
-        ({"bench_hash": "0" * 64}, "bench"),
-        ({"observation": (("velocity", "rad/s"), ("angle", "rad"), ("step", "1"))}, "observation"),
-        ({"observation": (("angle", "deg"), ("velocity", "rad/s"), ("step", "1"))}, "observation"),
-    ],
-)
-def test_a_policy_made_for_another_bench_is_refused(
-    emb_run: EmbRun, tmp_path: Path, bench: Bench, changes: dict[str, Any], reason: str
-) -> None:
-    if "observation" in changes:
-        changes = {"observation": tuple(Quantity(*q) for q in changes["observation"])}
+def test_a_policy_made_for_another_bench_is_refused(emb_run: EmbRun, tmp_path: Path, bench: Bench) -> None:
     path = tmp_path / "other.onnx"
-    path.write_bytes(constant_actor(bench, **changes))
-    emb_run.refused(reason, "--policy", str(path), code=5)
-    assert not (tmp_path / "run.mcap").exists()
+    for reason, changes in (
+        ("timing.sample_time", {"sample_time": 2e-3}),
+        ("limits.velocity", {"limits": PolicyLimits(6.0, (-10.0, 100.0), 400.0)}),
+    ):
+        path.write_bytes(constant_actor(bench, **changes))
+        emb_run.refused(reason, "--policy", str(path), code=5)
+        assert not (tmp_path / "run.mcap").exists()
 
 
 def test_a_truncated_policy_is_refused(emb_run: EmbRun, tmp_path: Path, bench: Bench) -> None:
@@ -117,8 +105,8 @@ def test_a_policy_whose_vectors_are_mad_is_refused_before_arming(
     emb_run: EmbRun, tmp_path: Path, bench: Bench, current: float
 ) -> None:
     path = tmp_path / "mad.onnx"
-    vectors = alone(Vector((0.0, 0.0, float(n)), 1.0) for n in range(MIN_VECTORS))
-    path.write_bytes(constant_actor(bench, current, sequences=vectors))
+    vectors = tuple(Vector((0.0, 0.0, 1e-3 * n), (1.0,)) for n in range(MIN_VECTORS))
+    path.write_bytes(constant_actor(bench, current, vectors=vectors))
     emb_run.refused("test vector 0", "--policy", str(path), code=5)
 
 

@@ -71,7 +71,7 @@ def findings(bench: Bench, layout: Layout, heard: BusStatistics) -> Findings:
         bus="can0, receive buffer 8388608 bytes",
         in_process=False,
         heard=heard,
-        policy={"sha256": "ab" * 32, "horizon": "500", "evaluated by": "numpy", "provenance": ""},
+        policy={"sha256": "ab" * 32, "kind": "current", "beyond": "", "provenance": ""},
         needed=400_000,
         free=1 << 33,
         watchdog="process 4711, heartbeat 5 ms, FIFO 90",

@@ -30,7 +30,7 @@ class Plan:
 
     def __init__(self, bench: Bench) -> None:
         self.bench, self.stage, self.limit = bench, "full", 6.0
-        self.policy = SimpleNamespace(contract=contract_for(bench, 1.0, {}))
+        self.policy = SimpleNamespace(contract=contract_for(bench, 1.0))
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import pytest
 from emb_bench.sim.transport import SimTransport
 from emb_runtime.can.messages import Layout
 from emb_runtime.errors import BusError, FrameError, PolicyRefusedError, UsageError
+from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.learning.learner import Learner
 from emb_runtime.records import Frame
 from emb_runtime.safety.guard import Guard, GuardRejectedError
@@ -61,9 +62,7 @@ LEAVING = (BaseException, KeyboardInterrupt, GeneratorExit)
 """No Exceptions: raised again, once the run has stopped."""
 
 HANDED_IN: tuple[str, ...] = (
-    "begin",
     "act",
-    "estimate",
     "stop_requested",
     "clock",
     "receive",
@@ -77,6 +76,7 @@ HANDED_IN: tuple[str, ...] = (
 OURS: dict[str, tuple[type, str]] = {
     "monitor": (SensorMonitor, "check"),
     "learner": (Learner, "hear"),
+    "estimator": (Estimator, "take"),
     "guard": (Guard, "send"),
     "guard's judge": (Guard, "judge"),
     "guard's clock": (Guard, "judge_time"),
@@ -124,15 +124,7 @@ class Actor:
     def __init__(self, at: At) -> None:
         self._at = at
 
-    def begin(self) -> None:
-        self._at("begin")
-
-    @property
-    def estimate(self) -> tuple[float, ...]:
-        self._at("estimate")
-        return (1.0, 0.1)
-
-    def act(self, angle: float, velocity: float, step: float, applied_current: float) -> float:
+    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         self._at("act")
         return 4.0
 
@@ -228,7 +220,7 @@ def test_whatever_is_raised_in_a_run_stop_frames_follow_and_nothing_else(
     place: str, watched: bool, simulate: Simulate, layout: Layout
 ) -> None:
     for kind in (*FAULTS, *LEAVING):
-        for after in (0,) if place == "begin" else (0, 10) if kind in (HostileError, KeyboardInterrupt) else (10,):
+        for after in (0, 10) if kind in (HostileError, KeyboardInterrupt) else (10,):
             planted = Planted(place, kind, after=after)
             with pytest.MonkeyPatch.context() as patch:
                 if place in OURS:
@@ -249,7 +241,7 @@ def test_what_is_raised_for_ever_keeps_no_stop_frame_back_that_can_leave(
     place: str, simulate: Simulate, layout: Layout
 ) -> None:
     for kind in (HostileError, SystemExit, KeyboardInterrupt):
-        planted = Planted(place, kind, after=0 if place == "begin" else 10, often=1 << 30)
+        planted = Planted(place, kind, after=10, often=1 << 30)
         with pytest.MonkeyPatch.context() as patch:
             if place in OURS:
                 plant(patch, place, planted.at)

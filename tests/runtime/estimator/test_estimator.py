@@ -7,13 +7,11 @@ import math
 
 import pytest
 
-from emb_bench.compiled import compiled
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import BenchFileError
 from emb_runtime.estimator.estimate import by_name, words
 from emb_runtime.estimator.estimator import Estimator, estimated
 from emb_runtime.estimator.kalman import follow, start
-from emb_runtime.estimator.speed_loop import follow_reference, scale_of
 
 BENCH = load_bench()
 SAMPLES = [(0.0, 0.3, 0.0, 0.0), (0.02, 15.0, 1.0, 6.0), (0.4, 80.0, 6.0, 6.0), (0.45, 60.0, 7.0, -6.0)]
@@ -61,17 +59,6 @@ def test_an_estimate_that_is_not_finite_is_none() -> None:
     estimator = Estimator(BENCH)
     estimator.take(math.nan, 0.0, 0.0, 0.0)
     assert estimator.estimate == ()
-
-
-def test_compiled_for_the_batch_it_has_the_same_bits() -> None:
-    for sticks in (False, True):
-        model = Estimator(BENCH).model._replace(sticks=sticks)
-        plain = fast = start(model)
-        for sample in SAMPLES:
-            plain, fast = follow(model, plain, *sample), compiled(follow)(model, fast, *sample)
-            assert plain == fast
-            asked = model, plain, scale_of(BENCH), (1.0, -1.0), (0.0131,), 6.0
-            assert follow_reference(*asked) == compiled(follow_reference)(*asked)
 
 
 def test_an_estimate_is_given_by_name_and_in_as_many_digits_as_its_interval_allows() -> None:

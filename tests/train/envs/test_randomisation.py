@@ -33,11 +33,10 @@ from emb_train.envs.critic_view import EXTRA, critic_size
 from emb_train.envs.env import EmbExcitationEnv, EmbExcitationVectorEnv
 from emb_train.envs.excitations import Played
 from emb_train.envs.measure import MEASURES
-from emb_train.envs.network import StatefulNetwork
 from emb_train.envs.play import fresh_draws, play
 from emb_train.evaluate import references
 from emb_train.rewards import Transition
-from emb_train.structured.actor import actor_of
+from emb_train.structured.played import Following
 from emb_train.structured.stored import stored
 from emb_train.structured.trial import Trials
 
@@ -352,11 +351,11 @@ def test_every_reference_excitation_can_be_played_where_samples_are_lost() -> No
         assert np.isfinite(outcome.matrices).all(), name
 
 
-def test_a_structured_actor_that_nobody_asks_remembers_what_it_knew_in_training_as_in_evaluation() -> None:
+def test_a_reference_that_nobody_asks_keeps_its_estimate_in_training_as_in_evaluation() -> None:
     kept, draws = stored("four-d-exact-quadratic"), fresh_draws(PM50, 9, 4)
     trials = Trials(BENCH, PM50, PARAMETER_NAMES, draws, "exact", LOSSY)
     (tuned,) = trials.play(kept.scale(BENCH), kept.array()[None])
-    actor = StatefulNetwork(actor_of(kept, BENCH))
+    actor = Following(kept, BENCH, PM50)
     played = play(BENCH, PM50, PARAMETER_NAMES, actor, draws, "exact", LOSSY)
     values = MEASURES["D"].values
     assert values(played.matrices) == pytest.approx(values(tuned.matrices), abs=0.05)

@@ -28,27 +28,6 @@ class Network(Stateless):
         return _column(currents.numpy())
 
 
-class StatefulNetwork:
-    """A network with state: (obs [N, 3 or 4], state [N, S]) to (currents [A] [N, 1], next state, estimate)."""
-
-    def __init__(self, module: Any) -> None:
-        """Use this module; it has the attributes ``initial_state``, shape [S], and ``observation_size``."""
-        self._module = module
-        self._state = torch.zeros(0, 0, dtype=torch.float64)
-
-    def begin(self, count: int) -> None:
-        """Every experiment begins with the initial state."""
-        self._state = self._module.initial_state.detach().to(torch.float64).repeat(count, 1)
-
-    def __call__(self, seen: Seen) -> Currents:
-        """See :class:`Excitation`."""
-        observed = torch.from_numpy(np.ascontiguousarray(seen[:, : self._module.observation_size]))
-        with torch.no_grad():
-            currents, state, *_ = self._module(observed, self._state)
-        self._state = torch.where(observed[:, :1].isnan(), self._state, state)
-        return _column(currents.numpy())
-
-
 def _column(currents: Any) -> Currents:
     if currents.ndim != 2 or currents.shape[1] != 1:
         raise UsageError(f"expected an actor that gives one current for each experiment, got shape {currents.shape}")

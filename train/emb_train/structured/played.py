@@ -9,8 +9,10 @@ import numpy as np
 from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import Bench, Ranges
+from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.kalman import Model, State, follow, make_model, start
 from emb_runtime.estimator.speed_loop import Scale
+from emb_runtime.policy.policy import Policy
 from emb_train.envs.excitations import ANGLE, Currents, Seen
 from emb_train.structured.law import Box, box_of, wanted_current
 from emb_train.structured.stored import Stored
@@ -43,6 +45,28 @@ class Following:
         compiled(answer)(
             self._model, self._scale, self._box, self._table, self.states, np.asarray(seen, np.float64), wanted
         )
+        return wanted
+
+
+class PolicyFile:
+    """A policy file, one experiment after the other as the runtime calls it, each with an estimator of its own."""
+
+    def __init__(self, policy: Policy, bench: Bench) -> None:
+        """Use this policy, with estimators as the bench has them."""
+        self._policy, self._bench = policy, bench
+        self._estimators: list[Estimator] = []
+
+    def begin(self, count: int) -> None:
+        """Begin N experiments anew."""
+        self._estimators = [Estimator(self._bench) for _ in range(count)]
+
+    def __call__(self, seen: Seen) -> Currents:
+        """See :class:`emb_train.envs.excitations.Excitation`."""
+        wanted: Currents = np.zeros(len(seen))
+        for i in np.flatnonzero(~np.isnan(seen[:, ANGLE])):
+            angle, velocity, step, applied = seen[i].tolist()
+            self._estimators[i].take(angle, velocity, step, applied)
+            wanted[i] = self._policy.act(angle, velocity, step, self._estimators[i])
         return wanted
 
 
