@@ -356,6 +356,23 @@ def test_an_error_of_numba_s_own_files_is_told_as_numba_tells_it(
         compiled(tenfold)(1.0)
 
 
+def test_machine_code_whose_types_are_no_more_is_dropped_and_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(*_: object) -> None:
+        raise ModuleNotFoundError("emb_runtime.gone")
+
+    monkeypatch.setattr("emb_bench.compiled._cache_root", lambda: tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(IndexDataCacheFile, "load", gone)
+        assert compiled(twentyfold)(1.0) == 20.0
+    assert kept(tmp_path)
+
+
+def twentyfold(x: float) -> float:
+    return 20.0 * x
+
+
 def counted(x: float) -> float:
     return halved(x) + quartered(x)
 
