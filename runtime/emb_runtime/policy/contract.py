@@ -102,7 +102,7 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return ""
 
     def warnings(self, bench: Bench) -> list[str]:
-        """What of a bench goes beyond what the policy was made for, without keeping it from driving it."""
+        """Differences of a bench from those that the policy was made for, with which it may drive all the same."""
         found = []
         if self.horizon != bench.timing.horizon:
             found.append(f"horizon of {bench.timing.horizon} samples, made for {self.horizon}")

@@ -36,7 +36,7 @@ class Policy:
         contract: what it computes, and what it was made for.
         data: the ONNX file as it was read, for the log.
         sha256: of :attr:`data`, in hexadecimal.
-        warnings: what of the bench goes beyond what it was made for.
+        warnings: differences of the bench from those that it was made for.
     """
 
     def __init__(self, data: bytes, contract: Contract, inference: Inference, bench: Bench) -> None:
