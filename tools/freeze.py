@@ -66,12 +66,14 @@ GONE: dict[str, str] = {"fim/*/normalise_by": "the parameters of an information 
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, each with the commit that says why."""
 REST = "0abcadc: a run is watched until the node is at rest, and recorded so far"
 WINDOWS = "8dba46e: windows begin at a state whose squares fell"
+GATEWAY = "emb-gateway: a mapped drive is armed before the run: noise of other samples, no counts of its node"
 EXPLAINED: dict[str, str] = {
     "runs/stiff/says/*": REST,
     "logs/aborted/*": REST,
     "info/aborted/says/*": REST,
     "estimate/emps windows/says/*": WINDOWS,
     "demo/fim/numbers": "the text of fim has half of the 95 % interval in place of standard deviations",
+    "*/mapped/*": GATEWAY,
     "demo/run/numbers": "76c82d4: the summary has a line on the motion",
     "design/D of two/*": "d35eddd: an annealing moves the Euler brake as every other, with a third of the variations",
 }

@@ -57,17 +57,19 @@ class Play:
         log = self.log or f"/dev/shm/{self.name}.mcap"
         run = ["--iface", self.iface or self.run_bus, "--json", "--yes", "--log", log, *self.options]
         node = ["--iface", self.iface or self.node_bus]
+        gateway: list[str] = []
         if self.drive:
-            run[1] = f"map:{EXAMPLES / self.drive}.toml@{self.run_bus}"
-            kind = "polled" if self.drive == "mit" else "late"
-            run += ["--serial", "simulated", "--bench", str(folder / f"{kind}.toml")]
-            run += ["--policy", str(folder / f"{kind}.onnx")]
+            kind, mapping = "polled" if self.drive == "mit" else "late", f"{EXAMPLES / self.drive}.toml"
+            bench = ["--bench", str(folder / f"{kind}.toml")]
+            run += ["--drive", f"{mapping}@{self.node_bus}", *bench, "--policy", str(folder / f"{kind}.onnx")]
             node += ["--drive", self.drive]
+            gateway = [mapping, "--drive", self.node_bus, "--node", self.run_bus, "--serial", "simulated", *bench]
+            gateway += ["--yes", "--json"]
         elif not self.lie:
             node.append("--json")
         if self.policy:
             run += ["--policy", str(folder / ("giant.onnx" if self.policy == "giant" else "constant.onnx"))]
-        return {**asdict(self), "node": node, "run": run, "log": log}
+        return {**asdict(self), "node": node, "gateway": gateway, "run": run, "log": log}
 
 
 def _signal(to: str, name: str, after: int = 0, pause: float = 0.0, stops: int = 0) -> dict[str, Any]:
@@ -83,7 +85,7 @@ def _lying(name: str, what: str, *results: str, **lie: Any) -> Play:
 def _mapped(name: str, what: str, drive: str, results: tuple[str, ...], code: int, *actions: Any, **more: Any) -> Play:
     return Play(
         f"mapped_{name}", what, results, (code,), actions, drive=drive, stops=False, stop_frames=None,
-        may_lose=10**6, **more,
+        may_lose=10**6, run_bus="vcan1", **more,
     )  # fmt: skip
 
 
@@ -259,16 +261,20 @@ PLAYS = (
     *(
         _mapped(
             f"{drive}_host", "kill -9 of all processes of the run", drive, (), -9,
-            {"do": "kill", "roles": ("drive_node", "watchdog", "recorder", "run"), "after": 60},
+            {"do": "kill", "roles": ("gateway", "watchdog", "recorder", "run"), "after": 60},
         )
         for drive in SHIPPED
     ),
     _mapped(
-        "node", "kill -9 of the software node", "odrive", ("BUS_LOST",), 4, _signal("drive_node", "SIGKILL", 60),
+        "left", "kill -9 of run, watchdog and recorder, not of the gateway", "odrive", (), -9,
+        {"do": "kill", "roles": ("watchdog", "recorder", "run"), "after": 60}, linger=2.5,
+    ),
+    _mapped(
+        "gateway", "kill -9 of the gateway", "odrive", ("SENSOR_LOST",), 3, _signal("gateway", "SIGKILL", 60),
         linger=0.5,
     ),
     _mapped(
-        "down", "the interface down", "odrive", ("BUS_LOST",), 4,
+        "down", "the drive's interface down", "odrive", ("SENSOR_LOST",), 3,
         {"do": "link", "interface": "vcan0", "up": False, "after": 60}, linger=0.5,
     ),
 )  # fmt: skip

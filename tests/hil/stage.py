@@ -31,6 +31,7 @@ from typing import Any
 import cantools
 
 import emb_bench.cli.node
+import emb_runtime.cli.gateway
 import emb_runtime.cli.main
 import emb_runtime.safety.watchdog_process  # its bytecode and what it imports are then in the page cache
 import simulated_drives
@@ -52,7 +53,6 @@ BABBLER = 97  # Real-time priority, above the node's: other nodes on a bus ask n
 ROLES = {
     "recorder": "emb_runtime.log.recorder_process",
     "watchdog": "emb_runtime.safety.watchdog_process",
-    "drive_node": "emb_runtime.drives.node_process",
 }
 
 
@@ -157,6 +157,7 @@ class Stage:
         self.commands = open_socket([self.command], self.bus)
         self.enabled = self.disabled = 0
         self.node: Child | None = None
+        self.gateway: Child | None = None
         self.run: Child | None = None
         self.nodes: list[dict[str, Any]] = []
         self.done: list[tuple[str, int]] = []
@@ -173,6 +174,12 @@ class Stage:
         node = Child(program, arguments, self.folder, "node")
         self.node = node
         assert wait_until(lambda: node.err.exists() and b"\n" in node.err.read_bytes(), PATIENCE), "no node"
+        if self.play["gateway"]:
+            gateway = Child(emb_runtime.cli.gateway.main, self.play["gateway"], self.folder, "gateway")
+            self.gateway = gateway
+            assert wait_until(lambda: gateway.err.exists() and b": armed, " in gateway.err.read_bytes(), PATIENCE), (
+                "no gateway"
+            )
 
     def start_run(self) -> None:
         """Start the run."""
@@ -213,7 +220,8 @@ class Stage:
     def find(self, role: str) -> int:
         """The process id of a part that runs."""
         assert self.run is not None
-        pid = {"run": self.run.pid, "node": self.node.pid if self.node else None}.get(role)
+        programs = {"run": self.run, "node": self.node, "gateway": self.gateway}
+        pid = child.pid if (child := programs.get(role)) else None
         found = pid if pid is not None else descendant(self.run.pid, ROLES[role])
         assert found is not None, f"there is no {role}"
         return found
@@ -323,7 +331,7 @@ def stage(play: dict[str, Any], folder: Path) -> Iterator[Stage]:
     try:
         yield made
     finally:
-        for child in (made.run, made.node):
+        for child in (made.run, made.gateway, made.node):
             if child is not None and child.running():
                 os.kill(child.pid, signal.SIGKILL)
                 wait_until(lambda child=child: not child.running(), PATIENCE)
@@ -349,11 +357,12 @@ def perform(play: dict[str, Any], out: Path) -> dict[str, Any]:
         assert on.run is not None or "error" in report
         report["run"] = on.run.end() if on.run else None
         time.sleep(play["linger"])
-        if on.node is not None:
-            with contextlib.suppress(ProcessLookupError):
-                if on.node.running():
-                    os.kill(on.node.pid, signal.SIGTERM)
-            on.nodes.append(on.node.end())
+        for child, kept in ((on.gateway, report.setdefault("gateways", [])), (on.node, on.nodes)):
+            if child is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    if child.running():
+                        os.kill(child.pid, signal.SIGTERM)
+                kept.append(child.end())
         wait_until(lambda: not left(), 10.0)
         report |= {"nodes": on.nodes, "done": on.done, "left": left()}
         report["frames"], report["dropped"] = read(everything)

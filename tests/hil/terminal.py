@@ -2,11 +2,11 @@
 
     python -m tests.hil.terminal SCENES.json FOLDER
 
-SCENES is a list of {"name", "node": [...] or null, "run": [...], "answers": [...], "interrupt": n, "command": id}: the
-node is started anew, unless it is null; the questions are answered by the answers in turn, those that are left by "y";
-after the n-th answer Ctrl-C is pressed as soon as something is on the bus. FOLDER/played.json has for each scene what
-was printed, the exit code, and for each question how many command frames were on the bus when it came, and when it was
-answered; "command" is their identifier where it is not ours.
+SCENES is a list of {"name", "node": [...] or null, "gateway": [...], "run": [...], "answers": [...], "interrupt": n}:
+the node is started anew, unless it is null, and a gateway where there is one; the questions are answered by the answers
+in turn, those that are left by "y"; after the n-th answer Ctrl-C is pressed as soon as something is on the bus.
+FOLDER/played.json has for each scene what was printed, the exit code, and for each question how many command frames
+were on the bus when it came, and when it was answered.
 """
 
 from __future__ import annotations
@@ -88,15 +88,27 @@ def main() -> None:
     """Play all scenes."""
     scenes, folder = json.loads(Path(sys.argv[1]).read_text()), Path(sys.argv[2])
     node: subprocess.Popen[bytes] | None = None
+    gateway: subprocess.Popen[bytes] | None = None
     played: dict[str, Any] = {"nodes": []}
     for scene in scenes:
         if scene["node"] is not None:
             if node is not None:
                 played["nodes"].append(ended(node))
             node = subprocess.Popen([sys.executable, "-m", *scene["node"]], stdout=subprocess.PIPE)
-        commands = open_socket([scene.get("command", COMMAND)])
+        if "gateway" in scene:
+            if gateway is not None:
+                ended(gateway)
+            gateway = subprocess.Popen(
+                [sys.executable, "-m", *scene["gateway"]], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            )
+            assert gateway.stderr is not None
+            while b": armed, node on" not in (line := gateway.stderr.readline()):
+                assert line, "the gateway has ended"
+        commands = open_socket([COMMAND])
         played[scene["name"]] = Scene(scene, commands).play()
         commands.close()
+    if gateway is not None:
+        played["gateway"] = ended(gateway)
     if node is not None:
         played["nodes"].append(ended(node))
     (folder / "played.json").write_text(json.dumps(played))

@@ -25,7 +25,7 @@ from tests.hil.plays import ROOT, SLOWLY
 
 SENDING = ("2-zero", "3-current", "4-first-move", "5-free-stroke", "6-small", "7-medium", "8-large", "9-full")
 """Steps that send something."""
-SCENES = ("nobody", "interrupted", "refused", "agreed", "finished", "mapped")
+SCENES = ("nobody", "interrupted", "refused", "agreed", "finished", "no_gateway", "mapped", "mapped_finished")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # far beyond what a busy computer needs
 
 
@@ -40,15 +40,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     run = call("vcan0", "sheet.toml", "brake")
     (folder / "late.toml").write_text(sheet().text.replace("[0, 3]", "[0, 1]"))
-    mapped = call(f"map:{mapping_for(folder, 'odrive')}@vcan0", "late.toml", "mapped", "--serial", "simulated")
+    mapping = str(mapping_for(folder, "odrive"))
+    mapped = call("vcan0", "late.toml", "mapped", "--drive", f"{mapping}@vcan1")
     brake = {**TRUTH, "angle_noise": sheet().noise.angle, "velocity_noise": sheet().noise.velocity}
     theta = ",".join(f"{name}={value}" for name, value in brake.items())
     working, found = (
         ["emb_bench.cli.node", "--iface", "vcan0", "--json", "--theta", theta, "--bench", str(folder / "brake" / name)]
         for name in ("working.toml", "bench.toml")
     )
-    drive = ["simulated_drives", "--iface", "vcan0", "--theta", theta, "--bench", str(folder / "late.toml")]
+    drive = ["simulated_drives", "--iface", "vcan1", "--theta", theta, "--bench", str(folder / "late.toml")]
     drive += ["--drive", "odrive"]
+    buses = ["--drive", "vcan1", "--node", "vcan0", "--serial", "simulated", "--yes", "--json"]
+    gateways = [
+        ["emb_runtime.cli.gateway", mapping, *buses, "--bench", str(folder / "mapped" / name)]
+        for name in ("working.toml", "bench.toml")
+    ]
     scenes = [
         {"name": "nobody", "node": None, "run": run},
         # What is typed beyond the first answer answers no other question; Ctrl-C comes in the middle of the third run.
@@ -56,7 +62,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"name": "refused", "node": None, "run": run, "answers": ["n\n"]},
         {"name": "agreed", "node": None, "run": run},
         {"name": "finished", "node": found, "run": run},
-        {"name": "mapped", "node": drive, "run": mapped, "command": 0x00E},
+        {"name": "no_gateway", "node": drive, "run": mapped},
+        {"name": "mapped", "node": None, "gateway": gateways[0], "run": mapped},
+        {"name": "mapped_finished", "node": None, "gateway": gateways[1], "run": mapped},
     ]
     (folder / "scenes.json").write_text(json.dumps(scenes))
     emb_hil = [sys.executable, "-m", "emb_bench.hil.cli", *SLOWLY, "--timeout", "1000"]
@@ -79,14 +87,16 @@ def steps_begun(scene: dict[str, Any]) -> list[str]:
 
 
 def test_each_scene_ends_as_it_should_and_the_last_one_with_a_bench_file(played: dict[str, Any]) -> None:
-    codes = {"nobody": 4, "finished": 0, "mapped": 0}
+    codes = {"nobody": 4, "finished": 0, "no_gateway": 4, "mapped_finished": 0}
     assert {name: played[name]["exit"] for name in SCENES} == dict.fromkeys(SCENES, 3) | codes
     assert "NO_NODE" in played["nobody"]["out"]
     assert "4-first-move was not completed: INTERRUPTED" in played["interrupted"]["out"]
     assert "stopped by the operator before anything was sent" in played["refused"]["out"]
     assert "another bench file" in played["agreed"]["out"]
     assert "done: 9 steps, 1 runs now" in played["finished"]["out"]
-    assert "done: 9 steps, 9 runs now" in played["mapped"]["out"]
+    assert "another bench file" in played["mapped"]["out"]
+    assert "done: 9 steps, 1 runs now" in played["mapped_finished"]["out"]
+    assert played["gateway"]["drive_time_out"].startswith("let go within 0.01")
     for name in SCENES:
         assert "Traceback" not in played[name]["out"]
 
@@ -98,10 +108,11 @@ def test_each_step_is_done_once_and_one_that_was_interrupted_again(played: dict[
     assert steps_begun(played["agreed"]) == list(SENDING[2:])
     assert steps_begun(played["finished"]) == ["9-full"]
     assert steps_begun(played["mapped"]) == ["1-listen", *SENDING]
+    assert steps_begun(played["mapped_finished"]) == ["9-full"]
 
 
 def test_nothing_leaves_before_its_step_was_agreed_to(played: dict[str, Any]) -> None:
-    for name, runs in zip(SCENES, (0, 3, 1, 5, 1, 8), strict=True):
+    for name, runs in zip(SCENES, (0, 3, 1, 5, 1, 0, 7, 1), strict=True):
         scene = played[name]
         assert len(scene["questions"]) == runs
         ends = [0]

@@ -163,24 +163,37 @@ def test_what_a_bus_gives_back_to_its_sender_is_nobody_else_s(played: Played) ->
     assert all(frame.own for frame in commands)
 
 
+DRIVE_FRAMES = {"mapped_odrive": (0x00E, 0x009), "mapped_zero": (0x00E, 0x009), "mapped_vesc": (0x105, 0x905)}
+DRIVE_FRAMES["mapped_mit"] = (1, 2)
 WHOLE = ("mapped_odrive", "mapped_vesc", "mapped_mit", "mapped_zero")
 
 
+def gateway(it: Any) -> dict[str, str]:
+    counts: dict[str, str] = json.loads(it.report["gateways"][0]["out"])
+    return counts
+
+
 @pytest.mark.slow
-@pytest.mark.plays(*WHOLE, *(f"{drive}_host" for drive in WHOLE[:3]), "mapped_node", "mapped_down")
-def test_a_mapped_drive_answers_every_sample_and_lets_go_when_its_host_dies(played: Played) -> None:
+@pytest.mark.plays(*WHOLE, *(f"{drive}_host" for drive in WHOLE[:3]), "mapped_left", "mapped_gateway", "mapped_down")
+def test_a_mapped_drive_answers_every_sample_and_is_let_go_when_its_host_dies(played: Played) -> None:
     for name in WHOLE:
-        run = played(name).summary
-        assert (run["answered"], run["not_obeyed"], run["log_complete"]) == (500, 0, True), name
-        assert (run["watchdog"]["tripped"], run["drive"]["drive_frames_refused"]) == ("", "0"), name
-    end = read_log(played("mapped_zero").log).metadata["emb.end"]
-    assert end["drive_time_out"].startswith("let go within 0.01")
-    assert end["drive_too_late"] == ""
+        it = played(name)
+        assert (it.summary["answered"], it.summary["not_obeyed"], it.summary["log_complete"]) == (500, 0, True), name
+        assert (it.summary["watchdog"]["tripped"], gateway(it)["drive_frames_refused"]) == ("", "0"), name
+        assert it.report["gateways"][0]["exit"] == 0, it.report["gateways"][0]["err"]
+        commands, samples = DRIVE_FRAMES[name]
+        logged = read_log(it.log).tables["/drive/rx"]["id"].tolist()
+        assert logged.count(commands) >= 500  # of the gateway, beside what the drive sends
+        assert logged.count(samples) >= 500
+    assert gateway(played("mapped_odrive"))["drive_time_out"].startswith("let go within 0.01")
+    assert gateway(played("mapped_zero"))["drive_too_late"] == ""
     assert played("mapped_zero").told[0]["top_speed"] == 0.0
     for drive in WHOLE[:3]:
         assert played(f"{drive}_host").told[0]["top_speed"] > 300.0  # it was killed in motion
-    for name, why in (("mapped_node", "the drive's node has ended"), ("mapped_down", "vcan0")):
-        assert why in played(name).summary["detail"]
+    left = played("mapped_left")
+    assert left.told[0]["top_speed"] <= load_bench().limits.velocity  # the gateway brakes by itself
+    for name, code in (("mapped_left", 3), ("mapped_down", 4)):
+        assert played(name).report["gateways"][0]["exit"] == code
 
 
 @pytest.fixture(scope="module")

@@ -45,8 +45,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--json", action="store_true", help="print the result as JSON")
     p.add_argument("--version", action="version", version=f"emb-commission {metadata.version('emb-excite')}")
     each = p.add_argument_group("for each run of emb-run, see there")
-    for option in ("--operator", "--serial", "--cpu"):
-        each.add_argument(option, metavar="TEXT" if option != "--cpu" else "N")
+    for option, value in (("--drive", "FILE@BUS"), ("--operator", "NAME"), ("--serial", "TEXT"), ("--cpu", "N")):
+        each.add_argument(option, metavar=value)
     for option in ("--no-rt", "--no-watchdog", "--long-timeouts"):
         each.add_argument(option, action="store_true")
     return p
@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
 def options(args: argparse.Namespace) -> list[str]:
     """Options of each run. On a bus that another program can be on, each one is confirmed."""
     given = [f"--{name.replace('_', '-')}" for name in ("no_rt", "no_watchdog", "long_timeouts") if getattr(args, name)]
-    for name in ("operator", "serial", "cpu"):
+    for name in ("drive", "operator", "serial", "cpu"):
         if getattr(args, name) is not None:
             given += [f"--{name}", getattr(args, name)]
     bus = args.iface.rpartition("@")[2] if args.iface.startswith("map:") else args.iface

@@ -19,7 +19,6 @@ from emb_bench.commission.steps import WIDENING, judged, next_step, suspected
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, parse_bench
 from emb_runtime.config.toml_text import parse_toml
-from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, SafetyStopError, UsageError
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system import signals
@@ -92,7 +91,6 @@ class Commissioning:
         self, folder: Path, sheet: Bench, iface: str, options: Sequence[str], run: Run, say: Callable[[str], None]
     ) -> None:
         self._folder, self._sheet, self._iface, self._options = folder, sheet, iface, options
-        self._asks = _asks(iface)
         self._make_run, self._say = run, say
         self._logs: dict[str, Path] = {}
         self._identity = sheet.contract_hash  # of the bench that the node is set up for
@@ -106,7 +104,7 @@ class Commissioning:
         """
         work = self._bench(WORKING, working_text(self._sheet))
         found = Findings()
-        while (step := next_step(self._sheet, work, found, list(self._logs), asks=self._asks)) is not None:
+        while (step := next_step(self._sheet, work, found, list(self._logs))) is not None:
             bench = self._bench_of(step, work, found)
             log = self._completed(step) or self._run(step, bench, found)
             self._logs[step.name] = log
@@ -250,14 +248,8 @@ def simulated(iface: str, sheet: Bench, run: int) -> str:
     return f"{head}{at}{name}:{','.join(given)}"
 
 
-def _asks(iface: str) -> bool:
-    """True for a mapped drive that sends samples only when it is asked for them."""
-    name, _, options = iface.partition(":")
-    return name == "map" and bool(options) and load_mapping(Path(options.rpartition("@")[0])).polled
-
-
 def _stage(step: Step) -> list[str]:
-    if step.kind is Kind.REST and not step.asks:
+    if step.kind is Kind.REST:
         return ["--read-only"]
     if step.limit == 0.0:
         return ["--zero"]

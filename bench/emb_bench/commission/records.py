@@ -42,7 +42,6 @@ class Step:
     currents: tuple[float, ...] = ()  # Wanted current by sample [A]; after the last one it stays
     learns: bool = False  # With the learning shield
     final: bool = False  # With the bench file that was found
-    asks: bool = False  # At rest: the drive sends samples only in answer to 0 A
 
 
 @dataclass(frozen=True)

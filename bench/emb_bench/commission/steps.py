@@ -54,7 +54,7 @@ FULL = "9-full"
 AGAIN = "and begin again in another folder"
 
 
-def next_step(sheet: Bench, work: Bench, found: Findings, done: Sequence[str], *, asks: bool = False) -> Step | None:
+def next_step(sheet: Bench, work: Bench, found: Findings, done: Sequence[str]) -> Step | None:
     """The next step; None after the last one.
 
     Args:
@@ -62,9 +62,8 @@ def next_step(sheet: Bench, work: Bench, found: Findings, done: Sequence[str], *
         work: bench file that the steps run with.
         found: so far.
         done: names of the completed steps.
-        asks: the drive sends samples only when it is asked for them.
     """
-    for step in (_listen(work, asks), _chain(work), _current(work), _first_move(work)):
+    for step in (_listen(work), _chain(work), _current(work), _first_move(work)):
         if step.name not in done:
             return step
     for row in WIDENING:
@@ -132,11 +131,9 @@ def _horizon(bench: Bench) -> float:
     return bench.timing.horizon * bench.timing.sample_time
 
 
-def _listen(work: Bench, asks: bool) -> Step:
+def _listen(work: Bench) -> Step:
     window = Window(*work.limits.angle, work.limits.velocity)
-    purpose = "listen: a drive that sends only what it is asked for is sent 0 A" if asks else "listen, send nothing"
-    duration = min(LISTENING, _horizon(work)) if asks else LISTENING
-    return Step("1-listen", Kind.REST, purpose, "nothing", 0.0, duration, window, asks=asks)
+    return Step("1-listen", Kind.REST, "listen, send nothing", "nothing", 0.0, LISTENING, window)
 
 
 def _chain(work: Bench) -> Step:

@@ -216,12 +216,14 @@ def _end(recorded: Mapping[str, str], outcome: Outcome) -> list[Difference]:
 
 def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
     """Differences between the hashes of what the log carries and those that it records."""
+    recorded = dict(log.run)
     if log.drive_files is not None:
-        carried = {**carried, "bus_mapping_sha256": mapping_hash(*log.drive_files)}
+        carried = {**carried, "mapping_sha256": mapping_hash(*log.drive_files)}
+        recorded["mapping_sha256"] = log.metadata["emb.drive"]["sha256"]
     return [
-        Difference(None, name, log.run[name], value)
+        Difference(None, name, recorded[name], value)
         for name, value in {**carried, "bench_hash": log.bench.contract_hash}.items()
-        if log.run.get(name, value) != value
+        if recorded.get(name, value) != value
     ]
 
 

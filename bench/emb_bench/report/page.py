@@ -186,8 +186,8 @@ def _identity(run: Run) -> list[str]:
 
 
 def _drive(run: Run) -> list[str]:
-    mapping = run.log.metadata.get("emb.drive", {}).get("sha256", "")
-    drive = f"{run.log.run.get('bus_drive', '')}, SHA-256 of the mapping {mapping[:SHORT_HASH]}" if mapping else ""
+    found = run.log.metadata.get("emb.drive", {})
+    drive = f"{found['name']}, SHA-256 of the mapping {found['sha256'][:SHORT_HASH]}" if found else ""
     lacks = "; ".join(f"{name}: {lost}" for name, lost in run.log.drive_lacks.items())
     return [value[:LONGEST] or "none" for value in (drive, lacks)]
 

@@ -77,7 +77,6 @@ class BusMonitor:
         self._frames: dict[str, int] = {}
         self._spans_ns: dict[str, tuple[int, int]] = {}
         self._others = 0
-        self._drive_bits = 0
         self._first_ns = self._last_ns = 0
         self._periods_ns: deque[int] = deque(maxlen=RECENT_PAIRS)
         self._at_rest: deque[tuple[float, float, float]] = deque(maxlen=RECENT_PAIRS)
@@ -107,11 +106,6 @@ class BusMonitor:
             self._follow(sample)
         return sample
 
-    def take_drive(self, frame: Frame) -> None:
-        """Take one frame of a mapped drive's bus: the load is that one's, for ours are on no bus."""
-        if not frame.error:
-            self._drive_bits += worst_bits(len(frame.data), extended=frame.extended)
-
     def take_old(self, frame: Frame) -> None:
         """Take a frame from before: it counts only if it must not be missed."""
         if is_alarming(frame, self._layout):
@@ -120,8 +114,7 @@ class BusMonitor:
     def statistics(self) -> BusStatistics:
         """Statistics so far."""
         reception, duration = self._reception, (self._last_ns - self._first_ns) * 1e-9
-        ours = sum(self._bits[name] * count for name, count in self._frames.items()) + OTHERS_BITS * self._others
-        bits = self._drive_bits or ours
+        bits = sum(self._bits[name] * count for name, count in self._frames.items()) + OTHERS_BITS * self._others
         times, angles, velocities = zip(*self._at_rest, strict=True) if self._at_rest else ((), (), ())
         angle, velocity = _about_a_line(times, angles), _about_a_line(times, velocities)
         return BusStatistics(

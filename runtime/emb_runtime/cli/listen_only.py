@@ -13,7 +13,6 @@ from emb_runtime.cli.preflight import CheckResult, RefusedError, check, refuse
 from emb_runtime.cli.preflight import table as preflight_table
 from emb_runtime.cli.session import Bus, Console, findings, paced_receive, push_clock, start_recorder
 from emb_runtime.control.start_conditions import Bounds, StartConditions
-from emb_runtime.drives.transport import overheard
 from emb_runtime.errors import EXIT_DONE, EXIT_LOG, BusError
 from emb_runtime.log.recorder import Recorder, RecorderResult
 from emb_runtime.records import Frame
@@ -78,12 +77,7 @@ def read(plan: Plan, bus: Bus, path: Path, console: Console) -> ListenResult:
 
         monitor = BusMonitor(plan.layout, plan.bench, rejected)
 
-        def drive_frame(frame: Frame) -> None:
-            recorder.push_drive_frame(frame)
-            monitor.take_drive(frame)
-
-        with overheard(bus.transport, drive_frame):
-            ended = _listen(plan, bus, paced_receive(bus, recorder), monitor, machine, recorder, console.stop_requested)
+        ended = _listen(plan, bus, paced_receive(bus, recorder), monitor, machine, recorder, console.stop_requested)
         heard = monitor.statistics()
         start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=False)
         lines = check(findings(plan, bus, start_conditions, heard, plan.listen, path))

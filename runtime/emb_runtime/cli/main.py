@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from pathlib import Path
@@ -16,30 +15,12 @@ from emb_runtime.cli.preflight import CheckResult, RefusedError, Verdict, table
 from emb_runtime.cli.repeat import campaign, experiment
 from emb_runtime.cli.session import Bus, Console
 from emb_runtime.config.bench import shipped_bench_text
-from emb_runtime.drives.transport import MappedTransport
-from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError, UsageError
+from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError
 from emb_runtime.run_type import LISTEN_ONLY_LOG
-from emb_runtime.system import signals
+from emb_runtime.system.signals import StopRequest
 from emb_runtime.system.terminal import as_json, complain, forget_typed, mention, show, typed_line
 
 LISTEN_NS = 50_000_000  # Time between two looks at the keyboard [ns]
-
-
-class StopRequest:
-    """Set by Ctrl-C, SIGTERM and SIGHUP from now on, asked by the loop."""
-
-    def __init__(self) -> None:
-        self._requested = False
-        for number in signals.ENDING:
-            if signal.getsignal(number) is not signal.SIG_IGN:  # nohup asked for that one to be ignored
-                signal.signal(number, self._request)
-
-    def __call__(self) -> bool:
-        """Returns True if an end is wanted."""
-        return self._requested
-
-    def _request(self, _signal: int, _frame: object) -> None:
-        self._requested = True
 
 
 class Operator:
@@ -136,8 +117,6 @@ def _read(plan: Plan, console: Console) -> int:
     path = log_path(plan.log, LISTEN_ONLY_LOG)
     transport, clock = open_transport(plan.iface, plan.bench)
     try:
-        if isinstance(transport, MappedTransport) and transport.mapping.polled:
-            raise UsageError("--read-only: this drive speaks only when it is spoken to; --zero asks it for samples")
         read = listen_only.read(plan, Bus(plan.iface, transport, clock), path, console)
     finally:
         transport.close()

@@ -16,6 +16,10 @@ from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
+from emb_runtime.drives.bench_fit import require_fit
+from emb_runtime.drives.lock_step import drive_file
+from emb_runtime.drives.mapping import Mapping
+from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import BenchFileError, PolicyRefusedError, UsageError
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.learning.assumptions import make_assumptions
@@ -103,6 +107,14 @@ class Ask(StrEnum):
 
 
 @dataclass(frozen=True)
+class MappedDrive:
+    """A drive with a DBC of its own, behind the node."""
+
+    mapping: Mapping
+    bus: str  # Its own bus, whose frames are recorded; "" in lock-step
+
+
+@dataclass(frozen=True)
 class Plan:
     """Plan of a run, checked as far as that is possible without a bus."""
 
@@ -127,6 +139,7 @@ class Plan:
     ask: Ask
     live: str | None  # Port at which the run is shown, or ``lines``
     json: bool
+    drive: MappedDrive | None = None  # The node is its gateway
     operator: str = ""  # Name of who makes the run; empty if that was not said
     serial: str = ""  # Serial number of the device; empty if that was not said
 
@@ -143,8 +156,13 @@ def parser() -> argparse.ArgumentParser:
     what = p.add_argument_group("what is run")
     what.add_argument(
         "--iface", default="sim", metavar="NAME",
-        help="SocketCAN interface (can0, vcan0), 'sim' (lock-step, no CAN needed), python-can BACKEND:CHANNEL, or "
-        "map:FILE@BUS for a drive with a DBC of its own (default: sim)",
+        help="SocketCAN interface (can0, vcan0), 'sim' (lock-step, no CAN needed) or python-can BACKEND:CHANNEL "
+        "(default: sim)",
+    )  # fmt: skip
+    what.add_argument(
+        "--drive", metavar="FILE@BUS",
+        help="the node is emb-gateway, for the drive of this mapping file: the pre-flight and the log have what the "
+        "drive lacks, and the log the frames of its bus, to which nothing is sent",
     )  # fmt: skip
     actor = what.add_mutually_exclusive_group()
     actor.add_argument("--policy", type=Path, metavar="FILE", help="actor as ONNX with its contract (default: shipped)")
@@ -285,9 +303,24 @@ def prepare(args: argparse.Namespace) -> Plan:
         ask=Ask.ALWAYS if args.confirm else Ask.NEVER if args.yes else Ask.REAL_BUS,
         live=_live(args.live),
         json=args.json,
+        drive=_drive(args.iface, args.drive, bench),
         operator=_label("--operator", args.operator),
         serial=_label("--serial", args.serial),
     )
+
+
+def _drive(iface: str, given: str | None, bench: Bench) -> MappedDrive | None:
+    file, bus = drive_file(iface), ""
+    if given is not None:
+        name, at, bus = given.rpartition("@")
+        if not (name and at and bus) or file is not None:
+            raise UsageError(f"--drive '{given}': expected FILE@BUS (drive.toml@can0), and a bus in --iface")
+        file = Path(name)
+    if file is None:
+        return None
+    mapping = load_mapping(file)
+    require_fit(mapping, bench)
+    return MappedDrive(mapping, bus)
 
 
 def _label(option: str, text: str) -> str:

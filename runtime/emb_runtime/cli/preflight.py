@@ -232,19 +232,17 @@ def _noise(f: Findings) -> CheckResult:
 
 
 def _bus_load(f: Findings) -> CheckResult:
-    bitrate, drive, command = f.bench.can.bitrate, f.drive, f.layout.command
-    planned = planned_load(f.bench, f.layout, drive)
-    if drive is None:
-        dbc, commands = "the DBC", command.worst_bits / command.cycle_time
-    else:
-        each = 0 if drive.polled else drive.messages[drive.command.message].worst_bits
-        dbc, commands = "the drive's DBC", each / f.bench.timing.sample_time
+    bitrate, command = f.bench.can.bitrate, f.layout.command
+    planned = planned_load(f.bench, f.layout, f.drive)
     expected = f"at most {HIGHEST_BUS_LOAD:.0%}"
-    found = f"{planned:.0%} at worst by {dbc} at {bitrate} bit/s (can.bitrate), {f.heard.load:.0%} heard"
+    if f.drive is not None:
+        found = f"{planned:.0%} of the drive's bus at worst by its DBC at {bitrate} bit/s (can.bitrate)"
+        return CheckResult("bus load", found, expected)
+    found = f"{planned:.0%} at worst by the DBC at {bitrate} bit/s (can.bitrate), {f.heard.load:.0%} heard"
     if planned > HIGHEST_BUS_LOAD:
         return CheckResult("bus load", found, expected, Verdict.REFUSED, BenchFileError.exit_code)
     foreign = f", {f.heard.others} frames of others" if f.heard.others else ""
-    to_come = f.heard.load + commands / bitrate  # a polled drive is asked already
+    to_come = f.heard.load + command.worst_bits / command.cycle_time / bitrate
     return _line("bus load", found + foreign, expected, to_come <= HIGHEST_BUS_LOAD)
 
 
@@ -314,10 +312,6 @@ def _core(f: Findings) -> CheckResult:
 
 def _drive(f: Findings) -> CheckResult:
     assert f.drive is not None
-    if "no_identity" in f.drive.lost and not (f.serial or f.in_process or f.stage is Stage.READ_ONLY):
-        expected = "--serial TEXT, the number on the drive that is there; --yes alone confirms no drive"
-        found = f"{f.drive.name} does not say what it is, and nobody has"
-        return CheckResult("drive", found, expected, Verdict.REFUSED, UsageError.exit_code)
     lacks = "; ".join(f"{name} ({PROPERTIES[name]})" for name in f.drive.lost)
     speed = released_speed(f.bench, f.drive.watchdog)
     named = f"{f.drive.sha256[:12]}, as the bench file names it"

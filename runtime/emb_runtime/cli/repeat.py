@@ -17,7 +17,6 @@ from emb_runtime.cli.options import Plan, log_path
 from emb_runtime.cli.session import Bus, Console, conduct, observe
 from emb_runtime.control.homing import may_go_home
 from emb_runtime.control.start_conditions import Bounds, StartConditions
-from emb_runtime.drives.transport import MappedTransport
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError
 from emb_runtime.run_type import HOMING_LOG, RunType
 
@@ -51,8 +50,6 @@ def experiment(plan: Plan, iface: str, path: Path, console: Console) -> Experime
     # commander still shows, for he uses an identifier of the DBC; --read-only shows all that is on the bus.
     identifiers = tuple(message.identifier for message in plan.layout.known)
     transport, clock = open_transport(iface, plan.bench, identifiers)
-    if isinstance(transport, MappedTransport):
-        transport.listen()
     bus = Bus(iface, transport, clock)
     truth = {name: str(value) for name, value in (transport.truth or {}).items()}
     try:

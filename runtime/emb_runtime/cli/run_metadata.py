@@ -15,7 +15,6 @@ from emb_runtime.cli.bus_monitor import planned_load
 from emb_runtime.cli.options import Plan
 from emb_runtime.cli.preflight import CheckResult
 from emb_runtime.config.bench import LEARNING
-from emb_runtime.drives.transport import MappedTransport
 from emb_runtime.estimator.estimate import Quantity
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder import Attachment, LogHeader
@@ -52,7 +51,7 @@ def header(
     """
     bench, policy = plan.bench, plan.policy
     slow = os.environ.get(SLOW_MARK)
-    mapping = transport.mapping if isinstance(transport, MappedTransport) else None
+    mapping = plan.drive.mapping if plan.drive is not None else None
     records = {
         "emb.run": {
             "tool": f"emb-excite {metadata.version('emb-excite')}",
@@ -97,7 +96,7 @@ def header(
     if learns:
         records["emb.run"] |= {key: str(getattr(bench.shield, key)) for key in LEARNING if key != "learn"}
     if mapping is not None:
-        records["emb.drive"] = {"lost": ", ".join(mapping.lost), "sha256": mapping.sha256}
+        records["emb.drive"] = {"name": mapping.name, "lost": ", ".join(mapping.lost), "sha256": mapping.sha256}
         attachments += [
             Attachment("drive.toml", "application/toml", mapping.text.encode()),
             Attachment("drive.dbc", "text/plain", mapping.dbc_text.encode()),
@@ -114,7 +113,7 @@ def header(
         attachments=tuple(attachments),
         estimates=estimates,
         learns=learns,
-        drive=mapping is not None,
+        drive_bus=plan.drive.bus if plan.drive is not None else "",
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import shorten
@@ -26,7 +26,6 @@ from emb_runtime.control.homing import Still, homing_steps
 from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.start_conditions import Bounds, StartConditions
-from emb_runtime.drives.transport import InProcessDrive, MappedTransport, overheard
 from emb_runtime.errors import BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Level
@@ -60,8 +59,7 @@ class Bus:
     @property
     def in_process(self) -> bool:
         """Returns True if nobody but this process can be on it."""
-        here = self.simulated or isinstance(self.transport, InProcessDrive)
-        return here or is_private(self.transport.name)
+        return self.simulated or is_private(self.transport.name)
 
     def pass_over(self, frame: Frame, layout: Layout) -> None:
         """Drop a frame, unless it is alarming."""
@@ -137,36 +135,13 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
                 pulse=pulse,
                 overheard=drop_backlog(bus, plan.layout),
             )
-            with _armed_drive(bus, recorder, zero=plan.stage is Stage.ZERO):
-                outcome = loop.run()
+            outcome = loop.run()
             push_clock(recorder, bus.clock)
         finally:
             stack.pop_all()
             watched = watchdog.finish() if watchdog is not None else None
-            drive = bus.transport.report() if isinstance(bus.transport, MappedTransport) else {}
-            result = recorder.finish(trailer(outcome, obtained or {}, watched) | drive)
-    unfit = drive.get("drive_too_late", "") if plan.stage is Stage.ZERO else ""
-    return RunResult(run_type, steps, lines, outcome, result, watched, obtained or {}, drive, unfit)
-
-
-@contextmanager
-def _armed_drive(bus: Bus, recorder: Recorder, *, zero: bool) -> Iterator[None]:
-    """Arm a mapped drive for a run, let it go after it, and record the frames of its bus meanwhile.
-
-    Raises:
-        BusError: it cannot be armed.
-    """
-    drive = bus.transport
-    if not isinstance(drive, MappedTransport):
-        yield
-        return
-    with overheard(drive, recorder.push_drive_frame):
-        try:
-            drive.arm(zero=zero)
-            yield
-        finally:
-            with suppress(BusError):  # whoever has lost the bus leaves the drive to its own time-out
-                drive.disarm()
+            result = recorder.finish(trailer(outcome, obtained or {}, watched))
+    return RunResult(run_type, steps, lines, outcome, result, watched, obtained or {})
 
 
 def drop_backlog(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
@@ -200,8 +175,7 @@ def observe(
         return not start_conditions.not_ready(monitor.status, sample, now_ns)
 
     receive, period_ns = bus.transport.receive, plan.bench.timing.sample_time_ns
-    with overheard(bus.transport, monitor.take_drive):
-        listen(monitor, receive, bus.clock, period_ns, deadline_ns, ready, stop_requested)
+    listen(monitor, receive, bus.clock, period_ns, deadline_ns, ready, stop_requested)
     if stop_requested():
         raise interrupted("before anything was sent")
     return monitor.statistics()
@@ -251,7 +225,7 @@ def findings(
         free=shutil.disk_usage(path.parent).free,
         watchdog=watched,
         core=compiled_core.running(),
-        drive=bus.transport.mapping if isinstance(bus.transport, MappedTransport) else None,
+        drive=plan.drive.mapping if plan.drive is not None else None,
         serial=plan.serial,
         realtime=obtained,
     )

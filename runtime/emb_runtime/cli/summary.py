@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from emb_runtime.cli.preflight import CheckResult, RefusedError
 from emb_runtime.control.result import Outcome
-from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_LOG, BusError, EmbError
+from emb_runtime.errors import EXIT_DONE, EXIT_LOG, BusError, EmbError
 from emb_runtime.estimator import estimate
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.learning.learner import ranges_of
@@ -37,8 +37,6 @@ class RunResult:
     log: RecorderResult
     watchdog: WatchdogResult | None  # None where there was none
     realtime: dict[str, str]  # Settings that were obtained
-    drive: Mapping[str, str] = field(default_factory=dict)  # Counts of a mapped drive's node, as for the log
-    unfit: str = ""  # Reason why no current may follow, with a mapped drive at 0 A; empty for none
 
     @property
     def exit_code(self) -> int:
@@ -47,7 +45,7 @@ class RunResult:
             return FAULTS[self.outcome.fault].exit_code
         if not self.log.complete:
             return EXIT_LOG
-        return EXIT_CHECK_FAILED if self.unfit else EXIT_DONE
+        return EXIT_DONE
 
 
 def trailer(
@@ -83,7 +81,7 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
     """A run's outcome as plain data."""
     outcome, fault = ran.outcome, ran.outcome.fault
     assert plan.policy is not None
-    result = _result(fault, ran.exit_code, outcome.detail or ran.unfit)
+    result = _result(fault, ran.exit_code, outcome.detail)
     if fault is None and not ran.log.complete:
         result |= {"result": LOG_INCOMPLETE, "cause": "the log is not whole", "detail": ran.log.error}
         result |= {"advice": "the brake and the node did what they should; the run must be made again for its data"}
@@ -114,7 +112,6 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         "preflight": [line.document() for line in ran.lines],
         "realtime": ran.realtime,
         "watchdog": None if ran.watchdog is None else asdict(ran.watchdog),
-        "drive": dict(ran.drive),
         "log": str(ran.log.path),
         "log_messages": ran.log.messages,
         "log_bytes": ran.log.bytes,
@@ -179,7 +176,6 @@ def text(s: Mapping[str, Any]) -> str:
             f"  watchdog   {watchdog['tripped'] or 'did not trip'}, {watchdog['frames']} stop frames"
             f"{': ' + watchdog['error'] if watchdog['error'] else ''}"
         )
-    lines += [f"  drive      {line}" for line in _drive(s["drive"])]
     missing = "" if s["log_complete"] else f", INCOMPLETE: {s['log_error']}"
     lines.append(f"  log        {s['log']} ({s['log_messages']} messages, {s['log_bytes'] / 1024:.0f} KiB{missing})")
     return "\n".join(lines)
@@ -236,14 +232,6 @@ def _motion(s: Mapping[str, Any]) -> str:
     return (
         f"one brake explains all but {s['unexplained']:.0f} rad/s of it, at most {s['unexplained_allowed']:.0f} may be"
     )
-
-
-def _drive(of: Mapping[str, str]) -> list[str]:
-    if not of:
-        return []
-    late = [f"TOO LATE: {of['drive_too_late']}"] if of["drive_too_late"] else []
-    age = f"answers acted at most {int(of['drive_largest_age_ns']) * 1e-6:.2f} ms after the measurement"
-    return [f"own time-out {of['drive_time_out']}; {age}", *late]
 
 
 def _stop_reason(name: str | None) -> str:

@@ -37,17 +37,12 @@ class Arming:
             return f"let go within {self._proof.seen_ns * 1e-9:.3f} s without a command"
         if self._mapping.state is None:
             return "not provable: the drive does not say whether it is armed"
-        return "not proved in this run: --zero proves it"
+        return "not proved yet"
 
-    def begin(self, now_ns: int, *, prove: bool) -> None:
-        """Send the first frames.
-
-        Args:
-            now_ns: monotonic [ns].
-            prove: where the drive says its state, it must let go by its own time-out once, and is armed anew.
-        """
+    def begin(self, now_ns: int) -> None:
+        """Send the first frames (monotonic time [ns])."""
         self._proof, self.done, self.failure = None, False, ""
-        if prove and self._mapping.state is not None:
+        if self._mapping.state is not None:
             watchdog, polled = self._mapping.watchdog, self._mapping.polled
             self._proof = TimeOutProof(watchdog, self._mapping.state, self._period_ns, polled=polled)
         self._begin_sequence(now_ns)

@@ -7,6 +7,7 @@ from emb_runtime.drives.mapping import Mapping, MappingError, Measured
 from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.end_stop import released_speed
 
+HIGHEST_BUS_LOAD = 0.8  # Beyond it, at worst-case bit stuffing, frames wait for each other
 COARSEST_CURRENT = 0.1  # Coarsest step of a command [A]
 LONGEST_PAIR_PERIODS = 0.5  # Longest ``can.pair_within``, in periods: later frames are of the next sample
 
@@ -53,6 +54,11 @@ def require_fit(mapping: Mapping, bench: Bench) -> None:
             f"{mapping.name}: node.end_stop_speed: without host or cable the drive holds its current for "
             f"{mapping.watchdog:g} s and lets go: the brake may reach {worst:.4g} rad/s, and bears "
             f"{mapping.end_stop_speed:g} rad/s; narrow the bench's limits"
+        )
+    if (load := mapping.bus_load(bench.timing.sample_time, bench.can.bitrate)) > HIGHEST_BUS_LOAD:
+        raise BenchFileError(
+            f"can.bitrate: at {bench.can.bitrate} bit/s the drive's frames take {load:.0%} of its bus at worst, "
+            f"expected at most {HIGHEST_BUS_LOAD:.0%}"
         )
     least = 1 if mapping.polled else 0
     low, high = bench.shield.frame_age

@@ -4,7 +4,7 @@ Pure logic: frames of both sides and times go in, frames come out; no clock, no 
 any other, see ``emb.dbc``: it obeys a valid, enabled answer to the newest sample, brakes a period that has none, and
 begins a stop after the bench's ``node.watchdog``. To the drive it is the commander: it arms by the file's sequence,
 sends one current for each sample, and so feeds the drive's own watchdog only as long as samples come and are answered
-or braked.
+or braked. A stop that the host asked for ends armed, at 0 A; after any other stop the drive is let go.
 
 What differs from a node that measures and acts in one device: a command acts when it arrives, within the period of its
 sample, or of the next one where the drive is polled. The bench says so by ``shield.frame_age``. Nothing here helps when
@@ -35,10 +35,11 @@ from emb_runtime.safety.shield import damped_current
 STATUS_PERIODS = 100  # A status message every so many samples
 ANSWER_PART = 0.75  # Part of a period after a sample within which its answer is obeyed; then the node brakes
 SILENT_PERIODS = 3  # Periods without a sample after which an armed drive is let go: its speed is not known any more
+READY_SAMPLES = 10  # Samples of a drive that broadcasts, before it is armed
 REST_TRAVEL = 0.05  # rad
 REST_PERIODS = 50  # The brake rests when it has stayed within REST_TRAVEL for so many samples
 LONGEST_STOP_PERIODS = 1000  # Samples after which a stopping drive is disarmed, at rest or not
-ARMED_PERIODS = 20_000  # Samples after which a drive that is armed and not commanded is disarmed
+ARMED_PERIODS = 600_000  # Samples after which a drive that is armed and not commanded is let go
 CONTRADICTIONS = 3
 """Samples in a row that contradict the one before, or a share of them, after which the drive is let go."""
 
@@ -55,6 +56,7 @@ class Phase(StrEnum):
 
 
 ARMED = (Phase.READY, Phase.ACTIVE, Phase.STOPPING)
+_STATES = {Phase.READY: NodeState.IDLE, Phase.ACTIVE: NodeState.ACTIVE, Phase.STOPPING: NodeState.STOPPING}
 
 
 @dataclass
@@ -100,18 +102,17 @@ class DriveNode:
         self._said = self._said_before = 0.0  # currents that the last two frames said [A]
         self._pending: float | None = None
         self._poll_ns = 0
+        self._armed_ns = self._let_go_ns = 0
         self._awaited = False  # a polled drive has not answered yet
-        self._zero = False
         box = bench.range_set(bench.shield.ranges)
         self._moves_none = box.low.T_c / box.high.k_m  # current that moves no brake of the bench [A]
-        self._largest = 0.0  # current that has left since it was armed [A]
+        self._largest = 0.0  # largest current of the latest run [A]
         self._unanswered = 0
         self._periods = 0  # samples since the phase began
         self._rest_angle, self._rest_periods = 0.0, 0
         self.arming = Arming(mapping, self._period_ns, self._send_step)
         self.times = SampleTimes(mapping, bench)
-        self.polling = not mapping.polled
-        """A polled drive may be asked for samples."""
+        self._is_ending = False  # the next stop ends with the drive let go
         self.phase = Phase.OFF
         self.stop_reason = StopReason.NEVER_COMMANDED
         self.failure = ""
@@ -122,6 +123,16 @@ class DriveNode:
     def rejected(self) -> dict[str, int]:
         """Number of the drive's frames that were not believed, by reason."""
         return self._receiver.rejected
+
+    @property
+    def may_arm(self) -> bool:
+        """True if the drive has been heard, or sends only what it is asked for."""
+        return self._mapping.polled or self.counts.samples >= READY_SAMPLES
+
+    def released(self, now_ns: int) -> bool:
+        """True if the drive has reported since it was let go that it is not armed; also where it reports no state."""
+        said_ns, state = self._receiver.said_ns, self._receiver.state(now_ns)
+        return self._mapping.state is None or (said_ns > self._let_go_ns and state is not DriveState.ACTIVE)
 
     def due_ns(self, now_ns: int) -> int:
         """Time at which :meth:`tick` should be called next, at the latest [ns]."""
@@ -134,21 +145,22 @@ class DriveNode:
 
     # --- requests of the host ---------------------------------------------------------------------------------------
 
-    def arm(self, now_ns: int, *, zero: bool = False) -> None:
+    def arm(self, now_ns: int) -> None:
         """Begin to arm the drive; :attr:`phase` becomes READY, or FAILED.
+
+        Where the drive reports its state, it must let go by its own time-out once before it is armed for good.
 
         Args:
             now_ns: monotonic [ns].
-            zero: nothing but 0 A may leave, not even to brake; where the drive says its state, it must let go by its
-                own time-out once before it is armed for the run.
         """
         if self.phase is Phase.OFF:
-            self._zero, self._largest, self.phase = zero, 0.0, Phase.ARMING
-            self.arming.begin(now_ns, prove=zero)
+            self.phase, self._armed_ns = Phase.ARMING, now_ns
+            self.arming.begin(now_ns)
             self._after_arming()
 
     def disarm(self) -> None:
         """Stop if it moves, and let go."""
+        self._is_ending = True
         if self.phase is Phase.ACTIVE:
             self._latch(StopReason.DISABLED)
         elif self.phase in (Phase.ARMING, Phase.READY):
@@ -175,7 +187,7 @@ class DriveNode:
             return
         if self.phase is Phase.READY:
             self._enter(Phase.ACTIVE)
-            self.stop_reason = StopReason.NONE
+            self.stop_reason, self._largest = StopReason.NONE, 0.0
         self._answered = True
         if self._mapping.polled:
             self._pending, self._obeyed_counter = taken.current, taken.counter
@@ -189,8 +201,7 @@ class DriveNode:
 
     def _may_obey(self, taken: CurrentCommand, now_ns: int) -> bool:
         in_time = self._sample is not None and not (self._answered or self._braked) and now_ns < self._deadline_ns()
-        limit = 0.0 if self._zero else self._bench.limits.current
-        permitted = self.phase in (Phase.READY, Phase.ACTIVE) and abs(taken.current) <= limit
+        permitted = self.phase in (Phase.READY, Phase.ACTIVE) and abs(taken.current) <= self._bench.limits.current
         return in_time and permitted and taken.answers == self._counter
 
     def _deadline_ns(self) -> int:
@@ -279,7 +290,9 @@ class DriveNode:
         if abs(sample.angle - self._rest_angle) > REST_TRAVEL:
             self._rest_angle, self._rest_periods = sample.angle, 0
         self._rest_periods += 1
-        if self._rest_periods > REST_PERIODS or self._periods > LONGEST_STOP_PERIODS:
+        if self._rest_periods > REST_PERIODS and self.stop_reason is StopReason.DISABLED and not self._is_ending:
+            self._enter(Phase.READY)
+        elif self._rest_periods > REST_PERIODS or self._periods > LONGEST_STOP_PERIODS:
             self._let_go()
 
     def _watch_drive(self, now_ns: int) -> None:
@@ -294,11 +307,12 @@ class DriveNode:
     def tick(self, now_ns: int) -> None:
         """Do what is due by the time [ns]: poll, brake a sample without an answer, let go of a silent drive."""
         if self.phase is Phase.ARMING:
+            self._armed_ns = now_ns
             self.arming.advance(now_ns, self._receiver.state(now_ns))
             self._after_arming()
         self._watch_drive(now_ns)
-        silent = self._sample is None or now_ns - self._sample.time_ns > SILENT_PERIODS * self._period_ns
-        if self.phase in ARMED and silent:
+        heard_ns = self._armed_ns if self._sample is None else max(self._armed_ns, self._sample.time_ns)
+        if self.phase in ARMED and now_ns - heard_ns > SILENT_PERIODS * self._period_ns:
             self._give_up(f"the drive is silent for {SILENT_PERIODS} periods")
         if self._mapping.polled:
             self._poll(now_ns)
@@ -318,7 +332,7 @@ class DriveNode:
             self._latch(StopReason.WATCHDOG)
 
     def _polls(self, now_ns: int) -> bool:
-        return self.polling and self.phase is not Phase.FAILED and not self._silent(now_ns)
+        return self.phase not in (Phase.OFF, Phase.FAILED) and not self._silent(now_ns)
 
     def _poll(self, now_ns: int) -> None:
         if now_ns < self._poll_ns or not self._polls(now_ns):
@@ -341,7 +355,7 @@ class DriveNode:
 
         None where no brake can have been moved: with a current of a wrong scale the stop would set it in motion.
         """
-        lets_go = self._zero or self._bench.node.stop == "freewheel" or self._largest <= self._moves_none
+        lets_go = self._bench.node.stop == "freewheel" or self._largest <= self._moves_none
         if lets_go or self._sample is None or self._contradictions.errors:
             return 0.0  # a velocity that may be wrong would drive the brake on
         limit = self._bench.limits.current
@@ -386,13 +400,14 @@ class DriveNode:
         if self.phase is Phase.FAILED:
             return
         self._enter(Phase.OFF)
+        self._let_go_ns = self._receiver.said_ns
         for step in self._mapping.disarm:
             self._send_step(step)
 
     def _give_up(self, reason: str) -> None:
         if self.phase is Phase.FAILED:
             return
-        self.phase, self.failure = Phase.FAILED, reason
+        self.phase, self.failure, self._let_go_ns = Phase.FAILED, reason, self._receiver.said_ns
         self._command(0.0)
         for step in self._mapping.disarm:
             self._send_step(step)
@@ -418,16 +433,7 @@ class DriveNode:
     @property
     def state(self) -> NodeState:
         """State as our frames have it."""
-        if self.phase is Phase.FAILED:
-            return NodeState.FAULT
-        if self.phase in (Phase.ACTIVE, Phase.STOPPING):
-            return NodeState.ACTIVE if self.phase is Phase.ACTIVE else NodeState.STOPPING
-        if self._mapping.state is None or self.phase is not Phase.OFF:
-            return NodeState.IDLE
-        drive = self._receiver.state(0 if self._sample is None else self._sample.time_ns)
-        if drive is DriveState.ACTIVE:
-            return NodeState.STOPPING
-        return NodeState.IDLE if drive is DriveState.IDLE else NodeState.FAULT
+        return _STATES.get(self.phase, NodeState.FAULT)
 
     def _frames(self, sample: DriveSample, applied: float, device_ns: int) -> list[Frame]:
         layout, counter, state = self._layout, self._counter, self.state

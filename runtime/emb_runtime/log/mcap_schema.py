@@ -138,8 +138,7 @@ def _frame_topic(name: str, what: str) -> Topic:
 
 CAN_RX = _frame_topic("/can/rx", "every frame that was received")
 CAN_TX = _frame_topic("/can/tx", "every frame that was sent")
-DRIVE_RX = _frame_topic("/drive/rx", "every frame that was received on the bus of a mapped drive")
-DRIVE_TX = _frame_topic("/drive/tx", "every frame that was sent to a mapped drive")
+DRIVE = _frame_topic("/drive/rx", "every frame on the bus of a mapped drive, its gateway's among them")
 
 _CYCLE_ENUMS = {"state": _names(RunState), "node_state": _names(NodeState)}
 

@@ -56,7 +56,7 @@ class LogHeader:
     attachments: Sequence[Attachment] = ()  # Further files: ``policy.onnx``, ``bench.toml``
     estimates: Sequence[tuple[str, str]] = ()  # Names and units of what is estimated
     learns: bool = False  # The shield learns which brakes are possible
-    drive: bool = False  # The drive is a mapped one, with a bus of its own
+    drive_bus: str = ""  # Bus of a mapped drive, whose frames the recorder reads by itself; "" for none
 
 
 class RecorderResult(NamedTuple):
@@ -160,10 +160,6 @@ class Recorder:
         """Record a frame that was on the bus; one whose echo came back (``own``) is one that was sent."""
         self.push(FrameRecord(Direction.TX if frame.own else Direction.RX, frame))
 
-    def push_drive_frame(self, frame: Frame) -> None:
-        """Record a frame of the bus of a mapped drive; ``own`` says that it was sent."""
-        self.push(FrameRecord(Direction.DRIVE_TX if frame.own else Direction.DRIVE_RX, frame))
-
     def push_event(self, time_ns: int, code: str, text: str) -> None:
         """Record something that the safety chain did.
 
@@ -218,6 +214,6 @@ def _document(path: Path, header: LogHeader) -> dict[str, object]:
         "metadata": {name: dict(entries) for name, entries in header.metadata.items()},
         "estimates": [list(estimate) for estimate in header.estimates],
         "learns": header.learns,
-        "drive": header.drive,
+        "drive_bus": header.drive_bus,
         "attachments": [[a.name, a.media_type, base64.b64encode(a.data).decode()] for a in header.attachments],
     }

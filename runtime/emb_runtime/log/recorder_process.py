@@ -26,8 +26,11 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
 from emb_runtime.can.codec import Signal
+from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
-from emb_runtime.errors import FrameError, LogError
+from emb_runtime.can.transport import Transport
+from emb_runtime.config.bench import parse_bench
+from emb_runtime.errors import BusError, EmbError, LogError
 from emb_runtime.log import mcap_schema
 from emb_runtime.log.ring_buffer import (
     ClockRecord,
@@ -41,7 +44,7 @@ from emb_runtime.log.ring_buffer import (
     Ring,
     unpack,
 )
-from emb_runtime.records import CycleRecord
+from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.system import child_side
 from emb_runtime.system.realtime import step_back
 
@@ -56,12 +59,7 @@ END = "emb.end"  # Names of the metadata records with the run's identity and wit
 DIED = "the runtime process died"  # Exit reason in a log whose runtime ended without saying why
 
 
-_FRAME_TOPICS = {
-    Direction.RX: mcap_schema.CAN_RX,
-    Direction.TX: mcap_schema.CAN_TX,
-    Direction.DRIVE_RX: mcap_schema.DRIVE_RX,
-    Direction.DRIVE_TX: mcap_schema.DRIVE_TX,
-}
+_FRAME_TOPICS = {Direction.RX: mcap_schema.CAN_RX, Direction.TX: mcap_schema.CAN_TX}
 
 
 class LogWriter:
@@ -97,8 +95,8 @@ class LogWriter:
             self._register(self._estimate)
         if header.get("learns"):
             self._register(mcap_schema.LEARNT)
-        for topic in (mcap_schema.DRIVE_RX, mcap_schema.DRIVE_TX) if header.get("drive") else ():
-            self._register(topic)
+        if header.get("drive_bus"):
+            self._register(mcap_schema.DRIVE)
         self._decoded = {
             message.name: mcap_schema.message_topic(
                 message.name, message.identifier, [_field(s) for s in message.signals]
@@ -141,6 +139,10 @@ class LogWriter:
                 line = {"timestamp": stamp, "level": int(level), "message": text, "name": "emb-run"}
                 self._add(mcap_schema.LOG, log_time, time_ns, line)
 
+    def write_drive(self, frame: Frame, read_ns: int, log_time: int) -> None:
+        """Write a frame of a mapped drive's bus, whose identifiers have another meaning."""
+        self._add(mcap_schema.DRIVE, log_time, frame.time_ns, _frame_values(frame, read_ns))
+
     def flush(self) -> None:
         """Hand everything written so far to the operating system."""
         self._mcap.flush()  # type: ignore[no-untyped-call]
@@ -153,19 +155,7 @@ class LogWriter:
 
     def _write_frame(self, record: FrameRecord, log_time: int) -> None:
         direction, frame, read_ns = record
-        values = {
-            "id": frame.identifier,
-            "is_rtr": frame.remote,
-            "is_extended": frame.extended,
-            "is_error": frame.error,
-            "dlc": len(frame.data),
-            "data": frame.data,
-            "dropped": frame.dropped,
-            "read_time_ns": read_ns,
-        }
-        self._add(_FRAME_TOPICS[direction], log_time, frame.time_ns, values)
-        if direction in (Direction.DRIVE_RX, Direction.DRIVE_TX):
-            return  # its identifiers have another meaning
+        self._add(_FRAME_TOPICS[direction], log_time, frame.time_ns, _frame_values(frame, read_ns))
         if decoded := self._layout.decode_any(frame):
             name, signals = decoded
             topic = self._decoded[name]
@@ -200,6 +190,19 @@ class LogWriter:
         self.messages += 1
 
 
+def _frame_values(frame: Frame, read_ns: int) -> dict[str, Any]:
+    return {
+        "id": frame.identifier,
+        "is_rtr": frame.remote,
+        "is_extended": frame.extended,
+        "is_error": frame.error,
+        "dlc": len(frame.data),
+        "data": frame.data,
+        "dropped": frame.dropped,
+        "read_time_ns": read_ns,
+    }
+
+
 def _field(signal: Signal) -> mcap_schema.Field:
     """The protobuf field of a signal: an enum if the DBC names all its values, else what its numbers need."""
     if signal.choices and set(range(signal.raw_minimum, signal.raw_maximum + 1)) <= set(signal.choices):
@@ -220,6 +223,7 @@ class Recording:
         self._inbox = b""
         self._output = output
         self._path = Path(header["path"])
+        self._drive_bus = _open_drive_bus(header)
         self.writer = LogWriter(output, header)
         self.lost = 0
         """Records that could not be written."""
@@ -233,7 +237,7 @@ class Recording:
         wait = POLL
         while trailer is None:
             trailer = self._listen(wait)
-            wait = 0.0 if self._drain() else POLL
+            wait = 0.0 if self._drain() | self._read_drive_bus() else POLL
             if time.monotonic() - flushed >= FLUSH:
                 self._guarded(self.writer.flush)
                 flushed = time.monotonic()
@@ -243,6 +247,23 @@ class Recording:
         """Write all that the ring holds."""
         while self._drain():
             pass
+
+    def _read_drive_bus(self) -> bool:
+        """Write what has come on a mapped drive's bus; True if there may be more."""
+        if self._drive_bus is None:
+            return False
+        read_ns = time.monotonic_ns()
+        for _ in range(BATCH):
+            try:
+                frame = self._drive_bus.receive(0)
+            except BusError as err:
+                self.error, self._drive_bus = self.error or str(err), None
+                return False
+            if frame is None:
+                return False
+            log_time = max(read_ns, frame.time_ns) + self._offset
+            self._guarded(partial(self.writer.write_drive, frame, read_ns, log_time))
+        return True
 
     def finish(self, trailer: dict[str, str]) -> dict[str, Any]:
         """Write the rest, close the file and report."""
@@ -311,6 +332,13 @@ class Recording:
             self.lost += 1
 
 
+def _open_drive_bus(header: Mapping[str, Any]) -> Transport | None:
+    if not header.get("drive_bus"):
+        return None
+    (bench,) = (data for name, _, data in header["attachments"] if name == "bench.toml")
+    return open_transport(header["drive_bus"], parse_bench(base64.b64decode(bench).decode(), "bench.toml"))[0]
+
+
 def _time(record: Record) -> int:
     match record:
         case FrameRecord(_, frame, _):
@@ -338,7 +366,7 @@ def begin(ring: Ring, header: Mapping[str, Any]) -> Recording:
         raise LogError(err.strerror or str(err)) from err
     try:
         return Recording(ring, header, output)
-    except (OSError, FrameError) as err:
+    except (OSError, EmbError) as err:
         os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())  # what could not be written is not tried again
         path.unlink(missing_ok=True)
         what = f"{err.strerror}; the file was begun, and is removed" if isinstance(err, OSError) else str(err)

@@ -159,8 +159,6 @@ class Direction(IntEnum):
 
     RX = 0
     TX = 1
-    DRIVE_RX = 2  # On the bus of a mapped drive, which is not ours
-    DRIVE_TX = 3
 
 
 class Level(IntEnum):

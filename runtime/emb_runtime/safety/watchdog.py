@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import asdict, dataclass, field
-from typing import Protocol, runtime_checkable
 
 from emb_runtime.can.transport import SocketCan, Transport, is_private
 from emb_runtime.config.bench import Bench
@@ -22,13 +21,6 @@ from emb_runtime.system.child_process import Child
 
 START_TIMEOUT = 30.0  # Longest wait for the process to be on the bus [s]
 FINISH_TIMEOUT = 5.0  # Longest wait for its report [s]
-
-
-@runtime_checkable
-class Linked(Protocol):
-    """A transport to a node in a process of its own, to which the watchdog has a link of its own."""
-
-    watchdog_link: int  # File descriptor
 
 
 @dataclass(frozen=True)
@@ -90,13 +82,10 @@ class WatchdogHandle:
             raise BusError(f"{name}: only this process can open this bus, so no watchdog can; run without one")
         # The loop's socket goes along, so that the bus can be taken away from it.
         sockets = [transport.descriptor] if isinstance(transport, SocketCan) else []
-        links = []
-        if isinstance(transport, Linked):  # its node hears the loop no more once the watchdog has spoken
-            name, links = f"drive-link:{transport.watchdog_link}", [transport.watchdog_link]
         document = {"iface": name, "bench": bench.text, "parent": os.getpid(), "real_time": real_time}
         try:
             pulse = Heartbeat.create(heartbeat, time.monotonic_ns())
-            child = Child("watchdog", "emb_runtime.safety.watchdog_process", document, [pulse.fd, *sockets], links)
+            child = Child("watchdog", "emb_runtime.safety.watchdog_process", document, [pulse.fd, *sockets])
         except OSError as err:
             raise BusError(f"{name}: cannot start the watchdog process: {err.strerror}") from err
         answer = child.answer(timeout)

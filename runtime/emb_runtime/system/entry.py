@@ -96,6 +96,11 @@ def _flush() -> None:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # Python flushes once more at exit
 
 
+def emb_gateway() -> int:
+    """``emb-gateway``: until it opens anything, Ctrl-C just ends it."""
+    return start("emb_runtime.cli.gateway", "", takes_signals=True)
+
+
 def emb_run() -> int:
     """``emb-run``: until it opens anything, Ctrl-C just ends it."""
     from emb_runtime.errors import UsageError

@@ -168,11 +168,11 @@ def test_a_wrong_scale_of_the_current_ends_it_before_the_brake_has_moved(tmp_pat
     assert not list(tmp_path.glob("*homing*"))
 
 
-def test_a_polled_drive_is_asked_for_its_samples(tmp_path: Path) -> None:
+def test_a_polled_drive_is_listened_to_as_any_other(tmp_path: Path) -> None:
     with pytest.raises(EnoughError):
-        on_a_drive(tmp_path, up_to("2-zero"), drive="mit", frame_age="[1, 3]").run()
-    sent = read_log(tmp_path / "1-listen.mcap").cycles["sent_current"]
-    assert set(np.asarray(sent)[np.isfinite(sent)]) == {0.0}
+        on_a_drive(tmp_path, up_to("3-current"), drive="mit", frame_age="[1, 3]").run()
+    assert read_log(tmp_path / "1-listen.mcap").run["stage"] == "read-only"
+    assert examination.at_rest(tmp_path / "1-listen.mcap").period == pytest.approx(1e-3, rel=1e-6)
 
 
 def test_a_run_that_was_not_completed_is_done_again_under_another_name(tmp_path: Path) -> None:

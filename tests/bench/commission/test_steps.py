@@ -135,15 +135,6 @@ def test_the_learning_shield_is_used_once_what_it_assumes_is_not_contradicted(sh
         assert not any(step.learns for step in steps[:4])
 
 
-def test_a_drive_that_speaks_only_when_it_is_spoken_to_is_listened_to_with_0_a(sheet: Bench, work: Bench) -> None:
-    step = next_step(sheet, work, Findings(), [], asks=True)
-    assert step is not None
-    assert (step.kind, step.asks, step.limit, step.currents) == (Kind.REST, True, 0.0, ())
-    assert step.duration <= work.timing.horizon * work.timing.sample_time
-    assert "0 A" in step.purpose
-    assert all_steps(sheet, work, found(sheet))[0].purpose == "listen, send nothing"
-
-
 def test_what_contradicts_the_data_sheet_ends_it(sheet: Bench, work: Bench) -> None:
     step = all_steps(sheet, work, found(sheet))[0]
     for finding, words in (

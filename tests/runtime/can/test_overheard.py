@@ -8,12 +8,13 @@ import pytest
 
 from emb_runtime.can.messages import Layout
 from emb_runtime.cli.bus_monitor import BusMonitor, listen
-from emb_runtime.cli.main import Operator, StopRequest
+from emb_runtime.cli.main import Operator
 from emb_runtime.cli.options import parser, prepare
 from emb_runtime.cli.session import Bus, drop_backlog
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
+from emb_runtime.system.signals import StopRequest
 from tests.runtime.operating import Keyboard
 
 MS = 1_000_000

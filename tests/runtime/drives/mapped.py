@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
-from emb_runtime.drives.bench_fit import require_fit
-from emb_runtime.drives.mapping_file import parse_mapping
-from emb_runtime.drives.transport import InProcessDrive
+from emb_runtime.drives.lock_step import LockStepDrive
+from emb_runtime.drives.mapping import Mapping
+from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
-from simulated_drives import SimDriveTransport, SimulatedDrive, open_sim_drive
+from simulated_drives import WATCHDOG, SimDriveTransport, SimulatedDrive, open_sim_drive
 from tests.actors import constant_actor
 from tests.drives import EXAMPLES
 from tests.runtime.operating import EmbRun
@@ -62,39 +62,46 @@ def protected(count: int, time_ns: int, current: float = 0.5, off: int = 0) -> F
 class MappedBus:
     """The bus that ``emb-run`` opens, with the drive on it.
 
-    ``change`` makes of each frame of the drive what is received, or None; ``edit`` changes the mapping's texts.
+    ``change`` makes of each frame of the drive what is received, or None; the mapping's files are in a folder.
     """
 
-    def __init__(self, name: str, bench_text: str) -> None:
-        self.name = name
+    def __init__(self, name: str, bench_text: str, folder: Path) -> None:
+        self.name, self.file = name, folder / f"{name}.toml"
+        for kind in ("toml", "dbc"):
+            (folder / f"{name}.{kind}").write_text((EXAMPLES / f"{name}.{kind}").read_text())
         self.bench = parse_bench(bench_text, "bench.toml")
         self.change: Change = lambda frame: frame
         self.at: tuple[int, Callable[[SimulatedDrive], object]] | None = None
-        self.edits: list[tuple[str, str]] = []
         self.sent: list[Frame] = []
         self.shift = 0
         """Periods that have passed when the bus is opened."""
+        self.watchdog: float | None = WATCHDOG
         self.before_send: Callable[[Frame], object] = lambda _frame: None
 
-    def open(self, _iface: str, bench: Bench, _identifiers: object = None) -> tuple[InProcessDrive, SteppedClock]:
-        texts = [(EXAMPLES / f"{self.name}.{kind}").read_text() for kind in ("toml", "dbc")]
-        for old, new in self.edits:
-            assert any(old in text for text in texts)
-            texts = [text.replace(old, new) for text in texts]
-        mapping = parse_mapping(texts[0], texts[1], f"{self.name}.toml")
-        require_fit(mapping, bench)
+    def edit(self, old: str, new: str) -> None:
+        """Change the mapping file or its DBC."""
+        files = [path for path in (self.file, self.file.with_suffix(".dbc")) if old in path.read_text()]
+        assert files
+        for path in files:
+            path.write_text(path.read_text().replace(old, new))
+
+    @property
+    def mapping(self) -> Mapping:
+        return load_mapping(self.file)
+
+    def open(self, _iface: str, bench: Bench, _identifiers: object = None) -> tuple[LockStepDrive, SteppedClock]:
         bus, clock = open_sim_drive(self.name, bench)
         self.bus, self.drive = bus, bus.drive
-        self.drive.periods = self.shift
+        self.drive.periods, self.drive.watchdog = self.shift, self.watchdog
         self._wrap(bus)
-        self.transport = InProcessDrive(mapping, bench, bus, clock, f"map:{self.name}.toml@sim-drive")
+        self.transport = LockStepDrive(self.mapping, bench, bus, clock, f"map:{self.file}@sim-drive")
         return self.transport, clock
 
     def _wrap(self, bus: SimDriveTransport) -> None:
         receive, send = bus.receive, bus.send
 
         def received(deadline_ns: int) -> Frame | None:
-            if self.at is not None and self.transport.node.counts.obeyed >= self.at[0]:
+            if self.at is not None and hasattr(self, "transport") and self.transport.node.counts.obeyed >= self.at[0]:
                 action, self.at = self.at[1], None
                 action(self.drive)
             frame = receive(deadline_ns)
@@ -115,11 +122,11 @@ def runner(
     for module in ("log.recorder", "log.ring_buffer", "policy.trial"):
         monkeypatch.setattr(f"emb_runtime.{module}.HAS_CHILD_PROCESSES", False)
     text = late_bench(polled=name == "mit")
-    bus = MappedBus(name, text)
+    bus = MappedBus(name, text, tmp_path)
     for module in ("repeat", "main"):
         monkeypatch.setattr(f"emb_runtime.cli.{module}.open_transport", bus.open)
     actor, bench = tmp_path / "actor.onnx", tmp_path / "late.toml"
     actor.write_bytes(constant_actor(bus.bench, current))
     bench.write_text(text)
-    arguments = ("--iface", f"map:{name}.toml@sim-drive", "--policy", str(actor), "--bench", str(bench))
+    arguments = ("--iface", f"map:{bus.file}@sim-drive", "--policy", str(actor), "--bench", str(bench))
     return bus, EmbRun(arguments, capsys, tmp_path / "run.mcap")

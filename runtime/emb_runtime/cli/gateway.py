@@ -1,0 +1,146 @@
+"""``emb-gateway``: a drive with a DBC of its own as a node on a bus that speaks ours."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from textwrap import dedent
+
+from emb_runtime.can.interfaces import open_transport
+from emb_runtime.can.messages import bench_identity, load_layout
+from emb_runtime.can.transport import is_private
+from emb_runtime.config.bench import load_bench
+from emb_runtime.drives.bench_fit import require_fit
+from emb_runtime.drives.gateway import Gateway
+from emb_runtime.drives.mapping import PROPERTIES, Mapping
+from emb_runtime.drives.mapping_file import load_mapping
+from emb_runtime.drives.node import report
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError, SafetyStopError, UsageError
+from emb_runtime.safety.end_stop import released_speed
+from emb_runtime.system import realtime
+from emb_runtime.system.signals import StopRequest
+from emb_runtime.system.terminal import as_json, complain, forget_typed, mention, show, typed_line
+
+PRIORITY = realtime.PRIORITY + 5  # Above the loop's, below its watchdog's
+LOOK = 0.05  # Time between two looks at the keyboard [s]
+DESCRIPTION = """\
+Put a node that speaks emb.dbc between a drive that does not, on one bus, and emb-run, on another. The drive is armed by
+the mapping file's sequence, after it has proved that it lets go by its own time-out, and is armed as long as this runs:
+it gets 0 A while no run commands it. The node brakes by itself as any node, and a second guard reads each frame that
+leaves. After a stop that emb-run did not ask for the drive is let go, and this ends.
+"""
+EPILOG = """\
+exit codes:
+  0  ended by Ctrl-C or SIGTERM, the drive is let go
+  1  the same, but answers acted later than shield.frame_age declares
+  2  usage: wrong argument, a file that is refused
+  3  the drive was let go: a stop that emb-run did not ask for, sensors that contradict each other, a refused frame
+  4  a bus is lost, or the drive cannot be armed
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = argparse.ArgumentParser(
+        prog="emb-gateway",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("mapping", type=Path, metavar="FILE", help="mapping file of the drive (TOML)")
+    p.add_argument("--drive", required=True, metavar="BUS", help="bus of the drive: can0, or BACKEND:CHANNEL")
+    p.add_argument("--node", required=True, metavar="BUS", help="bus of the node: vcan0, can1, or BACKEND:CHANNEL")
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description, that of emb-run")
+    p.add_argument(
+        "--serial", default="", metavar="TEXT", help="serial number on the drive, which has no other identity"
+    )
+    p.add_argument("--listen", action="store_true", help="send nothing to the drive: samples only, nothing is armed")
+    p.add_argument("--yes", action="store_true", help="do not ask before the drive is armed")
+    p.add_argument("--cpu", type=int, metavar="N", help="pin to this processor")
+    p.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")
+    p.add_argument("--json", action="store_true", help="print the counts at the end as JSON")
+    p.add_argument("--version", action="version", version=f"emb-gateway {metadata.version('emb-excite')}")
+    return p
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of ``emb-gateway``."""
+    args = parser().parse_args(argv)
+    try:
+        return _serve(args)
+    except EmbError as err:
+        return complain("emb-gateway", err)
+
+
+def _serve(args: argparse.Namespace) -> int:
+    bench, mapping = load_bench(args.bench), load_mapping(args.mapping)
+    require_fit(mapping, bench)
+    layout = load_layout()
+    if args.drive == args.node:
+        raise UsageError(
+            f"--node {args.node}: expected another bus than the drive's, whose identifiers differ in meaning"
+        )
+    if "no_identity" in mapping.lost and not (args.serial or args.listen or is_private(args.drive)):
+        raise UsageError(
+            f"{mapping.name} does not say what it is, and nobody has: expected --serial TEXT, the number on the drive"
+        )
+    speed = released_speed(bench, mapping.watchdog)
+    mention(_description(mapping, bench.name, bench_identity(bench.contract_hash), speed, args.serial))
+    stop = StopRequest()
+    if not args.listen and not _may_arm(args.yes, stop):
+        raise SafetyStopError("stopped by the operator before anything was sent")
+    infos = mapping.messages.values()
+    identifiers = None if any(info.extended for info in infos) else tuple(info.identifier for info in infos)
+    drive_bus, clock = open_transport(args.drive, bench, identifiers)
+    try:
+        node_bus, _ = open_transport(args.node, bench, (layout.command.identifier,))
+        try:
+            gateway = Gateway(mapping, bench, drive_bus, node_bus, clock)
+            if not args.no_rt:
+                realtime.obtain(cpu=args.cpu, priority=PRIORITY)
+            done = "listening" if args.listen else "armed"
+            try:
+                gateway.run(stop, lambda: mention(f"{mapping.name}: {done}, node on {args.node}"), arms=not args.listen)
+            finally:
+                counts = report(gateway.node)
+                show(as_json(counts) if args.json else "\n".join(f"{name}: {value}" for name, value in counts.items()))
+        finally:
+            node_bus.close()
+    finally:
+        drive_bus.close()
+    if late := gateway.node.times.too_late:
+        mention(f"emb-gateway: TOO LATE: {late}")
+    return EXIT_CHECK_FAILED if late else EXIT_DONE
+
+
+def _description(mapping: Mapping, bench: str, identity: int, speed: float, serial: str) -> str:
+    lost = "\n".join(f"  {name}: {PROPERTIES[name]}" for name in mapping.lost)
+    return (
+        dedent(f"""\
+        {mapping.name}{f", number {serial}" if serial else ""}, mapping {mapping.sha256}
+        bench {bench}, identity {identity:#06x}
+        time-out {mapping.watchdog:g} s; host or cable lost at the worst moment, and let go: below {speed:.4g} rad/s,
+        the brake bears {mapping.end_stop_speed:g} rad/s; what the drive lacks, accepted by the mapping file:
+        """)
+        + lost
+    )
+
+
+def _may_arm(agreed: bool, stop_requested: Callable[[], bool]) -> bool:
+    if agreed or sys.stdin is None or not sys.stdin.isatty():
+        return True
+    forget_typed()
+    mention("Arm now? y and Enter does, anything else ends here.")
+    while not stop_requested():
+        if (line := typed_line()) is not None:
+            return line.strip().lower() in ("y", "yes")
+        time.sleep(LOOK)
+    return False
+
+
+if __name__ == "__main__":
+    sys.exit(main())

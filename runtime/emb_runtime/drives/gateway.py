@@ -1,0 +1,135 @@
+"""The gateway between two buses: a drive on one, its software node on the other."""
+
+from __future__ import annotations
+
+import select
+from collections.abc import Callable
+
+from emb_runtime.can.messages import load_layout
+from emb_runtime.can.transport import TransmitQueueFullError, Transport
+from emb_runtime.config.bench import Bench
+from emb_runtime.drives.mapping import Mapping
+from emb_runtime.drives.node import DriveNode, Phase
+from emb_runtime.errors import BusError, SafetyStopError
+from emb_runtime.records import Frame
+from emb_runtime.system.clock import Clock
+
+LOOK_NS = 200_000  # Time between two looks at a bus that cannot be waited for [ns]
+LONGEST_WAIT_NS = 10_000_000  # Time between two looks at the operator's end [ns]
+MOST_FRAMES = 64  # Frames of one bus that are taken at once: a babbling bus must not hold up the other
+LONGEST_SILENCE_NS = 5_000_000_000  # Time for a drive to be heard before it is armed [ns]
+LINGER_NS = 1_000_000_000  # Time for which the node still reports its samples after the drive was let go [ns]
+
+
+class Gateway:
+    """Passes samples and commands on until it is ended, or the drive is let go.
+
+    Args:
+        mapping: the drive.
+        bench: limits, timing, the stop.
+        drive_bus: open.
+        node_bus: open.
+        clock: the time on both buses.
+    """
+
+    def __init__(self, mapping: Mapping, bench: Bench, drive_bus: Transport, node_bus: Transport, clock: Clock) -> None:
+        self.node = DriveNode(mapping, bench, load_layout(), drive_bus.send)
+        self._drive_bus, self._node_bus, self._clock = drive_bus, node_bus, clock
+        self._node_lost: BusError | None = None
+
+    def run(self, stop_requested: Callable[[], bool], ready: Callable[[], None], *, arms: bool) -> None:
+        """Arm the drive, serve, and let the drive go.
+
+        Args:
+            stop_requested: True if the operator wants an end.
+            ready: called when the drive is armed, or at once where it is not to be.
+            arms: False only listens: nothing is sent to the drive.
+
+        Raises:
+            BusError: the drive cannot be armed, or a bus is lost.
+            SafetyStopError: the node let the drive go, but not for the operator; the message says why.
+        """
+        if arms:
+            self._arm(stop_requested)
+        ready()
+        ended_ns = None
+        while ended_ns is None or self._clock.now_ns() < ended_ns:
+            self.step()
+            if stop_requested() or self._node_lost is not None:
+                self.node.disarm()
+                if self.node.phase in (Phase.OFF, Phase.FAILED):
+                    break
+            elif arms and ended_ns is None and self.node.phase in (Phase.OFF, Phase.FAILED):
+                ended_ns = self._clock.now_ns() + LINGER_NS
+        if arms and not self._released():
+            raise BusError("the drive still reports that it is armed: it ignores its disarming; switch it off")
+        if self._node_lost is not None:
+            raise self._node_lost
+        if self.node.failure:
+            raise SafetyStopError(f"the drive was let go: {self.node.failure}")
+        if ended_ns is not None and not stop_requested():
+            raise SafetyStopError(f"the drive was let go after a stop, reason {self.node.stop_reason.name}")
+
+    def _released(self) -> bool:
+        """True if the drive confirms within a time that it is let go."""
+        deadline_ns = self._clock.now_ns() + LINGER_NS
+        while not (released := self.node.released(self._clock.now_ns())) and self._clock.now_ns() < deadline_ns:
+            self.step()
+        return released
+
+    def _arm(self, stop_requested: Callable[[], bool]) -> None:
+        deadline_ns = self._clock.now_ns() + LONGEST_SILENCE_NS
+        while not self.node.may_arm and not stop_requested():
+            self.step()
+            if self._clock.now_ns() > deadline_ns:
+                raise BusError("no samples of the drive: check that it is on, on this bus, with this DBC")
+        self.node.arm(self._clock.now_ns())
+        while self.node.phase is Phase.ARMING:
+            self.step()
+            if stop_requested():
+                self.node.disarm()
+        if self.node.phase is Phase.FAILED:
+            raise BusError(f"cannot arm the drive: {self.node.failure}")
+
+    def step(self) -> None:
+        """Wait for what comes first, take what has come, and do what is due.
+
+        Raises:
+            BusError: the drive's bus is lost.
+        """
+        now_ns = self._clock.now_ns()
+        self._wait(min(self.node.due_ns(now_ns + 1) - now_ns, LONGEST_WAIT_NS))
+        for _ in range(MOST_FRAMES):
+            if self._node_lost is not None or (frame := self._received()) is None:
+                break
+            if not (frame.own or frame.error):
+                self.node.take_host(frame, self._clock.now_ns())
+        for _ in range(MOST_FRAMES):
+            if (frame := self._drive_bus.receive(0)) is None:
+                break
+            for ours in self.node.take_drive(frame, self._clock.now_ns()):
+                self._send(ours)
+        self.node.tick(self._clock.now_ns())
+
+    def _received(self) -> Frame | None:
+        try:
+            return self._node_bus.receive(0)
+        except BusError as err:
+            self._node_lost = err
+            return None
+
+    def _send(self, frame: Frame) -> None:
+        """Put a frame on the node's bus; one for which there is no room is lost, as on any bus."""
+        try:
+            self._node_bus.send(frame)
+        except TransmitQueueFullError:
+            pass
+        except BusError as err:
+            self._node_lost = err
+
+    def _wait(self, longest_ns: int) -> None:
+        descriptors = [getattr(bus, "descriptor", None) for bus in (self._drive_bus, self._node_bus)]
+        readable = [each for each in descriptors if each is not None]
+        if len(readable) < len(descriptors):
+            longest_ns = min(longest_ns, LOOK_NS)
+        select.select(readable, [], [], max(0, longest_ns) * 1e-9)

@@ -1,0 +1,308 @@
+"""The gateway between two buses, step by step: what passes, what the node does alone, and when the drive is let go."""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import pytest
+
+from emb_runtime.can.messages import StopReason, load_layout
+from emb_runtime.cli import gateway as cli
+from emb_runtime.config.bench import parse_bench
+from emb_runtime.drives.gateway import Gateway
+from emb_runtime.drives.mapping_file import load_mapping
+from emb_runtime.drives.node import ARMED_PERIODS, LONGEST_STOP_PERIODS, READY_SAMPLES, DriveNode, Phase
+from emb_runtime.errors import BusError, SafetyStopError
+from emb_runtime.records import CurrentCommand, Frame, NodeState
+from emb_runtime.system.clock import SteppedClock
+from tests.drives import EXAMPLES
+from tests.runtime.drives.mapped import late_bench
+
+MS = 1_000_000
+LAYOUT = load_layout()
+IDLE, CLOSED_LOOP = 1, 8  # States of an ODrive's axis
+
+
+class Bus:
+    """A bus on which a test is everybody else; time passes while the gateway finds nothing on it."""
+
+    name, truth, obtained = "bus", None, dict[str, str]()
+
+    def __init__(self) -> None:
+        self.waiting: deque[Frame] = deque()
+        self.sent: list[Frame] = []
+        self.error: BusError | None = None
+        self.passes: Callable[[], None] = lambda: None
+
+    def send(self, frame: Frame) -> None:
+        if self.error is not None:
+            raise self.error
+        self.sent.append(frame)
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        del deadline_ns
+        if self.error is not None:
+            raise self.error
+        if not self.waiting:
+            self.passes()
+            return None
+        return self.waiting.popleft()
+
+    def close(self) -> None:
+        pass
+
+
+class Played:
+    """A gateway of an ODrive that obeys its arming and disarming, and the host."""
+
+    def __init__(self) -> None:
+        self.clock = SteppedClock(1_000 * MS)
+        self.drive, self.host = Bus(), Bus()
+        mapping, bench = load_mapping(EXAMPLES / "odrive.toml"), parse_bench(late_bench(), "bench.toml")
+        self.gateway = Gateway(mapping, bench, self.drive, self.host, self.clock)
+        self.node = self.gateway.node
+        self.state, self.last_fed = IDLE, 0
+        self.position, self.velocity = 0.0, 0.0
+        self.taken = self.periods = self.counter = 0
+        self.ignores = False
+
+    def period(self, step: bool = True) -> list[Frame]:
+        """One period with a sample; frames of ours that the host gets."""
+        before = len(self.host.sent)
+        self.clock.advance_to(self.clock.now_ns() + MS)
+        now_ns, self.periods = self.clock.now_ns(), self.periods + 1
+        for frame in self.drive.sent[self.taken :]:
+            self.last_fed = self.periods
+            if frame.identifier == 0x007 and not self.ignores:
+                self.state = frame.data[0]
+        self.taken = len(self.drive.sent)
+        if self.periods - self.last_fed > 10 and not self.ignores:  # its own time-out
+            self.state = IDLE
+        self.drive.waiting += [
+            Frame(0x001, struct.pack("<IB3x", 0, self.state), now_ns),
+            Frame(0x009, struct.pack("<ff", self.position, self.velocity), now_ns),
+            Frame(0x014, struct.pack("<ff", 0.0, 0.0), now_ns),
+        ]
+        if step:
+            self.gateway.step()
+        return self.host.sent[before:]
+
+    def command(self, current: float, answers: int = 0, enable: bool = True) -> None:
+        """An answer to the newest sample, or to another."""
+        newest = next(f for f in reversed(self.host.sent) if f.identifier == LAYOUT.angle.identifier)
+        counter = (LAYOUT.decode_angle(newest).counter + answers) % 15
+        frame = LAYOUT.encode_command(CurrentCommand(self.counter, counter, current, enable))
+        self.counter = (self.counter + 1) % 15
+        self.host.waiting.append(frame)
+        self.gateway.step()
+
+    def arm(self) -> None:
+        for _ in range(READY_SAMPLES):
+            self.period()
+        assert self.node.may_arm
+        self.node.arm(self.clock.now_ns())
+        for _ in range(200):
+            if self.node.phase is Phase.READY:
+                return
+            self.period()
+        raise AssertionError(self.node.failure)
+
+    def drive_on(self, current: float) -> None:
+        self.period()
+        self.command(current)
+        assert self.node.phase is Phase.ACTIVE
+
+    def until(self, *phases: Phase, most: int = 2000) -> None:
+        for _ in range(most):
+            if self.node.phase in phases:
+                return
+            self.period()
+        raise AssertionError(self.node.phase)
+
+    @property
+    def torques(self) -> list[float]:
+        return [struct.unpack("<f", frame.data)[0] for frame in self.drive.sent if frame.identifier == 0x00E]
+
+    @property
+    def asked_states(self) -> list[int]:
+        return [frame.data[0] for frame in self.drive.sent if frame.identifier == 0x007]
+
+
+@pytest.fixture
+def played() -> Played:
+    return Played()
+
+
+def state_of(frames: list[Frame]) -> NodeState:
+    return LAYOUT.decode_velocity(next(f for f in frames if f.identifier == LAYOUT.velocity.identifier)).node_state
+
+
+def test_the_drive_proves_its_time_out_before_it_is_armed_and_then_gets_0_a(played: Played) -> None:
+    assert state_of([f for _ in range(3) for f in played.period()]) is NodeState.FAULT
+    assert played.drive.sent == []
+    played.arm()
+    assert played.node.arming.time_out.startswith("let go within 0.0")
+    assert played.asked_states == [CLOSED_LOOP, CLOSED_LOOP]
+    left = len(played.torques)
+    for _ in range(20):
+        assert state_of(played.period()) is NodeState.IDLE
+    assert played.torques[left:] == [0.0] * 20
+
+
+def test_a_command_in_time_becomes_a_torque_and_the_next_sample_names_it(played: Played) -> None:
+    played.arm()
+    played.drive_on(2.0)
+    assert played.torques[-1] == pytest.approx(2.0 * 0.0217)
+    frames = played.period()
+    velocity = LAYOUT.decode_velocity(next(f for f in frames if f.identifier == LAYOUT.velocity.identifier))
+    assert (velocity.node_state, velocity.command_counter) == (NodeState.ACTIVE, 0)
+
+
+def test_what_does_not_answer_the_newest_sample_in_time_moves_nothing(played: Played) -> None:
+    played.arm()
+    for refused, (answers, wait_ns) in enumerate(((1, 0), (14, 0), (0, 800_000)), 1):  # not yet, older, too late
+        played.period()
+        played.clock.advance_to(played.clock.now_ns() + wait_ns)
+        played.command(2.0, answers)
+        assert played.node.counts.refused == refused
+    assert set(played.torques) == {0.0}
+
+
+def test_a_sample_without_an_answer_is_braked_and_a_host_that_stays_silent_ends_in_a_stop(played: Played) -> None:
+    played.arm()
+    played.drive_on(1.0)
+    played.velocity = 1.0  # rev/s
+    for number in range(1, 11):
+        played.position += 1e-3
+        played.period()
+        played.clock.advance_to(played.clock.now_ns() + MS * 3 // 4)
+        played.gateway.step()
+        assert played.torques[-1] == pytest.approx(-6.0 * 2.0 * 3.14159 / 60.0 * 0.0217, rel=1e-3)
+        assert (played.node.phase is Phase.ACTIVE) == (number < 10)
+    assert (played.node.phase, played.node.stop_reason) == (Phase.STOPPING, StopReason.WATCHDOG)
+
+
+def test_after_a_stop_of_the_host_the_drive_stays_armed_and_after_any_other_it_is_let_go(played: Played) -> None:
+    played.arm()
+    for _ in range(2):
+        played.drive_on(1.0)
+        played.command(0.0, enable=False)
+        assert played.node.phase is Phase.STOPPING
+        played.until(Phase.READY)
+        assert state_of(played.period()) is NodeState.IDLE
+    assert IDLE not in played.asked_states
+    played.drive_on(1.0)
+    played.until(Phase.OFF)  # the host is silent
+    assert (played.torques[-1], played.asked_states[-1]) == (0.0, IDLE)
+
+
+def test_a_stop_that_does_not_come_to_rest_ends_in_letting_go(played: Played) -> None:
+    played.arm()
+    played.drive_on(1.0)
+    played.command(0.0, enable=False)
+    for _ in range(LONGEST_STOP_PERIODS + 5):
+        played.position, played.velocity = played.position + 0.002, 2.0
+        played.period()
+    assert played.node.phase is Phase.OFF
+
+
+def test_a_drive_that_nobody_commands_is_let_go_after_a_time(played: Played) -> None:
+    played.arm()
+    played.node._periods = ARMED_PERIODS - 1
+    for _ in range(3):
+        played.period()
+    assert played.node.phase is Phase.OFF
+
+
+def run(played: Played, periods: int, then: Callable[[], None] = lambda: None, *, arms: bool = True) -> list[str]:
+    """Serve on the gateway's own loop; ``then`` happens after 300 periods, the operator ends it after so many."""
+    said: list[str] = []
+    steps = 0
+
+    def quarter() -> None:
+        nonlocal steps
+        steps += 1
+        assert steps < 40_000, played.node.phase
+        if steps % 4 == 0:
+            played.period(step=False)
+        if played.periods == 300:
+            then()
+
+    played.drive.passes = quarter
+    played.gateway.run(lambda: played.periods > periods, lambda: said.append("ready"), arms=arms)
+    return said
+
+
+def test_the_operator_s_end_lets_the_drive_go_and_is_no_error(played: Played) -> None:
+    assert run(played, 400) == ["ready"]
+    assert (played.node.phase, played.state, played.asked_states[-1]) == (Phase.OFF, IDLE, IDLE)
+
+
+def test_listening_sends_nothing(played: Played) -> None:
+    assert run(played, 50, arms=False) == ["ready"]
+    assert played.drive.sent == []
+    assert len(played.host.sent) >= 98
+
+
+def test_every_other_end_is_an_error_with_the_drive_let_go() -> None:
+    down = BusError("it is down")
+    for happens, reason in (
+        (lambda it: setattr(it.host, "error", down), "it is down"),
+        (lambda it: setattr(it.drive, "error", down), "it is down"),
+        (lambda it: setattr(it, "velocity", 50.0), "angle and velocity contradict each other"),
+        (lambda it: setattr(it.node, "_periods", ARMED_PERIODS), "let go after a stop, reason NEVER_COMMANDED"),
+    ):
+        played = Played()
+        with pytest.raises((BusError, SafetyStopError), match=reason):
+            run(played, 5000, partial(happens, played))
+        assert played.drive.error or played.asked_states[-1] == IDLE
+    stubborn = Played()
+    with pytest.raises(BusError, match="it ignores its disarming"):
+        run(stubborn, 400, lambda: setattr(stubborn, "ignores", True))
+
+
+def test_a_drive_that_is_silent_or_cannot_be_armed_is_an_error_and_nothing_is_commanded() -> None:
+    silent = Played()
+    silent.drive.passes = lambda: silent.clock.advance_to(silent.clock.now_ns() + MS)
+    with pytest.raises(BusError, match="no samples of the drive"):
+        silent.gateway.run(lambda: False, lambda: None, arms=True)
+    assert silent.drive.sent == []
+    deaf = Played()
+    deaf.ignores = True
+    with pytest.raises(BusError, match="cannot arm the drive: the drive did not become active"):
+        run(deaf, 5000)
+    assert set(deaf.torques) == {0.0}
+
+
+def test_after_a_frame_of_the_arming_sequence_that_the_second_guard_refused_only_the_disarming_leaves() -> None:
+    mapping, sent = load_mapping(EXAMPLES / "odrive.toml"), list[Frame]()
+    (mode,), (arm,) = mapping.arm[1].frames, mapping.arm[2].frames
+    wrong = replace(mode, data=bytes(8))  # whoever encoded it was wrong
+    altered = replace(mapping, arm=(replace(mapping.arm[2], frames=(wrong, arm)),))
+    node = DriveNode(altered, parse_bench(late_bench(), "bench.toml"), LAYOUT, sent.append)
+    node.arm(0)
+    assert node.phase is Phase.FAILED
+    assert "Control_Mode says 0, meant was 1" in node.failure
+    assert [(frame.identifier, frame.data) for frame in sent] == [
+        (0x00E, bytes(4)), (0x00E, bytes(4)), (0x007, b"\x01\0\0\0"),
+    ]  # fmt: skip
+
+
+def test_wrong_arguments_are_one_line_before_anything_is_opened(
+    capsys: pytest.CaptureFixture[str], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    bench = tmp_path_factory.mktemp("bench") / "late.toml"
+    bench.write_text(late_bench())
+    odrive = str(EXAMPLES / "odrive.toml")
+    for arguments, reason, code in (
+        ([odrive, "--drive", "can0", "--node", "can0", "--serial", "7"], "expected another bus", 2),
+        ([odrive, "--drive", "can0", "--node", "vcan0"], "expected --serial TEXT", 2),
+        ([odrive, "--drive", "nosuch0", "--node", "vcan0", "--serial", "7", "--yes"], "nosuch0", 4),
+        ([f"{odrive}x", "--drive", "can0", "--node", "vcan0"], "cannot read it", 2),
+    ):
+        assert cli.main([*arguments, "--bench", str(bench)]) == code
+        assert reason in capsys.readouterr().err.splitlines()[-1]
