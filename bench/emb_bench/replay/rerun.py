@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import math
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+import msgspec
 
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_bench.replay.playback import Difference, Playback
@@ -24,7 +25,6 @@ from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, LogError, UsageErro
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder_process import DIED
 from emb_runtime.records import RunState
-from emb_runtime.run_type import RunType
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.terminal import as_json, show
@@ -44,6 +44,14 @@ followed as far as it goes.
 Rounding may differ with another ONNX Runtime, numpy, Python or processor; with differences, what is another one is
 named.
 """
+
+
+class Recorded(msgspec.Struct, frozen=True):
+    """Part of a log's identity that the loop depends on."""
+
+    purpose: Literal["experiment", "homing"]
+    steps: Annotated[int, msgspec.Meta(ge=1)]  # Samples that the run was to answer
+    limit: Annotated[float, msgspec.Meta(ge=0.0, le=CEILING_CURRENT)]  # Largest current that might be sent [A]
 
 
 class Version(NamedTuple):
@@ -88,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         PolicyRefusedError: the policy in the log is refused.
     """
     log = read_log(args.log)
-    if run_type(log) is RunType.HOMING:
+    if recorded_run(log).purpose == "homing":
         again = rerun(log, Still(), log.bench.limits.current)
         carried: dict[str, str] = {}
     else:
@@ -126,18 +134,18 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
     Raises:
         LogError: the log lacks what a rerun needs.
     """
-    bench, layout, limit, steps = log.bench, log.layout, _limit(log), _steps(log)
+    bench, layout, run = log.bench, log.layout, recorded_run(log)
     playback = Playback(log)
     core = Core(
         bench=bench,
         layout=layout,
-        law=make_law(bench)._replace(steps=steps),
+        law=make_law(bench)._replace(steps=run.steps),
         actor=actor,
         current_limit=current_limit,
-        steps=steps,
-        guard=Guard(layout, bench, playback.send, limit=limit),
-        limit=limit,
-        homing=run_type(log) is RunType.HOMING,
+        steps=run.steps,
+        guard=Guard(layout, bench, playback.send, limit=run.limit),
+        limit=run.limit,
+        homing=run.purpose == "homing",
         stop_condition=stop_condition,
     )
     playback.play(core)
@@ -152,44 +160,22 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
     )
 
 
-def run_type(log: RunLog) -> RunType:
-    """Run type of a log.
+def recorded_run(log: RunLog) -> Recorded:
+    """What a log says of its run.
 
     Raises:
         UsageError: nothing was driven.
-        LogError: its run type is unknown.
+        LogError: it is not that of a run.
     """
     require_driven(log)
-    recorded = log.run.get("purpose", "")
-    if recorded not in (RunType.EXPERIMENT, RunType.HOMING):
-        raise LogError(f"{log.path}: emb.run: purpose: expected experiment or homing, got {recorded[:40]!r}")
-    return RunType(recorded)
-
-
-def _limit(log: RunLog) -> float:
-    """Largest current that might be sent [A]."""
-    recorded = log.run.get("limit", "")
     try:
-        limit = float(recorded)
-    except ValueError:
-        limit = math.nan
-    if not 0.0 <= limit <= CEILING_CURRENT:
-        raise LogError(
-            f"{log.path}: emb.run: limit: expected a current from 0 to {CEILING_CURRENT:g} A, got {recorded[:40]!r}"
-        )
-    return limit
-
-
-def _steps(log: RunLog) -> int:
-    """Number of samples that the run was to answer."""
-    recorded, horizon = log.run.get("steps", ""), log.bench.timing.horizon
-    if run_type(log) is RunType.HOMING:
-        horizon = homing_steps(log.bench)
-    if not (recorded.isascii() and recorded.isdigit() and 1 <= int(recorded[:9]) <= horizon):
-        raise LogError(
-            f"{log.path}: emb.run: steps: expected a whole number from 1 to {horizon}, got '{recorded[:40]}'"
-        )
-    return int(recorded)
+        run = msgspec.convert(dict(log.run), Recorded, strict=False)
+    except msgspec.ValidationError as err:
+        raise LogError(f"{log.path}: emb.run: {err}") from err
+    most = homing_steps(log.bench) if run.purpose == "homing" else log.bench.timing.horizon
+    if run.steps > most:
+        raise LogError(f"{log.path}: emb.run: steps: expected at most {most}, got {run.steps}")
+    return run
 
 
 def _stop_condition(log: RunLog) -> StopCondition | None:

@@ -483,4 +483,4 @@ def test_a_number_of_steps_that_is_none_is_one_line(
     ]
     run = {"emb.run": {"steps": steps, "purpose": "experiment", "limit": "6.0"}}
     path = write_log(tmp_path / "odd.mcap", simulate(steps=20), metadata=run, attachments=files)
-    assert "steps: expected a whole number from 1 to 500" in replay.refused("rerun", path, code=6)
+    assert "steps" in replay.refused("rerun", path, code=6)

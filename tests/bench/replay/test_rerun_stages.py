@@ -11,13 +11,12 @@ import pytest
 
 from emb_bench.batch.find import find
 from emb_bench.logs.log import read_log
-from emb_bench.replay.rerun import rerun, run_type
+from emb_bench.replay.rerun import rerun
 from emb_runtime.can.messages import Layout
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.homing import Still, homing_steps
 from emb_runtime.records import RunState
-from emb_runtime.run_type import RunType
 from tests.actors import constant_actor
 from tests.bench.conftest import Replay
 from tests.bench.hostile import write_trace
@@ -90,7 +89,6 @@ def test_a_way_home_is_reproduced_and_needs_no_policy(homed: Path, replay: Repla
     out = replay.text("rerun", homed)
     assert out.startswith("reproduced   each of")
     assert "DONE, home" in out
-    assert run_type(read_log(homed)) is RunType.HOMING
 
 
 def test_a_way_home_is_counted_and_timed_like_an_experiment(homed: Path, replay: Replay) -> None:
@@ -132,8 +130,7 @@ def test_a_log_that_says_nonsense_of_its_run_is_refused(
     policy = constant_actor(bench, 1.0)
     write_trace(path, journal.records, bench, layout, done.outcome, steps=20, policy=policy, **stated)
     err = replay.refused("rerun", path, code=6)
-    assert f"{name}: expected" in err
-    assert said in err
+    assert name in err
 
 
 def test_a_folder_of_logs_is_searched_for_experiments_only(homed: Path, run: Run) -> None:
