@@ -47,6 +47,7 @@ HOME_PAIRS: Final = 50  # Valid pairs in a row, at home, that end a way home
 UNSTEADY: Final = "its samples come earlier and earlier by its own clock: they had piled up, or that clock is fast"
 """Reason why a node is not ready."""
 SILENT_WAIT: Final = 10  # Periods after which a driver that waits for the node asks again for the operator's wish
+IN_CONTROL: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
 COVERAGE: Final = 0.8
 """Share of an experiment's periods that must have had a sample and a command that acted: the rest may be what the leaky
 counts let pass."""
@@ -203,8 +204,8 @@ class Core:
         self._now_ns = now_ns
         newest: SensorSample | None = None
         for left, frame in enumerate(frames, 1 - len(frames)):
-            direction = Direction.TX if frame.own else Direction.RX
-            self.records.append(FrameRecord(direction, frame, now_ns if left == 0 else 0))
+            said = Direction.TX if frame.own else Direction.RX, frame, now_ns if left == 0 else 0
+            self.records.append(tuple.__new__(FrameRecord, said))
             try:
                 newest = self._take(frame, newest) if self.state is not RunState.OVER else None
             except StopError as stop:
@@ -347,14 +348,15 @@ class Core:
 
     def _take(self, frame: Frame, newest: SensorSample | None) -> SensorSample | None:
         """Take a frame; gives the newest sample of the read that is to be answered."""
-        while self.running and self.state is not RunState.SILENT and frame.time_ns >= self._deadline_ns:
+        while frame.time_ns >= self._deadline_ns and self.state in IN_CONTROL:
             self._miss()
         missed = self._missed
         sample = self._sample(frame)
-        if sample is None or not self.running:
+        if sample is None:
             return newest
-        if self.state is RunState.SILENT:
-            self._judge_node(sample)
+        if self.state not in IN_CONTROL:
+            if self.state is RunState.SILENT:
+                self._judge_node(sample)
             return None
         if newest is not None:  # overtaken: the node obeys an answer to its newest sample only
             self._remember(*NO_PAST[:missed], 0.0)
@@ -377,12 +379,13 @@ class Core:
             return None
         before, self._last = self._last, sample
         self._machine.handle_event(Event.PAIR, sample.receive_time_ns)
-        if self.state is RunState.STOPPING:
+        state = self.state
+        if state is RunState.STOPPING:
             self._watch_rest(sample)
             return sample
         self._end = sample
         self._deadline_ns = sample.receive_time_ns + self._period_ns * 3 // 2
-        if may_enable(self.state) and before is not None:
+        if before is not None and may_enable(state):
             self._follow(before, sample)
         return sample
 
