@@ -161,7 +161,7 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
 
 
 def recorded_run(log: RunLog) -> Recorded:
-    """What a log says of its run.
+    """Identity of a log's run, as far as the loop depends on it.
 
     Raises:
         UsageError: nothing was driven.
