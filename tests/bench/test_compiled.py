@@ -43,21 +43,6 @@ sensitivities = st.floats(-1e3, 1e3)
 sizes = st.floats(1e-6, 3.0)  # of matrix elements: squares and inverses are ordinary numbers
 
 
-@settings(deadline=None)  # the first call compiles
-@given(brakes(), angles, velocities, currents)
-def test_the_compiled_step_is_the_plain_one_bit_for_bit(p: BrakeParameters, x1: float, x2: float, u: float) -> None:
-    assert compiled(step)(p, x1, x2, u, T_S) == step(p, x1, x2, u, T_S)
-
-
-@settings(deadline=None)
-@given(brakes(), angles, velocities, currents, sensitivities, sensitivities, st.integers(0, 3))
-def test_the_compiled_sensitivity_step_is_the_plain_one_bit_for_bit(
-    p: BrakeParameters, x1: float, x2: float, u: float, s1: float, s2: float, i: int
-) -> None:
-    plain = sensitivity_step(p, x1, x2, u, T_S, s1, s2, i)
-    assert compiled(sensitivity_step)(p, x1, x2, u, T_S, s1, s2, i) == plain
-
-
 @settings(deadline=None)
 @given(st.integers(1, 4), st.lists(st.one_of(st.just(0.0), sizes, sizes.map(operator.neg)), min_size=16, max_size=16))
 def test_compiled_criteria_are_the_plain_ones_bit_for_bit(n: int, entries: list[float]) -> None:
@@ -141,12 +126,6 @@ def test_a_closure_is_refused_because_it_would_be_compiled_again_for_each_object
 
     with pytest.raises(TypeError, match="closure"):
         compiled(closure)
-
-
-def test_what_is_no_function_is_refused() -> None:
-    not_a_function: Any = 3
-    with pytest.raises(TypeError, match="expected a plain Python function"):
-        compiled(not_a_function)
 
 
 def test_without_numba_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -327,19 +306,6 @@ def test_a_process_that_never_gives_the_lock_back_delays_and_stops_nobody(
     assert not kept(tmp_path)
 
 
-def quartered(x: float) -> float:
-    return 0.25 * x
-
-
-def test_a_process_that_gives_the_lock_back_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    holder = Holder(tmp_path, monkeypatch, leaves=LOCK_WAIT - 1.0)
-    fast = compiled(quartered)
-    with holder:
-        assert fast(2.0) == 0.5
-    assert holder.now == pytest.approx(LOCK_WAIT - 1.0, abs=0.1)
-    assert kept(tmp_path)
-
-
 def tenfold(x: float) -> float:
     return 10.0 * x
 
@@ -374,7 +340,7 @@ def twentyfold(x: float) -> float:
 
 
 def counted(x: float) -> float:
-    return halved(x) + quartered(x)
+    return halved(x) + tenfold(x)
 
 
 def test_a_command_can_show_how_many_functions_were_compiled_and_when_the_last_one_was(
@@ -385,7 +351,7 @@ def test_a_command_can_show_how_many_functions_were_compiled_and_when_the_last_o
     told: list[tuple[int, bool]] = []
     on_compiling(lambda count, last: told.append((count, last)))
     fast = compiled(counted)
-    assert fast(2.0) == 1.5
+    assert fast(2.0) == 21.0
     assert told == [(1, False), (2, False), (3, True)]
-    assert fast(4.0) == 3.0
+    assert fast(4.0) == 42.0
     assert len(told) == 3

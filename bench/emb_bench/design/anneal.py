@@ -150,8 +150,8 @@ def anneal(task: Task, goal: Goal, count: int, rng: np.random.Generator, tracks:
         inform(task, first, u, x, s, m)
         left = 1.0 - number / count
         softness = max(0.0, 2.0 * left - 1.0) * SOFTNESS
-        now = phi(goal, tracks.m[at, n], rows, softness, packed, work) - PRICE * tracks.price[at]
-        worth = phi(goal, m[n], rows, softness, packed, work) - PRICE * tracks.price[to]
+        now = phi(goal, tracks.m[at, n], softness, packed, work) - PRICE * tracks.price[at]
+        worth = phi(goal, m[n], softness, packed, work) - PRICE * tracks.price[to]
         if worth >= now - TEMPERATURE * left * left * rng.exponential():
             s[:first], m[:first] = tracks.s[at, :first], tracks.m[at, :first]
             at = to

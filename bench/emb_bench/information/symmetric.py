@@ -170,15 +170,14 @@ class Goal(NamedTuple):
     nuisances: int  # Their number; 0 for all but Ds
 
 
-def phi(goal: Goal, m: Floats, rows: int, softness: float, packed: Floats, work: Floats) -> float:
-    """φ of the first n rows and columns of a packed matrix; −inf if they are singular.
+def phi(goal: Goal, m: Floats, softness: float, packed: Floats, work: Floats) -> float:
+    """φ of a packed matrix; −inf if it is singular.
 
     Ds is the sum of the logarithms of the last pivots if the nuisances come first.
 
     Args:
         goal: which φ.
-        m: packed matrix, shape (rows (rows + 1) / 2,).
-        rows: at least n.
+        m: packed matrix, shape (n (n + 1) / 2,).
         softness: rounds E's kinks, see :meth:`emb_bench.information.criteria.Criterion.phi`.
         packed: scratch, shape (n (n + 1) / 2,).
         work: scratch, shape (n, n).
@@ -187,7 +186,7 @@ def phi(goal: Goal, m: Floats, rows: int, softness: float, packed: Floats, work:
     for i in range(n):
         for j in range(i, n):
             a, b = goal.order[i], goal.order[j]
-            packed[packed_index(n, i, j)] = m[packed_index(rows, min(a, b), max(a, b))]
+            packed[packed_index(n, i, j)] = m[packed_index(n, min(a, b), max(a, b))]
     if not cholesky(packed, work):
         return -math.inf
     if goal.criterion == MINUS_LOG_TRACE:

@@ -80,42 +80,17 @@ def test_slopes_stay_finite_where_a_brake_creeps_across_rest_and_contact_for_lon
         assert np.abs(jacobian[:, :2, :2]).max() < 10.0
 
 
-@pytest.mark.parametrize(("f_v", "k_1"), [(5e-5, 25.0), (3e-5, 37.5)])
-def test_a_creeping_design_of_the_euler_brake_is_polished(f_v: float, k_1: float) -> None:
-    brake = BENCH.brake._replace(f_v=f_v, k_1=k_1)
-    p = make_problem(BENCH, GOALS[0], PARAMETER_NAMES, model="euler", brake=brake)
-    table = np.array([[1.0, 0.0, -0.1, 0.0, 1e-3, 0.0, 0.3, 0.32, 0.38]])
-    start = p.design(p.explore(table)[0][0])
-    assert (np.abs(start.states[:, 1]) < 1e-3).sum() > 50
-    end = polish(p, start.currents, Settings(steps=5, tolerance=1e-3, cuts=1))
-    assert merit(end) >= merit(start)
-
-
-@pytest.mark.slow
-def test_e_of_four_parameters_is_found_where_a_brake_waits_before_it_moves() -> None:
-    brake = BENCH.brake._replace(f_v=1e-5, k_1=50.0)
-    p = make_problem(BENCH, GOALS[2], PARAMETER_NAMES, model="euler", brake=brake)
-    assert np.exp(search(p, starts=12, seed=0).best.phi) > 1.7e10
-
-
 @given(information(), st.sampled_from([0.0, 0.03, 0.3]))
 @pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
 def test_a_compiled_loop_has_the_same_phi(goal: Criterion, m: Floats, softness: float) -> None:
-    found = symmetric.phi(goal.compiled(4), symmetric.pack(m), 4, softness, np.empty(10), np.empty((4, 4)))
+    found = symmetric.phi(goal.compiled(4), symmetric.pack(m), softness, np.empty(10), np.empty((4, 4)))
     assert found == pytest.approx(float(goal.phi(m, softness)), rel=1e-6)
-
-
-@given(information())
-@pytest.mark.parametrize("goal", [Criterion("D", (0, 1)), Criterion("E", (0, 1)), Criterion("Ds", (1,))], ids=str)
-def test_a_compiled_loop_takes_the_unknowns_that_come_first(goal: Criterion, m: Floats) -> None:
-    found = symmetric.phi(goal.compiled(2), symmetric.pack(m), 4, 0.0, np.empty(3), np.empty((2, 2)))
-    assert found == pytest.approx(float(goal.phi(m[:2, :2])), rel=1e-6)
 
 
 @pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
 def test_a_compiled_loop_has_minus_infinity_where_nothing_is_known(goal: Criterion) -> None:
     nothing = symmetric.pack(np.zeros((4, 4)))
-    assert symmetric.phi(goal.compiled(4), nothing, 4, 0.03, np.empty(10), np.empty((4, 4))) == -math.inf
+    assert symmetric.phi(goal.compiled(4), nothing, 0.03, np.empty(10), np.empty((4, 4))) == -math.inf
 
 
 @given(information(), information())
@@ -123,14 +98,6 @@ def test_a_compiled_loop_has_minus_infinity_where_nothing_is_known(goal: Criteri
 def test_a_tangent_lies_above_its_criterion_everywhere(goal: Criterion, here: Floats, there: Floats) -> None:
     tangent = float(goal.phi(here)) + float((goal.gradient(here) * (there - here)).sum())
     assert float(goal.phi(there)) <= tangent + 1e-6 * (1.0 + abs(tangent))
-
-
-@given(information())
-@pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
-def test_a_criterion_gains_its_degree_from_information_that_is_e_times_as_much(goal: Criterion, m: Floats) -> None:
-    degree = {"D": 4.0, "Ds": 2.0}.get(goal.name, 1.0)
-    assert float(goal.phi(math.e * m) - goal.phi(m)) == pytest.approx(degree, rel=1e-6)
-    assert float((goal.gradient(m) * m).sum()) == pytest.approx(degree, rel=1e-6)
 
 
 @given(information())
@@ -155,12 +122,6 @@ def test_e_with_its_kinks_rounded_is_lower_by_no_more_than_four_equal_eigenvalue
     assert -1e-9 <= lower <= soft * math.log(4.0) + 1e-9
     for goal in (*GOALS[:2], GOALS[3]):
         assert goal.phi(m, soft) == goal.phi(m)
-
-
-def test_rounding_lets_e_gain_from_either_of_two_equal_eigenvalues() -> None:
-    e, equal, one_more = GOALS[2], np.diag([1.0, 1.0, 9.0, 9.0]), np.diag([1.0, 1.1, 9.0, 9.0])
-    assert e.phi(one_more) == e.phi(equal)
-    assert e.phi(one_more, 0.03) > e.phi(equal, 0.03) + 0.01
 
 
 @given(information(), information(), st.integers(0, 2**32 - 1))
@@ -320,16 +281,6 @@ def test_an_independent_integrator_finds_the_limits_held_and_the_brake_at_home()
     assert (x1, x2) == pytest.approx(tuple(best.states[-1, :2]), abs=0.2)
 
 
-def test_a_design_is_worth_the_same_in_plain_python() -> None:
-    p = problem("E", horizon=60)
-    goal = criterion("E", TWO)
-    best = search(p, starts=1, seed=1).best
-    again = check(BENCH, p, goal, "physical", best.currents, "exact")
-    assert again.value == pytest.approx(goal.value(best.phi), rel=1e-9)
-    assert again.limits_held
-    assert again.home
-
-
 def test_check_sees_a_limit_that_is_left_and_a_brake_that_is_not_home() -> None:
     again = check(BENCH, problem(), criterion("D", TWO), "physical", np.full(60, 6.0), "exact")
     assert not again.limits_held
@@ -376,30 +327,6 @@ def test_no_design_is_above_the_proved_bound(name: Name) -> None:
     _, _, phi, price = p.explore(np.hstack([journeys, np.ones((200, 5))]))
     assert (price == 0.0).sum() > 50
     assert phi[price == 0.0].max() < ceiling(p, goal)
-
-
-def test_the_bound_of_a_single_sensitivity_holds_for_the_sensitivities_themselves() -> None:
-    p = make_problem(BENCH, criterion("D", PARAMETER_NAMES), PARAMETER_NAMES)
-    journeys = np.random.default_rng(4).uniform(-1.0, 1.0, (50, 8))
-    currents, _, _, price = p.explore(np.hstack([journeys, np.ones((50, 4))]))
-    for name in PARAMETER_NAMES:
-        alone = criterion("D", (name,))
-        single = make_problem(BENCH, alone, (name,))
-        highest = ceiling(single, alone)
-        assert all(single.design(u).phi < highest for u in currents[price == 0.0])
-
-
-def test_the_motion_is_the_sum_of_its_sensitivities_to_k_m_and_t_c() -> None:
-    p = make_problem(BENCH, criterion("D", TWO), TWO)
-    design = p.design(out_and_back(300))
-    np.testing.assert_allclose(design.sensitivities[:, :, :2].sum(axis=1), design.states[:, :2], rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize(("name", "model"), [("D", "euler"), ("D", "lag"), ("Ds", "exact")])
-def test_the_proved_bound_is_refused_where_it_is_not_proved(name: Name, model: str) -> None:
-    goal = criterion(name, PARAMETER_NAMES, ("f_v",) if name == "Ds" else ())
-    with pytest.raises(UsageError, match="proved"):
-        ceiling(make_problem(BENCH, goal, PARAMETER_NAMES, model=model), goal)
 
 
 @pytest.mark.parametrize("model", ["jitter", "observer"])

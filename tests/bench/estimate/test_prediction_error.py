@@ -331,15 +331,6 @@ def test_a_trial_step_at_which_the_filter_diverges_is_one_that_is_not_taken(benc
     assert math.isfinite(end.cost)
 
 
-def test_bounds_hold_and_are_said(bench: Bench) -> None:
-    data = record(bench, bench.plant("exact"), currents_of(bench, "chirp"))
-    low = 1.1 * bench.brake.f_v
-    found = estimate(bench, "exact", [data], EstimationProblem(bounds={"f_v": (low, 1.0)}))
-    assert found.values[3] == pytest.approx(low, rel=1e-3)
-    assert found.values[3] >= low
-    assert found.at_bound == ("f_v",)
-
-
 def test_what_cannot_be_estimated_is_refused(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), currents_of(bench, "chirp")[:50])
     for names, plant, records, starts, message in (
