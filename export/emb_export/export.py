@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
         "source",
         metavar="REFERENCE|EXCITATION|DESIGN|DIR",
         help="a tuned reference, one of those below or the reference.json of emb-train reference; a sequence: "
-        "step:amplitude=1.5, chirp:f1=20, ..., or the .npz file of emb-design; or a directory that emb-train wrote",
+        "step:amplitude=1.5, chirp:f1=20, ..., or the .csv file of emb-design; or a directory that emb-train wrote",
     )
     p.add_argument("--out", type=Path, metavar="FILE", help="the ONNX file (default: DIR/actor.onnx)")
     p.add_argument(

@@ -90,13 +90,13 @@ def read_sequence(text: str, bench: Bench) -> tuple[Floats, str]:
 
     Args:
         text: as :func:`emb_bench.excitation.reference.parse_excitation` reads it, or a file of ``emb-design -o``,
-            ``.npz``.
+            ``.csv``.
         bench: its sample time, horizon and limits.
 
     Raises:
         UsageError: there is no such excitation or file, it is for another bench, or it is a feedback law.
     """
-    if Path(text).suffix == ".npz":
+    if Path(text).suffix == ".csv":
         from emb_bench.design.report import read_design  # scipy takes its time
 
         return read_design(Path(text), bench)

@@ -197,10 +197,10 @@ def test_a_sequence_is_exported_as_a_policy_that_gives_it(tmp_path: Path) -> Non
 
 
 def test_a_design_is_exported_as_a_policy(tmp_path: Path) -> None:
-    design, path = tmp_path / "best.npz", tmp_path / "best.onnx"
+    design, path = tmp_path / "best.csv", tmp_path / "best.onnx"
     current = np.linspace(-6.0, 6.0, BENCH.timing.horizon + 1)
     metadata = json.dumps({"contract_hash": BENCH.contract_hash, "criterion": "D"})
-    np.savez(design, current=current, metadata=metadata)
+    design.write_text("\n".join([f"# {metadata}", "current", *map(str, current.tolist())]))
     assert main([str(design), "--out", str(path)]) == 0
     policy = load_policy(path, BENCH)
     found = [policy.act(0.0, 0.0, float(k), Estimator(BENCH)) for k in range(BENCH.timing.horizon)]
@@ -275,7 +275,7 @@ def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(
         ["step"],
         ["constant-speed", "--out", "x.onnx"],  # a feedback law
         ["sawtooth:f=1", "--out", "x.onnx"],
-        ["none.npz", "--out", "x.onnx"],
+        ["none.csv", "--out", "x.onnx"],
         ["none.json", "--out", "x.onnx"],
         ["bad.json", "--out", "x.onnx"],
         ["four-d-exact-blind"],

@@ -39,7 +39,7 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--version", action="version", version=f"emb-design {metadata.version('emb-excite')}")
     add(p, api.design)
-    p.add_argument("-o", "--output", type=Path, metavar="FILE", help="file to write: design.npz or design.csv")
+    p.add_argument("-o", "--output", type=Path, metavar="FILE", help="file to write: design.csv")
     p.add_argument("--plot", type=Path, metavar="FILE", help="figure to write: .png, .pdf or .svg")
     add_output_options(p)
     return p
@@ -56,7 +56,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _design(args: argparse.Namespace) -> None:
-    require_place("--output", args.output, (".npz", ".csv"))
+    require_place("--output", args.output, (".csv",))
     require_place("--plot", args.plot, ENDINGS)
     report = api.design(**given(args, api.design))
     if args.output is not None:

@@ -6,9 +6,6 @@ import csv
 import hashlib
 import io
 import json
-import zipfile
-import zlib
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -29,12 +26,7 @@ from emb_runtime.system.input_file import read_bytes
 from emb_runtime.system.terminal import as_json
 
 COLUMNS = ("time", "current", "angle", "velocity")
-MAX_DESIGN_BYTES = 64 << 20  # Of a design's file, packed and unpacked
-_UNREADABLE = (
-    *(OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, MemoryError, RecursionError),
-    *(NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error),
-)
-"""Exceptions of numpy, zipfile and json on a file that is no design."""
+MAX_DESIGN_BYTES = 64 << 20  # Of a design's file
 CHECKED = ("euler", "exact")  # Brakes on which every design is computed once more, besides its own
 
 
@@ -196,52 +188,37 @@ def make_report(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind
 
 
 def write(report: Report, path: Path) -> None:
-    """Write the design as ``.npz`` or ``.csv``, by the file's ending; CSV unless it is ``.npz``.
-
-    NPZ: the columns, ``information`` (the FIM after each sample) and ``metadata`` (JSON). CSV: the metadata as one line
-    of JSON behind ``#``, then the columns.
+    """Write the design as CSV: the metadata as one line of JSON behind ``#``, then the columns.
 
     Raises:
         UsageError: the file cannot be written.
     """
-    metadata, columns = report.json(), report.columns()
-    buffer = io.BytesIO()
-    if path.suffix == ".npz":
-        arrays: Mapping[str, Any] = {**columns, "information": report.information(), "metadata": np.array(metadata)}
-        np.savez_compressed(buffer, **arrays)
-    else:
-        text = io.TextIOWrapper(buffer, encoding="utf-8", newline="", write_through=True)
-        text.write(f"# {metadata}\n")
-        rows = csv.writer(text, lineterminator="\n")
-        rows.writerow(COLUMNS)
-        rows.writerows(zip(*(columns[name].tolist() for name in COLUMNS), strict=True))
-        text.detach()
+    columns, text = report.columns(), io.StringIO(newline="")
+    text.write(f"# {report.json()}\n")
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(COLUMNS)
+    rows.writerows(zip(*(columns[name].tolist() for name in COLUMNS), strict=True))
     try:
-        path.write_bytes(buffer.getvalue())
+        path.write_text(text.getvalue(), encoding="utf-8", newline="")
     except OSError as err:
         raise UsageError(f"--out {path}: cannot be written: {err.strerror}") from err
 
 
 def read_design(path: Path, bench: Bench) -> tuple[Floats, str]:
-    """Currents of a design that :func:`write` wrote as ``.npz`` [A], shape (horizon,); and a description with a hash.
+    """Currents of a design that :func:`write` wrote [A], shape (horizon,); and a description with a hash.
 
     Raises:
         UsageError: the file cannot be read, is no design, or was made for another bench.
     """
     try:
-        content = read_bytes(path, MAX_DESIGN_BYTES)
+        head, *rows = read_bytes(path, MAX_DESIGN_BYTES).decode().splitlines()
+        metadata = json.loads(head.removeprefix("#"))
+        made_for, label = str(metadata["contract_hash"]), f"{metadata['criterion']}-optimal design"
+        current = np.array([float(row["current"]) for row in csv.DictReader(rows)])
     except OSError as err:
         raise UsageError(f"{path}: cannot read the design: {err.strerror}") from err
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > MAX_DESIGN_BYTES:
-                raise ValueError
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            current = np.asarray(file["current"], dtype=np.float64)
-            metadata = json.loads(str(file["metadata"]))
-            made_for, label = str(metadata["contract_hash"]), f"{metadata['criterion']}-optimal design"
-    except _UNREADABLE as err:
-        raise UsageError(f"{path}: expected a design that emb-design wrote as .npz, and it is none") from err
+    except (ValueError, KeyError, TypeError, RecursionError, csv.Error) as err:
+        raise UsageError(f"{path}: expected a design that emb-design wrote, and it is none") from err
     if made_for != bench.contract_hash:
         raise UsageError(f"{path}: made for another bench: pass it with --bench, or search the design again")
     if current.shape != (bench.timing.horizon + 1,) or not np.isfinite(current).all():

@@ -33,7 +33,7 @@ def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
         ("brake", brake),
         ("bounds", ", ".join(f"{name} {deviation(bound, name)}" for name, bound in bounds.items())),
         ("optima", f"{optima} ({d['starts']} starts, seed {d['seed']})"),
-        ("currents", written or "not written: use -o design.npz or design.csv"),
+        ("currents", written or "not written: use -o design.csv"),
     )
     return "\n".join([*lines, *(["", *_checks(report).lines()] if verbose else [])])
 
