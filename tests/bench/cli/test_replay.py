@@ -18,6 +18,7 @@ from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench, shipped_bench_text
+from emb_runtime.records import CycleRecord
 
 from tests.bench.conftest import Log, Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
@@ -297,8 +298,10 @@ def test_the_sample_that_stopped_a_run_counts_among_the_largest(
 
 
 def test_info_tells_the_delay_from_sensor_to_command(tmp_path: Path, run: SimRun, replay: Replay) -> None:
-    cycles = run.journal.cycles
-    cycles[:] = [c._replace(send_time_ns=c.receive_time_ns + 1000 * c.step) for c in cycles]
+    records = run.journal.records
+    records[:] = [
+        r._replace(send_time_ns=r.receive_time_ns + 1000 * r.step) if isinstance(r, CycleRecord) else r for r in records
+    ]
     got = replay.document("info", write_log(tmp_path / "run.mcap", run))
     delays = [1e-6 * k for k in range(500)]
     expected = {f"p{q:g}": float(np.percentile(delays, q)) for q in (50, 90, 99, 99.9, 100)}

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from emb_bench.report.page import report_page, view
 from emb_bench.report.sentences import drift
 from emb_runtime.config.bench import Bench, shipped_bench_text
 from emb_runtime.log.ring_buffer import EventRecord, Level, LineRecord
+from emb_runtime.records import CycleRecord
 from emb_runtime.system.terminal import as_json
 
 from tests.bench.conftest import Replay  # isort: skip
@@ -329,8 +331,13 @@ def test_simulated_time_is_said_to_mean_nothing_and_real_time_is_drawn(
     folder: Path, bench: Bench, simulate: Simulate
 ) -> None:
     run = simulate(square, options="plant=exact", steps=60)
-    late = [c._replace(send_time_ns=c.receive_time_ns + 7_000 * (k % 50) + 1) for k, c in enumerate(run.journal.cycles)]
-    run.journal.cycles[:] = late
+    number, records = count(), run.journal.records
+    records[:] = [
+        r._replace(send_time_ns=r.receive_time_ns + 7_000 * (next(number) % 50) + 1)
+        if isinstance(r, CycleRecord)
+        else r
+        for r in records
+    ]
     metadata = {"emb.run": {"steps": "60", "iface": "can0"}}
     paths = [write_log(folder / "sim.mcap", run, steps=60)]
     paths.append(write_log(folder / "real.mcap", run, steps=60, metadata=metadata))
