@@ -62,7 +62,18 @@ RENAMED: dict[str, str] = {}
 """Keys of JSON documents: the new name, and the frozen one. ``{"identified": "told"}``."""
 RENAMED_FROZEN = {"told": "identified"}
 """Frozen keys and their new names, where other frozen documents have the new name already."""
-GONE: dict[str, str] = {"fim/*/normalise_by": "the parameters of an information are always relative to theta"}
+SUMMARY = "a campaign's JSON has the field names of its records as keys; the file of rows has log det of each"
+VERDICT = "a sentence: the text has it, not the JSON"
+GONE: dict[str, str] = {
+    "campaign/all/says/log_det*": SUMMARY,
+    "campaign/all/says/weighted_log_det*": SUMMARY,
+    "campaign/all/says/misfits*": SUMMARY,
+    "campaign/all/says/*/of": SUMMARY,
+    "campaign/all/says/*/why": SUMMARY,
+    "fim/*/verdict": VERDICT,
+    "report/*/verdict": VERDICT,
+    "fim/*/normalise_by": "the parameters of an information are always relative to theta",
+}
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, each with the commit that says why."""
 REST = "0abcadc: a run is watched until the node is at rest, and recorded so far"
 WINDOWS = "8dba46e: windows begin at a state whose squares fell"
@@ -72,6 +83,8 @@ EXPLAINED: dict[str, str] = {
     "logs/aborted/*": REST,
     "info/aborted/says/*": REST,
     "estimate/emps windows/says/*": WINDOWS,
+    "campaign/all/says/misfit": SUMMARY,
+    "campaign/all/says/parameters/*/cramer_rao": SUMMARY,
     "demo/fim/numbers": "the text of fim has half of the 95 % interval in place of standard deviations",
     "*/mapped/*": GATEWAY,
     "demo/run/numbers": "76c82d4: the summary has a line on the motion",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,21 +12,13 @@ import numpy as np
 from emb_bench.analysis.constancy import Constancy, constancy
 from emb_bench.analysis.random_walk import RandomWalk, random_walk
 from emb_bench.batch.row import NONE, Options, Parameter, Row, is_relative, unit_of
+from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.numbers import NOTHING, plain
 from emb_bench.report.sentences import INTERVALS, p_value
 from emb_bench.report.text import Table, listed, wrapped
 
 SHOWN = 20  # Most failed logs, and most campaigns, in the text; the file has them all
-
-
-@dataclass(frozen=True)
-class Quantiles:
-    """Median and extremes of a number over the runs."""
-
-    median: float
-    lowest: float
-    highest: float
 
 
 @dataclass(frozen=True)
@@ -64,7 +56,7 @@ class ParameterSummary:
 
     unit: str
     identified: int  # Number of the runs that identify it
-    cramer_rao: Quantiles | None
+    cramer_rao: float | None  # Median of the bounds by the information at the nominal brake
     relative: bool  # True if the bound is relative to the value
     estimate: ParameterEstimates | None  # None if no run that the model fits identifies it
     trend: Trend | None  # None for few runs
@@ -97,8 +89,6 @@ class Campaign:
     start_time: tuple[int, int] | None  # Of the first and of the last run [ns]; None if none has a date
     method: str
     models: tuple[str, ...]
-    log_det: Quantiles | None
-    weighted_log_det: Quantiles | None
     parameters: dict[str, ParameterSummary]
     campaigns: tuple[Folder, ...]  # The earliest first
 
@@ -127,43 +117,18 @@ def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
         start_time=(min(starts), max(starts)) if starts else None,
         method=options.method,
         models=tuple(sorted({row.model for row in good if row.model is not None})),
-        log_det=_quantiles(row.log_det for row in counted),
-        weighted_log_det=_quantiles(row.weighted_log_det for row in counted),
         parameters={name: _parameter(counted, name) for name in options.names},
         campaigns=_folders(counted, options),
     )
 
 
 def document(c: Campaign) -> dict[str, Any]:
-    """The summary as plain data."""
-    found = asdict(c) | {
-        "failed": [{"root": row.root, "log": row.log, "error": row.error} for row in c.failed],
-        "copies": [{"root": row.root, "log": row.log, "of": row.copy_of} for row in c.copies],
-        "stopped": [{"root": row.root, "log": row.log, "why": row.exit_reason} for row in c.stopped],
-        "misfit": len(c.misfit),
-        "misfits": [{"root": row.root, "log": row.log, "model": row.model} for row in c.misfit],
-        "start_time": c.start_time and dict(zip(("first", "last"), c.start_time, strict=True)),
-        "campaigns": [asdict(folder) for folder in c.campaigns],
-    }
-    for name, entry in found["parameters"].items():
-        entry["trend"] = _trend_document(c.parameters[name].trend)
-        if entry["estimate"] is None:
-            del entry["estimate"]
+    """The summary as plain data; of single logs the names, and what is said of them."""
+    found: dict[str, Any] = to_json(replace(c, failed=(), copies=(), stopped=(), misfit=()))
+    told = ("root", "log", "error", "copy_of", "exit_reason", "model")
+    for name in ("failed", "copies", "stopped", "misfit"):
+        found[name] = [{key: getattr(row, key) for key in told} for row in getattr(c, name)]
     return found
-
-
-def _trend_document(trend: Trend | None) -> dict[str, Any] | None:
-    if trend is None:
-        return None
-    return {
-        "walk_per_root_hour": trend.walk.walk,
-        "runs": [
-            {"start_time": start, "value": value, "interval": list(ends)}
-            for start, value, ends in zip(
-                trend.start_times, trend.walk.values.tolist(), trend.walk.ends.tolist(), strict=True
-            )
-        ],
-    }
 
 
 def mark_copies(rows: Sequence[Row]) -> list[Row]:
@@ -189,17 +154,13 @@ def _fits(row: Row) -> bool:
     return bool(row.nominal_fits if row.fits is None else row.fits)
 
 
-def _quantiles(values: Iterable[float | None]) -> Quantiles | None:
-    known = [value for value in values if value is not None]
-    return Quantiles(float(np.median(known)), min(known), max(known)) if known else None
-
-
 def _parameter(rows: Sequence[Row], name: str) -> ParameterSummary:
     found = [p for row in rows for p in row.parameters if p.name == name]
+    bounds = [p.cramer_rao for p in found if p.cramer_rao is not None]
     return ParameterSummary(
         unit=unit_of(name, "SI"),
         identified=sum(bool(p.identified) for p in found),
-        cramer_rao=_quantiles(p.cramer_rao for p in found),
+        cramer_rao=float(np.median(bounds)) if bounds else None,
         relative=is_relative(name),
         estimate=_estimates(_usable(rows, name)),
         trend=_trend(rows, name),
@@ -349,7 +310,7 @@ def parameter_table(c: Campaign) -> Table:
     for name, p in c.parameters.items():
         row = [f"{name} [{p.unit}]", f"{p.identified} of {c.evaluated}"]
         if not estimated:
-            bound = math.nan if p.cramer_rao is None else p.cramer_rao.median
+            bound = math.nan if p.cramer_rao is None else p.cramer_rao
             rows.append([*row, _share(bound, 1.0 if p.relative else 0.0)])
             continue
         if p.estimate is None:

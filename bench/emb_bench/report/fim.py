@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from emb_bench.brake.parameters import UNITS
 from emb_bench.brake.quantities import quantity
+from emb_bench.documents import to_json
 from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evenly
 from emb_bench.experiment.model_evaluator import KINDS, Fit
-from emb_bench.information.criteria import Criteria, criteria_series
+from emb_bench.information.criteria import criteria_series
 from emb_bench.information.identifiability import Finding, combination
 from emb_bench.numbers import NOTHING, in_samples, plain
 from emb_bench.report import sentences as say
@@ -32,59 +32,45 @@ CRITERIA = {
 }
 
 
-def document(evaluation: Evaluation) -> dict[str, Any]:
+def document(e: Evaluation) -> dict[str, Any]:
     """Everything about the information, for ``--json``; a number that is not finite becomes null."""
-    e = evaluation
-    document: dict[str, Any] = {
-        "log": str(e.log.path),
-        "complete": e.log.complete and not e.experiment.missing,
+    x, question, fisher, verdict = e.experiment, e.question, e.fisher("physical"), e.verdict()
+    times = (np.array(e.instants) + 1) * e.bench.timing.sample_time
+    numbers = ("log_det", "lambda_min", "trace_inverse", "condition", "singular")
+    found: dict[str, Any] = {
+        "log": e.log.path,
+        "complete": e.log.complete and not x.missing,
         "warnings": e.warnings,
         "notes": e.notes,
         "exit_reason": e.log.exit_reason,
         "samples": {
-            "planned": e.experiment.planned,
-            "periods": e.experiment.periods,
-            "measured": int(e.experiment.measured.sum()),
-            "braked_periods": e.experiment.braked,
-            "command_delay": e.experiment.command_delay,
+            "planned": x.planned,
+            "periods": x.periods,
+            "measured": x.measured.sum(),
+            "braked_periods": x.braked,
+            "command_delay": x.command_delay,
         },
         "model": e.plant.name,
         "theta": {"name": e.theta_name, **e.theta._asdict()},
-        "systematic": e.errors._asdict(),
-        "params": list(e.question.params),
-        "nuisances": list(e.question.nuisances),
-        "prior": e.question.prior.name if e.question.prior else None,
+        "systematic": e.errors,
+        "params": question.params,
+        "nuisances": question.nuisances,
+        "prior": question.prior.name if question.prior else None,
         "fit_sigmas": {"angle": e.fit.angle, "velocity": e.fit.velocity, "fits": e.fit.fits},
     }
-    times = ((np.array(e.instants) + 1) * e.bench.timing.sample_time).tolist()
     for kind in KINDS:
-        fisher = e.fisher(kind)
-        document[kind] = {"matrix": fisher.matrix.tolist(), **_numbers(fisher.criteria())}
-        series = criteria_series(e.histories[kind], e.question.names, e.question.params)
-        document[kind]["over_time"] = {
-            "time": times,
-            **{name: values.tolist() for name, values in series._asdict().items()},
-        }
-    fisher, verdict = e.fisher("physical"), e.verdict()
-    document["physical"] |= {
+        final, series = e.fisher(kind), criteria_series(e.histories[kind], question.names, question.params)
+        found[kind] = {"matrix": final.matrix, "over_time": {"time": times, **series._asdict()}}
+        found[kind] |= {name: getattr(final.criteria(), name) for name in numbers}
+    found["physical"] |= {
         "cramer_rao": fisher.cramer_rao(),
-        "correlation": fisher.correlation().tolist(),
+        "correlation": fisher.correlation(),
         "identified": verdict.identified,
-        "findings": [asdict(finding) | {"identified": finding.identified} for finding in verdict.findings],
-        "directions": [asdict(direction) for direction in verdict.directions],
+        "findings": [to_json(finding) | {"identified": finding.identified} for finding in verdict.findings],
+        "directions": verdict.directions,
     }
+    document: dict[str, Any] = to_json(found)
     return document
-
-
-def _numbers(c: Criteria) -> dict[str, Any]:
-    return {
-        "log_det": c.log_det,
-        "lambda_min": c.lambda_min,
-        "trace_inverse": c.trace_inverse,
-        "condition": c.condition,
-        "singular": c.singular,
-        "verdict": c.verdict(),
-    }
 
 
 def text(e: Evaluation, *, verbose: bool = False) -> str:

@@ -56,13 +56,6 @@ def test_of_runs_that_differ_by_more_it_says_how_much(bench: Bench) -> None:
     assert high - low == pytest.approx(2.0 * 1.96 * expected, rel=0.2)
 
 
-def test_a_seed_gives_the_same_draws_and_another_one_others(bench: Bench) -> None:
-    e = estimated(bench, runs(bench, count=4), ("k_m",))
-    first, again, other = (bootstrap(e, draws=30, seed=seed).values for seed in (5, 5, 6))
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
-
-
 def test_only_what_the_runs_share_is_drawn(bench: Bench) -> None:
     e = estimated(bench, runs(bench, count=3), ("x1_0", "k_m"), "offset")
     found = bootstrap(e, draws=20, seed=0)

@@ -19,7 +19,6 @@ from emb_bench.report.estimate import document, text
 from emb_bench.report.sentences import models
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.plants import EVERY, Plant
-from emb_runtime.errors import UsageError
 
 from tests.bench.flows import square  # isort: skip
 from tests.bench.measurements import currents_of, record  # isort: skip
@@ -183,9 +182,3 @@ def test_the_answer_allows_for_the_errors_of_the_bench_as_with_one_model(
     assert found.intervals() == pytest.approx(one.intervals(), rel=1e-5)
     ideal = make_study(bench, [log], StudyOptions(EstimationProblem(), starts=2, systematic=False, **options)).estimate
     assert len(ideal.unknowns) < len(found.unknowns)
-
-
-def test_models_are_compared_by_output_error_only(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
-    log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave)))
-    with pytest.raises(UsageError, match="expected --method oem, got pem"):
-        make_study(bench, [log], StudyOptions(EstimationProblem(), "pem", EVERY))

@@ -102,13 +102,6 @@ def test_where_no_model_fits_it_grows_with_systematic_errors(bench: Bench) -> No
     assert e.values[e.labels.index("velocity_gain")] == pytest.approx(0.003, rel=0.2)
 
 
-def test_where_a_model_fits_without_systematic_errors_it_is_the_answer(bench: Bench) -> None:
-    data = record(bench, bench.plant("hysteresis"), currents_of(bench, "chirp"), seed=3)
-    found = grow_with_errors(bench, bench.plant("exact"), [data], EstimationProblem(), starts=1, seed=0)
-    assert found.added == ("hysteresis",)
-    assert not found.choice.best.estimate.asked.along
-
-
 def test_a_study_has_the_path(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
     log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave, options="plant=hysteresis")))
     found = make_study(bench, [log], StudyOptions(EstimationProblem(), starts=2, grow=True))

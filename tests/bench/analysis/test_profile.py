@@ -12,7 +12,6 @@ from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import NORMAL_95, Estimate, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.errors import UsageError
 
 from tests.bench.measurements import currents_of, fit, record  # isort: skip
 
@@ -121,8 +120,3 @@ def test_a_profile_that_comes_upon_a_lower_minimum_says_that_the_estimate_was_a_
     assert bad.minimum == pytest.approx(found.values[0], rel=1e-5)
     assert bad.interval == pytest.approx(good.interval, rel=1e-6)
     assert bad.rise.min() > -1e-3
-
-
-def test_a_label_that_is_none_is_refused(told: Estimate) -> None:
-    with pytest.raises(UsageError, match="no profile of 'mass': expected one of k_m, k_1, T_c, f_v"):
-        profile(told, "mass")

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from emb_bench.analysis.recommendation import HELPS, PRECISE, advise, candidates
+from emb_bench.analysis.recommendation import HELPS, PRECISE, advise
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.excitation.reference import parse_excitation, run_excitation
@@ -70,16 +70,6 @@ def test_what_is_promised_of_a_disturbed_brake_allows_for_the_disturbance(bench:
     assert min(one.after["f_v"] for one in still) < 0.5 * first.after["f_v"]
 
 
-def test_what_was_known_of_all_runs_beforehand_counts_once(bench: Bench) -> None:
-    plant = bench.plant("exact")
-    asked = EstimationProblem(("k_m", "f_v"), systematic={"velocity_gain": 0.02, "current_offset": 0.05})
-    short = record(bench, plant, currents_of(bench, "step")[:30])
-    e = fit(bench, plant, [short], asked)
-    first = advise(e)[0]
-    both = fit(bench, plant, [short, record(bench, plant, currents_of(bench, first.excitation), seed=1)], asked)
-    assert list(first.after.values()) == pytest.approx(both.cramer_rao(), rel=0.1)
-
-
 def test_information_adds_up(bench: Bench) -> None:
     """The other implementation of the Fisher information, at the estimate."""
     plant, params = bench.plant("exact"), ("k_m", "k_1")
@@ -123,10 +113,3 @@ def test_what_each_run_has_anew_costs_information_in_the_next_one_too(bench: Ben
     for one in common:
         assert list(one.after) == list(PARAMETER_NAMES)
         assert one.after["k_1"] > plain[one.excitation]
-
-
-def test_candidates_are_those_that_the_bench_allows(bench: Bench) -> None:
-    found = candidates(bench)
-    assert len(found) == 14
-    for name, text in found:
-        assert parse_excitation(text, bench).name == name

@@ -233,7 +233,7 @@ def test_information_alone_estimates_nothing(
     asked = ("--method", "none", "--params", "k_m,f_v", "--model", "exact", "--jobs", "1")
     found = campaign(monkeypatch, folder / "tuesday", path, *asked)
     assert found.code == 0
-    assert found.document["misfit"] == 2
+    assert len(found.document["misfit"]) == 2
     row, its = (
         found.rows["c.mcap"],
         replay.document("fim", folder / "tuesday/c.mcap", "--theta", "nominal", "--params", "k_m,f_v"),
@@ -242,7 +242,7 @@ def test_information_alone_estimates_nothing(
     assert {name: row[f"{name}_cramer_rao"] for name in ("k_m", "f_v")} == its["physical"]["cramer_rao"]
     assert (row["fits"], row["f_v_estimate"], row["f_v_true"]) == (None, None, 3e-5)
     assert "T_c_cramer_rao" not in row
-    assert not any("estimate" in p for p in found.document["parameters"].values())
+    assert not any(p["estimate"] for p in found.document["parameters"].values())
 
 
 def test_a_campaign_of_broken_logs_writes_why_and_exits_with_6(

@@ -19,9 +19,8 @@ from pyarrow import parquet
 
 from emb_bench.analysis.constancy import DIFFERENT, constancy
 from emb_bench.batch.find import find
-from emb_bench.batch.row import RELATIVE, Options, Parameter, Row, Source, failed, unit_of, write_rows
+from emb_bench.batch.row import Options, Parameter, Row, Source, failed, write_rows
 from emb_bench.batch.summary import mark_copies, summarise, text
-from emb_bench.brake.parameters import PARAMETERS, SI
 from emb_bench.output import replacing
 from emb_bench.parallel.progress import Progress, StatusLine
 from emb_runtime.errors import UsageError
@@ -72,11 +71,6 @@ def test_runs_of_one_number_are_called_different_as_seldom_as_they_may() -> None
     assert np.std([one.mean for one in drawn]) == pytest.approx(drawn[0].deviation, rel=0.06)
 
 
-def test_one_run_is_constant() -> None:
-    found = constancy([3.0], [0.5])
-    assert (found.mean, found.deviation, found.chi2, found.p_value, found.scatter) == (3.0, 0.5, 0.0, 1.0, 0.0)
-
-
 def test_logs_are_found_sorted_and_once_whatever_leads_to_them(tmp_path: Path) -> None:
     for name in ("b/2.mcap", "b/1.MCAP", "a/3.mcap", "a/notes.txt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -90,11 +84,6 @@ def test_logs_are_found_sorted_and_once_whatever_leads_to_them(tmp_path: Path) -
     assert [log.campaign for log in found] == ["a", "b", "b"]
     assert {log.root for log in found} == {str(tmp_path)}
     assert [Path(log.path).is_file() for log in found] == [True] * 3
-
-
-def test_a_log_that_is_named_is_taken_whatever_its_name(tmp_path: Path) -> None:
-    (tmp_path / "run.bin").touch()
-    assert [(log.root, log.log) for log in find([tmp_path / "run.bin"])] == [(str(tmp_path), "run.bin")]
 
 
 def test_a_name_that_is_no_text_can_still_be_written(tmp_path: Path) -> None:
@@ -239,12 +228,6 @@ def test_the_help_needs_neither_pyarrow_nor_ray() -> None:
     code = "import sys, emb_bench.cli.campaign; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert {"pyarrow", "ray", "scipy", "numba"}.isdisjoint(done.stdout.split())
-
-
-def test_every_unknown_has_units_for_its_columns() -> None:
-    assert sorted(SI) == sorted(PARAMETERS)
-    assert (unit_of("k_m", "SI"), unit_of("k_m", RELATIVE)) == ("N·m/A", "1")
-    assert (unit_of("contact", "SI"), unit_of("contact", RELATIVE)) == ("rad", "rad")
 
 
 def test_a_run_counts_once_and_the_whole_log_or_the_one_that_holds_most_of_it_is_the_one() -> None:

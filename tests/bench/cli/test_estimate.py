@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emb_bench.cli.replay import main
-from emb_bench.estimate.records import METHODS
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_bench.report.text import WIDTH
@@ -87,11 +85,6 @@ def test_what_is_not_identified_has_no_interval_and_is_named_with_its_combinatio
     (flat,) = got["directions"]
     assert flat["deviation"] is None
     assert [flat["shares"][name] for name in (*PARAMETER_NAMES, "J")] == pytest.approx([5**-0.5] * 5, rel=1e-3)
-
-
-def test_an_unknown_beside_the_parameters_is_concluded_with_them(path: Path, replay: Replay) -> None:
-    got = replay.document(path, "--params", "f_v,T_c", "--nuisance", "J", "--starts", "1")
-    assert [(c["label"], c["unit"]) for c in got["conclusions"]][2] == ("J", "kg·m²")
 
 
 def test_repeatability_is_the_scatter_of_further_runs_and_less_than_the_total(path: Path, replay: Replay) -> None:
@@ -174,45 +167,12 @@ def three(tmp_path: Path, path: Path, simulate: Simulate) -> list[Path]:
     return [path, *others]
 
 
-@pytest.mark.parametrize("method", ["oem", "pem", "rls"])
-def test_every_method_answers_and_says_its_name(path: Path, method: str, replay: Replay) -> None:
-    got = replay.document(path, "--method", method, "--starts", "1", "--params", "k_m,f_v")
-    assert (got["method_name"], got["method"]) == (method, METHODS[method])
-    assert abs(got["parameters"]["k_m"]["value"] / 0.0217 - 1.0) < 0.1
-
-
-def test_an_unknown_method_is_refused(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as left:
-        main(["estimate", str(path), "--method", "guess"])
-    assert left.value.code == 2
-    assert "invalid choice: 'guess'" in capsys.readouterr().err
-
-
 def test_bounds_are_kept_and_a_value_at_one_is_named(path: Path, replay: Replay) -> None:
     got = replay.document(path, "--bounds", "f_v=1e-5:2e-5", "--starts", "1")
     assert got["bounds"] == {"f_v": [1e-5, 2e-5]}
     assert got["parameters"]["f_v"]["at_bound"]
     assert got["parameters"]["f_v"]["value"] <= 2e-5
     assert not got["parameters"]["f_v"]["identified"]
-
-
-def test_of_several_logs_each_is_predicted_from_the_others(three: list[Path], replay: Replay) -> None:
-    got = replay.document(*three, "--starts", "1")
-    assert [one["name"] for one in got["left_out"]] == [path.name for path in three]
-    assert got["predicts"]
-    assert replay.document(three[0])["left_out"] == []
-
-
-def test_a_log_that_is_held_out_is_not_estimated_from_and_decides_on_the_model(
-    three: list[Path], log: Log, replay: Replay
-) -> None:
-    alone = replay.document(three[0])
-    held = replay.document(three[0], "--hold-out", three[1], "--hold-out", three[2])
-    assert held["parameters"] == alone["parameters"]
-    assert [one["fits"] for one in held["held_out"]] == [True, True]
-    other = log("worn.mcap", "plant=exact,f_v=4e-5,T_c=1.2e-2")
-    wrong = replay.document(three[0], "--hold-out", other)
-    assert (wrong["model_fits"], wrong["predicts"], wrong["held_out"][0]["fits"]) == (True, False, False)
 
 
 def test_strict_fails_where_the_model_does_not_fit_or_predict_or_something_is_not_identified(
@@ -222,18 +182,6 @@ def test_strict_fails_where_the_model_does_not_fit_or_predict_or_something_is_no
     worn = log("worn.mcap", "plant=exact,f_v=4e-5,T_c=1.2e-2")
     for arguments in (("--model", "lag"), ("--nuisance", "J"), ("--hold-out", worn)):
         replay.text(path, "--strict", "--starts", "1", *arguments, code=1)
-
-
-def test_the_drift_since_an_earlier_estimate_is_said_of_each_parameter(
-    tmp_path: Path, path: Path, log: Log, replay: Replay
-) -> None:
-    last = tmp_path / "last.json"
-    last.write_text(replay.text(path, "--json"))
-    worn = log("worn.mcap", "plant=exact,f_v=3.3e-5,T_c=1.2e-2,seed=9")
-    got = {drift["name"]: drift for drift in replay.document(worn, "--last", last)["drifts"]}
-    assert [drift["drifted"] for drift in got.values()] == [False, False, False, True]
-    assert got["f_v"]["relative_change"] == pytest.approx(0.1, abs=0.01)
-    assert replay.document(worn)["drifts"] == []
 
 
 def test_profiles_and_the_bootstrap_come_when_asked_for(three: list[Path], replay: Replay) -> None:
@@ -249,20 +197,6 @@ def test_profiles_and_the_bootstrap_come_when_asked_for(three: list[Path], repla
         assert conclusion["interval"] == profile["interval_95"]
     plain = replay.document(three[0], "--starts", "1")
     assert (plain["profiles"], plain["bootstrap"]) == ([], None)
-
-
-def test_a_record_that_tells_little_says_which_run_would_tell_it(
-    tmp_path: Path, simulate: Simulate, replay: Replay
-) -> None:
-    def still(_angle: float, _velocity: float, _step: float) -> float:
-        return 0.2
-
-    path = write_log(tmp_path / "still.mcap", simulate(still, options="plant=exact"))
-    got = replay.document(path, "--starts", "1")
-    assert not got["identified"]
-    first = got["advice"][0]
-    assert all(value < 0.01 for value in first["after"].values())
-    assert {found["run"] for found in got["conclusions"]} == {first["excitation"]}
 
 
 def test_the_answer_is_short_unless_it_is_asked_for_more(path: Path, replay: Replay) -> None:

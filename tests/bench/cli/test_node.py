@@ -83,12 +83,6 @@ def test_a_late_node_skips_and_its_stamps_tell_the_true_time(bench: Bench, layou
     assert node.periods == 20
 
 
-def test_being_a_little_late_skips_nothing_and_does_not_move_the_grid(bench: Bench, layout: Layout) -> None:
-    bus, _, skipped = play(bench, layout, dict.fromkeys(range(1, 20, 2), MS // 2))
-    assert skipped == 0
-    assert node_times_ms(bus, layout) == list(range(1, 21))
-
-
 def test_a_babbling_commander_does_not_hold_the_node_up(bench: Bench, layout: Layout) -> None:
     class Babble(QuietBus):
         def receive(self, deadline_ns: int) -> Frame | None:
@@ -151,8 +145,3 @@ def test_what_a_user_can_get_wrong_is_one_line(
 def test_a_node_on_a_bus_of_python_can_ends_after_its_duration(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--iface", "virtual:node", "--duration", "0.2", "--no-rt", "--json"]) == 0
     assert '"obeyed": 0' in capsys.readouterr().out
-
-
-def test_the_node_says_which_plant_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--iface", "virtual:plant", "--plant", "exact", "--duration", "0.05", "--no-rt"]) == 0
-    assert "plant exact, J = 4.624e-06" in capsys.readouterr().err

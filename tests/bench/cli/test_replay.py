@@ -315,14 +315,6 @@ def test_info_says_when_a_log_is_cut(path: Path, replay: Replay) -> None:
     assert "NOT complete" in cut
 
 
-def test_info_of_a_run_that_never_became_active_is_still_told(log: Log, replay: Replay) -> None:
-    path = log("run.mcap", stop_requested=lambda: True)
-    got = replay.document("info", path)
-    assert got["cycles"]["active"] == 0
-    assert "largest" not in got
-    assert "INTERRUPTED" in replay.text("info", path)
-
-
 def test_a_wrong_argument_is_one_line_that_names_it(path: Path, replay: Replay) -> None:
     fim = ("fim", path)
     for arguments, name in {
@@ -364,14 +356,6 @@ def test_a_log_of_a_plant_that_the_bench_does_not_have_is_refused(
     assert err.removesuffix("\n").isprintable()
 
 
-def test_true_parameters_that_no_brake_has_are_refused(
-    tmp_path: Path, run: SimRun, bench: Bench, replay: Replay
-) -> None:
-    truth = {name: str(value) for name, value in bench.brake._replace(f_v=1e300)._asdict().items()}
-    path = write_log(tmp_path / "run.mcap", run, metadata={"emb.run": {}, "emb.truth": truth})
-    assert "--theta true: f_v: expected a number from" in replay.refused("fim", path, "--theta", "true")
-
-
 def test_an_unknown_that_the_model_does_not_have_is_said_to_be_missing(path: Path, replay: Replay) -> None:
     asked = ("fim", path, "--theta", "true", "--nuisance", "cubic")
     (warning,) = (w for w in replay.document(*asked, "--model", "euler")["warnings"] if "cubic" in w)
@@ -379,13 +363,6 @@ def test_an_unknown_that_the_model_does_not_have_is_said_to_be_missing(path: Pat
     assert not any("cubic" in w for w in replay.document(*asked, "--model", "cubic")["warnings"] if "is zero" in w)
     (note,) = replay.text(*asked, "--model", "all").partition("NOTE: cubic ")[2].split("log  ")[:1]
     assert all(f" {name}" in note for name in ("euler,", "exact,", "stribeck,"))
-
-
-def test_side_by_side_too_it_is_said_first_if_no_model_fits(path: Path, tmp_path: Path, replay: Replay) -> None:
-    theta = tmp_path / "theta.toml"
-    theta.write_text("k_1 = 40.0\n")
-    assert replay.text("fim", path, "--model", "all", "--theta", theta).startswith("WARNING")
-    assert "WARNING" not in replay.text("fim", path, "--model", "all", "--theta", "true")
 
 
 def test_the_information_is_that_at_the_controllers_estimate_where_the_log_has_one(
@@ -398,11 +375,6 @@ def test_the_information_is_that_at_the_controllers_estimate_where_the_log_has_o
     assert found["theta"] == {"name": "log", **run.bench.brake._replace(**last)._asdict()}
     assert found["fit_sigmas"]["fits"]
     assert not replay.document("fim", path, "--theta", "nominal")["fit_sigmas"]["fits"]
-
-
-def test_the_true_parameters_are_not_made_up(tmp_path: Path, run: SimRun, replay: Replay) -> None:
-    path = write_log(tmp_path / "run.mcap", run, metadata={"emb.run": {}})
-    assert "does not know the brake's true parameters" in replay.refused("fim", path, "--theta", "true")
 
 
 def test_the_help_of_a_command_has_its_own_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
