@@ -24,7 +24,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from emb_bench.brake.quantities import renamed
-from emb_bench.information.identifiability import TOUCHED, Spectrum, combination, schur_complement, unit_vector
+from emb_bench.information.identifiability import TOUCHED, Spectrum, schur_complement, unit_vector
 from emb_bench.information.symmetric import (
     LOG_DET,
     LOG_LAMBDA_MIN,
@@ -64,12 +64,6 @@ class Criteria:
         """Criteria by the names that a machine's unknowns are shown by."""
         flat = tuple(renamed(direction, machine) for direction in self.flat)
         return replace(self, weakest=renamed(self.weakest, machine), flat=flat)
-
-    def verdict(self) -> str:
-        """One line for a person."""
-        if self.singular:
-            return f"singular: no information on {'; nor '.join(map(combination, self.flat))}"
-        return f"not singular; least is known of {combination(self.weakest)}"
 
 
 def criteria(matrix: Any, params: Sequence[str], interest: Sequence[str] | None = None) -> Criteria:

@@ -171,15 +171,6 @@ class Finding:
         """Returns True if the data identify it."""
         return not self.why_not
 
-    def text(self) -> str:
-        """One line for a person."""
-        bound = f"{self.deviation:10.4g} {self.unit}" if self.unit else f"{100.0 * self.deviation:10.4g} %"
-        words = ["identified" if self.identified else f"not identified: {self.why_not}"]
-        if self.traded_with:
-            traded = ", ".join(f"{name} ({value:+.4f})" for name, value in self.traded_with.items())
-            words.append(f"traded off with {traded.replace('(', '(correlation ', 1)}")
-        return f"{self.name:17} {bound:18} {'; '.join([*words, self.border] if self.border else words)}"
-
 
 @dataclass(frozen=True)
 class Direction:
@@ -187,12 +178,6 @@ class Direction:
 
     shares: Mapping[str, float]  # Unit vector, in relative parameters and in the units of the others
     deviation: float  # Least standard deviation along it; inf if it leaves no trace at all
-
-    def text(self) -> str:
-        """One line for a person."""
-        if math.isinf(self.deviation):
-            return f"flat: {combination(self.shares)} leaves no trace in the data"
-        return f"nearly flat: {combination(self.shares)} is known to {self.deviation:.3g} times its size only"
 
 
 @dataclass(frozen=True)
@@ -221,12 +206,6 @@ class Identifiability:
             replace(direction, shares=renamed(direction.shares, machine)) for direction in self.directions
         )
         return Identifiability(tuple(findings), directions, tuple(renamed(s, machine) for s in self.left_to_prior))
-
-    def text(self) -> str:
-        """A line for each parameter, then one for each direction that is not identified, or by the prior alone."""
-        lines = [finding.text() for finding in self.findings] + [direction.text() for direction in self.directions]
-        lines += [f"from the prior alone: {combination(shares)}" for shares in self.left_to_prior]
-        return "\n".join(lines)
 
 
 def judge(

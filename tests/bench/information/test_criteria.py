@@ -24,7 +24,6 @@ def test_criteria_worked_by_hand() -> None:
     assert (found.trace_inverse, found.lambda_min, found.condition) == pytest.approx((1.25, 1.0, 4.0), rel=1e-15)
     assert not found.singular
     assert found.weakest == {"k_m": 0.0, "f_v": 1.0}
-    assert found.verdict() == "not singular; least is known of +1 f_v"
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4))
@@ -126,7 +125,6 @@ def test_a_singular_matrix_of_any_rank_has_the_worst_values_and_a_verdict_and_no
     assert (np.abs(correlation) <= 1.0).all()
     verdict = judge(s @ s.T, names, np.zeros((9, 9)) if with_prior else None)
     assert not verdict.identified
-    assert "nan" not in verdict.text().lower()
     assert [f.why_not for f in verdict.findings[:dead]] == ["the data do not depend on it"] * dead
     assert all(math.isinf(f.deviation) for f in verdict.findings[:dead])
 
@@ -157,7 +155,7 @@ def test_what_counts_as_told_depends_on_the_unit() -> None:
     assert [f.identified for f in verdict.findings] == [False, False, True]
     assert verdict.findings[0].why_not == "its bound is no smaller than its value"
     assert verdict.findings[1].why_not == "its bound is no smaller than a gross error"
-    assert [f.text().split()[1:3] for f in verdict.findings] == [["200", "%"], ["2", "samples"], ["2", "rad/s"]]
+    assert [(f.deviation, f.unit) for f in verdict.findings] == [(2.0, ""), (2.0, "samples"), (2.0, "rad/s")]
     assert {tuple(d.shares.values()) for d in verdict.directions} == {(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)}
     assert [d.deviation for d in verdict.directions] == [2.0, 2.0]
 
@@ -192,7 +190,6 @@ def test_what_only_the_prior_tells_is_said_to_come_from_it() -> None:
     prior = np.diag([12.0, 12.0, 12.0, 12.0, 0.0])
     (shares,) = judge(s.T @ s + prior, FIVE, prior).left_to_prior
     np.testing.assert_allclose(list(shares.values()), np.full(5, 5**-0.5), rtol=1e-6)
-    assert "from the prior alone: +0.447 k_m +0.447 k_1" in judge(s.T @ s + prior, FIVE, prior).text()
     assert judge(s.T @ s + prior, FIVE).left_to_prior == ()
 
 
