@@ -43,11 +43,11 @@ class Samples(NamedTuple):
     velocity: Floats  # [rad/s]
     late: Floats  # Lateness after the grid, by the node's own stamps [s]
     applied: Floats  # Current that acted in the period before the sample [A]
+    sent: Floats  # Current of the command for the sample, as a mapped drive's bus carried it [A]; NaN if none was sent
+    charge: Floats  # Integral of the current up to the sample, by the node's report [A·s]; NaN where none came
     obeyed: NDArray[np.int8]
     """Counter of the command that acted in that period, by the node's report; ``UNKNOWN`` where that is missing."""
     answer: NDArray[np.int8]  # Counter of the command that was sent for the sample; ``UNKNOWN`` where none was
-    sent: Floats  # Current of that command, as the bus of a mapped drive carried it [A]; NaN where none was sent
-    charge: Floats  # Integral of the current up to the sample, by the node's report [A·s]; NaN where none came
 
     @property
     def received(self) -> Booleans:
@@ -55,7 +55,7 @@ class Samples(NamedTuple):
         return np.isfinite(self.angle)
 
 
-LOST = Samples(math.nan, math.nan, 0.0, math.nan, UNKNOWN, UNKNOWN, math.nan, math.nan)  # type: ignore[arg-type]
+LOST = Samples(math.nan, math.nan, 0.0, math.nan, math.nan, math.nan, UNKNOWN, UNKNOWN)  # type: ignore[arg-type]
 """Values of a sample that was lost."""
 
 
@@ -79,13 +79,13 @@ def samples_on_grid(log: RunLog, bench: Bench, planned: int) -> Samples:
     if not len(step) or step[-1] < 1:
         raise LogError(f"{log.path}: not one whole period of the experiment is left")
     last = min(int(step[-1]), planned)
-    chosen = step <= last
-    grid: list[Any] = []
-    for lost in LOST:
-        column = np.full(last + 1, lost, np.int8 if lost == UNKNOWN else np.float64)
+    chosen = slice(None) if last == step[-1] else step <= last
+    floats, counters = np.empty((6, last + 1)), np.empty((2, last + 1), np.int8)
+    grid: list[Any] = [*floats, *counters]
+    for column, lost in zip(grid, LOST, strict=True):
+        column[:] = lost
         values = np.frombuffer(buffers.pop(0), column.dtype)
         column[step[chosen]] = values[chosen]  # of two samples of one step the later one counts
-        grid.append(column)
     return Samples(*grid)
 
 
@@ -126,10 +126,10 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[tuple[In
             cycles["velocity"],
             (since_ns - steps * period_ns) * 1e-9,
             cycles["applied_current"],
-            _counters(obeyed[chosen]),
-            _counters(np.where(answered, cycles["command_counter"], UNKNOWN)),
             np.where(answered, quantised(cycles["sent_current"], log.drive), np.nan),
             charge[chosen],
+            _counters(obeyed[chosen]),
+            _counters(np.where(answered, cycles["command_counter"], UNKNOWN)),
         )
         yield steps[on_time], Samples(*(column[on_time] for column in samples))
     if not active:

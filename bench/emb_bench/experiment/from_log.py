@@ -61,7 +61,7 @@ def read_experiment(log: RunLog, bench: Bench | None = None, name: str = "") -> 
         velocity=velocity,
         slack=slack,
         from_origin=velocity == 0.0 and abs(angle) <= REST_SIGMAS * slack,
-        late=samples.late[1:],
+        late=samples.late[1:].copy(),  # a view would keep all columns
         assumed=None if reported.all() else np.where(reported, np.nan, currents),
         first=(float(samples.angle[0]), float(samples.velocity[0])),
         planned=planned,
@@ -124,10 +124,13 @@ def _acted(log: RunLog, bench: Bench, samples: Samples, by_charge: Floats, delay
 
     By the report of the sample at its end, else by the charge, else the command, else the node's own stop.
     """
-    commanded, applied = _commanded(log, samples, delay), samples.applied[1:]
-    told = np.where(np.abs(commanded - applied) < within, commanded, applied)
-    assumed = np.where(np.isnan(by_charge[1:]), commanded, by_charge[1:])
-    currents: Floats = np.where(samples.received[1:], told, assumed)
+    commanded, currents = _commanded(log, samples, delay), samples.applied[1:].copy()
+    if within > 0.0:
+        near = np.abs(commanded - currents) < within
+        currents[near] = commanded[near]
+    lost = np.flatnonzero(~samples.received[1:])
+    charged = by_charge[lost + 1]
+    currents[lost] = np.where(np.isnan(charged), commanded[lost], charged)
     unknown = np.flatnonzero(np.isnan(currents))
     if len(unknown):
         every = samples.velocity

@@ -55,9 +55,9 @@ def test_the_samples_are_those_that_the_run_took_from_its_frames(
         for row in zip(*(column.tolist() for column in (step, *samples)), strict=True)
     ]
     assert rows
-    assert UNKNOWN not in [row[5] for row in rows]
+    assert UNKNOWN not in [row[7] for row in rows]
     t_s = bench.timing.sample_time_ns
-    assert [(*row[1:3], *row[4:6]) for row in rows] == [
+    assert [(*row[1:3], row[4], row[7]) for row in rows] == [
         (s.angle, s.velocity, s.applied_current, s.command_counter) for s in every[begin : begin + len(rows)]
     ]
     assert [row[3] for row in rows] == [
