@@ -105,7 +105,7 @@ def the_first_fault_is_forgotten(patch: Patch) -> None:
 
 
 def the_slew_is_not_limited(patch: Patch) -> None:
-    patch.setattr("emb_runtime.safety.guard.follows_from", lambda *_: 0.0)
+    patch.setattr("emb_runtime.safety.guard.slew_reference", lambda *_: 0.0)
 
 
 def an_old_sample_is_good_enough(patch: Patch) -> None:
