@@ -233,7 +233,7 @@ def test_the_optimum_of_a_plant_is_that_of_its_mechanics() -> None:
 def test_the_shipped_actor_is_on_its_own_ranges_inside_the_limits_at_home_and_beats_pushing() -> None:
     subject = open_subject("actor", None)
     assert (subject.ranges, subject.parameters, subject.shield) == ("pm50", PARAMETER_NAMES, None)
-    asked = Settings(MEASURES["D"], PARAMETER_NAMES, "pm50", ("exact",), 12, 0, 0)
+    asked = Settings(MEASURES["D"], PARAMETER_NAMES, "pm50", ("exact",), 12, 0, 0, PHYSICAL)
     (plant,) = evaluate(BENCH, asked, [subject], quiet)
     rows = {row.name: row for row in plant.rows}
     actor = rows["actor"]
@@ -264,7 +264,7 @@ def test_table_and_document_say_the_same(finished: Path, tmp_path: Path, capsys:
 
 def test_the_verdict_and_the_interval_over_policies_are_those_of_the_numbers() -> None:
     """Pushing with +6 A is the best reference in so short an experiment, and one of those that are played."""
-    asked = Settings(MEASURES["D"], PARAMETER_NAMES, "pm50", ("exact",), 5, 0, 0)
+    asked = Settings(MEASURES["D"], PARAMETER_NAMES, "pm50", ("exact",), 5, 0, 0, PHYSICAL)
     for current, how in ((6.0, "not significantly different from"), (0.0, "behind"), (-6.0, "behind")):
         subjects = [Subject("it", SHORT, constant(current)), Subject("twin", SHORT, constant(3.0))]
         (plant,) = evaluate(SHORT, asked, subjects, quiet)
@@ -282,7 +282,7 @@ def test_the_verdict_and_the_interval_over_policies_are_those_of_the_numbers() -
 
 
 def test_the_share_of_the_optimum_is_over_the_draws_that_have_one(searched: list[float]) -> None:
-    asked = Settings(MEASURES["weighted"], ("f_v",), "viscous", ("late", "exact"), 4, 0, 2)
+    asked = Settings(MEASURES["weighted"], ("f_v",), "viscous", ("late", "exact"), 4, 0, 2, Conditions())
     found = evaluate(BENCH, asked, [open_subject("actor", None)], quiet)
     assert len(searched) == 3  # the one in the middle and two draws, once for both plants
     for plant in found:
@@ -298,22 +298,22 @@ def test_a_policy_is_evaluated_behind_the_shield_that_it_was_made_behind_unless_
     arguments = ("viscous-exact-quadratic", "--criterion", "weighted", "--json")
     assert run(*arguments) == 0
     said = json.loads(capsys.readouterr().out)
-    assert (said["ranges"], said["shield"]) == ("viscous", "viscous")
+    assert (said["ranges"], said["conditions"]["shield_ranges"]) == ("viscous", "viscous")
     assert {row["left"] for row in said["plants"]["euler"]["rows"]} == {0}
     assert run(*arguments, "--shield", "pm50") == 2  # which does not cover the brakes
     assert run("actor", "viscous-exact-quadratic", "--ranges", "viscous", "--parameters", "f_v") == 2
 
 
-def test_what_is_randomised_changes_each_experiment_and_is_told(
+def test_delays_and_losses_change_each_experiment_and_are_told(
     finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    own = ("--randomise", "command_delay=0,2", "--randomise", "frame_loss=0,0.1", "--json")
+    own = ("--command-delay", "0", "2", "--frame-loss", "0", "0.1", "--json")
     documents = []
     for options in (("--json",), own):
         assert run(finished, *options) == 0
         documents.append(json.loads(capsys.readouterr().out))
     plain, random = documents
-    assert (plain["randomised"], random["randomised"]) == ({}, {"command_delay": [0, 2], "frame_loss": [0.0, 0.1]})
+    assert (plain["conditions"]["frame_loss"], random["conditions"]["frame_loss"]) == ([0.0, 0.0], [0.0, 0.1])
     values = [d["plants"]["euler"]["rows"][0]["values"] for d in documents]
     assert values[0] != values[1]
 
@@ -334,8 +334,7 @@ def test_what_cannot_be_evaluated_is_one_line_and_exit_code_2(
         ["actor", "--optimum", "-1"],
         ["actor", "--seed", "1000000"],
         ["actor", "--out", str(finished)],
-        ["actor", "--randomise", "wind=0,1"],
-        ["actor", "--randomise", "current_lag=0,0.002"],  # the thesis's brake knows none
+        ["actor", "--command-delay", "0", "9"],
         [str(finished), "--bench", "any.toml"],
     ):
         assert refused(lambda: main(["evaluate", *arguments]), capsys), arguments  # noqa: B023  # called at once

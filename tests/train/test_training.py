@@ -22,7 +22,7 @@ from emb_runtime.config.bench import BrakeParameters, load_bench
 from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_USAGE, UsageError
 from emb_train import names
 from emb_train.cli import main, parser
-from emb_train.envs.conditions import Conditions, Randomisation
+from emb_train.envs.conditions import Conditions
 from emb_train.presets import preset_summaries
 from emb_train.rewards import Transition, information_increment
 from emb_train.structured.evolution import Progress
@@ -131,7 +131,7 @@ def test_a_reference_is_searched_for_and_a_ctrl_c_keeps_what_was_found(
     assert main([*command, "--form", "blind", "--begin=1,-1,0,0.3,0.6", *options, "--out", str(blind)]) == 0
     assert main([*command, "--start", str(blind / "reference.json"), *options, "--out", str(found)]) == 0
     assert not stored(str(blind / "reference.json")).array()[:, 1:].any()
-    assert stored(str(found / "reference.json")).asked().conditions.randomised.command_delay == (1, 2)
+    assert stored(str(found / "reference.json")).asked().conditions.command_delay == (1, 2)
     done = Progress._asdict
 
     def pressed(step: Progress) -> dict[str, Any]:
@@ -216,7 +216,7 @@ def test_a_command_that_cannot_be_done_is_refused_in_one_line_and_makes_nothing(
         [*viscous, "--bench", "none.toml"],
         [*viscous, "--bench", "narrow.toml"],
         [*viscous, "--bench", "long.toml"],
-        [*viscous, "--randomise", "wind=0,1"],
+        [*viscous, "--frame-loss", "0.2", "0.1"],
         [*viscous[:3], "short.toml"],
         [*viscous[:3], str(finished)],
         [*viscous[:3], "."],
@@ -271,7 +271,7 @@ def test_a_damaged_folder_is_refused(finished: Path, tmp_path: Path) -> None:
 
 
 def test_every_configuration_survives_json_and_impossible_values_are_refused_by_their_key() -> None:
-    varied = Conditions(randomised=Randomisation(command_delay=(0, 2), encoder_offset=(-0.1, 0.1)))
+    varied = Conditions(command_delay=(0, 2), frame_loss=(0.0, 0.1))
     for name in preset_summaries():
         for training in (load_preset(name), load_preset(name, plant="exact", seed=3, conditions=varied)):
             record = msgspec.json.decode(msgspec.json.encode(training))
@@ -299,8 +299,9 @@ def test_every_configuration_survives_json_and_impossible_values_are_refused_by_
         ("conditions.horizon", 300),
         ("conditions.observes", "nothing"),
         ("conditions.information", "total"),
-        ("conditions.randomised.frame_loss", ["x", 0.0]),
-        ("conditions.randomised.unknown", 1),
+        ("conditions.frame_loss", ["x", 0.0]),
+        ("conditions.command_delay", [2, 1]),
+        ("conditions.unknown", 1),
     ]
     for key, value in cases:
         changed = json.loads(json.dumps(record))

@@ -134,14 +134,7 @@ def _add_reference(p: argparse.ArgumentParser) -> None:
         default="worst case",
         help="for the whole set (worst case), or for what has been learnt (bounded) (default: %(default)s)",
     )
-    p.add_argument(
-        "--command-delay",
-        type=_at_least(0),
-        nargs=2,
-        metavar=("LEAST", "MOST"),
-        default=(0, 0),
-        help="drawn per brake, samples (default: 0 0)",
-    )
+    _add_late(p)
     p.add_argument(
         "--gain",
         type=_gain,
@@ -162,7 +155,8 @@ def _add_ppo(p: argparse.ArgumentParser) -> None:
         help="environment steps in total, rounded up to whole iterations (default: the preset's)",
     )
     p.add_argument("--plant", metavar="NAME", help="plant of the bench that the brakes are (default: the preset's)")
-    _add_randomise(p)
+    _add_late(p)
+    _add_loss(p)
     _add_common(p, "of everything random")
 
 
@@ -190,19 +184,30 @@ def _add_evaluate(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument("--json", action="store_true", help="print JSON, with the values of every draw")
     p.add_argument("--out", type=Path, metavar="DIR", help="also write evaluation.txt and evaluation.json there")
-    _add_randomise(p)
+    _add_late(p)
+    _add_loss(p)
     _add_common(p, "of brakes and noise; never those of a training")
 
 
-def _add_randomise(p: argparse.ArgumentParser) -> None:
+def _add_late(p: argparse.ArgumentParser) -> None:
     p.add_argument(
-        "--randomise",
-        action="append",
-        default=[],
-        metavar="NAME=LEAST,MOST",
-        help="give each experiment its own command_delay or measurement_delay [samples], frame_loss [probability], "
-        "current_lag [s] or encoder_offset [rad], uniform from LEAST to MOST, on top of the plant's; repeatable. The "
-        "shield is widened to cover delay or lag",
+        "--command-delay",
+        type=_at_least(0),
+        nargs=2,
+        metavar=("LEAST", "MOST"),
+        default=(0, 0),
+        help="of each experiment, beside the plant's own; the shield covers it [samples] (default: 0 0)",
+    )
+
+
+def _add_loss(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "--frame-loss",
+        type=float,
+        nargs=2,
+        metavar=("LEAST", "MOST"),
+        default=(0.0, 0.0),
+        help="of each experiment: probability that a sample does not arrive (default: 0 0)",
     )
 
 
@@ -334,7 +339,6 @@ def ppo(arguments: argparse.Namespace) -> int:
     import msgspec
 
     from emb_train.bench_compatibility import unfit
-    from emb_train.envs.conditions import parse_randomisation
     from emb_train.evaluate import grid_outcomes, grid_text
     from emb_train.ppo import Metrics
     from emb_train.training import begin_training, load_preset, load_training, run_training
@@ -342,10 +346,8 @@ def ppo(arguments: argparse.Namespace) -> int:
     bench, folder = load_bench(arguments.bench), arguments.out
     changes = {"total_steps": arguments.steps, "plant": arguments.plant, "seed": arguments.seed}
     training = load_preset(arguments.preset, **{k: v for k, v in changes.items() if v is not None})
-    conditions = training.conditions
-    if arguments.randomise:
-        conditions = msgspec.structs.replace(conditions, randomised=parse_randomisation(arguments.randomise))
-        training = msgspec.structs.replace(training, conditions=conditions)
+    conditions = msgspec.structs.replace(training.conditions, **_varied(arguments))
+    training = msgspec.structs.replace(training, conditions=conditions)
     begin_training(folder, training, bench)
     if conditions.shielded and (said := unfit(bench, bench.range_set(training.ranges))):
         mention(f"emb-train: this actor cannot be exported for this bench: {said}")
@@ -365,6 +367,10 @@ def ppo(arguments: argparse.Namespace) -> int:
         show(grid_text(grid_outcomes(load_training(folder))))
     show(f"{folder}: export it with emb-export {folder}; emb-train evaluate {folder} compares it")
     return EXIT_DONE
+
+
+def _varied(arguments: argparse.Namespace) -> dict[str, Any]:
+    return {name: tuple(getattr(arguments, name)) for name in ("command_delay", "frame_loss")}
 
 
 def evaluate(arguments: argparse.Namespace) -> int:
@@ -398,7 +404,7 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subjec
         EmbError: a policy cannot be opened, or the bench has no such ranges or plant.
     """
     from emb_train.envs.batch import Batch
-    from emb_train.envs.conditions import parse_randomisation
+    from emb_train.envs.conditions import Conditions
     from emb_train.envs.measure import MEASURES
     from emb_train.evaluate import Settings, open_subject
     from emb_train.structured.evolution import TUNING_SEED
@@ -420,16 +426,20 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subjec
         raise UsageError(f"--plant: expected names of plants, each once, got '{arguments.plant}'")
     if arguments.shield is None and any(s.shield != subjects[0].shield for s in subjects):
         raise UsageError("--shield: the policies were made behind different ones: name the ranges that it covers")
+    measure = MEASURES[arguments.criterion]
     settings = Settings(
-        measure=MEASURES[arguments.criterion],
+        measure=measure,
         parameters=tuple(name for name in PARAMETER_NAMES if name in parameters),
         ranges=_one("--ranges", arguments.ranges, [s.ranges for s in subjects]),
         plants=plants,
         draws=arguments.draws,
         seed=arguments.seed,
         optimum=min(arguments.optimum, arguments.draws),
-        shield=arguments.shield or subjects[0].shield,
-        randomised=parse_randomisation(arguments.randomise),
+        conditions=Conditions(
+            information=measure.kind,
+            shield_ranges=arguments.shield or subjects[0].shield,
+            **_varied(arguments),
+        ),
     )
     ranges = bench.range_set(settings.ranges)
     for name in plants:  # what no experiment can be made of is refused before anything is looked for

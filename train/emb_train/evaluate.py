@@ -21,7 +21,7 @@ from emb_runtime.config.plants import EULER
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
-from emb_train.envs.conditions import EVERYTHING, NOTHING_RANDOM, Conditions, Randomisation
+from emb_train.envs.conditions import EVERYTHING, Conditions
 from emb_train.envs.excitations import Excitation, Played, reference_excitation
 from emb_train.envs.measure import Floats, Measure, mean_score
 from emb_train.envs.network import Network
@@ -119,13 +119,7 @@ class Settings:
     draws: int
     seed: int  # Seed of brakes and noise
     optimum: int  # Number of brakes, the first ones, whose optimum is searched for
-    shield: str | None = None  # Set of the bench that the shield covers; None for the one that the bench names
-    randomised: Randomisation = NOTHING_RANDOM  # Properties that are drawn for each experiment beside its brake
-
-    @property
-    def conditions(self) -> Conditions:
-        """Conditions in which all are played."""
-        return Conditions(information=self.measure.kind, shield_ranges=self.shield, randomised=self.randomised)
+    conditions: Conditions  # With the measure's kind of information
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,21 +219,19 @@ def text(settings: Settings, results: Sequence[PlantResult]) -> str:
 
 
 def _scene(a: Settings) -> str:
-    shield = f"shield, which covers '{a.shield}'" if a.shield else "shield"
-    own = ", ".join(f"{name} from {least:g} to {most:g}" for name, (least, most) in _varied(a).items())
-    own = f" Each experiment has its own {own}; the shield is widened to cover delay and lag." if own else ""
+    c = a.conditions
+    shield = f"shield, which covers '{c.shield_ranges}'" if c.shield_ranges else "shield"
+    own = (
+        f" Each experiment has its own delay of commands, {c.command_delay[0]} to {c.command_delay[1]} samples, which "
+        f"the shield covers, and its own probability of a lost sample, {c.frame_loss[0]:g} to {c.frame_loss[1]:g}."
+    )
     return (
         f"{a.measure.label} of {', '.join(a.parameters)}, relative to the true values; {a.draws} brakes drawn from the "
         f"ranges '{a.ranges}' for evaluation alone, seed {a.seed}; the same brakes and noise for all, all behind the "
         f"same {shield}. Brackets are 95 % intervals over the draws. 'left': experiments that left the limits and were "
         "stopped there; 'home': share that ended at the origin; 'end': the worst angle and speed at the end. 'ahead': "
-        f"the first policy's measure less that of the line, paired by draw.{own}"
+        f"the first policy's measure less that of the line, paired by draw.{own if c.varies else ''}"
     )
-
-
-def _varied(a: Settings) -> dict[str, list[float]]:
-    """Least and most of each property that is drawn for each experiment, by name."""
-    return {name: list(pair) for name, pair in msgspec.structs.asdict(a.randomised).items() if any(pair)}
 
 
 def _cells(measure: Measure, plant: PlantResult, row: Row) -> tuple[str, ...]:
@@ -291,8 +283,7 @@ def document(settings: Settings, results: Sequence[PlantResult]) -> dict[str, An
         "unit": UNIT[a.measure.against],
         "parameters": list(a.parameters),
         "ranges": a.ranges,
-        "shield": a.shield,
-        "randomised": _varied(a),
+        "conditions": msgspec.structs.asdict(a.conditions),
         "draws": a.draws,
         "seed": a.seed,
         "plants": {plant.plant: _on_plant(a.measure, plant) for plant in results},
@@ -335,7 +326,7 @@ def grid_outcomes(trained: Trained) -> dict[str, Outcome]:
     draws = grid_draws(ranges, training.parameters[0], training.seed)
 
     def on_grid(excitation: Excitation, times: int = 1) -> Outcome:
-        conditions = msgspec.structs.replace(training.conditions, randomised=NOTHING_RANDOM)
+        conditions = msgspec.structs.replace(training.conditions, command_delay=(0, 0), frame_loss=(0.0, 0.0))
         return play(trained.bench, ranges, training.parameters, excitation, draws * times, training.plant, conditions)
 
     found = {"trained actor": on_grid(Network(DeployedActor(trained.actor, limit)))}

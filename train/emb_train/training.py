@@ -112,7 +112,7 @@ def require_trainable(training: Training, bench: Bench) -> None:
     """Check that a bench is one for a training.
 
     Raises:
-        UsageError: the shield does not cover its brakes, the plant cannot have what is randomised, or an iteration
+        UsageError: the shield does not cover its brakes, the plant has a delay beside the drawn one, or an iteration
             would not see the end of its experiments.
         BenchFileError: the bench lacks the ranges or the plant.
     """

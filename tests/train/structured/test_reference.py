@@ -20,7 +20,7 @@ from emb_runtime.estimator.kalman import MISFIT, follow, make_model, start
 from emb_runtime.estimator.speed_loop import scale_of
 from emb_train.cli import parser
 from emb_train.envs.batch import Batch
-from emb_train.envs.conditions import Conditions, Randomisation
+from emb_train.envs.conditions import Conditions
 from emb_train.envs.play import Draw, fresh_draws, play
 from emb_train.names import reference_names
 from emb_train.structured.evolution import BATCH
@@ -90,7 +90,7 @@ def test_a_trial_is_the_environments_experiment_with_the_runtimes_functions(plan
 def test_a_reference_as_an_excitation_is_the_trial_also_where_samples_are_lost() -> None:
     kept, draws = stored("four-d-exact-quadratic"), fresh_draws(PM50, 9, 4)
     for loss in (0.0, 0.1):
-        conditions = Conditions(information="physical", randomised=Randomisation(frame_loss=(loss, loss)))
+        conditions = Conditions(information="physical", frame_loss=(loss, loss))
         (tuned,) = Trials(BENCH, PM50, PARAMETER_NAMES, draws, "exact", conditions).play(
             kept.scale(BENCH), kept.array()[None]
         )
@@ -126,7 +126,7 @@ def test_ranges_in_which_the_inertia_varies_are_refused() -> None:
 
 def followed(kind: str, delay: int, count: int, plant: str = "exact") -> tuple[list[Floats], Floats]:
     """States of the estimator at some steps [N, STATE] under an excitation, and the true relative parameters [N, 4]."""
-    conditions = Conditions(information="physical", randomised=Randomisation(command_delay=(delay, delay)))
+    conditions = Conditions(information="physical", command_delay=(delay, delay))
     batch = Batch(BENCH, PM50, PARAMETER_NAMES, count, plant, conditions)
     for i, draw in enumerate(fresh_draws(PM50, 11, count)):
         batch.begin(i, np.random.default_rng(draw.seed), draw.brake)
@@ -168,7 +168,7 @@ def test_references_for_delays_beat_a_constant_speed_and_come_home() -> None:
     for name, least in (("four-d-exact-delay-quadratic", 99.5), ("four-e-exact-delay-quadratic", 22.0)):
         kept = stored(name)
         task = kept.asked()
-        assert (kept.plant, task.conditions.randomised.command_delay) == ("exact", (0, 2))
+        assert (kept.plant, task.conditions.command_delay) == ("exact", (0, 2))
         (outcome,) = task.trials(BENCH, task.draws(BENCH, 3, 24)).play(kept.scale(BENCH), kept.array()[None])
         assert task.score(outcome).mean() > least  # constant-speed:turn=0.15 is worth 96.8 (D) without a delay
         assert outcome.home.all()

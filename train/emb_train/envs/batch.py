@@ -7,7 +7,7 @@ Time: a reset gives the measurement y_0. The action that answers y_k is shielded
 or later by the plant's command delay. The Fisher information is that of angle and velocity with the bench's noise: what
 the experiment is worth, whatever the plant's instruments make of it on the way.
 
-A sample may be lost (:class:`emb_train.envs.conditions.Randomisation`). It is then as on the bench: nothing is sent in
+A sample may be lost, see :class:`emb_train.envs.conditions.Conditions`. It is then as on the bench: nothing is sent in
 its period, the node brakes by itself, and the last sample received stays. A current requested then has no effect.
 """
 
@@ -23,21 +23,12 @@ from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats
 from emb_bench.sim.instruments import measure, settle
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
-from emb_runtime.config.plants import DEFAULT_PLANT, EXACT, LONGEST_DELAY, Plant
+from emb_runtime.config.plants import DEFAULT_PLANT, LONGEST_DELAY, Plant
 from emb_runtime.errors import UsageError
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.shield_design import make_law
-from emb_train.envs.closed_loop import advance, make_setup, no_experiments
-from emb_train.envs.conditions import (
-    BENCH_CONDITIONS,
-    EVERYTHING,
-    NOTHING_RANDOM,
-    Bools,
-    Conditions,
-    drawn,
-    instruments_of,
-    longest_loss,
-)
+from emb_train.envs.closed_loop import advance, delayed, make_setup, no_experiments
+from emb_train.envs.conditions import BENCH_CONDITIONS, EVERYTHING, Bools, Conditions, longest_loss
 from emb_train.envs.critic_view import EXTRA, critic_size, describe, make_scale
 
 
@@ -80,7 +71,7 @@ class Batch:
             BenchFileError: the bench has no such plant, or no such set for the shield, or the shield cannot hold the
                 limits there, as under a lag and a delay together.
             UsageError: a parameter is unknown or out of order, a brake of these ranges is not covered by the shield, or
-                the plant cannot have what is randomised.
+                the plant has a delay of its own beside a drawn one.
         """
         if not parameters or tuple(p for p in PARAMETER_NAMES if p in parameters) != tuple(parameters):
             raise UsageError(
@@ -96,13 +87,13 @@ class Batch:
             bench, make_law(bench), self._plant, parameters, conditions.information, conditions.shielded
         )
         require_possible(self._plant, conditions)
-        self.scale = make_scale(bench, ranges, parameters, conditions.randomised)
+        self.scale = make_scale(bench, ranges, parameters, conditions.command_delay[1])
         self._deviations = np.array([bench.noise.angle, bench.noise.velocity])
         self._advance, self._describe = compiled(advance), compiled(describe)
         e = self.experiments = no_experiments(count, len(parameters), self.setup.rules.horizon)
         self.brakes, self.x, self.y, self.m, self.k = e.brakes, e.x, e.y, e.m, e.k
         self.past, self.reasons, self.violated = e.past, e.reasons, e.violated
-        self.critic_size = critic_size(len(parameters)) + (0 if conditions.randomised == NOTHING_RANDOM else EXTRA)
+        self.critic_size = critic_size(len(parameters)) + (EXTRA if conditions.varies else 0)
         self.observation_size = conditions.observation_size(len(parameters))
 
     def begin(self, i: int, rng: np.random.Generator, brake: BrakeParameters | None = None) -> None:
@@ -111,20 +102,20 @@ class Batch:
         Args:
             i: row.
             rng: draws the uncertain parameters first (also if ``brake`` is given), then the noise of all samples, then
-                the jitter of their instants if there is any, then what else is randomised.
+                the jitter of their instants if there is any, then delay and losses if they vary.
             brake: the brake to use instead of a drawn one.
         """
-        e, randomised = self.experiments, self.conditions.randomised
+        e = self.experiments
         parameters = rng.uniform(self._ranges.low, self._ranges.high)
         e.brakes[i] = parameters if brake is None else brake
         e.noise[i] = rng.standard_normal(e.noise.shape[1:]) * self._deviations
         jitter = self._plant.instruments.clock_jitter
         if jitter > 0.0:
             e.late[i] = rng.normal(0.0, jitter, e.late.shape[1])
-        if randomised != NOTHING_RANDOM:
-            e.own[i], e.lost[i] = drawn(randomised, rng, e.lost.shape[1], longest_loss(self.bench))
+        if self.conditions.varies:
+            e.delay[i], e.lost[i] = self.conditions.drawn(rng, e.lost.shape[1], longest_loss(self.bench))
         e.x[i] = 0.0
-        instruments = instruments_of(self._plant.instruments, e.own, i)
+        instruments = delayed(self._plant.instruments, int(e.delay[i]))
         settle(instruments, e.memory[i], 0.0)
         errors = (float(error) for error in (e.late[i, 0], *e.noise[i, 0]))
         e.y[i] = measure(instruments, e.memory[i], self.setup.rules.sample_time, 0.0, 0.0, 0.0, *errors)
@@ -212,31 +203,22 @@ class Batch:
 
 
 def require_possible(plant: Plant, conditions: Conditions) -> None:
-    """Check that a plant can have what is randomised.
+    """Check that a plant can have the delay that is drawn.
 
     Raises:
-        UsageError: its solver knows no lag, a delay is longer than the instruments' memory, or the plant has a delay or
-            lag of its own beside the randomised one, and the shield covers only one of them.
+        UsageError: it is longer than the instruments' memory, or comes on top of a delay of the plant, and the shield
+            covers only one of them.
     """
-    randomised, sides, lag = conditions.randomised, plant.instruments, plant.mechanics.current_lag
-    sums = {
-        "delay": (sides.command_delay + sides.measurement_delay, randomised.delay[1]),
-        "lag": (lag, randomised.current_lag[1]),
-    }
-    for kind, (own, most) in sums.items():
-        if conditions.shielded and own > 0 and most > 0:
-            raise UsageError(
-                f"the plant '{plant.name}' has a {kind} of its own, and the shield covers that or the randomised one, "
-                "not their sum: randomise none, or choose another plant"
-            )
-    if randomised.current_lag[1] > 0.0 and plant.mechanics.solver != EXACT:
-        raise UsageError(f"current_lag: the plant '{plant.name}' knows none; choose one with the solver \"exact\"")
-    for name in ("command_delay", "measurement_delay"):
-        most = getattr(plant.instruments, name) + getattr(randomised, name)[1]
-        if most > LONGEST_DELAY:
-            raise UsageError(
-                f"{name}: with that of the plant '{plant.name}' at most {LONGEST_DELAY} samples, got {most}"
-            )
+    own, drawn = plant.instruments.command_delay + plant.instruments.measurement_delay, conditions.command_delay[1]
+    if conditions.shielded and own > 0 and drawn > 0:
+        raise UsageError(
+            f"the plant '{plant.name}' has a delay of its own, and the shield covers that or the drawn one, not their "
+            "sum: draw none, or choose another plant"
+        )
+    if (most := plant.instruments.command_delay + drawn) > LONGEST_DELAY:
+        raise UsageError(
+            f"command_delay: with that of the plant '{plant.name}' at most {LONGEST_DELAY} samples, got {most}"
+        )
 
 
 def require_covered(bench: Bench, ranges: Ranges, conditions: Conditions = BENCH_CONDITIONS) -> None:

@@ -26,7 +26,7 @@ from emb_runtime.safety.sensor_monitor import MEMORY as MONITOR
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw
-from emb_train.envs.conditions import OWN, Bools, instruments_of, mechanics_of
+from emb_train.envs.conditions import Bools
 
 Integers = NDArray[np.int64]
 
@@ -92,7 +92,7 @@ class Experiments(NamedTuple):
     """
 
     brakes: Floats  # Rows of :class:`BrakeParameters`, shape [N, 6]
-    own: Floats  # Values of each experiment beside those of its plant, columns as in ``OWN``, shape [N, 5]
+    delay: Integers  # Samples that each experiment's commands wait beside its plant's delay, shape [N]
     x: Floats
     """True states, see :mod:`emb_bench.brake.motion`: angle [rad], velocity [rad/s] and two more, shape [N, 4]."""
     s: Floats  # Sensitivities of all four to the relative parameters, shape [N, n, 4]
@@ -116,7 +116,7 @@ def no_experiments(count: int, n: int, steps: int) -> Experiments:
     """N experiments with n parameters that are over: each has to begin before its first step."""
     return Experiments(
         brakes=np.zeros((count, len(BrakeParameters._fields))),
-        own=np.zeros((count, len(OWN))),
+        delay=np.zeros(count, np.int64),
         x=np.zeros((count, STATES)),
         s=np.zeros((count, n, SENSITIVE)),
         m=np.zeros((count, packed_size(n))),
@@ -134,6 +134,17 @@ def no_experiments(count: int, n: int, steps: int) -> Experiments:
     )
 
 
+def delayed(instruments: Instruments, delay: int) -> Instruments:
+    """The plant's instruments with the commands later by some samples; compiled code has no ``_replace``."""
+    return Instruments(
+        instruments.command_delay + delay,
+        instruments.measurement_delay,
+        instruments.encoder_offset,
+        instruments.clock_jitter,
+        instruments.observer_bandwidth,
+    )
+
+
 def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
     """One sample period of all experiments, in place."""
     for i in range(experiments.k.shape[0]):
@@ -142,7 +153,7 @@ def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
 
 def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -> None:
     """One sample period of experiment ``i``, in place; arguments as for :func:`advance`."""
-    brakes, own, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated, monitor = experiments
+    brakes, delay, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated, monitor = experiments
     rules = setup.rules
     p = BrakeParameters(
         float(brakes[i, 0]),
@@ -152,7 +163,7 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
         float(brakes[i, 4]),
         float(brakes[i, 5]),
     )
-    mechanics, instruments = mechanics_of(setup.mechanics, own, i), instruments_of(setup.instruments, own, i)
+    instruments = delayed(setup.instruments, int(delay[i]))
     y1, y2 = float(y[i, 0]), float(y[i, 1])
     u1, u2, u3, u4, u5 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2]), float(past[i, 3]), float(past[i, 4])
     sent, asked = 0.0, math.nan
@@ -170,7 +181,7 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     k[i] += 1
     errors = (float(noise[i, k[i], 0]), float(noise[i, k[i], 1]), float(late[i, k[i]]))
     y1, y2 = pass_period(
-        mechanics, instruments, p, rules.sample_time, current, errors, x[i], setup.chosen, s[i], memory[i]
+        setup.mechanics, instruments, p, rules.sample_time, current, errors, x[i], setup.chosen, s[i], memory[i]
     )
     add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
     past[i, 0], past[i, 1], past[i, 2], past[i, 3], past[i, 4] = sent, u1, u2, u3, u4

@@ -13,11 +13,10 @@ from emb_bench.information.symmetric import Floats, packed_size
 from emb_runtime.config.bench import Bench, BrakeParameters, Ranges
 from emb_runtime.safety.shield import PAST
 from emb_train.envs.closed_loop import Experiments, Integers
-from emb_train.envs.conditions import OWN, Randomisation
 
 Singles = NDArray[np.float32]
 
-EXTRA = len(OWN) + 2 + PAST  # Numbers that are added to the critic's observation where something is randomised
+EXTRA = 3 + PAST  # Numbers that are added to the critic's observation where experiments vary beside the brake
 
 
 class Scale(NamedTuple):
@@ -30,32 +29,27 @@ class Scale(NamedTuple):
     columns: Integers  # Of the n parameters in ``Experiments.brakes``, shape [n]
     middle: Floats  # Of the range of each parameter, shape [n]
     half: Floats  # Its half width, shape [n]; 1 for a parameter that does not vary
-    own_middle: Floats  # Of the range of what each experiment has of its own, shape [5]
-    own_half: Floats  # Its half width, shape [5]; 1 for what does not vary
+    delay: float  # Greatest delay that is drawn, at least 1 [samples]
 
 
-def make_scale(bench: Bench, ranges: Ranges, parameters: Sequence[str], randomised: Randomisation) -> Scale:
-    """The scale for these parameters, drawn from these ranges."""
+def make_scale(bench: Bench, ranges: Ranges, parameters: Sequence[str], delay: int) -> Scale:
+    """The scale for these parameters, drawn from these ranges, and delays of at most so many samples."""
     columns = np.array([BrakeParameters._fields.index(name) for name in parameters], np.int64)
-    own = np.array([getattr(randomised, name) for name in OWN], np.float64)
+    low, high = np.array(ranges.low)[columns], np.array(ranges.high)[columns]
     return Scale(
         bench.timing.horizon,
         bench.limits.angle[1],
         bench.limits.velocity,
         bench.limits.current,
         columns,
-        *_span(np.array(ranges.low)[columns], np.array(ranges.high)[columns]),
-        *_span(own[:, 0], own[:, 1]),
+        0.5 * (low + high),
+        np.where(high > low, 0.5 * (high - low), 1.0),
+        float(max(delay, 1)),
     )
 
 
-def _span(low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Middle and half width of ranges; 1 for the width of one without any."""
-    return 0.5 * (low + high), np.where(high > low, 0.5 * (high - low), 1.0)
-
-
 def critic_size(n: int) -> int:
-    """Length of the critic's observation for n parameters where nothing is randomised beside the brake."""
+    """Length of the critic's observation for n parameters where nothing varies beside the brake."""
     return 3 + n + packed_size(n) + 2 * n
 
 
@@ -63,8 +57,8 @@ def describe(scale: Scale, experiments: Experiments, out: Singles) -> None:
     """Writes the critic's observation (thesis Table 4.2, and the sensitivities), in place.
 
     Without the sensitivities the next increment of the FIM is not a function of the state: it would not be Markov.
-    Where something is randomised beside the brake, what an experiment has of its own follows, whether its sample was
-    received, the current in its motor, and the last sent currents, which may still be on their way.
+    Where experiments vary beside the brake, the delay of the commands follows, whether the sample was received, the
+    current in the motor, and the last sent currents, which may still be on their way.
 
     Args:
         scale: of the numbers.
@@ -78,7 +72,7 @@ def describe(scale: Scale, experiments: Experiments, out: Singles) -> None:
 
 def describe_one(scale: Scale, experiments: Experiments, i: int, out: Singles) -> None:
     """Writes the critic's observation of experiment ``i`` to ``out``; see :func:`describe`."""
-    x, s, m, k, own = experiments.x, experiments.s, experiments.m, experiments.k, experiments.own
+    x, s, m, k = experiments.x, experiments.s, experiments.m, experiments.k
     n = scale.columns.shape[0]
     out[0] = x[i, 0] / scale.angle
     out[1] = x[i, 1] / scale.velocity
@@ -96,13 +90,11 @@ def describe_one(scale: Scale, experiments: Experiments, i: int, out: Singles) -
     at += 2 * n
     if at == out.shape[0]:
         return
-    for j in range(own.shape[1]):
-        out[at + j] = (own[i, j] - scale.own_middle[j]) / scale.own_half[j]
-    at += own.shape[1]
-    out[at] = 0.0 if experiments.lost[i, k[i]] else 1.0
-    out[at + 1] = x[i, 3] / scale.current
+    out[at] = experiments.delay[i] / scale.delay
+    out[at + 1] = 0.0 if experiments.lost[i, k[i]] else 1.0
+    out[at + 2] = x[i, 3] / scale.current
     for j in range(PAST):
-        out[at + 2 + j] = experiments.past[i, j] / scale.current
+        out[at + 3 + j] = experiments.past[i, j] / scale.current
 
 
 def signed_log(value: float) -> float:

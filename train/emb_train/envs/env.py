@@ -5,7 +5,7 @@
   under conditions in which the actor sees everything (5.2), the critic's observation without the sensitivities.
 * ``info["critic"]``: the critic's observation, see :func:`emb_train.envs.critic_view.describe`.
 * ``info["heard"]``: True if this observation is a new one. Where samples get lost
-  (:class:`emb_train.envs.conditions.Randomisation`) it is the last one with the step going on, and the action that
+  (see :class:`emb_train.envs.conditions.Conditions`) it is the last one with the step going on, and the action that
   answers it has no effect.
 * **Reward**: see :mod:`emb_train.rewards`.
 * **End**: leaving the limits and reaching the horizon are both terminal. The experiment is the horizon long by design

@@ -15,7 +15,6 @@ from emb_runtime.learning.assumptions import Assumptions, assumptions_of, make_a
 from emb_runtime.learning.bounded import hear, lose, start
 from emb_runtime.learning.known import Known
 from emb_runtime.safety.shield_design import DesignInputs, design_inputs
-from emb_train.envs.conditions import NOTHING_RANDOM, Randomisation
 
 Shield = Literal["worst case", "bounded"]
 SHIELDS: tuple[Shield, ...] = get_args(Shield)  # A law for the whole set, or for what has been learnt
@@ -30,7 +29,7 @@ class Learning(NamedTuple):
     assumptions: Assumptions
 
 
-def make_learning(bench: Bench, shield: Shield, plant: Plant, randomised: Randomisation) -> Learning:
+def make_learning(bench: Bench, shield: Shield, plant: Plant, delay: int) -> Learning:
     """Prior knowledge of the shield, which takes the brakes for what they are: Euler's, or ones that stick.
 
     Raises:
@@ -38,7 +37,7 @@ def make_learning(bench: Bench, shield: Shield, plant: Plant, randomised: Random
         UsageError: one does not hold for the brakes.
     """
     learns = shield == "bounded"
-    if learns and not can_learn(bench, plant, randomised):
+    if learns and not can_learn(bench, plant, delay):
         raise UsageError(
             "a shield that learns needs fresh frames, no lag, an encoder without an offset, a velocity that is "
             "measured and the braking envelope"
@@ -50,15 +49,15 @@ def make_learning(bench: Bench, shield: Shield, plant: Plant, randomised: Random
     return Learning(learns, design_inputs(bench), bench.brake, assumptions)
 
 
-def can_learn(bench: Bench, plant: Plant, randomised: Randomisation) -> bool:
+def can_learn(bench: Bench, plant: Plant, delay: int) -> bool:
     """Returns True if a shield can learn: its model has no delay, lag, offset or observer, and the drive has to brake.
 
     It matters whether the shield covers one, the plant has it or it is drawn.
     """
     shield, between = bench.shield, plant.instruments
-    late = max(shield.frame_age[1], between.command_delay, between.measurement_delay, randomised.delay[1]) > 0
-    lagging = max(shield.current_lag, plant.mechanics.current_lag, randomised.current_lag[1]) > 0.0
-    off = between.encoder_offset != 0.0 or randomised.encoder_offset != NOTHING_RANDOM.encoder_offset
+    late = max(shield.frame_age[1], between.command_delay, between.measurement_delay, delay) > 0
+    lagging = max(shield.current_lag, plant.mechanics.current_lag) > 0.0
+    off = between.encoder_offset != 0.0
     return not (late or lagging or off or between.observer_bandwidth > 0.0 or shield.envelope == "coasting")
 
 

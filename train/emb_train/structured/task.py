@@ -9,7 +9,7 @@ from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.estimator.kalman import Four
-from emb_train.envs.conditions import Conditions, Randomisation
+from emb_train.envs.conditions import Conditions
 from emb_train.envs.measure import MEASURES, Measure
 from emb_train.envs.play import Draw, Outcome, fresh_draws
 from emb_train.structured.learning import Shield
@@ -42,8 +42,9 @@ class Task:
     @property
     def conditions(self) -> Conditions:
         """Conditions in which it is trained and played."""
-        randomised = Randomisation(command_delay=self.command_delay)
-        return Conditions(shield_ranges=self.shield_ranges, information=self.measure.kind, randomised=randomised)
+        return Conditions(
+            shield_ranges=self.shield_ranges, information=self.measure.kind, command_delay=self.command_delay
+        )
 
     def draws(self, bench: Bench, seed: int, count: int) -> list[Draw]:
         """Brakes and noise."""

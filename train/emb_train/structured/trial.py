@@ -83,7 +83,7 @@ class Trials(Batch):
                 :func:`emb_train.structured.learning.make_learning`.
         """
         super().__init__(bench, ranges, parameters, len(draws), plant, conditions)
-        self.learning = make_learning(self.bench, shield, self._plant, conditions.randomised)
+        self.learning = make_learning(self.bench, shield, self._plant, conditions.command_delay[1])
         for name in ("J", "gamma"):
             if getattr(ranges.low, name) < getattr(ranges.high, name):
                 raise UsageError(f"the estimator takes {name} as known, the set of ranges '{ranges.name}' varies it")

@@ -1,0 +1,217 @@
+"""Late commands and lost samples, drawn for each experiment: as in the simulated node, and covered by the shield."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emb_bench.sim.node import BrakeNode
+from emb_runtime.can.messages import load_layout
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
+from emb_runtime.config.plants import Instruments, Plant
+from emb_runtime.errors import UsageError
+from emb_runtime.records import CurrentCommand, Reason
+from emb_train.envs.batch import Batch
+from emb_train.envs.closed_loop import delayed
+from emb_train.envs.conditions import Conditions, longest_loss
+from emb_train.envs.critic_view import critic_size
+from emb_train.envs.excitations import Played
+from emb_train.envs.play import fresh_draws, play
+from emb_train.evaluate import references
+
+BENCH = load_bench()
+SHORT = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=60))
+PM50 = BENCH.range_set("pm50")
+OPEN = Conditions(shielded=False)  # So that what is wanted is what is sent
+
+
+def with_(conditions: Conditions = OPEN, **changes: Any) -> Conditions:
+    return msgspec.structs.replace(conditions, **changes)
+
+
+@given(seed=st.integers(0, 2**40), delay=st.integers(0, 3), loss=st.sampled_from([0.0, 0.3]))
+@settings(max_examples=12, deadline=None)
+def test_an_experiment_is_what_the_node_makes_of_the_same_commands(seed: int, delay: int, loss: float) -> None:
+    """The node has the delay and the losses that the environment draws from ranges without width."""
+    layout, exact = load_layout(), BENCH.plant("exact")
+    conditions = with_(command_delay=(delay, delay), frame_loss=(loss, loss))
+    batch = Batch(SHORT, PM50, ("f_v",), 1, plant="exact", conditions=conditions)
+    batch.begin(0, np.random.default_rng(seed))
+    lost = batch.experiments.lost[0]
+    sides = exact.instruments._replace(command_delay=delay)
+    noise = iter([(*errors, 0.0) for errors in batch.experiments.noise[0].tolist()])
+    node = BrakeNode(
+        SHORT,
+        layout,
+        BrakeParameters(*batch.brakes[0].tolist()),
+        lambda: next(noise),
+        Plant("told", exact.mechanics, sides),
+    )
+    step = layout.command.signal("Current").factor
+    steps, frames = np.random.default_rng(seed).integers(-2000, 2000, SHORT.timing.horizon), node.tick()
+    commands = 0
+    for k in range(SHORT.timing.horizon):
+        said, applied = layout.decode_angle(frames[0]), layout.decode_velocity(frames[1])
+        if not lost[k]:
+            assert batch.y[0, 0] == pytest.approx(said.angle, abs=1e-3)  # the frame's resolution
+            assert batch.y[0, 1] == pytest.approx(applied.velocity, abs=0.05)
+            assert batch.experiments.applied[0] == pytest.approx(applied.applied_current, abs=1.01 * step)
+            node.receive(layout.encode_command(CurrentCommand(commands % 15, said.counter, steps[k] * step, True)))
+            commands += 1
+        batch.advance(np.array([np.nan if lost[k] else steps[k] * step]))
+        frames = node.tick()
+        # Its own braking is rounded to the frame's resolution.
+        assert batch.x[0, 0] == pytest.approx(node.angle, abs=1e-3 if loss else 1e-9)
+        assert batch.x[0, 1] == pytest.approx(node.velocity, abs=0.1 if loss else 1e-6)
+
+
+def test_in_a_lost_period_nothing_is_sent_the_node_brakes_and_the_last_sample_stays() -> None:
+    conditions = with_(frame_loss=(0.0, 0.1))
+    batch = Batch(BENCH, BENCH.range_set("nominal"), ("f_v",), 2, plant="euler", conditions=conditions)
+    for i in range(2):
+        batch.begin(i, np.random.default_rng(0), BENCH.brake)
+    batch.experiments.lost[:] = False
+    batch.experiments.lost[:, 20] = True
+    for _ in range(19):
+        batch.advance(np.array([3.0, 3.0]))
+    heard, velocity = batch.y.copy(), batch.x[0, 1]
+    batch.advance(np.array([3.0, 3.0]))  # answers sample 19; sample 20 does not come
+    assert (batch.y == heard).all()
+    assert not batch.heard.any()
+    assert batch.observation()[0].tolist() == [*heard[0].astype(np.float32), 20.0]
+    assert np.isnan(batch.seen()[:, [0, 1, 3]]).all()
+    assert (batch.seen()[:, 2] == 20.0).all()
+    x1, x2 = batch.x[0, :2]
+    assert x2 > velocity > 0.0
+    batch.advance(np.array([6.0, np.nan]))  # whatever is wanted
+    p, braked = BENCH.brake, -6.0 * x2 / BENCH.node.damping_velocity
+    assert braked < 0.0
+    slope = p.k_m * max(braked, -6.0) - p.gamma * p.k_1 * max(x1, 0.0) - p.T_c - p.f_v * x2
+    for row in range(2):
+        np.testing.assert_allclose(batch.x[row, :2], [x1 + 1e-3 * x2, x2 + 1e-3 * slope / p.J], rtol=1e-12)
+    assert batch.reasons.tolist() == [Reason.MISSED, Reason.MISSED]
+    assert batch.past[0].tolist() == [0.0, 3.0, 3.0, 3.0, 3.0]
+    assert batch.heard.all()
+    np.testing.assert_allclose(batch.y, batch.x[:, :2] + batch.experiments.noise[:, 21], rtol=1e-12)
+    np.testing.assert_allclose(batch.seen()[:, 3], max(braked, -6.0), rtol=1e-6)
+
+
+def test_a_loss_brakes_when_its_command_would_have_acted_and_a_node_that_lets_go_gives_no_current() -> None:
+    freewheel = dataclasses.replace(BENCH, node=dataclasses.replace(BENCH.node, stop="freewheel"))
+    acted: list[list[float]] = []
+    for bench, delay in ((BENCH, 2), (freewheel, 0)):
+        conditions = with_(frame_loss=(0.0, 0.1), command_delay=(delay, delay))
+        batch = Batch(bench, bench.range_set("nominal"), ("f_v",), 1, conditions=conditions)
+        batch.begin(0, np.random.default_rng(0))
+        batch.experiments.lost[:] = False
+        batch.experiments.lost[0, 5] = True
+        acted.append([])
+        for _ in range(10):
+            batch.advance(np.array([2.0]))
+            acted[-1].append(float(batch.x[0, 3]))
+    assert [u == 2.0 for u in acted[0]] == [False, False, *[True] * 5, False, True, True]
+    assert acted[0][:2] == [0.0, 0.0]
+    assert acted[0][7] < 0.0
+    assert acted[1] == [2.0] * 5 + [0.0] + [2.0] * 4
+
+
+@given(
+    seed=st.integers(0, 2**40),
+    delay=st.tuples(st.integers(0, 5), st.integers(0, 5)).map(sorted),
+    loss=st.tuples(st.floats(0.0, 0.5), st.floats(0.0, 0.5)).map(sorted),
+    longest=st.integers(0, 12),
+)
+def test_what_is_drawn_lies_in_its_range_and_no_loss_ends_a_run(
+    seed: int, delay: list[int], loss: list[float], longest: int
+) -> None:
+    conditions = with_(command_delay=(delay[0], delay[1]), frame_loss=(loss[0], loss[1]))
+    found, lost = conditions.drawn(np.random.default_rng(seed), 501, longest)
+    assert delay[0] <= found <= delay[1]
+    assert not lost[0]
+    assert not lost[-1]
+    assert max(len(run) for run in "".join("x" if v else " " for v in lost).split(" ")) <= longest
+
+
+def test_every_delay_comes_equally_often_and_as_many_samples_are_lost_as_the_probability_says() -> None:
+    conditions, rng = with_(command_delay=(1, 3), frame_loss=(0.1, 0.1)), np.random.default_rng(0)
+    pairs = [conditions.drawn(rng, 501, 9) for _ in range(3000)]
+    delays, lost = np.array([delay for delay, _ in pairs]), np.array([lost for _, lost in pairs])
+    assert np.bincount(delays).tolist() == pytest.approx([0, 1000, 1000, 1000], abs=110)
+    assert lost[:, 1:-1].mean() == pytest.approx(0.1, rel=0.01)
+    assert np.corrcoef(lost[:, 1:-2].ravel(), lost[:, 2:-1].ravel())[0, 1] == pytest.approx(0.0, abs=0.01)
+    assert longest_loss(BENCH) == 9  # its watchdog takes 10 ms, see the test of the node's safe stop
+
+
+def test_delay_and_losses_change_neither_the_brakes_nor_the_noise() -> None:
+    batches = [Batch(SHORT, PM50, ("f_v",), 1, conditions=c) for c in (OPEN, with_(frame_loss=(0.1, 0.2)))]
+    for batch in batches:
+        batch.begin(0, np.random.default_rng(4))
+    np.testing.assert_array_equal(batches[0].brakes, batches[1].brakes)
+    np.testing.assert_array_equal(batches[0].experiments.noise, batches[1].experiments.noise)
+    assert not batches[0].experiments.lost.any()
+    assert batches[1].experiments.lost.any()
+
+
+def test_the_critic_sees_what_an_experiment_has_of_its_own() -> None:
+    conditions = with_(command_delay=(0, 4), frame_loss=(0.0, 0.2))
+    batch = Batch(SHORT, PM50, PARAMETER_NAMES, 1, conditions=conditions)
+    batch.begin(0, np.random.default_rng(2))
+    batch.experiments.delay[0] = 2
+    batch.experiments.lost[0] = np.arange(61) == 3
+    for u in (1.5, -3.0, 6.0):
+        batch.advance(np.array([u]))
+    told = batch.critic_observation()[0, critic_size(4) :]
+    assert told[:2].tolist() == [0.5, 0.0]  # its delay of at most 4, and that the sample has not arrived
+    assert told[2] == pytest.approx(batch.x[0, 3] / 6.0)
+    assert told[3:] == pytest.approx([1.0, -0.5, 0.25, 0.0, 0.0])
+
+
+def test_the_shield_covers_the_drawn_delay_and_the_losses_and_no_more() -> None:
+    conditions = Conditions(command_delay=(0, 2), frame_loss=(0.0, 0.05))
+    for current in (6.0, -6.0):
+        pushing = Played(np.full(500, current))
+        assert not play(BENCH, PM50, PARAMETER_NAMES, pushing, fresh_draws(PM50, 5, 40), "exact", conditions).left.any()
+    plain, late = Conditions().applied(BENCH).shield, Conditions(command_delay=(1, 2))
+    assert late.applied(BENCH).shield == plain._replace(frame_age=(0, 2))
+    assert late.applied(late.applied(BENCH)) == late.applied(BENCH)
+    for unchanged in (Conditions(frame_loss=(0.0, 0.1)), with_(command_delay=(5, 5))):
+        assert unchanged.applied(BENCH).shield == plain
+
+
+def test_delays_that_cannot_be_are_refused() -> None:
+    slow = Plant("slow", BENCH.plant("exact").mechanics, BENCH.plant("exact").instruments._replace(command_delay=6))
+    bench = dataclasses.replace(BENCH, plants={**BENCH.plants, "slow": slow})
+    for plant, conditions in (
+        ("late", Conditions(command_delay=(0, 1))),  # the shield covers no sum of what the plant has and what is drawn
+        ("slow", with_(command_delay=(0, 5))),  # 11 samples: the instruments remember 10
+    ):
+        with pytest.raises(UsageError):
+            Batch(bench, PM50, ("f_v",), 1, plant=plant, conditions=conditions)
+    Batch(bench, PM50, ("f_v",), 1, plant="late", conditions=with_(command_delay=(0, 1)))
+    instruments = Instruments(*range(1, 1 + len(Instruments._fields)))
+    assert delayed(instruments, 2) == instruments._replace(command_delay=3)
+
+
+def test_an_excitation_sees_nothing_but_the_step_of_a_sample_that_is_lost() -> None:
+    lossy, observed = Conditions(information="physical", frame_loss=(0.05, 0.05)), []
+
+    class Noting(Played):
+        def __call__(self, seen: Any) -> Any:
+            observed.append(seen.copy())
+            return super().__call__(seen)
+
+    play(BENCH, PM50, ("f_v",), Noting(np.full(500, 2.0)), fresh_draws(PM50, 1, 8), conditions=lossy)
+    seen = np.stack(observed)
+    missing = np.isnan(seen[:, :, 0])
+    assert missing.mean() == pytest.approx(0.05, abs=0.015)
+    assert (np.isnan(seen[:, :, [1, 3]]) == missing[:, :, None]).all()
+    np.testing.assert_array_equal(seen[:, :, 2], np.arange(500.0)[:, None].repeat(8, 1))
+    for name, excitation in references(BENCH).items():  # each can be played where samples are lost
+        outcome = play(BENCH, PM50, ("f_v",), excitation, fresh_draws(PM50, 1, 2), conditions=lossy)
+        assert np.isfinite(outcome.matrices).all(), name
