@@ -89,8 +89,7 @@ class LeakyCount:
         if tolerated < 1:
             raise ValueError(f"tolerated: expected at least 1, got {tolerated}")
         self._full = WEIGHT * tolerated
-        self.errors = 0
-        """0..WEIGHT tolerated."""
+        self.errors = 0  # 0..WEIGHT tolerated
 
     @property
     def exceeded(self) -> bool:
@@ -116,8 +115,7 @@ class CounterCheck(LeakyCount):
 
     def __init__(self, tolerated: int) -> None:
         super().__init__(tolerated)
-        self.last: int | None = None
-        """Counter of the last accepted frame, 0..14; None before the first."""
+        self.last: int | None = None  # Counter of the last accepted frame, 0..14; None before the first
 
     def step(self, counter: int) -> int:
         """Judge the counter, 0..14, of a frame that is valid in itself, and count it.

@@ -81,10 +81,8 @@ class BusMonitor:
         self._periods_ns: deque[int] = deque(maxlen=RECENT_PAIRS)
         self._at_rest: deque[tuple[float, float, float]] = deque(maxlen=RECENT_PAIRS)
         self._missing = 0
-        self.pairs = 0
-        """Valid pairs so far."""
-        self.sample: SensorSample | None = None
-        """The newest one."""
+        self.pairs = 0  # Valid pairs so far
+        self.sample: SensorSample | None = None  # The newest one
 
     @property
     def status(self) -> StatusFrame | None:

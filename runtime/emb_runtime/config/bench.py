@@ -169,8 +169,7 @@ class GuardLimits:
 class Node:
     """Safe stop and time-outs of the node that owns the current."""
 
-    watchdog: Positive
-    """Time without a fresh, valid, enabled command until the safe stop latches [s]"""
+    watchdog: Positive  # Time without a fresh, valid, enabled command until the safe stop latches [s]
     stop: Literal["damped", "freewheel"]
     damping_velocity: Annotated[float, Meta(ge=50, le=200)]
     """Speed above which the damped stop brakes with the full current [rad/s]"""

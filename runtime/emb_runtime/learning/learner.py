@@ -45,8 +45,7 @@ class Learner:
         """The samples contradict the assumptions; :attr:`known` is then what was known just before."""
         self._nominal, self._inputs = bench.brake, design_inputs(bench)._replace(steps=whole.steps)
         self._prior = make_assumptions(bench) if active and bench.shield.learn else None
-        self.age = 0
-        """Periods since the law was made."""
+        self.age = 0  # Periods since the law was made
 
     def begin(self, sample: SensorSample) -> None:
         """Forget everything, and hear the first sample."""

@@ -78,10 +78,8 @@ class LogWriter:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._sequences: dict[int, int] = {}
-        self.messages = 0
-        """Messages written."""
-        self.undecoded = 0
-        """Frames that are no valid frame of ours: they are in the log as they were on the bus only."""
+        self.messages = 0  # Messages written
+        self.undecoded = 0  # Frames that are no valid frame of ours: they are in the log as they were on the bus only
         begin = self._offset + int(header["start_ns"])
         for name, entries in header["metadata"].items():
             self._mcap.add_metadata(name, entries)
@@ -225,10 +223,8 @@ class Recording:
         self._path = Path(header["path"])
         self._drive_bus = _open_drive_bus(header)
         self.writer = LogWriter(output, header)
-        self.lost = 0
-        """Records that could not be written."""
-        self.error = ""
-        """The first failure to write."""
+        self.lost = 0  # Records that could not be written
+        self.error = ""  # The first failure to write
 
     def run(self) -> dict[str, Any]:
         """Record until the trailer comes or the parent is gone; then write the rest and report."""

@@ -59,8 +59,7 @@ class Ring:
         # Items of a cast view are stored and loaded as whole machine words: an index is never half written.
         self._view = memoryview(self._memory)
         self._words = self._view[:_HEADER].cast("Q")
-        self.slots = self._words[_SLOTS_AT]
-        """Capacity in records."""
+        self.slots = self._words[_SLOTS_AT]  # Capacity in records
         if self._words[0] != _MAGIC or size != _HEADER + self.slots * SLOT:
             self.close()
             raise ValueError("the shared memory is not a ring of this version")

@@ -48,8 +48,7 @@ class DeviceClock:
         self._first_ns: int | None = None  # offset of the first pair of the reference
         self._window: list[int] = []  # offsets in the present one
         self._off_grid = LeakyCount(OFF_GRID)
-        self.problem = ""
-        """Fault of the clock; "" as long as there is none. Never taken back."""
+        self.problem = ""  # Fault of the clock; "" as long as there is none. Never taken back.
 
     def restart(self) -> None:
         """Forget the pairs before arming: the next one begins the reference."""

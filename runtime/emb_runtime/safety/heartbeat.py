@@ -48,8 +48,7 @@ class Heartbeat:
         if self._words[_MAGIC_AT] != _MAGIC:
             self.close()
             raise ValueError("the shared memory is not a heartbeat of this version")
-        self.heartbeat_ns = self._words[_HEARTBEAT_AT]
-        """Silence of the loop that trips the watchdog [ns]."""
+        self.heartbeat_ns = self._words[_HEARTBEAT_AT]  # Silence of the loop that trips the watchdog [ns]
 
     @classmethod
     def create(cls, heartbeat: float, now_ns: int) -> Heartbeat:

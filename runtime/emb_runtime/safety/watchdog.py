@@ -49,10 +49,8 @@ class WatchdogHandle:
     """A running watchdog process. Made by :meth:`start`, ended by :meth:`finish`."""
 
     def __init__(self, pulse: Heartbeat, child: Child, settings: dict[str, str]) -> None:
-        self.pulse = pulse
-        """The loop's side: what it and the guard must be given."""
-        self.realtime = settings
-        """Real-time settings that the process obtained."""
+        self.pulse = pulse  # The loop's side: what it and the guard must be given
+        self.realtime = settings  # Real-time settings that the process obtained
         self._child = child
 
     @classmethod

@@ -70,8 +70,7 @@ class SilenceMonitor:
 
     def __init__(self, heartbeat_ns: int, now_ns: int) -> None:
         self._heartbeat_ns = heartbeat_ns
-        self.interval_ns = heartbeat_ns // LOOKS
-        """Time between two looks [ns]."""
+        self.interval_ns = heartbeat_ns // LOOKS  # Time between two looks [ns]
         self._look_ns = now_ns
         self._idle_ns = now_ns
         self._since_ns = now_ns
