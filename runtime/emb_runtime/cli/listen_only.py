@@ -12,6 +12,7 @@ from emb_runtime.cli.options import Plan
 from emb_runtime.cli.preflight import CheckResult, RefusedError, check, refuse
 from emb_runtime.cli.preflight import table as preflight_table
 from emb_runtime.cli.session import Bus, Console, findings, paced_receive, push_clock, start_recorder
+from emb_runtime.cli.summary import log_facts, result_facts
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_DONE, EXIT_LOG, BusError
 from emb_runtime.log.recorder import Recorder, RecorderResult
@@ -149,23 +150,15 @@ def document(plan: Plan, iface: str, read: ListenResult) -> dict[str, Any]:
     """Result as plain data, with the log."""
     verdict = read.verdict
     return {
+        **result_facts(verdict.fault, read.exit_code, verdict.detail),
         "result": "done" if verdict.result == "DONE" else verdict.result,
-        "exit_code": read.exit_code,
-        "cause": FAULTS[verdict.fault].cause if verdict.fault else "",
-        "detail": verdict.detail,
-        "advice": FAULTS[verdict.fault].advice if verdict.fault else "",
         "purpose": str(RunType.LISTEN_ONLY),
         "stage": str(plan.stage),
         "iface": iface,
         "bench": plan.bench.name,
         "heard": heard_document(read.heard),
         "preflight": [line.document() for line in read.lines],
-        "log": str(read.log.path),
-        "log_messages": read.log.messages,
-        "log_bytes": read.log.bytes,
-        "log_dropped": read.log.dropped,
-        "log_complete": read.log.complete,
-        "log_error": read.log.error,
+        **log_facts(read.log),
     }
 
 

@@ -64,24 +64,48 @@ def trailer(
     if outcome is None:
         return {"exit_reason": Fault.INTERNAL.name, "detail": "the run ended before the loop did", **settings}
     entries = {"exit_reason": outcome.fault.name if outcome.fault else "DONE", "detail": outcome.detail}
-    entries |= {name: str(value) for name, value in asdict(outcome.counters).items()}
-    entries |= {"home": str(outcome.home), "node_at_rest": str(outcome.node_at_rest)}
-    entries |= {"goal_reached": str(outcome.goal_reached)}
-    entries |= {name: f"{value:.1f}" for name, value in motion(outcome).items() if value is not None}
-    if outcome.learnt is not None:
-        entries["learnt"] = json.dumps(ranges_of(outcome.learnt))
-    if outcome.node_stop_reason is not None:
-        entries["node_stop_reason"] = outcome.node_stop_reason.name
-    entries["rejections"] = json.dumps(outcome.rejections)
-    entries["bus_error_classes"] = json.dumps(outcome.bus_errors)
+    entries |= {name: _entry(value) for name, value in facts(outcome).items() if value is not None}
     return entries | settings
+
+
+def _entry(value: object) -> str:
+    if isinstance(value, Mapping):
+        return json.dumps(value)
+    return value if isinstance(value, str) else repr(value)
+
+
+def facts(outcome: Outcome) -> dict[str, Any]:
+    """Facts of an outcome that the log's trailer and the document have; None for one that there is not."""
+    return {
+        **asdict(outcome.counters),
+        "rejections": dict(outcome.rejections),
+        "bus_error_classes": dict(outcome.bus_errors),
+        "learnt": None if outcome.learnt is None else ranges_of(outcome.learnt),
+        **motion(outcome),
+        "goal_reached": outcome.goal_reached,
+        "home": outcome.home,
+        "node_at_rest": outcome.node_at_rest,
+        "node_stop_reason": None if outcome.node_stop_reason is None else outcome.node_stop_reason.name,
+    }
+
+
+def log_facts(log: RecorderResult) -> dict[str, Any]:
+    """Facts of a log for a document."""
+    return {
+        "log": str(log.path),
+        "log_messages": log.messages,
+        "log_bytes": log.bytes,
+        "log_dropped": log.dropped,
+        "log_complete": log.complete,
+        "log_error": log.error,
+    }
 
 
 def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
     """A run's outcome as plain data."""
     outcome, fault = ran.outcome, ran.outcome.fault
     assert plan.policy is not None
-    result = _result(fault, ran.exit_code, outcome.detail)
+    result = result_facts(fault, ran.exit_code, outcome.detail)
     if fault is None and not ran.log.complete:
         result |= {"result": LOG_INCOMPLETE, "cause": "the log is not whole", "detail": ran.log.error}
         result |= {"advice": "the brake and the node did what they should; the run must be made again for its data"}
@@ -94,30 +118,18 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         "bench": plan.bench.name,
         "steps": ran.steps,
         "duration_s": outcome.duration_ns * 1e-9,
-        **asdict(outcome.counters),
-        "rejections": dict(outcome.rejections),
-        "bus_error_classes": dict(outcome.bus_errors),
-        "estimate": estimate.by_name(estimated(plan.bench), outcome.estimate),
+        **facts(outcome),
         "learnt": {} if outcome.learnt is None else ranges_of(outcome.learnt),
-        **motion(outcome),
-        "goal_reached": outcome.goal_reached,
+        "estimate": estimate.by_name(estimated(plan.bench), outcome.estimate),
         "goal_s": outcome.goal_ns * 1e-9 if outcome.goal_reached else None,
-        "home": outcome.home,
         "end_angle": outcome.end_angle,
         "end_velocity": outcome.end_velocity,
         "node_state": outcome.node_state.name if outcome.node_state is not None else None,
-        "node_at_rest": outcome.node_at_rest,
-        "node_stop_reason": outcome.node_stop_reason.name if outcome.node_stop_reason is not None else None,
         "last_angle": outcome.last_angle,
         "preflight": [line.document() for line in ran.lines],
         "realtime": ran.realtime,
         "watchdog": None if ran.watchdog is None else asdict(ran.watchdog),
-        "log": str(ran.log.path),
-        "log_messages": ran.log.messages,
-        "log_bytes": ran.log.bytes,
-        "log_dropped": ran.log.dropped,
-        "log_complete": ran.log.complete,
-        "log_error": ran.log.error,
+        **log_facts(ran.log),
         "homing": {},
     }
 
@@ -136,7 +148,7 @@ def refusal(err: EmbError, iface: str) -> dict[str, Any]:
     refused = err if isinstance(err, RefusedError) else None
     fault = Fault.BUS_LOST if isinstance(err, BusError) else refused.fault if refused else None
     lines = refused.lines if refused else ()
-    found = _result(fault, err.exit_code, str(err)) | ({} if fault else {"result": "REFUSED"})
+    found = result_facts(fault, err.exit_code, str(err)) | ({} if fault else {"result": "REFUSED"})
     empty = {"iface": iface, "home": False, "log": None, "homing": {}}
     return found | empty | {"preflight": [line.document() for line in lines]}
 
@@ -199,7 +211,8 @@ def way_home(s: Mapping[str, Any]) -> str:
     return f"{how}, {s['last_angle']:.3f} rad after {s['duration_s']:.2f} s, {s['log']}"
 
 
-def _result(fault: Fault | None, exit_code: int, detail: str) -> dict[str, Any]:
+def result_facts(fault: Fault | None, exit_code: int, detail: str) -> dict[str, Any]:
+    """Result of a run for a document."""
     return {
         "result": "done" if fault is None else fault.name,
         "exit_code": exit_code,
