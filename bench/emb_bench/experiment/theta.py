@@ -15,7 +15,7 @@ from emb_bench.logs.log import RunLog
 from emb_bench.sim.plant_spec import check_near_nominal, parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
-from emb_runtime.config.validation import shown
+from emb_runtime.config.typed import shown
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.system.input_file import read_text
 

@@ -14,11 +14,9 @@ from msgspec import Meta
 
 from emb_runtime.config.typed import FieldError, NotNegative
 from emb_runtime.config.units import ANGLE, CURRENT, FORCE, LENGTH, TORQUE
-from emb_runtime.config.validation import Table
 
 Parameter = Literal["k_m", "k_1", "T_c", "f_v", "J", "coulomb_asymmetry", "viscous_asymmetry"]
 PARAMETERS = get_args(Parameter)  # Parameters of a machine that can be of interest
-WINDOWS = (lambda v: 1e-3 <= v <= 3600.0, "a time from 0.001 to 3600 s")  # Lengths of windows that are taken
 Window = Annotated[float, Meta(ge=1e-3, le=3600)]
 
 
@@ -71,16 +69,3 @@ class Machine:
     def command(self) -> str:
         """Unit in which commands are shown."""
         return self.units.command or "A"
-
-
-def read_units(table: Table, travel: float) -> dict[str, str]:
-    """Units in which results are shown, by ``angle`` and ``command``; lengths and forces are a linear machine's.
-
-    Raises:
-        BenchFileError: a key or a unit is unknown, or a length or a force is asked of a machine that turns.
-    """
-    linear = (LENGTH, FORCE) if travel else ({}, {})
-    known = {"angle": (*ANGLE, *linear[0]), "command": (*CURRENT, *TORQUE, *linear[1])}
-    found = {name: table.text(name, known[name]) for name in known if name in table.names()}
-    table.nothing_else(known)
-    return found

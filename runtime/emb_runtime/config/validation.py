@@ -10,12 +10,11 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from emb_runtime.errors import BenchFileError, EmbError
+from emb_runtime.config.typed import LONGEST_VALUE
+from emb_runtime.config.typed import shown as shown
+from emb_runtime.errors import EmbError
 
-LONGEST_VALUE = 120  # Characters of a foreign value that a message repeats
-BENCH_TEXT = 200
 LONGEST_LIST = 40  # Most texts in a list
-SMALLEST = 1e-30  # No quantity of a brake is smaller, or larger than its inverse; beyond it arithmetic overflows
 
 
 @dataclass(frozen=True)
@@ -28,11 +27,6 @@ class Rules:
     remedy: str = "add it"  # Advice where a key is missing
 
 
-BENCH_RULES = Rules(
-    BenchFileError, BENCH_TEXT, SMALLEST, "add it, as in the file that `emb-run --write-bench FILE` writes"
-)
-
-
 class Table:
     """A table of a document. Every method raises the rules' error for what is missing or not as it says.
 
@@ -43,7 +37,7 @@ class Table:
         rules: of the document.
     """
 
-    def __init__(self, source: str, path: str, content: object, rules: Rules = BENCH_RULES) -> None:
+    def __init__(self, source: str, path: str, content: object, rules: Rules) -> None:
         self._source = source
         self._path = path
         self._rules = rules
@@ -204,12 +198,3 @@ class Table:
 
 def _one_of(choices: tuple[str, ...]) -> str:
     return f"one of {', '.join(choices)}"
-
-
-def shown(value: object) -> str:
-    """A foreign value for a message: printable ASCII in one line, shortened."""
-    try:
-        text = ascii(value)
-    except ValueError:  # a whole number of more digits than Python turns into text
-        return "a number of too many digits"
-    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."
