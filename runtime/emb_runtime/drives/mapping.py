@@ -61,6 +61,7 @@ class Commanded:
     low: float
     high: float  # Least and largest value that may leave [DBC units]
     others: Dictionary[str, float]  # Values of the message's other signals, protection excepted [DBC units]
+    is_current: bool  # False for a torque, of which ``per_ampere`` makes an ampere
 
 
 @dataclass(frozen=True)
@@ -77,14 +78,17 @@ class State:
 
 @dataclass(frozen=True)
 class MessageInfo:
-    """One message: identifier, length, signals, protection."""
+    """One message, of a multiplexed one what has one value of its multiplexor."""
 
-    name: str
+    name: str  # ``MESSAGE``, or ``MESSAGE[value]``
+    message: str  # Name in the DBC
     identifier: int
     extended: bool
     length: int  # Payload bytes
     fields: Dictionary[str, Field]
     protection: Protection
+    page: Field | None = None  # Multiplexor; None where there is none
+    page_value: int = 0  # Its value
 
     @property
     def worst_bits(self) -> int:
@@ -127,7 +131,6 @@ class Mapping:
     disarm: tuple[Step, ...]
     watchdog: float  # The drive's own time-out [s]
     end_stop_speed: float  # Speed into an end stop that the brake bears [rad/s]: without host or cable nothing stops it
-    lost: tuple[str, ...]  # Names in :data:`PROPERTIES` of what the drive cannot give; all accepted
     text: str
     dbc_text: str
     database: Database
@@ -136,6 +139,20 @@ class Mapping:
     def sha256(self) -> str:
         """See :func:`mapping_hash`."""
         return mapping_hash(self.text, self.dbc_text)
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """Names in :data:`PROPERTIES` of what the drive cannot give."""
+        sensors = [self.messages[measured.message].protection for measured in (self.angle, self.velocity)]
+        has = {
+            "no_counter": all(protection.counter is not None for protection in sensors),
+            "no_crc": all(protection.checksum is not None for protection in sensors),
+            "no_command_crc": self.messages[self.command.message].protection.checksum is not None,
+            "no_current": self.current is not None,
+            "no_state": self.state is not None,
+            "relative_k_m": self.command.is_current,
+        }
+        return tuple(name for name in PROPERTIES if not has.get(name))
 
     @property
     def sensor_messages(self) -> frozenset[str]:

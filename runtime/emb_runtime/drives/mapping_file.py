@@ -8,13 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping as Dictionary
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from msgspec import Meta, Struct
 
 from emb_runtime.can.codec import parse
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import LONGEST_NODE_WATCHDOG
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
-from emb_runtime.config.validation import Rules, Table, shown
+from emb_runtime.config.typed import read, shown
 from emb_runtime.drives.mapping import (
     PROPERTIES,
     Commanded,
@@ -26,8 +28,8 @@ from emb_runtime.drives.mapping import (
     State,
     Step,
 )
-from emb_runtime.drives.protection import DATA_IDS, KINDS, MODULI, Protection
-from emb_runtime.drives.signals import Field, make_field
+from emb_runtime.drives.protection import DATA_IDS, MODULI, Protection
+from emb_runtime.drives.signals import Field, make_field, raw_value
 from emb_runtime.errors import FrameError
 from emb_runtime.system.input_file import read_text
 
@@ -35,20 +37,131 @@ if TYPE_CHECKING:
     from cantools.database.can import Database
     from cantools.database.can import Message as DbcMessage
 
-SCHEMA = 1
 MAX_DBC_BYTES = 4 << 20
 MOST_STEPS = 16  # Steps of a sequence, and frames of a step
-LONGEST_WAIT = 5.0  # Longest wait for a state [s]
 
-ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi}
-VELOCITY_UNITS = {
-    "rad/s": 1.0,
-    "deg/s": math.pi / 180.0,
-    "rev/s": 2.0 * math.pi,
-    "rpm": 2.0 * math.pi / 60.0,
-}
-CURRENT_UNITS = {"A": 1.0, "mA": 1e-3}
-TORQUE_UNITS = ("Nm", "per_mille")  # Units of a command or report that is no current: ``per_ampere`` of them make one
+UNITS = {
+    "rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi,
+    "rad/s": 1.0, "deg/s": math.pi / 180.0, "rev/s": 2.0 * math.pi, "rpm": 2.0 * math.pi / 60.0,
+    "A": 1.0, "mA": 1e-3,
+}  # fmt: skip
+"""SI units per unit; of Nm and per_mille ``per_ampere`` make one ampere."""
+
+
+# --- the file -------------------------------------------------------------------------------------------------------
+
+
+def _says(description: str) -> Meta:
+    return Meta(extra_json_schema={"description": description})
+
+
+Positive = Annotated[float, Meta(gt=0)]
+Wait = Annotated[float, Meta(gt=0, le=5)]  # [s]
+Byte = Annotated[int, Meta(ge=0, le=255)]
+States = Annotated[tuple[int, ...], Meta(min_length=1, max_length=16)]
+
+
+class _Signal(Struct, kw_only=True):
+    signal: str
+    sign: Literal[1, -1]  # +1 if it grows as the brake tightens
+    range: tuple[float, float]  # Values that are believed [DBC units]
+    scale: Positive = 1.0
+
+
+class _Angle(_Signal, kw_only=True):
+    unit: Literal["rad", "deg", "rev"]
+    offset: float = 0.0
+    wrap: Positive | None = None  # Period after which it begins anew [DBC units]
+
+
+class _Velocity(_Signal, kw_only=True):
+    unit: Literal["rad/s", "deg/s", "rev/s", "rpm"]
+    offset: float = 0.0
+
+
+class _Current(_Signal, kw_only=True):
+    unit: Literal["A", "mA", "Nm", "per_mille"]
+    offset: float = 0.0
+    per_ampere: Positive | None = None
+
+
+class _Command(_Signal, kw_only=True):
+    unit: Literal["A", "mA", "Nm", "per_mille"]
+    per_ampere: Positive | None = None
+    others: dict[str, float] = {}
+
+
+class _State(Struct, kw_only=True):
+    signal: str
+    idle: States
+    active: States
+    timeout: Wait
+    error: str | None = None
+
+
+class _Signals(Struct, kw_only=True):
+    command: _Command
+    angle: _Angle
+    velocity: Annotated[
+        _Velocity,
+        _says("the velocity, by which the shield stops the brake; none is made from the angle: use a gateway"),
+    ]
+    current: _Current | None = None
+    state: _State | None = None
+
+
+class _Wait(Struct, kw_only=True):
+    timeout: Wait
+    state: Literal["idle", "active"] | None = None
+
+
+class _Step(Struct, kw_only=True):
+    send: Annotated[dict[str, str | dict[str, float]], Meta(max_length=MOST_STEPS)]
+    wait: _Wait | None = None
+
+
+class _Protection(Struct, kw_only=True):
+    kind: Literal["none", "profile1", "profile2", "profile5", "xor", "sum"]
+    checksum: str | None = None
+    counter: str | None = None
+    modulus: Annotated[int, Meta(ge=2, le=1 << 16)] | None = None
+    data_ids: tuple[Annotated[int, Meta(ge=0, le=0xFFFF)], ...] = ()
+    start: Byte = 0
+
+
+Sequence = Annotated[tuple[_Step, ...], Meta(max_length=MOST_STEPS)]
+
+
+class _Can(Struct, kw_only=True):
+    dbc: str
+    exchange: Literal["broadcast", "poll"]
+    pair_within: Annotated[float, Meta(gt=0, le=0.1)]  # Longest time between the messages of one sample [s]
+    signals: _Signals
+    arm: Sequence = ()
+    disarm: Sequence = ()
+    protection: dict[str, Literal["none"] | _Protection] = {}
+
+
+class _Node(Struct, kw_only=True):
+    on_loss: Literal["hold"]
+    stop: Literal["freewheel"]
+    watchdog: Annotated[
+        float,
+        Meta(gt=0, le=LONGEST_NODE_WATCHDOG),
+        _says(
+            f"the drive's own time-out, above 0 to {LONGEST_NODE_WATCHDOG:g} s: a drive that never lets go by itself "
+            "is not commanded, and no key accepts it"
+        ),
+    ]
+    end_stop_speed: Annotated[Positive, _says("the speed into an end stop that the brake bears, in rad/s")]
+    accept: tuple[str, ...]
+
+
+class _File(Struct, kw_only=True):
+    schema: Literal[1]
+    name: str
+    can: _Can
+    node: _Node
 
 
 def load_mapping(path: str | Path) -> Mapping:
@@ -57,9 +170,9 @@ def load_mapping(path: str | Path) -> Mapping:
     Raises:
         MappingError: a file cannot be read, or is refused; the message has the file, the key and the reason.
     """
-    text = _read(path, MAX_TOML_BYTES)
-    dbc = Table(str(path), "", _parsed(text, str(path)), _RULES).table("can").text("dbc")
-    return parse_mapping(text, _read(Path(path).parent / dbc, MAX_DBC_BYTES), str(path))
+    text = _text(path, MAX_TOML_BYTES)
+    file = _file(text, str(path))
+    return _made(file, text, _text(Path(path).parent / file.can.dbc, MAX_DBC_BYTES), str(path))
 
 
 def parse_mapping(text: str, dbc_text: str, source: str) -> Mapping:
@@ -68,363 +181,264 @@ def parse_mapping(text: str, dbc_text: str, source: str) -> Mapping:
     Raises:
         MappingError: see :func:`load_mapping`.
     """
-    top = Table(source, "", _parsed(text, source), _RULES)
-    top.schema(SCHEMA)
-    name = top.text("name")
-    can = top.table("can")
-    can.text("dbc")
+    return _made(_file(text, source), text, dbc_text, source)
+
+
+def _file(text: str, source: str) -> _File:
     try:
-        database = parse(dbc_text)
-    except FrameError as err:
-        raise MappingError(f"{source}: can.dbc: {_one_line(err)}") from err
-    reader = _Reader(source, database, can.table("protection") if "protection" in can.names() else None)
-    signals = can.table("signals")
-    command = reader.command(signals)
-    angle = reader.measured(signals, "angle", ANGLE_UNITS)
-    if "velocity" not in signals.names():
-        raise signals.fail(
-            "velocity",
-            "missing: the shield stops the brake by it, and none is made from the angle; use a gateway that does",
-        )
-    velocity = reader.measured(signals, "velocity", VELOCITY_UNITS)
-    current = reader.measured(signals, "current", CURRENT_UNITS) if "current" in signals.names() else None
-    state = reader.state(signals) if "state" in signals.names() else None
-    signals.nothing_else(("current", "state"))
-    arm, disarm = (reader.sequence(can, key, command, state) for key in ("arm", "disarm"))
-    polled = can.text("exchange", ("broadcast", "poll")) == "poll"
-    pair_within = can.number("pair_within", lambda v: 0 < v <= 0.1, "a time in (0, 0.1] s")
-    can.nothing_else(("protection", "arm", "disarm"))
-    reader.no_other_protection()
-    node = top.table("node")
-    watchdog = _watchdog(node)
-    end_stop_speed = node.number(
-        "end_stop_speed", _positive, "the speed into an end stop that the brake bears, in rad/s"
-    )
-    relative = command.field.name if _is_torque(signals.table("command")) else ""
-    lost = _lost(reader, angle, velocity, current, command, state, relative)
-    _accepted(node, lost)
-    node.nothing_else()
-    top.nothing_else()
-    return Mapping(
-        name=name,
-        polled=polled,
-        pair_within=pair_within,
-        messages=reader.used,
-        angle=angle,
-        velocity=velocity,
-        current=current,
-        command=command,
-        state=state,
-        arm=arm,
-        disarm=disarm,
-        watchdog=watchdog,
-        end_stop_speed=end_stop_speed,
-        lost=lost,
-        text=text,
-        dbc_text=dbc_text,
-        database=database,
-    )
-
-
-_RULES = Rules(MappingError, 200)
-
-
-class _Reader:
-    """Reads what refers to the DBC, and keeps the messages that are used."""
-
-    def __init__(self, source: str, database: Database, protection: Table | None) -> None:
-        self._source = source
-        self._database = database
-        self._protection = protection
-        self._default = "none"
-        if protection is not None and "default" in protection.names():
-            self._default = protection.text("default", ("none",))
-        self.used: dict[str, MessageInfo] = {}
-
-    def measured(self, signals: Table, key: str, units: Dictionary[str, float]) -> Measured:
-        table = signals.table(key)
-        message, field = self._signal(table)
-        factor, offset = self._scale(table, units, torque=key == "current"), _optional(table, "offset", 0.0)
-        low, high = self._range(table)
-        wrap = _optional(table, "wrap", 0.0, _positive, "a positive number")
-        if wrap and key != "angle":
-            raise table.fail("wrap", "only an angle begins anew")
-        table.nothing_else()
-        return Measured(message.name, field, factor, offset, low, high, wrap)
-
-    def command(self, signals: Table) -> Commanded:
-        table = signals.table("command")
-        message, field = self._signal(table)
-        factor = 1.0 / self._scale(table, CURRENT_UNITS, torque=True)
-        low, high = self._range(table)
-        if not low <= 0.0 <= high:
-            raise table.fail("range", f"0 must lie inside, got {low:g} to {high:g}")
-        others: dict[str, float] = {}
-        if "others" in table.names():
-            given = table.table("others")
-            others = {name: given.number(name) for name in given.names()}
-        table.nothing_else(("others",))
-        info = self.used[message.name]
-        protected = {f.name for f in (info.protection.checksum, info.protection.counter) if f is not None}
-        needed = set(info.fields) - {field.name} - protected
-        if set(others) != needed:
-            raise table.fail("others", f"expected a value for {_names(needed)}, got {_names(others)}")
-        return Commanded(message.name, field, factor, low, high, others)
-
-    def state(self, signals: Table) -> State:
-        table = signals.table("state")
-        message, field = self._signal(table)
-        if field.is_float:
-            raise table.fail("signal", "expected a signal of whole numbers")
-        idle, active = (_integers(table, key) for key in ("idle", "active"))
-        if set(idle) & set(active):
-            raise table.fail("active", "a value cannot be both idle and active")
-        timeout = table.number("timeout", lambda v: 0 < v <= LONGEST_WAIT, f"a time in (0, {LONGEST_WAIT:g}] s")
-        error = None
-        if "error" in table.names():
-            error = self.used[message.name].fields.get(table.text("error"))
-            if error is None:
-                raise table.fail("error", f"no such signal in {message.name}")
-        table.nothing_else(("error",))
-        return State(message.name, field, idle, active, timeout, error)
-
-    def sequence(self, can: Table, key: str, command: Commanded, state: State | None) -> tuple[Step, ...]:
-        if key not in can.names():
-            return ()
-        return tuple(self._step(table, command, state) for table in can.tables(key, 1, MOST_STEPS))
-
-    def _step(self, table: Table, command: Commanded, state: State | None) -> Step:
-        send = table.table("send")
-        if len(send.names()) > MOST_STEPS:
-            raise table.fail("send", f"expected at most {MOST_STEPS} frames")
-        frames = tuple(self._constant(send, name, command) for name in send.names())
-        waits, timeout = "", 0.0
-        if "wait" in table.names():
-            wait = table.table("wait")
-            if "state" in wait.names():
-                waits = wait.text("state", ("idle", "active"))
-                if state is None:
-                    raise wait.fail("state", "this file names no state to wait for")
-            timeout = wait.number("timeout", lambda v: 0 < v <= LONGEST_WAIT, f"a time in (0, {LONGEST_WAIT:g}] s")
-            wait.nothing_else(("state",))
-        table.nothing_else(("wait",))
-        return Step(frames, waits, timeout)
-
-    def _constant(self, send: Table, name: str, command: Commanded) -> ConstantFrame:
-        message = self._message(send, name, name)
-        if isinstance(send.get(name), str):
-            try:
-                data = bytes.fromhex(send.text(name))
-            except ValueError:
-                raise send.fail(name, "expected signals, or bytes in hexadecimal") from None
-            if len(data) != message.length:
-                raise send.fail(name, f"expected {message.length} bytes, got {len(data)}")
-            return ConstantFrame(name, data, None)
-        table = send.table(name)
-        values = {key: table.number(key) for key in table.names()}
-        if self.used[name].protection.kind != "none":
-            raise send.fail(name, "a protected message cannot be part of a sequence")
-        if name == command.message and values.get(command.field.name) != 0.0:
-            raise send.fail(name, "a sequence commands no current: give 0, or the bytes that the drive's maker gives")
-        try:
-            data = message.encode(values, padding=False, strict=True)
-        except Exception as err:  # what cantools raises for values that do not fit is of several kinds
-            raise send.fail(name, f"does not fit the DBC: {_one_line(err)}") from err
-        return ConstantFrame(name, bytes(data), values)
-
-    def no_other_protection(self) -> None:
-        if self._protection is not None:
-            self._protection.nothing_else(("default",))
-
-    def _message(self, table: Table, key: str, name: str) -> DbcMessage:
-        try:
-            message = self._database.get_message_by_name(name)
-        except KeyError:
-            raise table.fail(key, f"the DBC has no message {shown(name)}") from None
-        if name in self.used:
-            return message
-        if message.is_fd or message.length > 8 or message.is_multiplexed():
-            raise table.fail(key, f"{name}: expected a classical frame without multiplexed signals; use a gateway")
-        ours = {m.identifier for m in load_layout().messages.values()}
-        if not message.is_extended_frame and message.frame_id in ours:
-            raise table.fail(
-                key, f"{name} has the identifier {message.frame_id:#05x} of a message of ours: give the drive another"
-            )
-        fields = {s.name: make_field(s) for s in message.signals}
-        for field in fields.values():
-            if field.is_float and field.length not in (16, 32, 64):
-                raise table.fail(key, f"{name}.{field.name}: expected a float of 16, 32 or 64 bits")
-            if not math.isfinite(field.scale) or field.scale == 0.0 or not math.isfinite(field.offset):
-                raise table.fail(key, f"{name}.{field.name}: expected a scale that is finite and not 0")
-        self.used[name] = MessageInfo(
-            name=name,
-            identifier=message.frame_id,
-            extended=message.is_extended_frame,
-            length=message.length,
-            fields=fields,
-            protection=self._protection_of(name, fields),
-        )
-        return message
-
-    def _signal(self, table: Table) -> tuple[DbcMessage, Field]:
-        text = table.text("signal")
-        message_name, dot, name = text.partition(".")
-        if not dot:
-            raise table.fail("signal", f"expected MESSAGE.SIGNAL, got {shown(text)}")
-        message = self._message(table, "signal", message_name)
-        field = self.used[message_name].fields.get(name)
-        if field is None:
-            known = _names(self.used[message_name].fields)
-            raise table.fail("signal", f"{message_name} has no signal {shown(name)}; it has {known}")
-        return message, field
-
-    def _scale(self, table: Table, units: Dictionary[str, float], torque: bool) -> float:
-        """SI units per DBC unit."""
-        unit = table.text("unit", (*units, *TORQUE_UNITS) if torque else tuple(units))
-        sign = table.get("sign", "1 or -1")
-        if isinstance(sign, bool) or sign not in (1, -1):
-            raise table.fail("sign", f"expected 1 or -1, got {shown(sign)}")
-        scale = _optional(table, "scale", 1.0, _positive, "a positive number")
-        if unit in TORQUE_UNITS:
-            return float(sign) * scale / table.number("per_ampere", _positive, f"a positive number of {unit}")
-        return float(sign) * scale * units[unit]
-
-    def _range(self, table: Table) -> tuple[float, float]:
-        low, high = table.number_pair("range")
-        if low == high:
-            raise table.fail("range", "expected two different values")
-        return low, high
-
-    def _protection_of(self, name: str, fields: Dictionary[str, Field]) -> Protection:
-        if self._protection is None or name not in self._protection.names():
-            return Protection(self._default)
-        table = self._protection.table(name)
-        kind = table.text("kind", KINDS)
-        checksum, counter = (_field_of(table, key, fields) for key in ("checksum", "counter"))
-        modulus = MODULI.get(kind, 0)
-        if counter is not None and not modulus:
-            most = 1 << min(counter.length, 16)
-            modulus = table.integer("modulus", 2, most) if "modulus" in table.names() else most
-        data_ids: tuple[int, ...] = ()
-        if kind in DATA_IDS:
-            count = DATA_IDS[kind]
-            highest = 0xFF if kind == "profile2" else 0xFFFF
-            data_ids = tuple(int(v) for v in table.numbers("data_ids", count, count))
-            if any(not 0 <= v <= highest for v in data_ids):
-                raise table.fail("data_ids", f"expected whole numbers from 0 to {highest}")
-        start = table.integer("start", 0, 255) if "start" in table.names() else 0
-        table.nothing_else(("checksum", "counter", "modulus", "data_ids", "start"))
-        _check_protection(table, kind, checksum, counter, modulus)
-        return Protection(kind, checksum, counter, modulus if counter is not None else 0, data_ids, start)
-
-
-def _check_protection(table: Table, kind: str, checksum: Field | None, counter: Field | None, modulus: int) -> None:
-    if kind != "none":
-        bits = 16 if kind == "profile5" else 8
-        if checksum is None:
-            raise table.fail("checksum", "missing: expected the name of a signal; add it")
-        whole = sorted(checksum.positions) == list(range(min(checksum.positions), min(checksum.positions) + bits))
-        if checksum.length != bits or not whole or min(checksum.positions) % 8 or checksum.signed or checksum.is_float:
-            raise table.fail("checksum", f"expected an unsigned signal of {bits} bits that begins with a byte")
-    if kind in MODULI and counter is None:
-        raise table.fail("counter", "missing: expected the name of a signal; add it")
-    if counter is not None and (counter.is_float or counter.signed or modulus > 1 << counter.length):
-        raise table.fail("counter", f"expected an unsigned signal that counts to {modulus}")
-
-
-def _field_of(table: Table, key: str, fields: Dictionary[str, Field]) -> Field | None:
-    if key not in table.names():
-        return None
-    name = table.text(key)
-    if name not in fields:
-        raise table.fail(key, f"no such signal; the message has {_names(fields)}")
-    return fields[name]
-
-
-def _watchdog(node: Table) -> float:
-    """The drive's own time-out [s]: a drive without one is refused, whatever is accepted."""
-    node.text("on_loss", ("hold",))
-    node.text("stop", ("freewheel",))
-    if "watchdog" not in node.names():
-        raise node.fail(
-            "watchdog", "missing: a drive that never lets go by itself is not commanded, and no key accepts it"
-        )
-    most = LONGEST_NODE_WATCHDOG
-    return node.number("watchdog", lambda v: 0 < v <= most, f"the drive's own time-out, in (0, {most:g}] s")
-
-
-def _lost(
-    reader: _Reader,
-    angle: Measured,
-    velocity: Measured,
-    current: Measured | None,
-    command: Commanded,
-    state: State | None,
-    relative: str,
-) -> tuple[str, ...]:
-    """Names of the properties that the drive lacks, in the order of :data:`PROPERTIES`."""
-    sensors = [reader.used[measured.message].protection for measured in (angle, velocity)]
-    absent = {"no_answers", "no_echo", "no_device_time", "no_identity", "hold_on_loss"}
-    absent |= {"no_counter"} if any(p.counter is None for p in sensors) else set()
-    absent |= {"no_crc"} if any(p.checksum is None for p in sensors) else set()
-    absent |= {"no_command_crc"} if reader.used[command.message].protection.checksum is None else set()
-    absent |= {"no_current"} if current is None else set()
-    absent |= {"no_state"} if state is None else set()
-    absent |= {"relative_k_m"} if relative else set()
-    return tuple(name for name in PROPERTIES if name in absent)
-
-
-def _accepted(node: Table, lost: tuple[str, ...]) -> None:
-    """Refuse a file that does not accept exactly what the drive lacks."""
-    given = node.get("accept", "a list of names")
-    if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
-        raise node.fail("accept", f"expected a list of names, got {shown(given)}")
-    if missing := [name for name in lost if name not in given]:
-        more = f"; nor are {', '.join(missing[1:])}" if missing[1:] else ""
-        raise node.fail("accept", f"'{missing[0]}' is not accepted: {PROPERTIES[missing[0]]}{more}")
-    if surplus := [name for name in given if name not in lost]:
-        raise node.fail("accept", f"{shown(surplus[0])} is nothing that this drive lacks")
-
-
-def _is_torque(command: Table) -> bool:
-    return command.get("unit") in TORQUE_UNITS
-
-
-def _optional(
-    table: Table, key: str, absent: float, check: Any = lambda _value: True, wanted: str = "a number"
-) -> float:
-    return table.number(key, check, wanted) if key in table.names() else absent
-
-
-def _positive(value: float) -> bool:
-    return value > 0.0
-
-
-def _integers(table: Table, key: str) -> tuple[int, ...]:
-    values = table.numbers(key, 1, 16)
-    if any(not value.is_integer() for value in map(float, values)):
-        raise table.fail(key, "expected whole numbers")
-    return tuple(int(value) for value in values)
-
-
-def _names(names: object) -> str:
-    assert isinstance(names, set | dict)
-    return ", ".join(sorted(names)) or "none"
-
-
-def _parsed(text: str, source: str) -> dict[str, Any]:
-    try:
-        return parse_toml(text)
+        document = parse_toml(text)
     except ValueError as err:
         raise MappingError(f"{source}: {err}") from err
+    return read(_File, document, source, MappingError)
 
 
-def _read(path: str | Path, most: int) -> str:
+def _text(path: str | Path, most: int) -> str:
     try:
         return read_text(path, most)
     except (OSError, UnicodeDecodeError) as err:
         reason = err.strerror if isinstance(err, OSError) else "not UTF-8 text"
         raise MappingError(f"{path}: cannot read it: {reason}") from err
+
+
+# --- with its DBC ---------------------------------------------------------------------------------------------------
+
+
+def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
+    can, signals = file.can, file.can.signals
+    try:
+        database = parse(dbc_text)
+    except FrameError as err:
+        raise MappingError(f"{source}: can.dbc: {_one_line(err)}") from err
+    reader = _Reader(source, database, can.protection)
+    command = reader.command(signals.command)
+    state = None if signals.state is None else reader.state(signals.state)
+    made = Mapping(
+        name=file.name,
+        polled=can.exchange == "poll",
+        pair_within=can.pair_within,
+        messages=reader.used,
+        angle=reader.measured(signals.angle, "can.signals.angle"),
+        velocity=reader.measured(signals.velocity, "can.signals.velocity"),
+        current=None if signals.current is None else reader.measured(signals.current, "can.signals.current"),
+        command=command,
+        state=state,
+        arm=tuple(reader.step(step, f"can.arm[{n}]", command, state) for n, step in enumerate(can.arm)),
+        disarm=tuple(reader.step(step, f"can.disarm[{n}]", command, state) for n, step in enumerate(can.disarm)),
+        watchdog=file.node.watchdog,
+        end_stop_speed=file.node.end_stop_speed,
+        text=text,
+        dbc_text=dbc_text,
+        database=database,
+    )
+    unused = set(can.protection) - {"default", *(info.message for info in reader.used.values())}
+    if unused:
+        raise reader.error(f"can.protection.{min(unused)}", "unknown key: no message of that name is used")
+    if missing := [name for name in made.lost if name not in file.node.accept]:
+        more = f"; nor are {', '.join(missing[1:])}" if missing[1:] else ""
+        raise reader.error("node.accept", f"'{missing[0]}' is not accepted: {PROPERTIES[missing[0]]}{more}")
+    if surplus := [name for name in file.node.accept if name not in made.lost]:
+        raise reader.error("node.accept", f"{shown(surplus[0])} is nothing that this drive lacks")
+    return made
+
+
+class _Reader:
+    """Finds what the file names in the DBC, and keeps the messages that are used."""
+
+    def __init__(self, source: str, database: Database, protection: Dictionary[str, str | _Protection]) -> None:
+        self._source, self._database, self._protection = source, database, protection
+        self.used: dict[str, MessageInfo] = {}
+
+    def error(self, key: str, reason: str) -> MappingError:
+        return MappingError(f"{self._source}: {key}: {reason}")
+
+    def measured(self, of: _Angle | _Velocity | _Current, key: str) -> Measured:
+        info, field = self._signal(of.signal, key)
+        wrap = of.wrap or 0.0 if isinstance(of, _Angle) else 0.0
+        return Measured(info.name, field, self._scale(of, key), of.offset, *self._range(of, key), wrap)
+
+    def command(self, of: _Command) -> Commanded:
+        key = "can.signals.command"
+        info, field = self._signal(of.signal, key)
+        if info.page is None and self._message(info.message, key).is_multiplexed():
+            raise self.error(f"{key}.signal", f"{of.signal}: expected a signal of one value of the multiplexor")
+        low, high = self._range(of, key)
+        if not low <= 0.0 <= high:
+            raise self.error(f"{key}.range", f"0 must lie inside, got {low:g} to {high:g}")
+        protected = {f.name for f in (info.protection.checksum, info.protection.counter) if f is not None}
+        needed = set(info.fields) - {field.name} - protected
+        if set(of.others) != needed:
+            raise self.error(f"{key}.others", f"expected a value for {_names(needed)}, got {_names(set(of.others))}")
+        if info.page is not None and of.others[info.page.name] != info.page_value:
+            raise self.error(f"{key}.others.{info.page.name}", f"expected {info.page_value}, of {of.signal}")
+        is_current = not _is_torque(of.unit)
+        return Commanded(info.name, field, 1.0 / self._scale(of, key), low, high, of.others, is_current)
+
+    def state(self, of: _State) -> State:
+        key = "can.signals.state"
+        info, field = self._signal(of.signal, key)
+        if field.is_float:
+            raise self.error(f"{key}.signal", "expected a signal of whole numbers")
+        if set(of.idle) & set(of.active):
+            raise self.error(f"{key}.active", "a value cannot be both idle and active")
+        if of.error is not None and of.error not in info.fields:
+            raise self.error(f"{key}.error", f"no such signal in {info.message}; it has {_names(set(info.fields))}")
+        error = None if of.error is None else info.fields[of.error]
+        return State(info.name, field, of.idle, of.active, of.timeout, error)
+
+    def step(self, of: _Step, key: str, command: Commanded, state: State | None) -> Step:
+        if of.wait is not None and of.wait.state is not None and state is None:
+            raise self.error(f"{key}.wait.state", "this file names no state to wait for")
+        frames = tuple(self._constant(name, given, f"{key}.send.{name}", command) for name, given in of.send.items())
+        return Step(frames, (of.wait and of.wait.state) or "", of.wait.timeout if of.wait else 0.0)
+
+    def _constant(self, name: str, given: str | dict[str, float], key: str, command: Commanded) -> ConstantFrame:
+        message = self._message(name, key)
+        if isinstance(given, str):
+            try:
+                data = bytes.fromhex(given)
+            except ValueError:
+                raise self.error(key, "expected signals, or bytes in hexadecimal") from None
+            if len(data) != message.length:
+                raise self.error(key, f"expected {message.length} bytes, got {len(data)}")
+            return ConstantFrame(self._info(message, _page_of(message, data), key).name, data, None)
+        try:
+            data = message.encode(given, padding=False, strict=True)
+        except Exception as err:  # of several kinds, by what does not fit
+            raise self.error(key, f"does not fit the DBC: {_one_line(err)}") from err
+        info = self._info(message, _page_of(message, data), key)
+        if info.protection.kind != "none":
+            raise self.error(key, "a protected message cannot be part of a sequence")
+        if info.name == command.message and given.get(command.field.name) != 0.0:
+            raise self.error(key, "a sequence commands no current: give 0, or the bytes that the drive's maker gives")
+        return ConstantFrame(info.name, bytes(data), given)
+
+    def _message(self, name: str, key: str) -> DbcMessage:
+        try:
+            message = self._database.get_message_by_name(name)
+        except KeyError:
+            raise self.error(key, f"the DBC has no message {shown(name)}") from None
+        if message.is_fd or message.length > 8:
+            raise self.error(key, f"{name}: expected a classical frame; use a gateway")
+        switches = [signal for signal in message.signals if signal.is_multiplexer]
+        if len(switches) > 1 or any(switch.multiplexer_ids for switch in switches):
+            raise self.error(key, f"{name}: expected one multiplexor at most; use a gateway")
+        ours = {m.identifier for m in load_layout().messages.values()}
+        if not message.is_extended_frame and message.frame_id in ours:
+            raise self.error(
+                key, f"{name} has the identifier {message.frame_id:#05x} of a message of ours: give the drive another"
+            )
+        return message
+
+    def _signal(self, text: str, key: str) -> tuple[MessageInfo, Field]:
+        key = f"{key}.signal"
+        name, dot, signal = text.partition(".")
+        if not dot:
+            raise self.error(key, f"expected MESSAGE.SIGNAL, got {shown(text)}")
+        message = self._message(name, key)
+        found = next((one for one in message.signals if one.name == signal), None)
+        if found is None:
+            known = _names({one.name for one in message.signals})
+            raise self.error(key, f"{name} has no signal {shown(signal)}; it has {known}")
+        pages = found.multiplexer_ids or []
+        if len(pages) > 1:
+            raise self.error(key, f"{text}: expected a signal of one value of the multiplexor, it is of {len(pages)}")
+        info = self._info(message, pages[0] if pages else None, key)
+        return info, info.fields[signal]
+
+    def _info(self, message: DbcMessage, page: int | None, key: str) -> MessageInfo:
+        """The message, of a multiplexed one what has this value of its multiplexor."""
+        name = message.name if page is None else f"{message.name}[{page}]"
+        if name in self.used:
+            return self.used[name]
+        chosen = [one for one in message.signals if one.multiplexer_ids is None or page in one.multiplexer_ids]
+        fields = {one.name: make_field(one) for one in chosen}
+        for field in fields.values():
+            if field.is_float and field.length not in (16, 32, 64):
+                raise self.error(key, f"{message.name}.{field.name}: expected a float of 16, 32 or 64 bits")
+            if not math.isfinite(field.scale) or field.scale == 0.0 or not math.isfinite(field.offset):
+                raise self.error(key, f"{message.name}.{field.name}: expected a scale that is finite and not 0")
+        protection = self._protection_of(message.name, fields)
+        if page is not None and protection.counter is not None:
+            raise self.error(f"can.protection.{message.name}", "a multiplexed message with a counter needs a gateway")
+        self.used[name] = info = MessageInfo(
+            name=name,
+            message=message.name,
+            identifier=message.frame_id,
+            extended=message.is_extended_frame,
+            length=message.length,
+            fields=fields,
+            protection=protection,
+            page=None if page is None else fields[_switch(message)],
+            page_value=page or 0,
+        )
+        return info
+
+    def _scale(self, of: _Angle | _Velocity | _Current | _Command, key: str) -> float:
+        """SI units per DBC unit."""
+        if not _is_torque(of.unit):
+            return of.sign * of.scale * UNITS[of.unit]
+        assert isinstance(of, _Current | _Command)
+        if of.per_ampere is None:
+            raise self.error(f"{key}.per_ampere", f"missing: expected a positive number of {of.unit}; add it")
+        return of.sign * of.scale / of.per_ampere
+
+    def _range(self, of: _Signal, key: str) -> tuple[float, float]:
+        low, high = of.range
+        if not low < high:
+            raise self.error(f"{key}.range", f"expected the lower value first, got {low:g} and {high:g}")
+        return low, high
+
+    def _protection_of(self, name: str, fields: Dictionary[str, Field]) -> Protection:
+        of, key = self._protection.get(name), f"can.protection.{name}"
+        if not isinstance(of, _Protection):
+            return Protection("none")
+        checksum = self._field(fields, of.checksum, f"{key}.checksum")
+        counter = self._field(fields, of.counter, f"{key}.counter")
+        modulus = MODULI.get(of.kind, 0)
+        if counter is not None and not modulus:
+            modulus = of.modulus or 1 << min(counter.length, 16)
+        if of.kind != "none":
+            self._check_checksum(checksum, 16 if of.kind == "profile5" else 8, f"{key}.checksum")
+        if of.kind in MODULI and counter is None:
+            raise self.error(f"{key}.counter", "missing: expected the name of a signal; add it")
+        if counter is not None and (counter.is_float or counter.signed or modulus > 1 << counter.length):
+            raise self.error(f"{key}.counter", f"expected an unsigned signal that counts to {modulus}")
+        count, highest = DATA_IDS.get(of.kind, 0), 0xFF if of.kind == "profile2" else 0xFFFF
+        if len(of.data_ids) != count or any(v > highest for v in of.data_ids):
+            raise self.error(f"{key}.data_ids", f"expected {count} whole numbers from 0 to {highest}")
+        return Protection(of.kind, checksum, counter, modulus if counter is not None else 0, of.data_ids, of.start)
+
+    def _field(self, fields: Dictionary[str, Field], name: str | None, key: str) -> Field | None:
+        if name is not None and name not in fields:
+            raise self.error(key, f"no such signal; the message has {_names(set(fields))}")
+        return None if name is None else fields[name]
+
+    def _check_checksum(self, checksum: Field | None, bits: int, key: str) -> None:
+        if checksum is None:
+            raise self.error(key, "missing: expected the name of a signal; add it")
+        first = min(checksum.positions)
+        whole = sorted(checksum.positions) == list(range(first, first + bits))
+        if checksum.length != bits or not whole or first % 8 or checksum.signed or checksum.is_float:
+            raise self.error(key, f"expected an unsigned signal of {bits} bits that begins with a byte")
+
+
+def _switch(message: DbcMessage) -> str:
+    return next(signal.name for signal in message.signals if signal.is_multiplexer)
+
+
+def _page_of(message: DbcMessage, data: bytes) -> int | None:
+    """Value of a message's multiplexor in a payload; None of a message without one."""
+    if not message.is_multiplexed():
+        return None
+    return raw_value(make_field(message.get_signal_by_name(_switch(message))), bytes(data))
+
+
+def _is_torque(unit: str) -> bool:
+    return unit not in UNITS
+
+
+def _names(names: set[str]) -> str:
+    return ", ".join(sorted(names)) or "none"
 
 
 def _one_line(err: Exception) -> str:

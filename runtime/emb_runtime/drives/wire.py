@@ -42,7 +42,7 @@ class Encoder:
         self._mapping = mapping
         command = mapping.command
         self._info = mapping.messages[command.message]
-        self._message = mapping.database.get_message_by_name(command.message)
+        self._message = mapping.database.get_message_by_name(self._info.message)
         self._counter = 0
 
     def command(self, current: float) -> Frame:
@@ -98,8 +98,10 @@ class Receiver:
         self._mapping = mapping
         self._sensors = mapping.sensor_messages
         heard = self._sensors | ({mapping.state.message} if mapping.state else set())
-        self._infos = {(i.extended, i.identifier): i for i in (mapping.messages[name] for name in heard)}
-        self._codecs = {name: mapping.database.get_message_by_name(name) for name in heard}
+        self._infos: dict[tuple[bool, int], list[MessageInfo]] = {}
+        for info in (mapping.messages[name] for name in sorted(heard)):
+            self._infos.setdefault((info.extended, info.identifier), []).append(info)
+        self._codecs = {name: mapping.database.get_message_by_name(mapping.messages[name].message) for name in heard}
         self._counters: dict[str, int] = {}
         self._missing = {name: LeakyCount(tolerated) for name in heard}
         self._waiting: dict[str, tuple[dict[str, float], int]] = {}
@@ -128,15 +130,15 @@ class Receiver:
 
         A frame that is none of the drive's is passed over; one that cannot be believed is counted.
         """
-        info = self._infos.get((frame.extended, frame.identifier))
-        if info is None or frame.own or frame.error:
-            return None
-        values = self._believed(info, frame)
-        if values is None:
-            return None
-        if self._mapping.state is not None and info.name == self._mapping.state.message:
-            self._take_state(values, frame.time_ns)
-        return self._pair(info.name, values, frame.time_ns) if info.name in self._sensors else None
+        sample = None
+        for info in self._infos.get((frame.extended, frame.identifier), ()):
+            if frame.own or frame.error or not _is_of(info, frame) or (values := self._believed(info, frame)) is None:
+                continue
+            if self._mapping.state is not None and info.name == self._mapping.state.message:
+                self._take_state(values, frame.time_ns)
+            if info.name in self._sensors:
+                sample = self._pair(info.name, values, frame.time_ns) or sample
+        return sample
 
     def _believed(self, info: MessageInfo, frame: Frame) -> dict[str, float] | None:
         """Values of a frame, None if it is not to be believed."""
@@ -157,7 +159,8 @@ class Receiver:
             if info.name in self._counters:
                 self._missing[info.name].reject((count - self._counters[info.name]) % info.protection.modulus - 1)
             self._counters[info.name] = count
-        decoded = self._codecs[info.name].decode_simple(frame.data, decode_choices=False)
+        decoded = self._codecs[info.name].decode(frame.data, decode_choices=False)
+        assert isinstance(decoded, dict)
         values = {name: float(value) for name, value in decoded.items() if isinstance(value, int | float)}
         mapping = self._mapping
         for measured in (mapping.angle, mapping.velocity, mapping.current):
@@ -212,6 +215,13 @@ class Receiver:
             self._turns -= measured.wrap * round((value + self._turns - last) / measured.wrap)
             value = self._wrapped = value + self._turns
         return value * measured.factor + measured.offset
+
+
+def _is_of(info: MessageInfo, frame: Frame) -> bool:
+    """True if a frame of the message's identifier has its value of the multiplexor, or is too short to tell."""
+    if info.page is None or frame.remote or len(frame.data) != info.length:
+        return True
+    return raw_value(info.page, frame.data) == info.page_value
 
 
 def _si(measured: Measured, values: dict[str, float]) -> float:
