@@ -25,7 +25,8 @@ class Estimator:
         """Make the model, and begin."""
         ranges = bench.range_set(bench.prior)
         self.model = make_model(bench, ranges, sticks=bench.shield.model != "euler")
-        self._varied = [PARAMETER_NAMES.index(quantity.name) for quantity in estimated(bench)]
+        varied = [PARAMETER_NAMES.index(quantity.name) for quantity in estimated(bench)]
+        self._varied = [*varied, *(len(PARAMETER_NAMES) + i for i in varied)]  # Indices in :attr:`parameters`
         self.state: State = start(self.model)
 
     def begin(self) -> None:
@@ -50,7 +51,7 @@ class Estimator:
     def estimate(self) -> tuple[float, ...]:
         """Values of :func:`estimated`, then their standard deviations, in SI units; empty if one is not finite."""
         numbers = self.parameters
-        chosen = tuple(numbers[i + offset] for offset in (0, len(PARAMETER_NAMES)) for i in self._varied)
+        chosen = tuple(numbers[i] for i in self._varied)
         return chosen if all(map(math.isfinite, chosen)) else ()
 
 

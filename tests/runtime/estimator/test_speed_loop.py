@@ -70,7 +70,8 @@ def test_levels_hold_between_their_switches_and_in_the_period_of_a_switch_by_the
     assert wanted(levels, [0.2, 0.1], 99.0) == pytest.approx(1.0)  # a switch before the one that comes first
     assert wanted(levels, [0.2, 0.1], 101.0) == pytest.approx(-0.01)
     assert wanted([0.5], [], 7.0) == pytest.approx(0.5)
-    assert [share_after(0.1, step, 500.0) for step in (0.0, 49.0, 49.5, 50.0)] == pytest.approx([0.0, 0.0, 0.5, 1.0])
+    found = [share_after(0.1, step, 500.0) for step in (0.0, 49.0, 49.5, 50.0, 60.0)]
+    assert found == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0])
 
 
 def test_it_believes_the_estimate_within_its_range_only() -> None:
@@ -79,4 +80,4 @@ def test_it_believes_the_estimate_within_its_range_only() -> None:
     assert believed(MODEL, free) == believed(MODEL, edge)
     ask = [follow_reference(MODEL, s, SCALE, [0.1], [], 0.0) for s in (free, edge)]
     assert ask[0] == ask[1] != 0.0
-    assert scale_of(BENCH, 0.3) == (500.0, 500.0, 0.3)
+    assert (scale_of(BENCH, 0.3), scale_of(BENCH).gain) == ((500.0, 500.0, 0.3), 1.0)

@@ -190,5 +190,5 @@ def test_every_packaged_reference_is_made_by_a_command_that_exists_and_keeps_wha
 def test_a_kept_delay_that_is_none_is_refused() -> None:
     record: dict[str, Any] = json.loads(stored("four-d-exact-delay-quadratic").to_json())
     for delay in ([0], [2, 1], [0, 99], [0, 1.5], [-1, 0]):
-        with pytest.raises(UsageError, match="mine: command_delay: "):
+        with pytest.raises(UsageError, match="mine: command_delay"):
             read_text(json.dumps({**record, "command_delay": delay}), "mine")
