@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emb_bench.commission.bench_file import MEASURED, found_text
 from emb_bench.logs.log import read_log
 from emb_export.reference import reference_file
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, parse_bench, shipped_bench_text
@@ -20,6 +21,7 @@ from emb_train.structured.played import Following, PolicyFile
 from emb_train.structured.stored import stored
 from tools.shipped_actors import REFERENCES
 
+from tests.bench.commission.test_steps import LOGS, found, sheet_text  # isort: skip
 from tests.runtime.operating import EmbRun  # isort: skip
 
 PHYSICAL = Conditions(information="physical")
@@ -88,6 +90,25 @@ def test_it_runs_on_a_bench_of_ones_own_as_one_made_for_that_bench_does() -> Non
             assert (int(played.left.sum()), int(played.home.sum())) == (0, 4), what
             values.append(MEASURES["D"].values(played.matrices))
         assert np.abs(values[0] - values[1]).max() < 0.005, what
+
+
+def test_it_runs_with_the_bench_file_that_a_commissioning_writes(tmp_path: Path) -> None:
+    sheet = parse_bench(sheet_text(), "sheet")
+    bench = parse_bench(found_text(sheet, found(sheet), LOGS), "found")
+    assert (bench.prior, bench.noise == sheet.noise) == (MEASURED, False)
+    ranges = bench.range_set(MEASURED)
+    push = Played(np.full(bench.timing.horizon, bench.limits.current))
+    for quick in (False, True):
+        policy = load_policy(shipped_actor_path(quick), bench)
+        assert policy.warnings == []
+        both = [
+            play(bench, ranges, PARAMETER_NAMES, e, fresh_draws(ranges, 5, 4), conditions=PHYSICAL)
+            for e in (PolicyFile(policy, bench), push)
+        ]
+        for played in both:
+            assert (int(played.left.sum()), int(played.home.sum())) == (0, 4)
+        more = MEASURES["D"].values(both[0].matrices) - MEASURES["D"].values(both[1].matrices)
+        assert quick or (more > 1.0).all(), more  # the quick one is made for a tenth of a second
 
 
 def test_the_first_run_of_a_newcomer_states_all_four_parameters_to_three_thousandths_of_a_percent_and_is_right(
