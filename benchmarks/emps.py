@@ -75,7 +75,7 @@ def of_machine(e: Estimate) -> dict[str, tuple[float, float]]:
         value, half = values["current_offset"]  # ours drives the machine, the published one opposes the command
         return found | {"offset": (-value / TRAVEL, half / TRAVEL)}
     names = [u.name for u in e.unknowns]
-    scale = np.array([abs(v) if u.relative else 1.0 for u, v in zip(e.unknowns, e.values, strict=True)])
+    scale = e.scale
     covariance = e.sandwich * np.outer(scale, scale)
     v, share = e.values[names.index("f_v")], e.values[names.index("viscous_asymmetry")]
     c, offset = e.values[names.index("T_c")], e.values[names.index("current_offset")]

@@ -100,8 +100,8 @@ def conclude(
         certain = Standing.BIASED if e.method == "rls" else Standing.IF_MODEL_RIGHT
     found = []
     columns = (e.unknowns, e.shown, e.labels, e.values.tolist(), e.intervals().tolist(), e.deviations().tolist())
-    noise = noise_deviations(e).tolist()
-    for unknown, shown, label, value, (low, high), deviation, own in zip(*columns, noise, strict=True):
+    noise = (noise_deviations(e).tolist(), e.scale.tolist())
+    for unknown, shown, label, value, (low, high), deviation, own, scale in zip(*columns, *noise, strict=True):
         finding, one = findings.get(label), of_profile.get(label)
         interval = (low, high)
         if one is not None:
@@ -119,7 +119,7 @@ def conclude(
                 value=value * shown.factor,
                 unit=shown.unit,
                 interval=(interval[0] * shown.factor, interval[1] * shown.factor),
-                repeatability=NORMAL_95 * own * shown.factor * (abs(value) if unknown.relative else 1.0),
+                repeatability=NORMAL_95 * own * shown.factor * scale,
                 of_interest=of_interest,
                 standing=Standing.NOT_IDENTIFIED if why_not else certain,
                 why_not=why_not,

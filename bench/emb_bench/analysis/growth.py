@@ -71,7 +71,7 @@ def growth(e: Estimate, number: int) -> Growth:
     z = (e.values / whole.units)[whole.columns(number)]
     weights = problem.weights(z)
     n, size = len(weights[0]), len(z)
-    units = np.array([value if unknown.relative else 1.0 for unknown, value in zip(problem.unknowns, z, strict=True)])
+    units = problem.scale(z)
     rows = problem.jacobian(z, weights)[1] * units
     before, own = rows[2 * n :], rows[: 2 * n].reshape(n, 2, size)
     added = np.einsum("koi,koj->kij", own, own)

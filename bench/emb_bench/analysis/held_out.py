@@ -89,7 +89,7 @@ def _predicted(e: Estimate, record: Experiment, level: float) -> HeldOut:
     start[index] = e.values[e.shared()] / problem.units[index]
     start = np.clip(start, *problem.bounds)
     at = start[index]
-    scale = np.array([z if problem.unknowns[i].relative else 1.0 for i, z in zip(index, at.tolist(), strict=True)])
+    scale = problem.scale(start)[index]
     known = np.zeros((len(index), len(start)))
     known[:, index] = _root(e.shared_information() / np.outer(scale, scale))
     weights = problem.weights(start)

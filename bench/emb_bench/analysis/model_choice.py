@@ -107,9 +107,9 @@ class ModelChoice:
         """Changes of the parameters of interest if ``other`` were right instead of the best model."""
         e, found = self.best.estimate, []
         theirs = dict(zip(other.estimate.unknowns, other.estimate.values.tolist(), strict=True))
-        for unknown, value, deviation in zip(e.unknowns, e.values.tolist(), e.deviations().tolist(), strict=True):
+        columns = (e.unknowns, e.values.tolist(), e.deviations().tolist(), e.scale.tolist())
+        for unknown, value, deviation, size in zip(*columns, strict=True):
             if unknown.name in e.asked.params and unknown in theirs:
-                size = abs(value) if unknown.relative else 1.0
                 change = (theirs[unknown] - value) / size if size > 0.0 else math.nan
                 sigmas = change / deviation if deviation > 0.0 else math.nan
                 found.append(Change(unknown.name, 100.0 * change, sigmas))
@@ -352,6 +352,6 @@ def _parts(records: Sequence[Experiment]) -> list[tuple[list[int], tuple[Experim
 
 def _volume(problem: Problem, z: Floats) -> float:
     """Logarithm of the determinant of the information, 1 for what nothing is known of."""
-    scale = np.array([v if u.relative else 1.0 for u, v in zip(problem.unknowns, z, strict=True)])
+    scale = problem.scale(z)
     rows = problem.jacobian(z, problem.weights(z))[1] * scale
     return float(np.linalg.slogdet(rows.T @ rows + np.eye(len(z)))[1])

@@ -162,7 +162,7 @@ def profile(e: Estimate, label: str) -> Profile:
         (False, False): "flat",
     }[below.closed, above.closed]
     minimum = float(z[i]) * unit
-    half = NORMAL_95 * float(e.cramer_rao()[i]) * (abs(float(e.values[i])) if e.unknowns[i].relative else 1.0)
+    half = NORMAL_95 * float(e.cramer_rao()[i] * e.scale[i])
     open_sides = tuple(
         OpenSide(above, last.rise, float(last.z[i]) * unit, last.rise >= LEVEL)
         for above, side in zip((False, True), sides, strict=True)
@@ -184,7 +184,7 @@ def profile(e: Estimate, label: str) -> Profile:
 def _sides(
     e: Estimate, problem: Problem, weights: Sequence[Floats], i: int, z: Floats, cost: float
 ) -> tuple[_Side, _Side]:
-    deviation = float(e.cramer_rao()[i]) * (float(z[i]) if e.unknowns[i].relative else 1.0)
+    deviation = float(e.cramer_rao()[i] * problem.scale(z)[i])
     low, high = (float(border[i]) for border in problem.bounds)
     below = _walk(problem, weights, i, z, cost, low, min(STEP * deviation, SHARE * (z[i] - low)))
     above = _walk(problem, weights, i, z, cost, high, min(STEP * deviation, SHARE * (high - z[i])))

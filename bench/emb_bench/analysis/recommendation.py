@@ -135,7 +135,7 @@ def _information(e: Estimate, text: str) -> Floats:
     z[own] = [values[problem.unknowns[i]] / problem.units[i] for i in own]
     z = np.clip(z, *problem.bounds)
     rows = _rows(e, problem, z)
-    rows *= np.array([value if u.relative else 1.0 for u, value in zip(problem.unknowns, z.tolist(), strict=True)])
+    rows *= problem.scale(z)
     return schur_complement(rows.T @ rows, own)
 
 
