@@ -91,11 +91,13 @@ def run(args: argparse.Namespace) -> int:
     """Runs a log's loop again; returns the exit code.
 
     Raises:
-        UsageError: the file cannot be read.
+        UsageError: the file cannot be read, or is a recording of others.
         LogError: it is no log, or lacks what a rerun needs.
         PolicyRefusedError: the policy in the log is refused.
     """
     log = read_log(args.log)
+    if log.imported:
+        raise UsageError(f"{args.log}: a recording of others has no loop to run again")
     if recorded_run(log).purpose == "homing":
         again = rerun(log, Still(), log.bench.limits.current)
         carried: dict[str, str] = {}

@@ -26,7 +26,7 @@ WORKS: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 LACKS: dict[str, tuple[tuple[str, ...], str]] = {
     "timing": (("timing", "RUN"), "no loop whose timing"),
-    "rerun": (("rerun", "RUN"), "no policy.onnx"),
+    "rerun": (("rerun", "RUN"), "no loop to run again"),
     "estimate --method rls": (("estimate", "RUN", "--method", "rls"), "another method does"),
     "estimate --model all": (("estimate", "RUN", "--model", "all"), "expected --method oem"),
     "estimate --grow": (("estimate", "RUN", "--grow"), "expected --method oem"),

@@ -171,7 +171,7 @@ MAPS_REFUSED = (
     ("mass = 70.0", "mass = 70.0\ngamma = 1e-5", "k_1 and gamma go together"),
     ("window = 0.5", "window = 0.5\nspring = 1", "machine.spring: unknown key"),
     ('["current_offset"]', '["wind"]', "machine.nuisances[0]: expected one of"),
-    ("schema = 1", "schema = 2", "schema: expected one of 1, got 2"),
+    ("schema = 1", "schema = 2", "schema: expected 1, got 2"),
     ("schema = 1", "schema = ", "not valid TOML"),
     (f"noise = {5e-8 / 12**0.5}", "", "signals.angle.noise: missing"),
     (f"sample_time = {T_S}", "sample_time = 5", "sample_time: expected a time from 0.0001 to 0.1 s"),
