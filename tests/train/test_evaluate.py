@@ -300,6 +300,7 @@ def test_a_policy_is_evaluated_behind_the_shield_that_it_was_made_behind_unless_
     said = json.loads(capsys.readouterr().out)
     assert (said["ranges"], said["conditions"]["shield_ranges"]) == ("viscous", "viscous")
     assert {row["left"] for row in said["plants"]["euler"]["rows"]} == {0}
+    assert run("actor", "four-d-exact-blind") == 0  # both behind the bench's own
     assert run(*arguments, "--shield", "pm50") == 2  # which does not cover the brakes
     assert run("actor", "viscous-exact-quadratic", "--ranges", "viscous", "--parameters", "f_v") == 2
 

@@ -341,7 +341,7 @@ def ppo(arguments: argparse.Namespace) -> int:
     from emb_train.bench_compatibility import unfit
     from emb_train.evaluate import grid_outcomes, grid_text
     from emb_train.ppo import Metrics
-    from emb_train.training import begin_training, load_preset, load_training, run_training
+    from emb_train.training import ACTOR, begin_training, load_preset, load_training, run_training
 
     bench, folder = load_bench(arguments.bench), arguments.out
     changes = {"total_steps": arguments.steps, "plant": arguments.plant, "seed": arguments.seed}
@@ -359,7 +359,8 @@ def ppo(arguments: argparse.Namespace) -> int:
         try:
             run_training(folder, training, bench, note)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"emb-train: interrupted; the best actor so far is in {folder}") from None
+            kept = f"the best actor so far is in {folder}" if (folder / ACTOR).exists() else "nothing was trained"
+            raise KeyboardInterrupt(f"emb-train: interrupted; {kept}") from None
     if not conditions.shielded:
         show(f"{folder}: trained without a shield, which no bench runs; the study of the thesis shows what it does")
         return EXIT_DONE

@@ -70,7 +70,7 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
         task = kept.asked()
         sticks = bench.plant(kept.plant).mechanics.solver != EULER
         following = Following(kept, bench, bench.range_set(task.ranges), sticks=sticks)
-        return Subject(given, bench, following, task.ranges, task.parameters, task.shield_ranges)
+        return Subject(given, bench, following, task.ranges, task.parameters, _other_shield(task.shield_ranges, bench))
     if not path.is_dir():
         raise UsageError(
             f"{given}: no such folder, and no reference of that name; there are: {ACTOR}, "
@@ -83,7 +83,13 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
     if conditions.observes == EVERYTHING:
         raise UsageError(f"{given}: sees the parameters and the information, which no bench measures: it cannot be run")
     excitation = Network(DeployedActor(trained.actor, trained.bench.limits.current))
-    return Subject(given, trained.bench, excitation, training.ranges, training.parameters, conditions.shield_ranges)
+    shield = _other_shield(conditions.shield_ranges, trained.bench)
+    return Subject(given, trained.bench, excitation, training.ranges, training.parameters, shield)
+
+
+def _other_shield(name: str | None, bench: Bench) -> str | None:
+    """The set that a shield covered; None if it is the one that the bench names."""
+    return None if name == bench.shield.ranges else name
 
 
 def _file(name: str, path: Path, bench: Bench) -> Subject:

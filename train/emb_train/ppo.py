@@ -2,7 +2,7 @@
 
 The actor sees what the bench measures, the critic sees the true state. Each iteration begins N new experiments,
 collects T steps of each, and then improves both networks, which share nothing, on those N T steps. All randomness of
-iteration i comes from (seed, i).
+iteration i comes from (seed, i); the networks begin with torch's global random numbers.
 """
 
 from __future__ import annotations
@@ -202,7 +202,6 @@ def train(env: EmbExcitationVectorEnv, actor: Actor, ppo: Ppo, seed: int) -> Ite
         TrainingDivergedError: something is not finite any more, or for long every experiment has left the limits.
     """
     torch.set_num_threads(1)  # networks this small lose more by sharing out a product than they win
-    torch.manual_seed(seed)
     critic = Critic(env.batch.critic_size, ppo.hidden)
     optimisers = [torch.optim.Adam(network.parameters(), eps=1e-5, fused=True) for network in (actor, critic)]
     early = 0
