@@ -6,6 +6,7 @@ Sources: AUTOSAR "Specification of SW-C End-to-End Communication Protection Libr
 
 from __future__ import annotations
 
+import binascii
 from dataclasses import dataclass
 
 from emb_runtime.can import e2e
@@ -45,7 +46,7 @@ class Protection:
             data_id = self.data_ids[raw_value(self.counter, data) % len(self.data_ids)]
             return crc8_h2f(rest + bytes((data_id & 0xFF,)))
         if self.kind == "profile5":
-            return crc16_ccitt(rest + self.data_ids[0].to_bytes(2, "little"))
+            return binascii.crc_hqx(rest + self.data_ids[0].to_bytes(2, "little"), 0xFFFF)
         state = self.start
         for byte in rest:
             state = state ^ byte if self.kind == "xor" else (state + byte) & 0xFF
@@ -64,17 +65,14 @@ def crc8_h2f(data: bytes) -> int:
     """CRC-8 with the polynomial 0x2F, start value and final XOR 0xFF: 0xDF for ``b"123456789"``."""
     state = 0xFF
     for byte in data:
-        state ^= byte
-        for _ in range(8):
-            state = (state << 1 ^ 0x2F if state & 0x80 else state << 1) & 0xFF
+        state = _H2F[state ^ byte]
     return state ^ 0xFF
 
 
-def crc16_ccitt(data: bytes) -> int:
-    """CRC-16-CCITT-FALSE, polynomial 0x1021 and start value 0xFFFF: 0x29B1 for ``b"123456789"``."""
-    state = 0xFFFF
-    for byte in data:
-        state ^= byte << 8
-        for _ in range(8):
-            state = (state << 1 ^ 0x1021 if state & 0x8000 else state << 1) & 0xFFFF
+def _h2f(state: int) -> int:
+    for _ in range(8):
+        state = (state << 1 ^ 0x2F if state & 0x80 else state << 1) & 0xFF
     return state
+
+
+_H2F = tuple(map(_h2f, range(256)))
