@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -116,6 +119,21 @@ class Played:
         self.command(current)
         assert self.node.phase is Phase.ACTIVE
 
+    def serve(self, periods: int, then: Callable[[], None] = lambda: None) -> None:
+        """Let time pass by itself from now on; something happens after so many periods."""
+        steps = 0
+
+        def quarter() -> None:
+            nonlocal steps
+            steps += 1
+            assert steps < 40_000, self.node.phase
+            if steps % 4 == 0:
+                self.period(step=False)
+            if self.periods == periods:
+                then()
+
+        self.drive.passes = quarter
+
     def until(self, *phases: Phase, most: int = 2000) -> None:
         for _ in range(most):
             if self.node.phase in phases:
@@ -130,6 +148,12 @@ class Played:
     @property
     def asked_states(self) -> list[int]:
         return [frame.data[0] for frame in self.drive.sent if frame.identifier == 0x007]
+
+
+@pytest.fixture(autouse=True)
+def no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time of these buses passes by itself."""
+    monkeypatch.setattr("emb_runtime.drives.gateway.LOOK_NS", 0)
 
 
 @pytest.fixture
@@ -221,18 +245,7 @@ def test_a_drive_that_nobody_commands_is_let_go_after_a_time(played: Played) -> 
 def run(played: Played, periods: int, then: Callable[[], None] = lambda: None, *, arms: bool = True) -> list[str]:
     """Serve on the gateway's own loop; ``then`` happens after 300 periods, the operator ends it after so many."""
     said: list[str] = []
-    steps = 0
-
-    def quarter() -> None:
-        nonlocal steps
-        steps += 1
-        assert steps < 40_000, played.node.phase
-        if steps % 4 == 0:
-            played.period(step=False)
-        if played.periods == 300:
-            then()
-
-    played.drive.passes = quarter
+    played.serve(300, then)
     played.gateway.run(lambda: played.periods > periods, lambda: said.append("ready"), arms=arms)
     return said
 
@@ -290,6 +303,34 @@ def test_after_a_frame_of_the_arming_sequence_that_the_second_guard_refused_only
     assert [(frame.identifier, frame.data) for frame in sent] == [
         (0x00E, bytes(4)), (0x00E, bytes(4)), (0x007, b"\x01\0\0\0"),
     ]  # fmt: skip
+
+
+def test_the_command_asks_serves_and_ends_with_its_counts(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "late.toml").write_text(late_bench())
+    arguments = [str(EXAMPLES / "odrive.toml"), "--drive", "can0", "--node", "vcan0", "--serial", "7", "--no-rt"]
+    arguments += ["--json", "--bench", str(tmp_path / "late.toml")]
+    typed = ["n", "y\n", "y\n"]
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr(cli, "forget_typed", lambda: None)
+    monkeypatch.setattr(cli, "typed_line", lambda: typed.pop(0))
+    for late_ns, code in ((0, 3), (0, 0), (1_200_000, 1)):
+        played = Played()
+        buses = {"can0": played.drive, "vcan0": played.host}
+        monkeypatch.setattr(cli, "open_transport", lambda name, *_, p=played, b=buses: (b[name], p.clock))
+        monkeypatch.setattr(cli, "Gateway", lambda *_, p=played: p.gateway)
+        monkeypatch.setattr(cli, "StopRequest", lambda p=played: lambda: p.periods > 400)
+        played.serve(400)
+        played.node.times.largest_age_ns = late_ns
+        assert cli.main(arguments) == code
+        out, err = capsys.readouterr()
+        assert "number 7, mapping " in err
+        assert "hold_on_loss: " in err
+        assert bool(played.drive.sent) == (code != 3)  # who said no
+        if code != 3:
+            assert json.loads(out)["drive_time_out"].startswith("let go within 0.0")
+            assert ("TOO LATE: an answer acted 1.20 periods" in err) == (code == 1)
 
 
 def test_wrong_arguments_are_one_line_before_anything_is_opened(
