@@ -89,7 +89,7 @@ class _NodesEnd:
 def _serve(end: socket.socket, bench: Bench, ready: Any, stop: Any) -> None:
     clock = MonotonicClock()
     transport = _NodesEnd(end, clock)
-    node = BrakeNode(bench, load_layout(), bench.brake, gaussian_noise(bench, 1))
+    node = BrakeNode(bench, load_layout(), bench.brake, gaussian_noise(bench.noise, 1))
     realtime.obtain()
     ready.set()
     with suppress(BusError):  # the other end was closed: that is how it ends

@@ -22,12 +22,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from emb_bench.cli.node import PRIORITY, run_node
-from emb_bench.sim.plant_spec import NOISES, gaussian_noise, parse_assignments, true_parameters, with_sensors
+from emb_bench.sim.plant_spec import read_brake
 from emb_bench.sim.simulated_brake import Noise, SimulatedBrake
-from emb_bench.sim.transport import DEFAULT_SEED, LONGEST_SEED, LockstepBus
+from emb_bench.sim.transport import LockstepBus
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
-from emb_runtime.config.plants import DEFAULT_PLANT, Plant
+from emb_runtime.config.plants import Plant
 from emb_runtime.errors import UsageError
 from emb_runtime.records import Frame
 from emb_runtime.system import realtime
@@ -239,19 +239,11 @@ def open_sim_drive(options: str, bench: Bench) -> tuple[SimDriveTransport, Stepp
     name, _, rest_of = options.partition(",")
     if name not in DRIVES:
         raise UsageError(f"sim-drive: expected one of {', '.join(DRIVES)}, got '{name}'")
-    assignments = parse_assignments(rest_of, "sim-drive: ")
-    seed_text = assignments.pop("seed", str(DEFAULT_SEED))
-    if not seed_text.isdecimal() or len(seed_text) > LONGEST_SEED:
-        raise UsageError(f"sim-drive: seed: expected a whole number of up to {LONGEST_SEED} digits, got '{seed_text}'")
-    plant = bench.plant(assignments.pop("plant", DEFAULT_PLANT))
-    sensors = with_sensors(bench, assignments, "sim-drive: ")
-    theta = true_parameters(bench, assignments, ("plant", "seed", *NOISES), "sim-drive: ")
-    noise = gaussian_noise(sensors, int(seed_text), plant.instruments.clock_jitter)
+    brake = read_brake(rest_of, bench, "sim-drive: ")
     now_ns = time.monotonic_ns()
     clock = SteppedClock(now_ns, time.time_ns() - now_ns)
-    truth = {**theta._asdict(), "seed": int(seed_text), "plant": plant.name}
-    drive = DRIVES[name](bench, theta, noise, plant)
-    return SimDriveTransport(drive, clock, bench.timing.sample_time_ns, truth), clock
+    drive = DRIVES[name](bench, brake.theta, brake.noise, brake.plant)
+    return SimDriveTransport(drive, clock, bench.timing.sample_time_ns, brake.truth), clock
 
 
 class OnBus:
@@ -279,14 +271,11 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--iface", required=True)
     p.add_argument("--drive", required=True, choices=sorted(DRIVES))
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
-    p.add_argument("--theta", default="", metavar="f_v=3e-5,...", help="true parameters, angle_noise, velocity_noise")
+    p.add_argument("--brake", default="", metavar="plant=exact,f_v=3e-5,...", help="as for emb-node")
     args = p.parse_args(argv)
     bench = load_bench(args.bench)
-    plant = bench.plant(DEFAULT_PLANT)
-    assignments = parse_assignments(args.theta, "--theta: ")
-    sensors = with_sensors(bench, assignments, "--theta: ")
-    theta = true_parameters(bench, assignments, NOISES, "--theta: ")
-    drive = DRIVES[args.drive](bench, theta, gaussian_noise(sensors, 1, plant.instruments.clock_jitter), plant)
+    brake = read_brake(args.brake, bench, "--brake: ")
+    drive = DRIVES[args.drive](bench, brake.theta, brake.noise, brake.plant)
     ended = False
 
     def end(_signal: int, _frame: object) -> None:

@@ -94,7 +94,7 @@ class HostileBus:
 
     def __post_init__(self) -> None:
         seed = self.dice.randrange(1000)
-        self.node = BrakeNode(self.bench, self.layout, self.bench.brake, gaussian_noise(self.bench, seed))
+        self.node = BrakeNode(self.bench, self.layout, self.bench.brake, gaussian_noise(self.bench.noise, seed))
         self._tick_at = self.now + MS
         self._asked = 0
         self._let_pass(self.backlog_ms * MS)

@@ -45,10 +45,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     brake = {**TRUTH, "angle_noise": sheet().noise.angle, "velocity_noise": sheet().noise.velocity}
     theta = ",".join(f"{name}={value}" for name, value in brake.items())
     working, found = (
-        ["emb_bench.cli.node", "--iface", "vcan0", "--json", "--theta", theta, "--bench", str(folder / "brake" / name)]
+        ["emb_bench.cli.node", "--iface", "vcan0", "--json", "--brake", theta, "--bench", str(folder / "brake" / name)]
         for name in ("working.toml", "bench.toml")
     )
-    drive = ["simulated_drives", "--iface", "vcan1", "--theta", theta, "--bench", str(folder / "late.toml")]
+    drive = ["simulated_drives", "--iface", "vcan1", "--brake", theta, "--bench", str(folder / "late.toml")]
     drive += ["--drive", "odrive"]
     buses = ["--drive", "vcan1", "--node", "vcan0", "--serial", "simulated", "--yes", "--json"]
     gateways = [

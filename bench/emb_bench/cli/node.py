@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Protocol
 
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.plant_spec import NOISES, gaussian_noise, parse_assignments, true_parameters, with_sensors
+from emb_bench.sim.plant_spec import read_brake
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import load_bench
-from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.records import Frame
 from emb_runtime.safety import watchdog_process
@@ -62,14 +61,10 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--iface", required=True, help="SocketCAN interface (vcan0, can0) or python-can BACKEND:CHANNEL")
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
     p.add_argument(
-        "--plant", default=DEFAULT_PLANT, metavar="NAME", help="which of the bench's plants (default: %(default)s)"
-    )
-    p.add_argument("--charge", action="store_true", help="send the integral of the current along, for lost samples")
-    p.add_argument(
-        "--theta", default="", metavar="f_v=3e-5,...",
-        help="true parameters (default: nominal), and angle_noise, velocity_noise (default: the bench file's)",
+        "--brake", default="", metavar="plant=stribeck,f_v=3e-5,...",
+        help="as for `emb-run --iface sim:`: one of the bench's plants, true parameters (default: nominal), seed (1), "
+        "angle_noise, velocity_noise (the bench file's), charge=1: send the integral of the current along",
     )  # fmt: skip
-    p.add_argument("--seed", type=int, default=1, metavar="S", help="seed of the sensors' noise (default: 1)")
     p.add_argument("--duration", type=float, metavar="S", help="seconds to run (default: until stopped)")
     p.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")
     p.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -124,12 +119,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     bench = load_bench(args.bench)
-    plant = bench.plant(args.plant)
-    assignments = parse_assignments(args.theta, "--theta: ")
-    sensors = with_sensors(bench, assignments, "--theta: ")
-    theta = true_parameters(bench, assignments, NOISES, "--theta: ")
-    if args.seed < 0:
-        raise UsageError(f"--seed: expected a number from 0, got {args.seed}")
+    brake = read_brake(args.brake, bench, "--brake: ")
     if args.duration is not None and not 0 < args.duration < 1e6:
         raise UsageError(f"--duration: expected seconds above 0, got {args.duration:g}")
     if args.iface.partition(":")[0] == "sim":
@@ -145,12 +135,11 @@ def _run(args: argparse.Namespace) -> int:
     layout = load_layout()
     transport, clock = open_transport(args.iface, bench, (layout.command.identifier,))
     try:
-        noise = gaussian_noise(sensors, args.seed, plant.instruments.clock_jitter)
-        node = BrakeNode(bench, layout, theta, noise, plant, charge=args.charge)
+        node = BrakeNode(bench, layout, brake.theta, brake.noise, brake.plant, charge=brake.charge)
         if not args.no_rt:
             realtime.obtain(priority=PRIORITY)
-        parameters = ", ".join(f"{name} = {value:g}" for name, value in theta._asdict().items())
-        mention(f"emb-node: on {transport.name}, plant {plant.name}, {parameters}")
+        parameters = ", ".join(f"{name} = {value:g}" for name, value in brake.theta._asdict().items())
+        mention(f"emb-node: on {transport.name}, plant {brake.plant.name}, {parameters}")
         periods = None if args.duration is None else round(args.duration / bench.timing.sample_time)
         skipped = run_node(node, transport, clock, bench.timing.sample_time_ns, periods, lambda: stop)
     finally:

@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from emb_bench.sim.simulated_brake import Noise
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from emb_runtime.config.bench import Noise as SensorNoise
+from emb_runtime.config.plants import DEFAULT_PLANT, Plant
 from emb_runtime.errors import UsageError
 
-NOISES = ("angle_noise", "velocity_noise")
-"""Options for sensors that are not as the bench file says: standard deviations [rad, rad/s]."""
+NOISES = ("angle_noise", "velocity_noise")  # Options for sensors that are not as the bench file says
+LONGEST_SEED = 18  # Digits of a seed
 FARTHEST = 100.0  # A brake that is farther from nominal, by this factor, is a typing error
 
 
@@ -79,40 +82,76 @@ def check_near_nominal(bench: Bench, name: str, value: float, where: str = "", g
         raise UsageError(f"{where}{name}: expected a number from {low:g} to {high:g}, got {got or repr(value)}")
 
 
-def with_sensors(bench: Bench, assignments: dict[str, str], option: str = "") -> Bench:
-    """The bench with the noise of other sensors, where that is given.
+class BrakeToSimulate(NamedTuple):
+    """A brake with its plant and sensors."""
+
+    theta: BrakeParameters  # True parameters
+    plant: Plant
+    noise: Noise
+    seed: int
+    charge: bool  # The node sends the integral of its current along
+
+    @property
+    def truth(self) -> dict[str, float | str]:
+        """What is true of it, for the log."""
+        return {**self.theta._asdict(), "seed": self.seed, "plant": self.plant.name}
+
+
+def read_brake(text: str, bench: Bench, option: str) -> BrakeToSimulate:
+    """Reads ``plant=exact,seed=3,f_v=3e-5``; what is not given is the default plant, seed 1, nominal.
 
     Args:
-        bench: its own noise counts for what is not given.
-        assignments: text by name, from which ``NOISES`` are taken out.
+        text: one of the bench's plants, a seed of the sensors' noise, true parameters; ``charge=1`` has the node send
+            the integral of its current; ``angle_noise`` [rad] and ``velocity_noise`` [rad/s] are standard deviations of
+            sensors that are not as the bench file says.
+        bench: knows the plants.
         option: begin of a message, which names what was given.
 
     Raises:
-        UsageError: a standard deviation is no number from 0 on.
+        UsageError: an option is unknown or has no sensible value.
+        BenchFileError: the bench has no such plant.
     """
-    values = []
-    for name, own in zip(NOISES, (bench.noise.angle, bench.noise.velocity), strict=True):
-        text = assignments.pop(name, repr(own))
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not 0.0 <= value < math.inf:
-            raise UsageError(f"{option}{name}: expected a standard deviation from 0 on, got '{text}'")
-        values.append(value)
-    return replace(bench, noise=replace(bench.noise, angle=values[0], velocity=values[1]))
+    given = parse_assignments(text, option)
+    plant = bench.plant(given.pop("plant", DEFAULT_PLANT))
+    seed, charge = given.pop("seed", "1"), given.pop("charge", "0")
+    if not seed.isdecimal() or len(seed) > LONGEST_SEED:
+        raise UsageError(f"{option}seed: expected a whole number from 0 of up to {LONGEST_SEED} digits, got '{seed}'")
+    if charge not in ("0", "1"):
+        raise UsageError(f"{option}charge: expected 0 or 1, got '{charge}'")
+    angle, velocity = (_deviation(given, name, option) for name in NOISES)
+    sensors = replace(
+        bench.noise,
+        angle=bench.noise.angle if angle is None else angle,
+        velocity=bench.noise.velocity if velocity is None else velocity,
+    )
+    theta = true_parameters(bench, given, ("plant", "seed", "charge", *NOISES), option)
+    noise = gaussian_noise(sensors, int(seed), plant.instruments.clock_jitter)
+    return BrakeToSimulate(theta, plant, noise, int(seed), charge == "1")
 
 
-def gaussian_noise(bench: Bench, seed: int, clock_jitter: float = 0.0) -> Noise:
-    """White Gaussian errors of the bench's sensors and clock; the same seed gives the same errors.
+def _deviation(given: dict[str, str], name: str, option: str) -> float | None:
+    text = given.pop(name, None)
+    if text is None:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value < math.inf:
+        raise UsageError(f"{option}{name}: expected a standard deviation from 0 on, got '{text}'")
+    return value
+
+
+def gaussian_noise(sensors: SensorNoise, seed: int, clock_jitter: float = 0.0) -> Noise:
+    """White Gaussian errors of sensors and clock; the same seed gives the same errors.
 
     Args:
-        bench: standard deviations of the sensors.
+        sensors: standard deviations.
         seed: of the generator.
         clock_jitter: standard deviation of the instant of sampling [s].
     """
     generator = np.random.default_rng(seed)
-    angle_std, velocity_std = bench.noise.angle, bench.noise.velocity
+    angle_std, velocity_std = sensors.angle, sensors.velocity
 
     def draw() -> tuple[float, float, float]:
         first, second = generator.standard_normal(2)

@@ -11,16 +11,11 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.plant_spec import NOISES, gaussian_noise, parse_assignments, true_parameters, with_sensors
+from emb_bench.sim.plant_spec import read_brake
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import Bench
-from emb_runtime.config.plants import DEFAULT_PLANT
-from emb_runtime.errors import UsageError
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
-
-DEFAULT_SEED = 1
-LONGEST_SEED = 18  # Digits of a seed
 
 
 class Device(Protocol):
@@ -97,30 +92,16 @@ def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
     """Open the simulated bus.
 
     Args:
-        options: ``plant=exact,seed=3,f_v=3e-5``: which of the bench's plants, a seed for the sensors' noise, and true
-            parameters; ``exact``, 1 and nominal where none is given. ``charge=1``: the node sends the integral of its
-            current along. ``angle_noise`` [rad] and ``velocity_noise`` [rad/s] are standard deviations of sensors that
-            are not as the bench file says.
+        options: see :func:`~emb_bench.sim.plant_spec.read_brake`.
         bench: knows the plants.
 
     Raises:
         UsageError: an option is unknown or has no sensible value.
         BenchFileError: the bench has no such plant.
     """
-    assignments = parse_assignments(options, "sim: ")
-    seed_text = assignments.pop("seed", str(DEFAULT_SEED))
-    if not seed_text.isdecimal() or len(seed_text) > LONGEST_SEED:
-        raise UsageError(f"sim: seed: expected a whole number from 0 of up to {LONGEST_SEED} digits, got '{seed_text}'")
-    plant = bench.plant(assignments.pop("plant", DEFAULT_PLANT))
-    charge = assignments.pop("charge", "0")
-    if charge not in ("0", "1"):
-        raise UsageError(f"sim: charge: expected 0 or 1, got '{charge}'")
-    sensors = with_sensors(bench, assignments, "sim: ")
-    theta = true_parameters(bench, assignments, ("plant", "seed", "charge", *NOISES), "sim: ")
-    noise = gaussian_noise(sensors, int(seed_text), plant.instruments.clock_jitter)
-    node = BrakeNode(bench, load_layout(), theta, noise, plant, charge=charge == "1")
+    brake = read_brake(options, bench, "sim: ")
+    node = BrakeNode(bench, load_layout(), brake.theta, brake.noise, brake.plant, charge=brake.charge)
     # Monotonic time starts where the computer's stands, so that a log has the date of its run.
     now_ns = time.monotonic_ns()
     clock = SteppedClock(now_ns, time.time_ns() - now_ns)
-    truth = {**theta._asdict(), "seed": int(seed_text), "plant": plant.name}
-    return SimTransport(node, clock, bench.timing.sample_time_ns, truth), clock
+    return SimTransport(node, clock, bench.timing.sample_time_ns, brake.truth), clock

@@ -123,11 +123,15 @@ def _handlers() -> Iterator[None]:
     [
         (["--iface", "nocan99"], 4, "nocan99"),
         (["--iface", "sim"], 2, "needs no emb-node"),
-        (["--iface", "vcan0", "--theta", "mass=1"], 2, "not a parameter"),
-        (["--iface", "vcan0", "--theta", "angle_noise=-1"], 2, "angle_noise: expected a standard deviation from 0 on"),
-        (["--iface", "vcan0", "--plant", "rubber"], 2, "no plant is called 'rubber'; this bench has: euler, exact"),
+        (["--iface", "vcan0", "--brake", "mass=1"], 2, "not a parameter"),
+        (["--iface", "vcan0", "--brake", "angle_noise=-1"], 2, "angle_noise: expected a standard deviation from 0 on"),
+        (
+            ["--iface", "vcan0", "--brake", "plant=rubber"],
+            2,
+            "no plant is called 'rubber'; this bench has: euler",
+        ),
         (["--iface", "vcan0", "--bench", "missing.toml"], 2, "missing.toml"),
-        (["--iface", "vcan0", "--seed", "-1"], 2, "--seed"),
+        (["--iface", "vcan0", "--brake", "seed=-1"], 2, "seed"),
         (["--iface", "vcan0", "--duration", "0"], 2, "--duration"),
     ],
 )

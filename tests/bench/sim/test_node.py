@@ -297,7 +297,7 @@ def test_without_a_plant_the_node_is_the_brake_that_sticks(bench: Bench, layout:
 
 
 def test_sensor_noise_has_the_bench_s_standard_deviations_and_follows_its_seed(bench: Bench) -> None:
-    draws = [gaussian_noise(bench, 5) for _ in range(2)]
+    draws = [gaussian_noise(bench.noise, 5) for _ in range(2)]
     values = [draws[0]() for _ in range(20_000)]
     assert values[:100] == [draws[1]() for _ in range(100)]
     assert all(late == 0.0 for _, _, late in values)
@@ -307,7 +307,7 @@ def test_sensor_noise_has_the_bench_s_standard_deviations_and_follows_its_seed(b
 
 
 def test_the_jitter_has_its_standard_deviation_and_follows_the_seed(bench: Bench) -> None:
-    draws = [gaussian_noise(bench, 5, 2e-5) for _ in range(2)]
+    draws = [gaussian_noise(bench.noise, 5, 2e-5) for _ in range(2)]
     late = [draws[0]()[2] for _ in range(20_000)]
     assert late[:50] == [draws[1]()[2] for _ in range(50)]
     assert math.sqrt(math.fsum(v**2 for v in late) / len(late)) == pytest.approx(2e-5, rel=0.02)

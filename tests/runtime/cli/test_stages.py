@@ -124,7 +124,7 @@ def test_read_only_hears_a_real_bus_beside_others(
     tmp_path: Path, actor: Path, bench: Bench, layout: Layout, capsys: pytest.CaptureFixture[str]
 ) -> None:
     over = threading.Event()
-    node = BrakeNode(bench, layout, bench.brake, gaussian_noise(bench, 1, 0.0))
+    node = BrakeNode(bench, layout, bench.brake, gaussian_noise(bench.noise, 1, 0.0))
 
     def talk() -> None:
         transport, _ = open_transport("virtual:shared", bench)
