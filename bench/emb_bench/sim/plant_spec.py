@@ -93,7 +93,7 @@ class BrakeToSimulate(NamedTuple):
 
     @property
     def truth(self) -> dict[str, float | str]:
-        """What is true of it, for the log."""
+        """True parameters, seed and plant, for the log."""
         return {**self.theta._asdict(), "seed": self.seed, "plant": self.plant.name}
 
 
