@@ -20,6 +20,7 @@ from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.system.clock import SteppedClock
 
 from tests.conftest import SimRun, Simulate  # isort: skip
+from tests.independent import encoded, read
 
 MS = 1_000_000
 LEARNING = parse_bench(shipped_bench_text().replace("[shield]", "[shield]\nlearn = true\n#"), "learning")
@@ -50,6 +51,17 @@ def changing(
         return change(frame)
 
     return receive
+
+
+def saying(**changes: float | Callable[[float], float]) -> Callable[[Frame], Frame]:
+    """Changes signals of each frame that has them: to a value, or by a function of the old one."""
+
+    def change(frame: Frame) -> Frame:
+        values = read(frame) or {}
+        new = {name: by(values[name]) if callable(by) else by for name, by in changes.items() if name in values}
+        return encoded(frame.identifier, values | new)._replace(time_ns=frame.time_ns) if new else frame
+
+    return change
 
 
 Injection = Callable[[Simulate], SimRun]
@@ -108,34 +120,13 @@ def _pushed_by_hand(simulate: Simulate) -> SimRun:
     return simulate(homing=True, on_receive=push)
 
 
-def sensing(
-    change: Callable[[float, float, int], tuple[float, float]],
-) -> Callable[[Frame | None, SimTransport, SteppedClock], Frame | None]:
-    """The node's sensors tell other angles and velocities, which may depend on the period."""
-    layout = load_layout()
-    angles: list[float] = [0.0]
-
-    def receive(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if frame is not None and frame.identifier == ANGLE:
-            told = layout.decode_angle(frame)
-            angles[0] = told.angle
-            angle, _ = change(told.angle, transport.node.velocity, transport.node.periods)
-            return layout.encode_angle(told.counter, angle, told.device_time_ns)._replace(time_ns=frame.time_ns)
-        if frame is not None and frame.identifier == VELOCITY:
-            said = layout.decode_velocity(frame)
-            _, velocity = change(angles[0], said.velocity, transport.node.periods)
-            changed = layout.encode_velocity(
-                said.counter, velocity, said.applied_current, said.node_state, said.command_counter
-            )
-            return changed._replace(time_ns=frame.time_ns)
-        return frame
-
-    return receive
-
-
 @injects(Fault.SENSORS_CONTRADICT)
 def _drifting_angle(simulate: Simulate) -> SimRun:
-    return simulate(on_receive=sensing(lambda x, v, k: (x + 0.03 * max(k - 100, 0), v)))
+    def drift(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        late = max(transport.node.periods - 100, 0)
+        return frame and saying(Angle=lambda angle: angle + 0.03 * late)(frame)
+
+    return simulate(on_receive=drift)
 
 
 @injects(Fault.MOTION_OUTSIDE_SET)
@@ -145,7 +136,7 @@ def _a_brake_outside_the_set(simulate: Simulate) -> SimRun:
 
 @injects(Fault.WRONG_POLARITY)
 def _sensor_with_the_wrong_sign(simulate: Simulate) -> SimRun:
-    return simulate(on_receive=sensing(lambda x, v, _k: (-x, -v)))
+    return simulate(on_receive=changing(saying(Angle=lambda angle: -angle, Velocity=lambda velocity: -velocity)))
 
 
 @injects(Fault.NODE_STOPPED)
@@ -229,14 +220,8 @@ def _bug(simulate: Simulate) -> SimRun:
 
 @injects(Fault.CURRENT_MISMATCH)
 def _weak_drive(simulate: Simulate) -> SimRun:
-    layout = load_layout()
-
-    def weaken(frame: Frame) -> Frame:
-        said = layout.decode_velocity(frame)
-        weak = layout.encode_velocity(said.counter, said.velocity, 0.5, said.node_state, said.command_counter)
-        return weak._replace(time_ns=frame.time_ns)
-
-    return simulate(lambda *_: 3.0, on_receive=changing(weaken, VELOCITY, range(200, 10_000)))
+    weak = saying(AppliedCurrent=0.5)
+    return simulate(lambda *_: 3.0, on_receive=changing(weak, VELOCITY, range(200, 10_000)))
 
 
 class Pulse(Unwatched):
@@ -280,14 +265,7 @@ def _too_far_away(simulate: Simulate) -> SimRun:
 
 @injects(Fault.DEVICE_TIME)
 def _clock_jumps(simulate: Simulate) -> SimRun:
-    layout = load_layout()
-
-    def later(frame: Frame) -> Frame:
-        said = layout.decode_angle(frame)
-        return layout.encode_angle(said.counter, said.angle, said.device_time_ns + 500 * MS)._replace(
-            time_ns=frame.time_ns
-        )
-
+    later = saying(DeviceTime=lambda time: time + 0.5)
     return simulate(on_receive=changing(later, ANGLE, range(200, 10_000)))
 
 
@@ -299,16 +277,8 @@ def _21_percent_are_missing(simulate: Simulate) -> SimRun:
 
 @injects(Fault.NODE_CHANGED)
 def _another_node(simulate: Simulate) -> SimRun:
-    layout = load_layout()
-
-    def of_another_bench(frame: Frame) -> Frame:
-        said = layout.decode_status(frame)
-        other = layout.encode_status(
-            said.counter, said.node_state, said.stop_reason, said.rejected, said.bench_identity ^ 1
-        )
-        return other._replace(time_ns=frame.time_ns)
-
-    return simulate(on_receive=changing(of_another_bench, STATUS, range(200, 10_000)))
+    other = saying(BenchIdentity=lambda identity: int(identity) ^ 1)
+    return simulate(on_receive=changing(other, STATUS, range(200, 10_000)))
 
 
 @injects(Fault.SET_CONTRADICTED)
@@ -318,13 +288,7 @@ def _another_brake_than_the_shield_was_told(simulate: Simulate) -> SimRun:
 
 @injects(Fault.MOTION_UNEXPLAINED)
 def _a_reported_current_that_is_off(simulate: Simulate) -> SimRun:
-    layout = load_layout()
-
-    def more(frame: Frame) -> Frame:
-        said = layout.decode_velocity(frame)
-        said = said._replace(applied_current=said.applied_current + 0.4)
-        return layout.encode_velocity(*said)._replace(time_ns=frame.time_ns)
-
+    more = saying(AppliedCurrent=lambda current: current + 0.4)
     return simulate(lambda _x, _v, step: 6.0 if step // 60 % 2 == 0 else -6.0, on_receive=changing(more, VELOCITY))
 
 
@@ -349,15 +313,7 @@ def test_a_node_that_sends_the_velocity_first_is_there_and_not_ready(simulate: S
 
 @injects(Fault.NOT_AT_REST)
 def _the_node_does_not_let_go(simulate: Simulate) -> SimRun:
-    layout = load_layout()
-
-    def failed(frame: Frame) -> Frame:
-        said = layout.decode_velocity(frame)
-        other = layout.encode_velocity(
-            said.counter, said.velocity, said.applied_current, NodeState.FAULT, said.command_counter
-        )
-        return other._replace(time_ns=frame.time_ns)
-
+    failed = saying(NodeState=NodeState.FAULT)
     return simulate(on_receive=changing(failed, VELOCITY, range(520, 10_000)))
 
 

@@ -16,11 +16,10 @@ from emb_runtime.records import Frame, NodeState, Reason
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Unwatched
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.clock import SteppedClock
-from tests.independent import encoded
 
 from tests.conftest import SimRun, Simulate  # isort: skip
 
-from .test_faults import assert_within_limits, changing, commands, dropping
+from .test_faults import assert_within_limits, changing, commands, dropping, saying
 
 MS = 1_000_000
 ANGLE, VELOCITY, STATUS, COMMAND = 0x100, 0x101, 0x102, 0x80
@@ -37,24 +36,6 @@ def assert_ended_safely(run: SimRun, layout: Layout) -> None:
     else:
         assert sent == []
     assert_within_limits(run)
-
-
-def status_with(layout: Layout, **changes: int) -> Callable[[Frame], Frame]:
-    """Gives a status with other values."""
-
-    def change(frame: Frame) -> Frame:
-        status = layout.decode_status(frame)
-        values = {
-            "Counter": status.counter,
-            "NodeState": status.node_state,
-            "ProtocolVersion": status.protocol_version,
-            "StopReason": status.stop_reason,
-            "RejectedCommands": 0,
-            "BenchIdentity": status.bench_identity,
-        }
-        return encoded(frame.identifier, {**values, **changes})._replace(time_ns=frame.time_ns)
-
-    return change
 
 
 def older_by(duration_ns: int) -> Callable[[Frame], Frame]:
@@ -273,7 +254,7 @@ def test_a_node_of_another_bench_or_protocol_is_not_armed(simulate: Simulate, la
         ({"BenchIdentity": 0x1234}, "another bench file"),
         ({"ProtocolVersion": 99}, "protocol 99"),
     ):
-        run = simulate(on_receive=changing(status_with(layout, **changes), STATUS))
+        run = simulate(on_receive=changing(saying(**changes), STATUS))
         assert run.outcome.fault is Fault.NODE_NOT_READY
         assert reason in run.outcome.detail
         assert run.sent == []
@@ -317,7 +298,7 @@ def test_the_stop_reason_is_that_of_this_stop_or_is_not_told(simulate: Simulate)
 
 
 def test_a_status_from_before_the_node_stopped_does_not_say_why(simulate: Simulate, layout: Layout) -> None:
-    before_the_stop = status_with(layout, NodeState=NodeState.ACTIVE, StopReason=StopReason.WATCHDOG)
+    before_the_stop = saying(NodeState=NodeState.ACTIVE, StopReason=StopReason.WATCHDOG)
     run = simulate(on_receive=changing(before_the_stop, STATUS, range(521, 10_000)))
     assert run.outcome.node_stop_reason is None
 
