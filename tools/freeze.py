@@ -89,6 +89,8 @@ EXPLAINED: dict[str, str] = {
     "*/mapped/*": GATEWAY,
     "demo/run/numbers": "76c82d4: the summary has a line on the motion",
     "design/D of two/*": "d35eddd: an annealing moves the Euler brake as every other, with a third of the variations",
+    "estimate/clean windows/says/parameters/*/sandwich": "ee3542a: the start of each window is at its minimum",
+    "estimate/damaged oem/says/misfit/suspects/play/*": "19e394e: a secant has the shift of an early command too",
 }
 """The same, of values that differ on purpose."""
 
