@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from emb_bench.brake import exact
-from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
-from emb_bench.compiled import compiled
+from emb_bench.brake.motion import Floats, no_sensitivity, rest
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import BrakeParameters, load_bench
 from emb_runtime.config.plants import EULER, Mechanics
@@ -182,32 +181,6 @@ def test_friction_never_creates_energy(case: Case) -> None:
     lost = p.k_m * currents * np.diff(states[:, 0]) - np.diff(energy)
     travelled = np.abs(np.diff(states[:, 0]))
     assert (lost >= p.T_c * travelled - 1e-12 * (1.0 + energy[:-1])).all()
-
-
-def cut(p: BrakeParameters, currents: Floats, x0: tuple[float, float], share: float) -> tuple[Floats, Floats]:
-    """States and sensitivities when each period is made of two parts."""
-    chosen, s = no_sensitivity(WITHOUT_DELAY)
-    x = rest()
-    x[:2] = x0
-    states, shown = [], []
-    for u in currents.tolist():
-        for part in (share, 1.0 - share):
-            compiled(advance)(EXACT, p, x, u, part * T_S, chosen, s)
-        states.append(x[:2].copy())
-        shown.append(s[:, :2].copy())
-    return np.array(states), np.array(shown)
-
-
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
-@given(cases(), st.floats(0.05, 0.95))
-def test_a_period_is_its_two_parts(case: Case, share: float) -> None:
-    # The parts cut the series elsewhere: what they agree on, state and sensitivities, is the flow and no step.
-    p, currents, x0 = case
-    states, s = marched(EXACT, p, currents, x0, WITHOUT_DELAY)
-    of_parts, s_of_parts = cut(p, currents, x0, share)
-    np.testing.assert_allclose(of_parts, states[1:], rtol=1e-9, atol=1e-9)
-    scale = 1.0 + np.abs(s).max(axis=0)
-    np.testing.assert_allclose(s_of_parts / scale, s / scale, rtol=0.0, atol=1e-6)
 
 
 @settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))

@@ -226,17 +226,3 @@ def test_each_matrix_has_the_numbers_that_it_has_alone(
     np.testing.assert_allclose(series.log_det, [c.log_det for c in alone], rtol=1e-7, atol=1e-6)
     np.testing.assert_allclose(series.lambda_min, [c.lambda_min for c in alone], rtol=1e-6)
     np.testing.assert_allclose(series.trace_inverse, [c.trace_inverse for c in alone], rtol=1e-6)
-
-
-def test_of_a_diagonal_matrix_the_numbers_are_known() -> None:
-    series = criteria_series(np.diag([2.0, 4.0, 5.0, 8.0])[None], PARAMETER_NAMES, PARAMETER_NAMES)
-    np.testing.assert_allclose([series.log_det[0], series.lambda_min[0]], [np.log(320.0), 2.0])
-    np.testing.assert_allclose(series.trace_inverse, 0.5 + 0.25 + 0.2 + 0.125)
-
-
-@pytest.mark.parametrize("wrong", [np.nan, np.inf, -1.0])
-def test_a_matrix_that_is_no_information_is_refused(wrong: float) -> None:
-    matrices = np.tile(np.eye(4), (3, 1, 1))
-    matrices[1, 2, 2] = wrong
-    with pytest.raises(UsageError, match="expected a square, finite Fisher information matrix"):
-        criteria_series(matrices, PARAMETER_NAMES, PARAMETER_NAMES)
