@@ -71,15 +71,14 @@ def next_counter(counter: int) -> int:
 
 
 WEIGHT: Final = 4
-"""Good ones that forgive a bad one: a share of more than 1 in 1 + WEIGHT, a fifth, is too many sooner or later."""
+"""Good events that forgive a bad one."""
 
 
 class LeakyCount:
-    """Counts what was bad among all that was judged: by a share, in any order, and at once if in a row.
+    """Leaky bucket: +:data:`WEIGHT` per bad event, -1 per good one.
 
-    A bad one counts :data:`WEIGHT`, a good one takes 1 away. A share d of bad ones above a fifth is too many after
-    about WEIGHT tolerated / ((1 + WEIGHT) d - 1) of them all, as many as are tolerated if they come in a row. The count
-    saturates, so that a burst is forgiven in bounded time.
+    Full after ``tolerated`` bad ones in a row, or after about WEIGHT tolerated / ((1 + WEIGHT) d - 1) events if a share
+    d of them, more than a fifth, is bad. It saturates, so that a burst is forgiven in bounded time.
 
     Args:
         tolerated: bad ones in a row that are too many.

@@ -51,8 +51,9 @@ def generate_codec(message: Message, record: type[Any], fields: tuple[Field, ...
         "new": tuple.__new__,
         "word_of": int.from_bytes,
         "refusal": lambda values: message.refusal({c.signal.name: v for c, v in zip(coded, values, strict=True)}),
-        "rejection": _rejection(message),
-        **{f"choices_{c.name}": c.field.choices for c in coded if c.field.choices},
+        "explain": lambda frame: message.decode(frame),
+        "FrameError": FrameError,
+        **{f"choices_{c.name}": c.field.choices for c in coded},
     }
     exec(_encoder(message, coded) + _decoder(message, coded), known)
     return Codec(known["encode"], known["decode"])
@@ -132,7 +133,8 @@ def decode(f):
         if b[0] == {_crc(message, "b")} and w & 0xF00 != 0xF00 and not w & {message.reserved}:
 {raws}            if {ranges}:
                 return new(Record, ({values},))
-    raise rejection(f)
+    explain(f)
+    raise FrameError(f"{message.name}: the two decoders disagree on {{f}}")
 """
 
 
@@ -141,14 +143,3 @@ def _crc(message: Message, payload: str) -> str:
     for at in range(1, message.length):
         state = f"T[{state} ^ {payload}[{at}]]"
     return state
-
-
-def _rejection(message: Message) -> Callable[[Frame], FrameError]:
-    def rejection(frame: Frame) -> FrameError:
-        try:
-            message.decode(frame)
-        except FrameError as err:
-            return err
-        return FrameError(f"{message.name}: the two decoders disagree on {frame}")
-
-    return rejection

@@ -24,9 +24,8 @@ _STAMP_SLACK_NS = 50_000  # what floating-point seconds and two readings of the 
 class PythonCan:
     """Any python-can backend: the in-process ``virtual`` bus, vendor adapters. Slower than a raw socket.
 
-    Some backends stamp frames with this computer's wall clock, some with clocks of their own. Stamps count, so that
-    what had to wait to be read is not taken for new, unless one goes back, is ahead of now, or lies before the wait for
-    its frame, when none was there; then frames come when they are read, until one that was waited for is stamped right.
+    The adapter's time stamps are used while they are consistent with our clock: monotonic, not in the future, not
+    before an empty poll. Else a frame has the time of its reading, until one that was waited for is stamped right.
     """
 
     truth = None

@@ -212,8 +212,7 @@ class SocketCan:
     def receive(self, deadline_ns: int) -> Frame | None:
         """See :meth:`Transport.receive`.
 
-        The kernel says once that the interface is down and then stays silent: until a frame comes again, not one that
-        had waited, that silence is an error too.
+        The kernel reports link-down once. Later time-outs raise too, until a frame newer than that arrives.
         """
         datagram = self._read()
         if datagram is None:

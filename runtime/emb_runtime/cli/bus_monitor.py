@@ -36,8 +36,7 @@ class BusStatistics:
 
     duration: float  # Time from the first frame to the last [s]
     frames: Mapping[str, int]  # Frames by message name
-    rates: Mapping[str, float]
-    """Frames per second by message name, from the first of them to the last; of those that came twice."""
+    rates: Mapping[str, float]  # Mean rate by message name, of those seen at least twice [1/s]
     others: int  # Data and remote frames that are none of the DBC's
     rejections: Mapping[str, Mapping[str, int]]  # Rejections as in :class:`~emb_runtime.control.result.Outcome`
     distrusted: bool  # True after so many of them that a run would have been stopped

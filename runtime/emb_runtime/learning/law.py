@@ -77,9 +77,9 @@ def relative_brake(nominal: BrakeParameters, k_m: float, k_1: float, t_c: float,
 
 
 def covered_viscous(inputs: DesignInputs, low: BrakeParameters, high: BrakeParameters) -> float:
-    """Least f_v to count on: as much as the velocity pad covers the change of, within a sample of full braking (L1).
+    """Lower bound on f_v, capped so that its change within a sample of full braking stays inside VELOCITY_PAD (L1).
 
-    A part of the set may have a stronger motor and a stiffer spring for sure than the set has, and then brakes harder.
+    A part of the set may have a stronger motor and a stiffer spring than the set guarantees, and then brakes harder.
     """
     slowed = inputs.current * low.k_m / high.J + low.T_c / high.J + low.gamma * low.k_1 / high.J * inputs.highest_angle
     slowed += low.f_v / high.J * inputs.speed

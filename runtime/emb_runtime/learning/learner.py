@@ -80,10 +80,7 @@ class Learner:
             self.known = now
 
     def question(self, sample: SensorSample) -> tuple[ShieldLaw, float, float]:
-        """Question to the shield: the law for the brakes that are possible at the newest sample, and a measurement.
-
-        In its noise the true state lies: the middle of the possible angles [rad] and velocities [rad/s].
-        """
+        """Law of the shield for the newest sample, and its state: the middle of the known box [rad, rad/s]."""
         if self.known is None or self.contradicted:
             return self.whole, sample.angle, sample.velocity
         if self._law is None or self.age >= LONGEST_KEPT or not fits(self._law, self.known):

@@ -262,7 +262,7 @@ def damped_current(velocity: float, limit: float, damping_velocity: float) -> fl
 
 
 def _now(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[float, float, float, float]:
-    """Box of states in which the way home begins, for a measurement of any age, if all commands were obeyed.
+    """State box at the start of this period, if every command was obeyed; hull over all frame ages.
 
     Where the current lags, the velocities are those after what flows has decayed.
     """

@@ -59,7 +59,7 @@ FRESH_LANDING = Landing(share=0.8, gain=0.6, reserve=7)
 """For commands that act in the very period of the sample that they answer."""
 LATE_LANDING = Landing(share=0.5, gain=0.283, reserve=25)
 """For unknown or greater frame ages, where the loop has dead time."""
-CREEPS: Final = 3.0  # Coasting: the speed allowed at the apex, in what the slowest brake may be below it
+CREEPS: Final = 3.0  # Coasting: speed allowed at the largest angle, as a multiple of ``creep``
 LONGEST_LAG: Final = 2.0  # Samples. With a slower current loop the limits would hold, but the landing would not.
 COMMITTED: Final = 16  # Samples before the reserve in which the policy does not get control back
 

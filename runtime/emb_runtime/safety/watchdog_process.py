@@ -59,9 +59,8 @@ class LoopStatus(StrEnum):
 class SilenceMonitor:
     """Judges the loop's silence. Pure: time is handed in.
 
-    A silence as long as the heartbeat trips. Where two looks lie more than two intervals apart, the processor was taken
-    from this process, and the loop may have been robbed as well: what is beyond one interval is then not held against
-    it. No theft excuses a silence of twice the heartbeat, so that is the longest, plus the time until the next look.
+    A silence as long as the heartbeat trips. If this process itself was delayed by more than two polls, the excess is
+    not counted as loop silence, up to two heartbeats in all: that is the longest silence, plus the time of one poll.
 
     Args:
         heartbeat_ns: silence that trips [ns].

@@ -111,6 +111,8 @@ def test_frames_have_the_bytes_that_were_worked_out_by_hand() -> None:
 
 def test_typed_decoders_read_what_the_typed_encoders_wrote() -> None:
     assert LAYOUT.decode_command(GOLDEN["EMB_Command"][2]) == COMMAND
+    assert LAYOUT.decode_command(GOLDEN["EMB_Command"][2]).enable is True
+    assert isinstance(LAYOUT.decode_velocity(GOLDEN["EMB_Velocity"][2]).node_state, NodeState)
     assert LAYOUT.decode_angle(GOLDEN["EMB_Angle"][2]) == AngleFrame(7, 2_775_000 * 2e-5, 123_456_750)
     assert LAYOUT.decode_velocity(GOLDEN["EMB_Velocity"][2]) == VelocityFrame(
         14, -3_215_000 * 1e-4, -6_170 * 2e-4, NodeState.ACTIVE, 4
@@ -236,6 +238,11 @@ def test_device_time_is_rounded_to_its_step_and_wraps(time_ns: int) -> None:
     assert decoded % 250 == 0
     error = (decoded - time_ns + 2_000_000_000) % LAYOUT.device_time_period_ns - 2_000_000_000
     assert abs(error) <= 125
+
+
+def test_device_time_between_two_steps_is_rounded_up() -> None:
+    for time_ns, rounded in [(124, 0), (125, 250), (374, 250), (375, 500), (625, 750)]:
+        assert LAYOUT.decode_angle(LAYOUT.encode_angle(0, 0.0, time_ns)).device_time_ns == rounded
 
 
 def test_device_time_at_its_ends_is_exact() -> None:
