@@ -97,7 +97,7 @@ EXPLAINED: dict[str, str] = {
 # ---- what is kept of a document ----------------------------------------------------------------------------------
 
 LEFT_OUT = (
-    "log path root campaign page result_file made_by version bench_sha256 sha256 contract_hash bench_hash "
+    "log path root campaign page result_file made_by version bench_sha256 sha256 identity_hash bench_hash "
     "policy_sha256 policy_provenance command tool core python numpy onnxruntime kernel began start_time time_of_day "
     "log_bytes wall_time evaluated_by other_versions policy_evaluated_by emb.preflight preflight starts attachments "
     "bytes file realtime disk conclusions theta advice "

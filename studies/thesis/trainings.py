@@ -123,7 +123,7 @@ class Trainings:
             begin_training(folder, config, self._bench)
             run_training(folder, config, self._bench)
         trained = load_training(folder)
-        if (trained.training, trained.bench.contract_hash) != (config, self._bench.contract_hash):
+        if (trained.training, trained.bench.identity_hash) != (config, self._bench.identity_hash):
             raise UsageError(f"{folder}: holds another training, of other steps or bench: choose another --out")
         try:
             records = [json.loads(line) for line in (folder / METRICS).read_text(encoding="utf-8").splitlines()]

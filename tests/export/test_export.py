@@ -199,7 +199,7 @@ def test_a_sequence_is_exported_as_a_policy_that_gives_it(tmp_path: Path) -> Non
 def test_a_design_is_exported_as_a_policy(tmp_path: Path) -> None:
     design, path = tmp_path / "best.csv", tmp_path / "best.onnx"
     current = np.linspace(-6.0, 6.0, BENCH.timing.horizon + 1)
-    metadata = json.dumps({"contract_hash": BENCH.contract_hash, "criterion": "D"})
+    metadata = json.dumps({"identity_hash": BENCH.identity_hash, "criterion": "D"})
     design.write_text("\n".join([f"# {metadata}", "current", *map(str, current.tolist())]))
     assert main([str(design), "--out", str(path)]) == 0
     policy = load_policy(path, BENCH)

@@ -46,7 +46,7 @@ from tests.hil.failing_policy import make_it_hang
 from tests.hil.sniffer import FRAME, open_socket, read, wait_until
 
 LAYOUT = load_layout()
-IDENTITY = bench_identity(load_bench().contract_hash)
+IDENTITY = bench_identity(load_bench().identity_hash)
 COMMAND, VELOCITY = LAYOUT.command.identifier, LAYOUT.velocity.identifier
 PATIENCE = 120.0  # For anything that must come [s]
 BABBLER = 97  # Real-time priority, above the node's: other nodes on a bus ask nobody

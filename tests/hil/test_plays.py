@@ -90,7 +90,7 @@ def test_its_log_holds_every_frame_with_its_direction_and_is_evaluated(
     assert {frame.identifier for frame in log.frames if not frame.own} == {ANGLE, VELOCITY, STATUS}
     assert sum(frame.own for frame in log.frames) == len(it.commands())
     assert all(int(b) > int(a) for a, b in pairwise(log.cycles["device_time_ns"]))
-    assert log.bench.contract_hash == load_bench().contract_hash
+    assert log.bench.identity_hash == load_bench().identity_hash
     assert replay(["fim", str(it.log), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["physical"]["log_det"] > 60.0

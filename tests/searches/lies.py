@@ -49,7 +49,7 @@ NEW: dict[str, tuple[Lie, ...]] = {
 
 def played(lie: Lie, policy: Policy, goal: str, seed: int = 1) -> tuple[str, int, float, float, LyingNode]:
     """Result, exit code, unexplained velocity and greatest stated deviation of one experiment, and its node."""
-    node = LyingNode(bench_identity(BENCH.contract_hash), lie, seed)
+    node = LyingNode(bench_identity(BENCH.identity_hash), lie, seed)
     bus = LyingBus(node, lambda: 0)
     driven: Any = {
         "send": bus.send,

@@ -416,7 +416,7 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subjec
         raise UsageError("a policy is named twice: expected each once")
     subjects = [open_subject(given, arguments.bench) for given in arguments.policies]
     bench = subjects[0].bench
-    if any(s.bench.contract_hash != bench.contract_hash for s in subjects):
+    if any(s.bench.identity_hash != bench.identity_hash for s in subjects):
         raise UsageError("the policies are for different benches: evaluate them apart")
     names = None if arguments.parameters is None else tuple(arguments.parameters.split(","))
     parameters = _one("--parameters", names, [s.parameters for s in subjects])

@@ -129,7 +129,7 @@ def _of_the_experiment(log: RunLog, experiment: Experiment, bench: Bench) -> dic
         "measured": int(experiment.measured.sum()),
         "command_delay": experiment.command_delay,
         "bench_name": printable(bench.name),
-        "bench_hash": bench.contract_hash,
+        "bench_hash": bench.identity_hash,
         "violations": beyond,
     }
 

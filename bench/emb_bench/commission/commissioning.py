@@ -93,7 +93,7 @@ class Commissioning:
         self._folder, self._sheet, self._iface, self._options = folder, sheet, iface, options
         self._make_run, self._say = run, say
         self._logs: dict[str, Path] = {}
-        self._identity = sheet.contract_hash  # of the bench that the node is set up for
+        self._identity = sheet.identity_hash  # of the bench that the node is set up for
         self._runs = 0
 
     def run(self) -> Commissioned:
@@ -125,7 +125,7 @@ class Commissioning:
             there = load_bench(path)
             if parse_toml(there.text) == parse_toml(text):
                 return there
-            is_another = there.contract_hash != parse_bench(text, name).contract_hash
+            is_another = there.identity_hash != parse_bench(text, name).identity_hash
             if is_another and (any(self._folder.glob("*.mcap")) or WRITTEN not in there.text):
                 raise UsageError(
                     f"{path}: another bench than this data sheet's or these logs', which rest on it; go on with the "
@@ -162,9 +162,9 @@ class Commissioning:
     def _run(self, step: Step, bench: Bench, found: Findings) -> Path:
         self._say(f"{step.name}: {step.purpose}\n  relies on {step.rests_on}")
         path = self._folder / (FOUND if step.final else LEARNING_FILE if step.learns else WORKING)
-        if bench.contract_hash != self._identity:
-            self._identity = bench.contract_hash
-            identity = bench_identity(bench.contract_hash)
+        if bench.identity_hash != self._identity:
+            self._identity = bench.identity_hash
+            identity = bench_identity(bench.identity_hash)
             self._say(f"  the node has to be set up for {path}, bench identity {identity:#06x}")
         policy = self._folder / f"{step.name}.onnx"
         policy.write_bytes(policy_file(step, bench))

@@ -119,7 +119,7 @@ class Report:
             "command": "emb-design",
             "version": self.version,
             "bench": self.bench.name,
-            "contract_hash": self.bench.contract_hash,
+            "identity_hash": self.bench.identity_hash,
             "bench_sha256": hashlib.sha256(self.bench.text.encode()).hexdigest(),
             "criterion": criterion.name,
             "value": criterion.value(self.found.best.phi),
@@ -213,13 +213,13 @@ def read_design(path: Path, bench: Bench) -> tuple[Floats, str]:
     try:
         head, *rows = read_bytes(path, MAX_DESIGN_BYTES).decode().splitlines()
         metadata = json.loads(head.removeprefix("#"))
-        made_for, label = str(metadata["contract_hash"]), f"{metadata['criterion']}-optimal design"
+        made_for, label = str(metadata["identity_hash"]), f"{metadata['criterion']}-optimal design"
         current = np.array([float(row["current"]) for row in csv.DictReader(rows)])
     except OSError as err:
         raise UsageError(f"{path}: cannot read the design: {err.strerror}") from err
     except (ValueError, KeyError, TypeError, RecursionError, csv.Error) as err:
         raise UsageError(f"{path}: expected a design that emb-design wrote, and it is none") from err
-    if made_for != bench.contract_hash:
+    if made_for != bench.identity_hash:
         raise UsageError(f"{path}: made for another bench: pass it with --bench, or search the design again")
     if current.shape != (bench.timing.horizon + 1,) or not np.isfinite(current).all():
         raise UsageError(f"{path}: expected {bench.timing.horizon + 1} finite currents, got shape {current.shape}")

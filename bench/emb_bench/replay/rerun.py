@@ -210,7 +210,7 @@ def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
         recorded["mapping_sha256"] = log.metadata["emb.drive"]["sha256"]
     return [
         Difference(None, name, recorded[name], value)
-        for name, value in {**carried, "bench_hash": log.bench.contract_hash}.items()
+        for name, value in {**carried, "bench_hash": log.bench.identity_hash}.items()
         if recorded.get(name, value) != value
     ]
 

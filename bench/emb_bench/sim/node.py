@@ -62,7 +62,7 @@ class BrakeNode(SimulatedBrake):
         self._layout = layout
         self._watchdog_periods = math.ceil(bench.node.watchdog / self._t_s - 1e-9)
         self._current_step = layout.command.signal("Current").factor
-        self._identity = bench_identity(bench.contract_hash)
+        self._identity = bench_identity(bench.identity_hash)
         self._check = CounterCheck(COUNTER_MODULUS)
         self._counter = NO_COUNTER - 1  # the first sample has counter 0
         self._status_counter = 0

@@ -184,9 +184,9 @@ class Layout:
         return sum(m.worst_bits / m.cycle_time for m in self.messages.values()) / bitrate
 
 
-def bench_identity(contract_hash: str) -> int:
+def bench_identity(identity_hash: str) -> int:
     """The 16 bits of a bench's hash (hexadecimal) that the status message carries."""
-    return int(contract_hash[:4], 16)
+    return int(identity_hash[:4], 16)
 
 
 def load_layout(dbc_text: str | None = None) -> Layout:

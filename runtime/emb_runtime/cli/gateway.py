@@ -89,7 +89,7 @@ def _serve(args: argparse.Namespace) -> int:
             f"{mapping.name} does not say what it is, and nobody has: expected --serial TEXT, the number on the drive"
         )
     speed = released_speed(bench, mapping.watchdog)
-    mention(_description(mapping, bench.name, bench_identity(bench.contract_hash), speed, args.serial))
+    mention(_description(mapping, bench.name, bench_identity(bench.identity_hash), speed, args.serial))
     stop = StopRequest()
     if not args.listen and not _may_arm(args.yes, stop):
         raise SafetyStopError("stopped by the operator before anything was sent")

@@ -169,7 +169,7 @@ def _interface(f: Findings) -> CheckResult:
 
 def _node(f: Findings) -> CheckResult:
     status = f.heard.status
-    identity = f"protocol {f.layout.protocol_version}, bench {bench_identity(f.bench.contract_hash):#06x}"
+    identity = f"protocol {f.layout.protocol_version}, bench {bench_identity(f.bench.identity_hash):#06x}"
     if not f.heard.frames:
         return _faulty("node", Fault.NO_NODE, "nothing heard", identity)
     if why := f.start_conditions.mismatch(status):

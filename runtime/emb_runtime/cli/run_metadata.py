@@ -62,7 +62,7 @@ def header(
             "limit": repr(plan.limit),
             "steps": str(steps),
             "bench_name": bench.name,
-            "bench_hash": bench.contract_hash,
+            "bench_hash": bench.identity_hash,
             "dbc_protocol": str(plan.layout.protocol_version),
             "bus_load_worst": f"{planned_load(bench, plan.layout, mapping):.4f}",
             "core": compiled_core.running().text,

@@ -1,7 +1,7 @@
 """The one description of the bench: ``bench.toml`` as frozen, checked records.
 
 Training draws from its ranges, the runtime takes its limits, the node its plant, the replay its nominal values.
-:attr:`Bench.contract_hash` covers what a policy depends on and travels in the ONNX contract and in every log.
+:attr:`Bench.identity_hash` is what the node reports and each log has: both sides have the same bench.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ LONGEST_NODE_WATCHDOG = 0.010  # s
 LONGEST_HEARTBEAT = 0.005  # s
 
 LEARNING = ("learn", "model", "model_error", "current_error")
-"""Keys of the shield that concern what it learns while it runs: no policy and no node depends on them."""
+"""Keys of the shield that concern what it learns while it runs: no node depends on them."""
 
 FASTEST = 10.0  # No time constant of a brake is shorter than the sample time over this
 REMEDY = "add it, as in the file that `emb-run --write-bench FILE` writes"
@@ -279,10 +279,10 @@ class Bench:
                 )
 
     @property
-    def contract_hash(self) -> str:
-        """SHA-256 of what a policy depends on: brake, ranges, limits, noise, timing, shield, drive's mapping if named.
+    def identity_hash(self) -> str:
+        """SHA-256 of brake, ranges, limits, noise, timing, shield and the drive's mapping: node and runtime must agree.
 
-        Not the time-outs; nor what the shield learns, which only widens what a policy may do.
+        Not of the time-outs, nor of what the shield learns.
         """
         record: dict[str, Any] = {
             "brake": self.brake._asdict(),

@@ -3,7 +3,7 @@
 Every bench has the plants ``euler`` and ``exact``: the thesis's equations stepped as it does, and solved exactly. The
 latter, which sticks at rest as a real brake does, is meant wherever none is named. A
 bench file adds others, ``[plants.NAME]``, to see what happens on a brake that the model does not match. They are what
-is simulated and evaluated, not what a policy depends on, so that they are not part of the contract hash.
+is simulated and evaluated: neither node nor policy is concerned.
 """
 
 from __future__ import annotations

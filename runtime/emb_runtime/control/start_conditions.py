@@ -54,7 +54,7 @@ class StartConditions:
         self.layout = layout
         self.bounds = bounds
         self.anywhere = anywhere
-        self.identity = bench_identity(bench.contract_hash)  # once: it is a hash of the whole bench
+        self.identity = bench_identity(bench.identity_hash)  # once: it is a hash of the whole bench
         """Bench identity that the node's status must report."""
 
     def not_ready(self, status: StatusFrame | None, sample: SensorSample, now_ns: int) -> str:

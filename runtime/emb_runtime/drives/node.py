@@ -88,7 +88,7 @@ class DriveNode:
         self._receiver = Receiver(mapping, bench.watch.stop_missed)
         self._encoder = Encoder(mapping)
         self.guard = WireGuard(mapping, bench.limits.current, send)
-        self._identity = bench_identity(bench.contract_hash)
+        self._identity = bench_identity(bench.identity_hash)
         self._watchdog_periods = math.ceil(bench.node.watchdog / bench.timing.sample_time - 1e-9)
         self._check = CounterCheck(COUNTER_MODULUS)
         self._counter = NO_COUNTER - 1  # the first sample has counter 0

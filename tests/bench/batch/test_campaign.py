@@ -176,7 +176,7 @@ def test_identity_and_time_are_those_of_the_file_and_of_its_first_message(
     for log in GOOD:
         row, data = said.rows[log], (folder / log).read_bytes()
         assert row["sha256"] == hashlib.sha256(data).hexdigest()
-        assert (row["bench_name"], row["bench_hash"], row["policy_sha256"]) == (bench.name, bench.contract_hash, None)
+        assert (row["bench_name"], row["bench_hash"], row["policy_sha256"]) == (bench.name, bench.identity_hash, None)
         with (folder / log).open("rb") as file:
             first = min(message.publish_time for _, _, message in make_reader(file).iter_messages())
         assert int(row["start_time"].timestamp()) == first // 10**9

@@ -55,7 +55,7 @@ def test_the_file_holds_a_design_that_can_be_simulated_again(
 
 def test_a_file_that_is_no_design_of_the_bench_is_refused(short: Path, tmp_path: Path) -> None:
     bench, path = load_bench(short), tmp_path / "design.csv"
-    of_the_bench = json.dumps({"contract_hash": bench.contract_hash, "criterion": "D"})
+    of_the_bench = json.dumps({"identity_hash": bench.identity_hash, "criterion": "D"})
     whole = "\n".join(["current", *["1.0"] * (PERIODS + 1)])
     path.write_text(f"# {of_the_bench}\n{whole}")
     assert read_design(path, bench)[0].tolist() == [1.0] * PERIODS
@@ -65,7 +65,7 @@ def test_a_file_that_is_no_design_of_the_bench_is_refused(short: Path, tmp_path:
         f"# {of_the_bench}\n{whole}\n1.0",
         f"# {of_the_bench}\n{whole}".replace("1.0", "nan"),
         f"# {of_the_bench}\n{whole}".replace("1.0", "one"),
-        f"# {of_the_bench}\n{whole}".replace(bench.contract_hash, "another"),
+        f"# {of_the_bench}\n{whole}".replace(bench.identity_hash, "another"),
     ):
         path.write_text(text)
         with pytest.raises(UsageError):

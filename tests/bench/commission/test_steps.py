@@ -247,7 +247,7 @@ def test_the_working_bench_has_the_data_sheets_ranges_and_a_learning_shield(shee
     assert learning_possible(work)
     learning = parse_bench(working_text(sheet, learns=True), "learning")
     assert learning.shield.learn
-    assert learning.contract_hash == work.contract_hash
+    assert learning.identity_hash == work.identity_hash
 
 
 def test_a_data_sheet_without_any_shield_is_refused_with_the_reason() -> None:

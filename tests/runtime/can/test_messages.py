@@ -423,7 +423,7 @@ def test_the_layout_reads_back_from_its_own_text() -> None:
 
 def test_the_bench_identity_is_the_start_of_its_hash() -> None:
     assert bench_identity("beef" + 60 * "0") == 0xBEEF
-    assert 0 <= bench_identity(load_bench().contract_hash) <= 0xFFFF
+    assert 0 <= bench_identity(load_bench().identity_hash) <= 0xFFFF
 
 
 def test_a_dbc_that_is_not_a_layout_of_this_bench_is_refused() -> None:

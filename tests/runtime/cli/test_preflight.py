@@ -34,7 +34,7 @@ SAMPLE = SensorSample(3, 0.001, 0.5, 0, 0, 0.0, 15, NodeState.IDLE)
 @pytest.fixture
 def heard(bench: Bench, layout: Layout) -> BusStatistics:
     """A healthy node."""
-    status = STATUS._replace(protocol_version=layout.protocol_version, bench_identity=int(bench.contract_hash[:4], 16))
+    status = STATUS._replace(protocol_version=layout.protocol_version, bench_identity=int(bench.identity_hash[:4], 16))
     return BusStatistics(
         duration=0.2,
         frames={"EMB_Angle": 200, "EMB_Velocity": 200, "EMB_Status": 2},

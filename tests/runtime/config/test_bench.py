@@ -164,16 +164,16 @@ def test_a_longer_time_out_is_read_and_not_armed() -> None:
         assert str(caught.value).startswith(message)
 
 
-def test_the_contract_hash_ignores_time_outs_and_comments_but_not_the_physics(bench: Bench) -> None:
+def test_the_identity_ignores_time_outs_and_comments_but_not_the_physics(bench: Bench) -> None:
     patient = parse_bench(TEXT.replace("stop_missed  = 20", "stop_missed  = 200"), "t")
-    assert patient.contract_hash == bench.contract_hash
-    assert parse_bench(TEXT + "\n# a comment\n", "t").contract_hash == bench.contract_hash
+    assert patient.identity_hash == bench.identity_hash
+    assert parse_bench(TEXT + "\n# a comment\n", "t").identity_hash == bench.identity_hash
     for old, new in [
         ("2.170e-2", "2.171e-2"),
         ("horizon     = 500", "horizon     = 400"),
         ("margin  = 0.3", "margin  = 0.4"),
     ]:
-        assert parse_bench(TEXT.replace(old, new, 1), "t").contract_hash != bench.contract_hash
+        assert parse_bench(TEXT.replace(old, new, 1), "t").identity_hash != bench.identity_hash
 
 
 @given(st.floats(min_value=0.001, max_value=CEILING_CURRENT))

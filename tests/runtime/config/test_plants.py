@@ -48,7 +48,7 @@ def test_what_is_said_is_read_and_the_rest_has_its_default() -> None:
 
 
 def test_the_plants_are_not_part_of_the_contract(bench: Bench) -> None:
-    assert parse_bench(TEXT, "my.toml").contract_hash == bench.contract_hash
+    assert parse_bench(TEXT, "my.toml").identity_hash == bench.identity_hash
 
 
 def test_an_unknown_plant_is_refused_with_the_names_of_those_that_there_are(bench: Bench) -> None:

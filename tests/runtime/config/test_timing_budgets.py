@@ -24,7 +24,7 @@ def test_budgets_are_read_as_they_stand() -> None:
 
 
 def test_budgets_are_no_part_of_what_a_policy_depends_on() -> None:
-    assert with_budgets("").contract_hash == parse_bench(shipped_bench_text(), "t").contract_hash
+    assert with_budgets("").identity_hash == parse_bench(shipped_bench_text(), "t").identity_hash
 
 
 def test_the_shipped_response_is_well_within_the_period() -> None:

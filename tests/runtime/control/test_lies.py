@@ -26,7 +26,7 @@ from tests.conftest import FunctionActor, Journal, make_loop
 from tests.lying.node import COMMAND, HONEST, PERIOD_NS, Lie, LyingNode
 
 BENCH = load_bench()
-IDENTITY = bench_identity(BENCH.contract_hash)
+IDENTITY = bench_identity(BENCH.identity_hash)
 
 
 class LyingBus:
@@ -89,7 +89,7 @@ def run(
     bench: Bench = BENCH,
     actor: Actor | None = None,
 ) -> Seen:
-    node = LyingNode(bench_identity(bench.contract_hash), lie, seed)
+    node = LyingNode(bench_identity(bench.identity_hash), lie, seed)
     bus, journal = LyingBus(node, delay_ns), Journal()
     driven: Any = {
         "send": bus.send,

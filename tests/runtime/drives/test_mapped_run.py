@@ -108,7 +108,7 @@ def test_a_bench_file_that_names_its_mapping_takes_no_other(odrive: tuple[Mapped
     there = bus.mapping.sha256
     without = parse_bench(late_bench(), "bench.toml")
     named = late_bench().replace("bitrate = 1000000", f'bitrate = 1000000\nmapping = "{there}"')
-    assert parse_bench(named, "bench.toml").contract_hash != without.contract_hash
+    assert parse_bench(named, "bench.toml").identity_hash != without.identity_hash
     (tmp_path / "late.toml").write_text(named)
     (tmp_path / "actor.onnx").write_bytes(constant_actor(parse_bench(named, "bench.toml")))
     document = emb_run.document("--duration", "0.05", "--zero")

@@ -60,7 +60,7 @@ def test_the_keys_of_learning_are_read_and_change_no_contract() -> None:
     bench = parse_bench(text.replace("[shield]", "[shield]\n" + keys + "#"), "t")
     shield = bench.shield
     assert (shield.learn, shield.model, shield.model_error, shield.current_error) == (True, "euler", 50.0, 0.01)
-    assert bench.contract_hash == BENCH.contract_hash
+    assert bench.identity_hash == BENCH.identity_hash
     assumptions = make_assumptions(bench)
     assert (assumptions.flow, assumptions.model_error) == (False, 50.0)
     assert (BENCH.shield.learn, BENCH.shield.model) == (False, "flow")

@@ -138,7 +138,7 @@ def test_what_a_bench_file_does_not_declare_its_brake_does_not_have() -> None:
     ]
     older = parse_bench("\n".join(lines), "test")
     assert older.shield == SHIPPED.shield
-    assert older.contract_hash == SHIPPED.contract_hash
+    assert older.identity_hash == SHIPPED.identity_hash
 
 
 def test_friction_beyond_coulombs_widens_only_the_upper_bound_of_friction() -> None:
