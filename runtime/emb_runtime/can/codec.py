@@ -207,7 +207,7 @@ def generate(database: Database, name: str, expected: Set[str]) -> Message:
     if found.keys() != {"CRC", *expected}:
         raise FrameError(f"DBC: {name}: expected the signals CRC, {', '.join(sorted(expected))}")
     signals = tuple(sorted(found.values(), key=lambda signal: signal.shift))
-    if source.is_extended_frame or source.is_fd:
+    if source.is_extended_frame or source.is_fd or source.length > 8:
         raise FrameError(f"DBC: {name}: expected a classical frame with an 11-bit identifier")
     header = [(s.name, s.shift, s.mask) for s in signals[:2]]
     if header != [("CRC", 0, 0xFF), ("Counter", 8, 0x0F)]:
@@ -242,6 +242,8 @@ def _generate_signal(message: str, source: DbcSignal) -> Signal:
     factor, offset = _number(source.scale), _number(source.offset)
     if factor <= 0 or source.minimum is None or source.maximum is None:
         raise FrameError(f"{where}: expected a positive step and a range [minimum|maximum]")
+    if not all(map(math.isfinite, (factor, offset, source.minimum, source.maximum))):
+        raise FrameError(f"{where}: expected finite numbers")
     # The range is meant to lie on steps; the slack absorbs the decimal fractions' rounding, never a whole step.
     raw_minimum = math.ceil((source.minimum - offset) / factor - 1e-6)
     raw_maximum = math.floor((source.maximum - offset) / factor + 1e-6)

@@ -1,7 +1,7 @@
 """Encoder and decoder of a message as Python functions that are generated from its description in the DBC.
 
-Each is one expression per signal on the payload as one little-endian word. What does not fit is told by the functions
-:meth:`emb_runtime.can.codec.Message.refusal` and ``decode``, which go by the table of signals.
+Each is one expression per signal on the payload as one little-endian word; of a DBC only finite numbers get into the
+text. What does not fit is told by :meth:`emb_runtime.can.codec.Message.refusal` and ``decode``, which go by the table.
 """
 
 from __future__ import annotations
