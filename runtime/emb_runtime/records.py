@@ -84,8 +84,7 @@ class CycleRecord(NamedTuple):
     Times are monotonic nanoseconds. A value that does not exist in a cycle (a policy output in a missed one) is NaN.
 
     The record in the ring buffer, the log's topic ``/cycle`` and its columns follow from these fields and
-    :data:`CYCLE_UNITS`; the loop fills them in ``_record``. Logs written before a field was added lack it, and
-    the readers that require ``CycleRecord._fields`` would refuse them: let a new field be optional there.
+    :data:`CYCLE_UNITS`; the core fills them in ``_record``.
     """
 
     step: int  # Sample index since the experiment began; −1 before
@@ -103,8 +102,7 @@ class CycleRecord(NamedTuple):
     sent_current: float  # After the shield: what the guard let out [A]
     device_time_ns: int  # The node's own time of the sample
     receive_time_ns: int  # Arrival of the later frame of the pair
-    wake_time_ns: int
-    """Time at which the loop had received the pair; that of its arrival where reading the clock is dear."""
+    wake_time_ns: int  # Time at which the loop had the frames of the read that completed the pair
     decide_time_ns: int  # Time at which policy, clip and shield had answered and the frame was ready; 0 if it never was
     send_time_ns: int  # Time at which the command had been handed to the bus; 0 if none was
 
