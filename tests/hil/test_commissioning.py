@@ -88,7 +88,8 @@ def steps_begun(scene: dict[str, Any]) -> list[str]:
 
 def test_each_scene_ends_as_it_should_and_the_last_one_with_a_bench_file(played: dict[str, Any]) -> None:
     codes = {"nobody": 4, "finished": 0, "no_gateway": 4, "mapped_finished": 0}
-    assert {name: played[name]["exit"] for name in SCENES} == dict.fromkeys(SCENES, 3) | codes
+    for name in SCENES:
+        assert played[name]["exit"] == codes.get(name, 3), (name, played[name]["out"][-1000:])
     assert "NO_NODE" in played["nobody"]["out"]
     assert "4-first-move was not completed: INTERRUPTED" in played["interrupted"]["out"]
     assert "stopped by the operator before anything was sent" in played["refused"]["out"]
