@@ -108,7 +108,7 @@ class Gateway:
             if (frame := self._drive_bus.receive(0)) is None:
                 break
             for ours in self.node.take_drive(frame, self._clock.now_ns()):
-                self._send(ours)
+                self._pass_on(ours)
         self.node.tick(self._clock.now_ns())
 
     def _received(self) -> Frame | None:
@@ -118,7 +118,7 @@ class Gateway:
             self._node_lost = err
             return None
 
-    def _send(self, frame: Frame) -> None:
+    def _pass_on(self, frame: Frame) -> None:
         """Put a frame on the node's bus; one for which there is no room is lost, as on any bus."""
         try:
             self._node_bus.send(frame)

@@ -358,16 +358,14 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
         ("safety/watchdog_process.py", "self.send"),
         ("drives/wire_guard.py", "self._send"),  # the second guard
         ("drives/arming.py", "self._send"),  # the node's own method, which hands each frame to the second guard
-        ("drives/transport.py", "bus.send"),  # handed to the node, and by it to the second guard
-        ("drives/node_process.py", "bus.send"),
-        ("drives/transport.py", "self._link.send"),  # a link between processes, no bus
-        ("drives/link.py", "self._end.send"),
-        ("drives/node_process.py", "self._loop.send"),
-        ("drives/node_process.py", "loop.send"),
+        ("drives/gateway.py", "drive_bus.send"),  # handed to the node, and by it to the second guard
+        ("drives/lock_step.py", "bus.send"),
+        ("drives/gateway.py", "self._node_bus.send"),  # samples and status of the node, to the loop
+        ("drives/mapping_file.py", "of.send"),  # a key of the file
     }
     owner = (folder / "drives" / "node.py").read_text(encoding="utf-8")
     assert "WireGuard(mapping, bench.limits.current, send)" in owner
-    for opener in ("node_process.py", "transport.py"):
+    for opener in ("gateway.py", "lock_step.py"):
         assert "bus.send)" in (folder / "drives" / opener).read_text(encoding="utf-8")
     session = (folder / "cli" / "session.py").read_text(encoding="utf-8")
     assert "Guard(plan.layout, plan.bench, bus.transport.send" in session
