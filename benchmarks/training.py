@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from emb_runtime.config.bench import Bench, load_bench
@@ -75,15 +74,6 @@ class Batched(VecEnv):
         return [False] * self.num_envs
 
 
-class _Until(BaseCallback):
-    def __init__(self, until: float) -> None:
-        super().__init__()
-        self._until = until
-
-    def _on_step(self) -> bool:
-        return time.process_time() < self._until
-
-
 def stable_baselines(training: Training, bench: Bench, seconds: float) -> float:
     """Steps per second of processor time of Stable-Baselines3's PPO."""
     ppo, actor = training.ppo, training.untrained_actor(bench)
@@ -107,7 +97,9 @@ def stable_baselines(training: Training, bench: Bench, seconds: float) -> float:
         device="cpu",
     )
     start = time.process_time()
-    model.learn(10**12, callback=_Until(start + seconds))
+    model.learn(ppo.batch)  # whole iterations, as ours: a rollout and what is learned from it
+    while time.process_time() - start < seconds:
+        model.learn(ppo.batch, reset_num_timesteps=False)
     return model.num_timesteps / (time.process_time() - start)
 
 
