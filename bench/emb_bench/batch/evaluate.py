@@ -22,6 +22,7 @@ from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog, read_log, require_driven
+from emb_bench.report.sentences import warnings
 from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.input_file import open_regular
@@ -149,7 +150,7 @@ def _of_the_information(e: Evaluation) -> dict[str, Any]:
     identified = {finding.name: finding.identified for finding in e.verdict().findings}
     said = {e.log.missing, *e.experiment.missing}
     return {
-        "warnings": tuple(printable(warning) for warning in e.warnings if warning not in said),
+        "warnings": tuple(printable(warning) for warning in warnings(e) if warning not in said),
         "nominal_fits": e.fit.fits,
         "nominal_angle_sigmas": e.fit.angle,
         "nominal_velocity_sigmas": e.fit.velocity,

@@ -10,14 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from emb_bench.brake.parameters import UNITS
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.model_evaluator import NO_ERRORS, Fit, ModelEvaluator, SystematicErrors
 from emb_bench.information.fisher import Fisher, Kind, uniform_prior
 from emb_bench.information.identifiability import Identifiability
 from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import RunLog
-from emb_bench.numbers import in_samples
 from emb_bench.sim.open_loop import check_unknowns
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT, IMPORTED_PLANT, THESIS_PLANT, Plant
@@ -107,64 +105,6 @@ class Evaluation:
         """Unknowns that are zero in the model: relative to zero they have no sensitivity, whatever the brake has."""
         has = self.plant.mechanics._asdict()
         return tuple(name for name in self.question.names if has.get(name) == 0.0)
-
-    @property
-    def warnings(self) -> list[str]:
-        """Reasons to doubt the numbers."""
-        found = [self.log.missing] if self.log.missing else []
-        found += self.experiment.missing
-        late, expected = self.experiment.command_delay, self.plant.instruments.command_delay
-        if late != expected:
-            found.append(
-                f"commands acted {in_samples(late)} late, in the model '{self.plant.name}' {in_samples(expected)}: "
-                "what acted is taken from the log, not from the model"
-            )
-        if self.absent:
-            found.append(
-                f"in the model '{self.plant.name}' {', '.join(self.absent)} is zero: there it neither shows nor costs "
-                "the others; ask a model that has it"
-            )
-        if not self.fit.fits:
-            worst = max(self.fit.angle, self.fit.velocity)
-            found.append(
-                f"the record and the model '{self.plant.name}' at {self.theta_name} parameters differ by {worst:.3g} "
-                "sigma: the information is evaluated with this model at these parameters, and "
-                + (
-                    "they are guesses of the map: expected --theta with an estimate"
-                    if self.log.imported and self.theta_name == "nominal"
-                    else "the whole recording is followed from one start: what disturbed it is not in the model"
-                    if self.log.imported
-                    else "what was lost hides whether they are this brake's"
-                    if self.log.missing or self.experiment.missing
-                    else "they are not this brake's, or that is not its model (--model names another)"
-                )
-            )
-        return found
-
-    @property
-    def notes(self) -> list[str]:
-        """Descriptions of what was taken for the currents that acted, and of what the model's instruments change."""
-        instruments = self.plant.instruments
-        notes = list(self.experiment.notes)
-        if known := {name: value for name, value in self.errors._asdict().items() if value}:
-            said = ", ".join(f"{n} = {v:.3g} {UNITS[n]}".removesuffix(" 1") for n, v in known.items())
-            notes.append(f"the systematic errors that {self.theta_name} estimates of this record count as well: {said}")
-        if instruments.observer_bandwidth > 0.0:
-            notes.append(
-                "the velocity is an observer's, derived from the measured angles: it counts for no physical "
-                "information, and its fit is that of an observer of the model's angle"
-            )
-        if instruments.clock_jitter > 0.0:
-            notes.append(
-                "a sigma includes what the brake moves during the jitter of the clock; angle and velocity of a sample "
-                "count as independent, which one instant for both is not: bounds are right to a percent up to 20 us"
-            )
-        if instruments.measurement_delay > 0:
-            delay = in_samples(instruments.measurement_delay)
-            notes.append(f"each sample is taken to show the brake as it was {delay} earlier")
-        if instruments.encoder_offset != 0.0 and self.errors.offset is None:
-            notes.append(f"the encoder is taken to show {instruments.encoder_offset:g} rad at the origin")
-        return notes
 
 
 def evaluate(

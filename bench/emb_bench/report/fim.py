@@ -40,8 +40,8 @@ def document(e: Evaluation) -> dict[str, Any]:
     found: dict[str, Any] = {
         "log": e.log.path,
         "complete": e.log.complete and not x.missing,
-        "warnings": e.warnings,
-        "notes": e.notes,
+        "warnings": say.warnings(e),
+        "notes": say.notes(e),
         "exit_reason": e.log.exit_reason,
         "samples": {
             "planned": x.planned,
@@ -75,7 +75,7 @@ def document(e: Evaluation) -> dict[str, Any]:
 
 def text(e: Evaluation, *, verbose: bool = False) -> str:
     """The best possible intervals; what is missing comes before any number. With ``verbose`` the criteria over time."""
-    doubts, lines = [*listed("WARNING: ", e.warnings), *listed("NOTE: ", e.notes)], _heading(e)
+    doubts, lines = [*listed("WARNING: ", say.warnings(e)), *listed("NOTE: ", say.notes(e))], _heading(e)
     fit = f"angle {e.fit.angle:.3g}, velocity {e.fit.velocity:.3g} sigma; at most {e.fit.expected:.2f} if it fits"
     lines += [*facts(("model", f"{e.plant.name} ({_why(e)}); {fit}")), *_unknowns(e.question)]
     if not e.fisher("weighted").matrix.any():  # which has no prior

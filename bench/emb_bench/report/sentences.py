@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from emb_bench.brake.parameters import UNITS
 from emb_bench.information.identifiability import combination
-from emb_bench.numbers import amount, between, percent, plain, spread
+from emb_bench.numbers import amount, between, in_samples, percent, plain, spread
 
 if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.conclusion import Conclusion
@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.recommendation import Recommendation
     from emb_bench.analysis.study import Study
     from emb_bench.estimate.records import Estimate
+    from emb_bench.experiment.evaluation import Evaluation
     from emb_bench.information.identifiability import Direction, Finding, Identifiability
     from emb_bench.report.content import Content, Run
 
@@ -259,7 +260,57 @@ def impact(run: Run, speed: float | None, why_not: str) -> str:
     return f"{how}, and a brake of the set may hit an end stop with {plain(speed, 3)} rad/s"
 
 
-# ---- identifiability ----
+# ---- Fisher information ----
+
+
+def warnings(e: Evaluation) -> list[str]:
+    """Reasons to doubt an information."""
+    found = [text for text in (e.log.missing, *e.experiment.missing) if text]
+    late, expected = e.experiment.command_delay, e.plant.instruments.command_delay
+    if late != expected:
+        found.append(
+            f"commands acted {in_samples(late)} late, in the model '{e.plant.name}' {in_samples(expected)}: the "
+            "currents are those of the log"
+        )
+    if e.absent:
+        found.append(
+            f"{', '.join(e.absent)} is zero in the model '{e.plant.name}': the data say nothing about it; use a model "
+            "that has it"
+        )
+    if e.fit.fits:
+        return found
+    if e.log.imported:
+        why = (
+            "they are guesses of the map: pass --theta with an estimate"
+            if e.theta_name == "nominal"
+            else "what disturbed the machine is not in the model"
+        )
+    elif e.log.missing or e.experiment.missing:
+        why = "what was lost hides whether they are this brake's"
+    else:
+        why = "pass --theta or --model"
+    worst = max(e.fit.angle, e.fit.velocity)
+    return [*found, f"model '{e.plant.name}' at {e.theta_name} parameters does not fit (rms {worst:.3g} sigma): {why}"]
+
+
+def notes(e: Evaluation) -> list[str]:
+    """Assumptions about the currents that acted, and effects of the model's instruments."""
+    instruments, found = e.plant.instruments, list(e.experiment.notes)
+    if known := {name: value for name, value in e.errors._asdict().items() if value}:
+        values = ", ".join(f"{n} = {v:.3g} {UNITS[n]}".removesuffix(" 1") for n, v in known.items())
+        found.append(f"systematic errors of this record, from {e.theta_name}, are taken as known: {values}")
+    if instruments.observer_bandwidth > 0.0:
+        found.append("the velocity is an observer's, derived from the angle: it adds no physical information")
+    if instruments.clock_jitter > 0.0:
+        found.append(
+            "a sigma includes the motion during the clock's jitter; angle and velocity of a sample count as "
+            "independent, so bounds are right to a percent up to 20 µs"
+        )
+    if instruments.measurement_delay > 0:
+        found.append(f"samples show the brake {in_samples(instruments.measurement_delay)} earlier")
+    if instruments.encoder_offset != 0.0 and e.errors.offset is None:
+        found.append(f"the encoder is assumed to show {instruments.encoder_offset:g} rad at the origin")
+    return found
 
 
 def finding(f: Finding) -> str:

@@ -15,6 +15,7 @@ from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.numbers import in_samples
 from emb_bench.report import estimate as report
+from emb_bench.report.sentences import notes
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import PARAMETER_NAMES, parse_bench
 from emb_runtime.records import Frame
@@ -75,7 +76,7 @@ def test_parameters_are_known_from_a_log_of_a_drive_that_tells_its_current_coars
     (note,) = study.notes
     assert f"the command as its bus carried it, {in_samples(late)} late" in note
     assert f"NOTE: {note}" in " ".join(report.text(study).split())
-    assert note in api.fisher_information(log, model="exact").notes
+    assert note in notes(api.fisher_information(log, model="exact"))
 
 
 def test_of_a_mapping_that_is_not_readable_what_was_told_acted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
