@@ -42,6 +42,7 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.control import core, loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE
+from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.policy.policy import Policy
 from emb_runtime.safety.guard import Guard
@@ -52,6 +53,7 @@ LIMITS = {50.0: 60e-6, 99.9: 150e-6}  # Limits of the cycle's work [s], by quant
 STEPS: dict[str, tuple[Any, str]] = {
     "reading a frame (after the wait)": (SocketCan, "_frame"),
     "reception": (Reception, "take"),
+    "estimator": (Estimator, "take"),
     "policy": (Policy, "act"),
     "clip, slew, shield": (core, "decide"),
     "encoding": (Layout, "encode_command"),

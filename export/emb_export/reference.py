@@ -19,8 +19,6 @@ from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
 from emb_train.structured.law import FEATURES, PRODUCTS, Box, box_of, features, set_reference
 from emb_train.structured.stored import stored
 
-FREE = 1e9  # Bound of a switch, which is not clipped
-
 
 def reference_file(source: str, bench: Bench) -> tuple[bytes, float]:
     """The file of a reference, and the largest difference of its levels and switches from the table's.
@@ -47,15 +45,13 @@ def reference_file(source: str, bench: Bench) -> tuple[bytes, float]:
     provenance = {"reference": Path(source).stem, **kept_of}
     nodes = [
         helper.make_node("Log", [INPUT_NAME], ["logarithm"]),
-        helper.make_node("Mul", ["logarithm", "scale"], ["scaled"]),
-        helper.make_node("Sub", ["scaled", "middle"], ["centred"]),
-        helper.make_node("Clip", ["centred", "minus_one", "one"], ["feature"]),
+        helper.make_node("Gemm", ["logarithm", "scale", "middle"], ["scaled"]),
+        helper.make_node("Clip", ["scaled", "minus_one", "one"], ["feature"]),
         helper.make_node("Gemm", ["feature", "first", "no_first"], ["left"]),
         helper.make_node("Gemm", ["feature", "second", "no_second"], ["right"]),
         helper.make_node("Mul", ["left", "right"], ["terms"]),
         helper.make_node("Gemm", ["terms", "slopes", "constants"], ["free"]),
-        helper.make_node("Max", ["free", "lowest"], ["raised"]),
-        helper.make_node("Min", ["raised", "highest"], [OUTPUT_NAME]),
+        helper.make_node("Clip", ["free", "minus_one", "one"], [OUTPUT_NAME]),
     ]
     model = graph_of(nodes, _constants(table, box, nominal), "reference", (FEATURES, len(table)))
     return policy_file(
@@ -68,10 +64,9 @@ def _constants(table: Floats, box: Box, nominal: Floats) -> dict[str, Floats]:
     low, high = (np.log(np.array(end) * nominal) for end in box)
     width = np.where(high > low, high - low, np.inf)  # 0 for a parameter that is known
     one, pairs = np.eye(FEATURES), np.array(PRODUCTS)
-    bound = np.where(np.arange(len(table)) < (len(table) + 1) // 2, 1.0, FREE)[None]
     return {
-        "scale": (2.0 / width)[None],
-        "middle": ((low + high) / width)[None],
+        "scale": np.diag(2.0 / width),
+        "middle": -((low + high) / width)[None],
         "minus_one": np.array(-1.0),
         "one": np.array(1.0),
         "first": np.hstack([one, one[:, pairs[:, 0]]]),
@@ -80,8 +75,6 @@ def _constants(table: Floats, box: Box, nominal: Floats) -> dict[str, Floats]:
         "no_second": np.repeat([[1.0, 0.0]], [FEATURES, len(PRODUCTS)], axis=1),
         "slopes": np.ascontiguousarray(table[:, 1:].T),
         "constants": table[:, :1].T.copy(),
-        "lowest": -bound,
-        "highest": bound,
     }
 
 

@@ -1,6 +1,6 @@
 """Reference as a table: levels and switches that are polynomials of the estimated parameters.
 
-Each of l_0, l_1, … and t_1, t_2, … is l_i0 + Σ l_ij φ_j + Σ l_ijk φ_j φ_k, the levels clipped to ±1, with φ the
+Each of l_0, l_1, … and t_1, t_2, … is l_i0 + Σ l_ij φ_j + Σ l_ijk φ_j φ_k, clipped to ±1, with φ the
 logarithms of the estimates, scaled to −1..1 over their ranges and cut off there. With zeros for all slopes the
 reference is blind: it depends on no measurement. A first level of small speed is a probe: its few milliseconds tell
 the estimator enough to decide on the rest. How it is followed: :mod:`emb_runtime.estimator.speed_loop`.
@@ -68,12 +68,10 @@ def set_reference(table: Any, f: Four, reference: Any) -> None:
     Args:
         table: n levels, then n − 1 switches, shape [2 n − 1, TERMS].
         f: from :func:`features`.
-        reference: becomes levels, clipped, and switches, shape [2 n − 1].
+        reference: becomes levels and switches, shape [2 n − 1].
     """
-    levels = (len(reference) + 1) // 2
     for i in range(len(reference)):
-        value = of_features(table[i], f)
-        reference[i] = min(max(value, -1.0), 1.0) if i < levels else value
+        reference[i] = min(max(of_features(table[i], f), -1.0), 1.0)
 
 
 def wanted_current(model: Model, state: State, scale: Scale, box: Box, table: Any, reference: Any) -> float:
