@@ -33,7 +33,6 @@ REST: Final = 1e-5  # Standard deviation of the velocity below which a brake is 
 DOUBT: Final = 2.0
 """Factor on the standard deviation of the velocity that decides whether a brake sticks: there the errors are not
 Gaussian, and the filter does not recover from taking a moving brake for one that sticks."""
-SHORTEST: Final = 1e-6  # Least duration that is divided by [s]
 FARTHEST: Final = 12.0  # Standard deviations from a kink beyond which its effect is zero
 
 
@@ -102,7 +101,7 @@ def move(
         now: accelerations.
         x: angle [rad].
         v: velocity [rad/s].
-        t: duration [s].
+        t: duration [s]; not 0.
         spread: standard deviation of the velocity at the start [rad/s].
         spread_against: of that at the end of sliding against the pull, W₁ [rad/s].
         spread_along: of that at the end of sliding with the pull, W₂ [rad/s].
@@ -140,7 +139,7 @@ def move(
     doubt = DOUBT * math.sqrt(max(spread_along * spread_along - spread * spread, REST * REST))
     leaving = min(max(t * driven / doubt, -FARTHEST), FARTHEST)
     released = normal(leaving)
-    sure, share = max(2.0 * released - 1.0, 0.0), (t - before) / max(t, SHORTEST) if ahead < 0.0 else 0.0
+    sure, share = max(2.0 * released - 1.0, 0.0), (t - before) / t if ahead < 0.0 else 0.0
     wide = share * doubt
     v1 += toward * stopped * wide * excess(leaving, released)
     unsure = (1.0 - sure * sure) * released * released + KINK * math.exp(-KINK_DECAY * (leaving * leaving))
