@@ -19,7 +19,7 @@ TASKS: Mapping[str, str] = {
 
 
 def reference_names() -> list[str]:
-    """Names of the tuned references of the structured actor that are part of the package."""
+    """Names of the tuned references that are part of the package."""
     folder = resources.files("emb_train").joinpath("structured", "tuned")
     return sorted(file.name.removesuffix(".json") for file in folder.iterdir() if file.name.endswith(".json"))
 

@@ -188,7 +188,7 @@ LOG = Topic(
     {},
     bare_enums=True,
 )
-ESTIMATE = "/estimate"  # Topic of logs whose actor estimates something, see :func:`estimate_topic`
+ESTIMATE = "/estimate"  # Topic of an experiment, see :func:`estimate_topic`
 LEARNT = Topic(
     "/learnt",
     "emb.Learnt",
@@ -223,15 +223,15 @@ def message_topic(name: str, identifier: int, fields: Sequence[Field]) -> Topic:
 
 
 def estimate_topic(estimates: Sequence[tuple[str, str]]) -> Topic:
-    """The topic of what an actor estimates.
+    """The topic of the running estimate.
 
     Args:
-        estimates: names and units, in the order in which the actor gives them.
+        estimates: names and units, in their order.
     """
     fields = [Field("step", "int64")]
     for name, unit in estimates:
         fields += [Field(name, "double", unit), Field(deviation_of(name), "double", unit)]
-    notes = {"description": "what the actor itself estimates, and the standard deviation of each"}
+    notes = {"description": "the running estimate, and the standard deviation of each"}
     return Topic(ESTIMATE, "emb.Estimate", tuple(fields), notes)
 
 

@@ -449,7 +449,7 @@ def test_a_policy_or_a_bench_that_is_not_the_run_s_is_reported(
 def test_a_policy_in_a_log_is_refused_as_emb_run_refuses_it(
     with_policy: Callable[..., list[str]], bench: Bench, replay: Replay
 ) -> None:
-    for policy in (b"no actor", constant_actor(bench, 2.0)[:-50], constant_actor(bench, bench_hash="0" * 64)):
+    for policy in (b"no actor", constant_actor(bench, 2.0)[:-50], constant_actor(bench, sample_time=2e-3)):
         replay.refused(*with_policy(policy=policy), code=5)
 
 
