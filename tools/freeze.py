@@ -76,10 +76,13 @@ GONE: dict[str, str] = {
 }
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, each with the commit that says why."""
 REST = "0abcadc: a run is watched until the node is at rest, and recorded so far"
+ESTIMATE = "a38226b: the estimate is the runtime's, no longer rounded to single precision"
 WINDOWS = "8dba46e: windows begin at a state whose squares fell"
 GATEWAY = "emb-gateway: a mapped drive is armed before the run: noise of other samples, no counts of its node"
 EXPLAINED: dict[str, str] = {
     "runs/stiff/says/*": REST,
+    "runs/*/says/estimate/*": ESTIMATE,
+    "info/*/says/estimate/*": ESTIMATE,
     "logs/aborted/*": REST,
     "info/aborted/says/*": REST,
     "estimate/emps windows/says/*": WINDOWS,
