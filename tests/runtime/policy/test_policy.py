@@ -11,7 +11,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
-from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -107,18 +106,6 @@ def test_a_contract_survives_json_with_full_precision(
     assert read_contract(contract.to_json()) == contract
 
 
-def test_a_contract_without_a_key_or_with_one_too_many_is_refused_by_its_name() -> None:
-    for key in json.loads(GOOD.to_json()).keys() - {"schema", "ranges", "gain", "provenance"}:
-        assert key in refusal(partial(read_contract, edited(methodcaller("pop", key))))
-    places: list[tuple[str | int, ...]] = [(), ("limits",), ("ranges",), ("vectors", 3)]
-    for place in places:
-        record = inner = json.loads(GOOD.to_json())
-        for step in place:
-            inner = inner[step]
-        inner["surprise"] = 1
-        assert "surprise" in refusal(partial(read_contract, json.dumps(record)))
-
-
 def every_place(value: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
     entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [path, *(p for key, child in list(entries)[:9] for p in every_place(child, (*path, key)))]
@@ -156,12 +143,8 @@ def test_what_is_no_contract_is_refused() -> None:
         edited(lambda r: r.update(kind="state")),
         edited(lambda r: r.update(inputs=["angle", "velocity", "step"])),
         edited(lambda r: r.update(inputs=list(PARAMETER_NAMES))),
-        edited(lambda r: r.update(sample_time="0.001")),
         edited(lambda r: r.update(sample_time=0.0)),
-        edited(lambda r: r.update(horizon=True)),
-        edited(lambda r: r.update(horizon=500.5)),
         edited(lambda r: r.update(gain=1.5)),
-        edited(lambda r: r["limits"].update(current=-6.0)),
         edited(lambda r: r["limits"].update(angle=[1.0, -1.0])),
         edited(lambda r: r["ranges"].update(f_v=[2e-5, 1e-5])),
         edited(lambda r: r["ranges"].update(J=[1e-6, 1e-5])),
