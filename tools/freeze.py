@@ -94,6 +94,8 @@ EXPLAINED: dict[str, str] = {
     "design/D of two/*": "d35eddd: an annealing moves the Euler brake as every other, with a third of the variations",
     "estimate/clean windows/says/parameters/*/sandwich": "ee3542a: the start of each window is at its minimum",
     "estimate/damaged oem/says/misfit/suspects/play/*": "19e394e: a secant has the shift of an early command too",
+    "campaign/all/says/parameters/*/estimate/constancy/mean": "19e394e: weights, by the same score of the damaged log",
+    "campaign/all/says/campaigns/*/means/*/mean": "19e394e: weights, by the same score of the damaged log",
 }
 """The same, of values that differ on purpose."""
 
