@@ -32,13 +32,6 @@ METHODS: Mapping[str, str] = {
     "windows": "output error over windows",
 }
 """Estimation methods by their names."""
-TERMS = {
-    "sigma": "standard deviation",
-    "chi2/n": "mean square of the residuals in sigmas, near 1 if the model is right",
-    "identified": "the 95 % interval is closed, excludes zero and ends at no border of the search",
-    "traded off": "the data tell two parameters well only together: an error of one makes up for that of the other",
-}
-"""Terms of the results, each explained in a line."""
 WINDOW = 0.5  # Length of a window of the method ``windows`` where nothing else says it [s]
 STARTS = 8  # Default number of local searches
 DONE = "DONE"  # Exit reason of a run that came to its planned end

@@ -21,7 +21,7 @@ from markupsafe import Markup
 from emb_bench import numbers
 from emb_bench.analysis.growth import Growth
 from emb_bench.analysis.study import Study
-from emb_bench.estimate.records import METHODS, TERMS
+from emb_bench.estimate.records import METHODS
 from emb_bench.logs.learnt import history, last_ranges
 from emb_bench.logs.timing import INTERVALS, Timing, quantiles
 from emb_bench.numbers import percent, plain, seconds, signed
@@ -97,7 +97,7 @@ def report_page(content: Content) -> str:
             trend_panels=trend_panels(found),
             tested=_tested(content),
             reasons=REASONS,
-            terms=TERMS,
+            terms=sentences.TERMS,
             **({} if content.study is None else _of_study(content, content.study)),
         )
     )

@@ -29,6 +29,17 @@ INTERVALS = (
 )
 
 
+TERMS = {
+    "sigma": "standard deviation",
+    "repeatability": "half of the 95 % interval by sensor noise alone: the scatter of further runs",
+    "total": "half of the 95 % interval, also with systematic errors and effects that the record cannot exclude",
+    "chi2/n": "mean square of the residuals in sigmas, near 1 if the model is right",
+    "identified": "the 95 % interval is closed, excludes zero and ends at no border of the search",
+    "trades off": "the data determine two parameters well only together: their errors compensate",
+}
+"""Terms of the results, each explained in a line."""
+
+
 def p_value(value: float) -> str:
     """A p value behind its letter."""
     return "p < 1e-6" if value < 1e-6 else f"p = {value:.2g}"
