@@ -73,6 +73,7 @@ GONE: dict[str, str] = {
     "fim/*/verdict": VERDICT,
     "report/*/verdict": VERDICT,
     "fim/*/normalise_by": "the parameters of an information are always relative to theta",
+    "info/*/says/metadata/emb.run/first_*": "14a0cd8: the first move has one limit, so that no log says which",
 }
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, each with the commit that says why."""
 REST = "0abcadc: a run is watched until the node is at rest, and recorded so far"

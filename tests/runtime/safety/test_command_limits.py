@@ -119,6 +119,11 @@ def test_a_limit_of_nothing_sends_nothing_but_zero() -> None:
         assert decision.reasons & Reason.CLIPPED
 
 
+def test_a_request_at_the_limit_is_sent_as_it_is() -> None:
+    for current in (6.0, -6.0):
+        assert decide(LAW, FULL, 20.0, 0.0, current, NO_PAST, 0.0, 10) == (current, current, Reason.NONE)
+
+
 def test_a_narrower_limit_clips_the_wish() -> None:
     decision = decide(LAW, CommandLimits(1.5, 12.0), 0.0, 0.0, -4.0, NO_PAST, 0.0, 0)
     assert (decision.clipped, decision.current, decision.reasons) == (-1.5, -1.5, Reason.CLIPPED)
