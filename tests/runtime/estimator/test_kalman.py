@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.estimator.kalman import (
-    MISFIT,
     Model,
     State,
     believed,
@@ -33,6 +33,7 @@ EULER, EXACT = (make_model(BENCH, PM50, sticks=sticks) for sticks in (False, Tru
 NOMINAL = np.array([getattr(BENCH.brake, n) for n in PARAMETER_NAMES])
 T_S = BENCH.timing.sample_time
 UNIT = (1.0, 1.0, 1.0, 1.0)
+UNEQUAL = EXACT._replace(low=(0.5, 0.6, 0.7, 0.8), high=(1.4, 1.6, 1.8, 2.0))  # Ranges that tell parameters apart
 
 
 def state_of(mean: Any, covariance: Floats) -> State:
@@ -116,8 +117,8 @@ def test_the_prior_is_uniform_in_the_ranges_and_at_home() -> None:
     ranges = BENCH.range_set("viscous")
     state = start(make_model(BENCH, ranges, sticks=True))
     assert state.mean == pytest.approx((0.0, 0.0, 1.0, 1.0, 1.0, 3.0e-5 / 2.16e-5))
-    deviation = np.sqrt(np.diag(unpack(np.array(state.covariance), 6)))
-    assert deviation == pytest.approx([0.5, 5.0, 0.0, 0.0, 0.0, 4.0e-5 / 2.16e-5 / math.sqrt(12.0)])
+    deviation = np.array([0.5, 5.0, 0.0, 0.0, 0.0, 4.0e-5 / 2.16e-5 / math.sqrt(12.0)])
+    assert unpack(np.array(state.covariance), 6) == pytest.approx(np.diag(deviation**2))
     assert (state.step, state.innovation, state.worst) == (0.0, 1.0, 1.0)
     widths = np.sqrt(np.diag(unpack(np.array(start(EXACT).covariance), 6)))[2:]
     assert widths == pytest.approx(np.full(4, 1.0 / math.sqrt(12.0)))
@@ -130,7 +131,9 @@ def test_the_model_has_the_numbers_of_the_bench() -> None:
     assert 1e-3 * (0.5 * model.motor - 2.0 * model.spring - model.coulomb - 3.0 * model.viscous) == pytest.approx(
         acceleration
     )
-    assert (model.angle_variance, model.velocity_variance) == pytest.approx((1e-6, 1.0))
+    noisy = replace(BENCH, noise=replace(BENCH.noise, angle=2e-3, velocity=1.3))
+    noise = make_model(noisy, PM50, sticks=True)
+    assert (noise.angle_variance, noise.velocity_variance) == pytest.approx((4e-6, 1.69))
     assert (model.start_angle_variance, model.start_velocity_variance) == pytest.approx((0.25, 25.0))
     assert model.lost == pytest.approx(6.0 * 1.5 * model.motor * 1e-3)
     assert model.low == pytest.approx([0.5] * 4)
@@ -140,7 +143,7 @@ def test_the_model_has_the_numbers_of_the_bench() -> None:
 def test_the_direction_of_an_uncertain_velocity_has_the_mean_sign_of_a_gaussian_number() -> None:
     for v, sigma in [(0.0, 1.0), (0.5, 1.0), (-2.0, 1.5), (3.0, 0.2)]:
         assert direction(v, sigma**2) == pytest.approx(math.erf(v / sigma / math.sqrt(2.0)), abs=0.03)
-    assert direction(1.0, 0.0) == 1.0
+    assert direction(1e-6, 0.0) == pytest.approx(math.tanh(0.8))
 
 
 def test_lost_samples_leave_it_less_sure_by_the_currents_that_may_have_acted() -> None:
@@ -149,6 +152,7 @@ def test_lost_samples_leave_it_less_sure_by_the_currents_that_may_have_acted() -
         variances = [unpack(np.array(predict(model, state, n, 0.0)[1]), 6)[1, 1] for n in (1.0, 2.0, 4.0)]
         assert variances[1] - variances[0] == pytest.approx(model.lost**2, rel=1e-2)
         assert variances[2] - variances[0] == pytest.approx((3.0 * model.lost) ** 2, rel=1e-2)
+        assert predict(model, state, 0.5, 1.0) == predict(model._replace(lost=0.0), state, 0.5, 1.0)
         for periods in (0.0, -3.0):
             assert predict(model, state, periods, 6.0) == (state.mean, state.covariance)
     late = follow(EXACT, start(EXACT), 0.5, 3.0, 40.0, 0.0)
@@ -179,14 +183,19 @@ def test_a_running_mean_of_the_innovations_is_kept_and_its_greatest_value_decide
         state = follow(EXACT, state, state.mean[0], state.mean[1], 0.0, 0.0)
     assert state.innovation < 2.0
     assert state.worst > 20.0
-    sure = known(1.0, 0.0, 1e-8)._replace(worst=MISFIT)
-    assert deviations(EXACT, sure) == pytest.approx([1e-4] * 4)
-    assert deviations(EXACT, sure._replace(worst=1.01 * MISFIT)) == pytest.approx([1.0 / math.sqrt(12.0)] * 4)
+    sure = known(1.0, 0.0, 1e-8)._replace(worst=1.6)
+    assert deviations(UNEQUAL, sure) == pytest.approx([1e-4] * 4)
+    widths = np.subtract(UNEQUAL.high, UNEQUAL.low)
+    assert deviations(UNEQUAL, sure._replace(worst=1.601)) == pytest.approx(widths / math.sqrt(12.0))
 
 
 def test_values_are_cut_off_at_their_ranges_and_known_no_better_than_by_what_is_cut_off() -> None:
-    state = state_of((0.0, 0.0, 0.3, 1.7, 1.1, -1.0), 1e-8 * np.eye(6))
-    assert believed(EXACT, state) == pytest.approx((0.5, 1.5, 1.1, 0.5))
-    assert deviations(EXACT, state) == pytest.approx((0.2, 0.2, 1e-4, 1.5))
+    for beyond, ends in ((-1.0, UNEQUAL.low), (5.0, UNEQUAL.high)):
+        state = state_of((0.0, 0.0, *[beyond] * 4), 1e-8 * np.eye(6))
+        assert believed(UNEQUAL, state) == ends
+        assert deviations(UNEQUAL, state) == pytest.approx(np.abs(np.subtract(beyond, ends)))
+    state = state_of((0.0, 0.0, 0.9, 1.0, 1.1, 1.2), 1e-8 * np.eye(6))
+    assert believed(UNEQUAL, state) == (0.9, 1.0, 1.1, 1.2)
+    assert deviations(UNEQUAL, state) == pytest.approx([1e-4] * 4)
     broken = state_of(state.mean, -1e-8 * np.eye(6))  # by rounding
     assert deviations(EXACT, broken)[2] == 0.0
