@@ -78,9 +78,7 @@ GONE: dict[str, str] = {
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, each with the commit that says why."""
 REST = "0abcadc: a run is watched until the node is at rest, and recorded so far"
 ESTIMATE = "a38226b: the estimate is the runtime's, no longer rounded to single precision"
-DOUBLE = (
-    "8c3e4e84: a policy gets the estimate in double precision: a current is a step of its signal off here and there"
-)
+DOUBLE = "8c3e4e84: estimates in double precision: a current is a step of its signal off here and there"
 FITS = "8c3e4e84: of a bench only limits and sample time decide whether a policy is refused"
 WINDOWS = "8dba46e: windows begin at a state whose squares fell"
 GATEWAY = "emb-gateway: a mapped drive is armed before the run: noise of other samples, no counts of its node"

@@ -120,8 +120,8 @@ def test_the_prior_is_uniform_in_the_ranges_and_at_home() -> None:
     deviation = np.array([0.5, 5.0, 0.0, 0.0, 0.0, 4.0e-5 / 2.16e-5 / math.sqrt(12.0)])
     assert unpack(np.array(state.covariance), 6) == pytest.approx(np.diag(deviation**2))
     assert (state.step, state.innovation, state.worst) == (0.0, 1.0, 1.0)
-    widths = np.sqrt(np.diag(unpack(np.array(start(EXACT).covariance), 6)))[2:]
-    assert widths == pytest.approx(np.full(4, 1.0 / math.sqrt(12.0)))
+    deviation = np.sqrt(np.diag(unpack(np.array(start(UNEQUAL).covariance), 6)))[2:]
+    assert deviation == pytest.approx(np.subtract(UNEQUAL.high, UNEQUAL.low) / math.sqrt(12.0))
 
 
 def test_the_model_has_the_numbers_of_the_bench() -> None:
