@@ -41,13 +41,17 @@ class Operator:
         return Console(self._stop_requested, self._show, self._may_arm)
 
     def _show(self, lines: tuple[CheckResult, ...], bus: Bus) -> None:
-        """Show the table; of the next ones what is not as it should be, below the stage: it says what they are of."""
-        shown = [line for line in lines if not self._seen or line.verdict is not Verdict.OK]
-        if self._seen and shown:
+        """Show the checks that are not ok, below the stage: it says what they are of. All where they are agreed to."""
+        whole = not self._seen and (self._plan.verbose or self._asks(bus))
+        shown = [line for line in lines if whole or line.verdict is not Verdict.OK]
+        if shown and not whole:
             shown = [lines[0], *(line for line in shown if line is not lines[0])]
-        self._seen = True
-        if shown and (not self._plan.json or self._asks(bus)):
+        quiet = self._plan.json and not self._asks(bus)
+        if shown and not quiet:
             mention(table(shown))
+        elif not self._seen and not quiet:
+            mention(f"pre-flight: {len(lines)} checks, all ok (-v shows them)")
+        self._seen = True
 
     def _may_arm(self, bus: Bus) -> bool:
         if not self._agreed:
@@ -97,7 +101,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _experiment(plan: Plan, console: Console) -> int:
     done = experiment(plan, plan.iface, log_path(plan.log), console)
-    show(as_json(done.document) if plan.json else summary.text(done.document))
+    show(as_json(done.document) if plan.json else summary.text(done.document, plan.verbose))
     return done.exit_code
 
 

@@ -139,6 +139,7 @@ class Plan:
     ask: Ask
     live: str | None  # Port at which the run is shown, or ``lines``
     json: bool
+    verbose: bool
     drive: MappedDrive | None = None  # The node is its gateway
     operator: str = ""  # Name of who makes the run; empty if that was not said
     serial: str = ""  # Serial number of the device; empty if that was not said
@@ -195,6 +196,9 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument("--operator", default="", metavar="NAME", help="who makes the run, for the log and its report")
     what.add_argument("--serial", default="", metavar="TEXT", help="serial number of the device, for the log")
     what.add_argument("--json", action="store_true", help="print the summary as JSON")
+    what.add_argument(
+        "-v", "--verbose", action="store_true", help="print every check of the pre-flight and every count"
+    )
 
     stage = p.add_argument_group("stage: how much of the chain may act (default: all of it)")
     one = stage.add_mutually_exclusive_group()
@@ -303,6 +307,7 @@ def prepare(args: argparse.Namespace) -> Plan:
         ask=Ask.ALWAYS if args.confirm else Ask.NEVER if args.yes else Ask.REAL_BUS,
         live=_live(args.live),
         json=args.json,
+        verbose=args.verbose,
         drive=_drive(args.iface, args.drive, bench),
         operator=_label("--operator", args.operator),
         serial=_label("--serial", args.serial),

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from emb_runtime.cli.preflight import CheckResult, RefusedError
+from emb_runtime.config.bench import Bench
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import EXIT_DONE, EXIT_LOG, BusError, EmbError
 from emb_runtime.estimator import estimate
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from emb_runtime.cli.options import Plan
 
 
+BORDER = 1e-6  # Share of a range's end that counts as the end
 LOG_INCOMPLETE = "LOG_INCOMPLETE"  # Result of a run that was completed and not recorded
 
 
@@ -121,6 +123,7 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         **facts(outcome),
         "learnt": {} if outcome.learnt is None else ranges_of(outcome.learnt),
         "estimate": estimate.by_name(estimated(plan.bench), outcome.estimate),
+        "outside": outside(plan.bench, outcome.estimate),
         "goal_s": outcome.goal_ns * 1e-9 if outcome.goal_reached else None,
         "end_angle": outcome.end_angle,
         "end_velocity": outcome.end_velocity,
@@ -132,6 +135,21 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         **log_facts(ran.log),
         "homing": {},
     }
+
+
+def outside(bench: Bench, numbers: Sequence[float]) -> dict[str, tuple[float, float, float, str]]:
+    """Estimates at or beyond the border of the ranges for which the limits hold: value, range, and the ranges' name.
+
+    The estimator does not go beyond the ranges itself.
+    """
+    name, quantities = bench.shield.ranges, estimated(bench)
+    ranges = bench.range_set(name)
+    found = {}
+    for quantity, value in zip(quantities, numbers[: len(quantities)], strict=False):
+        low, high = getattr(ranges.low, quantity.name), getattr(ranges.high, quantity.name)
+        if not low * (1.0 + BORDER) < value < high * (1.0 - BORDER):
+            found[quantity.name] = (value, low, high, name)
+    return found
 
 
 def motion(outcome: Outcome) -> dict[str, float | None]:
@@ -153,10 +171,10 @@ def refusal(err: EmbError, iface: str) -> dict[str, Any]:
     return found | empty | {"preflight": [line.document() for line in lines]}
 
 
-def text(s: Mapping[str, Any]) -> str:
-    """A :func:`document` for a person."""
+def text(s: Mapping[str, Any], details: bool = False) -> str:
+    """A :func:`document` for a person: the answer and what was unusual; every count with ``details``."""
     early = f", ended early: enough is known after {s['goal_s']:.3f} s" if s["goal_reached"] else ""
-    lines = [f"done: {s['answered']} of {s['steps']} samples answered{early}"]
+    lines = [f"done: {s['answered']} of {s['steps']} samples answered, {'home' if s['home'] else 'NOT HOME'}{early}"]
     if s["result"] != "done":
         where = " on the way home" if s["purpose"] == RunType.HOMING else ""
         why = f"{s['cause']}: {s['detail']}" if s["detail"] else s["cause"]
@@ -166,13 +184,34 @@ def text(s: Mapping[str, Any]) -> str:
     if s["stage"] != "full":
         lines.append(f"  stage      {s['stage']}, at most {s['limit']:g} A")
     if s["pairs"]:
-        lines += _experiment(s)
-    if s["result"] == "done" and s["purpose"] == RunType.EXPERIMENT:
+        lines += _brake(s)
+    if s["pairs"] and (details or s["result"] != "done" or s["unanswered"] or s["missed"] or s["rejected"]):
+        lines += _counts(s)
+    completed = s["result"] == "done" and s["purpose"] == RunType.EXPERIMENT
+    if completed and (details or s["unexplained"] is None):
         lines.append(f"  motion     {_motion(s)}")
-    lines += [f"  estimate   {line}" for line in estimate.words(s["estimate"])]
-    lines += [
-        f"  learnt     {name} between {low:.3f} and {high:.3f} of nominal, if what the shield assumes is true"
-        for name, (low, high) in s["learnt"].items()
+    lines += _unusual(s)
+    if details:
+        lines += [
+            f"  learnt     {name} between {low:.3f} and {high:.3f} of nominal, if what the shield assumes is true"
+            for name, (low, high) in s["learnt"].items()
+        ]
+    if s["estimate"]:
+        lines.append("estimate while running ± half of the 95 % interval (k=2), if the model is right")
+        lines += [f"  {line}" for line in estimate.words(s["estimate"])]
+    missing = "" if s["log_complete"] else f", INCOMPLETE: {s['log_error']}"
+    lines.append(f"log: {s['log']} ({s['log_messages']} messages, {s['log_bytes'] / 1024:.0f} KiB{missing})")
+    if completed:
+        lines.append(f"next: emb-replay estimate {s['log']}   (tests the model; the final intervals)")
+    return "\n".join(lines)
+
+
+def _unusual(s: Mapping[str, Any]) -> list[str]:
+    """Lines on what an undisturbed run does not have."""
+    lines = [
+        f"  OUTSIDE    {name} = {value:.4g} is at or beyond the border of ranges.{ranges} ({low:.4g} to {high:.4g}): "
+        "the limits were not guaranteed; look for what is wrong, or widen the range"
+        for name, (value, low, high, ranges) in s["outside"].items()
     ]
     if s["bus_errors"]:
         classes = ", ".join(f"{name} ({count})" for name, count in s["bus_error_classes"].items())
@@ -188,9 +227,7 @@ def text(s: Mapping[str, Any]) -> str:
             f"  watchdog   {watchdog['tripped'] or 'did not trip'}, {watchdog['frames']} stop frames"
             f"{': ' + watchdog['error'] if watchdog['error'] else ''}"
         )
-    missing = "" if s["log_complete"] else f", INCOMPLETE: {s['log_error']}"
-    lines.append(f"  log        {s['log']} ({s['log_messages']} messages, {s['log_bytes'] / 1024:.0f} KiB{missing})")
-    return "\n".join(lines)
+    return lines
 
 
 def brief(s: Mapping[str, Any]) -> str:
@@ -222,19 +259,22 @@ def result_facts(fault: Fault | None, exit_code: int, detail: str) -> dict[str, 
     }
 
 
-def _experiment(s: Mapping[str, Any]) -> list[str]:
+def _brake(s: Mapping[str, Any]) -> list[str]:
     return [
         f"  brake      {s['angle_min']:.2f} to {s['angle_max']:.2f} rad, top speed {s['top_speed']:.1f} rad/s, "
         f"top current {s['top_current']:.2f} A",
-        f"  end        {s['end_angle']:.3f} rad, {s['end_velocity']:.1f} rad/s at the last sample in control: "
-        f"{'home' if s['home'] else 'NOT HOME'}",
-        f"  afterwards {s['last_angle']:.3f} rad, the node is {s['node_state']}"
-        f"{', at rest' if s['node_at_rest'] else ', still stopping'}"
+        f"  end        {s['end_angle']:.3f} rad, {s['end_velocity']:.1f} rad/s; then {s['last_angle']:.3f} rad, "
+        f"the node is {s['node_state']}{', at rest' if s['node_at_rest'] else ', still stopping'}"
         f"{_stop_reason(s['node_stop_reason'])}",
+    ]
+
+
+def _counts(s: Mapping[str, Any]) -> list[str]:
+    return [
         f"  commands   {s['answered']} sent, {s['confirmed']} frames seen on the bus, {s['limited']} limited by the "
         f"shield, {s['returning']} to return, {s['clipped']} clipped, {s['not_obeyed']} came too late",
-        f"  samples    {s['pairs']} pairs, {s['unanswered']} unanswered ({s['not_taken']} for want of room on the "
-        f"interface, {s['left']} left to the node), {s['missed']} periods missed, {s['rejected']} frames rejected, "
+        f"  samples    {s['pairs']} pairs, {s['unanswered']} without a command (send buffer full: {s['not_taken']}, "
+        f"left to the node: {s['left']}), {s['missed']} periods missed, {s['rejected']} frames rejected, "
         f"{s['dropped']} dropped by the kernel",
     ]
 

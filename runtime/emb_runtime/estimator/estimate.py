@@ -43,9 +43,10 @@ def words(estimate: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, said in estimate.items():
         value, half = said["value"], NORMAL_95 * said["deviation"]
-        part = f" ({100.0 * half / abs(value):.2g} %)" if value else ""
-        known = f"{name} = {_with_zeros(value, _digits(value, half))} ± {_with_zeros(half, 2)} {said['unit']}{part}"
-        lines.append(f"{known} at 95 %, if the brake is as the model says")
+        part = f"   {100.0 * half / abs(value):.2g} %" if value else ""
+        lines.append(
+            f"{name} = {_with_zeros(value, _digits(value, half))} ± {_with_zeros(half, 2)} {said['unit']}{part}"
+        )
     return lines
 
 

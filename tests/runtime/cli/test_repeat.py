@@ -163,7 +163,7 @@ def test_a_campaign_in_words_is_a_line_per_run_and_a_summary(
     lines = out.splitlines()
     assert [line[:19] for line in lines[:2]] == ["run 1 of 2: done: 2", "run 2 of 2: done: 2"]
     assert lines[2].startswith("2 of 2 runs: 2 done; logs in ")
-    assert err.count("PRE-FLIGHT") == 1
+    assert err.count("pre-flight: ") == 1
 
 
 def test_a_campaign_ends_after_a_fault_that_wants_to_be_looked_at(short: EmbRun, sim: Sim) -> None:

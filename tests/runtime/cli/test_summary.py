@@ -74,11 +74,31 @@ def told(bench: Bench, ran: RunResult) -> Any:
 
 
 def test_a_run_in_words_has_every_count(told: Any) -> None:
-    said = text(told())
-    assert said.startswith("done: 490 of 500 samples answered\n")
-    assert "493 frames seen on the bus" in said
-    assert "10 unanswered (2 for want of room on the interface, 3 left to the node)" in said
-    assert said.endswith("  log        run.mcap (3787 messages, 146 KiB)")
+    said = text(told(), details=True)
+    for part in (
+        "490 of 500",
+        "493 frames",
+        "10 without a command",
+        "full: 2",
+        "node: 3",
+        "run.mcap (3787 messages, 146 KiB)",
+    ):
+        assert part in said
+
+
+def test_an_undisturbed_run_is_told_in_14_lines_and_one_that_lost_samples_says_so(told: Any) -> None:
+    whole = RunCounters(pairs=501, answered=500, confirmed=503)
+    said = text(told(counters=whole, estimate=(0.02, 23.0, 0.01, 2e-5, 1e-5, 0.0004, 1e-5, 1e-7)))
+    assert len(said.splitlines()) <= 14
+    assert "periods missed" not in said
+    assert "12 periods missed" in text(told(counters=replace(whole, missed=12)))
+
+
+@pytest.mark.parametrize(("k_1", "outside"), [(23.0, False), (11.0, True), (34.56, True), (34.5, False)])
+def test_an_estimate_at_the_border_of_the_ranges_or_beyond_is_said(told: Any, k_1: float, outside: bool) -> None:
+    document = told(estimate=(0.02, k_1, 0.01, 2e-5, 1e-5, 0.0004, 1e-5, 1e-7))
+    assert list(document["outside"]) == (["k_1"] if outside else [])
+    assert ("OUTSIDE" in text(document)) == outside
 
 
 @pytest.mark.parametrize("fault", Fault)
@@ -168,18 +188,17 @@ def test_the_last_estimate_is_told_with_its_interval_and_unit(bench: Bench, ran:
     interval = pytest.approx([2e-5 - 1.96e-7, 2e-5 + 1.96e-7])
     assert said["estimate"]["f_v"] == {"value": 2e-5, "deviation": 1e-7, "interval_95": interval, "unit": "N·m·s/rad"}
     lines = text(said).splitlines()
-    assert lines[0] == "done: 490 of 500 samples answered, ended early: enough is known after 0.094 s"
+    assert lines[0].endswith(", ended early: enough is known after 0.094 s")
     assert said["goal_s"] == pytest.approx(0.094)
-    k_1, f_v = "k_1 = 0.05000 ± 0.00078 N/rad (1.6 %) at 95 %", "f_v = 2.000e-05 ± 2.0e-07 N·m·s/rad (0.98 %) at 95 %"
-    for line in (k_1, f_v):
-        assert f"  estimate   {line}, if the brake is as the model says" in lines
+    for line in ("k_1 = 0.05000 ± 0.00078 N/rad   1.6 %", "f_v = 2.000e-05 ± 2.0e-07 N·m·s/rad   0.98 %"):
+        assert f"  {line}" in lines
     assert trailer(known, {})["goal_reached"] == "True"
 
 
 def test_the_motion_that_no_one_brake_explains_is_told(told: Any, outcome: Outcome) -> None:
     judged = told(unexplained=3.6, allowed=28.4)
     assert (judged["unexplained"], judged["unexplained_allowed"]) == (3.6, 28.4)
-    assert "  motion     one brake explains all but 4 rad/s of it, at most 28 may be\n" in text(judged)
+    assert "  motion     one brake explains all but 4 rad/s of it, at most 28 may be\n" in text(judged, details=True)
     ended = trailer(replace(outcome, unexplained=3.6, allowed=28.4), {})
     assert (float(ended["unexplained"]), float(ended["unexplained_allowed"])) == (3.6, 28.4)
 
