@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar, cast
@@ -23,11 +24,11 @@ from emb_runtime.cli.main import main
 from emb_runtime.cli.session import Bus
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
-from emb_runtime.policy.policy import shipped_actor_path
 from emb_runtime.records import Frame
 from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.watchdog import WatchdogHandle, WatchdogResult
 from emb_runtime.system.clock import SteppedClock
+from tests.actors import constant_actor
 from tests.runtime.operating import Edited, EmbRun, Keyboard, Sim
 
 pytestmark = pytest.mark.usefixtures("handlers")
@@ -61,16 +62,14 @@ def test_read_only_logs_all_sends_nothing_and_says_what_is_on_the_bus(
 
 
 def test_read_only_needs_no_policy_and_refuses_one_that_was_named_and_does_not_fit(
-    capsys: pytest.CaptureFixture[str], edited: Edited, tmp_path: Path, sim: Sim
+    emb_run: EmbRun, bench: Bench, tmp_path: Path, sim: Sim
 ) -> None:
-    """On a bench that the shipped policy was not made for."""
-    bench, path = edited("angle    = [-10.0, 100.0]", "angle = [-10.0, 90.0]"), tmp_path / "read.mcap"
-    emb_run = EmbRun(("--bench", bench), capsys, path)
-    emb_run.refused("export one for this bench file: emb-export four-d-exact-quadratic", "--zero", code=5)
     heard = emb_run.document("--read-only", "--duration", "0.5")
     assert (heard["result"], heard["exit_code"]) == ("done", 0)
-    assert "policy.onnx" not in read_log(path).attachments
-    emb_run.refused("does not fit this bench", "--policy", str(shipped_actor_path()), "--read-only", code=5)
+    assert "policy.onnx" not in emb_run.log().attachments
+    weak = tmp_path / "weak.onnx"
+    weak.write_bytes(constant_actor(replace(bench, limits=replace(bench.limits, current=3.0))))
+    emb_run.refused("limits.current is 6.0 A", "--policy", str(weak), "--read-only", code=5)
     assert sim.sent == []
 
 
