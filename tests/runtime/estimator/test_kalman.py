@@ -33,7 +33,7 @@ EULER, EXACT = (make_model(BENCH, PM50, sticks=sticks) for sticks in (False, Tru
 NOMINAL = np.array([getattr(BENCH.brake, n) for n in PARAMETER_NAMES])
 T_S = BENCH.timing.sample_time
 UNIT = (1.0, 1.0, 1.0, 1.0)
-UNEQUAL = EXACT._replace(low=(0.5, 0.6, 0.7, 0.8), high=(1.4, 1.6, 1.8, 2.0))  # Ranges that tell parameters apart
+UNEQUAL = EXACT._replace(low=(0.5, 0.65, 0.7, 0.8), high=(1.4, 1.6, 1.8, 2.0))  # Ranges that tell parameters apart
 
 
 def state_of(mean: Any, covariance: Floats) -> State:
