@@ -225,6 +225,7 @@ class Recording:
         self.writer = LogWriter(output, header)
         self.lost = 0  # Records that could not be written
         self.error = ""  # The first failure to write
+        self.drive_error = ""  # Loss of the drive's bus, which the file outlives
 
     def run(self) -> dict[str, Any]:
         """Record until the trailer comes or the parent is gone; then write the rest and report."""
@@ -253,7 +254,7 @@ class Recording:
             try:
                 frame = self._drive_bus.receive(0)
             except BusError as err:
-                self.error, self._drive_bus = self.error or str(err), None
+                self.drive_error, self._drive_bus = str(err), None  # the log of the run goes on without it
                 return False
             if frame is None:
                 return False
@@ -267,6 +268,8 @@ class Recording:
         unreadable = len(self._ring)  # only a producer that died between two stores leaves any
         self.lost += unreadable
         trailer["dropped_records"] = str(self._ring.dropped + self.lost)
+        if self.drive_error:
+            trailer["drive_bus_error"] = self.drive_error
         self._guarded(partial(self._close, trailer))
         if not self.error and not self._is_there():
             self.error = "it was removed or replaced while it was written: run again, and leave its folder alone"

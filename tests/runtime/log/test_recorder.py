@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,10 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from emb_runtime.can.messages import load_layout
-from emb_runtime.errors import LogError
-from emb_runtime.log.recorder import Attachment, LogHeader, Recorder
-from emb_runtime.log.ring_buffer import Level
+from emb_runtime.errors import BusError, LogError
+from emb_runtime.log import recorder_process
+from emb_runtime.log.recorder import Attachment, LogHeader, Recorder, _document
+from emb_runtime.log.ring_buffer import EventRecord, Level, Ring, pack
 from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, Reason, RunState
 
 from tests.bench.processes import wait_until_gone  # isort: skip
@@ -93,6 +95,36 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert (result.complete, result.error, result.dropped, result.bytes) == (True, "", 0, path.stat().st_size)
     assert result.messages == sum(summary(path)[0].statistics.channel_message_counts.values())
     return path
+
+
+def test_the_loss_of_the_drive_s_bus_costs_its_frames_and_not_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waiting = [Frame(9, b"drive", START)]
+
+    class Bus:
+        def receive(self, _deadline_ns: int) -> Frame | None:
+            if not waiting:
+                raise BusError("can0 is down")
+            return waiting.pop()
+
+    monkeypatch.setattr(recorder_process, "_open_drive_bus", lambda _header: Bus())
+    path, ring = tmp_path / "run.mcap", Ring.create(16)
+    recording = recorder_process.begin(ring, _document(path, replace(HEADER, drive_bus="can0")))
+    commands = iter((None, None, {"exit_reason": "BUS_LOST"}))
+
+    def listen(_wait: float) -> dict[str, str] | None:
+        ring.push(*pack(EventRecord(START, "X", "")))
+        return next(commands)
+
+    monkeypatch.setattr(recording, "_listen", listen)
+    answer = recording.run()
+    assert (answer["error"], answer["lost"]) == ("", 0)
+    topics = decode(path)
+    assert (len(topics["/drive/rx"]), len(topics["/safety"])) == (1, 3)
+    assert summary(path)[1]["emb.end"] == {
+        "exit_reason": "BUS_LOST", "dropped_records": "0", "drive_bus_error": "can0 is down", "undecoded_frames": "0",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("replaced", [False, True])
