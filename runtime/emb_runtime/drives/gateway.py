@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import select
 from collections.abc import Callable
 
@@ -49,9 +50,16 @@ class Gateway:
             BusError: the drive cannot be armed, or a bus is lost.
             SafetyStopError: the node let the drive go, but not for the operator; the message says why.
         """
-        if arms:
-            self._arm(stop_requested)
-        ready()
+        try:
+            self._serve(stop_requested, ready, arms=arms)
+        finally:
+            with contextlib.suppress(BusError):  # the drive's bus may be what is lost
+                self.node.abandon()
+
+    def _serve(self, stop_requested: Callable[[], bool], ready: Callable[[], None], *, arms: bool) -> None:
+        sent = arms and self._arm(stop_requested)
+        if not arms or self.node.phase is Phase.READY:
+            ready()
         ended_ns = None
         while ended_ns is None or self._clock.now_ns() < ended_ns:
             self.step()
@@ -61,35 +69,51 @@ class Gateway:
                     break
             elif arms and ended_ns is None and self.node.phase in (Phase.OFF, Phase.FAILED):
                 ended_ns = self._clock.now_ns() + LINGER_NS
-        if arms and not self._released():
-            raise BusError("the drive still reports that it is armed: it ignores its disarming; switch it off")
+        problem = self._release_problem() if sent else ""
+        failure = self._failure(stopped=ended_ns is not None and not stop_requested())
+        if problem:
+            raise BusError(f"{failure}; {problem}" if failure else problem)
+        if failure is not None:
+            raise failure
+
+    def _failure(self, *, stopped: bool) -> BusError | SafetyStopError | None:
         if self._node_lost is not None:
-            raise self._node_lost
+            return self._node_lost
         if self.node.failure:
-            raise SafetyStopError(f"the drive was let go: {self.node.failure}")
-        if ended_ns is not None and not stop_requested():
-            raise SafetyStopError(f"the drive was let go after a stop, reason {self.node.stop_reason.name}")
+            return SafetyStopError(f"the drive was let go: {self.node.failure}")
+        if stopped:
+            return SafetyStopError(f"the drive was let go after a stop, reason {self.node.stop_reason.name}")
+        return None
 
-    def _released(self) -> bool:
-        """True if the drive confirms within a time that it is let go."""
+    def _release_problem(self) -> str:
+        """Reason why the drive may still be armed; empty if it reports within a time that it is not."""
         deadline_ns = self._clock.now_ns() + LINGER_NS
-        while not (released := self.node.released(self._clock.now_ns())) and self._clock.now_ns() < deadline_ns:
-            self.step()
-        return released
+        while (problem := self.node.release_problem) and self._clock.now_ns() < deadline_ns:
+            try:
+                self.step()
+            except BusError as err:
+                problem = f"{problem}: {err}"
+                break
+        return problem and f"{problem}; switch it off"
 
-    def _arm(self, stop_requested: Callable[[], bool]) -> None:
+    def _arm(self, stop_requested: Callable[[], bool]) -> bool:
+        """Arm the drive; False if the end came first, and nothing was sent."""
         deadline_ns = self._clock.now_ns() + LONGEST_SILENCE_NS
-        while not self.node.may_arm and not stop_requested():
+        while not (self.node.may_arm or stop_requested() or self._node_lost):
             self.step()
             if self._clock.now_ns() > deadline_ns:
                 raise BusError("no samples of the drive: check that it is on, on this bus, with this DBC")
+        if stop_requested() or self._node_lost:
+            return False
         self.node.arm(self._clock.now_ns())
         while self.node.phase is Phase.ARMING:
             self.step()
             if stop_requested():
                 self.node.disarm()
         if self.node.phase is Phase.FAILED:
-            raise BusError(f"cannot arm the drive: {self.node.failure}")
+            problem = self._release_problem()
+            raise BusError(f"cannot arm the drive: {self.node.failure}{problem and f'; {problem}'}")
+        return True
 
     def step(self) -> None:
         """Wait for what comes first, take what has come, and do what is due.

@@ -129,10 +129,16 @@ class DriveNode:
         """True if the drive has been heard, or sends only what it is asked for."""
         return self._mapping.polled or self.counts.samples >= READY_SAMPLES
 
-    def released(self, now_ns: int) -> bool:
-        """True if the drive has reported since it was let go that it is not armed; also where it reports no state."""
-        said_ns, state = self._receiver.said_ns, self._receiver.state(now_ns)
-        return self._mapping.state is None or (said_ns > self._let_go_ns and state is not DriveState.ACTIVE)
+    @property
+    def release_problem(self) -> str:
+        """Reason why a drive that was let go may be armed; empty if it reports that it is not, or reports no state."""
+        if self._mapping.state is None:
+            return ""
+        if self._receiver.said_ns <= self._let_go_ns:
+            return "the drive has reported nothing since its disarming"
+        if self._receiver.said is DriveState.ACTIVE:
+            return "the drive still reports that it is armed: it ignores its disarming"
+        return ""
 
     def due_ns(self, now_ns: int) -> int:
         """Time at which :meth:`tick` should be called next, at the latest [ns]."""
@@ -165,6 +171,11 @@ class DriveNode:
             self._latch(StopReason.DISABLED)
         elif self.phase in (Phase.ARMING, Phase.READY):
             self._let_go()
+
+    def abandon(self) -> None:
+        """Let an armed drive go at once, moving or not."""
+        if self.phase is not Phase.OFF:
+            self._give_up("the gateway ended while the drive was armed")
 
     def take_host(self, frame: Frame, now_ns: int) -> None:
         """Take a frame of ours; only a valid, fresh answer to the newest sample is obeyed."""
@@ -453,7 +464,7 @@ class DriveNode:
 
 
 def report(node: DriveNode) -> dict[str, str]:
-    """Counts of a node, for the log."""
+    """Counts of a node, for the operator."""
     times, rejected = node.times, ", ".join(f"{reason} ({count})" for reason, count in node.rejected.items())
     return {f"drive_{name}": str(value) for name, value in asdict(node.counts).items()} | {
         "drive_largest_age_ns": str(times.largest_age_ns),

@@ -107,7 +107,7 @@ class Receiver:
         self._waiting: dict[str, tuple[dict[str, float], int]] = {}
         self._turns = 0.0
         self._wrapped: float | None = None
-        self._state = DriveState.UNKNOWN
+        self.said = DriveState.UNKNOWN  # State by the latest message with it, however old that is
         self.said_ns = 0
         """Arrival of the latest message with the state [ns]."""
         self.rejected: dict[str, int] = {}
@@ -123,7 +123,7 @@ class Receiver:
         state = self._mapping.state
         if state is not None and now_ns - self.said_ns > state.timeout * 1e9:
             return DriveState.UNKNOWN
-        return self._state
+        return self.said
 
     def take(self, frame: Frame) -> DriveSample | None:
         """Take a frame from the bus; gives the sample that it completes.
@@ -179,11 +179,11 @@ class Receiver:
         assert state is not None
         value = values[state.field.name]
         if state.error is not None and values[state.error.name] != 0.0:
-            self._state = DriveState.FAULT
+            self.said = DriveState.FAULT
         elif value in state.idle:
-            self._state = DriveState.IDLE
+            self.said = DriveState.IDLE
         else:
-            self._state = DriveState.ACTIVE if value in state.active else DriveState.FAULT
+            self.said = DriveState.ACTIVE if value in state.active else DriveState.FAULT
         self.said_ns = time_ns
 
     def _pair(self, name: str, values: dict[str, float], time_ns: int) -> DriveSample | None:

@@ -273,9 +273,65 @@ def test_every_other_end_is_an_error_with_the_drive_let_go() -> None:
         with pytest.raises((BusError, SafetyStopError), match=reason):
             run(played, 5000, partial(happens, played))
         assert played.drive.error or played.asked_states[-1] == IDLE
-    stubborn = Played()
-    with pytest.raises(BusError, match="it ignores its disarming"):
-        run(stubborn, 400, lambda: setattr(stubborn, "ignores", True))
+
+
+def test_a_release_that_is_not_confirmed_is_an_error_after_the_reason_of_the_end() -> None:
+    armed, nothing = "still reports that it is armed: it ignores its disarming", "has reported nothing since"
+
+    def stubborn(it: Played) -> None:
+        it.ignores = True
+
+    def contradicting(it: Played) -> None:
+        it.ignores, it.velocity = True, 50.0
+
+    def deaf_host(it: Played) -> None:
+        it.ignores, it.host.error = True, BusError("vcan0 is down")
+
+    def dumb(it: Played) -> None:
+        it.drive.passes = lambda: it.clock.advance_to(it.clock.now_ns() + MS)
+
+    def unplugged(it: Played) -> None:
+        """Reports nothing more after it has reported, disarmed, that it is armed."""
+        it.ignores = True
+        it.serve(401, partial(dumb, it))
+
+    for happens, reason in (
+        (stubborn, f"^the drive {armed}; switch it off"),
+        (contradicting, f"angle and velocity contradict each other.*; the drive {armed}"),
+        (deaf_host, f"vcan0 is down; the drive {armed}"),
+        (dumb, f"silent for 3 periods; the drive {nothing}"),
+        (unplugged, armed),
+    ):
+        played = Played()
+        with pytest.raises(BusError, match=reason):
+            run(played, 400, partial(happens, played))
+        assert played.asked_states[-1] == IDLE
+
+
+def test_an_end_before_the_drive_is_heard_sends_nothing_and_is_not_ready() -> None:
+    for periods, error in ((3, None), (10**9, BusError("vcan0 is down"))):
+        played = Played()
+        played.host.error = error
+        if error is None:
+            assert run(played, periods) == []
+        else:
+            with pytest.raises(BusError, match="vcan0 is down"):
+                run(played, periods)
+        assert played.drive.sent == []
+
+
+def test_an_end_while_the_drive_is_armed_lets_it_go_and_is_not_ready(played: Played) -> None:
+    assert run(played, READY_SAMPLES + 5) == []
+    assert (played.node.phase, played.asked_states[-1]) == (Phase.OFF, IDLE)
+
+
+def test_a_defect_leaves_with_0_a_and_the_disarming(played: Played) -> None:
+    def defect() -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run(played, 400, lambda: setattr(played.gateway, "_received", defect))
+    assert (played.torques[-1], played.asked_states[-1]) == (0.0, IDLE)
 
 
 def test_a_drive_that_is_silent_or_cannot_be_armed_is_an_error_and_nothing_is_commanded() -> None:
