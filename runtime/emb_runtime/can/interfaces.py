@@ -45,6 +45,11 @@ def open_transport(iface: str, bench: Bench, identifiers: tuple[int, ...] | None
     return SocketCan(tail or head, clock, identifiers), clock
 
 
+def same_bus(one: str, other: str) -> bool:
+    """Returns True if two names open the same bus: SocketCAN needs no prefix."""
+    return one.removeprefix("socketcan:") == other.removeprefix("socketcan:")
+
+
 def require_linux(iface: str) -> None:
     """Refuse a bus on another system.
 

@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from textwrap import dedent
 
-from emb_runtime.can.interfaces import open_transport
+from emb_runtime.can.interfaces import open_transport, same_bus
 from emb_runtime.can.messages import bench_identity, load_layout
 from emb_runtime.can.transport import is_private
 from emb_runtime.config.bench import load_bench
@@ -58,7 +58,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--serial", default="", metavar="TEXT", help="serial number on the drive, which has no other identity"
     )
-    p.add_argument("--listen", action="store_true", help="send nothing to the drive: samples only, nothing is armed")
+    p.add_argument(
+        "--listen", action="store_true", help="send nothing to a drive that broadcasts: samples only, nothing is armed"
+    )
     p.add_argument("--yes", action="store_true", help="do not ask before the drive is armed")
     p.add_argument("--cpu", type=int, metavar="N", help="pin to this processor")
     p.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")
@@ -80,9 +82,13 @@ def _serve(args: argparse.Namespace) -> int:
     bench, mapping = load_bench(args.bench), load_mapping(args.mapping)
     require_fit(mapping, bench)
     layout = load_layout()
-    if args.drive == args.node:
+    if same_bus(args.drive, args.node):
         raise UsageError(
             f"--node {args.node}: expected another bus than the drive's, whose identifiers differ in meaning"
+        )
+    if args.listen and mapping.polled:
+        raise UsageError(
+            f"--listen: {mapping.name} sends nothing unless it is asked; only a drive that broadcasts is heard"
         )
     if "no_identity" in mapping.lost and not (args.serial or args.listen or is_private(args.drive)):
         raise UsageError(

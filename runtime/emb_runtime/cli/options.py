@@ -12,6 +12,7 @@ from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
 
+from emb_runtime.can.interfaces import same_bus
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT
@@ -320,6 +321,10 @@ def _drive(iface: str, given: str | None, bench: Bench) -> MappedDrive | None:
         name, at, bus = given.rpartition("@")
         if not (name and at and bus) or file is not None:
             raise UsageError(f"--drive '{given}': expected FILE@BUS (drive.toml@can0), and a bus in --iface")
+        if same_bus(iface, bus):
+            raise UsageError(
+                f"--drive '{given}': expected another bus than --iface, whose identifiers differ in meaning"
+            )
         file = Path(name)
     if file is None:
         return None

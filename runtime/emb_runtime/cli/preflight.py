@@ -233,17 +233,21 @@ def _noise(f: Findings) -> CheckResult:
 
 def _bus_load(f: Findings) -> CheckResult:
     bitrate, command = f.bench.can.bitrate, f.layout.command
-    planned = planned_load(f.bench, f.layout, f.drive)
     expected = f"at most {HIGHEST_BUS_LOAD:.0%}"
-    if f.drive is not None:
-        found = f"{planned:.0%} of the drive's bus at worst by its DBC at {bitrate} bit/s (can.bitrate)"
-        return CheckResult("bus load", found, expected)
+    of_drive = ""
+    if f.drive is not None:  # that it fits was checked with the mapping file
+        load = planned_load(f.bench, f.layout, f.drive)
+        of_drive = f"{load:.0%} of the drive's bus at worst by its DBC at {bitrate} bit/s (can.bitrate)"
+    if of_drive and f.in_process:  # in lock-step there is no other bus
+        return CheckResult("bus load", of_drive, expected)
+    planned = f.layout.bus_load(bitrate)
     found = f"{planned:.0%} at worst by the DBC at {bitrate} bit/s (can.bitrate), {f.heard.load:.0%} heard"
+    found += f", {f.heard.others} frames of others" if f.heard.others else ""
+    found += f"; {of_drive}" if of_drive else ""
     if planned > HIGHEST_BUS_LOAD:
         return CheckResult("bus load", found, expected, Verdict.REFUSED, BenchFileError.exit_code)
-    foreign = f", {f.heard.others} frames of others" if f.heard.others else ""
     to_come = f.heard.load + command.worst_bits / command.cycle_time / bitrate
-    return _line("bus load", found + foreign, expected, to_come <= HIGHEST_BUS_LOAD)
+    return _line("bus load", found, expected, to_come <= HIGHEST_BUS_LOAD)
 
 
 def _disk(f: Findings) -> CheckResult:

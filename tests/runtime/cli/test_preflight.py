@@ -240,6 +240,21 @@ def test_the_bus_load_is_the_worst_case_of_davis_and_others_worked_out_by_hand(f
     assert f"{percent:.0f}% at worst" in lines_of(findings)["bus load"].found
 
 
+def test_the_load_of_the_node_s_bus_is_judged_beside_that_of_a_mapped_drive_s(
+    findings: Findings, heard: BusStatistics
+) -> None:
+    mapped = replace(findings, drive=load_mapping(EXAMPLES / "odrive.toml"))
+    assert lines_of(mapped)["bus load"].verdict is Verdict.OK
+    busy = lines_of(replace(mapped, heard=replace(heard, load=0.72, others=500)))["bus load"]
+    assert busy.verdict is Verdict.WARNING
+    for part in ("38% at worst", "72% heard, 500 frames of others", "% of the drive's bus at worst"):
+        assert part in busy.found
+    slow = parse_bench(findings.bench.text.replace("bitrate = 1000000", "bitrate = 250000"), "slow")
+    assert lines_of(replace(mapped, bench=slow))["bus load"].verdict is Verdict.REFUSED
+    alone = lines_of(replace(mapped, bench=slow, in_process=True))["bus load"]
+    assert (alone.verdict, "heard" in alone.found) == (Verdict.OK, False)
+
+
 def test_nothing_is_missed_where_nobody_else_is_on_the_bus_or_nothing_leaves(findings: Findings) -> None:
     alone = replace(findings, in_process=True, watchdog="", realtime=None)
     reading = replace(findings, stage=Stage.READ_ONLY, watchdog="", realtime=None, policy=None)

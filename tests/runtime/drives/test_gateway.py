@@ -392,14 +392,18 @@ def test_the_command_asks_serves_and_ends_with_its_counts(
 def test_wrong_arguments_are_one_line_before_anything_is_opened(
     capsys: pytest.CaptureFixture[str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    bench = tmp_path_factory.mktemp("bench") / "late.toml"
+    folder = tmp_path_factory.mktemp("bench")
+    bench, polled = folder / "late.toml", folder / "polled.toml"
     bench.write_text(late_bench())
-    odrive = str(EXAMPLES / "odrive.toml")
+    polled.write_text(late_bench(polled=True))
+    odrive, mit = str(EXAMPLES / "odrive.toml"), str(EXAMPLES / "mit.toml")
     for arguments, reason, code in (
         ([odrive, "--drive", "can0", "--node", "can0", "--serial", "7"], "expected another bus", 2),
+        ([odrive, "--drive", "can0", "--node", "socketcan:can0", "--serial", "7"], "expected another bus", 2),
+        ([mit, "--drive", "can0", "--node", "vcan0", "--listen", "--bench", str(polled)], "only a drive that", 2),
         ([odrive, "--drive", "can0", "--node", "vcan0"], "expected --serial TEXT", 2),
         ([odrive, "--drive", "nosuch0", "--node", "vcan0", "--serial", "7", "--yes"], "nosuch0", 4),
         ([f"{odrive}x", "--drive", "can0", "--node", "vcan0"], "cannot read it", 2),
     ):
-        assert cli.main([*arguments, "--bench", str(bench)]) == code
+        assert cli.main(["--bench", str(bench), *arguments]) == code
         assert reason in capsys.readouterr().err.splitlines()[-1]

@@ -232,6 +232,7 @@ def test_options_that_name_no_drive_and_bus_are_refused(odrive: tuple[MappedBus,
     bus, emb_run = odrive
     for given in ("", "drive.toml", "@can0", "drive.toml@"):
         emb_run.refused("expected FILE@BUS", "--iface", "vcan0", "--drive", given)
+    emb_run.refused("expected another bus", "--iface", "can0", "--drive", f"{bus.file}@socketcan:can0")
     emb_run.refused("expected FILE@BUS", "--drive", f"{bus.file}@can0")  # in lock-step it is known already
     bench = parse_bench(late_bench(), "bench.toml")
     for options in ("@can0", f"{bus.file}@", f"{bus.file}@sim", "a@map:b@can0", f"{bus.file}@virtual:x"):
