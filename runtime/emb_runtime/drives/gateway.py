@@ -18,6 +18,7 @@ from emb_runtime.system.clock import Clock
 LOOK_NS = 200_000  # Time between two looks at a bus that cannot be waited for [ns]
 LONGEST_WAIT_NS = 10_000_000  # Time between two looks at the operator's end [ns]
 MOST_FRAMES = 64  # Frames of one bus that are taken at once: a babbling bus must not hold up the other
+LISTEN_NS = 50_000_000  # Least time for which the drive's bus is observed before it is armed [ns]
 LONGEST_SILENCE_NS = 5_000_000_000  # Time for a drive to be heard before it is armed [ns]
 LINGER_NS = 1_000_000_000  # Time for which the node still reports its samples after the drive was let go [ns]
 
@@ -37,6 +38,11 @@ class Gateway:
         self.node = DriveNode(mapping, bench, load_layout(), drive_bus.send)
         self._drive_bus, self._node_bus, self._clock = drive_bus, node_bus, clock
         self._node_lost: BusError | None = None
+        command = mapping.messages[mapping.command.message]
+        sensors = (mapping.messages[name] for name in mapping.sensor_messages)
+        answers = {(info.extended, info.identifier) for info in sensors}
+        self._commands = {(command.extended, command.identifier)} - answers  # a drive may answer under the same one
+        self._is_commanded = False  # by another node
 
     def run(self, stop_requested: Callable[[], bool], ready: Callable[[], None], *, arms: bool) -> None:
         """Arm the drive, serve, and let the drive go.
@@ -98,12 +104,17 @@ class Gateway:
 
     def _arm(self, stop_requested: Callable[[], bool]) -> bool:
         """Arm the drive; False if the end came first, and nothing was sent."""
-        deadline_ns = self._clock.now_ns() + LONGEST_SILENCE_NS
-        while not (self.node.may_arm or stop_requested() or self._node_lost):
-            self.step()
-            if self._clock.now_ns() > deadline_ns:
+        begin_ns = self._clock.now_ns()
+        while not (stop_requested() or self._node_lost):
+            now_ns = self._clock.now_ns()
+            if self.node.may_arm and now_ns > begin_ns + LISTEN_NS:
+                break
+            if now_ns > begin_ns + LONGEST_SILENCE_NS:
                 raise BusError("no samples of the drive: check that it is on, on this bus, with this DBC")
-        if stop_requested() or self._node_lost:
+            self.step()
+            if self._is_commanded:
+                raise BusError("cannot arm the drive: another node commands it; end that first, a second gateway maybe")
+        else:
             return False
         self.node.arm(self._clock.now_ns())
         while self.node.phase is Phase.ARMING:
@@ -131,6 +142,8 @@ class Gateway:
         for _ in range(MOST_FRAMES):
             if (frame := self._drive_bus.receive(0)) is None:
                 break
+            if not (frame.own or frame.error) and (frame.extended, frame.identifier) in self._commands:
+                self._is_commanded = True
             for ours in self.node.take_drive(frame, self._clock.now_ns()):
                 self._pass_on(ours)
         self.node.tick(self._clock.now_ns())

@@ -16,7 +16,7 @@ import pytest
 from emb_runtime.can.messages import StopReason, load_layout
 from emb_runtime.cli import gateway as cli
 from emb_runtime.config.bench import parse_bench
-from emb_runtime.drives.gateway import Gateway
+from emb_runtime.drives.gateway import LISTEN_NS, Gateway
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.drives.node import ARMED_PERIODS, LONGEST_STOP_PERIODS, READY_SAMPLES, DriveNode, Phase
 from emb_runtime.errors import BusError, SafetyStopError
@@ -320,8 +320,34 @@ def test_an_end_before_the_drive_is_heard_sends_nothing_and_is_not_ready() -> No
         assert played.drive.sent == []
 
 
+def test_a_drive_that_another_node_commands_is_not_armed() -> None:
+    def passes(it: Played) -> None:
+        it.clock.advance_to(it.clock.now_ns() + MS)
+        it.periods += 1
+
+    def ended(it: Played) -> bool:
+        return it.periods > LISTEN_NS // MS - 5
+
+    for name in ("odrive", "mit"):
+        mapping, bench = load_mapping(EXAMPLES / f"{name}.toml"), parse_bench(late_bench(name == "mit"), "bench.toml")
+        command = mapping.messages[mapping.command.message]
+        for own in (False, True):
+            it = Played()
+            gateway = Gateway(mapping, bench, it.drive, it.host, it.clock)
+            it.drive.passes = partial(passes, it)
+            it.drive.waiting.append(
+                Frame(command.identifier, bytes(command.length), extended=command.extended, own=own)
+            )
+            if own:
+                gateway.run(partial(ended, it), lambda: None, arms=True)
+            else:
+                with pytest.raises(BusError, match="another node commands it"):
+                    gateway.run(lambda: False, lambda: None, arms=True)
+            assert it.drive.sent == []
+
+
 def test_an_end_while_the_drive_is_armed_lets_it_go_and_is_not_ready(played: Played) -> None:
-    assert run(played, READY_SAMPLES + 5) == []
+    assert run(played, LISTEN_NS // MS + 5) == []
     assert (played.node.phase, played.asked_states[-1]) == (Phase.OFF, IDLE)
 
 
