@@ -24,6 +24,7 @@ MAX_VECTORS = 4096
 MAX_WIDTH = 64  # Numbers that a graph takes or gives
 VECTOR_TOLERANCE = 1e-5
 """Largest difference of a replayed test vector from the recorded one: of a current as a part of its limit."""
+ROUNDING = 1e-6  # Relative: single precision in the policy may pass the greatest output by so much
 
 SAMPLE = ("angle", "velocity", "time")  # Measured [rad, rad/s], and since the experiment began [s]
 DEVIATIONS = tuple(f"{name}_deviation" for name in PARAMETER_NAMES)
@@ -55,6 +56,7 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     A graph of the kind ``current`` gives a current [A]. One of the kind ``reference`` gives n levels of speed, as parts
     of the limit, then n − 1 switches between them, as parts of the horizon, which the runtime's speed loop follows.
+    All are within ±1; a level whose switch is not above 0 is left out.
     """
 
     schema: Literal[4] = SCHEMA
@@ -80,8 +82,17 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         for i, vector in enumerate(self.vectors):
             if (len(vector.inputs), len(vector.outputs)) != (len(self.inputs), width):
                 raise FieldError(f"vectors[{i}]", f"expected {len(self.inputs)} inputs and {width} outputs")
+            if not all(
+                abs(output) <= self.greatest * (1.0 + ROUNDING) for output in vector.outputs
+            ):  # this way round, NaN is refused
+                raise FieldError(f"vectors[{i}]", f"expected outputs within ±{self.greatest:g}")
         if width % 2 == 0 or (self.kind == "current" and width > 1):
             raise FieldError("vectors", f"expected one current, or an odd number of levels and switches, got {width}")
+
+    @property
+    def greatest(self) -> float:
+        """Greatest output of the graph, both signs, but for its rounding: a current [A], or a level or switch."""
+        return self.limits.current if self.kind == "current" else 1.0
 
     def to_json(self) -> str:
         """The contract as JSON; floats keep their full precision."""

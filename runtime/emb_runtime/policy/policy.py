@@ -9,13 +9,14 @@ it. Its currents are still clipped, shielded and guarded.
 from __future__ import annotations
 
 import hashlib
+import math
 from pathlib import Path
 
 from emb_runtime.config.bench import CEILING_CURRENT, Bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.speed_loop import follow_reference, scale_of
-from emb_runtime.policy.contract import CONTRACT_KEY, SAMPLE, VECTOR_TOLERANCE, Contract, read_contract
+from emb_runtime.policy.contract import CONTRACT_KEY, ROUNDING, SAMPLE, VECTOR_TOLERANCE, Contract, read_contract
 from emb_runtime.policy.inference import Inference
 from emb_runtime.policy.onnx_file import Graph, read_graph
 from emb_runtime.policy.operators import require_bounded
@@ -50,9 +51,13 @@ class Policy:
         self._sample_time = bench.timing.sample_time
         self._scale = scale_of(bench, contract.gain)
         self._levels = (len(inference.outputs) + 1) // 2
+        self._greatest = contract.greatest * (1.0 + ROUNDING)
 
     def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         """Current for the period that begins at a sample [A]; finite and within limits only if the caller checks it.
+
+        The speed loop cuts off every current at the limit. So a reference that is not finite gives NaN, and one beyond
+        ±1 a current beyond the contract's limit.
 
         Args:
             angle: measured [rad].
@@ -67,6 +72,10 @@ class Policy:
         if self._is_reference:
             inputs[0], inputs[1], inputs[2], inputs[3] = estimator.values
             self._inference.run()
+            if not all(map(math.isfinite, outputs)):
+                return math.nan
+            if max(map(abs, outputs)) > self._greatest:
+                return 2.0 * self.contract.limits.current
             levels, switches = outputs[: self._levels], outputs[self._levels :]
             return follow_reference(estimator.model, estimator.state, self._scale, levels, switches, step)
         inputs[0], inputs[1], inputs[2] = angle, velocity, step * self._sample_time

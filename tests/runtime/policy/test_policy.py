@@ -40,6 +40,8 @@ from emb_runtime.policy.inference import open_session
 from emb_runtime.policy.onnx_file import MAX_PARTS, read_graph
 from emb_runtime.policy.operators import FIXED
 from emb_runtime.policy.policy import MAX_FILE_BYTES, load_policy, shipped_actor_path
+from emb_runtime.safety.command_limits import checked
+from emb_runtime.safety.state_machine import Fault, StopError
 from tests.actors import constant_actor, contract_for, parsed, reference_actor, with_contract
 from tests.runtime.operating import refusal
 
@@ -81,7 +83,7 @@ def asked(policy: Any, angle: float, velocity: float, step: float) -> float:
     horizon=st.integers(1, 1_000_000),
     bounds=st.lists(st.tuples(positive, positive).map(sorted), min_size=4, max_size=4),
     numbers=st.lists(st.tuples(finite, finite, finite), min_size=MIN_VECTORS, max_size=MIN_VECTORS),
-    answer=finite,
+    share=st.floats(-1.0, 1.0),
     provenance=st.dictionaries(words, st.one_of(words, st.integers(-(2**60), 2**60), finite), max_size=5),
 )
 @settings(max_examples=50)
@@ -91,7 +93,7 @@ def test_a_contract_survives_json_with_full_precision(
     horizon: int,
     bounds: list[list[float]],
     numbers: list[tuple[float, float, float]],
-    answer: float,
+    share: float,
     provenance: dict[str, str | int | float],
 ) -> None:
     contract = msgspec.structs.replace(
@@ -100,7 +102,7 @@ def test_a_contract_survives_json_with_full_precision(
         sample_time=sample_time,
         horizon=horizon,
         ranges={name: (low, high) for name, (low, high) in zip(PARAMETER_NAMES, bounds, strict=True)},
-        vectors=tuple(Vector(n, (answer,)) for n in numbers),
+        vectors=tuple(Vector(n, (share * limits[0],)) for n in numbers),
         provenance=provenance,
     )
     assert read_contract(contract.to_json()) == contract
@@ -159,9 +161,30 @@ def test_what_is_no_contract_is_refused() -> None:
         GOOD.to_json() + " " * 1_000_001,
     ):
         refusal(partial(read_contract, text))
-    two = [{"inputs": [1.0] * 4, "outputs": [0.0, 0.0]}] * MIN_VECTORS  # levels and switches are an odd number
-    even = edited(lambda r: r.update(kind="reference", inputs=list(PARAMETER_NAMES), vectors=two))
+    even = vectors_of("reference", [0.0, 0.0])  # levels and switches are an odd number
     assert "vectors" in refusal(partial(read_contract, even))
+
+
+def vectors_of(kind: str, outputs: list[float]) -> str:
+    """A contract for 3 A, all of whose test vectors have these outputs."""
+    inputs = list(INPUTS[kind][0])
+    vectors = [{"inputs": [1.0] * len(inputs), "outputs": outputs}] * MIN_VECTORS
+    record = json.loads(GOOD.to_json()) | {"kind": kind, "inputs": inputs, "vectors": vectors}
+    record["limits"]["current"] = 3.0
+    return json.dumps(record)
+
+
+def test_the_outputs_of_test_vectors_are_within_what_a_policy_may_ask_for() -> None:
+    for kind, outputs in (("current", [3.0]), ("current", [-3.0 * (1.0 + 0.5e-6)]), ("reference", [1.0, -1.0, -1.0])):
+        assert read_contract(vectors_of(kind, outputs)).vectors[0].outputs == tuple(outputs)
+    for kind, outputs in (
+        ("current", [3.0 * (1.0 + 2e-6)]),
+        ("current", [-1e9]),
+        ("reference", [1.0 + 2e-6, 0.0, 0.5]),
+        ("reference", [0.0, -1.1, 0.5]),
+        ("reference", [0.0, 0.0, 1.1]),
+    ):
+        assert "vectors[0]" in refusal(partial(read_contract, vectors_of(kind, outputs)))
 
 
 # The bench ------------------------------------------------------------------------------------------------------------
@@ -229,7 +252,7 @@ def test_angle_velocity_and_time_reach_the_graph_and_the_estimate_where_it_asks_
         weights = np.random.default_rng(1).uniform(0.5, 1.0, width).astype(np.float32)
         numbers = ", ".join(map(repr, weights.tolist()))
         text = f"agent (float[1,{width}] inputs) => (float[1,1] outputs) <float[{width},1] w = {{{numbers}}}>"
-        vectors = tuple(Vector((float(n),) * width, (float(n * weights.sum()),)) for n in range(MIN_VECTORS))
+        vectors = tuple(Vector((n / 64,) * width, (float(n / 64 * weights.sum()),)) for n in range(MIN_VECTORS))
         return model_of(text + " { outputs = MatMul(inputs, w) }", inputs=inputs, vectors=vectors), weights
 
     estimator = Estimator(BENCH)
@@ -249,6 +272,36 @@ def test_a_reference_is_followed_by_the_speed_loop_at_the_benchs_scale() -> None
             scale = scale_of(bench, 0.5)
             wanted = follow_reference(estimator.model, estimator.state, scale, (0.5, -0.25), (0.4,), step)
             assert policy.act(0.0, 0.0, step, estimator) == wanted
+
+
+def test_a_reference_that_is_not_finite_or_beyond_its_contract_asks_for_a_current_that_is_so_too() -> None:
+    model = parsed(
+        """agent (double[1,4] inputs) => (double[1,3] outputs)
+        <int64[1] zero = {0}, int64[1] one = {1}, double[1,1] half = {0.5},
+         double[1,3] now = {0.5, -0.25, 0.4}, double[1,3] later = {0., 0., 0.}> {
+            k_m = Slice(inputs, zero, one, one)
+            estimated = Less(k_m, half)
+            outputs = Where(estimated, later, now) }"""
+    )
+    vectors = (Vector((1.0,) * 4, (0.5, -0.25, 0.4)),) * MIN_VECTORS  # k_m of 1 N·m/A, which no estimate is
+    contract = contract_for(BENCH, 1.0, kind="reference", inputs=PARAMETER_NAMES, vectors=vectors)
+    (later,) = (tensor for tensor in model.graph.initializer if tensor.name == "later")
+    for output, fault in (
+        *((output, Fault.POLICY_NOT_FINITE) for output in (math.nan, math.inf, -math.inf)),
+        *((output, Fault.POLICY_BEYOND_CONTRACT) for output in (1e9, -1e9, 1.0 + 2e-6, -1.0 - 2e-6)),
+        *((output, None) for output in (1.0, -1.0, 1.0 + 0.5e-6)),
+    ):
+        for place in range(3):
+            numbers = np.array([[0.5, -0.25, 0.4]])
+            numbers[0, place] = output
+            later.CopyFrom(onnx.numpy_helper.from_array(numbers, "later"))
+            current = asked(load_policy(with_contract(model, contract), BENCH), 0.0, 0.0, 0)
+            if fault is None:
+                assert checked(current, BENCH.limits.current) == current
+                continue
+            with pytest.raises(StopError) as stopped:
+                checked(current, BENCH.limits.current)
+            assert stopped.value.fault is fault, (place, output)
 
 
 def test_what_the_graph_gives_is_passed_on_as_it_is_and_nan_measurements_raise_nothing() -> None:
