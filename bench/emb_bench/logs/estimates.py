@@ -8,7 +8,7 @@ from typing import Any
 
 from emb_bench.logs.log import RunLog
 from emb_runtime.errors import LogError
-from emb_runtime.estimator.estimate import Quantity, by_name
+from emb_runtime.estimator.estimate import LOST, Quantity, by_name
 from emb_runtime.log.mcap_schema import ESTIMATE, deviation_of, estimate_topic
 
 
@@ -40,11 +40,13 @@ def by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
 
 
 def last_estimate(log: RunLog) -> dict[str, dict[str, Any]]:
-    """The last estimate: value, standard deviation and unit by name; empty if there was none.
+    """The estimate at the end: value, standard deviation and unit by name; empty if there was none.
 
     Raises:
         LogError: see :func:`by_step`.
     """
+    if any(event.code == LOST for event in log.events):
+        return {}
     last = deque(_rows(log), maxlen=1)
     return by_name(quantities(log), last[0][1:] if last else ())
 

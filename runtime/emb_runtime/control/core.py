@@ -29,6 +29,7 @@ from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.result import Outcome, RunCounters
 from emb_runtime.control.start_conditions import READY_PAIRS, Bounds, StartConditions
 from emb_runtime.control.stop_condition import REACHED, StopCondition
+from emb_runtime.estimator.estimate import LOST
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.learning.known import numbers
 from emb_runtime.learning.learner import Learner, words
@@ -141,6 +142,7 @@ class Core:
         self._answered: int | None = None  # counter of the sample that the newest of them answered
         self._permitted = True
         self._estimate: tuple[float, ...] = ()  # the latest
+        self._estimates = not self.homing and bool(self._estimator.estimate)  # there is one, and it was finite so far
         self._condition_met = False
         self._met_ns = 0  # from the first sample to that at which it was met, device time
         self._silent: SensorSample | None = None  # the newest one before arming
@@ -598,8 +600,8 @@ class Core:
 
     def _end_cycle(self, sample: SensorSample, step: int) -> None:
         """Record what is known at a sample, and judge the motion so far."""
-        if not self.homing and (estimate := self._estimator.estimate):
-            self._keep_estimate(estimate, sample, step)
+        if self._estimates:
+            self._keep_estimate(self._estimator.estimate, sample, step)
         if self._learner.known is not None:
             learnt = numbers(self._learner.known, self._learner.age)
             self.records.append(LearntRecord(sample.receive_time_ns, step, learnt))
@@ -609,8 +611,16 @@ class Core:
             self._fail(stop.fault, stop.detail)
 
     def _keep_estimate(self, estimate: tuple[float, ...], sample: SensorSample, step: int) -> None:
-        """Record the estimate; once it meets the stop condition, all that is left is the way home."""
+        """Record the estimate; once it meets the stop condition, all that is left is the way home.
+
+        Once it is not finite, the run has none.
+        """
         self._estimate = estimate
+        if not estimate:
+            self._estimates = False
+            text = "not finite: the measurements do not fit the bench's noise; the run goes on without an estimate"
+            self.note(sample.receive_time_ns, LOST, text)
+            return
         self.records.append(EstimateRecord(sample.receive_time_ns, step, estimate))
         condition = self.stop_condition
         if condition is not None and not self._condition_met and condition.reached(estimate):

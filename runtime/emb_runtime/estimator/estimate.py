@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+LOST = "ESTIMATE_LOST"  # Code of the event after which a run has no estimate: it was not finite
 NORMAL_95 = 1.959963984540054  # Standard deviations that 95 % of a Gaussian lie within
 
 

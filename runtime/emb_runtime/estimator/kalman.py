@@ -199,7 +199,7 @@ def believed(model: Model, state: State) -> Four:
 def deviations(model: Model, state: State) -> Four:
     """Standard deviations of the relative parameters; at least the distance of the filter's value from the range.
 
-    Once the model did not fit, at least those of the prior.
+    Once the model did not fit, at least those of the prior. Infinite where rounding has made a variance negative.
     """
     mean, p, used, doubted = state.mean, state.covariance, believed(model, state), state.worst > MISFIT
     low, high = model.low, model.high
@@ -212,7 +212,9 @@ def deviations(model: Model, state: State) -> Four:
 
 
 def _deviation(variance: float, beyond: float, width: float, doubted: bool) -> float:
-    known = max(math.sqrt(max(variance, 0.0)), abs(beyond))
+    if variance < 0.0:
+        return math.inf
+    known = max(math.sqrt(variance), abs(beyond))
     return max(known, width / math.sqrt(12.0)) if doubted else known
 
 

@@ -17,10 +17,11 @@ from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.stop_condition import parse_stop_condition
 from emb_runtime.errors import LogError
+from emb_runtime.estimator.estimate import LOST
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log import mcap_schema
 from emb_runtime.log.mcap_schema import Field, Topic
-from emb_runtime.log.ring_buffer import EstimateRecord, Record
+from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, Record
 from emb_runtime.records import CycleRecord
 
 from tests.bench.conftest import Replay  # isort: skip
@@ -89,6 +90,14 @@ def test_all_of_them_are_read_with_their_names_and_units(
     }  # fmt: skip
     assert said["f_v"]["interval_95"] == pytest.approx([value - 1.959964 * deviation, value + 1.959964 * deviation])
     assert info_document(log)["estimate"] == said
+
+
+def test_a_run_that_has_lost_its_estimate_has_none_at_the_end(
+    write: Write, driven: tuple[SimRun, list[Record]]
+) -> None:
+    time_ns = next(record.time_ns for record in driven[1] if isinstance(record, EventRecord))
+    log = read_log(write(lambda records: records.append(EventRecord(time_ns, LOST, "not finite"))))
+    assert (last_estimate(log), bool(by_step(log))) == ({}, True)
 
 
 def test_a_run_that_ended_early_decides_and_estimates_the_same_again(write: Write, bench: Bench) -> None:

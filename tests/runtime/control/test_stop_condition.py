@@ -20,7 +20,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.control.core import HOME_PAIRS
 from emb_runtime.control.stop_condition import REACHED, parse_stop_condition
 from emb_runtime.errors import UsageError
-from emb_runtime.estimator.estimate import Quantity
+from emb_runtime.estimator.estimate import LOST, Quantity
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.records import Reason
 from emb_runtime.safety.shield_design import make_law
@@ -78,6 +78,14 @@ def test_on_the_way_home_and_where_the_bench_leaves_nothing_open_nothing_is_reco
     assert (run.journal.estimates, run.outcome.estimate, run.outcome.goal_reached) == ([], (), False)
     run = simulate(on_bench=dataclasses.replace(BENCH, prior="nominal"))
     assert (run.journal.estimates, run.outcome.estimate) == ([], ())
+
+
+def test_an_estimate_that_is_not_finite_any_more_is_none_and_said_once(simulate: Simulate) -> None:
+    sharp = dataclasses.replace(BENCH, noise=dataclasses.replace(BENCH.noise, angle=1e-30, velocity=1e-30))
+    run = simulate(actor=FunctionActor(LAWS["square"]), on_bench=sharp)
+    assert run.journal.codes.count(LOST) == 1
+    assert 0 < len(run.journal.estimates) < len(run.journal.cycles) - 1
+    assert (run.outcome.estimate, run.outcome.goal_reached) == ((), False)
 
 
 def test_a_condition_is_reached_when_each_deviation_is_below_its_part_of_the_value() -> None:
@@ -180,7 +188,7 @@ def test_a_run_is_logged_with_its_estimates_and_decides_the_same_again(
     assert emb_replay(["rerun", str(path)]) == 0
     assert capsys.readouterr().out.startswith("reproduced   each of 501 decisions, 503 sent frames")
     assert emb_replay(["info", str(path)]) == 0
-    assert "estimate     f_v = " in capsys.readouterr().out
+    assert "\n  f_v  " in capsys.readouterr().out
     assert emb_replay(["info", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["estimate"] == summary["estimate"]
 
@@ -190,7 +198,9 @@ def test_it_ends_early_where_that_is_asked_for(
 ) -> None:
     path = tmp_path / "run.mcap"
     out = steady.text("--stop-when", "k_m=1%")
-    answered = re.match(r"done: (\d+) of 500 samples answered, ended early: enough is known after 0\.\d+ s\n", out)
+    answered = re.match(
+        r"done: (\d+) of 500 samples answered, home, ended early: enough is known after 0\.\d+ s\n", out
+    )
     assert answered is not None
     assert HOME_PAIRS < int(answered[1]) < 500
     log = steady.log()

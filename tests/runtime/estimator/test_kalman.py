@@ -198,4 +198,6 @@ def test_values_are_cut_off_at_their_ranges_and_known_no_better_than_by_what_is_
     assert believed(UNEQUAL, state) == (0.9, 1.0, 1.1, 1.2)
     assert deviations(UNEQUAL, state) == pytest.approx([1e-4] * 4)
     broken = state_of(state.mean, -1e-8 * np.eye(6))  # by rounding
-    assert deviations(EXACT, broken)[2] == 0.0
+    assert deviations(EXACT, broken) == deviations(EXACT, broken._replace(worst=2.0)) == (math.inf,) * 4
+    sure = state_of((0.0, 0.0, *UNIT), np.zeros((6, 6)))
+    assert deviations(EXACT, sure) == (0.0,) * 4
