@@ -42,8 +42,14 @@ def generate_codec(message: Message, record: type[Any], fields: tuple[Field, ...
         message: its description.
         record: named tuple that a frame is decoded to; its fields, but fixed ones, are the arguments of the encoder.
         fields: of the record, in order: every signal but the CRC, once.
+
+    Raises:
+        FrameError: a signal cannot carry the choices or the fixed value of its field.
     """
     coded = [_Coded(message.signal(field.signal), field, f"v{at}") for at, field in enumerate(fields)]
+    for c in coded:
+        if problem := c.field_problem():
+            raise FrameError(f"DBC: {message.name}.{c.signal.name}: {problem}")
     known: dict[str, Any] = {
         "T": CRC_TABLE,
         "Frame": Frame,
@@ -69,6 +75,17 @@ class _Coded(NamedTuple):
         """Record's value of a step."""
         factor = self.signal.factor
         return factor if self.field.scale == 1 else round(factor * self.field.scale)
+
+    def field_problem(self) -> str:
+        """Reason why the signal cannot carry what its field says; "" if it can."""
+        low, high = self.signal.raw_minimum, self.signal.raw_maximum
+        choices, fixed = self.field.choices, self.field.fixed
+        unscaled = (self.signal.factor, self.signal.offset) == (1, 0)
+        if choices and not (unscaled and (low, high) == (0, len(choices) - 1)):
+            return f"expected the whole numbers from 0 to {len(choices) - 1}"
+        if fixed is not None and not (unscaled and low <= fixed <= high):
+            return f"expected whole numbers with {fixed} among them"
+        return ""
 
     def check(self) -> str:
         """True for a value that can be encoded; NaN is refused by the order of the comparisons."""

@@ -195,7 +195,12 @@ def load_layout(dbc_text: str | None = None) -> Layout:
     Raises:
         FrameError: the text is not a DBC, or not one of this protocol: the message names the entry and the reason.
     """
-    return _shipped_layout() if dbc_text is None else _generate(dbc_text)
+    if dbc_text is None:
+        return _shipped_layout()
+    try:
+        return _generate(dbc_text)
+    except ArithmeticError as err:  # of a number of 400 digits, or a step of 1e-310
+        raise FrameError(f"DBC: expected numbers that can be calculated with: {err}") from err
 
 
 @cache

@@ -460,6 +460,50 @@ def test_a_dbc_that_is_not_a_layout_of_this_bench_is_refused() -> None:
             load_layout(text)
 
 
+def test_a_dbc_whose_numbers_are_too_large_or_too_small_to_calculate_with_is_refused() -> None:
+    for old in ("(0.0002,0) [-6|6]", "(0.00002,0) [-160|160]", "(0.00000025,0) [0|4.19430375]"):
+        assert LAYOUT.text.count(old) == 1
+        ends = old.partition(" ")[2]
+        for new in (
+            f"({'9' * 400},0) {ends}",
+            f"(1e-310,0) {ends}",
+            f"(1,{'9' * 400}) {ends}",
+            f"(0.0001,1e308) {ends}",
+            f"(1,0) [0|{'9' * 400}]",
+        ):
+            with pytest.raises(FrameError, match="calculated with"):
+                load_layout(LAYOUT.text.replace(old, new))
+    with pytest.raises(FrameError, match="calculated with"):  # nanoseconds in a step
+        with_time_step("1e308")
+
+
+def test_a_signal_that_cannot_carry_the_values_of_its_field_is_refused() -> None:
+    enable, state = "Enable : 32|1@1+ (1,0) [0|1]", "NodeState : 12|3@1+ (1,0) [0|3]"
+    version, charge = "ProtocolVersion : 16|8@1+ (1,0) [0|255]", "Version : 12|4@1+ (1,0) [1|1]"
+    attribute = 'BA_ "EmbProtocolVersion" 1;'
+    for old, new, reason in (
+        (enable, "Enable : 32|2@1+ (1,0) [0|2]", "EMB_Command.Enable: expected the whole numbers from 0 to 1"),
+        (enable, "Enable : 32|2@1- (1,0) [-1|1]", "EMB_Command.Enable: expected the whole numbers from 0 to 1"),
+        (enable, "Enable : 32|2@1+ (1,0) [1|1]", "EMB_Command.Enable: expected the whole numbers from 0 to 1"),
+        (enable, "Enable : 32|1@1+ (2,0) [0|2]", "EMB_Command.Enable: expected the whole numbers from 0 to 1"),
+        (enable, "Enable : 32|1@1+ (1,1) [1|2]", "EMB_Command.Enable: expected the whole numbers from 0 to 1"),
+        (state, "NodeState : 12|3@1+ (2,0) [0|6]", "EMB_Velocity.NodeState: expected the whole numbers from 0 to 3"),
+        (version, "ProtocolVersion : 16|8@1+ (1,0) [2|255]", "EMB_Status.ProtocolVersion: expected whole numbers with"),
+        (version, "ProtocolVersion : 16|8@1+ (2,0) [0|510]", "EMB_Status.ProtocolVersion: expected whole numbers with"),
+        (version, "ProtocolVersion : 16|8@1+ (1,1) [1|256]", "EMB_Status.ProtocolVersion: expected whole numbers with"),
+        (attribute, 'BA_ "EmbProtocolVersion" 256;', "EMB_Status.ProtocolVersion: expected whole numbers with"),
+        (attribute, 'BA_ "EmbProtocolVersion" -1;', "EMB_Status.ProtocolVersion: expected whole numbers with"),
+        (charge, "Version : 12|4@1+ (1,0) [2|2]", "EMB_Charge.Version: expected whole numbers with 1"),
+    ):
+        assert old in LAYOUT.text
+        with pytest.raises(FrameError, match=f"DBC: {reason}"):
+            load_layout(LAYOUT.text.replace(old, new))
+    for number in (0, 255):
+        layout = load_layout(LAYOUT.text.replace(attribute, attribute.replace("1", str(number))))
+        status = layout.decode_status(layout.encode_status(3, NodeState.ACTIVE, StopReason.NONE, 0, 7))
+        assert status.protocol_version == layout.protocol_version == number
+
+
 def test_the_enable_bit_is_read_as_it_was_written() -> None:
     for enable in (False, True):
         command = CurrentCommand(3, 4, 0.0, enable)
