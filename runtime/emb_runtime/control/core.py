@@ -221,8 +221,8 @@ class Core:
                 self._wait_for_node()
                 return None
             return None if newest is None else self._propose(newest)
-        except StopError as stop:
-            self._fail(stop.fault, stop.detail)
+        except StopError as ended:
+            self._fail(ended.fault, ended.detail)
         return None
 
     def commit(self, proposal: Proposal, now_ns: int) -> Frame | None:

@@ -115,3 +115,6 @@ def test_a_run_without_a_watchdog_is_never_tripped_and_always_watched() -> None:
     assert pulse.watched(1 << 62)
     pulse.disarm()
     assert not pulse.tripped
+    pulse.trip()
+    pulse.close()
+    assert not Unwatched().tripped  # another run's memory is its own

@@ -114,7 +114,7 @@ def test_emb_run_refuses_another_wish_in_one_line(installed: Path) -> None:
 
 def test_a_core_that_differs_in_one_bit_is_found_by_the_comparison(installed: Path) -> None:
     text = SOURCE.read_text()
-    changed = text.replace("max(wanted, -reach.limit)", "max(wanted, -reach.limit * (1.0 + 2.0**-52))")
+    changed = text.replace("max(requested, -limits.current)", "max(requested, -limits.current * (1.0 + 2.0**-52))")
     assert changed != text
     for content, code, said in ((text, 0, "the same, bit for bit"), (changed, 1, ": compiled ")):
         add_core(installed, content)
