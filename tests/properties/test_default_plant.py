@@ -12,6 +12,7 @@ import pytest
 from emb_bench import api
 from emb_bench.cli import node, replay
 from emb_bench.design.problem import make_problem
+from emb_bench.sim.plant_spec import read_brake
 from emb_bench.sim.transport import open_sim
 from emb_runtime.cli import options
 from emb_runtime.config.bench import Bench
@@ -34,7 +35,7 @@ def test_the_default_brake_sticks(bench: Bench) -> None:
 def test_whatever_is_told_no_plant_takes_the_same(bench: Bench) -> None:
     defaults = [
         open_sim("", bench)[0].truth["plant"],
-        node.parser().parse_args(["--iface", "vcan0"]).plant,
+        read_brake(node.parser().parse_args(["--iface", "vcan0"]).brake, bench, "").plant.name,
         train.parser().parse_args(["reference", "four-d", "--out", "a"]).plant,
         *(inspect.signature(call).parameters["plant"].default for call in (api.simulate, Batch)),
         *(inspect.signature(call).parameters["model"].default for call in (api.design, make_problem)),

@@ -68,7 +68,7 @@ def test_read_only_needs_no_policy_and_refuses_one_that_was_named_and_does_not_f
     assert (heard["result"], heard["exit_code"]) == ("done", 0)
     assert "policy.onnx" not in emb_run.log().attachments
     weak = tmp_path / "weak.onnx"
-    weak.write_bytes(constant_actor(replace(bench, limits=replace(bench.limits, current=3.0))))
+    weak.write_bytes(constant_actor(replace(bench, limits=replace(bench.limits, current=3.0)), 2.0))
     emb_run.refused("limits.current is 6.0 A", "--policy", str(weak), "--read-only", code=5)
     assert sim.sent == []
 
@@ -256,6 +256,7 @@ class RecordedPulse(Unwatched):
     """A pulse that keeps what it is told."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.told: list[str] = []
 
     def arm(self, now_ns: int) -> None:

@@ -228,6 +228,7 @@ class Pulse(Unwatched):
     """A watchdog that speaks, or falls silent, at the n-th time that the loop asks."""
 
     def __init__(self, trips_at: int = 10**9, silent_at: int = 10**9) -> None:
+        super().__init__()
         self.trips_at, self.silent_at = trips_at, silent_at
         self.asked = self.signs = 0
         self.calls: list[bool] = []
