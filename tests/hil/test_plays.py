@@ -75,6 +75,11 @@ def test_of_an_undisturbed_run_each_sample_is_answered_once_and_both_ends_agree(
     assert len(answered) == summary["answered"]
 
 
+def unwrapped(capsys: pytest.CaptureFixture[str]) -> str:
+    """What was printed, without its line ends."""
+    return " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.plays("normal")
 def test_its_log_holds_every_frame_with_its_direction_and_is_evaluated(
     played: Played, capsys: pytest.CaptureFixture[str]
@@ -97,7 +102,7 @@ def test_its_log_holds_every_frame_with_its_direction_and_is_evaluated(
     assert all(0.0 < value < 0.1 for value in report["physical"]["cramer_rao"].values())
     assert replay(["rerun", str(it.log)]) == 0
     assert replay(["timing", str(it.log)]) == 2
-    assert "not judged: time ran 1000 times slower than the computer's" in capsys.readouterr().out
+    assert "time ran 1000 times slower" in unwrapped(capsys)
 
 
 @pytest.mark.plays(*UNHEARD)
@@ -147,7 +152,7 @@ def test_what_the_killed_left_can_be_evaluated(played: Played, capsys: pytest.Ca
     assert "cut" in log.missing or "closed" in log.missing
     capsys.readouterr()
     assert replay(["fim", str(cut.log)]) == 0
-    assert log.missing.split(";")[0] in capsys.readouterr().out
+    assert log.missing.split(";")[0] in unwrapped(capsys)
 
 
 @pytest.mark.plays("multicast")
