@@ -23,7 +23,7 @@ from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError, SafetySto
 from emb_runtime.safety.end_stop import released_speed
 from emb_runtime.system import realtime
 from emb_runtime.system.signals import StopRequest
-from emb_runtime.system.terminal import as_json, complain, forget_typed, mention, show, typed_line
+from emb_runtime.system.terminal import ARM_QUESTION, as_json, complain, confirmed, mention, show
 
 PRIORITY = realtime.PRIORITY + 5  # Above the loop's, below its watchdog's
 LOOK = 0.05  # Time between two looks at the keyboard [s]
@@ -139,13 +139,7 @@ def _description(mapping: Mapping, bench: str, identity: int, speed: float, seri
 def _may_arm(agreed: bool, stop_requested: Callable[[], bool]) -> bool:
     if agreed or sys.stdin is None or not sys.stdin.isatty():
         return True
-    forget_typed()
-    mention("Arm now? y and Enter does, anything else ends here.")
-    while not stop_requested():
-        if (line := typed_line()) is not None:
-            return line.strip().lower() in ("y", "yes")
-        time.sleep(LOOK)
-    return False
+    return confirmed(ARM_QUESTION, stop_requested, lambda: time.sleep(LOOK))
 
 
 if __name__ == "__main__":

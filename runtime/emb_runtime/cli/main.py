@@ -18,7 +18,7 @@ from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError
 from emb_runtime.run_type import LISTEN_ONLY_LOG
 from emb_runtime.system.signals import StopRequest
-from emb_runtime.system.terminal import as_json, complain, forget_typed, mention, show, typed_line
+from emb_runtime.system.terminal import ARM_QUESTION, as_json, complain, confirmed, mention, show
 
 LISTEN_NS = 50_000_000  # Time between two looks at the keyboard [ns]
 
@@ -64,18 +64,15 @@ class Operator:
         return self._plan.ask is Ask.ALWAYS
 
     def _ask(self, bus: Bus) -> bool:
-        forget_typed()  # an answer to an earlier question, or to none, arms nothing
-        mention("Arm now? y and Enter does, anything else ends here.")
-        while not self._stop_requested():
-            if (line := typed_line()) is not None:
-                return line.strip().lower() in ("y", "yes")
+        def wait() -> None:
             if bus.simulated:
                 time.sleep(LISTEN_NS * 1e-9)
             else:  # what comes meanwhile must not fill the kernel's buffer
                 frame = bus.transport.receive(bus.clock.now_ns() + LISTEN_NS)
                 if frame is not None:
                     bus.pass_over(frame, self._plan.layout)
-        return False
+
+        return confirmed(ARM_QUESTION, self._stop_requested, wait)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -20,6 +20,7 @@ from emb_runtime.errors import EmbError, UsageError
 
 LONGEST_MESSAGE = 1000  # Characters of an error's message
 LONGEST_STRING = 2000  # Characters of a string from outside
+ARM_QUESTION = "Arm now? y and Enter does, anything else ends here."
 
 _CONTROL = re.compile(
     "[\x00-\x1f\x7f-\x9f\ud800-\udfff"  # C0, DEL and C1; halves of characters, which no terminal takes
@@ -81,6 +82,25 @@ def typed_line() -> str | None:
     if sys.platform != "win32" and not select.select([sys.stdin], [], [], 0.0)[0]:
         return None
     return sys.stdin.readline()
+
+
+def confirmed(question: str, stop_requested: Callable[[], bool], wait: Callable[[], object]) -> bool:
+    """Ask a question on the terminal; True if the operator answers y, False for any other answer or an end.
+
+    An answer to an earlier question, or to none, does not count.
+
+    Args:
+        question: in one line.
+        stop_requested: True if the operator wants an end.
+        wait: called as long as there is no answer.
+    """
+    forget_typed()
+    mention(question)
+    while not stop_requested():
+        if (line := typed_line()) is not None:
+            return line.strip().lower() in ("y", "yes")
+        wait()
+    return False
 
 
 def complain(command: str, err: EmbError) -> int:

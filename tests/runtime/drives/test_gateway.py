@@ -21,6 +21,7 @@ from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.drives.node import ARMED_PERIODS, LONGEST_STOP_PERIODS, READY_SAMPLES, DriveNode, Phase
 from emb_runtime.errors import BusError, SafetyStopError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
+from emb_runtime.system import terminal
 from emb_runtime.system.clock import SteppedClock
 from tests.drives import EXAMPLES
 from tests.runtime.drives.mapped import late_bench
@@ -395,8 +396,8 @@ def test_the_command_asks_serves_and_ends_with_its_counts(
     arguments += ["--json", "--bench", str(tmp_path / "late.toml")]
     typed = ["n", "y\n", "y\n"]
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
-    monkeypatch.setattr(cli, "forget_typed", lambda: None)
-    monkeypatch.setattr(cli, "typed_line", lambda: typed.pop(0))
+    monkeypatch.setattr(terminal, "forget_typed", lambda: None)
+    monkeypatch.setattr(terminal, "typed_line", lambda: typed.pop(0))
     for late_ns, code in ((0, 3), (0, 0), (1_200_000, 1)):
         played = Played()
         buses = {"can0": played.drive, "vcan0": played.host}
