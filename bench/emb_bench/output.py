@@ -63,6 +63,20 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
         raise
 
 
+def make_empty_folder(path: Path) -> None:
+    """Make a folder for results.
+
+    Raises:
+        UsageError: it holds something already, or cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        if any(path.iterdir()):
+            raise UsageError(f"{path}: holds something already: choose a new folder")
+    except OSError as err:
+        raise UsageError(f"{path}: cannot use this folder: {err.strerror}") from err
+
+
 @contextmanager
 def reported_if_interrupted(command: str) -> Iterator[None]:
     """Say on Ctrl-C that there is no result; the exit code is the entry's."""

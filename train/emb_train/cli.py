@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from emb_bench.output import replacing
+from emb_bench.output import make_empty_folder, replacing
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT, EVERY
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
@@ -273,7 +273,8 @@ def reference(arguments: argparse.Namespace) -> int:
     task = replace(TASKS[arguments.task], plant=arguments.plant, shield=arguments.shield, command_delay=(least, most))
     begin, blind = _beginning(arguments, task), arguments.form == "blind"
     task.trials(bench, task.draws(bench, 0, 1))  # what cannot be is refused before there is a folder
-    folder = _new_folder(arguments.out)
+    folder = arguments.out
+    make_empty_folder(folder)
     (folder / BENCH).write_text(bench.text, encoding="utf-8")
     with (folder / METRICS).open("a", encoding="utf-8") as metrics, progress(task.name, arguments.steps) as advance:
 
@@ -318,16 +319,6 @@ def _beginning(arguments: argparse.Namespace, task: Task) -> Floats:
     table = np.zeros((len(numbers), TERMS))
     table[:, 0] = numbers
     return table
-
-
-def _new_folder(folder: Path) -> Path:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise UsageError(f"--out {folder}: holds something already: choose a new folder")
-    except OSError as err:
-        raise UsageError(f"--out {folder}: cannot use this folder: {err.strerror}") from err
-    return folder
 
 
 def ppo(arguments: argparse.Namespace) -> int:
@@ -386,7 +377,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
 
     bench, settings, subjects = prepare(arguments)
     if arguments.out is not None:
-        _new_folder(arguments.out)
+        make_empty_folder(arguments.out)
     with Console(stderr=True).status("") as status:
         results = evaluate(bench, settings, subjects, status.update)
     table, record = text(settings, results), as_json(document(settings, results))

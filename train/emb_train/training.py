@@ -22,7 +22,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from emb_bench.output import replacing
+from emb_bench.output import make_empty_folder, replacing
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.config.typed import read
@@ -180,14 +180,12 @@ def begin_training(folder: Path, training: Training, bench: Bench) -> None:
         EmbError: see :func:`require_trainable`; or the folder holds something already, or cannot be written.
     """
     require_trainable(training, bench)
+    make_empty_folder(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise UsageError(f"{folder}: holds something already: choose a new folder")
         (folder / BENCH).write_text(bench.text, encoding="utf-8")
         (folder / CONFIGURATION).write_bytes(msgspec.json.format(msgspec.json.encode(training), indent=2) + b"\n")
     except OSError as err:
-        raise UsageError(f"{folder}: cannot make this folder: {err.strerror}") from err
+        raise UsageError(f"{folder}: cannot write: {err.strerror}") from err
 
 
 def save_actor(folder: Path, actor: Actor, iteration: int, score: float) -> None:

@@ -127,10 +127,6 @@ def break_away(bench: Bench) -> tuple[float, float]:
 # --- the steps ------------------------------------------------------------------------------------------------------
 
 
-def _horizon(bench: Bench) -> float:
-    return bench.timing.horizon * bench.timing.sample_time
-
-
 def _listen(work: Bench) -> Step:
     window = Window(*work.limits.angle, work.limits.velocity)
     return Step("1-listen", Kind.REST, "listen, send nothing", "nothing", 0.0, LISTENING, window)
@@ -166,7 +162,7 @@ def _first_move(work: Bench) -> Step:
         f"a current that rises to {most:.2f} A at most until the brake moves, in either direction",
         "greatest friction and weakest motor of the data sheet; sign and scale of the current",
         most,
-        _horizon(work),
+        work.timing.duration,
         Window(-1.0, 1.0, 10.0),
         (*ramp, *[0.0] * (quarter // 5), *[-value for value in ramp], 0.0),
     )
@@ -187,7 +183,7 @@ def _experiment(
         f"{words}: {limit:.2f} A, {window.lowest:.1f} to {window.highest:.1f} rad, {speed:g} rad/s",
         rests_on + ("; with the learning shield, as it contradicts nothing that this assumes" if learns else ""),
         limit,
-        _horizon(work),
+        work.timing.duration,
         window,
         _alternating(limit, work.timing.horizon),
         learns=learns,
@@ -204,7 +200,7 @@ def _full(sheet: Bench) -> Step:
         f"{window.speed:.0f} rad/s",
         "all of it",
         limits.current,
-        _horizon(sheet),
+        sheet.timing.duration,
         window,
         _alternating(limits.current, sheet.timing.horizon),
         final=True,

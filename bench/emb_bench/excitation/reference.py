@@ -269,10 +269,6 @@ def _played(currents: Floats) -> Law:
     return lambda _angle, _velocity, k: sequence[k]
 
 
-def _lasting(bench: Bench) -> float:
-    return bench.timing.horizon * bench.timing.sample_time
-
-
 def _times(bench: Bench) -> Floats:
     """Begin of each period [s], shape (horizon,)."""
     times: Floats = bench.timing.sample_time * np.arange(bench.timing.horizon, dtype=np.float64)
@@ -311,7 +307,7 @@ def _square(bench: Bench, amplitude: float, period: float) -> Floats:
 def _chirp(bench: Bench, amplitude: float, f0: float, f1: float) -> Floats:
     """Swept sine from f0 to f1, which it reaches at the end of the experiment; either may be the higher one."""
     t = _times(bench)
-    return amplitude * np.sin(2.0 * math.pi * (f0 + 0.5 * (f1 - f0) * t / _lasting(bench)) * t)
+    return amplitude * np.sin(2.0 * math.pi * (f0 + 0.5 * (f1 - f0) * t / bench.timing.duration) * t)
 
 
 def _prbs(bench: Bench, amplitude: float, hold: float, order: float, seed: float) -> Floats:
@@ -339,7 +335,7 @@ def _multisine(bench: Bench, amplitude: float, f0: float, f1: float) -> Floats:
 
 def _ramp(bench: Bench, amplitude: float, start: float) -> Floats:
     """Ramp from ``start`` to ``amplitude``, which it would reach at the end of the experiment."""
-    return start + (amplitude - start) / _lasting(bench) * _times(bench)
+    return start + (amplitude - start) / bench.timing.duration * _times(bench)
 
 
 def _step(bench: Bench, amplitude: float, at: float) -> Floats:

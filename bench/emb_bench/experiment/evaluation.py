@@ -209,8 +209,3 @@ def bench_for(log: RunLog, path: str | Path | None) -> Bench:
     if (its := other_sample_time(log, bench)) is not None:
         raise UsageError(f"{path}: expected the sample time of the log, {its:g} s, got {bench.timing.sample_time:g} s")
     return bench
-
-
-def names_of(text: str) -> tuple[str, ...]:
-    """``k_m, f_v`` as a tuple; an empty text is an empty one."""
-    return tuple(name.strip() for name in text.split(",")) if text.strip() else ()

@@ -117,6 +117,11 @@ class Timing:
         """The sample time in whole nanoseconds."""
         return round(self.sample_time * 1e9)
 
+    @property
+    def duration(self) -> float:
+        """Duration of one experiment [s]."""
+        return self.horizon * self.sample_time
+
 
 class Shield(NamedTuple):
     """Assumptions of the envelope shield, see :mod:`emb_runtime.safety.shield`. numba takes it."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -16,8 +16,7 @@ from emb_runtime.learning.bounded import hear, lose, start
 from emb_runtime.learning.known import Known
 from emb_runtime.safety.shield_design import DesignInputs, design_inputs
 
-Shield = Literal["worst case", "bounded"]
-SHIELDS: tuple[Shield, ...] = get_args(Shield)  # A law for the whole set, or for what has been learnt
+Shield = Literal["worst case", "bounded"]  # A law for the whole set, or for what has been learnt
 
 
 class Learning(NamedTuple):
