@@ -123,7 +123,7 @@ def topic(run: Source, name: str) -> Table:
         UsageError: the run has no such topic, or pyarrow is missing.
         LogError: the topic cannot be decoded.
     """
-    from emb_bench.export.tables import arrow_batches
+    from emb_bench.export.export import arrow_batches
 
     schema, tables = arrow_batches(_opened(run), name)
     import pyarrow as pa
@@ -431,7 +431,7 @@ def design(
     """
     from emb_bench.design.problem import make_problem
     from emb_bench.information.criteria import criterion as criterion_of
-    from emb_bench.sim.plant_spec import parse_assignments, true_parameters
+    from emb_bench.sim.simulated_brake import parse_assignments, true_parameters
 
     _check({"--starts": (starts, 1), "--seed": (seed, 0)})
     its, names = load_bench(bench), _names(params)

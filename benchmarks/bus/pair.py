@@ -16,7 +16,7 @@ from typing import Any
 
 from emb_bench.cli.node import run_node
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.plant_spec import gaussian_noise
+from emb_bench.sim.simulated_brake import gaussian_noise
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import SocketCan, TransmitQueueFullError
 from emb_runtime.config.bench import Bench

@@ -22,8 +22,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from emb_bench.cli.node import PRIORITY, run_node
-from emb_bench.sim.plant_spec import read_brake
-from emb_bench.sim.simulated_brake import Noise, SimulatedBrake
+from emb_bench.sim.simulated_brake import Noise, SimulatedBrake, read_brake
 from emb_bench.sim.transport import LockstepBus
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.config.bench import Bench, BrakeParameters, load_bench

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.plant_spec import gaussian_noise
+from emb_bench.sim.simulated_brake import gaussian_noise
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.result import Outcome

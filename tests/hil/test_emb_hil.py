@@ -17,7 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from emb_bench.hil import host, uml
+from emb_bench.hil import uml
+from emb_bench.hil.supervise import interface
 from emb_runtime.errors import BusError
 
 from .conftest import EMB_HIL, Hil
@@ -28,7 +29,7 @@ PYTHON = sys.executable
 def places() -> list[tuple[str, ...]]:
     """Wherever this machine can have a vcan0. Where it has none, the kernel: so that the tests fail with its line."""
     found: list[tuple[str, ...]] = []
-    with contextlib.suppress(BusError), host.interface():
+    with contextlib.suppress(BusError), interface():
         found.append(("--host",))
     if shutil.which(uml.PROGRAM) is not None or not found:
         found.append(("--uml",))

@@ -12,7 +12,7 @@ import pytest
 from emb_bench import api
 from emb_bench.cli import node, replay
 from emb_bench.design.problem import make_problem
-from emb_bench.sim.plant_spec import read_brake
+from emb_bench.sim.simulated_brake import read_brake
 from emb_bench.sim.transport import open_sim
 from emb_runtime.cli import options
 from emb_runtime.config.bench import Bench

@@ -16,8 +16,7 @@ from emb_bench.batch.row import ENDINGS as ROWS
 from emb_bench.batch.row import Options, Row, write_rows
 from emb_bench.batch.summary import Campaign, mark_copies, summarise
 from emb_bench.figures import ENDINGS, require_place
-from emb_bench.output import replacing, say_if_compiling
-from emb_bench.parallel.progress import Progress
+from emb_bench.output import Progress, replacing, say_if_compiling
 from emb_runtime.errors import UsageError
 from emb_runtime.system.realtime import processors
 

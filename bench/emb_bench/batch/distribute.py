@@ -8,8 +8,7 @@ from functools import partial
 
 from emb_bench.batch.evaluate import OUT_OF_TIME, limited_to
 from emb_bench.batch.row import Row, Source, failed
-from emb_bench.parallel.processes import Lost, shared_out
-from emb_bench.parallel.ray_tasks import shared_out_on_ray
+from emb_bench.parallel import Lost, shared_out, shared_out_on_ray
 
 Evaluate = Callable[[Source], Row]  # A function that another process can import; a ``functools.partial`` of one as well
 

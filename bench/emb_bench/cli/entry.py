@@ -6,7 +6,7 @@ import gc
 import os
 import sys
 
-from emb_bench.parallel.threads import ONE_THREAD
+from emb_bench import ONE_THREAD
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.system.entry import start
 

@@ -7,8 +7,7 @@ import glob
 import time
 from pathlib import Path
 
-from emb_bench.live.follow import NewLogs, Viewer, follow
-from emb_bench.live.lines import Lines
+from emb_bench.live.follow import Lines, NewLogs, Viewer, follow
 from emb_bench.live.process import POLL
 from emb_bench.live.serve import HOST, PORT, Server
 from emb_runtime.errors import EXIT_DONE, LogError, UsageError

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.plant_spec import read_brake
+from emb_bench.sim.simulated_brake import read_brake
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport

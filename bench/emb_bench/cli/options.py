@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from emb_bench.report.text import show
-from emb_bench.sim.plant_spec import parse_assignments
+from emb_bench.sim.simulated_brake import parse_assignments
 from emb_runtime.errors import UsageError
 from emb_runtime.system.terminal import as_json
 

@@ -71,7 +71,7 @@ COMMANDS: Mapping[str, Command] = {
         },
     ),
     "rerun": Command(
-        "emb_bench.replay.rerun",
+        "emb_bench.rerun",
         OF_A_RUN
         | {1: "something came out otherwise: the first differences are printed", 5: "the policy in the log is refused"},
     ),

@@ -9,20 +9,22 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from scipy import optimize, stats
 
 from emb_bench.analysis.model_choice import fit_from
 from emb_bench.analysis.model_growth import grow_model
 from emb_bench.brake.parameters import FEATURES, SI
-from emb_bench.commission.noise import noise_at_rest, noise_in_motion
 from emb_bench.commission.records import CurrentCheck, FirstMove, Identification, Rest
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, EstimationProblem, with_systematic
+from emb_bench.experiment.cycles import step_of
 from emb_bench.experiment.experiment import Booleans, Experiment, Floats
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, Ranges
 from emb_runtime.config.plants import Instruments, Mechanics, Plant
+from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.errors import LogError
 from emb_runtime.run_type import RunType
 
@@ -279,3 +281,41 @@ def _smoothed(values: Floats) -> Floats:
 def _first(currents: Floats, chosen: Booleans) -> float:
     at = np.flatnonzero(chosen)
     return float(currents[at[0]]) if len(at) else math.nan
+
+
+UNIFORM = math.sqrt(1.0 / 12.0)  # Standard deviation of an error that may be anything within a step, in steps
+
+
+def noise_at_rest(angle: Floats, velocity: Floats, drive: DriveMapping | None) -> Noise:
+    """Noise of a resting brake's samples, below the steps of a mapped drive."""
+    steps = (0.0, 0.0) if drive is None else (step_of(drive.angle), step_of(drive.velocity))
+    return Noise(scatter(angle, steps[0]), scatter(velocity, steps[1]))
+
+
+def noise_in_motion(at_rest: Noise, drive: DriveMapping | None) -> Noise:
+    """Noise of a moving brake's samples: a mapped drive's steps add to it."""
+    if drive is None:
+        return at_rest
+    added = UNIFORM * step_of(drive.angle), UNIFORM * step_of(drive.velocity)
+    return Noise(math.hypot(at_rest.angle, added[0]), math.hypot(at_rest.velocity, added[1]))
+
+
+def scatter(values: Floats, step: float) -> float:
+    """Standard deviation of a normal noise before it was rounded to steps, about a constant: most likely one.
+
+    Args:
+        values: as they came.
+        step: of their signal.
+    """
+    found = float(np.std(values, ddof=1))
+    if found >= step:
+        return math.sqrt(found**2 - (UNIFORM * step) ** 2)
+    places, counts = np.unique(np.round((values - values[0]) / step), return_counts=True)
+
+    def unlikelihood(at: Floats) -> float:
+        below, above = (places - at[0] - 0.5) / math.exp(at[1]), (places - at[0] + 0.5) / math.exp(at[1])
+        share = np.maximum(stats.norm.cdf(above) - stats.norm.cdf(below), 1e-300)
+        return -float(counts @ np.log(share))
+
+    begin = [float(np.mean(values - values[0])) / step, math.log(0.25)]
+    return step * math.exp(float(optimize.minimize(unlikelihood, begin, method="Nelder-Mead").x[1]))

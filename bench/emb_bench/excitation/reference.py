@@ -34,7 +34,7 @@ from emb_bench.brake.euler import sign, stiffness
 from emb_bench.brake.motion import Floats
 from emb_bench.sim.closed_loop import clipped, sent_current
 from emb_bench.sim.open_loop import feedback
-from emb_bench.sim.plant_spec import parse_assignments
+from emb_bench.sim.simulated_brake import parse_assignments
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Mechanics
 from emb_runtime.control.interfaces import Actor

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.experiment.drive_steps import quantised
 from emb_bench.experiment.experiment import Booleans, Floats, Integers
 from emb_bench.logs.log import RunLog, Table
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER
 from emb_runtime.can.messages import CHARGE, Layout
 from emb_runtime.can.receiver import Reception, fresh_ns
 from emb_runtime.config.bench import Bench
+from emb_runtime.drives.mapping import Mapping, Measured
 from emb_runtime.errors import LogError
 from emb_runtime.records import CycleRecord, Frame, RunState, SensorSample
 
@@ -250,3 +250,29 @@ def _frames(received: Table, layout: Layout, end: int | None, count: int) -> lis
     at = np.flatnonzero(chosen)[-count:]
     rows = (received[name][at].tolist() for name in ("id", "data", "publish_time", "is_extended", "is_rtr", "is_error"))
     return [Frame(*row) for row in zip(*rows, strict=True)]
+
+
+def step_of(measured: Measured) -> float:
+    """Step of a measured signal [SI]; next to nothing for a floating-point number."""
+    return measured.field.step(0.0) * abs(measured.factor)
+
+
+def quantised(currents: Floats, drive: Mapping | None) -> Floats:
+    """Currents of commands as the drive's own message carries them; of our own node, as they are [A]."""
+    if drive is None or drive.command.field.is_float:
+        return currents
+    field, factor = drive.command.field, drive.command.factor
+    with np.errstate(over="ignore"):  # a damaged log may say anything
+        steps: Floats = np.round((currents * factor - field.offset) / field.scale)
+        return (steps * field.scale + field.offset) / factor
+
+
+def match_tolerance(drive: Mapping | None, layout: Layout) -> float:
+    """Distance from the report within which a command acted; 0 for our own node, which reports exactly [A].
+
+    Two quantisation steps: one between node and drive, one between drive and actuator.
+    """
+    if drive is None:
+        return 0.0
+    step = 0.0 if drive.current is None else step_of(drive.current)
+    return 2.0 * step + layout.velocity.signal("AppliedCurrent").factor

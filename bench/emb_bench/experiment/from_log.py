@@ -11,8 +11,7 @@ import math
 
 import numpy as np
 
-from emb_bench.experiment.cycles import UNKNOWN, Samples, samples_before, samples_on_grid
-from emb_bench.experiment.drive_steps import match_tolerance, quantised
+from emb_bench.experiment.cycles import UNKNOWN, Samples, match_tolerance, quantised, samples_before, samples_on_grid
 from emb_bench.experiment.experiment import REST_SIGMAS, Experiment, Floats
 from emb_bench.logs.log import RunLog
 from emb_bench.numbers import in_samples

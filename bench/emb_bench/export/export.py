@@ -3,13 +3,111 @@
 from __future__ import annotations
 
 import argparse
+import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from emb_bench.export.picture import ENDINGS, draw_run
-from emb_bench.export.tables import write_csv, write_parquet
-from emb_bench.logs.log import read_log
+from emb_bench.logs.columns import Column
+from emb_bench.logs.log import UNIX_TIME, RunLog, read_log
+from emb_bench.output import new_file
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.system.terminal import as_json, show
+
+
+def arrow_batches(log: RunLog, topic: str) -> tuple[Any, Iterator[Any]]:
+    """One topic as Arrow tables: units in the fields' metadata, the run's identity and completeness in the schema's.
+
+    Returns:
+        The schema, and the tables, whose rows follow each other.
+
+    Raises:
+        UsageError: the log has no such topic, or pyarrow is missing.
+        LogError: the topic cannot be decoded.
+    """
+    try:
+        import pyarrow as pa
+    except ImportError as err:
+        raise UsageError("Arrow and Parquet need pyarrow: pip install 'emb-excite[bench]'") from err
+    table = log.describe(topic)
+
+    def kind(column: Column) -> Any:
+        if column is UNIX_TIME:
+            return pa.timestamp("ns", tz="UTC")
+        if column.choices is not None or column.kind == "text":
+            return pa.string()
+        return pa.binary() if column.kind == "bytes" else pa.from_numpy_dtype(column.kind)
+
+    def array(column: Column, part: NDArray[Any]) -> Any:
+        plain = column.labels(part) if column.choices is not None else part
+        return pa.array(plain, kind(column), from_pandas=True)  # what is not a number has no value
+
+    about = {
+        "emb.log": log.path.name,
+        "emb.topic": topic,
+        "emb.complete": str(log.complete).lower(),
+        "emb.missing": log.missing,
+        "emb.run": json.dumps(dict(log.run)),
+    }
+    units = [{"unit": column.unit} if column.unit else None for column in table]
+    fields = [pa.field(column.name, kind(column), metadata=unit) for column, unit in zip(table, units, strict=True)]
+    schema = pa.schema(fields, metadata=about)
+    names = [column.name for column in table[2:]]  # behind the two times
+    rows = (
+        pa.table([array(column, log.values(batch[topic], column)) for column in table], schema=schema)
+        for batch in log.batches({topic: names})  # some at a time: a log may be longer than the memory
+    )
+    return schema, rows
+
+
+def write_parquet(log: RunLog, topic: str, path: Path) -> str:
+    """One topic as Parquet, see :func:`arrow_batches`.
+
+    Returns:
+        A description of the file's content.
+
+    Raises:
+        UsageError: the log has no such topic, pyarrow is missing, or the file exists or cannot be written.
+        LogError: the topic cannot be decoded.
+    """
+    schema, tables = arrow_batches(log, topic)
+    from pyarrow import parquet
+
+    with new_file(path) as file, parquet.ParquetWriter(file, schema) as writer:
+        for table in tables:
+            writer.write_table(table)
+    return f"{log.counts[topic]} rows of {topic}"
+
+
+def write_csv(log: RunLog, topic: str, path: Path) -> str:
+    """One topic as comma-separated values with units in the head: bytes are hex, times nanoseconds since 1970.
+
+    Returns:
+        A description of the file's content.
+
+    Raises:
+        UsageError: the log has no such topic, pyarrow is missing, or the file exists or cannot be written.
+        LogError: the topic cannot be decoded.
+    """
+    schema, tables = arrow_batches(log, topic)
+    import pyarrow as pa
+    from pyarrow import csv
+
+    def plain(column: Any) -> Any:
+        if pa.types.is_binary(column.type):
+            return pa.array([value.as_py().hex() for value in column], pa.string())
+        return column.cast(pa.int64()) if pa.types.is_timestamp(column.type) else column
+
+    titles = [column.title for column in log.describe(topic)]
+    head = pa.table([plain(column) for column in schema.empty_table()], titles)
+    with new_file(path) as file, csv.CSVWriter(file, head.schema) as writer:
+        for table in tables:
+            writer.write_table(pa.table([plain(column) for column in table], titles))
+    return f"{log.counts[topic]} rows of {topic}"
+
 
 TABLES = {"csv": write_csv, "parquet": write_parquet}  # Formats of one topic as a table
 FORMATS = (*TABLES, "plot")

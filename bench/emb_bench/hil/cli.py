@@ -9,9 +9,9 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from emb_bench.hil import host, uml
-from emb_bench.hil.kernel import KernelCommand, state_directory
-from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
+from emb_bench.hil import uml
+from emb_bench.hil.supervise import EXIT_TIMEOUT, HostCommand, interface, supervise
+from emb_bench.hil.uml import KernelCommand, state_directory
 from emb_runtime.errors import EXIT_BUS, EXIT_USAGE, BusError, EmbError, UsageError
 from emb_runtime.system.terminal import complain
 
@@ -51,12 +51,12 @@ def _run(options: argparse.Namespace, command: list[str]) -> int:
     with contextlib.ExitStack() as stack:
         if not options.uml:
             try:
-                stack.enter_context(host.interface())
+                stack.enter_context(interface())
             except BusError:
                 if options.host:
                     raise
             else:
-                return supervise(lambda: host.HostCommand(command), options.timeout)
+                return supervise(lambda: HostCommand(command), options.timeout)
         stack.enter_context(uml.own_processor())
         state = stack.enter_context(state_directory())
 

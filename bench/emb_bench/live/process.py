@@ -10,8 +10,7 @@ import select
 import sys
 from pathlib import Path
 
-from emb_bench.live.follow import NewLogs, Viewer, follow
-from emb_bench.live.lines import Lines
+from emb_bench.live.follow import Lines, NewLogs, Viewer, follow
 from emb_bench.live.serve import Server
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.system import child_side

@@ -1,4 +1,4 @@
-"""The running estimate of an experiment: the topic ``/estimate`` of a log."""
+"""Topics of an experiment by step: its running estimate, and the sets that its shield learnt."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from emb_bench.logs.log import RunLog
 from emb_runtime.errors import LogError
 from emb_runtime.estimator.estimate import LOST, Quantity, by_name
-from emb_runtime.log.mcap_schema import ESTIMATE, deviation_of, estimate_topic
+from emb_runtime.log.mcap_schema import ESTIMATE, LEARNT, deviation_of, estimate_topic
 
 
 def quantities(log: RunLog) -> tuple[Quantity, ...]:
@@ -54,3 +57,45 @@ def last_estimate(log: RunLog) -> dict[str, dict[str, Any]]:
 def _rows(log: RunLog) -> Iterator[tuple[Any, ...]]:
     names = [quantity.name for quantity in quantities(log)]
     return log.rows(ESTIMATE, "step", *names, *map(deviation_of, names))
+
+
+_STEP, *_LEARNT = (field.name for field in LEARNT.fields)
+
+
+def learnt_by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
+    """All sets by their step: the numbers of :func:`emb_runtime.learning.known.numbers`; empty if nothing was learnt.
+
+    Raises:
+        LogError: the topic has other fields, or a message cannot be decoded.
+    """
+    return {step: tuple(numbers) for step, *numbers in log.rows(LEARNT.name, _STEP, *_LEARNT)}
+
+
+def learnt_history(log: RunLog) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Steps, shape [n], and the numbers at each, shape [n, 13]; nothing if nothing was learnt.
+
+    Raises:
+        LogError: see :func:`learnt_by_step`.
+    """
+    found = learnt_by_step(log)
+    return np.array([*found], np.int64), np.array([*found.values()]).reshape(len(found), len(_LEARNT))
+
+
+def learnt_ranges(numbers: NDArray[np.float64]) -> dict[str, list[float]]:
+    """The last set, by parameter: its least and greatest value, relative to the nominal brake; empty if there is none.
+
+    Args:
+        numbers: of a :func:`learnt_history`.
+    """
+    names = [name.removesuffix("_low") for name in _LEARNT[:8:2]]
+    return {name: last[2 * i : 2 * i + 2] for last in numbers[-1:].tolist() for i, name in enumerate(names)}
+
+
+def last_learnt(log: RunLog) -> dict[str, Any]:
+    """The :func:`learnt_ranges` of a log.
+
+    Raises:
+        LogError: see :func:`learnt_by_step`.
+    """
+    last = deque(log.rows(LEARNT.name, *_LEARNT), maxlen=1)
+    return learnt_ranges(np.array(last).reshape(-1, len(_LEARNT)))

@@ -257,7 +257,7 @@ def learnt(run: Run, steps: NDArray[np.int64], numbers: Floats) -> list[Panel]:
 
     Args:
         run: its bench gives the sample time.
-        steps: see :func:`emb_bench.logs.learnt.history`.
+        steps: see :func:`emb_bench.logs.estimates.learnt_history`.
         numbers: the same.
     """
     time = 1e3 * run.bench.timing.sample_time * steps

@@ -12,8 +12,7 @@ import numpy as np
 from emb_bench.brake.parameters import UNITS
 from emb_bench.brake.quantities import quantity
 from emb_bench.documents import to_json
-from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evenly
-from emb_bench.experiment.model_evaluator import KINDS, Fit
+from emb_bench.experiment.evaluation import KINDS, Evaluation, Fit, Question, default_model, evenly
 from emb_bench.information.criteria import criteria_series
 from emb_bench.information.identifiability import Finding, combination
 from emb_bench.numbers import NOTHING, in_samples, plain

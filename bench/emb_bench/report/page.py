@@ -22,7 +22,7 @@ from emb_bench import numbers
 from emb_bench.analysis.growth import Growth
 from emb_bench.analysis.study import Study
 from emb_bench.estimate.records import METHODS
-from emb_bench.logs.learnt import history, last_ranges
+from emb_bench.logs.estimates import learnt_history, learnt_ranges
 from emb_bench.logs.timing import INTERVALS, Timing, quantiles
 from emb_bench.numbers import percent, plain, seconds, signed
 from emb_bench.report import certainty, figures, sentences, tables
@@ -203,8 +203,8 @@ def _motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) ->
 
 
 def _learnt(run: Run) -> tuple[list[Panel], dict[str, list[float]]]:
-    steps, numbers = history(run.log)
-    return figures.learnt(run, steps, numbers), last_ranges(numbers)
+    steps, numbers = learnt_history(run.log)
+    return figures.learnt(run, steps, numbers), learnt_ranges(numbers)
 
 
 def _cycles(run: Run) -> ActiveCycles | None:

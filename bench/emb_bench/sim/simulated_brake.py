@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Final
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.sim.closed_loop import pass_period
 from emb_bench.sim.instruments import MEMORY, command, settle
-from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import Plant
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from emb_runtime.config.bench import Noise as SensorNoise
+from emb_runtime.config.plants import DEFAULT_PLANT, Plant
+from emb_runtime.errors import UsageError
 
 Noise = Callable[[], tuple[float, float, float]]
 """Draws one error of the angle [rad], one of the velocity [rad/s] and one of the instant of sampling [s]."""
@@ -79,3 +83,149 @@ class SimulatedBrake:
         self.angle_range = (min(self.angle_range[0], self.angle), max(self.angle_range[1], self.angle))
         self.top_speed = max(self.top_speed, abs(self.velocity))
         return measured
+
+
+NOISES = ("angle_noise", "velocity_noise")  # Options for sensors that are not as the bench file says
+LONGEST_SEED = 18  # Digits of a seed
+FARTHEST = 100.0  # A brake that is farther from nominal, by this factor, is a typing error
+
+
+def parse_assignments(text: str, option: str = "") -> dict[str, str]:
+    """``name=value,name=value`` as a dictionary.
+
+    Args:
+        text: to be parsed.
+        option: begin of a message, which names what was given.
+
+    Raises:
+        UsageError: something is not of that form, or a name comes twice.
+    """
+    pairs: dict[str, str] = {}
+    for item in filter(None, (part.strip() for part in text.split(","))):
+        name, equals, value = (part.strip() for part in item.partition("="))
+        if not equals or not name or not value:
+            raise UsageError(f"{option}expected name=value,name=value, got '{item}'")
+        if name in pairs:
+            raise UsageError(f"{option}'{name}' is given twice")
+        pairs[name] = value
+    return pairs
+
+
+def true_parameters(
+    bench: Bench, assignments: dict[str, str], besides: Sequence[str] = (), option: str = ""
+) -> BrakeParameters:
+    """The bench's nominal brake with some parameters replaced.
+
+    Args:
+        bench: knows the nominal brake.
+        assignments: text by parameter.
+        besides: what else could have been given, for the message.
+        option: begin of a message, which names what was given.
+
+    Raises:
+        UsageError: an unknown parameter, or a value that is not a positive number.
+    """
+    theta = bench.brake
+    for name, text in assignments.items():
+        if name not in PARAMETER_NAMES:
+            known = ", ".join((*PARAMETER_NAMES, *besides))
+            raise UsageError(f"{option}'{name}' is not a parameter; expected one of {known}")
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        check_near_nominal(bench, name, value, option, got=f"'{text}'")
+        theta = theta._replace(**{name: value})
+    return theta
+
+
+def check_near_nominal(bench: Bench, name: str, value: float, where: str = "", got: str = "") -> None:
+    """Refuse a parameter that must be a typing error: a brake that fast would take for ever to simulate.
+
+    Raises:
+        UsageError: it is farther from nominal than by the factor FARTHEST, or not a number; the message begins with
+            ``where`` and ends with ``got``, or with the value.
+    """
+    nominal = getattr(bench.brake, name)
+    low, high = nominal / FARTHEST, nominal * FARTHEST
+    if not low <= value <= high:  # this way round, NaN is refused
+        raise UsageError(f"{where}{name}: expected a number from {low:g} to {high:g}, got {got or repr(value)}")
+
+
+class BrakeToSimulate(NamedTuple):
+    """A brake with its plant and sensors."""
+
+    theta: BrakeParameters  # True parameters
+    plant: Plant
+    noise: Noise
+    seed: int
+    charge: bool  # The node sends the integral of its current along
+
+    @property
+    def truth(self) -> dict[str, float | str]:
+        """True parameters, seed and plant, for the log."""
+        return {**self.theta._asdict(), "seed": self.seed, "plant": self.plant.name}
+
+
+def read_brake(text: str, bench: Bench, option: str) -> BrakeToSimulate:
+    """Reads ``plant=exact,seed=3,f_v=3e-5``; what is not given is the default plant, seed 1, nominal.
+
+    Args:
+        text: one of the bench's plants, a seed of the sensors' noise, true parameters; ``charge=1`` has the node send
+            the integral of its current; ``angle_noise`` [rad] and ``velocity_noise`` [rad/s] are standard deviations of
+            sensors that are not as the bench file says.
+        bench: knows the plants.
+        option: begin of a message, which names what was given.
+
+    Raises:
+        UsageError: an option is unknown or has no sensible value.
+        BenchFileError: the bench has no such plant.
+    """
+    given = parse_assignments(text, option)
+    plant = bench.plant(given.pop("plant", DEFAULT_PLANT))
+    seed, charge = given.pop("seed", "1"), given.pop("charge", "0")
+    if not seed.isdecimal() or len(seed) > LONGEST_SEED:
+        raise UsageError(f"{option}seed: expected a whole number from 0 of up to {LONGEST_SEED} digits, got '{seed}'")
+    if charge not in ("0", "1"):
+        raise UsageError(f"{option}charge: expected 0 or 1, got '{charge}'")
+    angle, velocity = (_deviation(given, name, option) for name in NOISES)
+    sensors = replace(
+        bench.noise,
+        angle=bench.noise.angle if angle is None else angle,
+        velocity=bench.noise.velocity if velocity is None else velocity,
+    )
+    theta = true_parameters(bench, given, ("plant", "seed", "charge", *NOISES), option)
+    noise = gaussian_noise(sensors, int(seed), plant.instruments.clock_jitter)
+    return BrakeToSimulate(theta, plant, noise, int(seed), charge == "1")
+
+
+def _deviation(given: dict[str, str], name: str, option: str) -> float | None:
+    text = given.pop(name, None)
+    if text is None:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value < math.inf:
+        raise UsageError(f"{option}{name}: expected a standard deviation from 0 on, got '{text}'")
+    return value
+
+
+def gaussian_noise(sensors: SensorNoise, seed: int, clock_jitter: float = 0.0) -> Noise:
+    """White Gaussian errors of sensors and clock; the same seed gives the same errors.
+
+    Args:
+        sensors: standard deviations.
+        seed: of the generator.
+        clock_jitter: standard deviation of the instant of sampling [s].
+    """
+    generator = np.random.default_rng(seed)
+    angle_std, velocity_std = sensors.angle, sensors.velocity
+
+    def draw() -> tuple[float, float, float]:
+        first, second = generator.standard_normal(2)
+        late = generator.normal(0.0, clock_jitter) if clock_jitter > 0.0 else 0.0
+        return float(first) * angle_std, float(second) * velocity_std, float(late)
+
+    return draw

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.plant_spec import read_brake
+from emb_bench.sim.simulated_brake import read_brake
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame
@@ -92,7 +92,7 @@ def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
     """Open the simulated bus.
 
     Args:
-        options: see :func:`~emb_bench.sim.plant_spec.read_brake`.
+        options: see :func:`~emb_bench.sim.simulated_brake.read_brake`.
         bench: knows the plants.
 
     Raises:

@@ -21,8 +21,7 @@ from emb_bench.analysis.constancy import DIFFERENT, constancy
 from emb_bench.batch.find import find
 from emb_bench.batch.row import Options, Parameter, Row, Source, failed, write_rows
 from emb_bench.batch.summary import mark_copies, summarise, text
-from emb_bench.output import replacing
-from emb_bench.parallel.progress import Progress, StatusLine
+from emb_bench.output import Progress, StatusLine, replacing
 from emb_runtime.errors import UsageError
 
 from tests.bench.conftest import Replay  # isort: skip

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from emb_bench import ONE_THREAD
 from emb_bench.batch.distribute import in_processes
 from emb_bench.batch.row import Row, Source
-from emb_bench.parallel.threads import ONE_THREAD
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.bench.processes import WAIT, emb_replay, left_of, press_ctrl_c, processes, started  # isort: skip

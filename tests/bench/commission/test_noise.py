@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from emb_bench.commission.noise import noise_in_motion, scatter
+from emb_bench.commission.examination import noise_in_motion, scatter
 from emb_runtime.config.bench import Noise
 from emb_runtime.drives.mapping_file import load_mapping
 from tests.drives import EXAMPLES

@@ -15,9 +15,8 @@ from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_bench.recordings.map_file import parse_map
-from emb_bench.recordings.readers import Column
+from emb_bench.recordings.readers import Column, recorded
 from emb_bench.recordings.run_file import bench_of
-from emb_bench.recordings.samples import recorded
 from emb_runtime.config.bench import Bench, parse_bench
 from emb_runtime.errors import UsageError
 from tests.bench.linear_machine import MAP, TRAVEL, Machine, Recording, record

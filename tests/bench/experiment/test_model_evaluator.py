@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from emb_bench.experiment.evaluation import NO_ERRORS, ModelEvaluator, SystematicErrors
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.experiment.model_evaluator import NO_ERRORS, ModelEvaluator, SystematicErrors
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import Bench
 

@@ -9,8 +9,8 @@ import pytest
 
 from emb_bench.hil import uml
 from emb_bench.hil.cli import main
-from emb_bench.hil.kernel import Kernel
 from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
+from emb_bench.hil.uml import Kernel
 
 
 class Patient:

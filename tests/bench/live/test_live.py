@@ -24,8 +24,7 @@ from mcap.reader import make_reader
 from websockets.sync.client import ClientConnection, connect
 
 from emb_bench.cli.replay import main as emb_replay
-from emb_bench.live.follow import NewLogs, chunks, follow
-from emb_bench.live.lines import Lines
+from emb_bench.live.follow import Lines, NewLogs, chunks, follow
 from emb_bench.live.serve import Server
 from emb_bench.logs.log import read_log
 from emb_bench.logs.mcap_file import HEADER, Chunk

@@ -12,7 +12,7 @@ import pytest
 from emb_bench.logs.estimates import by_step, last_estimate, quantities
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import RunLog, read_log
-from emb_bench.replay.rerun import Rerun, rerun
+from emb_bench.rerun import Rerun, rerun
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.stop_condition import parse_stop_condition

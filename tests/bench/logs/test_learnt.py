@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emb_bench.logs.learnt import by_step, document, history
+from emb_bench.logs.estimates import last_learnt, learnt_by_step, learnt_history
 from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
@@ -40,14 +40,14 @@ def learnt_log(tmp_path: Path, bench_file: Path, capsys: pytest.CaptureFixture[s
 
 def test_every_cycle_s_set_is_in_the_log_and_holds_the_true_brake(learnt_log: Path, replay: Replay) -> None:
     log = read_log(learnt_log)
-    steps, numbers = history(log)
+    steps, numbers = learnt_history(log)
     assert steps.tolist() == list(range(500))
     assert numbers.shape == (500, 13)
-    assert list(by_step(log)) == list(range(500))
+    assert list(learnt_by_step(log)) == list(range(500))
     truth = np.array([0.025 / 2.17e-2, 1.0, 1.0, 1.0])
     assert (numbers[:, 0:8:2] <= truth).all()
     assert (truth <= numbers[:, 1:8:2]).all()
-    assert document(log) == {n: [*numbers[-1, 2 * i : 2 * i + 2]] for i, n in enumerate(PARAMETER_NAMES)}
+    assert last_learnt(log) == {n: [*numbers[-1, 2 * i : 2 * i + 2]] for i, n in enumerate(PARAMETER_NAMES)}
     assert {key: log.run[key] for key in ("model", "model_error", "current_error")} == {
         "model": "flow",
         "model_error": "5.0",
@@ -55,7 +55,7 @@ def test_every_cycle_s_set_is_in_the_log_and_holds_the_true_brake(learnt_log: Pa
     }
     assert json.loads(log.end["learnt"])["k_m"] == pytest.approx(numbers[-1, :2], abs=0.1)
     assert replay.document("rerun", learnt_log)["reproduced"]
-    assert replay.document("info", learnt_log)["learnt"] == document(log)
+    assert replay.document("info", learnt_log)["learnt"] == last_learnt(log)
     assert "learnt       k_m " in replay.text("info", learnt_log)
 
 
@@ -71,9 +71,9 @@ def test_a_report_shows_how_the_set_shrank(learnt_log: Path, tmp_path: Path, rep
 def test_a_log_of_a_shield_that_learns_nothing_has_no_such_topic(log: Log, replay: Replay) -> None:
     path = log("plain.mcap")
     found = read_log(path)
-    assert by_step(found) == {}
-    assert document(found) == {}
-    assert history(found)[1].shape == (0, 13)
+    assert learnt_by_step(found) == {}
+    assert last_learnt(found) == {}
+    assert learnt_history(found)[1].shape == (0, 13)
     assert "learnt" not in replay.document("info", path)
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from emb_bench.brake.euler import step
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.plant_spec import gaussian_noise, parse_assignments, true_parameters
+from emb_bench.sim.simulated_brake import gaussian_noise, parse_assignments, true_parameters
 from emb_runtime.can.messages import Layout, StopReason, load_layout
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.config.plants import Instruments, Plant

@@ -16,7 +16,7 @@ import pytest
 
 from emb_bench.logs.log import read_log
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.plant_spec import gaussian_noise
+from emb_bench.sim.simulated_brake import gaussian_noise
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.transport import Transport

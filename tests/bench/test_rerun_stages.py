@@ -11,7 +11,7 @@ import pytest
 
 from emb_bench.batch.find import find
 from emb_bench.logs.log import read_log
-from emb_bench.replay.rerun import rerun
+from emb_bench.rerun import rerun
 from emb_runtime.can.messages import Layout
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import Bench

@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from emb_bench.parallel.processes import Lost, shared_out
+from emb_bench.parallel import Lost, shared_out
 from emb_runtime.errors import PolicyRefusedError
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from emb_bench.logs.log import read_log
-from emb_bench.replay.rerun import Rerun, carried_policy, rerun
+from emb_bench.rerun import Rerun, carried_policy, rerun
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import Bench, load_bench, parse_bench

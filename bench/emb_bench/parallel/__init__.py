@@ -1,1 +1,0 @@
-"""Work shared out to processes of this machine or to Ray."""

@@ -1,1 +1,0 @@
-"""Replay of a logged run through the same control loop."""
