@@ -1,16 +1,186 @@
-"""``emb-replay``: evaluation of logs. Each command is in a module of its own and described there."""
+"""``emb-replay``: evaluation of logs. The options of a command are the arguments of a function."""
 
 from __future__ import annotations
 
 import argparse
 import importlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
-from typing import NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from emb_runtime.errors import EmbError
+from emb_bench import api
+from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.cli.options import add, add_output_options, answer, given, summary
+from emb_bench.figures import ENDINGS, require_place
+from emb_bench.logs.info import info_document
+from emb_bench.logs.log import read_log
+from emb_bench.output import reported_if_interrupted
+from emb_bench.report import fim, runs
+from emb_bench.report.runs import RunTiming, draw_timing, run_timing
+from emb_bench.report.text import show
+from emb_runtime.config.plants import EVERY
+from emb_runtime.errors import (
+    EXIT_CANNOT_TELL,
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    EXIT_LOG,
+    EXIT_USAGE,
+    EmbError,
+    LogError,
+)
 from emb_runtime.system.terminal import complain
+
+if TYPE_CHECKING:
+    from emb_bench.report.content import Content
+
+METHODS = """\
+
+methods:
+  oem      output error: simulated angle and velocity nearest to the measured ones
+  pem      prediction error: a Kalman filter, for brakes that are disturbed
+  rls      recursive least squares: simple and biased, as a baseline
+  windows  output error over windows, for machines without a spring
+"""
+UNKNOWNS = METHODS + "\nThe names of unknowns are in the help of emb-replay estimate.\n"
+
+
+# ---- what each command does, from its arguments to its exit code ----
+
+
+def _fim(args: argparse.Namespace) -> int:
+    options = given(args, api.fisher_information)
+    if options.get("model") == EVERY:
+        del options["model"]
+        every = api.compare_models(**options)
+        answer(args, lambda: {"models": [fim.document(e) for e in every]}, lambda _: fim.models_text(every))
+    else:
+        found = api.fisher_information(**options)
+        answer(args, lambda: fim.document(found), lambda verbose: fim.text(found, verbose=verbose))
+    return EXIT_DONE
+
+
+def _estimate(args: argparse.Namespace) -> int:
+    study = api.estimate(**given(args, api.estimate))
+    from emb_bench.report.estimate import document, text
+
+    answer(args, lambda: document(study), lambda verbose: text(study, verbose=verbose))
+    return EXIT_CHECK_FAILED if args.strict and not (study.holds and study.identified) else EXIT_DONE
+
+
+def _report(args: argparse.Namespace) -> int:
+    content = api.report(**given(args, api.report), **given(args, api.estimate, leave_out=("runs",)))
+    from emb_bench.report.sentences import verdict
+
+    show(f"{args.output} and {args.output.with_suffix('.json').name}: {verdict(content)}")
+    for line in content.without_part:
+        complain("emb-replay", LogError(line))
+    return _accepted(content, strict=args.strict)
+
+
+def _accepted(content: Content, *, strict: bool) -> int:
+    if content.without_part:
+        return EXIT_CHECK_FAILED
+    if not strict:
+        return EXIT_DONE
+    if content.acceptance is not None:
+        codes = {"pass": EXIT_DONE, "fail": EXIT_CHECK_FAILED, "cannot tell": EXIT_CANNOT_TELL}
+        return codes[content.acceptance.result.value]
+    study = content.study
+    good = study is not None and study.holds and study.identified and not content.stopped
+    return EXIT_DONE if good else EXIT_CHECK_FAILED
+
+
+def _campaign(args: argparse.Namespace) -> int:
+    found = api.campaign(**given(args, api.campaign))
+    from emb_bench.batch.summary import document, text
+
+    answer(args, lambda: document(found), lambda verbose: text(found, verbose=verbose))
+    if not found.evaluated:
+        return EXIT_LOG
+    return EXIT_CHECK_FAILED if found.failed else EXIT_DONE
+
+
+def info(run: Path) -> dict[str, Any]:
+    """Summary of a run: end, counts, largest values, completeness.
+
+    Args:
+        run: MCAP file of emb-run.
+    """
+    return info_document(read_log(run))
+
+
+def _info(args: argparse.Namespace) -> int:
+    document = info(args.run)
+    answer(args, lambda: document, lambda verbose: runs.info(document, verbose=verbose))
+    return EXIT_DONE
+
+
+def timing(runs: Sequence[Path], *, plot: Path | None = None) -> list[RunTiming]:
+    """Timing of runs, judged by the budgets of their bench.
+
+    Args:
+        runs: MCAP files of emb-run.
+        plot: histograms of all runs together; .png, .svg or .pdf.
+    """
+    require_place("--plot", plot, ENDINGS)
+    found = [run_timing(read_log(path)) for path in runs]
+    if plot is not None:
+        draw_timing(plot, [entry.timing for entry in found])
+    return found
+
+
+def _timing(args: argparse.Namespace) -> int:
+    found = timing(**given(args, timing))
+    answer(
+        args,
+        lambda: {"logs": [runs.timing_document(entry) for entry in found]},
+        lambda verbose: "\n\n".join(runs.timing_text(entry, verbose=verbose) for entry in found),
+    )
+    codes = {entry.exit_code for entry in found}
+    return next(code for code in (EXIT_CHECK_FAILED, EXIT_USAGE, EXIT_DONE) if code in codes)
+
+
+# ---- the commands ----
+
+
+class Command(NamedTuple):
+    """One command."""
+
+    help: str
+    description: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]  # Gives the exit code
+
+
+def _command(
+    function: Callable[..., Any], run: Callable[[argparse.Namespace], int], text: str = "", strict: str = ""
+) -> Command:
+    """A command whose options are the arguments of a function.
+
+    Args:
+        function: its docstring is the help.
+        run: does what the options ask for.
+        text: further description.
+        strict: help of the option ``--strict``; empty if there is none.
+    """
+
+    def add_arguments(p: argparse.ArgumentParser) -> None:
+        add(p, function)
+        if function is api.report:
+            add(p, api.estimate, leave_out=("runs", "profile"))
+        else:
+            add_output_options(p)
+        if strict:
+            p.add_argument("--strict", action="store_true", help=strict)
+
+    def reported(args: argparse.Namespace) -> int:
+        with reported_if_interrupted(f"emb-replay {args.command}"):
+            return run(args)
+
+    return Command(summary(function), f"{summary(function)}.\n{text}", add_arguments, reported)
+
 
 ANY = {0: "done", 2: "usage: wrong argument, a file that cannot be read or written, a missing library", 130: "Ctrl-C"}
 """Exit codes of every command, and their meanings."""
@@ -18,26 +188,41 @@ OF_A_LOG = ANY | {6: "the log is not a log, or too damaged to say anything true 
 
 OF_A_RUN = OF_A_LOG | {2: f"{ANY[2]}, the log of a run that only listened (--read-only)"}
 
-
-class Command(NamedTuple):
-    """One command."""
-
-    module: str  # With ``HELP``, ``DESCRIPTION``, ``add_arguments`` and ``run``; imported where the command is wanted
-    codes: Mapping[int, str]  # Meanings of its exit codes
-
-
-COMMANDS: Mapping[str, Command] = {
-    "fim": Command("emb_bench.cli.fim", OF_A_RUN),
-    "estimate": Command(
-        "emb_bench.cli.estimate",
-        OF_A_RUN
-        | {
-            1: "with --strict: the model does not fit, does not predict a log, or a parameter is not identified",
-            6: f"{OF_A_LOG[6]}; or too short for the unknowns",
-        },
+CHECKED = "the model does not fit, does not predict a log, or a parameter is not identified"
+COMMANDS: Mapping[str, tuple[Command | str, Mapping[int, str]]] = {
+    "fim": (
+        _command(
+            api.fisher_information,
+            _fim,
+            "Intervals are half of the 95 % interval by sensor noise alone (the Cramer-Rao bound):\n"
+            "no method can do better from this record. With -v the criteria over time, and the\n"
+            "information as the thesis weights it.\n",
+        ),
+        OF_A_RUN,
     ),
-    "report": Command(
-        "emb_bench.cli.report",
+    "estimate": (
+        _command(
+            api.estimate,
+            _estimate,
+            "The verdict on the model comes first; then each parameter, what limits its interval,\n"
+            "and the next step. Of several logs, each is also predicted from the others.\n"
+            f"{METHODS}\nunknowns for --nuisance, besides the parameters:\n"
+            + "".join(f"  {name:17} {row.about}\n" for name, row in PARAMETERS.items() if row.about),
+            strict=f"exit with 1 if {CHECKED}",
+        ),
+        OF_A_RUN | {1: f"with --strict: {CHECKED}", 6: f"{OF_A_LOG[6]}; or too short for the unknowns"},
+    ),
+    "report": (
+        _command(
+            api.report,
+            _report,
+            "The verdict comes first, then what it rests on. The page needs nothing but itself, on\n"
+            "the screen and on paper. A log that cannot be used is named and left out; a run without\n"
+            f"an experiment is reported without an estimate.\n{UNKNOWNS}",
+            strict=f"exit with {EXIT_CHECK_FAILED} if a criterion failed, else {EXIT_CANNOT_TELL} if one is not "
+            f"decided; without --acceptance with {EXIT_CHECK_FAILED} if a run was stopped, the model does not fit or "
+            "predict, or a parameter is not identified",
+        ),
         OF_A_LOG
         | {
             0: "the page is written, from all logs",
@@ -48,8 +233,15 @@ COMMANDS: Mapping[str, Command] = {
             130: "Ctrl-C: nothing is written",
         },
     ),
-    "campaign": Command(
-        "emb_bench.cli.campaign",
+    "campaign": (
+        _command(
+            api.campaign,
+            _campaign,
+            "A row says what the run was, its Fisher information at the bench's nominal brake, and\n"
+            "an estimate of the parameters. A log that cannot be evaluated becomes a row with the\n"
+            "reason. The rows are the same however many processes or machines made them; on a Ray\n"
+            f"cluster all machines need emb-excite and the logs at the same paths.\n{UNKNOWNS}",
+        ),
         OF_A_LOG
         | {
             0: "every log was evaluated",
@@ -59,9 +251,16 @@ COMMANDS: Mapping[str, Command] = {
             130: "Ctrl-C: no result is written",
         },
     ),
-    "info": Command("emb_bench.cli.info", OF_A_LOG),
-    "timing": Command(
-        "emb_bench.cli.timing",
+    "info": (_command(info, _info), OF_A_LOG),
+    "timing": (
+        _command(
+            timing,
+            _timing,
+            "How long each part of a control cycle took, from the stamps that the run made itself:\n"
+            "sample to sample, sample to loop, deciding, sending, sensor to command, and the time to\n"
+            "spare until the answer would have come too late. Judged by the [budgets] of the bench\n"
+            "description inside the log. Simulated time says nothing of a computer and is not judged.\n",
+        ),
         OF_A_LOG
         | {
             0: "every run kept to every budget",
@@ -70,24 +269,37 @@ COMMANDS: Mapping[str, Command] = {
             "time",
         },
     ),
-    "rerun": Command(
+    "rerun": (
         "emb_bench.rerun",
         OF_A_RUN
         | {1: "something came out otherwise: the first differences are printed", 5: "the policy in the log is refused"},
     ),
-    "repair": Command(
-        "emb_bench.export.repair", OF_A_LOG | {6: "the log is not a log, or not one message in it can be saved"}
+    "repair": (
+        "emb_bench.export.repair",
+        OF_A_LOG | {6: "the log is not a log, or not one message in it can be saved"},
     ),
-    "export": Command("emb_bench.export.export", OF_A_LOG),
-    "import": Command("emb_bench.cli.import_recording", ANY),
-    "live": Command(
+    "export": ("emb_bench.export.export", OF_A_LOG),
+    "import": ("emb_bench.cli.import_recording", ANY),
+    "live": (
         "emb_bench.cli.live",
         {0: "ended by Ctrl-C, or the one log is over", 2: ANY[2], 6: "the one log is not a log, or is damaged"},
     ),
 }
-"""Commands by their names, in the order of ``--help``."""
+"""Commands and the meanings of their exit codes, in the order of ``--help``.
 
-EVERY = OF_A_LOG | {1: "checked, and it is not as it should be", 5: "a policy is damaged or does not fit the bench"}
+A text is a module with ``HELP``, ``DESCRIPTION``, ``add_arguments`` and ``run``, which is imported where it is needed.
+"""
+
+
+def _found(name: str) -> Command:
+    command = COMMANDS[name][0]
+    if isinstance(command, Command):
+        return command
+    module = importlib.import_module(command)
+    return Command(module.HELP, module.DESCRIPTION, module.add_arguments, module.run)
+
+
+TOGETHER = OF_A_LOG | {1: "checked, and it is not as it should be", 5: "a policy is damaged or does not fit the bench"}
 """Exit codes of all commands together."""
 CUT = "\nA log that was cut (kill -9, full disk) is read as far as it goes, and what is missing is said.\n"
 
@@ -107,22 +319,22 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
         prog="emb-replay",
         description="Evaluate logs of emb-run.",
-        epilog=epilog(EVERY) + "\nemb-replay COMMAND --help says what they mean there.\n",
+        epilog=epilog(TOGETHER) + "\nemb-replay COMMAND --help says what they mean there.\n",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("--version", action="version", version=f"emb-replay {metadata.version('emb-excite')}")
     commands = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS if only is None else (only,):
-        module, codes = importlib.import_module(COMMANDS[name].module), COMMANDS[name].codes
+        found = _found(name)
         command = commands.add_parser(
             name,
-            help=module.HELP,
-            description=module.DESCRIPTION,
-            epilog=epilog(codes),
+            help=found.help,
+            description=found.description,
+            epilog=epilog(COMMANDS[name][1]),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        module.add_arguments(command)
-        command.set_defaults(start=module.run)
+        found.add_arguments(command)
+        command.set_defaults(start=found.run)
     return p
 
 

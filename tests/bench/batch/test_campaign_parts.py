@@ -224,7 +224,7 @@ def test_a_missing_library_is_named_with_what_to_install(
 
 
 def test_the_help_needs_neither_pyarrow_nor_ray() -> None:
-    code = "import sys, emb_bench.cli.campaign; print(*sys.modules)"
+    code = "import sys, emb_bench.cli.replay; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert {"pyarrow", "ray", "scipy", "numba"}.isdisjoint(done.stdout.split())
 

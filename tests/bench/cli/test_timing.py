@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from emb_runtime.can.messages import Layout
@@ -152,21 +151,6 @@ def test_of_several_logs_one_that_is_not_met_decides(write: Write, replay: Repla
 def test_a_file_that_is_no_log_is_unusable(tmp_path: Path, replay: Replay) -> None:
     (tmp_path / "x.mcap").write_bytes(b"nothing of the kind")
     replay.refused("timing", tmp_path / "x.mcap", code=6)
-
-
-def test_each_value_is_in_exactly_one_row_of_its_histogram(write: Write, replay: Replay) -> None:
-    rng = np.random.default_rng(5)
-    cycles = [
-        cycle(n, START + n * MS, wake_time_ns=START + n * MS + int(rng.lognormal(11.0, 1.0))) for n in range(1500)
-    ]
-    text = replay.text("timing", write(cycles, None), "-v", code=2)
-    part = text.split("\nsample to loop\n")[1].split("\n\n")[0].splitlines()
-    counts = [int(line.split("#")[0].split()[-1]) for line in part]
-    assert sum(counts) == 1500
-    assert all(("#" in line) == (count > 0) for line, count in zip(part, counts, strict=True))
-    # Every period is the same: one row holds them all.
-    (row,) = text.split("\nsample to sample\n")[1].split("\n\n")[0].splitlines()
-    assert row.split("#")[0].split()[-1] == "1499"
 
 
 def test_a_figure_of_an_unknown_format_is_refused_before_any_log_is_read(tmp_path: Path, replay: Replay) -> None:

@@ -1,0 +1,221 @@
+"""Summary of a run, and its timing beside the budgets of its bench, as text; base install only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from emb_bench.figures import COLOURS, GREY, drawn
+from emb_bench.logs.log import IMPORT, RunLog
+from emb_bench.logs.timing import INTERVALS, BudgetCheck, Timing, document, judge, quantiles, timing
+from emb_bench.numbers import NOTHING, around, percent, seconds
+from emb_bench.report.text import Table, facts, listed, wrapped
+from emb_runtime.config.timing_budgets import COUNTED, QUANTILE_NAMES
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE, LogError
+from emb_runtime.estimator.estimate import NORMAL_95
+from emb_runtime.system.terminal import one_line
+
+SHOWN = ("period", "age", "decision", "response", "slack")
+"""Intervals that get a histogram; sending has a row of the table."""
+UNITS = ((1.0, "s"), (1e3, "ms"), (1e6, "µs"))  # Of times, with their factors
+
+
+def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
+    """A :func:`emb_bench.logs.info.info_document` for a person; with ``verbose`` all metadata and events."""
+    d = _lines(d)
+    learnt, imported = d.get("learnt", {}), IMPORT in d["metadata"]
+    lines = listed("WARNING: ", [d["missing"]])
+    lines += wrapped(
+        f"{d['log']}: {d['exit_reason']}{_why(d['metadata'].get('emb.end', {}))}, {d['duration']:.3f} s, log "
+        f"{'complete' if d['complete'] else 'NOT complete'}"
+    )
+    lines += facts(
+        *(_recording(d) if imported else _loop(d["cycles"])),
+        ("largest", _largest(d.get("largest")) + (", in coordinates of the motor" if imported else "")),
+        *(("drive lacks", f"{name}: {lost}") for name, lost in d.get("drive_lacks", {}).items()),
+        ("response", _delays(d)),
+    )
+    if estimate := d.get("estimate"):
+        lines += ["", *wrapped("estimated while running; ± is half of the 95 % interval, if the model is right", 0)]
+        lines += [
+            f"  {name}  {around(q['value'], NORMAL_95 * q['deviation'])} {q['unit']}" for name, q in estimate.items()
+        ]
+    lines += facts(*(("learnt", f"{name} {low:.4f} to {high:.4f} of nominal") for name, (low, high) in learnt.items()))
+    if not verbose:
+        return "\n".join(lines)
+    lines += _listed("messages", {topic: f"{count:9}" for topic, count in d["messages"].items()})
+    lines += _listed("attachments", {name: f"{size:9} bytes" for name, size in d["attachments"].items()})
+    for name, record in d["metadata"].items():
+        lines += _listed(name, record)
+    return "\n".join([*lines, "", "events", *(f"  {event['code']:24} {event['text']}" for event in d["events"])])
+
+
+def _recording(d: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Samples of an imported recording, and the signals that it lacks."""
+    return [("samples", f"{d['cycles']['active']}, of a recording"), *(("lacks", lack) for lack in d.get("lacks", ()))]
+
+
+def _delays(d: Mapping[str, Any]) -> str:
+    """Time from a sample to the command that answers it."""
+    delays = d.get("sensor_to_command", {})
+    simulated = " (simulated time)" if "emb.truth" in d["metadata"] else ""
+    return (
+        ", ".join(f"{name} {1e6 * value:.0f}" for name, value in delays.items()) + f" µs{simulated}" if delays else ""
+    )
+
+
+def _loop(c: Mapping[str, int]) -> tuple[tuple[str, str], ...]:
+    """Counts of the control loop's cycles."""
+    return (
+        (
+            "cycles",
+            f"{c['active']} active, {c['answered']} answered, {c['unanswered']} unanswered, "
+            f"{c['missed_periods']} periods missed",
+        ),
+        (
+            "commands",
+            f"{c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home, "
+            f"{c['left']} left to the node",
+        ),
+    )
+
+
+def _lines(value: Any) -> Any:
+    """The document with all its strings as single lines: they come from the log."""
+    if isinstance(value, Mapping):
+        return {one_line(key): _lines(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_lines(item) for item in value]
+    return one_line(value) if isinstance(value, str) else value
+
+
+def _largest(largest: Mapping[str, float] | None) -> str:
+    if largest is None:
+        return ""
+    return (
+        f"angle {largest['angle_min']:.3f} to {largest['angle_max']:.3f} rad, speed {largest['speed']:.1f} rad/s, "
+        f"current {largest['current']:.3f} A"
+    )
+
+
+def _listed(title: str, entries: Mapping[str, str]) -> list[str]:
+    return ["", title, *(f"  {name:24} {said}" for name, said in entries.items())]
+
+
+def _why(end: Mapping[str, str]) -> str:
+    """Reasons of the loop and of the node."""
+    said = [end.get("detail", ""), f"the node's stop reason: {end['node_stop_reason']}" if _stopped(end) else ""]
+    return f" ({'; '.join(filter(None, said))})" if any(said) else ""
+
+
+def _stopped(end: Mapping[str, str]) -> bool:
+    return end.get("node_stop_reason", "NONE") not in ("NONE", "NEVER_COMMANDED")
+
+
+class RunTiming(NamedTuple):
+    """Timing of one run, and the checks of its budgets."""
+
+    log: RunLog
+    timing: Timing
+    checks: tuple[BudgetCheck, ...]  # Empty if no budget can be checked
+    why_not: str  # Reason that no budget can be checked; empty if one can
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of the command for this run alone."""
+        if self.why_not:
+            return EXIT_USAGE
+        return EXIT_DONE if all(check.met for check in self.checks) else EXIT_CHECK_FAILED
+
+
+def run_timing(log: RunLog) -> RunTiming:
+    """Timing of a run beside the budgets of its own bench.
+
+    Raises:
+        LogError: the log has no control cycles or no bench, or was imported.
+    """
+    if log.imported:
+        raise LogError(f"{log.path}: a recording of others has no loop whose timing could be told")
+    t = timing(log)
+    budgets = log.bench.budgets
+    if t.simulated:
+        return RunTiming(log, t, (), "the time was simulated: it says nothing of any computer or bus")
+    if ran := log.metadata.get("emb.run", {}).get("time"):
+        return RunTiming(log, t, (), f"time ran {ran}: it says nothing of any computer or bus")
+    if budgets is None:
+        return RunTiming(log, t, (), "the bench description in the log has no [budgets]")
+    checks = tuple(judge(t, budgets))
+    return RunTiming(log, t, checks, "" if checks else "the [budgets] of the bench description in the log are empty")
+
+
+def timing_document(entry: RunTiming) -> dict[str, Any]:
+    """Timing and budgets of one run; times in seconds."""
+    return {
+        "log": str(entry.log.path),
+        "missing": entry.log.missing,
+        **document(entry.timing),
+        "budgets": [{**check._asdict(), "met": check.met} for check in entry.checks],
+        "not_judged": entry.why_not,
+        "met": None if entry.why_not else all(check.met for check in entry.checks),
+    }
+
+
+def timing_text(entry: RunTiming, *, verbose: bool = False) -> str:
+    """Verdict on the budgets of a run, and its intervals; with ``verbose`` all budgets."""
+    t, missed = entry.timing, [check for check in entry.checks if not check.met]
+    if entry.why_not:
+        verdict = f"not judged: {entry.why_not}"
+    elif missed:
+        verdict = f"NOT MET: {len(missed)} of {len(entry.checks)} budgets ({', '.join(one.name for one in missed)})"
+    else:
+        verdict = f"met: all {len(entry.checks)} budgets"
+    obeyed = "commands not obeyed: not known" if t.not_obeyed is None else f"{t.not_obeyed} commands not obeyed"
+    answers = f"{len(t.response)} answered, {t.unanswered} unanswered, {t.missed} periods missed, {obeyed}"
+    lines = listed("WARNING: ", [entry.log.missing])
+    lines += [*wrapped(f"{entry.log.path}: {verdict}"), *facts(("samples", f"{t.samples}, {answers}"))]
+    if t.simulated:
+        return "\n".join(lines)
+    rows = [_row(said, list(quantiles(t.interval(name)).values())) for name, said in INTERVALS.items()]
+    lines += ["", *Table("", ("", *QUANTILE_NAMES, "unit"), rows, words=(0, len(QUANTILE_NAMES) + 1)).lines()]
+    shown = entry.checks if verbose else missed
+    rows = [[check.name, _check(check, check.budget), _check(check, check.measured), _met(check)] for check in shown]
+    if rows:
+        lines += ["", *Table("", ("budget", "at most", "measured", ""), rows, words=(0, 3)).lines()]
+    return "\n".join(lines)
+
+
+def _met(check: BudgetCheck) -> str:
+    return "met" if check.met else "NOT MET"
+
+
+def _check(check: BudgetCheck, value: float | None) -> str:
+    if value is None:
+        return "nothing"
+    return percent(value) if check.name in COUNTED else seconds(value)
+
+
+def _row(said: str, values: list[float]) -> list[str]:
+    """Quantiles of an interval, all in the unit that suits the largest."""
+    if not values:
+        return [said, *[NOTHING] * len(QUANTILE_NAMES), ""]
+    factor, unit = next(((f, u) for f, u in UNITS if max(map(abs, values)) * f >= 1.0), UNITS[-1])
+    return [said, *(f"{factor * value:.4g}" for value in values), unit]
+
+
+def draw_timing(path: Path, timings: Sequence[Timing]) -> None:
+    """Draw histograms of the intervals of all runs together.
+
+    Raises:
+        UsageError: matplotlib is missing, or the file cannot be written.
+    """
+    with drawn(path, len(SHOWN), 1, "Timing of the control cycles", (7.0, 9.0)) as axes:
+        for axis, colour, name in zip(axes[:, 0], COLOURS, SHOWN, strict=False):
+            values = 1e6 * np.concatenate([t.interval(name) for t in timings])
+            if len(values):
+                axis.hist(values, bins=60, color=colour, log=True)
+                axis.axvline(float(np.median(values)), color=GREY, linewidth=0.9, linestyle=(0, (5, 3)))
+            axis.set_xlabel(f"{INTERVALS[name]} [µs]")
+            axis.set_ylabel("count")
