@@ -16,8 +16,8 @@ from hypothesis import HealthCheck, settings
 from emb_bench.sim.transport import SimTransport, open_sim
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
+from emb_runtime.control.actor import Actor
 from emb_runtime.control.core import Core
-from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.estimator.estimator import Estimator

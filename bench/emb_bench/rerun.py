@@ -25,9 +25,8 @@ from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_runtime.can.e2e import COUNTER_MODULUS
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import CEILING_CURRENT
+from emb_runtime.control.actor import Actor, Still, homing_steps
 from emb_runtime.control.core import Core, Proposal
-from emb_runtime.control.homing import Still, homing_steps
-from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import detail_of, fault_of
 from emb_runtime.control.result import Outcome
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition

@@ -6,7 +6,7 @@ constructor of a named tuple is interpreted, also where it is called from compil
 
 from __future__ import annotations
 
-from enum import IntEnum, IntFlag
+from enum import IntEnum, IntFlag, StrEnum
 from typing import NamedTuple
 
 
@@ -65,6 +65,18 @@ class RunState(IntEnum):
     STOPPING = 4  # Sends stop frames
     OVER = 5
     HOMING = 6  # Stands in place of ACTIVE where the brake is brought back to the origin
+
+
+class RunType(StrEnum):
+    """Type of a run, as in the log's metadata under ``purpose``."""
+
+    EXPERIMENT = "experiment"
+    HOMING = "homing"  # To bring the brake to the origin
+    LISTEN_ONLY = "reading"  # To see what is on the bus
+
+
+HOMING_LOG = "-home"
+LISTEN_ONLY_LOG = "-read"  # Endings, before the suffix, of the names of logs that hold no experiment
 
 
 class Reason(IntFlag):

@@ -15,7 +15,7 @@ from emb_bench.rerun import rerun
 from emb_runtime.can.messages import Layout
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import Bench
-from emb_runtime.control.homing import Still, homing_steps
+from emb_runtime.control.actor import Still, homing_steps
 from emb_runtime.records import RunState
 from tests.actors import constant_actor
 from tests.bench.conftest import Replay

@@ -20,7 +20,7 @@ with atheris.instrument_imports(
     include=[
         "emb_runtime.can.codec",
         "emb_runtime.can.e2e",
-        "emb_runtime.can.error_frames",
+        "emb_runtime.can.receiver",
         "emb_runtime.can.messages",
         "emb_runtime.safety.guard",
         "emb_runtime.can.receiver",

@@ -6,9 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from emb_runtime.can.error_frames import BUS_OFF
 from emb_runtime.can.messages import Layout, StopReason
-from emb_runtime.can.receiver import Reception
+from emb_runtime.can.receiver import BUS_OFF, Reception
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState
 from emb_runtime.safety.guard import Guard, GuardRejectedError

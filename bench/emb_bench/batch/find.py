@@ -8,7 +8,7 @@ from pathlib import Path, PurePath
 
 from emb_bench.batch.row import Source
 from emb_runtime.errors import UsageError
-from emb_runtime.run_type import HOMING_LOG, LISTEN_ONLY_LOG
+from emb_runtime.records import HOMING_LOG, LISTEN_ONLY_LOG
 
 SUFFIX = ".mcap"
 PASSED_OVER = (HOMING_LOG + SUFFIX, LISTEN_ONLY_LOG + SUFFIX)  # Logs of emb-run that hold no experiment

@@ -24,7 +24,7 @@ from emb_runtime.config.toml_text import parse_toml
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, SafetyStopError, UsageError
 from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, SAMPLE, Contract, PolicyLimits, Vector
 from emb_runtime.safety.state_machine import Fault
-from emb_runtime.system import signals
+from emb_runtime.system import terminal
 
 WORKING, LEARNING_FILE, FOUND = "working.toml", "working-learning.toml", "bench.toml"
 """Names of the bench files in the folder."""
@@ -207,7 +207,7 @@ def emb_run(arguments: Sequence[str]) -> Mapping[str, Any]:
         StepFailedError: it printed no document; it has said why.
     """
     code = "import sys; from emb_runtime.system.entry import emb_run; sys.exit(emb_run())"
-    before = {number: signal.getsignal(number) for number in signals.ENDING}
+    before = {number: signal.getsignal(number) for number in terminal.ENDING}
     process = subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, text=True)
     ended: list[int] = []
 

@@ -26,7 +26,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, Ranges
 from emb_runtime.config.plants import Instruments, Mechanics, Plant
 from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.errors import LogError
-from emb_runtime.run_type import RunType
+from emb_runtime.records import RunType
 
 MOST_JITTER = 1e-4  # Jitter that is believed, at most [s]
 CERTAIN = 4.0  # Standard errors from which on a jitter is taken for one

@@ -37,7 +37,7 @@ from emb_bench.sim.open_loop import feedback
 from emb_bench.sim.simulated_brake import parse_assignments
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.config.plants import Mechanics
-from emb_runtime.control.interfaces import Actor
+from emb_runtime.control.actor import Actor
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.safety.sensor_monitor import CONFIRMED, MEMORY, begin, judge, largest_current

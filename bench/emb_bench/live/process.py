@@ -13,7 +13,7 @@ from pathlib import Path
 from emb_bench.live.follow import Lines, NewLogs, Viewer, follow
 from emb_bench.live.serve import Server
 from emb_runtime.errors import LogError, UsageError
-from emb_runtime.system import child_side
+from emb_runtime.system import child_process
 from emb_runtime.system.realtime import step_back
 from emb_runtime.system.terminal import mention
 
@@ -24,15 +24,15 @@ def main(arguments: list[str]) -> int:
     """Show one run. Returns the exit status."""
     step_back()
     (fd,) = map(int, arguments)
-    document = child_side.read_document(fd)
+    document = child_process.read_document(fd)
     viewer: Viewer
     try:
         viewer = Lines(mention) if document["port"] is None else Server(port=document["port"])
     except UsageError as err:
-        child_side.answer({"error": str(err)})
+        child_process.answer({"error": str(err)})
         return 1
     logs = NewLogs(Path(document["folder"]), document["pattern"])
-    child_side.answer({"ready": viewer.address if isinstance(viewer, Server) else ""})
+    child_process.answer({"ready": viewer.address if isinstance(viewer, Server) else ""})
     follow(logs, viewer, _wait, _complain)
     if isinstance(viewer, Server):
         viewer.close()

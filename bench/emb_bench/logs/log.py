@@ -29,8 +29,7 @@ from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.drives.mapping_file import parse_mapping
 from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
 from emb_runtime.log.mcap_schema import FIXED_TOPICS, LEARNT
-from emb_runtime.records import CycleRecord, Frame
-from emb_runtime.run_type import RunType
+from emb_runtime.records import CycleRecord, Frame, RunType
 from emb_runtime.system import terminal
 from emb_runtime.system.input_file import open_regular
 

@@ -20,8 +20,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, parse_bench
 from emb_runtime.config.plants import IMPORTED_PLANT
 from emb_runtime.config.systematic import Systematic
 from emb_runtime.log.recorder_process import LogWriter
-from emb_runtime.records import CycleRecord, NodeState, RunState
-from emb_runtime.run_type import RunType
+from emb_runtime.records import CycleRecord, NodeState, RunState, RunType
 from emb_runtime.system.input_file import open_regular
 
 COUNTERS = 15  # Values of the counter that each command gets, so that a reader knows which sample it answered

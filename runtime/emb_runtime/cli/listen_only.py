@@ -16,8 +16,7 @@ from emb_runtime.cli.summary import log_facts, result_facts
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_DONE, EXIT_LOG, BusError
 from emb_runtime.log.recorder import Recorder, RecorderResult
-from emb_runtime.records import Frame
-from emb_runtime.run_type import RunType
+from emb_runtime.records import Frame, RunType
 from emb_runtime.safety.state_machine import FAULTS, Event, Fault, StateMachine, timeouts
 from emb_runtime.system.terminal import as_json
 

@@ -16,9 +16,8 @@ from emb_runtime.cli.repeat import campaign, experiment
 from emb_runtime.cli.session import Bus, Console
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError
-from emb_runtime.run_type import LISTEN_ONLY_LOG
-from emb_runtime.system.signals import StopRequest
-from emb_runtime.system.terminal import ARM_QUESTION, as_json, complain, confirmed, mention, show
+from emb_runtime.records import LISTEN_ONLY_LOG
+from emb_runtime.system.terminal import ARM_QUESTION, StopRequest, as_json, complain, confirmed, mention, show
 
 LISTEN_NS = 50_000_000  # Time between two looks at the keyboard [ns]
 

@@ -15,10 +15,10 @@ from emb_runtime.cli import summary
 from emb_runtime.cli.bus_monitor import BusStatistics
 from emb_runtime.cli.options import Plan, log_path
 from emb_runtime.cli.session import Bus, Console, conduct, observe
-from emb_runtime.control.homing import may_go_home
+from emb_runtime.control.result import may_go_home
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError
-from emb_runtime.run_type import HOMING_LOG, RunType
+from emb_runtime.records import HOMING_LOG, RunType
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from emb_runtime.config.bench import LEARNING
 from emb_runtime.estimator.estimate import Quantity
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder import Attachment, LogHeader
-from emb_runtime.run_type import RunType
+from emb_runtime.records import RunType
 from emb_runtime.system import compiled_core
 from emb_runtime.system.clock import Clock
 

@@ -21,17 +21,15 @@ from emb_runtime.cli.options import Plan, Stage
 from emb_runtime.cli.preflight import CheckResult, Findings, check, interrupted, refuse
 from emb_runtime.cli.run_metadata import header, log_bytes
 from emb_runtime.cli.summary import RunResult, trailer
+from emb_runtime.control.actor import Actor, Still, homing_steps
 from emb_runtime.control.core import Core
-from emb_runtime.control.homing import Still, homing_steps
-from emb_runtime.control.interfaces import Actor
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Level
 from emb_runtime.policy.policy import Policy
-from emb_runtime.records import Frame, SensorSample
-from emb_runtime.run_type import RunType
+from emb_runtime.records import Frame, RunType, SensorSample
 from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import Unwatched

@@ -16,7 +16,7 @@ from emb_runtime.estimator import estimate
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.learning.learner import ranges_of
 from emb_runtime.log.recorder import RecorderResult
-from emb_runtime.run_type import RunType
+from emb_runtime.records import RunType
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.safety.watchdog import WatchdogResult
 

@@ -21,11 +21,10 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, LeakyCount, next_counter
-from emb_runtime.can.error_frames import BUS_OFF
 from emb_runtime.can.messages import Layout, StatusFrame
-from emb_runtime.can.receiver import Reception
+from emb_runtime.can.receiver import BUS_OFF, Reception
 from emb_runtime.config.bench import CEILING_CURRENT, Bench
-from emb_runtime.control.interfaces import Actor
+from emb_runtime.control.actor import Actor
 from emb_runtime.control.result import Outcome, RunCounters
 from emb_runtime.control.start_conditions import READY_PAIRS, Bounds, StartConditions
 from emb_runtime.control.stop_condition import REACHED, StopCondition

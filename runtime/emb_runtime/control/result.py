@@ -87,3 +87,24 @@ class Outcome:
     """Brakes and states that were possible at the last sample; None where the shield learnt nothing."""
     goal_reached: bool = False  # The experiment ended early because the stop condition was met
     goal_ns: int = 0  # Time from the first sample to the one at which it was met, device time [ns]; 0 if it was not
+
+
+TRUSTED_AFTER = frozenset(
+    {
+        Fault.POLICY_NOT_FINITE,
+        Fault.POLICY_BEYOND_CONTRACT,
+        Fault.NOT_OBEYED,
+        Fault.SENSOR_LOST,
+        Fault.NODE_STOPPED,
+        Fault.INCOMPLETE,
+    }
+)
+"""Faults after which brake, drive and bus are as they were: the policy or this computer's timing was at fault.
+After the others a person should look before anything moves again."""
+
+
+def may_go_home(outcome: Outcome) -> bool:
+    """Returns True if the brake may move by itself after such a run, once the node has come to rest."""
+    return outcome.node_stop_reason is not StopReason.LIMIT and (
+        outcome.fault is None or outcome.fault in TRUSTED_AFTER
+    )

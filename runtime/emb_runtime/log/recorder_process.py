@@ -45,7 +45,7 @@ from emb_runtime.log.ring_buffer import (
     unpack,
 )
 from emb_runtime.records import CycleRecord, Frame
-from emb_runtime.system import child_side
+from emb_runtime.system import child_process
 from emb_runtime.system.realtime import step_back
 
 CHUNK = 256 * 1024  # Bytes after which a chunk is closed
@@ -374,18 +374,18 @@ def begin(ring: Ring, header: Mapping[str, Any]) -> Recording:
 
 def main(arguments: list[str]) -> int:
     """Record one run. Returns the exit status."""
-    child_side.leave_ending_to_parent()
+    child_process.leave_ending_to_parent()
     step_back()
     ring_fd, header_fd = map(int, arguments)
-    header = child_side.read_document(header_fd)
+    header = child_process.read_document(header_fd)
     try:
         recording = begin(Ring(ring_fd), header)
     except LogError as err:
-        child_side.answer({"error": str(err)})
+        child_process.answer({"error": str(err)})
         return 1
-    child_side.answer({"ready": True})
+    child_process.answer({"ready": True})
     answer = recording.run()
-    child_side.answer(answer)
+    child_process.answer(answer)
     return 1 if answer["error"] else 0
 
 

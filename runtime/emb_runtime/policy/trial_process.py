@@ -14,13 +14,13 @@ import sys
 import time
 
 from emb_runtime.errors import EmbError
-from emb_runtime.system import child_side
-from emb_runtime.system.confinement import confine, end_with
+from emb_runtime.system import child_process
+from emb_runtime.system.child_process import confine, end_with
 
 
 def main(arguments: list[str]) -> int:
     """Try one policy. Returns the exit status."""
-    document = child_side.read_document(int(arguments[0]))
+    document = child_process.read_document(int(arguments[0]))
     end_with(document["parent"])
     import onnxruntime  # noqa: F401  # so that it is part of the time that is measured
 
@@ -32,15 +32,15 @@ def main(arguments: list[str]) -> int:
     os.dup2(nowhere, 2)  # what a library has to say when it fails is not for the user
     seconds = document["multiple"] * time.process_time()
     confine(document["memory"], seconds)
-    child_side.answer({"ready": seconds})
+    child_process.answer({"ready": seconds})
     try:
         load_policy(data, bench)
     except EmbError as err:
-        child_side.answer({"refused": str(err)})
+        child_process.answer({"refused": str(err)})
     except MemoryError:
-        child_side.answer({"refused": f"loading it takes more than {document['memory'] >> 20} MiB of memory"})
+        child_process.answer({"refused": f"loading it takes more than {document['memory'] >> 20} MiB of memory"})
     else:
-        child_side.answer({"accepted": True})
+        child_process.answer({"accepted": True})
     return 0
 
 

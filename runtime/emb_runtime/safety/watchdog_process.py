@@ -34,7 +34,7 @@ from emb_runtime.config.bench import parse_bench
 from emb_runtime.errors import EmbError
 from emb_runtime.records import CurrentCommand, Frame
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat
-from emb_runtime.system import child_side, realtime
+from emb_runtime.system import child_process, realtime
 from emb_runtime.system.clock import Clock
 
 PRIORITY = realtime.PRIORITY + 10  # Above the loop's, which may hog the only processor
@@ -206,15 +206,15 @@ def _unbind(descriptors: Sequence[int]) -> None:
 
 def main(arguments: list[str]) -> int:
     """Watch over one run. Returns the exit status."""
-    child_side.leave_ending_to_parent()
+    child_process.leave_ending_to_parent()
     heartbeat_fd, *loop_sockets, document_fd = map(int, arguments)
-    document = child_side.read_document(document_fd)
+    document = child_process.read_document(document_fd)
     bench = parse_bench(document["bench"], "bench")
     try:
         transport, clock = open_transport(document["iface"], bench, identifiers=())
         wait = _loop_is_gone(int(document["parent"]), clock)
     except (EmbError, OSError) as err:
-        child_side.answer({"error": str(err)})
+        child_process.answer({"error": str(err)})
         return 1
     watchdog = Watchdog(
         heartbeat=Heartbeat(heartbeat_fd),
@@ -226,8 +226,8 @@ def main(arguments: list[str]) -> int:
         wait=wait,
     )
     obtained = realtime.obtain(priority=PRIORITY) if document["real_time"] else {}
-    child_side.answer({"ready": True, "realtime": obtained})
-    child_side.answer(watchdog.run())
+    child_process.answer({"ready": True, "realtime": obtained})
+    child_process.answer(watchdog.run())
     transport.close()
     return 0
 

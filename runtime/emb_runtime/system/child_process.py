@@ -1,21 +1,32 @@
-"""A process of our own: it takes one document, answers in lines of JSON, and ends when its standard input does."""
+"""Processes of our own: each takes one document, answers in lines of JSON, and ends when its standard input does.
+
+The runtime's side is :class:`Child`; the functions below it are for the child.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import gc
 import json
+import math
 import os
 import select
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
+
+from emb_runtime.system.terminal import ENDING
 
 HAS_CHILD_PROCESSES = sys.platform == "linux"  # True where there are processes of our own
 END_TIMEOUT = 1.0  # Time for the process to end when nothing is asked of it any more; then it is killed [s]
 
 MAX_ANSWER = 1 << 20  # Longest line that it may answer [bytes]
+_PR_SET_PDEATHSIG = 1
 
 
 class Child:
@@ -125,3 +136,64 @@ class Child:
 
 def _ending(code: int) -> str:
     return f"signal {-code}" if code < 0 else f"exit status {code}"
+
+
+# --- the child's side ------------------------------------------------------------------------------------------------
+
+
+def leave_ending_to_parent() -> None:
+    """Ignore the signals that end a run: the runtime decides when it is over."""
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def read_document(fd: int) -> dict[str, Any]:
+    """Read what the parent has written for this process, from the memory that it has passed as a file descriptor."""
+    gc.freeze()  # or Python searches all that was imported for garbage before it ends
+    with os.fdopen(fd, "rb") as memory:
+        memory.seek(0)
+        document: dict[str, Any] = json.loads(memory.read())
+    return document
+
+
+def answer(document: Mapping[str, Any]) -> None:
+    """Write one line of JSON to the parent; one that is gone hears nothing."""
+    with contextlib.suppress(OSError):
+        os.write(1, json.dumps(dict(document)).encode() + b"\n")
+
+
+def end_with(parent: int) -> None:
+    """End this process when the one that started it ends.
+
+    Args:
+        parent: its process id.
+    """
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, *map(ctypes.c_ulong, (signal.SIGKILL, 0, 0, 0)))
+    if os.getppid() != parent:  # it was gone before
+        os._exit(1)
+
+
+def confine(memory: int, seconds: float) -> None:
+    """Limit this process for good: it handles what nobody vouches for. It keeps the rights of its user.
+
+    The limits are against files that take too much, not against ones that take over the process, and hold for each
+    process: a copy that it makes of itself has them anew.
+
+    Args:
+        memory: bytes that it may take besides those that it has.
+        seconds: processor time that it may take besides what it has taken; rounded up to whole seconds.
+    """
+    import resource  # Linux only, as all of this
+
+    def limit(which: int, value: int) -> None:
+        """Set a limit, unless there is a narrower one."""
+        _, most = resource.getrlimit(which)
+        value = value if most == resource.RLIM_INFINITY else min(value, most)
+        resource.setrlimit(which, (value, value))
+
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit(resource.RLIMIT_AS, pages * resource.getpagesize() + memory)
+    limit(resource.RLIMIT_CPU, math.ceil(used.ru_utime + used.ru_stime + seconds))
+    limit(resource.RLIMIT_FSIZE, 0)
+    limit(resource.RLIMIT_CORE, 0)

@@ -1,4 +1,4 @@
-"""Output of a command: results on standard output, errors in one line on standard error.
+"""The operator's end of a command: results on standard output, errors in one line on standard error, the wish to end.
 
 Whatever a text is made of, names and strings of files included, it can do nothing to the terminal: characters that
 control one are written as escape sequences, visibly.
@@ -12,6 +12,7 @@ import math
 import os
 import re
 import select
+import signal
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -20,6 +21,8 @@ from emb_runtime.errors import EmbError, UsageError
 
 LONGEST_MESSAGE = 1000  # Characters of an error's message
 LONGEST_STRING = 2000  # Characters of a string from outside
+ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Signals with which an operator ends a command, those of them that this operating system has."""
 ARM_QUESTION = "Arm now? y and Enter does, anything else ends here."
 
 _CONTROL = re.compile(
@@ -67,6 +70,23 @@ def mention(text: str) -> None:
         with contextlib.suppress(OSError):
             sys.stderr.write(escaped(text, "\n") + "\n")
             sys.stderr.flush()
+
+
+class StopRequest:
+    """Set by Ctrl-C, SIGTERM and SIGHUP from now on, asked by the loop."""
+
+    def __init__(self) -> None:
+        self._requested = False
+        for number in ENDING:
+            if signal.getsignal(number) is not signal.SIG_IGN:  # nohup asked for that one to be ignored
+                signal.signal(number, self._request)
+
+    def __call__(self) -> bool:
+        """Returns True if an end is wanted."""
+        return self._requested
+
+    def _request(self, _signal: int, _frame: object) -> None:
+        self._requested = True
 
 
 def forget_typed() -> None:

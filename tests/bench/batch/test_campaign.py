@@ -24,7 +24,7 @@ from emb_bench.cli.replay import main
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.run_type import RunType
+from emb_runtime.records import RunType
 
 from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip

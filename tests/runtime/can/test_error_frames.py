@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_runtime.can.error_frames import BUS_OFF, CONTROLLER_KINDS, KINDS, UNKNOWN, WITHOUT_DETAILS, classify
+from emb_runtime.can.receiver import BUS_OFF, CONTROLLER_KINDS, KINDS, UNKNOWN, WITHOUT_DETAILS, classify
 from emb_runtime.records import Frame
 
 

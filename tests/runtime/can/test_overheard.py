@@ -14,7 +14,7 @@ from emb_runtime.cli.session import Bus, drop_backlog
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
-from emb_runtime.system.signals import StopRequest
+from emb_runtime.system.terminal import StopRequest
 from tests.runtime.operating import Keyboard
 
 MS = 1_000_000

@@ -15,8 +15,7 @@ import can
 import pytest
 from can.interfaces.virtual import VirtualBus
 
-from emb_runtime.can.interfaces import open_transport
-from emb_runtime.can.python_can import PythonCan
+from emb_runtime.can.interfaces import PythonCan, open_transport
 from emb_runtime.can.transport import Datagram, SocketCan, TransmitQueueFullError, Transport
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import BusError, UsageError

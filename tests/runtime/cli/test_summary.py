@@ -18,8 +18,7 @@ from emb_runtime.config.bench import Bench
 from emb_runtime.control.result import Outcome, RunCounters
 from emb_runtime.errors import BusError, UsageError
 from emb_runtime.log.recorder import RecorderResult
-from emb_runtime.records import NodeState
-from emb_runtime.run_type import RunType
+from emb_runtime.records import NodeState, RunType
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.safety.watchdog import WatchdogResult
 from tests.actors import contract_for

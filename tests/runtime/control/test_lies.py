@@ -16,7 +16,7 @@ import pytest
 
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import Bench, load_bench
-from emb_runtime.control.interfaces import Actor
+from emb_runtime.control.actor import Actor
 from emb_runtime.control.result import Outcome
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import Frame

@@ -350,7 +350,7 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
                 mentions.add((path.relative_to(folder).as_posix(), ast.unparse(node)))
     assert mentions == {
         ("can/transport.py", "self._socket.send"),
-        ("can/python_can.py", "self._bus.send"),
+        ("can/interfaces.py", "self._bus.send"),
         ("safety/guard.py", "self._send"),
         ("cli/session.py", "bus.transport.send"),  # handed to the guard, and kept by nobody else
         ("control/loop.py", "core.guard.send"),

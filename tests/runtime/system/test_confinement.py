@@ -10,7 +10,7 @@ from pathlib import Path
 
 PROGRAM = """
 import json, signal, sys
-from emb_runtime.system.confinement import confine
+from emb_runtime.system.child_process import confine
 confine(64 << 20, 1.0)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 def tried(action):
@@ -36,6 +36,6 @@ def test_memory_processor_time_and_files_are_limited(tmp_path: Path) -> None:
 
 
 def test_it_does_not_begin_when_the_one_that_started_it_is_gone() -> None:
-    code = "from emb_runtime.system.confinement import end_with\nend_with(1)\nprint('here')"
+    code = "from emb_runtime.system.child_process import end_with\nend_with(1)\nprint('here')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert (done.returncode, done.stdout) == (1, b"")
