@@ -1,4 +1,4 @@
-"""What decides in a run: the interface of the core to it, and the actor of the way home."""
+"""Interface of the core to the source of currents, and the actor of the way home."""
 
 from __future__ import annotations
 
