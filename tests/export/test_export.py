@@ -266,20 +266,9 @@ def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("bad.json").write_text("{")
     Path("10:30").mkdir()  # a directory, and no excitation with options
     before = sorted(tmp_path.iterdir())
     for arguments in (
-        ["step"],
-        ["constant-speed", "--out", "x.onnx"],  # a feedback law
-        ["sawtooth:f=1", "--out", "x.onnx"],
-        ["none.csv", "--out", "x.onnx"],
-        ["none.json", "--out", "x.onnx"],
-        ["bad.json", "--out", "x.onnx"],
-        ["four-d-exact-blind"],
-        ["step", "--bench", "none.toml", "--out", "x.onnx"],
-        ["step", "--out", "."],
-        ["nowhere", "--out", "x.onnx"],
         ["10:30"],
         [str(run), "--out", "none/actor.onnx"],
         [str(run), "--bench", str(run / BENCH_FILE)],

@@ -171,38 +171,6 @@ def test_a_result_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.parquet"]
 
 
-def test_what_cannot_be_done_is_refused_in_one_line_before_any_log_is_read(tmp_path: Path, replay: Replay) -> None:
-    (tmp_path / "1.mcap").touch()
-    (tmp_path / "none").mkdir()
-    (tmp_path / "folder.csv").mkdir()
-    os.mkfifo(tmp_path / "pipe.csv")
-    result, bench = tmp_path / "r.parquet", Path("runtime/emb_runtime/config/bench.toml").resolve()
-    refused: list[tuple[str | Path, ...]] = [
-        *((tmp_path / name, "-o", result) for name in ("nowhere", "none")),
-        *(
-            (tmp_path, "-o", tmp_path / name)
-            for name in ("r.txt", "r", "r.parquet.gz", "folder.csv", "nowhere/r.csv", "pipe.csv")
-        ),
-        *(
-            (tmp_path, "-o", result, "--bench", bench, *option)
-            for option in (
-                ("--jobs", "0"),
-                ("--starts", "0"),
-                ("--time-limit", "nan"),
-                ("--params", "spring"),
-                ("--nuisance", "stribeck_exponent"),
-                ("--model", "wooden"),
-                ("--prior", "wide"),
-            )
-        ),
-    ]
-    before = sorted(tmp_path.iterdir())
-    for arguments in refused:
-        replay.refused("campaign", *arguments)
-    assert sorted(tmp_path.iterdir()) == before
-    assert (tmp_path / "pipe.csv").is_fifo()
-
-
 def test_a_ray_that_is_not_there_is_refused_at_once(tmp_path: Path, replay: Replay) -> None:
     (tmp_path / "1.mcap").touch()
     with socket.socket() as nobody:

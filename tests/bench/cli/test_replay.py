@@ -172,11 +172,6 @@ def test_parameters_from_an_estimate_replace_nominal_ones(tmp_path: Path, path: 
         f_v = said["parameters"]["f_v"]["value"]
         assert found["theta"]["name"] == "estimate.json"
         assert found["physical"] == replay.document("fim", path, "--theta", f"f_v={f_v!r}")["physical"]
-    for text in ("[]", '{"parameters": {"J": {"value": 1}}}', '{"parameters": {"k_m": {"value": null}}}', "{"):
-        file.write_text(text)
-        replay.refused("fim", path, "--theta", file)
-    file.write_text('{"parameters": {"k_m": 1e9}}')
-    assert "k_m" in replay.refused("fim", path, "--theta", file)
 
 
 def test_the_command_calculates_on_one_thread_unless_the_caller_says_another_number() -> None:
@@ -231,13 +226,6 @@ def test_another_bench_file_replaces_the_noise_of_the_one_in_the_log(
     file.write_text(noisy)
     once, ten = replay.document("fim", path), replay.document("fim", path, "--bench", file)
     np.testing.assert_allclose(np.array(ten["physical"]["matrix"]) * 100.0, once["physical"]["matrix"], rtol=1e-9)
-
-
-def test_a_bench_file_with_another_sample_time_is_refused(tmp_path: Path, path: Path, replay: Replay) -> None:
-    file = tmp_path / "bench.toml"
-    file.write_text(shipped_bench_text().replace("sample_time = 1.0e-3", "sample_time = 2.0e-3"))
-    said = replay.refused("fim", path, "--bench", file)
-    assert said.endswith("expected the sample time of the log, 0.001 s, got 0.002 s\n")
 
 
 def test_a_cut_log_says_first_what_is_missing_and_gives_the_rest(path: Path, replay: Replay) -> None:
@@ -313,36 +301,6 @@ def test_info_says_when_a_log_is_cut(path: Path, replay: Replay) -> None:
     cut = replay.text("info", path)
     assert cut.startswith("WARNING")
     assert "NOT complete" in cut
-
-
-def test_a_wrong_argument_is_one_line_that_names_it(path: Path, replay: Replay) -> None:
-    fim = ("fim", path)
-    for arguments, name in {
-        (*fim, "--params", "k_m,x"): "'x'",
-        (*fim, "--params", ""): "parameter",
-        (*fim, "--params", "k_m,k_m"): "k_m",
-        (*fim, "--model", "rubber"): "rubber",
-        (*fim, "--nuisance", "x"): "'x'",
-        (*fim, "--nuisance", "k_m"): "k_m",
-        (*fim, "--prior", "narrow"): "narrow",
-        (*fim, "--params", "J", "--prior", "pm50"): "J",
-        (*fim, "--theta", "absent.toml"): "absent.toml",
-        (*fim, "--bench", "absent.toml"): "absent.toml",
-        ("fim", "absent.mcap"): "absent.mcap",
-        ("info", "absent.mcap"): "absent.mcap",
-        ("info", path.parent): str(path.parent),
-    }.items():
-        assert name in replay.refused(*arguments)
-
-
-def test_a_parameter_file_is_checked(tmp_path: Path, path: Path, replay: Replay) -> None:
-    file = tmp_path / "theta.toml"
-    for value in ("'x'", "-1.0", "nan", "inf", "1.0", "true"):
-        file.write_text(f"f_v = {value}")
-        assert "f_v" in replay.refused("fim", path, "--theta", file)
-    for text in ("k_1 = 0", "J = 1.0", "f_v = ", "\udcff"):
-        file.write_bytes(text.encode("utf-8", "surrogateescape"))
-        replay.refused("fim", path, "--theta", file)
 
 
 @pytest.mark.parametrize("name", ["rubber", "all", "", "\x1b[31m"])

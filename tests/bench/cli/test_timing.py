@@ -148,16 +148,6 @@ def test_of_several_logs_one_that_is_not_met_decides(write: Write, replay: Repla
     ]
 
 
-def test_a_file_that_is_no_log_is_unusable(tmp_path: Path, replay: Replay) -> None:
-    (tmp_path / "x.mcap").write_bytes(b"nothing of the kind")
-    replay.refused("timing", tmp_path / "x.mcap", code=6)
-
-
-def test_a_figure_of_an_unknown_format_is_refused_before_any_log_is_read(tmp_path: Path, replay: Replay) -> None:
-    for name, reason in (("x.bogus", "ends in .png or .pdf or .svg"), ("x", "ends in"), ("no/x.png", "no folder")):
-        assert reason in replay.refused("timing", tmp_path / "none.mcap", "--plot", tmp_path / name)
-
-
 def test_the_figure_has_the_format_that_its_name_says(write: Write, tmp_path: Path, replay: Replay) -> None:
     path = write(punctual(), "[budgets.response]\np50 = 1e-3\n")
     figure = tmp_path / "timing.svg"

@@ -139,29 +139,6 @@ def test_an_incomplete_log_is_exported_with_a_warning_first(path: Path, tmp_path
     assert document["missing"].startswith("the file is cut")
 
 
-def test_what_cannot_be_exported_is_one_line_and_leaves_no_file(path: Path, tmp_path: Path, replay: Replay) -> None:
-    (tmp_path / "bad.mcap").write_bytes(b"bad")
-    refused: list[tuple[int, tuple[str | Path, ...]]] = []
-    for form in FORMATS:
-        to, name = ("--to", form, "-o"), "out.png" if form == "plot" else f"out.{form}"
-        (tmp_path / f"kept.{name}").write_bytes(b"kept")
-        refused += [
-            (2, (path, *to, tmp_path / f"kept.{name}")),
-            (2, (path, *to, tmp_path / "nowhere" / name)),
-            (6, (tmp_path / "bad.mcap", *to, tmp_path / name)),
-            (2, (tmp_path / "none.mcap", *to, tmp_path / name)),
-            *((2, (path, *to, tmp_path / wrong)) for wrong in ("new", "new.out", f"{form}.mcap", "new.csvs")),
-        ]
-    refused += [
-        (2, (path, "--to", "csv", "-o", tmp_path / "new.csv", "--topic", "/cycles")),
-        (2, (path, "--to", "plot", "-o", tmp_path / "new.png", "--topic", "/cycle")),
-    ]
-    before = {p: p.read_bytes() for p in tmp_path.iterdir()}
-    for code, arguments in refused:
-        replay.refused("export", *arguments, code=code)
-    assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
-
-
 def test_a_missing_extra_is_named(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replay: Replay) -> None:
     for form, name, module in (("csv", "out.csv", "pyarrow"), ("plot", "out.png", "matplotlib")):
         with monkeypatch.context() as missing:

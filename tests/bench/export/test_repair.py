@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
 import tracemalloc
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -187,17 +186,6 @@ def test_a_log_that_is_whole_is_left_alone(path: Path, tmp_path: Path, replay: R
     assert not out.exists()
     expected = {"log": str(path), "written": None, "missing": "", "messages": None}
     assert replay.document("repair", path, "-o", out) == expected
-
-
-def test_a_file_that_exists_is_never_overwritten(path: Path, tmp_path: Path, replay: Replay) -> None:
-    cut, kept = tmp_path / "cut.mcap", tmp_path / "kept.mcap"
-    cut.write_bytes(path.read_bytes()[:-5])
-    shutil.copy(path, kept)
-    for target in (kept, cut, path):
-        before = target.read_bytes()
-        err = replay.refused("repair", cut, "-o", target)
-        assert target.read_bytes() == before
-        assert err == f"emb-replay: {target}: exists, and nothing is overwritten: choose another name\n"
 
 
 def test_an_output_that_cannot_be_written_is_one_line(path: Path, tmp_path: Path) -> None:

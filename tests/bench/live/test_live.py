@@ -23,7 +23,6 @@ from mcap import records as mcap
 from mcap.reader import make_reader
 from websockets.sync.client import ClientConnection, connect
 
-from emb_bench.cli.replay import main as emb_replay
 from emb_bench.live.follow import Lines, NewLogs, chunks, follow
 from emb_bench.live.serve import Server
 from emb_bench.logs.log import read_log
@@ -340,12 +339,6 @@ def test_a_port_that_is_taken_is_refused_in_one_line_before_anything_runs(
     assert not list(tmp_path.rglob("*.mcap"))
 
 
-def test_a_port_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    for wanted in ("-1", "65536", "line", ""):
-        assert emb_run.main([f"--live={wanted}"]) == EXIT_USAGE
-        assert "--live: expected a port" in capsys.readouterr().err
-
-
 def test_a_run_that_is_shown_is_the_same_run(shipped: Path, tmp_path: Path) -> None:
     log = tmp_path / "run.mcap"
     arguments = ["-m", "emb_runtime.cli.main", "--iface", "sim", "--no-rt", "--log", str(log), "--live", "lines"]
@@ -355,13 +348,6 @@ def test_a_run_that_is_shown_is_the_same_run(shipped: Path, tmp_path: Path) -> N
     ours, theirs = (read_log(path).cycles for path in (log, shipped))
     for column in ("step", "angle", "velocity", "policy_current", "sent_current", "state", "reasons"):
         assert list(map(repr, ours[column].tolist())) == list(map(repr, theirs[column].tolist())), column
-
-
-def test_a_place_in_a_folder_that_does_not_exist_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "file").touch()
-    for place in ("nowhere/run.mcap", "nowhere/runs", "file/run.mcap"):
-        assert emb_replay(["live", "--lines", str(tmp_path / place)]) == EXIT_USAGE
-        assert f"there is no folder {(tmp_path / place).parent}" in capsys.readouterr().err
 
 
 def test_ctrl_c_is_how_watching_a_folder_ends(tmp_path: Path) -> None:

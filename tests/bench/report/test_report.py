@@ -356,16 +356,6 @@ def test_simulated_time_is_said_to_mean_nothing_and_real_time_is_drawn(
     assert document(real)["runs"][0]["timing"]["intervals"]["response"]["p100"] == pytest.approx(343.001e-6)
 
 
-def test_a_wrong_argument_is_one_line(folder: Path, good: Path, replay: Replay) -> None:
-    page = folder / "x.html"
-    assert "there is no folder" in replay.refused("report", good, "-o", folder / "nowhere" / "x.html")
-    assert "expected a name that ends in .html or .htm" in replay.refused("report", good, "-o", folder / "x.mcap")
-    assert "No such file" in replay.refused("report", good, folder / "absent.mcap", "-o", page)
-    assert "no plant is called 'rubber'" in replay.refused("report", good, "--model", "rubber", "-o", page)
-    assert "'mass' is no parameter" in replay.refused("report", good, "--params", "mass", "-o", page)
-    assert not page.exists()
-
-
 def test_a_report_replaces_a_report_but_never_what_it_reads(folder: Path, good: Path, replay: Replay) -> None:
     here = folder / "again"
     here.mkdir()
@@ -377,21 +367,6 @@ def test_a_report_replaces_a_report_but_never_what_it_reads(folder: Path, good: 
     page.write_text("the last one", encoding="utf-8")
     make(page, log, code=int(never.exists()))
     assert sorted(path.name for path in here.iterdir()) == ["log.html", "page.html", "page.json"]
-
-
-def test_damage_in_every_log_is_one_line(folder: Path, replay: Replay) -> None:
-    for name in ("a.mcap", "b.mcap"):
-        (folder / name).write_bytes(b"no log")
-    page = folder / "none.html"
-    assert "not an MCAP file" in replay.refused("report", folder / "a.mcap", "-o", page, code=6)
-    said = replay.refused("report", folder / "a.mcap", folder / "b.mcap", "-o", page, code=6)
-    assert "not one of these logs can be used" in said
-    assert not page.exists()
-
-
-def test_a_page_that_cannot_be_written_is_one_line(folder: Path, good: Path, replay: Replay) -> None:
-    (folder / "taken.html").mkdir()
-    assert "is a folder" in replay.refused("report", good, "-o", folder / "taken.html")
 
 
 def test_the_last_report_says_what_has_changed(folder: Path, bench: Bench, report: Report, simulate: Simulate) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -164,28 +162,6 @@ def test_the_zero_stage_moves_nothing_and_goes_through_the_whole_chain(emb_run: 
     assert sim.node.angle_range == (0.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [
-        (["--limit", "0"], "--limit"),
-        (["--limit", "-1"], "--limit"),
-        (["--limit", "6.1"], "--limit"),
-        (["--limit", "nan"], "--limit"),
-        (["--read-only", "--home"], "--read-only"),
-        (["--read-only", "--repeat", "2"], "--read-only"),
-        (["--read-only", "--duration", "1e9"], "--duration"),
-        (["--zero", "--home"], "--zero"),
-        (["--repeat", "0"], "--repeat"),
-        (["--repeat", "2", "--log", "x.mcap"], "--repeat"),
-    ],
-)
-def test_a_stage_or_a_campaign_that_makes_no_sense_is_one_line(
-    emb_run: EmbRun, tmp_path: Path, arguments: list[str], reason: str
-) -> None:
-    log = [] if "--log" in arguments else ["--log", str(tmp_path)]
-    emb_run.refused(reason, *arguments, *log)
-
-
 # --- asking ---------------------------------------------------------------------------------------------------------
 
 
@@ -218,12 +194,6 @@ def test_ctrl_c_at_the_prompt_ends_cleanly_and_nothing_was_sent(
     assert "Traceback" not in err
     assert sim.sent == []
     assert not logs.exists()
-
-
-def test_confirm_without_anybody_to_ask_is_refused(emb_run: EmbRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    with Path(os.devnull).open() as nobody:
-        monkeypatch.setattr(sys, "stdin", nobody)
-        emb_run.refused("--confirm", "--confirm")
 
 
 def test_on_the_simulated_bus_nobody_is_asked(emb_run: EmbRun, keyboard: Keyboard) -> None:
@@ -352,10 +322,8 @@ def test_the_pre_flight_and_what_was_counted_are_in_the_log_and_the_document(emb
     assert json.loads(log.end["bus_error_classes"]) == summary["bus_error_classes"] == {}
 
 
-def test_time_outs_longer_than_the_shipped_ones_are_refused_unless_there_is_no_brake(
+def test_time_outs_longer_than_the_shipped_ones_are_for_where_there_is_no_brake(
     emb_run: EmbRun, sim: Sim, edited: Edited
 ) -> None:
     patient = edited("heartbeat    = 0.005", "heartbeat    = 0.5")
-    emb_run.refused("watch.heartbeat: expected at most 0.005, got 0.5", "--bench", patient)
-    assert sim.opened == []
     emb_run.document("--bench", patient, "--long-timeouts")
