@@ -21,10 +21,11 @@ from scipy.integrate import solve_ivp
 from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.brake.motion import SENSITIVE, STATES, advance, no_sensitivity
 from emb_bench.compiled import compiled
+from emb_bench.config.bench import load_bench
+from emb_bench.config.plants import Mechanics
 from emb_bench.information.fisher import physical_weights
 from emb_bench.information.symmetric import Floats, add_increment, packed_size, unpack
-from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
-from emb_runtime.config.plants import Mechanics
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 
 STEPS = 500
 REPEATS = 5

@@ -37,11 +37,12 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "drives"))  # wh
 
 import simulated_drives
 from emb_bench.commission.commissioning import Commissioning
+from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_bench.sim import transport
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.simulated_brake import SimulatedBrake
 from emb_runtime.cli.main import main as emb_run
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import EmbError
 

@@ -30,6 +30,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from emb_bench.config.bench import Bench, load_bench
 from emb_bench.design.polish import polish
 from emb_bench.design.problem import COARSE_SEARCHES, Problem, make_problem
 from emb_bench.design.report import check
@@ -37,7 +38,7 @@ from emb_bench.design.search import LONG, coarse, evolved, search
 from emb_bench.information.criteria import criterion
 from emb_bench.information.fisher import Kind
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 
 KNOWN = Path(__file__).with_name("design_known.json")
 DRAWN = 20261122  # Seed of the brakes

@@ -28,6 +28,7 @@ import numpy as np
 from scipy import stats
 
 from emb_bench.brake.motion import Floats
+from emb_bench.config.bench import Bench, load_bench
 from emb_bench.design.problem import make_problem
 from emb_bench.design.search import search
 from emb_bench.estimate.methods import method_of
@@ -41,7 +42,7 @@ from emb_bench.logs.log import read_log
 from emb_bench.sim.instruments import MEMORY, measure, settle
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.cli.main import main as emb_run
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import EXIT_DONE
 
 F_V = 3e-5  # True f_v of the brake, nominal 2.16e-5 [N·m·s/rad]

@@ -14,9 +14,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.config.plants import EULER, Plant
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.config.plants import EULER, Plant
 
 Floats = NDArray[np.float64]
 

@@ -35,11 +35,12 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # the simulator is a neighbo
 
 from benchmarks.independent_simulator import Brake, Floats, Losses, brake_of, simulate
 from benchmarks.intervals import share
+from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.plants import Plant
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Experiment
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
-from emb_runtime.config.plants import Plant
+from emb_runtime.config.bench import PARAMETER_NAMES
 
 FAR = 3.0  # Stated deviations; a value further off that is said to be usable is wrong
 BURST = 20  # Samples in a burst of losses

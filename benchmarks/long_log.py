@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.compiled import compiled
+from emb_bench.config.bench import Bench
 from emb_bench.logs.log import read_log
 from emb_bench.logs.mcap_file import MAGIC
 from emb_bench.sim.open_loop import held, march, trajectory
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, protect
 from emb_runtime.can.messages import Layout, Message
-from emb_runtime.config.bench import Bench, shipped_bench_text
+from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.log import mcap_schema
 from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.records import CycleRecord, NodeState, RunState

@@ -31,12 +31,13 @@ import numba  # noqa: F401  # what is loaded is used
 import numpy as np
 
 from benchmarks.long_log import BEFORE, Writer
+from emb_bench.config.bench import load_bench
 from emb_bench.experiment.evaluation import Question, evaluate
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import load_layout
 from emb_runtime.cli.main import main as emb_run
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EXIT_DONE
 
 BATCH = 20  # Logs whose time is measured together

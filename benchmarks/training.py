@@ -20,7 +20,7 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
-from emb_runtime.config.bench import Bench, load_bench
+from emb_bench.config.bench import Bench, load_bench
 from emb_train.envs.env import EmbExcitationVectorEnv
 from emb_train.evaluate import grid_outcomes
 from emb_train.ppo import train

@@ -13,9 +13,11 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
+from emb_bench.config.bench import Bench, load_bench
 from emb_bench.sim.transport import SimTransport, open_sim
 from emb_runtime.can.messages import Layout, load_layout
-from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
+from emb_runtime.config.bench import CEILING_CURRENT
+from emb_runtime.config.bench import Bench as RuntimeBench
 from emb_runtime.control.actor import Actor
 from emb_runtime.control.core import Core
 from emb_runtime.control.loop import Loop
@@ -138,7 +140,7 @@ class FunctionActor:
 
 
 def make_loop(
-    bench: Bench,
+    bench: RuntimeBench,
     actor: Actor,
     steps: int,
     *,

@@ -556,7 +556,8 @@ def of_design(checkout: Checkout) -> Mapping[str, Any]:
 
 ACTOR = """
 import json, sys
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_bench.config.bench import load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train.envs.conditions import Conditions
 from emb_train.structured.played import PolicyFile

@@ -20,13 +20,14 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.plants import DEFAULT_PLANT, EVERY
 from emb_bench.design.problem import COARSE_SEARCHES
 from emb_bench.estimate.records import STARTS
 from emb_bench.figures import require_place
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_bench.output import replacing, say_if_compiling
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
-from emb_runtime.config.plants import DEFAULT_PLANT, EVERY
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.system.terminal import as_json, mention
 

@@ -22,11 +22,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from emb_bench.cli.node import PRIORITY, run_node
+from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.plants import Plant
 from emb_bench.sim.simulated_brake import Noise, SimulatedBrake, read_brake
 from emb_bench.sim.transport import LockstepBus
 from emb_runtime.can.interfaces import open_transport
-from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
-from emb_runtime.config.plants import Plant
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.records import Frame
 from emb_runtime.system import realtime

@@ -10,8 +10,8 @@ import contextlib
 import sys
 from pathlib import Path
 
+from emb_bench.config.bench import load_bench
 from emb_bench.excitation.reference import EXCITATIONS
-from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.policy.policy import load_policy
 from emb_runtime.safety.shield_design import make_law

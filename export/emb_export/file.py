@@ -12,8 +12,9 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
+from emb_bench.config.bench import Bench
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Ranges
+from emb_runtime.config.bench import PARAMETER_NAMES, Ranges
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, VECTOR_TOLERANCE, Contract, PolicyLimits, Vector
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME, Inference

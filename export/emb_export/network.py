@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from emb_bench.config.bench import Bench
 from emb_export.file import OPSET, policy_file, versions
-from emb_runtime.config.bench import Bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import SAMPLE
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME

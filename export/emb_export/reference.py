@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
 from emb_bench.brake.motion import Floats
+from emb_bench.config.bench import Bench
 from emb_bench.excitation.reference import parse_excitation
 from emb_export.file import VECTORS, graph_of, policy_file
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 from emb_runtime.policy.contract import SAMPLE
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from emb_runtime.config.bench import Bench, load_bench
+from emb_bench.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
 from emb_runtime.system.terminal import complain, mention, show
 from studies.thesis.determinant_facts import protected_facts, unprotected_facts

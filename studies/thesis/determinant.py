@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.brake.euler import sensitivity_step, step
+from emb_bench.config.bench import Bench
 from emb_bench.information.criteria import criteria
 from emb_bench.information.fisher import (
     Weights,
@@ -27,7 +28,7 @@ from emb_bench.information.fisher import (
 )
 from emb_bench.information.symmetric import Floats, information, log_det, pack
 from emb_bench.sim.open_loop import simulate
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 
 AMPLITUDE = 0.7  # A
 EPSILON = 1e-6

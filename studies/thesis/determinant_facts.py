@@ -7,8 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.config.bench import Bench
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from studies.thesis.determinant import AMPLITUDE, EPSILON, SETTLED, SPIKE, protected, unprotected
 from studies.thesis.facts import Fact
 

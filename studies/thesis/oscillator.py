@@ -15,9 +15,10 @@ import numpy as np
 
 from emb_bench.brake.euler import sensitivity_step, stiffness
 from emb_bench.brake.parameters import F_V
+from emb_bench.config.bench import Bench
 from emb_bench.information.fisher import Weights, physical_weights, thesis_weights
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.bench import BrakeParameters
 from studies.thesis.facts import Fact
 
 FIGURE = "fig-5.1"

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from emb_runtime.config.bench import Bench
+from emb_bench.config.bench import Bench
 from emb_runtime.errors import UsageError
 from emb_train.envs.batch import Batch
 from emb_train.envs.env import Scoring

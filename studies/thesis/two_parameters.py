@@ -9,11 +9,11 @@ import numpy as np
 from emb_bench.brake.euler import sensitivity_step
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import F_V, K_1
+from emb_bench.config.bench import Bench
 from emb_bench.excitation.reference import Response, parse_excitation, run_excitation
 from emb_bench.information.criteria import criteria
 from emb_bench.information.fisher import information_over_time, thesis_weights
 from emb_bench.sim.open_loop import simulate
-from emb_runtime.config.bench import Bench
 from studies.thesis.facts import Fact
 
 FIGURE = "sec-6.1"

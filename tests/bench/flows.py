@@ -9,9 +9,9 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats, no_sensitivity, rest
 from emb_bench.compiled import compiled
+from emb_bench.config.plants import EULER, Mechanics
 from emb_bench.sim.open_loop import held, march, simulate, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
-from emb_runtime.config.plants import EULER, Mechanics
 
 T_S = 1e-3
 NOMINAL = load_bench().brake

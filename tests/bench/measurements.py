@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import Plant
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, EstimationProblem
@@ -18,8 +20,7 @@ from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.instruments import MEMORY, measure, settle
 from emb_bench.sim.open_loop import simulate
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
-from emb_runtime.config.plants import Plant
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 
 AT_REST = 7.0  # The start is the mean of about 50 samples: this many times better known than one
 

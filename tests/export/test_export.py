@@ -18,6 +18,7 @@ import onnx
 import pytest
 import torch
 
+from emb_bench.config.bench import Bench, load_bench
 from emb_bench.excitation.reference import excitation
 from emb_export import file
 from emb_export.entry import emb_export
@@ -25,7 +26,7 @@ from emb_export.export import main
 from emb_export.file import answers
 from emb_export.network import network_file, observations
 from emb_export.reference import reference_file
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, Contract, read_contract

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.motion import SENSITIVE, STATES, advance
 from emb_bench.compiled import compiled
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
-from emb_runtime.config.plants import Mechanics
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import Mechanics
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.learning.assumptions import assumptions_of
 from emb_runtime.learning.known import HIGH, LOW, Known, known
 from emb_runtime.learning.law import law_for, middle

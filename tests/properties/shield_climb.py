@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from emb_bench.compiled import compiled
-from emb_runtime.config.bench import Bench
+from emb_bench.config.bench import Bench
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from tests.properties.shield_search import (
     AS_PLANNED,

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from emb_bench.brake.euler import step as euler_step
 from emb_bench.brake.motion import SENSITIVE, STATES, advance
 from emb_bench.compiled import compiled
-from emb_runtime.config.bench import Bench, BrakeParameters, Ranges, load_bench
-from emb_runtime.config.plants import Mechanics
+from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.plants import Mechanics
+from emb_runtime.config.bench import BrakeParameters, Ranges
 from emb_runtime.safety.shield import NO_PAST, PAST, Past, shield
 from emb_runtime.safety.shield_design import ShieldLaw, damped_excess, make_law
 
@@ -228,7 +229,7 @@ DROPS: dict[str, Callable[[Generator, int, int], Codes]] = {
 
 
 class Features(NamedTuple):
-    """What a brake has beyond the thesis's: as in ``emb_runtime.config.plants.Mechanics``."""
+    """What a brake has beyond the thesis's: as in ``emb_bench.config.plants.Mechanics``."""
 
     current_lag: float = 0.0
     break_away: float = 1.0

@@ -11,12 +11,12 @@ import pytest
 
 from emb_bench import api
 from emb_bench.cli import node, replay
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import DEFAULT_PLANT, EXACT
 from emb_bench.design.problem import make_problem
 from emb_bench.sim.simulated_brake import read_brake
 from emb_bench.sim.transport import open_sim
 from emb_runtime.cli import options
-from emb_runtime.config.bench import Bench
-from emb_runtime.config.plants import DEFAULT_PLANT, EXACT
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train import cli as train
 from emb_train.envs.batch import Batch

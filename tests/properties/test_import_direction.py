@@ -23,8 +23,8 @@ MAY_IMPORT = {
 OURS = set.union(*MAY_IMPORT.values())
 ROOMS = {
     "runtime/emb_runtime": "errors records system config can estimator policy log safety drives learning control cli",
-    "bench/emb_bench": "documents numbers compiled figures parallel output brake sim information design excitation "
-    "logs recordings experiment export hil rerun estimate analysis commission report live batch api cli",
+    "bench/emb_bench": "config documents numbers compiled figures parallel output brake sim information design "
+    "excitation logs recordings experiment export hil rerun estimate analysis commission report live batch api cli",
     "train/emb_train": "names presets rewards envs bench_compatibility ppo training structured optimum "
     "evaluate cli entry",
     "export/emb_export": "file network reference export entry",

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from emb_bench.brake.euler import step as euler_step
 from emb_bench.compiled import compiled
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Limits, Noise, Ranges, load_bench
+from emb_bench.config.bench import Bench, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Limits, Noise, Ranges
 from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.shield import NO_PAST, shield, successor
 from emb_runtime.safety.shield_design import ShieldLaw, chatter_excess, damped_excess, make_law

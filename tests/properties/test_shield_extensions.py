@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from emb_bench.compiled import compiled
-from emb_runtime.config.bench import Bench, load_bench
+from emb_bench.config.bench import Bench, load_bench
 from emb_runtime.safety.shield import shield, window
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from tests.properties.shield_climb import climb

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from emb_runtime.config.bench import load_bench
+from emb_bench.config.bench import load_bench
 from tests.properties.learning_mutants import MUTANTS, broken
 from tests.properties.learning_search import Found, episodes, search, setting_for
 

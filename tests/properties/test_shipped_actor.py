@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from emb_bench.commission.bench_file import MEASURED, found_text
+from emb_bench.config.bench import Bench, parse_bench
+from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.logs.log import read_log
 from emb_export.reference import reference_file
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, parse_bench, shipped_bench_text
-from emb_runtime.config.plants import DEFAULT_PLANT
+from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train.envs.conditions import Conditions
 from emb_train.envs.excitations import Played

@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from emb_runtime.config.bench import Bench, Noise, load_bench
+from emb_bench.config.bench import Bench, load_bench
+from emb_runtime.config.bench import Noise
 from tests.properties.learning_mutants import MUTANTS, broken
 from tests.properties.learning_search import NOISES, Found, episodes, search, setting_for
 from tests.properties.shield_search import of_plant, within_stiffness

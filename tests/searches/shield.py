@@ -18,8 +18,9 @@ import numpy as np
 
 from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.compiled import compiled
+from emb_bench.config.bench import Bench, load_bench
 from emb_bench.information.fisher import physical_weights
-from emb_runtime.config.bench import Bench, BrakeParameters, Ranges, load_bench
+from emb_runtime.config.bench import BrakeParameters, Ranges
 from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.safety.shield import NO_PAST, shield
 from emb_runtime.safety.shield_design import ShieldLaw, chatter_excess, damped_excess, make_law

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emb_runtime.config.bench import load_bench
+from emb_bench.config.bench import load_bench
 from emb_train.cli import main as emb_train
 from emb_train.envs.play import Draw
 from emb_train.training import METRICS, Training, load_preset

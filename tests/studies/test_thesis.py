@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.brake.euler import stiffness
+from emb_bench.config.bench import Bench, load_bench
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_DONE
 from studies.thesis import oscillator, two_parameters
 from studies.thesis.cli import ANALYSIS, main

@@ -13,11 +13,12 @@ import scipy.stats
 from numpy.typing import NDArray
 from torch import nn
 
+from emb_bench.config.bench import load_bench, parse_bench
 from emb_bench.design.problem import Problem, make_problem
 from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import fisher
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train import optimum

@@ -14,7 +14,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_runtime.config.bench import load_bench
+from emb_bench.config.bench import load_bench
 from emb_train.envs.conditions import Conditions
 from emb_train.envs.env import EmbExcitationVectorEnv
 from emb_train.ppo import (

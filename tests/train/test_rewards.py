@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from emb_bench.config.bench import load_bench
 from emb_bench.information.symmetric import pack, unpack
-from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import UsageError
 from emb_train.envs.batch import Batch
 from emb_train.envs.env import Scoring

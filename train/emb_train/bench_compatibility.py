@@ -6,7 +6,8 @@ the bench's shield does not cover. Its actor is then for a bench file that names
 
 from __future__ import annotations
 
-from emb_runtime.config.bench import Bench, Ranges
+from emb_bench.config.bench import Bench
+from emb_runtime.config.bench import Ranges
 
 
 def unfit(bench: Bench, ranges: Ranges) -> str:

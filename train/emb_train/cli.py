@@ -15,17 +15,18 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
+from emb_bench.config.bench import load_bench
+from emb_bench.config.plants import DEFAULT_PLANT, EVERY
 from emb_bench.output import make_empty_folder, replacing
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
-from emb_runtime.config.plants import DEFAULT_PLANT, EVERY
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
 from emb_runtime.system.terminal import as_json, complain, mention, show
 from emb_train.names import TASKS, listed, reference_names, wrapped
 from emb_train.presets import preset_summaries
 
 if TYPE_CHECKING:
+    from emb_bench.config.bench import Bench
     from emb_bench.information.symmetric import Floats
-    from emb_runtime.config.bench import Bench
     from emb_train.evaluate import Settings, Subject
     from emb_train.structured.task import Task
 

@@ -13,11 +13,12 @@ import msgspec
 import numpy as np
 import torch
 
+from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.plants import EULER
 from emb_bench.excitation.reference import ACTOR, COMPARED, parse_excitation
 from emb_bench.numbers import Score
 from emb_bench.report.text import WIDTH, Table
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
-from emb_runtime.config.plants import EULER
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy

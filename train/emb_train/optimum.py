@@ -18,12 +18,13 @@ import numpy as np
 
 from emb_bench.brake.euler import sign, stiffness
 from emb_bench.brake.motion import is_plain
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import EULER, EXACT, Plant
 from emb_bench.design.problem import Problem, make_problem
 from emb_bench.design.search import search
 from emb_bench.output import replacing
 from emb_bench.sim.open_loop import feedback
-from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import EULER, EXACT, Plant
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_train.envs.measure import Floats, Measure
 

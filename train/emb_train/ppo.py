@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from emb_runtime.config.bench import Bench
+from emb_bench.config.bench import Bench
 from emb_runtime.errors import EmbError
 from emb_train.envs.env import EmbExcitationVectorEnv
 

@@ -22,9 +22,9 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
+from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.output import make_empty_folder, replacing
-from emb_runtime.config.bench import Bench, load_bench
-from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.config.typed import read
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes

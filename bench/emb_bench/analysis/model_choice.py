@@ -34,6 +34,8 @@ import numpy as np
 from scipy import optimize, special
 
 from emb_bench.brake.motion import Floats
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import REWEIGHTED, finished, most, search, settled
 from emb_bench.estimate.prediction import Problem, make_problem
@@ -49,8 +51,6 @@ from emb_bench.estimate.records import (
 from emb_bench.estimate.search import released
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.instruments import observer_gains
-from emb_runtime.config.bench import Bench
-from emb_runtime.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 
 NEGLIGIBLE = 0.01  # Weight below which a model adds nothing to an interval
 WRONG = 25  # Simulations after which the search of a model that does not explain the records ends

@@ -21,12 +21,12 @@ import numpy as np
 
 from emb_bench.analysis.model_choice import Candidate, ModelChoice, candidate, fit_from, ranked
 from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import EXACT, Plant
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, EstimationProblem, check_model, with_systematic
 from emb_bench.experiment.experiment import Experiment
-from emb_runtime.config.bench import Bench
-from emb_runtime.config.plants import EXACT, Plant
 from emb_runtime.errors import UsageError
 
 ADDITIONS: Mapping[str, tuple[str, ...]] = {

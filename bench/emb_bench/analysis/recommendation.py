@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from emb_bench.brake.motion import Floats
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, Unknown
@@ -23,7 +24,7 @@ from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.criteria import criteria
 from emb_bench.information.identifiability import GROSS, Spectrum, combination, schur_complement
-from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 
 PRECISE = 0.01  # Largest deviation of a well identified unknown, as a share of its value or of a gross error

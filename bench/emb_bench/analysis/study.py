@@ -22,6 +22,8 @@ from emb_bench.analysis.model_choice import ModelChoice, choose_model, fit_from
 from emb_bench.analysis.model_growth import ModelGrowth, grow_model, grow_with_errors
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.recommendation import Recommendation, advise
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import DEFAULT_PLANT, EVERY, Plant
 from emb_bench.estimate.intervals import union
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import SAME
@@ -41,8 +43,7 @@ from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import RunLog
 from emb_bench.numbers import amount
-from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import DEFAULT_PLANT, EVERY, Plant
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 
 SHOWN = 3  # Most suspected effects that are named

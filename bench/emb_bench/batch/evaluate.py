@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.batch.row import NONE, Options, Parameter, Row, Source, failed, is_relative, one_line, printable
+from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.records import Estimate, EstimationProblem, with_systematic
 from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
 from emb_bench.experiment.experiment import Experiment
@@ -23,7 +24,7 @@ from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_bench.report.sentences import warnings
-from emb_runtime.config.bench import Bench, BrakeParameters, parse_bench
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.input_file import open_regular
 

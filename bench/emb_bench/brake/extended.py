@@ -45,8 +45,8 @@ from emb_bench.brake.runge_kutta import (
     vary,
 )
 from emb_bench.brake.stiffness import clamping_force, edge_ahead, stop_limit, stop_rate, travel
+from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import Mechanics
 
 TOLERANCE = 1e-8  # Local error of the velocity per step [rad/s]
 ROUNDING = 1e-13

@@ -17,8 +17,8 @@ from __future__ import annotations
 import math
 
 from emb_bench.brake.parameters import BREAK_AWAY, F_L, F_V, STRIBECK_VELOCITY, T_C
+from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import Mechanics
 
 
 def static_torque(m: Mechanics, p: BrakeParameters, force: float) -> float:

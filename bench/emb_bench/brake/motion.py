@@ -14,8 +14,8 @@ from emb_bench.brake.euler import advance_euler
 from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
 from emb_bench.brake.parameters import PARAMETERS, X1_0, X2_0
+from emb_bench.config.plants import EULER, Mechanics
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import EULER, Mechanics
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

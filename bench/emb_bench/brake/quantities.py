@@ -10,8 +10,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from emb_bench.brake.parameters import SI
-from emb_runtime.config.machine import Machine
-from emb_runtime.config.units import ANGLE, ANGULAR_SPEED, CURRENT, FORCE, LENGTH, TORQUE
+from emb_bench.config.machine import ANGLE, ANGULAR_SPEED, CURRENT, FORCE, LENGTH, TORQUE, Machine
 
 LINEAR: Mapping[str, str] = {"mass": "J", "F_c": "T_c", "F_v": "f_v"}
 """Parameters of a linear machine [kg, N, N·s/m], and what they are in coordinates of its motor."""

@@ -19,8 +19,8 @@ from typing import NamedTuple
 from emb_bench.brake.friction import decay, sliding_share, sliding_slope, sliding_torque
 from emb_bench.brake.parameters import COMMAND, CONTACT, CURRENT_LAG, CURRENT_OFFSET, DELAY, K_M, PAST_COMMAND, J
 from emb_bench.brake.stiffness import clamping_force, clamping_share, clamping_slopes
+from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import Mechanics
 
 Angles = tuple[float, float, float, float, float, float]
 

@@ -21,8 +21,8 @@ from __future__ import annotations
 import math
 
 from emb_bench.brake.parameters import CONTACT, CUBIC, HYSTERESIS, K_1, QUADRATIC
+from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import Mechanics
 
 SATURATED = 1.0 - 1e-9
 """Share of its limit from which on w counts as saturated: what is missing would not be seen in the angle's last

@@ -7,8 +7,8 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
+from emb_bench.config.bench import load_bench
 from emb_runtime.can.transport import is_private
-from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import as_json, complain, mention, show
 

@@ -10,12 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
+from emb_bench.config.bench import load_bench
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.simulated_brake import read_brake
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
-from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.records import Frame
 from emb_runtime.safety import watchdog_process

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from emb_bench import api
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.cli.options import add, add_output_options, answer, given, summary
+from emb_bench.config.plants import EVERY
 from emb_bench.figures import ENDINGS, require_place
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import read_log
@@ -20,7 +21,6 @@ from emb_bench.output import reported_if_interrupted
 from emb_bench.report import fim, runs
 from emb_bench.report.runs import RunTiming, draw_timing, run_timing
 from emb_bench.report.text import show
-from emb_runtime.config.plants import EVERY
 from emb_runtime.errors import (
     EXIT_CANNOT_TELL,
     EXIT_CHECK_FAILED,

@@ -14,8 +14,9 @@ from typing import Any
 import tomlkit
 
 from emb_bench.commission.records import CurrentCheck, Findings, Identification, Rest
-from emb_runtime.config.bench import LEARNING, PARAMETER_NAMES, Bench, Noise, parse_bench
-from emb_runtime.config.plants import SHORTEST_LAG
+from emb_bench.config.bench import Bench, parse_bench
+from emb_bench.config.plants import SHORTEST_LAG
+from emb_runtime.config.bench import LEARNING, PARAMETER_NAMES, Noise
 from emb_runtime.config.toml_text import parse_toml
 from emb_runtime.errors import BenchFileError
 from emb_runtime.learning.assumptions import make_assumptions

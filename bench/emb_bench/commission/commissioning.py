@@ -18,8 +18,9 @@ from emb_bench.commission import examination
 from emb_bench.commission.bench_file import WRITTEN, found_text, measured_ranges, working_text
 from emb_bench.commission.records import Findings, Identification, Kind, Step
 from emb_bench.commission.steps import WIDENING, judged, next_step, suspected
+from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_runtime.can.messages import bench_identity
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, parse_bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.toml_text import parse_toml
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, SafetyStopError, UsageError
 from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, SAMPLE, Contract, PolicyLimits, Vector

@@ -15,6 +15,8 @@ from emb_bench.analysis.model_choice import fit_from
 from emb_bench.analysis.model_growth import grow_model
 from emb_bench.brake.parameters import FEATURES, SI
 from emb_bench.commission.records import CurrentCheck, FirstMove, Identification, Rest
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import Instruments, Mechanics, Plant
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, EstimationProblem, with_systematic
@@ -22,8 +24,7 @@ from emb_bench.experiment.cycles import step_of
 from emb_bench.experiment.experiment import Booleans, Experiment, Floats
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import RunLog, read_log
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, Ranges
-from emb_runtime.config.plants import Instruments, Mechanics, Plant
+from emb_runtime.config.bench import PARAMETER_NAMES, Noise, Ranges
 from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.errors import LogError
 from emb_runtime.records import RunType

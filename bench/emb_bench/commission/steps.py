@@ -26,7 +26,7 @@ from emb_bench.commission.records import (
     Step,
     Window,
 )
-from emb_runtime.config.bench import Bench
+from emb_bench.config.bench import Bench
 from emb_runtime.errors import BenchFileError, SafetyStopError
 
 LISTENING = 4.0  # Time to listen [s]: the noise is to be known better than by the residuals of an experiment

@@ -14,9 +14,9 @@ import numpy as np
 
 from emb_bench.brake.euler import sign
 from emb_bench.brake.motion import SENSITIVE, STATES, Integers, advance
+from emb_bench.config.plants import Mechanics
 from emb_bench.information.symmetric import Floats, add_increment
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import Mechanics
 
 STATE_STEP = 1e-5
 """Half width of the differences in state and current [rad, rad/s, 1, A]: the maps are smooth, of order 1."""

@@ -16,9 +16,9 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_array, hstack
 
+from emb_bench.config.plants import EXACT
 from emb_bench.design.problem import Design, Problem
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.plants import EXACT
 
 FIRST_RADIUS = 2.0  # Largest change of a current in the first step [A]
 SMALLEST_RADIUS = 1e-4  # Largest change of a current in a step at which a polish ends [A]

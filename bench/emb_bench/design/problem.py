@@ -10,14 +10,15 @@ import numpy as np
 from emb_bench.brake.motion import STATES, Floats, no_sensitivity, rest
 from emb_bench.brake.parameters import OFFSET, PARAMETERS
 from emb_bench.compiled import compiled
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import DEFAULT_PLANT, EXACT, Plant
 from emb_bench.design import kernel
 from emb_bench.design.kernel import Box, Task
 from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import Kind, Weights, weights_of
 from emb_bench.information.symmetric import packed_size, unpack
 from emb_bench.sim.open_loop import check_unknowns, held, march, trajectory
-from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import DEFAULT_PLANT, EXACT, Plant
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 
 COARSE_SEARCHES = 18  # Of one design, if nobody asks for another number; the best of them go on

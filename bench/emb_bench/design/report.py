@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import EXACT
 from emb_bench.design.problem import PARTS, Problem
 from emb_bench.design.search import Found, search
 from emb_bench.information.criteria import Criterion, criteria
 from emb_bench.information.fisher import Kind, fisher, information_over_time, weights_of
 from emb_bench.information.symmetric import Floats
 from emb_bench.sim.open_loop import simulate
-from emb_runtime.config.bench import Bench
-from emb_runtime.config.plants import EXACT
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
 from emb_runtime.system.terminal import as_json

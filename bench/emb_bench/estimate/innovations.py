@@ -30,10 +30,10 @@ import numpy as np
 from emb_bench.brake.motion import Floats, Integers
 from emb_bench.brake.parameters import OFFSET, VELOCITY_GAIN
 from emb_bench.compiled import compiled
+from emb_bench.config.plants import Mechanics
 from emb_bench.estimate.prediction import Problem
 from emb_bench.sim.open_loop import advance_period, delay_share
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import Mechanics
 
 START = ("x1_0", "x2_0", "current_offset")
 """Sensitivities to the state at the start of a period and to its load come first: the transition matrix."""

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from emb_bench.brake.motion import Floats, is_plain
+from emb_bench.config.plants import EXACT
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.output_error import finished, sandwich
 from emb_bench.estimate.prediction import Problem
@@ -26,7 +27,6 @@ from emb_bench.estimate.records import End, Estimate
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.instruments import observer_noise
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.config.plants import EXACT
 from emb_runtime.errors import UsageError
 
 SURE = 4.0  # Standard deviations of a velocity beyond which its sign is taken as known

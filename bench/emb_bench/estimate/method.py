@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 from emb_bench.brake.quantities import command, quantity
+from emb_bench.config.bench import Bench
+from emb_bench.config.machine import CURRENT
+from emb_bench.config.plants import Plant
 from emb_bench.estimate.prediction import Problem, make_problem
 from emb_bench.estimate.records import STARTS, Estimate, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
-from emb_runtime.config.bench import Bench
-from emb_runtime.config.plants import Plant
-from emb_runtime.config.units import CURRENT
 from emb_runtime.errors import UsageError
 
 IDEAL_SENSORS = (

@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from scipy import special
 
 from emb_bench.brake.motion import Floats
+from emb_bench.config.machine import Machine
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Independence, ModelValidation, Suspect, Whiteness, chance
 from emb_bench.estimate.suspects import Scores, Shown, Simulated, explained, score, shown_as
-from emb_runtime.config.machine import Machine
 
 Bools = NDArray[np.bool_]
 

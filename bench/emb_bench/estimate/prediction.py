@@ -13,13 +13,14 @@ from scipy.linalg import block_diag
 from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
 from emb_bench.brake.parameters import COMMAND, DELAY, FEATURES, OFFSET, PARAMETERS, VELOCITY_GAIN, scale
 from emb_bench.compiled import compiled
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import Mechanics, Plant
 from emb_bench.estimate.records import EstimationProblem, Unknown, check_model, searched
 from emb_bench.experiment.evaluation import later
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import uniform_prior, weights_along
 from emb_bench.sim.open_loop import Input, march, trajectory
-from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import Mechanics, Plant
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError, UsageError
 
 

@@ -12,12 +12,13 @@ import numpy as np
 from emb_bench.brake.motion import Floats, is_plain
 from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS, scale
 from emb_bench.brake.quantities import Quantity, quantity
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import ASYMMETRIES, EXACT, Plant
 from emb_bench.estimate.intervals import deviations
 from emb_bench.experiment.evaluation import Question, SystematicErrors
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
-from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import ASYMMETRIES, EXACT, Plant
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator import estimate
 

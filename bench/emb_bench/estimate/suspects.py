@@ -22,12 +22,12 @@ from scipy import special
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import PARAMETERS, SI, Parameter
 from emb_bench.brake.quantities import Quantity, quantity
+from emb_bench.config.bench import Systematic
+from emb_bench.config.machine import Machine
+from emb_bench.config.plants import EXACT, Mechanics
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Suspect, has_time_for_a_delay
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.config.machine import Machine
-from emb_runtime.config.plants import EXACT, Mechanics
-from emb_runtime.config.systematic import Systematic
 
 SLOW = 30.0  # Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]
 

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.config.bench import Bench
 from emb_bench.experiment.experiment import Booleans, Floats, Integers
 from emb_bench.logs.log import RunLog, Table
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER
 from emb_runtime.can.messages import CHARGE, Layout
 from emb_runtime.can.receiver import Reception, fresh_ns
-from emb_runtime.config.bench import Bench
 from emb_runtime.drives.mapping import Mapping, Measured
 from emb_runtime.errors import LogError
 from emb_runtime.records import CycleRecord, Frame, RunState, SensorSample

@@ -13,6 +13,8 @@ import numpy as np
 
 from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.brake.parameters import DELAY, OFFSET, VELOCITY_GAIN
+from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.plants import DEFAULT_PLANT, IMPORTED_PLANT, THESIS_PLANT, Plant
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import Fisher, Kind, information_over_time, uniform_prior, weights_along
 from emb_bench.information.identifiability import Identifiability
@@ -20,8 +22,7 @@ from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import RunLog
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_bench.sim.open_loop import check_unknowns, fast_loop, held, trajectory
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges, load_bench
-from emb_runtime.config.plants import DEFAULT_PLANT, IMPORTED_PLANT, THESIS_PLANT, Plant
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import LogError, UsageError
 
 KINDS: tuple[Kind, ...] = ("physical", "weighted")

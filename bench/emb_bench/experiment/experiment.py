@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_runtime.config.plants import Plant
+from emb_bench.config.plants import Plant
 
 REST_SIGMAS = 4.0
 """A mean that lies this near to zero, in its own standard deviations, is taken as zero: the origin, at rest."""

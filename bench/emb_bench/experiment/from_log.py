@@ -11,14 +11,14 @@ import math
 
 import numpy as np
 
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import LONGEST_DELAY
 from emb_bench.experiment.cycles import UNKNOWN, Samples, match_tolerance, quantised, samples_before, samples_on_grid
 from emb_bench.experiment.experiment import REST_SIGMAS, Experiment, Floats
 from emb_bench.logs.log import RunLog
 from emb_bench.numbers import in_samples
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import Layout
-from emb_runtime.config.bench import Bench
-from emb_runtime.config.plants import LONGEST_DELAY
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.shield import damped_current
 

@@ -9,11 +9,12 @@ from typing import Any
 
 from emb_bench.brake.parameters import SI
 from emb_bench.brake.quantities import Quantity, quantity
+from emb_bench.config.bench import Bench
 from emb_bench.experiment.evaluation import NO_ERRORS, SystematicErrors
 from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import RunLog
 from emb_bench.sim.simulated_brake import check_near_nominal, parse_assignments, true_parameters
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
 from emb_runtime.config.typed import shown
 from emb_runtime.errors import LogError, UsageError

@@ -24,6 +24,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from emb_bench.brake.quantities import renamed
+from emb_bench.config.machine import Machine
 from emb_bench.information.identifiability import TOUCHED, Spectrum, schur_complement, unit_vector
 from emb_bench.information.symmetric import (
     LOG_DET,
@@ -33,7 +34,6 @@ from emb_bench.information.symmetric import (
     Floats,
     Goal,
 )
-from emb_runtime.config.machine import Machine
 from emb_runtime.errors import UsageError
 
 Name = Literal["D", "A", "E", "Ds"]

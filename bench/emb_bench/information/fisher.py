@@ -18,12 +18,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import Instruments, Plant
 from emb_bench.information.criteria import Criteria, criteria
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge
 from emb_bench.information.symmetric import Floats, pack, unpack, upper
 from emb_bench.sim.open_loop import check_unknowns, simulate
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Limits, Noise, Ranges
-from emb_runtime.config.plants import Instruments, Plant
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Limits, Noise, Ranges
 from emb_runtime.errors import UsageError
 
 Kind = Literal["physical", "weighted"]

@@ -23,8 +23,8 @@ import numpy as np
 
 from emb_bench.brake.parameters import PARAMETERS, UNITS
 from emb_bench.brake.quantities import quantity, renamed
+from emb_bench.config.machine import Machine
 from emb_bench.information.symmetric import SINGULAR, Floats
-from emb_runtime.config.machine import Machine
 from emb_runtime.errors import UsageError
 
 TRADED_OFF = 0.95  # Correlation from which on two estimates are traded off against each other

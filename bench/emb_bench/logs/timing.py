@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.config.bench import COUNTED, QUANTILE_NAMES, QUANTILES, Budgets
 from emb_bench.logs.log import RunLog, Table
 from emb_runtime.can.e2e import NO_COUNTER
-from emb_runtime.config.timing_budgets import COUNTED, QUANTILE_NAMES, QUANTILES, Budgets
 from emb_runtime.control.core import latest_answer_ns
 from emb_runtime.records import Reason, RunState
 
@@ -64,7 +64,7 @@ class Timing:
         return values
 
     def share(self, name: str) -> float | None:
-        """Share of one of :data:`emb_runtime.config.timing_budgets.COUNTED`, 0..1; None where nothing was counted."""
+        """Share of one of :data:`emb_bench.config.bench.COUNTED`, 0..1; None where nothing was counted."""
         count = {"missed": self.missed, "unanswered": self.unanswered, "not_obeyed": self.not_obeyed}[name]
         of = {"missed": self.samples + self.missed, "unanswered": self.samples, "not_obeyed": len(self.response)}[name]
         return None if count is None or of == 0 else count / of

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
+from emb_bench.config.bench import Systematic, parse_bench
+from emb_bench.config.plants import IMPORTED_PLANT
 from emb_bench.logs.log import IMPORT
 from emb_bench.output import new_file
 from emb_bench.recordings.map_file import RecordingMap, read_map
 from emb_bench.recordings.readers import Recorded, read_columns, recorded
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import load_layout
-from emb_runtime.config.bench import PARAMETER_NAMES, parse_bench
-from emb_runtime.config.plants import IMPORTED_PLANT
-from emb_runtime.config.systematic import Systematic
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.records import CycleRecord, NodeState, RunState, RunType
 from emb_runtime.system.input_file import open_regular

@@ -16,6 +16,7 @@ from emb_bench.analysis.acceptance import Acceptance, Criteria, Result, RunFacts
 from emb_bench.analysis.drift import Earlier
 from emb_bench.analysis.growth import Growth, growth
 from emb_bench.analysis.study import Study, StudyOptions, begun_with, make_study, was_stopped
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.prediction import too_few
 from emb_bench.estimate.records import DONE
 from emb_bench.experiment.experiment import Experiment
@@ -24,7 +25,6 @@ from emb_bench.logs import timing
 from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import Timing
-from emb_runtime.config.bench import Bench
 from emb_runtime.errors import LogError
 from emb_runtime.records import Reason
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from emb_bench.brake.parameters import UNITS
 from emb_bench.brake.quantities import quantity
+from emb_bench.config.machine import CURRENT
 from emb_bench.documents import to_json
 from emb_bench.experiment.evaluation import KINDS, Evaluation, Fit, Question, default_model, evenly
 from emb_bench.information.criteria import criteria_series
@@ -19,7 +20,6 @@ from emb_bench.numbers import NOTHING, in_samples, plain
 from emb_bench.report import sentences as say
 from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.config.units import CURRENT
 from emb_runtime.estimator.estimate import NORMAL_95
 
 INSTANTS = 10  # Rows of the table over time; the document has more

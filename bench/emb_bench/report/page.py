@@ -21,6 +21,7 @@ from markupsafe import Markup
 from emb_bench import numbers
 from emb_bench.analysis.growth import Growth
 from emb_bench.analysis.study import Study
+from emb_bench.config.bench import QUANTILES
 from emb_bench.estimate.records import METHODS
 from emb_bench.logs.estimates import learnt_history, learnt_ranges
 from emb_bench.logs.timing import INTERVALS, Timing, quantiles
@@ -32,7 +33,6 @@ from emb_bench.report.text import Table
 from emb_bench.report.trend import panels as trend_panels
 from emb_bench.report.trend import table as run_table
 from emb_bench.report.trend import trends
-from emb_runtime.config.timing_budgets import QUANTILES
 from emb_runtime.errors import BenchFileError, LogError
 from emb_runtime.log.mcap_schema import LEARNT
 from emb_runtime.safety.end_stop import end_stop_speed

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from emb_bench.config.bench import COUNTED, QUANTILE_NAMES
 from emb_bench.figures import COLOURS, GREY, drawn
 from emb_bench.logs.log import IMPORT, RunLog
 from emb_bench.logs.timing import INTERVALS, BudgetCheck, Timing, document, judge, quantiles, timing
 from emb_bench.numbers import NOTHING, around, percent, seconds
 from emb_bench.report.text import Table, facts, listed, wrapped
-from emb_runtime.config.timing_budgets import COUNTED, QUANTILE_NAMES
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE, LogError
 from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.system.terminal import one_line

@@ -10,9 +10,9 @@ import math
 from typing import Any
 
 from emb_bench.brake.motion import Floats, Integers, advance
+from emb_bench.config.plants import Instruments, Mechanics
 from emb_bench.sim.instruments import measure
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import Instruments, Mechanics
 from emb_runtime.safety.command_limits import shielded
 from emb_runtime.safety.shield import Past
 from emb_runtime.safety.shield_design import ShieldLaw

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from emb_runtime.config.plants import LONGEST_DELAY, Instruments
+from emb_bench.config.plants import LONGEST_DELAY, Instruments
 
 DAMPING = 0.7
 

@@ -16,11 +16,11 @@ from __future__ import annotations
 
 import math
 
+from emb_bench.config.plants import BUILT_IN, DEFAULT_PLANT, Plant
 from emb_bench.sim.simulated_brake import Noise, SimulatedBrake
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck
 from emb_runtime.can.messages import Layout, Signal, StopReason, bench_identity
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import DEFAULT_PLANT, Plant
 from emb_runtime.errors import FrameError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 from emb_runtime.safety.shield import damped_current
@@ -57,7 +57,7 @@ class BrakeNode(SimulatedBrake):
         *,
         charge: bool = False,
     ) -> None:
-        super().__init__(theta, noise, plant or bench.plant(DEFAULT_PLANT), bench.timing.sample_time)
+        super().__init__(theta, noise, plant or BUILT_IN[DEFAULT_PLANT], bench.timing.sample_time)
         self._bench = bench
         self._layout = layout
         self._watchdog_periods = math.ceil(bench.node.watchdog / self._t_s - 1e-9)

@@ -23,8 +23,8 @@ import numpy as np
 
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, Integers, advance, no_sensitivity, rest
 from emb_bench.brake.parameters import COMMAND, DELAY, OFFSET, PARAMETERS, PAST_COMMAND, VELOCITY_GAIN
+from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.config.plants import Mechanics
 from emb_runtime.errors import UsageError
 
 WORTH_COMPILING = 20_000  # Periods from which on loading the compiled functions takes less time than they save

@@ -10,11 +10,12 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import no_sensitivity, rest
+from emb_bench.config.bench import with_tables
+from emb_bench.config.plants import DEFAULT_PLANT, Plant
 from emb_bench.sim.closed_loop import pass_period
 from emb_bench.sim.instruments import MEMORY, command, settle
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.bench import Noise as SensorNoise
-from emb_runtime.config.plants import DEFAULT_PLANT, Plant
 from emb_runtime.errors import UsageError
 
 Noise = Callable[[], tuple[float, float, float]]
@@ -182,7 +183,7 @@ def read_brake(text: str, bench: Bench, option: str) -> BrakeToSimulate:
         BenchFileError: the bench has no such plant.
     """
     given = parse_assignments(text, option)
-    plant = bench.plant(given.pop("plant", DEFAULT_PLANT))
+    plant = with_tables(bench, "bench file").plant(given.pop("plant", DEFAULT_PLANT))
     seed, charge = given.pop("seed", "1"), given.pop("charge", "0")
     if not seed.isdecimal() or len(seed) > LONGEST_SEED:
         raise UsageError(f"{option}seed: expected a whole number from 0 of up to {LONGEST_SEED} digits, got '{seed}'")

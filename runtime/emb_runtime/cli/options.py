@@ -15,7 +15,6 @@ from pathlib import Path
 from emb_runtime.can.interfaces import same_bus
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
-from emb_runtime.config.plants import DEFAULT_PLANT
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.drives.bench_fit import require_fit
 from emb_runtime.drives.lock_step import drive_file
@@ -43,7 +42,7 @@ out. Before anything is armed, a pre-flight table says what was found on the bus
 does not fit. Results go to standard output, the table and progress to standard error.
 """
 
-EPILOG = f"""\
+EPILOG = """\
 with --json:
   One document on a line: the outcome, what was counted, the pre-flight lines, and the ways home. With --repeat one such
   line per run (JSON Lines). A pre-flight that refuses has a document too; what is wrong before it has a line on
@@ -51,7 +50,7 @@ with --json:
 
 the simulated bus:
   --iface sim:KEY=VALUE,... where KEY is seed, of the sensors' noise (default 1); plant, one of the bench file's
-  (default {DEFAULT_PLANT}); a parameter of the true brake: k_m, k_1, T_c, f_v (default nominal); angle_noise,
+  (default exact); a parameter of the true brake: k_m, k_1, T_c, f_v (default nominal); angle_noise,
   velocity_noise, standard deviations of its sensors (default: the bench file's); or charge, 1 for a node that
   sends the integral of its current along (default 0).
 

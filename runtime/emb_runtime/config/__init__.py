@@ -1,1 +1,1 @@
-"""Configuration: the bench file as checked records, plants, and timing budgets."""
+"""Configuration: the bench file as checked records."""

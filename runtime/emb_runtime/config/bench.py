@@ -18,10 +18,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
 import msgspec
 from msgspec import Meta
 
-from emb_runtime.config.machine import Machine
-from emb_runtime.config.plants import ASYMMETRIES, BUILT_IN, Plant, read_plant
-from emb_runtime.config.systematic import Systematic
-from emb_runtime.config.timing_budgets import Budgets
 from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
 from emb_runtime.config.typed import SMALLEST, FieldError, Positive, read, struct_of
 from emb_runtime.errors import BenchFileError
@@ -38,9 +34,6 @@ CEILING_HEARTBEAT = 0.5  # s
 CEILINGS = CEILING_CURRENT, CEILING_ANGLE, CEILING_VELOCITY
 OLDEST_FRAME = 5  # samples
 FAR = 1e9  # of a machine that is never driven, in SI units
-AROUND = 3.0  # Factor around its nominal parameters within which searches for those of a machine begin
-
-DRIVEN = ("ranges", "shield", "watch", "guard", "node", "can")  # Tables that the file of a machine does not have
 SHORTEST_SAMPLE = 1e-4  # s
 
 # Ceilings of what is armed on a bus with a brake; up to those above, a file can be read and a bus without one driven.
@@ -51,6 +44,8 @@ LONGEST_HEARTBEAT = 0.005  # s
 
 LEARNING = ("learn", "model", "model_error", "current_error")
 """Keys of the shield that concern what it learns while it runs: no node depends on them."""
+
+ANALYSIS = ("budgets", "plants", "systematic", "machine")  # Tables that only simulation and analysis read
 
 FASTEST = 10.0  # No time constant of a brake is shorter than the sample time over this
 REMEDY = "add it, as in the file that `emb-run --write-bench FILE` writes"
@@ -212,10 +207,10 @@ class _Document(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     node: Node
     can: Can
     estimator: Estimator | None = None
-    budgets: Budgets | None = None
-    plants: dict[str, dict[str, Any]] = {}
-    systematic: Systematic = Systematic()
-    machine: Machine | None = None
+    budgets: Any = None
+    plants: Any = None
+    systematic: Any = None
+    machine: Any = None
 
 
 @dataclass(frozen=True)
@@ -234,11 +229,8 @@ class Bench:
     guard: GuardLimits
     node: Node
     can: Can
-    budgets: Budgets | None  # Timing budgets of a run; None if the file has none
-    plants: Mapping[str, Plant]
-    systematic: Systematic  # Systematic errors that an estimate has to allow for
-    machine: Machine | None  # A machine that is no brake of ours, for analysis only; None for a brake, which is driven
     text: str  # The file as it was read: it goes into the log, so that the log replays alone
+    tables: Mapping[str, Any]  # Tables of ANALYSIS as they stand, which :mod:`emb_bench.config` reads
 
     def range_set(self, name: str) -> Ranges:
         """The named set of uncertain parameters; "nominal", where nothing is uncertain, is always there.
@@ -253,17 +245,6 @@ class Bench:
                 return Ranges(name, self.brake, self.brake)
             known = ", ".join(sorted(self.ranges))
             raise BenchFileError(f"no set of ranges is called '{name}'; this bench has: {known}") from None
-
-    def plant(self, name: str) -> Plant:
-        """The named brake to simulate or to evaluate with.
-
-        Raises:
-            BenchFileError: no plant has that name.
-        """
-        try:
-            return self.plants[name]
-        except KeyError:
-            raise BenchFileError(f"no plant is called {name!r}; this bench has: {', '.join(self.plants)}") from None
 
     def refuse_long_timeouts(self) -> None:
         """Refuse time-outs and counts beyond those with which a brake is driven.
@@ -307,82 +288,87 @@ def shipped_bench_text() -> str:
     return resources.files("emb_runtime.config").joinpath("bench.toml").read_text(encoding="utf-8")
 
 
-def load_bench(path: str | Path | None = None, *, analysis: bool = False) -> Bench:
+def load_bench(path: str | Path | None = None) -> Bench:
     """Read a bench file; without a path, the shipped one.
-
-    Args:
-        path: the file.
-        analysis: True where logs are evaluated and nothing is driven, designed or trained: takes ``[machine]`` too.
 
     Raises:
         BenchFileError: the file cannot be read, or says something unknown, of the wrong type, not finite,
             beyond a ceiling, or contradictory. The message has the file, the key and the reason.
     """
+    return parse_bench(*read_bench_text(path))
+
+
+def read_bench_text(path: str | Path | None = None) -> tuple[str, str]:
+    """Text of a bench file, of the shipped one without a path, and its name for messages.
+
+    Raises:
+        BenchFileError: it cannot be read.
+    """
     if path is None:
-        return parse_bench(shipped_bench_text(), "shipped bench.toml")
+        return shipped_bench_text(), "shipped bench.toml"
     try:
-        text = read_text(path, MAX_TOML_BYTES)
+        return read_text(path, MAX_TOML_BYTES), str(path)
     except (OSError, UnicodeDecodeError) as err:
         reason = err.strerror if isinstance(err, OSError) else "not UTF-8 text"
         raise BenchFileError(f"{path}: cannot read the bench file: {reason}") from err
-    return parse_bench(text, str(path), analysis=analysis)
 
 
-def parse_bench(text: str, source: str, *, analysis: bool = False) -> Bench:
+def parse_bench(text: str, source: str) -> Bench:
     """Turn the text of a bench file into checked records.
 
     Args:
         text: TOML.
         source: what to call it in error messages.
-        analysis: as for :func:`load_bench`.
 
     Raises:
         BenchFileError: see :func:`load_bench`.
     """
+    document = parse_document(text, source)
+    if "machine" in document:
+        reason = "a machine for the analysis of recordings: nothing is driven or designed with it"
+        raise BenchFileError(f"{source}: machine: {reason}")
+    return checked_bench(document, text, source)
+
+
+def parse_document(text: str, source: str) -> dict[str, Any]:
+    """The tables of a bench file, unchecked.
+
+    Raises:
+        BenchFileError: the text is not TOML, or too large.
+    """
     try:
-        document = parse_toml(text)
-        if "machine" in document:
-            if not analysis:
-                reason = "a machine for the analysis of recordings: nothing is driven or designed with it"
-                raise FieldError("machine", reason)
-            document = _never_driven(document)
-        found = read(_Document, document, source, BenchFileError, remedy=REMEDY, smallest=SMALLEST)
-        return _checked(found, text, source)
-    except FieldError as err:
-        raise BenchFileError(f"{source}: {err.key}: {err}") from err
+        return parse_toml(text)
     except ValueError as err:
         raise BenchFileError(f"{source}: {err}") from err
 
 
-def _never_driven(document: Mapping[str, Any]) -> dict[str, Any]:
-    """The document of a machine with what only a driven brake needs as it is in the shipped file.
+def checked_bench(document: Mapping[str, Any], text: str, source: str, *, driven: bool = True) -> Bench:
+    """The records of a bench file's tables.
 
-    The ranges, in which searches begin, are the nominal parameters over and times ``AROUND``.
+    Args:
+        document: the tables.
+        text: where they stand.
+        source: what to call it in error messages.
+        driven: False for a machine that is only analysed: the ceilings do not hold, and there may be no spring.
+
+    Raises:
+        BenchFileError: see :func:`load_bench`.
     """
-    for key in DRIVEN:
-        if key in document:
-            raise FieldError(key, "does not go with [machine], with which nothing is driven")
-    shipped = parse_toml(shipped_bench_text())
-    nominal = document.get("brake")
-    around = {}
-    for parameter in PARAMETER_NAMES:
-        value = nominal.get(parameter) if isinstance(nominal, dict) else None
-        if isinstance(value, int | float) and value > 0.0:
-            around[parameter] = [value / AROUND, value * AROUND]
-    ranges = {shipped["shield"]["ranges"]: around}
-    return {**document, **{key: shipped[key] for key in DRIVEN}, "ranges": ranges}
+    found = read(_Document, document, source, BenchFileError, remedy=REMEDY, smallest=SMALLEST)
+    try:
+        return _checked(found, document, text, driven)
+    except FieldError as err:
+        raise BenchFileError(f"{source}: {err.key}: {err}") from err
 
 
-def _checked(found: _Document, text: str, source: str) -> Bench:
+def _checked(found: _Document, document: Mapping[str, Any], text: str, driven: bool) -> Bench:
     """The records of a document whose values do not contradict each other.
 
     Raises:
         FieldError: they do.
-        BenchFileError: a plant is none.
     """
     brake = BrakeParameters(**msgspec.structs.asdict(found.brake))
     shield = Shield(**msgspec.structs.asdict(found.shield))
-    plants = {name: read_plant(name, table, source) for name, table in found.plants.items()}
     bench = Bench(
         name=found.name,
         brake=brake,
@@ -396,13 +382,10 @@ def _checked(found: _Document, text: str, source: str) -> Bench:
         guard=found.guard,
         node=found.node,
         can=found.can,
-        budgets=found.budgets,
-        plants={plant.name: plant for plant in BUILT_IN} | plants,
-        systematic=found.systematic,
-        machine=found.machine,
         text=text,
+        tables={key: document[key] for key in ANALYSIS if key in document},
     )
-    for key, reason in (*_limit_problems(bench), *_setting_problems(bench)):
+    for key, reason in (*_limit_problems(bench, driven), *_setting_problems(bench, driven)):
         raise FieldError(key, reason)
     return bench
 
@@ -419,9 +402,9 @@ def _check_pair(key: str, pair: tuple[float, float]) -> None:
         raise FieldError(key, f"the lower value {pair[0]:g} is above the upper {pair[1]:g}")
 
 
-def _limit_problems(bench: Bench) -> Iterator[tuple[str, str]]:
+def _limit_problems(bench: Bench, driven: bool) -> Iterator[tuple[str, str]]:
     """Keys of the brake and its limits that are beyond a ceiling or contradict each other, and why."""
-    driven, limits = bench.machine is None, bench.limits
+    limits = bench.limits
     _check_pair("limits.angle", limits.angle)
     if driven and bench.brake.k_1 == 0.0:
         yield "brake.k_1", "expected a positive number, got 0"
@@ -440,12 +423,9 @@ def _limit_problems(bench: Bench) -> Iterator[tuple[str, str]]:
         if lasts < shortest:  # simulating it would take for ever: some number has another unit
             wanted = f"expected J/f_v and sqrt(J/(gamma k_1)) of at least {shortest:g} s in all ranges"
             yield "brake", f"{wanted}, got {lasts:g} s"
-    for name, plant in bench.plants.items():
-        if driven and any(getattr(plant.mechanics, key) != 0.0 for key in ASYMMETRIES):  # the shield assumes none
-            yield f"plants.{name}", f"{' and '.join(ASYMMETRIES)} go with [machine] only"
 
 
-def _setting_problems(bench: Bench) -> Iterator[tuple[str, str]]:
+def _setting_problems(bench: Bench, driven: bool) -> Iterator[tuple[str, str]]:
     """Keys of the shield and the time-outs that contradict others, and why."""
     shield, watch, covered = bench.shield, bench.watch, bench.ranges.get(bench.shield.ranges)
     _check_pair("shield.frame_age", shield.frame_age)
@@ -460,7 +440,7 @@ def _setting_problems(bench: Bench) -> Iterator[tuple[str, str]]:
     if watch.soft_missed > watch.stop_missed:
         yield "watch.soft_missed", f"{watch.soft_missed} is above stop_missed = {watch.stop_missed}"
     # One late sample or command stops nothing: the loop gives a sign of life 1.5 periods after a sample at the latest.
-    cycle = 2.0 * (bench.timing.sample_time if bench.machine is None else SHORTEST_SAMPLE)
+    cycle = 2.0 * (bench.timing.sample_time if driven else SHORTEST_SAMPLE)
     for key, value, shortest, ceiling in (
         ("watch.heartbeat", watch.heartbeat, max(0.002, cycle), CEILING_HEARTBEAT),
         ("node.watchdog", bench.node.watchdog, cycle, CEILING_NODE_WATCHDOG),

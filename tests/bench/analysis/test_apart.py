@@ -3,11 +3,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from emb_bench.analysis.study import Study, StudyOptions, make_study
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.logs.log import read_log
 from emb_bench.report.estimate import text
 from emb_bench.report.sentences import apart
-from emb_runtime.config.bench import Bench
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import Simulate  # isort: skip

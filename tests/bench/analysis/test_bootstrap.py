@@ -8,10 +8,10 @@ import pytest
 
 from emb_bench.analysis import bootstrap as module
 from emb_bench.analysis.bootstrap import bootstrap
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.methods import method_of, refit
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
-from emb_runtime.config.bench import Bench
 from emb_runtime.errors import UsageError
 
 from tests.bench.flows import square  # isort: skip

@@ -8,11 +8,11 @@ import pytest
 from scipy import stats
 
 from emb_bench.analysis.held_out import held_out, leave_one_out
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.open_loop import simulate
-from emb_runtime.config.bench import Bench
 
 from tests.bench.flows import square  # isort: skip
 from tests.bench.measurements import fit, record  # isort: skip

@@ -12,13 +12,14 @@ from scipy import stats
 from emb_bench.analysis.model_choice import ModelChoice, choose_model, mixture_interval
 from emb_bench.analysis.study import StudyOptions, make_study
 from emb_bench.brake.motion import Floats
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import EVERY, Plant
 from emb_bench.estimate.records import EstimationProblem, Unknown, with_systematic
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document, text
 from emb_bench.report.sentences import models
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.config.plants import EVERY, Plant
+from emb_runtime.config.bench import PARAMETER_NAMES
 
 from tests.bench.flows import square  # isort: skip
 from tests.bench.measurements import currents_of, record  # isort: skip

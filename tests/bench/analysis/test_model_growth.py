@@ -8,11 +8,12 @@ import pytest
 
 from emb_bench.analysis.model_growth import ADDITIONS, ModelGrowth, grow_model, grow_with_errors, wanted
 from emb_bench.analysis.study import StudyOptions, make_study
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import EVERY
 from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.logs.log import read_log
 from emb_bench.report.estimate import document
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.config.plants import EVERY
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 
 from tests.bench.measurements import currents_of, fit, record  # isort: skip

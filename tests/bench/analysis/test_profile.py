@@ -8,10 +8,11 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from emb_bench.analysis.profile import LEVEL, profile
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import NORMAL_95, Estimate, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 
 from tests.bench.measurements import currents_of, fit, record  # isort: skip
 

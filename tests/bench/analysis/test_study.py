@@ -13,11 +13,12 @@ from emb_bench.analysis.profile import profile
 from emb_bench.analysis.study import ModelStanding, StudyOptions, make_study
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
+from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, parse_bench, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import UsageError
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from emb_bench.config.bench import Bench
 from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main as emb_run
-from emb_runtime.config.bench import Bench
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.safety.state_machine import Fault
 

@@ -12,9 +12,9 @@ from scipy.integrate import solve_ivp
 
 from emb_bench.brake import exact
 from emb_bench.brake.motion import Floats, no_sensitivity, rest
+from emb_bench.config.plants import EULER, Mechanics
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import BrakeParameters, load_bench
-from emb_runtime.config.plants import EULER, Mechanics
 from tests.bench.flows import ALL, EXACT, STEP, T_S, changed, difference, events, marched, moved
 
 BENCH = load_bench()

@@ -16,8 +16,9 @@ from emb_bench.brake.motion import Floats, no_sensitivity, rest
 from emb_bench.brake.parameters import FEATURES, PARAMETERS
 from emb_bench.brake.runge_kutta import current
 from emb_bench.compiled import compiled
-from emb_runtime.config.bench import BrakeParameters, load_bench
-from emb_runtime.config.plants import Mechanics
+from emb_bench.config.bench import load_bench
+from emb_bench.config.plants import Mechanics
+from emb_runtime.config.bench import BrakeParameters
 from tests.bench.flows import difference, whole
 
 BENCH = load_bench()

@@ -17,8 +17,8 @@ from emb_bench.brake.friction import (
     static_torque,
 )
 from emb_bench.brake.parameters import BREAK_AWAY, F_L, F_V, STRIBECK_VELOCITY, T_C
+from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import load_bench
-from emb_runtime.config.plants import Mechanics
 
 P = load_bench().brake
 FIGURE_3_3 = Mechanics(break_away=1.2, stribeck_velocity=30.0, stribeck_exponent=2.0)

@@ -11,8 +11,8 @@ from emb_bench.brake.euler import advance_euler, step
 from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, is_plain, no_sensitivity, rest
-from emb_runtime.config.bench import load_bench
-from emb_runtime.config.plants import ASYMMETRIES, EULER, EXACT, Mechanics
+from emb_bench.config.bench import load_bench
+from emb_bench.config.plants import ASYMMETRIES, EULER, EXACT, Mechanics
 
 BENCH = load_bench()
 P = BENCH.brake

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from emb_bench.brake.parameters import FEATURES, PARAMETERS, scale
-from emb_runtime.config.plants import Mechanics
+from emb_bench.config.plants import Mechanics
 
 SHAPING = {"solver", "stribeck_exponent", "hysteresis_travel"}  # say how, not how much
 

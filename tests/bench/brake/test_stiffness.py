@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from emb_bench.brake.parameters import CONTACT, CUBIC, HYSTERESIS, K_1, K_M, PLAY, QUADRATIC
 from emb_bench.brake.stiffness import clamping_force, clamping_share, clamping_slopes, edge_ahead, stop_rate
+from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import load_bench
-from emb_runtime.config.plants import Mechanics
 
 P = load_bench().brake
 CURVED = Mechanics(quadratic=0.002, cubic=2e-5, hysteresis=0.05, hysteresis_travel=1.0)

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from emb_bench.cli.design import main
+from emb_bench.config.bench import load_bench
 from emb_bench.design.report import read_design
 from emb_bench.information.fisher import fisher
 from emb_bench.sim.open_loop import simulate
-from emb_runtime.config.bench import load_bench, shipped_bench_text
+from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import UsageError
 
 PERIODS = 50

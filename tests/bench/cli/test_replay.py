@@ -13,11 +13,12 @@ import pytest
 
 from emb_bench import api
 from emb_bench.cli.replay import COMMANDS, main
+from emb_bench.config.bench import Bench
 from emb_bench.information.fisher import fisher
 from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import Layout
-from emb_runtime.config.bench import Bench, shipped_bench_text
+from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.records import CycleRecord
 
 from tests.bench.conftest import Log, Replay  # isort: skip

@@ -23,10 +23,11 @@ from emb_bench.cli import commission
 from emb_bench.commission import examination
 from emb_bench.commission.bench_file import working_text
 from emb_bench.commission.commissioning import Commissioned, Commissioning, Run, StepFailedError, simulated
+from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main
-from emb_runtime.config.bench import Bench, Noise, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.config.bench import Noise, shipped_bench_text
 from emb_runtime.errors import EmbError
 from tests.bench.commission.test_steps import sheet_text
 from tests.drives import EXAMPLES

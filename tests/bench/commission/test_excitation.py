@@ -7,7 +7,7 @@ import pytest
 
 from emb_bench.commission.commissioning import policy_file
 from emb_bench.commission.records import Kind, Step, Window
-from emb_runtime.config.bench import load_bench
+from emb_bench.config.bench import load_bench
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.policy.policy import Policy, load_policy
 

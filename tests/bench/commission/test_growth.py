@@ -9,7 +9,8 @@ import pytest
 
 from emb_bench.commission.examination import identify
 from emb_bench.commission.records import Identification
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_bench.config.bench import Bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import Simulate  # isort: skip

@@ -18,7 +18,8 @@ from emb_bench.commission.bench_file import (
 )
 from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Kind, Rest, Step
 from emb_bench.commission.steps import WIDENING, break_away, judged, next_step, suspected
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Noise, load_bench, parse_bench, shipped_bench_text
+from emb_bench.config.bench import Bench, load_bench, parse_bench
+from emb_runtime.config.bench import PARAMETER_NAMES, Noise, shipped_bench_text
 from emb_runtime.errors import BenchFileError, EmbError
 from emb_runtime.safety.shield_design import make_law
 

@@ -13,11 +13,11 @@ import math
 
 import numpy as np
 
+from emb_bench.config.plants import EXACT
 from emb_bench.design.problem import Problem
 from emb_bench.information.criteria import Criterion
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.config.plants import EXACT
 from emb_runtime.errors import UsageError
 
 

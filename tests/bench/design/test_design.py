@@ -12,6 +12,7 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emb_bench.config.bench import load_bench
 from emb_bench.design import anneal
 from emb_bench.design.anneal import HOPELESS, PRICE, annealed, tracked, vary
 from emb_bench.design.polish import Settings, merit, polish
@@ -22,7 +23,7 @@ from emb_bench.information import symmetric
 from emb_bench.information.criteria import Criterion, Name, criterion, distances
 from emb_bench.information.fisher import Kind
 from emb_bench.information.symmetric import Floats, unpack
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 from tests.bench.design.bound import ceiling
 

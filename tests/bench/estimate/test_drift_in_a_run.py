@@ -7,10 +7,11 @@ import pytest
 
 from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.estimate.suspects import DRIFTS, Simulated, explained, secants
 from emb_bench.experiment.experiment import Experiment
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 
 from tests.bench.measurements import currents_of, errors_in_sigmas, fit, problem_of, record  # isort: skip
 

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from emb_bench.brake.motion import no_sensitivity, rest
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import search, start_points
 from emb_bench.estimate.prediction import Problem
@@ -15,7 +16,7 @@ from emb_bench.estimate.records import METHODS, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import fisher, uniform_prior
 from emb_bench.sim.open_loop import held, march, simulate, trajectory
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import LogError, UsageError
 
 from tests.bench.measurements import (  # isort: skip

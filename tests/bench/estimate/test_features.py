@@ -3,9 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import EstimationProblem
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 
 from tests.bench.measurements import check_derivatives, currents_of, fit, record  # isort: skip

@@ -9,6 +9,7 @@ import pytest
 
 from emb_bench.analysis.held_out import held_out
 from emb_bench.analysis.model_choice import choose_model, fit_from
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.least_squares import regression
 from emb_bench.estimate.methods import refit
@@ -16,7 +17,7 @@ from emb_bench.estimate.output_error import settled
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 
 from tests.bench.measurements import currents_of, errors_in_sigmas, fit, problem_of, record  # isort: skip
 

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.least_squares import SURE
 from emb_bench.estimate.method import IDEAL_SENSORS
 from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Experiment
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 
 from tests.bench.measurements import currents_of, fit, record  # isort: skip

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from emb_bench.config.bench import Bench, load_bench
 from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
 from emb_bench.estimate.records import NORMAL_95, Estimate, EstimationProblem, with_systematic
 from emb_bench.sim.open_loop import simulate
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 
 from tests.bench.measurements import coloured, currents_of, fit, record  # isort: skip
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.outliers import few, outliers
 from emb_bench.experiment.experiment import Experiment
-from emb_runtime.config.bench import Bench
 
 from tests.bench.measurements import currents_of, fit, record  # isort: skip
 

@@ -9,13 +9,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.innovations import GAIN, START, Filter, FilterInput, Innovations, march_filtered
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.estimate.search import converge, minimise, released, strong
 from emb_bench.experiment.experiment import Experiment
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 
 from tests.bench.measurements import (  # isort: skip

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import Estimate, EstimationProblem
@@ -17,7 +18,6 @@ from emb_bench.logs.log import read_log
 from emb_bench.recordings.map_file import parse_map
 from emb_bench.recordings.readers import Column, recorded
 from emb_bench.recordings.run_file import bench_of
-from emb_runtime.config.bench import Bench, parse_bench
 from emb_runtime.errors import UsageError
 from tests.bench.linear_machine import MAP, TRAVEL, Machine, Recording, record
 

@@ -14,6 +14,7 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emb_bench.config.bench import Bench, load_bench
 from emb_bench.excitation.reference import (
     EXCITATIONS,
     Excitation,
@@ -25,7 +26,7 @@ from emb_bench.excitation.reference import (
 )
 from emb_bench.information.symmetric import Floats
 from emb_bench.sim.open_loop import simulate as simulate_brake
-from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.records import Reason

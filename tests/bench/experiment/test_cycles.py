@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from emb_bench.config.bench import Bench
 from emb_bench.experiment.cycles import UNKNOWN, control_cycles, samples_before
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.receiver import Reception
-from emb_runtime.config.bench import Bench
 from emb_runtime.records import RunState, SensorSample
 
 from tests.bench.hostile import HostileBus, drive, write_trace  # isort: skip

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import Plant
 from emb_bench.experiment.cycles import LOST, Samples
 from emb_bench.experiment.evaluation import Fit, ModelEvaluator
 from emb_bench.experiment.experiment import Experiment
@@ -16,8 +18,7 @@ from emb_bench.logs.log import RunLog, read_log
 from emb_bench.sim.transport import SimTransport
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import Layout
-from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import Plant
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError
 from emb_runtime.log.ring_buffer import FrameRecord
 from emb_runtime.records import CycleRecord, Frame

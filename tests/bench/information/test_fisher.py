@@ -9,6 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from emb_bench.config.bench import load_bench
+from emb_bench.config.plants import Instruments
 from emb_bench.information.criteria import criteria
 from emb_bench.information.fisher import (
     Fisher,
@@ -22,8 +24,7 @@ from emb_bench.information.fisher import (
 )
 from emb_bench.information.symmetric import Floats, log_det, pack
 from emb_bench.sim.open_loop import simulate
-from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
-from emb_runtime.config.plants import Instruments
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 from tests.bench.flows import euler_states, of_euler, square
 

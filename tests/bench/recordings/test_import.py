@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from emb_bench.cli.replay import main
+from emb_bench.config.bench import load_bench
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
-from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import BenchFileError
 from tests.bench.linear_machine import MAP, T_S, TRAVEL, Machine, Recording, record
 

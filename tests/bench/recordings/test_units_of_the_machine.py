@@ -10,9 +10,9 @@ import pytest
 
 from emb_bench.brake.quantities import angle, command, quantity, velocity
 from emb_bench.cli.replay import main
+from emb_bench.config.machine import Machine as Kind
+from emb_bench.config.machine import Units
 from emb_bench.recordings.map_file import parse_map
-from emb_runtime.config.machine import Machine as Kind
-from emb_runtime.config.machine import Units
 from emb_runtime.errors import UsageError
 from tests.bench.linear_machine import MAP, TRAVEL, Machine, record
 

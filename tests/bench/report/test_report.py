@@ -22,6 +22,7 @@ from emb_bench.analysis.drift import Earlier, read_last
 from emb_bench.analysis.growth import growth
 from emb_bench.analysis.study import StudyOptions, make_study
 from emb_bench.cli.replay import main
+from emb_bench.config.bench import Bench
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.evaluation import Question, evaluate
@@ -35,7 +36,7 @@ from emb_bench.report.document import document
 from emb_bench.report.figures import applied_as_sent
 from emb_bench.report.page import report_page, view
 from emb_bench.report.sentences import drift
-from emb_runtime.config.bench import Bench, shipped_bench_text
+from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.log.ring_buffer import EventRecord, Level, LineRecord
 from emb_runtime.records import CycleRecord
 from emb_runtime.system.terminal import as_json

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_bench.brake.euler import step
+from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.plants import Instruments, Plant
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.simulated_brake import gaussian_noise, parse_assignments, true_parameters
 from emb_runtime.can.messages import Layout, StopReason, load_layout
-from emb_runtime.config.bench import Bench, load_bench
-from emb_runtime.config.plants import Instruments, Plant
 from emb_runtime.errors import UsageError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 from tests.independent import DATABASE

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from emb_bench.brake.euler import step
+from emb_bench.config.bench import load_bench
 from emb_bench.information.symmetric import Floats
 from emb_bench.sim.open_loop import simulate
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 from tests.bench.flows import ALL, difference, euler_states, of_euler, square
 

@@ -9,14 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_runtime.config.bench import (
-    CEILING_CURRENT,
-    PARAMETER_NAMES,
-    Bench,
-    load_bench,
-    parse_bench,
-    shipped_bench_text,
-)
+from emb_bench.config.bench import Bench, load_bench, parse_bench
+from emb_runtime.config.bench import CEILING_CURRENT, PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import EXIT_USAGE, BenchFileError
 
 TEXT = shipped_bench_text()

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
+from emb_bench.config.bench import Bench, parse_bench
+from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.drives.lock_step import LockStepDrive
 from emb_runtime.drives.mapping import Mapping
 from emb_runtime.drives.mapping_file import load_mapping

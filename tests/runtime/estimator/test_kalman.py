@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from emb_bench.brake import euler
 from emb_bench.brake.motion import advance, no_sensitivity, rest
+from emb_bench.config.bench import load_bench
 from emb_bench.information.symmetric import Floats, unpack
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.estimator.kalman import (
     Model,
     State,

@@ -13,10 +13,11 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.plants import Instruments, Plant
 from emb_bench.information.fisher import fisher
 from emb_bench.information.symmetric import unpack
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges, load_bench
-from emb_runtime.config.plants import Instruments, Plant
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import BenchFileError, UsageError
 from emb_runtime.safety.sensor_monitor import largest_current
 from emb_runtime.safety.shield import NO_PAST, shield

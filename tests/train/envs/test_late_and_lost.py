@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emb_bench.config.bench import load_bench
+from emb_bench.config.plants import Instruments, Plant
 from emb_bench.sim.node import BrakeNode
 from emb_runtime.can.messages import load_layout
-from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
-from emb_runtime.config.plants import Instruments, Plant
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.records import CurrentCommand, Reason
 from emb_train.envs.batch import Batch

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_bench.config.bench import load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 from emb_train.envs.conditions import Conditions
 from emb_train.structured.stored import stored

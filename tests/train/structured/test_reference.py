@@ -13,8 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
+from emb_bench.config.bench import load_bench
 from emb_bench.information.symmetric import Floats, unpack
-from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.kalman import MISFIT, follow, make_model, start
 from emb_runtime.estimator.speed_loop import scale_of

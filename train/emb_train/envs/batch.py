@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.compiled import compiled
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import DEFAULT_PLANT, LONGEST_DELAY, Plant
 from emb_bench.information.symmetric import Floats
 from emb_bench.sim.instruments import measure, settle
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
-from emb_runtime.config.plants import DEFAULT_PLANT, LONGEST_DELAY, Plant
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import UsageError
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.shield_design import make_law

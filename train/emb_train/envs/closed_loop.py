@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.brake.motion import SENSITIVE, STATES, no_sensitivity
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import Instruments, Mechanics, Plant
 from emb_bench.information.fisher import Kind, weights_of
 from emb_bench.information.symmetric import Floats, add_increment, packed_size
 from emb_bench.sim.closed_loop import pass_period, sent_current
 from emb_bench.sim.instruments import MEMORY, command
-from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.config.plants import Instruments, Mechanics, Plant
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.records import Reason
 from emb_runtime.safety.sensor_monitor import CONFIRMED, judge, largest_current
 from emb_runtime.safety.sensor_monitor import MEMORY as MONITOR

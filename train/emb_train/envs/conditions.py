@@ -14,9 +14,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.config.bench import Bench
 from emb_bench.information.fisher import Kind
 from emb_bench.information.symmetric import packed_size
-from emb_runtime.config.bench import OLDEST_FRAME, Bench
+from emb_runtime.config.bench import OLDEST_FRAME
 from emb_runtime.errors import UsageError
 
 MEASURED: Literal["measured"] = "measured"

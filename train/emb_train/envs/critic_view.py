@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.config.bench import Bench
 from emb_bench.information.symmetric import Floats, packed_size
-from emb_runtime.config.bench import Bench, BrakeParameters, Ranges
+from emb_runtime.config.bench import BrakeParameters, Ranges
 from emb_runtime.safety.shield import PAST
 from emb_train.envs.closed_loop import Experiments, Integers
 

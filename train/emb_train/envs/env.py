@@ -28,8 +28,9 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from emb_runtime.config.bench import Bench, BrakeParameters, load_bench
-from emb_runtime.config.plants import DEFAULT_PLANT
+from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.plants import DEFAULT_PLANT
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import BENCH_CONDITIONS, MEASURED, Conditions

@@ -12,9 +12,10 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.information.symmetric import Floats, unpack
-from emb_runtime.config.bench import Bench, BrakeParameters, Ranges
-from emb_runtime.config.plants import DEFAULT_PLANT
+from emb_runtime.config.bench import BrakeParameters, Ranges
 from emb_runtime.errors import PolicyRefusedError
 from emb_train.envs.batch import Batch
 from emb_train.envs.conditions import BENCH_CONDITIONS, Bools, Conditions

@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from emb_bench.config.bench import Bench
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import Bench
 from emb_runtime.estimator.speed_loop import Scale
 from emb_train.envs.measure import mean_score
 from emb_train.envs.play import begin_all

@@ -13,7 +13,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from emb_runtime.config.bench import Bench, Ranges
+from emb_bench.config.bench import Bench
+from emb_runtime.config.bench import Ranges
 from emb_runtime.estimator.kalman import Four, Model, State, believed, relative
 from emb_runtime.estimator.speed_loop import Scale, follow_reference
 

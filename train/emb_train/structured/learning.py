@@ -7,9 +7,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import EULER, Plant
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import Bench, BrakeParameters, LearntModel
-from emb_runtime.config.plants import EULER, Plant
+from emb_runtime.config.bench import BrakeParameters, LearntModel
 from emb_runtime.errors import UsageError
 from emb_runtime.learning.assumptions import Assumptions, assumptions_of, make_assumptions
 from emb_runtime.learning.bounded import hear, lose, start

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from emb_bench.compiled import compiled
+from emb_bench.config.bench import Bench
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import Bench, Ranges
+from emb_runtime.config.bench import Ranges
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.kalman import Model, State, follow, make_model, start
 from emb_runtime.estimator.speed_loop import Scale

@@ -11,8 +11,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from emb_bench.config.bench import Bench
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import OLDEST_FRAME, Bench
+from emb_runtime.config.bench import OLDEST_FRAME
 from emb_runtime.config.typed import FieldError, read
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.speed_loop import Scale, scale_of

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.config.plants import DEFAULT_PLANT
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.estimator.kalman import Four
 from emb_train.envs.conditions import Conditions
 from emb_train.envs.measure import MEASURES, Measure

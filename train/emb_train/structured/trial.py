@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from emb_bench.compiled import compiled
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import DEFAULT_PLANT, EULER
 from emb_bench.information.symmetric import Floats, unpack
-from emb_runtime.config.bench import Bench, Ranges
-from emb_runtime.config.plants import DEFAULT_PLANT, EULER
+from emb_runtime.config.bench import Ranges
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.kalman import MISFIT, Four, Model, State, believed, deviations, follow, make_model, start
 from emb_runtime.estimator.speed_loop import Scale, share_after

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
+from emb_bench.config.bench import Bench, parse_bench
+from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import BenchFileError
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
-from emb_runtime.config.plants import ASYMMETRIES, EXACT, Instruments, Mechanics, Plant
+from emb_bench.config.bench import Bench, parse_bench
+from emb_bench.config.plants import ASYMMETRIES, EXACT, Instruments, Mechanics, Plant
+from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import BenchFileError
 
 TEXT, _, _ = shipped_bench_text().partition("# Brakes to simulate")

@@ -93,10 +93,10 @@ class Plant:
 DEFAULT_PLANT = "exact"  # Plant where none is named: it sticks at rest, as a real brake does
 THESIS_PLANT = "euler"  # The thesis's plant; that of logs and trainings of versions that knew no other
 IMPORTED_PLANT = "recorded"  # Name of the machine in the bench file of a recording that was imported
-BUILT_IN = (
-    Plant(THESIS_PLANT, Mechanics(solver=EULER), Instruments()),
-    Plant(DEFAULT_PLANT, Mechanics(solver=EXACT), Instruments()),
-)
+BUILT_IN = {
+    THESIS_PLANT: Plant(THESIS_PLANT, Mechanics(solver=EULER), Instruments()),
+    DEFAULT_PLANT: Plant(DEFAULT_PLANT, Mechanics(solver=EXACT), Instruments()),
+}
 
 ASYMMETRIES = ("coulomb_asymmetry", "viscous_asymmetry")
 """Friction by direction, which goes with no other feature of the mechanics."""
@@ -113,7 +113,7 @@ def read_plant(name: str, document: Mapping[str, Any], source: str) -> Plant:
         BenchFileError: a key is unknown, of the wrong type or out of range, or a feature does not go with the solver.
     """
     at = f"{source}: plants.{key_text((name,))}"
-    if any(name == plant.name for plant in BUILT_IN):
+    if name in BUILT_IN:
         raise BenchFileError(f"{at}: this name is taken by the built-in plant")
     if name == EVERY or not _NAME.fullmatch(name):
         wanted = f"expected a name of 1 to 40 letters, digits, '-' and '_', other than '{EVERY}'"
