@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from random import Random
 from typing import Any
 
 from emb_bench.sim.node import BrakeNode
@@ -23,9 +24,8 @@ from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.clock import SteppedClock
 from tests.conftest import Journal, make_loop
-from tests.fuzz.draws import Draw, chance, pick
 from tests.fuzz.model import ReceptionModel
-from tests.fuzz.stream import ANGLE, COMMAND, MS, STATUS, anything, damaged
+from tests.fuzz.stream import ANGLE, COMMAND, MS, STATUS, anything, chance, damaged
 from tests.fuzz.targets import Played, demand
 from tests.independent import read
 
@@ -47,14 +47,14 @@ class PolicyError(RuntimeError):
 class HostileBus:
     """The simulated bus, with somebody between it and the loop."""
 
-    def __init__(self, draw: Draw, transport: SimTransport, clock: SteppedClock) -> None:
+    def __init__(self, draw: Random, transport: SimTransport, clock: SteppedClock) -> None:
         self._draw, self._transport, self._clock = draw, transport, clock
         self._queue: deque[Frame] = deque()
         self._lost_until_ns = 0
-        self.muted = pick(draw, [None] * 7 + [STATUS, ANGLE])
+        self.muted = draw.choice([None] * 7 + [STATUS, ANGLE])
         """A message that is lost for good at some time, and nothing else happens."""
-        self._muted_from_ns = clock.now_ns() + draw.integer(0, 200) * MS
-        self._percent = pick(draw, [0, 1, 5, 20]) if self.muted is None else 0
+        self._muted_from_ns = clock.now_ns() + draw.randint(0, 200) * MS
+        self._percent = draw.choice([0, 1, 5, 20]) if self.muted is None else 0
         self.judge = Judge()
         self.forged = False
         """Somebody has sent well-formed frames in the node's name: what the loop believes may be false."""
@@ -106,14 +106,14 @@ class HostileBus:
         self._transport.send(frame)
 
     def _spoiled(self, frame: Frame | None) -> Frame | None:
-        draw, how = self._draw, self._draw.integer(0, 8)
+        draw, how = self._draw, self._draw.randint(0, 8)
         if how == 0 and chance(draw, 5):
             self.broken = True
             raise BusError("the cable is gone")
         if how == 1:
-            self._lost_until_ns = self._clock.now_ns() + pick(draw, [1, 3, 6, 25]) * MS
+            self._lost_until_ns = self._clock.now_ns() + draw.choice([1, 3, 6, 25]) * MS
         elif how == 2 and chance(draw, 30):  # this computer stands still
-            self.spend(pick(draw, [MS, 3 * MS, 12 * MS]))
+            self.spend(draw.choice([MS, 3 * MS, 12 * MS]))
         elif how == 3:
             self.spend(FRAME_NS)
             self.forged = True
@@ -131,14 +131,16 @@ class HostileBus:
         if how == 5:
             self._queue.appendleft(frame)
         elif how == 6:
-            self._queue.insert(draw.integer(0, len(self._queue)), frame)
+            self._queue.insert(draw.randint(0, len(self._queue)), frame)
             return None
         elif how == 7:
             self.forged = True
             return damaged(draw, frame)
         elif how == 8 and chance(draw, 20):
             self.forged = True
-            return frame._replace(time_ns=frame.time_ns + pick(draw, [-1, 1]) * pick(draw, [MS, 5 * MS, 3600_000 * MS]))
+            return frame._replace(
+                time_ns=frame.time_ns + draw.choice([-1, 1]) * draw.choice([MS, 5 * MS, 3600_000 * MS])
+            )
         return frame
 
 
@@ -187,31 +189,31 @@ class Judge:
 class Actor:
     """A policy that may be broken in every way; what it wants is drawn."""
 
-    def __init__(self, draw: Draw, bus: HostileBus) -> None:
+    def __init__(self, draw: Random, bus: HostileBus) -> None:
         self._draw, self._bus = draw, bus
-        self._constant = pick(draw, [6.0, -6.0, 0.0, None])
-        self._slow, self._broken = pick(draw, [0, 0, 2]), chance(draw, 10)
+        self._constant = draw.choice([6.0, -6.0, 0.0, None])
+        self._slow, self._broken = draw.choice([0, 0, 2]), chance(draw, 10)
 
     def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         """A current, or what is none."""
         if chance(self._draw, self._slow):  # it thinks for longer than it may
-            self._bus.spend(pick(self._draw, [MS // 2, MS, 3 * MS, 12 * MS]))
+            self._bus.spend(self._draw.choice([MS // 2, MS, 3 * MS, 12 * MS]))
         if self._broken and chance(self._draw, 2):
             if chance(self._draw, 50):
                 raise PolicyError("out of memory")
-            return pick(self._draw, [math.nan, math.inf, -math.inf, 1e30, 6.1])
-        return self._draw.integer(-30_000, 30_000) * 2e-4 if self._constant is None else self._constant
+            return self._draw.choice([math.nan, math.inf, -math.inf, 1e30, 6.1])
+        return self._draw.randint(-30_000, 30_000) * 2e-4 if self._constant is None else self._constant
 
 
-def run(draw: Draw) -> Played:
+def run(draw: Random) -> Played:
     """One run."""
-    transport, clock = open_sim(f"seed={draw.integer(0, 10**6)}", BENCH)
+    transport, clock = open_sim(f"seed={draw.randint(0, 10**6)}", BENCH)
     bus = HostileBus(draw, transport, clock)
-    homing, steps = chance(draw, 20), pick(draw, [20, 60, 150])
+    homing, steps = chance(draw, 20), draw.choice([20, 60, 150])
     if bus.muted is not None:
         homing, steps = False, 450  # long enough to miss it
     if homing:
-        transport.node.angle = draw.integer(-3, 80)
+        transport.node.angle = draw.randint(-3, 80)
     journal = Journal()
     stop = chance(draw, 5)
     driven: Any = {"send": bus.send, "receive": bus.receive, "now_ns": clock.now_ns, "push": journal.push}

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from random import Random
 
 from emb_runtime.can.messages import StopReason, load_layout
 from emb_runtime.records import Frame, NodeState
-from tests.fuzz.draws import Draw, chance, pick
 from tests.independent import MESSAGES, protected
 
 LAYOUT = load_layout()
@@ -14,48 +14,53 @@ MS = 1_000_000
 COMMAND, ANGLE, VELOCITY, STATUS = 0x080, 0x100, 0x101, 0x102
 
 
-def anything(draw: Draw, time_ns: int = 0) -> Frame:
+def chance(draw: Random, percent: int) -> bool:
+    """True so often; false is what hypothesis shrinks to."""
+    return draw.randrange(100) >= 100 - percent
+
+
+def anything(draw: Random, time_ns: int = 0) -> Frame:
     """Any frame at all: mostly with an identifier of ours and often with a CRC that is right."""
-    identifier = pick(draw, [COMMAND, ANGLE, VELOCITY, STATUS, draw.integer(0, 0x7FF)])
-    frame = Frame(identifier, draw.blob(draw.integer(0, 8)), time_ns)
+    identifier = draw.choice([COMMAND, ANGLE, VELOCITY, STATUS, draw.randint(0, 0x7FF)])
+    frame = Frame(identifier, draw.randbytes(draw.randint(0, 8)), time_ns)
     if identifier in MESSAGES and chance(draw, 70):
-        frame = frame._replace(data=protected(identifier, draw.blob(MESSAGES[identifier].length - 1)))
+        frame = frame._replace(data=protected(identifier, draw.randbytes(MESSAGES[identifier].length - 1)))
     return of_a_kind(draw, frame) if chance(draw, 15) else frame
 
 
-def of_a_kind(draw: Draw, frame: Frame) -> Frame:
+def of_a_kind(draw: Random, frame: Frame) -> Frame:
     """The same frame, but not a standard data frame on the bus."""
-    kind = draw.integer(0, 4)
+    kind = draw.randint(0, 4)
     if kind == 0:
-        return frame._replace(extended=True, identifier=pick(draw, [frame.identifier, draw.integer(0, 0x1FFFFFFF)]))
+        return frame._replace(extended=True, identifier=draw.choice([frame.identifier, draw.randint(0, 0x1FFFFFFF)]))
     if kind == 1:
-        return frame._replace(remote=True, data=pick(draw, [b"", frame.data]))
+        return frame._replace(remote=True, data=draw.choice([b"", frame.data]))
     if kind == 2:
-        return frame._replace(error=True, identifier=draw.integer(0, 0xFFF))
+        return frame._replace(error=True, identifier=draw.randint(0, 0xFFF))
     if kind == 3:
         return frame._replace(own=True)
-    return frame._replace(dropped=draw.integer(0, 1000))
+    return frame._replace(dropped=draw.randint(0, 1000))
 
 
-def damaged(draw: Draw, frame: Frame) -> Frame:
+def damaged(draw: Random, frame: Frame) -> Frame:
     """A frame that the bus, a gateway or another sender has changed."""
     data = bytearray(frame.data)
-    how = draw.integer(0, 5)
+    how = draw.randint(0, 5)
     if how == 0 and data:  # bit errors that the CAN controller has overlooked
-        for _ in range(draw.integer(1, 4)):
-            bit = draw.integer(0, 8 * len(data) - 1)
+        for _ in range(draw.randint(1, 4)):
+            bit = draw.randint(0, 8 * len(data) - 1)
             data[bit // 8] ^= 1 << bit % 8
     elif how == 1:
-        data = data[: draw.integer(0, len(data))]
+        data = data[: draw.randint(0, len(data))]
     elif how == 2 and len(data) > 1 and frame.identifier in MESSAGES:  # something else, properly protected
-        data[1 + draw.integer(0, len(data) - 2)] = draw.integer(0, 255)
+        data[1 + draw.randint(0, len(data) - 2)] = draw.randint(0, 255)
         data = bytearray(protected(frame.identifier, bytes(data[1:])))
     elif how == 3 and len(data) > 1 and frame.identifier in MESSAGES:  # of another sender
-        data = bytearray(protected(frame.identifier, bytes(data[1:]), by=draw.integer(0, 0xFFFF)))
+        data = bytearray(protected(frame.identifier, bytes(data[1:]), by=draw.randint(0, 0xFFFF)))
     elif how == 4:
         return of_a_kind(draw, frame)
     else:
-        data += draw.blob(8 - min(8, len(data)))
+        data += draw.randbytes(8 - min(8, len(data)))
     return frame._replace(data=bytes(data))
 
 
@@ -63,17 +68,17 @@ def damaged(draw: Draw, frame: Frame) -> Frame:
 class Stream:
     """A node at constant speed, and everything that can happen between it and its reader."""
 
-    draw: Draw
+    draw: Random
     now_ns: int = 1_000 * MS
     count: int = 0  # Sampling periods so far
 
     def __post_init__(self) -> None:
         """Begin anywhere."""
-        self._speed = self.draw.integer(-300, 300)
-        self._percent = pick(self.draw, [3, 10, 30])
+        self._speed = self.draw.randint(-300, 300)
+        self._percent = self.draw.choice([3, 10, 30])
         self._status_counter = 0
         self._past: list[Frame] = []
-        self.count = self.draw.integer(0, 20)
+        self.count = self.draw.randint(0, 20)
 
     def period(self) -> list[Frame]:
         """The frames that come in the next sampling period, with their arrival times."""
@@ -98,8 +103,8 @@ class Stream:
     def _spoiled(self, frames: list[Frame]) -> list[Frame]:
         draw = self.draw
         self._past = [*self._past, *frames][-40:]
-        at = draw.integer(0, len(frames) - 1)
-        how = draw.integer(0, 8)
+        at = draw.randint(0, len(frames) - 1)
+        how = draw.randint(0, 8)
         if how == 0:
             del frames[at]
         elif how == 1:
@@ -109,16 +114,16 @@ class Stream:
         elif how == 3:
             frames[at] = damaged(draw, frames[at])
         elif how == 4:  # an old one once more
-            frames.append(pick(draw, self._past)._replace(time_ns=self.now_ns))
+            frames.append(draw.choice(self._past)._replace(time_ns=self.now_ns))
         elif how == 5:
             frames.insert(at, anything(draw, self.now_ns))
         elif how == 6:  # silence, long enough for the counter to come round now and then
-            missed = pick(draw, [1, 2, 14, 15, 19, 20, 250])
+            missed = draw.choice([1, 2, 14, 15, 19, 20, 250])
             self.count += missed
             self.now_ns += missed * MS
             return frames[:1]
         elif how == 7:  # the computer's clock steps
-            self.now_ns += pick(draw, [-5 * MS, 5 * MS, 3600 * 1000 * MS, -3600 * 1000 * MS])
+            self.now_ns += draw.choice([-5 * MS, 5 * MS, 3600 * 1000 * MS, -3600 * 1000 * MS])
         else:  # the node has begun anew
             self.count = 0
         return frames

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from random import Random
 from typing import NamedTuple
 
 from emb_runtime.can.messages import FrameRejectedError, load_layout
@@ -20,9 +21,8 @@ from emb_runtime.errors import BusError
 from emb_runtime.records import Frame, NodeState, RunState, SensorSample
 from emb_runtime.safety.guard import Guard, GuardRejectedError
 from emb_runtime.safety.state_machine import FAULTS, Event, Fault, Run, StopError, may_enable, may_send, step, timeouts
-from tests.fuzz.draws import Draw, chance, pick
 from tests.fuzz.model import MachineModel, ReceptionModel
-from tests.fuzz.stream import COMMAND, MS, Stream, anything, damaged
+from tests.fuzz.stream import COMMAND, MS, Stream, anything, chance, damaged
 from tests.independent import encoded, protected, read
 
 LENGTH = 100  # Frames or events in a sequence
@@ -52,11 +52,9 @@ def demand(holds: bool, *what: object) -> None:
         raise ViolationError(" ".join(map(str, what)))
 
 
-def decoder(draw: Draw) -> Played:
+def decoder(draw: Random) -> Played:
     """Frames of all kinds are read or rejected as by cantools and the AUTOSAR library; what is read can be said."""
-    for n in range(LENGTH):
-        if draw.spent:
-            return Played(n)
+    for _ in range(LENGTH):
         frame = valid_frame(draw) if chance(draw, 60) else anything(draw)
         if chance(draw, 50):
             frame = damaged(draw, frame)
@@ -75,25 +73,25 @@ def decoder(draw: Draw) -> Played:
     return Played(LENGTH)
 
 
-def valid_frame(draw: Draw) -> Frame:
+def valid_frame(draw: Random) -> Frame:
     """A frame of ours that says anything that it may."""
-    message = pick(draw, list(LAYOUT.messages.values()))
-    raws = [draw.integer(s.raw_minimum, s.raw_maximum) for s in message.signals[1:]]
+    message = draw.choice(list(LAYOUT.messages.values()))
+    raws = [draw.randint(s.raw_minimum, s.raw_maximum) for s in message.signals[1:]]
     word = sum((raw & s.mask) << s.shift for raw, s in zip(raws, message.signals[1:], strict=True))
     return Frame(message.identifier, protected(message.identifier, word.to_bytes(message.length, "little")[1:]))
 
 
-def reception(draw: Draw) -> Played:
+def reception(draw: Random) -> Played:
     """Whatever is lost, damaged, repeated, swapped, forged or mistimed, no frame counts for more than it is."""
     stream, model = Stream(draw), ReceptionModel(BENCH)
     taken = Reception(LAYOUT, BENCH, lambda _frame, _why: None)
     count = 0
-    while count < LENGTH and not draw.spent:
+    while count < LENGTH:
         for frame in stream.period():
             count += 1
             ours, expected = taken.take(frame), model.take(frame)
             demand(ours == expected, frame, "made", ours, "expected", expected)
-            now_ns = frame.time_ns + draw.integer(-2 * MS, 3 * MS)
+            now_ns = frame.time_ns + draw.randint(-2 * MS, 3 * MS)
             demand((taken.inhibit_reason(now_ns) == "") == model.permitted(now_ns), "permission at", now_ns, taken)
             compare(taken, model)
     return Played(count)
@@ -109,19 +107,17 @@ def compare(taken: Reception, model: ReceptionModel) -> None:
         demand(state.errors.last == model.counters.get(key), state.name, "stored counter", state.errors.last)
 
 
-def machine(draw: Draw) -> Played:
+def machine(draw: Random) -> Played:
     """Every event in every state at every time leads where the table says, and no way leads back from a stop."""
     times, run, model = timeouts(BENCH), Run(), MachineModel(BENCH)
-    now_ns, stopped = draw.integer(0, 10**12), False
-    for n in range(LENGTH):
-        if draw.spent:
-            return Played(n)
-        now_ns += pick(draw, [0, 1, MS // 2, MS, MS, MS, 5 * MS, 19 * MS, 20 * MS, 400 * MS, 5000 * MS, -MS])
-        event: Event | Fault = pick(draw, [*Event, Event.PAIR, Event.TIME, Event.TIME])
+    now_ns, stopped = draw.randint(0, 10**12), False
+    for _ in range(LENGTH):
+        now_ns += draw.choice([0, 1, MS // 2, MS, MS, MS, 5 * MS, 19 * MS, 20 * MS, 400 * MS, 5000 * MS, -MS])
+        event: Event | Fault = draw.choice([*Event, Event.PAIR, Event.TIME, Event.TIME])
         if chance(draw, 10):
-            event = pick(draw, list(Fault))
+            event = draw.choice(list(Fault))
         elif chance(draw, 60):  # on to the next state, so that all are reached
-            event = pick(draw, model.possible())
+            event = draw.choice(model.possible())
         try:
             run = step(times, run, event, now_ns)
             possible = True
@@ -143,25 +139,23 @@ SLEW = 1500.05
 SLEW_STEPS = 7_501  # Of the current signal's 0.2 mA, the one that rounding may cost included
 
 
-def guard(draw: Draw) -> Played:
+def guard(draw: Random) -> Played:
     """What reaches the bus is in the contract, and what is in the contract reaches the bus."""
     bench = replace(BENCH, guard=replace(BENCH.guard, slew=SLEW))
-    limit = pick(draw, [6.0, 6.0, 2.0])
+    limit = draw.choice([6.0, 6.0, 2.0])
     bus, failing = list[Frame](), list[bool]()
 
     def send(frame: Frame) -> None:
         if failing.pop():
-            raise pick(draw, [BusError, TransmitQueueFullError])("gone")
+            raise draw.choice([BusError, TransmitQueueFullError])("gone")
         bus.append(frame)
 
     watched, model = Guard(LAYOUT, bench, send, limit=limit), GuardModel(bench, limit)
-    now_ns = draw.integer(0, 10**12)
-    for n in range(LENGTH):
-        if draw.spent:
-            return Played(n, len(bus))
-        now_ns += pick(draw, [MS, MS, MS, MS, MS, MS, 0, MS // 5, 5 * MS, 1000 * MS, -MS])
-        state = pick(draw, [*RunState, *[RunState.ACTIVE] * 20])
-        age_ns = pick(draw, [0, MS // 3, MS // 3, MS, 2 * MS, 2 * MS + 1, -MS, -MS - 1, 10 * MS])
+    now_ns = draw.randint(0, 10**12)
+    for _ in range(LENGTH):
+        now_ns += draw.choice([MS, MS, MS, MS, MS, MS, 0, MS // 5, 5 * MS, 1000 * MS, -MS])
+        state = draw.choice([*RunState, *[RunState.ACTIVE] * 20])
+        age_ns = draw.choice([0, MS // 3, MS // 3, MS, 2 * MS, 2 * MS + 1, -MS, -MS - 1, 10 * MS])
         frame = attempt(draw, model)
         fails = chance(draw, 3)
         failing.append(fails)
@@ -178,18 +172,18 @@ def guard(draw: Draw) -> Played:
     return Played(LENGTH, len(bus))
 
 
-def attempt(draw: Draw, model: GuardModel) -> Frame:
+def attempt(draw: Random, model: GuardModel) -> Frame:
     """A command that is nearly always nearly right."""
     if chance(draw, 3):
         return anything(draw)
     counter, answers, last = model.expected()
     if chance(draw, 10):
-        counter = draw.integer(0, 15)
+        counter = draw.randint(0, 15)
     if chance(draw, 10):
-        answers, last = draw.integer(0, 15), 0
+        answers, last = draw.randint(0, 15), 0
     enable = not chance(draw, 15)
-    near = last + pick(draw, [-1, 1]) * pick(draw, [0, 100, SLEW_STEPS - 1, SLEW_STEPS, SLEW_STEPS, SLEW_STEPS + 1])
-    raw = pick(draw, [near, near, near, near, draw.integer(-32_768, 32_767), 30_000, -30_001, 10_001])
+    near = last + draw.choice([-1, 1]) * draw.choice([0, 100, SLEW_STEPS - 1, SLEW_STEPS, SLEW_STEPS, SLEW_STEPS + 1])
+    raw = draw.choice([near, near, near, near, draw.randint(-32_768, 32_767), 30_000, -30_001, 10_001])
     if not enable and not chance(draw, 20):
         raw = 0
     body = struct.pack("<BhB", counter | answers << 4, min(max(raw, -32_768), 32_767), enable)
@@ -197,10 +191,10 @@ def attempt(draw: Draw, model: GuardModel) -> Frame:
     return damaged(draw, frame) if chance(draw, 10) else frame
 
 
-def report(draw: Draw) -> SensorSample:
+def report(draw: Random) -> SensorSample:
     """What a drive might say of the period before."""
-    applied = draw.integer(-100_000, 100_000) * 2e-4
-    return SensorSample(draw.integer(0, 14), 0.0, 0.0, 0, 0, applied, draw.integer(0, 15), NodeState.ACTIVE)
+    applied = draw.randint(-100_000, 100_000) * 2e-4
+    return SensorSample(draw.randint(0, 14), 0.0, 0.0, 0, 0, applied, draw.randint(0, 15), NodeState.ACTIVE)
 
 
 class GuardModel:
@@ -244,7 +238,7 @@ class GuardModel:
         return True
 
 
-TARGETS: dict[str, Callable[[Draw], Played]] = {
+TARGETS: dict[str, Callable[[Random], Played]] = {
     "decoder": decoder,
     "reception": reception,
     "machine": machine,

@@ -1,43 +1,35 @@
 """Fuzz: random, mutated and forged frames and sequences of events, judged by accounts that share no code with ours.
 
-    python -m tests.searches.fuzz [--seed 0] [--scale 1.0] [--target guard [--sequence 17]] [--no-guided]
+    python -m tests.searches.fuzz [--seed 0] [--scale 1.0] [--target guard [--sequence 17]]
 
 Each sequence is drawn by a generator seeded with its target, the seed and its number, so that any of them can be played
 again alone: ``--target NAME --sequence NUMBER`` shows its traceback. "hangs" are sequences that took more than a
 minute, or a run that would not end; "wrong" are verdicts that differ from the independent account's, and each illegal
-one of the commands that reached the bus. Where atheris is installed it looks, guided by coverage, for what chance does
-not find.
-Ends with 1 if anything was found.
+one of the commands that reached the bus. Ends with 1 if anything was found.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import re
 import signal
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
-from pathlib import Path
+from random import Random
 
 from emb_runtime.can.messages import FrameRejectedError, load_layout
 from emb_runtime.records import Frame
 from tests.fuzz import runs
-from tests.fuzz.draws import Draw, RandomDraw
 from tests.fuzz.runs import HangError
 from tests.fuzz.targets import TARGETS, Played, ViolationError, valid_frame
 
-GUIDE = Path(__file__).parents[1] / "fuzz" / "guided.py"
 LONGEST = 60.0  # Time for one sequence [s]; the slowest takes a tenth of a second
 
 
-def bit_errors(draw: Draw) -> Played:
+def bit_errors(draw: Random) -> Played:
     """Every frame with one or two wrong bits that can be made of a valid one is rejected."""
     frame = valid_frame(draw)
     message = next(m for m in load_layout().messages.values() if m.identifier == frame.identifier)
@@ -57,7 +49,7 @@ def bit_errors(draw: Draw) -> Played:
 class Entry:
     """Target of the fuzzing, and its default number of inputs."""
 
-    target: Callable[[Draw], Played]
+    target: Callable[[Random], Played]
     sequences: int
     judge: str
 
@@ -70,8 +62,6 @@ ENTRIES = {
     "guard": Entry(TARGETS["guard"], 3_000, "model in whole steps: sent if and only if legal"),
     "loop": Entry(runs.run, 1_500, "each command on the bus by cantools, E2E library, model of the reception"),
 }
-GUIDED = {"decoder": 20_000, "reception": 5_000, "machine": 50_000, "guard": 10_000}  # Runs of atheris
-GUIDED_SECONDS = 90  # Most time for one target under atheris [s]
 
 
 @dataclass
@@ -122,34 +112,13 @@ def fuzz(name: str, entry: Entry, seed: int, count: int) -> Tally:
         tally.sequences += 1
         try:
             with bounded():
-                items, commands = entry.target(RandomDraw(name, seed, number))
+                items, commands = entry.target(Random(f"{name}:{seed}:{number}"))
             tally.items += items
             tally.commands += commands
         except (Exception, HangError) as error:
             tally.found(name, number, error)
     tally.seconds = time.monotonic() - begin
     return tally
-
-
-def guided(name: str, seed: int, count: int) -> tuple[str, bool]:
-    """Run one target under atheris; a line for the table, and whether nothing was found."""
-    with tempfile.TemporaryDirectory() as kept:
-        command = [
-            *(sys.executable, str(GUIDE), name),
-            *(f"-runs={count}", f"-seed={seed + 1}", f"-max_total_time={GUIDED_SECONDS}", f"-timeout={LONGEST:.0f}"),
-            *("-max_len=2048", "-len_control=0", f"-artifact_prefix={kept}/"),
-        ]
-        begin = time.monotonic()
-        ended = subprocess.run(command, capture_output=True, text=True, check=False, cwd=kept)
-        seconds = time.monotonic() - begin
-        output = ended.stdout + ended.stderr
-        done = re.search(r"Done (\d+) runs", output)
-        covered = re.findall(r"cov: (\d+) ft: (\d+) corp: (\d+)/", output)
-        if ended.returncode != 0 or done is None or not covered:
-            kind = "hang" if "ERROR: libFuzzer: timeout" in output else "finding"
-            return f"| {name} | {kind}, exit code {ended.returncode} | | | | {seconds:.0f} |\n{output[-3000:]}", False
-        edges, features, corpus = covered[-1]
-        return f"| {name} | {done[1]} | {edges} | {features} | {corpus} | {seconds:.0f} |", True
 
 
 def main() -> int:
@@ -159,12 +128,11 @@ def main() -> int:
     parser.add_argument("--scale", type=float, default=1.0, help="so many times as many sequences")
     parser.add_argument("--target", choices=ENTRIES, help="this one alone")
     parser.add_argument("--sequence", type=int, help="of the target, this sequence alone, with its traceback")
-    parser.add_argument("--no-guided", action="store_true", help="without atheris")
     args = parser.parse_args()
     if args.sequence is not None:
         if args.target is None:
             parser.error("--sequence needs --target")
-        print(f"fine: {ENTRIES[args.target].target(RandomDraw(args.target, args.seed, args.sequence))}")
+        print(ENTRIES[args.target].target(Random(f"{args.target}:{args.seed}:{args.sequence}")))
         return 0
     names = [args.target] if args.target else list(ENTRIES)
     total = Tally()
@@ -179,10 +147,7 @@ def main() -> int:
         for key in ("sequences", "items", "commands", "exceptions", "hangs", "wrong", "seconds"):
             setattr(total, key, getattr(total, key) + getattr(tally, key))
     print(row("all", total, ""))
-    clean = total.findings == 0
-    if not args.no_guided:
-        clean = guide([name for name in names if name in GUIDED], args.seed, args.scale) and clean
-    return 0 if clean else 1
+    return 1 if total.findings else 0
 
 
 def row(name: str, tally: Tally, judge: str) -> str:
@@ -190,21 +155,6 @@ def row(name: str, tally: Tally, judge: str) -> str:
     played = f"{tally.sequences:,} | {tally.items:,} | {tally.commands:,}"
     found = f"{tally.exceptions} | {tally.hangs} | {tally.wrong}"
     return f"| {name} | {played} | {found} | {tally.seconds:.0f} | {judge} |"
-
-
-def guide(names: list[str], seed: int, scale: float) -> bool:
-    """The table of the coverage-guided runs; whether nothing was found."""
-    if find_spec("atheris") is None:
-        print("\natheris is not installed: nothing was guided by coverage (pip install atheris)")
-        return True
-    print("\n| guided by coverage (atheris) | runs | edges | features | corpus | s |")
-    print("|---|---|---|---|---|---|")
-    clean = True
-    for name in names:
-        line, fine = guided(name, seed, max(1, round(GUIDED[name] * scale)))
-        print(line, flush=True)
-        clean = clean and fine
-    return clean
 
 
 if __name__ == "__main__":
