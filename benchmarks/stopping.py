@@ -25,7 +25,7 @@ import numpy as np
 from emb_bench.config.bench import load_bench
 from emb_bench.logs.estimates import by_step
 from emb_bench.logs.log import read_log
-from emb_export.reference import reference_file
+from emb_export.file import reference_file
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES
 

@@ -21,7 +21,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
 from emb_bench.config.bench import Bench, load_bench
-from emb_train.envs.env import EmbExcitationVectorEnv
+from emb_train.env import EmbExcitationVectorEnv
 from emb_train.evaluate import grid_outcomes
 from emb_train.ppo import train
 from emb_train.training import Training, begin_training, load_preset, load_training, run_training

@@ -559,10 +559,10 @@ import json, sys
 from emb_bench.config.bench import load_bench
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
-from emb_train.envs.conditions import Conditions
-from emb_train.structured.played import PolicyFile
-from emb_train.envs.measure import MEASURES
-from emb_train.envs.play import fresh_draws, play
+from emb_train.closed_loop import Conditions
+from emb_train.reference import PolicyFile
+from emb_train.play import MEASURES
+from emb_train.play import fresh_draws, play
 bench = load_bench()
 ranges, out = bench.range_set("pm50"), {}
 draws = fresh_draws(ranges, 0, int(sys.argv[1]))

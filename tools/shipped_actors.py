@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from emb_bench.config.bench import load_bench
-from emb_export.reference import reference_file
+from emb_export.file import reference_file
 from emb_runtime.policy.policy import shipped_actor_path
 from emb_runtime.system.terminal import show
 

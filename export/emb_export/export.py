@@ -6,17 +6,17 @@ What needs torch is imported inside functions, so that ``--help`` is quick and a
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
 from pathlib import Path
 
 from emb_bench.config.bench import load_bench
 from emb_bench.excitation.reference import EXCITATIONS
+from emb_bench.output import replacing
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.policy.policy import load_policy
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.terminal import complain, show
-from emb_train.names import reference_names, wrapped
+from emb_train.presets import reference_names, wrapped
 
 EPILOG = """\
 sequences:
@@ -83,7 +83,7 @@ def _export(arguments: argparse.Namespace) -> str:
         data, difference, origin = network_file(source)
         of = f"of the trained network, {origin}"
     else:
-        from emb_export.reference import read_sequence, reference_file, sequence_file
+        from emb_export.file import read_sequence, reference_file, sequence_file
 
         bench = load_bench(arguments.bench)
         make_law(bench)  # where no shield can be made, emb-run would refuse the bench
@@ -95,21 +95,9 @@ def _export(arguments: argparse.Namespace) -> str:
             data, difference = sequence_file(currents, what, bench)
             of = f"of {what}"
         load_policy(data, bench)  # with each check of emb-run
-    _write(path, data)
+    with replacing(path) as beside:
+        beside.write_bytes(data)
     return f"{path}: {len(data)} bytes, within {difference:.1e} {of}"
-
-
-def _write(path: Path, data: bytes) -> None:
-    if path.is_dir():
-        raise UsageError(f"{path}: expected a file to write, got a directory")
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_bytes(data)
-        part.replace(path)
-    except OSError as err:
-        with contextlib.suppress(OSError):
-            part.unlink()
-        raise UsageError(f"{path}: cannot write: {err.strerror}") from err
 
 
 if __name__ == "__main__":

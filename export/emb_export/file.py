@@ -1,10 +1,11 @@
-"""Policy files: an ONNX graph of one opset with its contract in the metadata, and the proof that it is right."""
+"""Policy files of references and of sequences of currents: an ONNX graph with its contract, and the proof of both."""
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Mapping
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -13,11 +14,22 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from emb_bench.config.bench import Bench
+from emb_bench.excitation.reference import parse_excitation
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES, Ranges
-from emb_runtime.errors import PolicyRefusedError
-from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, VECTOR_TOLERANCE, Contract, PolicyLimits, Vector
+from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.policy.contract import (
+    CONTRACT_KEY,
+    MIN_VECTORS,
+    SAMPLE,
+    VECTOR_TOLERANCE,
+    Contract,
+    PolicyLimits,
+    Vector,
+)
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME, Inference
+from emb_train.reference import FEATURES, PRODUCTS, Box, box_of, features, set_reference, stored
+from emb_train.trial import Task
 
 OPSET = 20  # Of the default domain: old enough for ONNX Runtime 1.20, the oldest that the runtime allows
 IR_VERSION = 10  # Of the file format: the one that goes with the opset
@@ -55,7 +67,7 @@ def policy_file(
     Args:
         model: the graph.
         bench: limits, sample time and horizon that it was made for.
-        kind: of the graph, see :class:`emb_runtime.policy.contract.Contract`, as the names of its inputs and the gain.
+        kind: as of :class:`emb_runtime.policy.contract.Contract`, like ``inputs`` and ``gain``.
         inputs: names.
         seen: inputs, shape [N, n].
         wanted: outputs for them, shape [N, m]; some become the test vectors.
@@ -67,6 +79,7 @@ def policy_file(
         PolicyRefusedError: an output differs by more than the tolerance of a test vector.
     """
     chosen = np.linspace(0, len(seen) - 1, VECTORS).astype(int)
+    bounds: Any = {n: (getattr(ranges.low, n), getattr(ranges.high, n)) for n in PARAMETER_NAMES} if ranges else {}
     contract = Contract(
         kind=kind,
         inputs=inputs,
@@ -74,7 +87,7 @@ def policy_file(
         sample_time=bench.timing.sample_time,
         horizon=bench.timing.horizon,
         vectors=tuple(Vector(tuple(seen[i].tolist()), tuple(wanted[i].tolist())) for i in chosen),
-        ranges={} if ranges is None else _bounds(ranges),
+        ranges=bounds,
         gain=gain,
         provenance={**provenance, **versions("emb-excite", "onnx", "numpy")},
     )
@@ -91,10 +104,6 @@ def policy_file(
     return data, difference
 
 
-def _bounds(ranges: Ranges) -> Any:
-    return {name: (getattr(ranges.low, name), getattr(ranges.high, name)) for name in PARAMETER_NAMES}
-
-
 def answers(data: bytes, contract: Contract, seen: NDArray[Any]) -> Floats:
     """Outputs of a file for inputs of shape [N, n], by the runtime's own evaluation, shape [N, m]."""
     inference, found = Inference(data, contract), []
@@ -108,3 +117,101 @@ def answers(data: bytes, contract: Contract, seen: NDArray[Any]) -> Floats:
 def versions(*names: str) -> dict[str, str]:
     """Versions of packages, for a provenance."""
     return {name: version(name) for name in names}
+
+
+def reference_file(source: str, bench: Bench) -> tuple[bytes, float]:
+    """The file of a reference (:func:`emb_train.reference.stored`), and the largest difference from its table.
+
+    Raises:
+        UsageError: there is no such reference, or the file is something else.
+        BenchFileError: the bench lacks its set of ranges.
+        PolicyRefusedError: the file would differ from the table.
+    """
+    kept = stored(source)
+    task = Task.of(kept)
+    ranges, table = bench.range_set(task.ranges), kept.array()
+    box = box_of(bench, ranges)
+    seen = np.random.default_rng(0).uniform(0.4, 1.6, (4 * VECTORS, FEATURES))
+    wanted = np.zeros((len(seen), len(table)))
+    for relative, reference in zip(seen.tolist(), wanted, strict=True):
+        set_reference(table, features(box, tuple(relative)), reference)
+    nominal = np.array([getattr(bench.brake, name) for name in PARAMETER_NAMES])
+    kept_of = {name: getattr(kept, name) for name in ("task", "form", "plant", "shield", "seed", "command")}
+    provenance = {"reference": Path(source).stem, **kept_of}
+    nodes = [
+        helper.make_node("Log", [INPUT_NAME], ["logarithm"]),
+        helper.make_node("Gemm", ["logarithm", "scale", "middle"], ["scaled"]),
+        helper.make_node("Clip", ["scaled", "minus_one", "one"], ["feature"]),
+        helper.make_node("Gemm", ["feature", "first", "no_first"], ["left"]),
+        helper.make_node("Gemm", ["feature", "second", "no_second"], ["right"]),
+        helper.make_node("Mul", ["left", "right"], ["terms"]),
+        helper.make_node("Gemm", ["terms", "slopes", "constants"], ["free"]),
+        helper.make_node("Clip", ["free", "minus_one", "one"], [OUTPUT_NAME]),
+    ]
+    model = graph_of(nodes, _constants(table, box, nominal), "reference", (FEATURES, len(table)))
+    return policy_file(
+        model, bench, "reference", PARAMETER_NAMES, seen * nominal, wanted, provenance, ranges, kept.gain
+    )
+
+
+def _constants(table: Floats, box: Box, nominal: Floats) -> dict[str, Floats]:
+    """Scaling of the features over their ranges, the factors of each term, and the table."""
+    low, high = (np.log(np.array(end) * nominal) for end in box)
+    width = np.where(high > low, high - low, np.inf)  # 0 for a parameter that is known
+    one, pairs = np.eye(FEATURES), np.array(PRODUCTS)
+    return {
+        "scale": np.diag(2.0 / width),
+        "middle": -((low + high) / width)[None],
+        "minus_one": np.array(-1.0),
+        "one": np.array(1.0),
+        "first": np.hstack([one, one[:, pairs[:, 0]]]),
+        "no_first": np.zeros((1, FEATURES + len(PRODUCTS))),
+        "second": np.hstack([0.0 * one, one[:, pairs[:, 1]]]),
+        "no_second": np.repeat([[1.0, 0.0]], [FEATURES, len(PRODUCTS)], axis=1),
+        "slopes": np.ascontiguousarray(table[:, 1:].T),
+        "constants": table[:, :1].T.copy(),
+    }
+
+
+def read_sequence(text: str, bench: Bench) -> tuple[Floats, str]:
+    """The currents [A], shape [horizon], of an excitation or of a ``.csv`` file of ``emb-design``; and their name.
+
+    Raises:
+        UsageError: there is no such excitation or file, it is for another bench, or it is a feedback law.
+    """
+    if Path(text).suffix == ".csv":
+        from emb_bench.design.report import read_design  # scipy takes its time
+
+        return read_design(Path(text), bench)
+    excited = parse_excitation(text, bench)
+    if excited.currents is None:
+        raise UsageError(f"{excited.name} is a feedback law: expected an excitation that is a sequence of currents")
+    return excited.currents, excited.text
+
+
+def sequence_file(currents: Floats, what: str, bench: Bench) -> tuple[bytes, float]:
+    """The file of a sequence of currents [A], shape [horizon], and its largest difference as a part of their limit.
+
+    Raises:
+        PolicyRefusedError: the file would differ from the sequence.
+    """
+    last, t_s = len(currents) - 1, bench.timing.sample_time
+    constants: dict[str, NDArray[Any]] = {
+        "currents": currents.astype(np.float32),
+        "time_index": np.array([2]),
+        "rate": np.array(1.0 / t_s, np.float32),
+        "begin": np.array(0),
+        "end": np.array(last),
+    }
+    nodes = [
+        helper.make_node("Gather", [INPUT_NAME, "time_index"], ["time"], axis=1),
+        helper.make_node("Mul", ["time", "rate"], ["step"]),
+        helper.make_node("Round", ["step"], ["whole"]),
+        helper.make_node("Cast", ["whole"], ["number"], to=TensorProto.INT64),
+        helper.make_node("Clip", ["number", "begin", "end"], ["place"]),
+        helper.make_node("Gather", ["currents", "place"], [OUTPUT_NAME], axis=0),
+    ]
+    model = graph_of(nodes, constants, "current", (len(SAMPLE), 1))
+    seen = np.zeros((len(currents), len(SAMPLE)))
+    seen[:, 2] = t_s * np.arange(len(currents))
+    return policy_file(model, bench, "current", SAMPLE, seen, currents[:, None], {"sequence": what})

@@ -20,7 +20,7 @@ from emb_export.file import OPSET, policy_file, versions
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import SAMPLE
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
-from emb_train.envs.conditions import EVERYTHING
+from emb_train.closed_loop import EVERYTHING
 from emb_train.ppo import DeployedActor
 from emb_train.training import load_training
 
@@ -43,9 +43,6 @@ class InSeconds(nn.Module):
 
 def network_file(directory: Path) -> tuple[bytes, float, str]:
     """The file of a training, its largest difference from the network as a part of the limit, and its origin.
-
-    Args:
-        directory: of the training.
 
     Raises:
         UsageError: the directory holds no usable training.
@@ -101,15 +98,10 @@ def _graph(module: nn.Module) -> onnx.ModelProto:
         )
     assert program is not None  # it is None only for the old exporter
     model = program.model_proto
-    _strip(model)
-    return model
-
-
-def _strip(model: onnx.ModelProto) -> None:
-    """Remove the exporter's notes beside the graph: stack traces, with paths of this machine."""
     graph = model.graph
     del graph.value_info[:]
     parts: list[Any] = [model, graph, *graph.node, *graph.initializer, *graph.input, *graph.output]
-    for part in parts:
+    for part in parts:  # stack traces, with paths of this machine
         part.doc_string = ""
         del part.metadata_props[:]
+    return model

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from emb_bench.config.bench import Bench
 from emb_runtime.errors import UsageError
-from emb_train.envs.batch import Batch
-from emb_train.envs.env import Scoring
-from emb_train.envs.play import Draw, begin_all
+from emb_train.closed_loop import Batch
+from emb_train.env import Scoring
+from emb_train.play import Draw, begin_all
 from emb_train.ppo import DeployedActor
 from emb_train.rewards import REWARDS, Reward
 from emb_train.training import METRICS, begin_training, load_preset, load_training, run_training

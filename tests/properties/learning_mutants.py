@@ -8,7 +8,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, NamedTuple
 
-import emb_train.structured.learning as learning_module
+import emb_train.trial as learning_module
 import tests.properties.learning_search as search_module
 from emb_bench.compiled import source_module
 

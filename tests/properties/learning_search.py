@@ -26,7 +26,7 @@ from emb_runtime.learning.known import HIGH, LOW, Known, known
 from emb_runtime.learning.law import law_for, middle
 from emb_runtime.safety.shield import NO_PAST, damped_current, shield
 from emb_runtime.safety.shield_design import ShieldLaw, design_inputs, make_law
-from emb_train.structured.learning import Learning, begin, holds, listen, miss
+from emb_train.trial import Learning, begin, holds, listen, miss
 from tests.properties.shield_search import (
     DROPS,
     LOST,

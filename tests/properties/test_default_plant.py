@@ -19,10 +19,10 @@ from emb_bench.sim.transport import open_sim
 from emb_runtime.cli import options
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train import cli as train
-from emb_train.envs.batch import Batch
+from emb_train.closed_loop import Batch
 from emb_train.presets import preset_summaries
-from emb_train.structured.task import TASKS
 from emb_train.training import load_preset
+from emb_train.trial import TASKS
 
 from tests.bench.simulated_logs import write_log  # isort: skip
 from tests.conftest import Simulate  # isort: skip

@@ -25,9 +25,8 @@ ROOMS = {
     "runtime/emb_runtime": "errors records system config can estimator policy log safety drives learning control cli",
     "bench/emb_bench": "config documents numbers compiled figures parallel output brake sim information design "
     "excitation logs recordings experiment export hil rerun estimate analysis commission report live batch api cli",
-    "train/emb_train": "names presets rewards envs bench_compatibility ppo training structured optimum "
-    "evaluate cli entry",
-    "export/emb_export": "file network reference export entry",
+    "train/emb_train": "presets rewards closed_loop env play reference trial evolve ppo training optimum evaluate cli",
+    "export/emb_export": "file network export",
 }
 """Sub-packages and single modules of each package, lowest first: each imports from those before it only."""
 SIDE_BY_SIDE = 14  # The most modules in one room

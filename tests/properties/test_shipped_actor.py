@@ -11,15 +11,12 @@ from emb_bench.commission.bench_file import MEASURED, found_text
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.logs.log import read_log
-from emb_export.reference import reference_file
+from emb_export.file import reference_file
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
-from emb_train.envs.conditions import Conditions
-from emb_train.envs.excitations import Played
-from emb_train.envs.measure import MEASURES
-from emb_train.envs.play import fresh_draws, play
-from emb_train.structured.played import Following, PolicyFile
-from emb_train.structured.stored import stored
+from emb_train.closed_loop import Conditions
+from emb_train.play import MEASURES, Played, fresh_draws, play
+from emb_train.reference import Following, PolicyFile, stored
 from tools.shipped_actors import REFERENCES
 
 from tests.bench.commission.test_steps import LOGS, found, sheet_text  # isort: skip

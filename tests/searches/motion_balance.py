@@ -43,8 +43,7 @@ from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current, shield, window
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
-from emb_train.structured.law import Box, box_of, wanted_current
-from emb_train.structured.stored import stored
+from emb_train.reference import Box, box_of, stored, wanted_current
 from tests.searches.sensor_monitor import COMMAND_LOST, COVERED, SAMPLE_LOST, Script, covered, draw, tail
 
 Floats = NDArray[np.float64]

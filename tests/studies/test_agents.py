@@ -13,7 +13,7 @@ import pytest
 
 from emb_bench.config.bench import load_bench
 from emb_train.cli import main as emb_train
-from emb_train.envs.play import Draw
+from emb_train.play import Draw
 from emb_train.training import METRICS, Training, load_preset
 from studies.thesis import agents, trainings
 from studies.thesis.agents import (

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import scipy.stats
 from numpy.typing import NDArray
-from torch import nn
 
 from emb_bench.config.bench import load_bench, parse_bench
 from emb_bench.design.problem import Problem, make_problem
@@ -19,19 +18,15 @@ from emb_bench.excitation.reference import parse_excitation, run_excitation
 from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import fisher
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
-from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train import optimum
 from emb_train.cli import main
-from emb_train.envs.batch import Batch
-from emb_train.envs.conditions import Conditions
-from emb_train.envs.excitations import Played, reference_excitation
-from emb_train.envs.measure import MEASURES, mean_score
-from emb_train.envs.network import Network
-from emb_train.envs.play import Draw, fresh_draws, play
+from emb_train.closed_loop import Batch, Conditions
 from emb_train.evaluate import Settings, Subject, document, evaluate, open_subject, references, text
 from emb_train.optimum import followed, optima, searchable
-from emb_train.structured.played import PolicyFile
+from emb_train.play import MEASURES, Draw, Played, fresh_draws, mean_score, play, reference_excitation
+from emb_train.reference import PolicyFile
 from emb_train.training import VALIDATION_STREAM
 from tests.commands import refused
 from tests.train.trainings import HORIZON
@@ -113,8 +108,6 @@ def test_an_experiment_that_leaves_the_limits_keeps_what_it_had_and_is_not_home(
 def test_policies_that_cannot_be_played_are_refused(tmp_path: Path) -> None:
     with pytest.raises(PolicyRefusedError):
         play(SHORT, SHORT.range_set("pm50"), ("f_v",), Played([1.0] * 7 + [math.nan] * 60), fresh_draws(WIDE, 0, 1))
-    with pytest.raises(UsageError):
-        Network(nn.Linear(3, 2))(np.zeros((5, 4), np.float32))
     path = tmp_path / "empty.onnx"
     path.touch()
     with pytest.raises(PolicyRefusedError, match=str(path)):
@@ -235,13 +228,12 @@ def test_the_shipped_actor_is_on_its_own_ranges_inside_the_limits_at_home_and_be
     subject = open_subject("actor", None)
     assert (subject.ranges, subject.parameters, subject.shield) == ("pm50", PARAMETER_NAMES, None)
     asked = Settings(MEASURES["D"], PARAMETER_NAMES, "pm50", ("exact",), 12, 0, 0, PHYSICAL)
-    (plant,) = evaluate(BENCH, asked, [subject], quiet)
+    plant = evaluate(BENCH, asked, [subject], quiet)["exact"]
     rows = {row.name: row for row in plant.rows}
     actor = rows["actor"]
-    assert not actor.outcome.left.any()
-    assert actor.outcome.home.all()
-    assert np.abs(actor.outcome.angle).max() < 0.5
-    assert plant.ahead(rows["step:amplitude=6"]).low > 0.0
+    assert (actor.left, actor.home) == (0, 12)
+    assert np.abs(actor.end_angle).max() < 0.5
+    assert rows["step:amplitude=6"].first_ahead_by.low > 0.0
     policy = load_policy(shipped_actor_path(), BENCH)
     file, draws = PolicyFile(policy, BENCH), fresh_draws(BENCH.range_set("pm50"), 0, 12)
     alone = play(BENCH, BENCH.range_set("pm50"), PARAMETER_NAMES, file, draws, "exact", PHYSICAL)
@@ -268,16 +260,17 @@ def test_the_verdict_and_the_interval_over_policies_are_those_of_the_numbers() -
     asked = Settings(MEASURES["D"], PARAMETER_NAMES, "pm50", ("exact",), 5, 0, 0, PHYSICAL)
     for current, how in ((6.0, "not significantly different from"), (0.0, "behind"), (-6.0, "behind")):
         subjects = [Subject("it", SHORT, constant(current)), Subject("twin", SHORT, constant(3.0))]
-        (plant,) = evaluate(SHORT, asked, subjects, quiet)
-        means = {row.name: row.score.value for row in plant.rows[2:]}
+        found = evaluate(SHORT, asked, subjects, quiet)
+        plant = found["exact"]
+        means = {row.name: row.measure.value for row in plant.rows[2:]}
         best = max(means, key=lambda name: means[name])
-        said = " ".join(text(asked, [plant]).split())
+        said = " ".join(text(asked, found).split())
         assert f"it is {how} the best reference on these draws, {best}, by" in said
         assert "0 of 5 runs left the limits, and 0 did not end at the origin" in said
-        scores = [row.score.value for row in plant.rows[:2]]
+        scores = [row.measure.value for row in plant.rows[:2]]
         theirs = scipy.stats.ttest_1samp(scores, 0.0).confidence_interval(0.95)
         assert plant.over_policies == pytest.approx((np.mean(scores), theirs.low, theirs.high))
-        record = document(asked, [plant])["plants"]["exact"]
+        record = document(asked, found)["plants"]["exact"]
         assert record["best_reference"] == best
         assert record["over_policies"]["value"] == pytest.approx(np.mean(scores))
 
@@ -286,11 +279,10 @@ def test_the_share_of_the_optimum_is_over_the_draws_that_have_one(searched: list
     asked = Settings(MEASURES["weighted"], ("f_v",), "viscous", ("late", "exact"), 4, 0, 2, Conditions())
     found = evaluate(BENCH, asked, [open_subject("actor", None)], quiet)
     assert len(searched) == 3  # the one in the middle and two draws, once for both plants
-    for plant in found:
+    for plant in found.values():
         row = plant.rows[0]
-        share = plant.share(row, asked.measure)
-        assert share is not None
-        assert share.value == pytest.approx(np.mean(row.values[:2] / plant.optima))
+        assert row.against_optimum is not None
+        assert row.against_optimum.value == pytest.approx(np.mean(row.values[:2] / plant.optima))
 
 
 def test_a_policy_is_evaluated_behind_the_shield_that_it_was_made_behind_unless_another_one_is_named(

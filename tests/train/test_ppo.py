@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.config.bench import load_bench
-from emb_train.envs.conditions import Conditions
-from emb_train.envs.env import EmbExcitationVectorEnv
+from emb_train.closed_loop import Conditions
+from emb_train.env import EmbExcitationVectorEnv
 from emb_train.ppo import (
     Actor,
     Critic,

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from emb_bench.config.bench import load_bench
 from emb_bench.information.symmetric import pack, unpack
 from emb_runtime.errors import UsageError
-from emb_train.envs.batch import Batch
-from emb_train.envs.env import Scoring
+from emb_train.closed_loop import Batch
+from emb_train.env import Scoring
 from emb_train.presets import preset_summaries
 from emb_train.rewards import (
     ONE_PARAMETER,
@@ -184,7 +184,7 @@ def test_the_rewards_of_one_parameter_refuse_two() -> None:
 
 
 def test_a_reward_gets_the_state_in_which_the_way_home_began(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("emb_train.envs.env.OUTWARD", 20)
+    monkeypatch.setattr("emb_train.env.OUTWARD", 20)
     turns = []
 
     def noted(t: Transition) -> Any:

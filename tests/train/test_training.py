@@ -18,16 +18,16 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from emb_runtime.config.bench import BrakeParameters, load_bench
+from emb_bench.config.bench import load_bench
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_USAGE, UsageError
-from emb_train import names
+from emb_train import presets as names
 from emb_train.cli import main, parser
-from emb_train.envs.conditions import Conditions
+from emb_train.closed_loop import Conditions
+from emb_train.evolve import Progress
 from emb_train.presets import preset_summaries
+from emb_train.reference import stored
 from emb_train.rewards import Transition, information_increment
-from emb_train.structured.evolution import Progress
-from emb_train.structured.stored import stored
-from emb_train.structured.task import TASKS
 from emb_train.training import (
     ACTOR,
     BENCH,
@@ -38,6 +38,7 @@ from emb_train.training import (
     load_training,
     training_from,
 )
+from emb_train.trial import TASKS, Task
 from tests.commands import refused
 from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench, tiny
 
@@ -116,7 +117,7 @@ def test_a_reference_is_searched_for_and_a_ctrl_c_keeps_what_was_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for module, value in (("BATCH", 4), ("JUDGED", 4)):
-        monkeypatch.setattr(f"emb_train.structured.evolution.{module}", value)
+        monkeypatch.setattr(f"emb_train.evolve.{module}", value)
     command = ["reference", "viscous", "--bench", str(short_bench(tmp_path)), "--steps", "3", "--seed", "7"]
     assert main([*command, "--out", str(tmp_path / "whole")]) == 0
     assert sorted(p.name for p in (tmp_path / "whole").iterdir()) == ["bench.toml", "metrics.jsonl", "reference.json"]
@@ -131,7 +132,7 @@ def test_a_reference_is_searched_for_and_a_ctrl_c_keeps_what_was_found(
     assert main([*command, "--form", "blind", "--begin=1,-1,0,0.3,0.6", *options, "--out", str(blind)]) == 0
     assert main([*command, "--start", str(blind / "reference.json"), *options, "--out", str(found)]) == 0
     assert not stored(str(blind / "reference.json")).array()[:, 1:].any()
-    assert stored(str(found / "reference.json")).asked().conditions.command_delay == (1, 2)
+    assert Task.of(stored(str(found / "reference.json"))).conditions.command_delay == (1, 2)
     done = Progress._asdict
 
     def pressed(step: Progress) -> dict[str, Any]:
@@ -174,7 +175,7 @@ def test_every_command_has_a_help_that_takes_no_torch_and_lists_what_there_is(
 def test_ctrl_c_in_the_imports_and_a_missing_extra_are_no_traceback(tmp_path: Path) -> None:
     code = (
         "import os, signal, sys\n"
-        "from emb_train.entry import emb_train\n"
+        "from emb_train import emb_train\n"
         "class Pressed:\n"
         "    def find_spec(self, name, *_):\n"
         "        if name == 'emb_train.cli': os.kill(os.getpid(), signal.SIGINT)\n"

@@ -1,1 +1,10 @@
 """Learning an excitation: environments, rewards, asymmetric PPO, contextual evolution of references, evaluation."""
+
+from __future__ import annotations
+
+from emb_runtime.system.entry import start
+
+
+def emb_train() -> int:
+    """``emb-train``; imports the command after the first handler of a Ctrl-C."""
+    return start("emb_train.cli", "emb-train: interrupted")

@@ -21,14 +21,13 @@ from emb_bench.output import make_empty_folder, replacing
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
 from emb_runtime.system.terminal import as_json, complain, mention, show
-from emb_train.names import TASKS, listed, reference_names, wrapped
-from emb_train.presets import preset_summaries
+from emb_train.presets import TASKS, listed, preset_summaries, reference_names, wrapped
 
 if TYPE_CHECKING:
     from emb_bench.config.bench import Bench
     from emb_bench.information.symmetric import Floats
     from emb_train.evaluate import Settings, Subject
-    from emb_train.structured.task import Task
+    from emb_train.trial import Task
 
 T = TypeVar("T")
 
@@ -266,9 +265,9 @@ def reference(arguments: argparse.Namespace) -> int:
         BenchFileError: the bench lacks a set or the plant.
     """
     from emb_runtime.estimator.speed_loop import scale_of
-    from emb_train.structured.evolution import BATCH, Progress, evolve
-    from emb_train.structured.stored import Stored
-    from emb_train.structured.task import TASKS
+    from emb_train.evolve import BATCH, Progress, evolve
+    from emb_train.reference import Stored
+    from emb_train.trial import TASKS
 
     bench, (least, most) = load_bench(arguments.bench), arguments.command_delay
     task = replace(TASKS[arguments.task], plant=arguments.plant, shield=arguments.shield, command_delay=(least, most))
@@ -308,8 +307,7 @@ def _beginning(arguments: argparse.Namespace, task: Task) -> Floats:
     """The table that the search begins with, shape [2 n − 1, TERMS]."""
     import numpy as np
 
-    from emb_train.structured.law import TERMS
-    from emb_train.structured.stored import stored
+    from emb_train.reference import TERMS, stored
 
     if arguments.start is not None:
         table = stored(arguments.start).array()
@@ -330,10 +328,9 @@ def ppo(arguments: argparse.Namespace) -> int:
     """
     import msgspec
 
-    from emb_train.bench_compatibility import unfit
     from emb_train.evaluate import grid_outcomes, grid_text
     from emb_train.ppo import Metrics
-    from emb_train.training import ACTOR, begin_training, load_preset, load_training, run_training
+    from emb_train.training import ACTOR, begin_training, load_preset, load_training, run_training, unfit
 
     bench, folder = load_bench(arguments.bench), arguments.out
     changes = {"total_steps": arguments.steps, "plant": arguments.plant, "seed": arguments.seed}
@@ -396,11 +393,10 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subjec
         UsageError: an argument is out of its range, or the policies do not go together.
         EmbError: a policy cannot be opened, or the bench has no such ranges or plant.
     """
-    from emb_train.envs.batch import Batch
-    from emb_train.envs.conditions import Conditions
-    from emb_train.envs.measure import MEASURES
+    from emb_train.closed_loop import Batch, Conditions
     from emb_train.evaluate import Settings, open_subject
-    from emb_train.structured.evolution import TUNING_SEED
+    from emb_train.evolve import TUNING_SEED
+    from emb_train.play import MEASURES
 
     if arguments.seed >= TUNING_SEED:
         raise UsageError(f"--seed: expected less than {TUNING_SEED}, for references are tuned on what is from there on")

@@ -5,34 +5,63 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import torch
+from torch import nn
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import EULER
+from emb_bench.documents import to_json
 from emb_bench.excitation.reference import ACTOR, COMPARED, parse_excitation
+from emb_bench.information.symmetric import Floats
 from emb_bench.numbers import Score
 from emb_bench.report.text import WIDTH, Table
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
-from emb_train.envs.conditions import EVERYTHING, Conditions
-from emb_train.envs.excitations import Excitation, Played, reference_excitation
-from emb_train.envs.measure import Floats, Measure, mean_score
-from emb_train.envs.network import Network
-from emb_train.envs.play import Outcome, fresh_draws, grid_draws, middle_of, play
-from emb_train.names import reference_names
+from emb_train.closed_loop import EVERYTHING, Conditions
 from emb_train.optimum import optima, searchable
+from emb_train.play import (
+    Currents,
+    Excitation,
+    Measure,
+    Outcome,
+    Played,
+    Seen,
+    fresh_draws,
+    grid_draws,
+    mean_score,
+    middle_of,
+    play,
+    reference_excitation,
+)
 from emb_train.ppo import DeployedActor
-from emb_train.structured.played import Following, PolicyFile
-from emb_train.structured.stored import stored
+from emb_train.presets import reference_names
+from emb_train.reference import Following, PolicyFile, stored
 from emb_train.training import Trained, load_training
+from emb_train.trial import Task
+
+MEASURED_COLUMNS = 3  # Angle, velocity and step: what a network observes
+
+
+class Network(Excitation):
+    """A network as an excitation, :class:`emb_train.ppo.DeployedActor` for one; no exploration."""
+
+    def __init__(self, module: nn.Module) -> None:
+        self._module = module
+
+    def __call__(self, seen: Seen) -> Currents:
+        """See :class:`Excitation`."""
+        with torch.no_grad():
+            currents = self._module(torch.from_numpy(np.ascontiguousarray(seen[:, :MEASURED_COLUMNS])))
+        return np.array(currents[:, 0].numpy(), np.float64)
+
 
 Tell = Callable[[str], object]
 
@@ -68,7 +97,7 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
         return _file(given, shipped_actor_path() if given == ACTOR else path, load_bench(bench_file))
     if path.suffix == ".json" or given in reference_names():
         bench, kept = load_bench(bench_file), stored(given)
-        task = kept.asked()
+        task = Task.of(kept)
         sticks = bench.plant(kept.plant).mechanics.solver != EULER
         following = Following(kept, bench, bench.range_set(task.ranges), sticks=sticks)
         return Subject(given, bench, following, task.ranges, task.parameters, _other_shield(task.shield_ranges, bench))
@@ -135,46 +164,29 @@ class Row:
 
     name: str
     learned: bool  # False for a reference excitation
-    outcome: Outcome
+    measure: Score  # Mean over the draws
+    against_optimum: Score | None
+    """Mean share of the optimum over the draws that have one, see :meth:`emb_train.play.Measure.shares`."""
+    first_ahead_by: Score  # Mean lead of the first policy, paired by draw
+    left: int  # Experiments that left the limits, and were stopped there
+    home: int  # Experiments that ended at home
     values: Floats  # The measure of each draw, shape [draws]
-
-    @property
-    def score(self) -> Score:
-        """Mean of the measure over the draws."""
-        return mean_score(self.values)
+    end_angle: Floats  # Of each draw [rad], shape [draws]
+    end_velocity: Floats  # Of each draw [rad/s], shape [draws]
 
 
 @dataclass(frozen=True, eq=False)
 class PlantResult:
     """All rows on one plant."""
 
-    plant: str
+    optima: Floats  # The measure of the optimum for the first draws, shape [optimum draws], or [0]
+    best_reference: str
+    """The row with the largest mean on the draws of this evaluation, which favours it and not the policy."""
+    over_policies: Score | None  # Mean of the policies' scores with its interval over them; None unless several
     rows: tuple[Row, ...]  # Policies first
-    optima: Floats = field(default_factory=lambda: np.empty(0))
-    """The measure of the optimum for the first draws, shape [optimum draws], or [0]."""
-
-    def share(self, row: Row, measure: Measure) -> Score | None:
-        """Mean share of the optimum over the draws that have one; None without. See :meth:`Measure.shares`."""
-        count = len(self.optima)
-        return mean_score(measure.shares(row.values[:count], self.optima)) if count else None
-
-    def ahead(self, row: Row) -> Score:
-        """Mean lead of the first policy over a row, paired by draw."""
-        return mean_score(self.rows[0].values - row.values)
-
-    @property
-    def over_policies(self) -> Score | None:
-        """Mean of the policies' scores with its interval over the policies; None unless there are several."""
-        own = [row.score.value for row in self.rows if row.learned]
-        return mean_score(np.array(own)) if len(own) > 1 else None
-
-    @property
-    def best_reference(self) -> Row:
-        """That with the largest mean on the draws of this evaluation, which favours it and not the policy."""
-        return max((row for row in self.rows if not row.learned), key=lambda row: row.score.value)
 
 
-def evaluate(bench: Bench, settings: Settings, subjects: Sequence[Subject], tell: Tell) -> list[PlantResult]:
+def evaluate(bench: Bench, settings: Settings, subjects: Sequence[Subject], tell: Tell) -> dict[str, PlantResult]:
     """Play all on all plants.
 
     Args:
@@ -184,38 +196,50 @@ def evaluate(bench: Bench, settings: Settings, subjects: Sequence[Subject], tell
         tell: called with a line on the progress.
 
     Raises:
-        EmbError: see :func:`emb_train.envs.play.play` and :func:`emb_train.optimum.optima`.
+        EmbError: see :func:`emb_train.play.play` and :func:`emb_train.optimum.optima`.
     """
     ranges, measure, names = bench.range_set(settings.ranges), settings.measure, settings.parameters
     draws = fresh_draws(ranges, settings.seed, settings.draws)
     brakes = [middle_of(ranges), *(draw.brake for draw in draws[: settings.optimum])]
-    excitations = [(s.name, True, s.excitation) for s in subjects]
-    excitations += [(name, False, excitation) for name, excitation in references(bench).items()]
-    found, known = [], {}
+    excitations = {**{s.name: s.excitation for s in subjects}, **references(bench)}
+    found, known = {}, {"": np.empty(0)}
     for plant in settings.plants:
-        rows = []
-        for name, learned, excitation in excitations:
+        outcomes = {}
+        for name, excitation in excitations.items():
             tell(f"plant {plant}: {name}")
-            outcome = play(bench, ranges, names, excitation, draws, plant, settings.conditions)
-            rows.append(Row(name, learned, outcome, measure.values(outcome.matrices)))
-        model = searchable(bench.plant(plant))
-        if settings.optimum and model and model not in known:
+            outcomes[name] = play(bench, ranges, names, excitation, draws, plant, settings.conditions)
+        model = searchable(bench.plant(plant)) if settings.optimum else ""
+        if model not in known:
             known[model] = optima(bench, measure, names, model, brakes, tell)[1:]
-        found.append(PlantResult(plant, tuple(rows), known.get(model or "", np.empty(0))))
+        found[plant] = result(measure, outcomes, len(subjects), known[model])
     return found
+
+
+def result(measure: Measure, outcomes: Mapping[str, Outcome], policies: int, best: Floats) -> PlantResult:
+    """The rows of outcomes on one plant, of which the first are those of policies; ``best`` are the optima."""
+    rows: list[Row] = []
+    for name, o in outcomes.items():
+        values = measure.values(o.matrices)
+        share = mean_score(measure.shares(values[: len(best)], best)) if len(best) else None
+        ahead = mean_score((rows[0].values if rows else values) - values)
+        learned, left, home = len(rows) < policies, int(o.left.sum()), int(o.home.sum())
+        rows.append(Row(name, learned, mean_score(values), share, ahead, left, home, values, o.angle, o.velocity))
+    means = np.array([row.measure.value for row in rows])
+    over = mean_score(means[:policies]) if policies > 1 else None
+    return PlantResult(best, rows[policies + int(np.argmax(means[policies:]))].name, over, tuple(rows))
 
 
 HEADER = ("excitation", "measure", "against optimum", "first ahead by", "left", "home", "end rad", "end rad/s")
 UNIT: Mapping[str, str] = {"difference": "nat", "log-ratio": "nat", "ratio": ""}
 
 
-def text(settings: Settings, results: Sequence[PlantResult]) -> str:
+def text(settings: Settings, results: Mapping[str, PlantResult]) -> str:
     """The tables."""
     lines = textwrap.wrap(_scene(settings), WIDTH)
-    for plant in results:
+    for name, plant in results.items():
         found = f"the optimum if the brake were known: of the first {len(plant.optima)} draws"
-        title = f"plant {plant.plant}; {found if len(plant.optima) else 'no optimum was searched for'}"
-        rows = [_cells(settings.measure, plant, row) for row in plant.rows]
+        title = f"plant {name}; {found if len(plant.optima) else 'no optimum was searched for'}"
+        rows = [_cells(settings.measure, row, row is plant.rows[0]) for row in plant.rows]
         lines += ["", *Table(title, HEADER, rows).text()[:-1]]
         if plant.over_policies is not None:
             lines.append(
@@ -241,21 +265,21 @@ def _scene(a: Settings) -> str:
     )
 
 
-def _cells(measure: Measure, plant: PlantResult, row: Row) -> tuple[str, ...]:
-    outcome, share, against = row.outcome, plant.share(row, measure), "-"
+def _cells(measure: Measure, row: Row, first: bool) -> tuple[str, ...]:
+    share, against = row.against_optimum, "-"
     if share is not None and measure.against == "difference":
         against = f"{_between(share, '+.3f')} nat"
     elif share is not None:
         against = f"{_between(Score(*(100.0 * value for value in share)), '.2f')} %"
     return (
         row.name,
-        _interval(row.score, measure),
+        _interval(row.measure, measure),
         against,
-        "" if row is plant.rows[0] else _interval(plant.ahead(row), measure),
-        f"{outcome.left.sum()}/{len(row.values)}",
-        f"{100.0 * outcome.home.mean():.4g} %",
-        f"{np.abs(outcome.angle).max():.3f}",
-        f"{np.abs(outcome.velocity).max():.2f}",
+        "" if first else _interval(row.first_ahead_by, measure),
+        f"{row.left}/{len(row.values)}",
+        f"{100.0 * row.home / len(row.values):.4g} %",
+        f"{np.abs(row.end_angle).max():.3f}",
+        f"{np.abs(row.end_velocity).max():.2f}",
     )
 
 
@@ -271,56 +295,22 @@ def _between(score: Score, form: str) -> str:
 
 def _verdict(measure: Measure, plant: PlantResult) -> str:
     """The first policy in a sentence."""
-    first, best = plant.rows[0], plant.best_reference
-    ahead, count = plant.ahead(best), len(first.values)
+    first, best = plant.rows[0], next(row for row in plant.rows if row.name == plant.best_reference)
+    ahead, count = best.first_ahead_by, len(first.values)
     how = "ahead of" if ahead.low > 0.0 else "behind" if ahead.high < 0.0 else "not significantly different from"
-    left, away = int(first.outcome.left.sum()), int((~first.outcome.home).sum())
     return (
         f"{first.name} is {how} the best reference on these draws, {best.name}, by {_interval(ahead, measure)}; "
-        f"{left} of {count} runs left the limits, and {away} did not end at the origin"
+        f"{first.left} of {count} runs left the limits, and {count - first.home} did not end at the origin"
     )
 
 
-def document(settings: Settings, results: Sequence[PlantResult]) -> dict[str, Any]:
+def document(settings: Settings, results: Mapping[str, PlantResult]) -> dict[str, Any]:
     """The JSON document; what is not there is null."""
-    a = settings
-    return {
-        "measure": a.measure.name,
-        "measure_is": a.measure.label,
-        "unit": UNIT[a.measure.against],
-        "parameters": list(a.parameters),
-        "ranges": a.ranges,
-        "conditions": msgspec.structs.asdict(a.conditions),
-        "draws": a.draws,
-        "seed": a.seed,
-        "plants": {plant.plant: _on_plant(a.measure, plant) for plant in results},
-    }
-
-
-def _on_plant(measure: Measure, plant: PlantResult) -> dict[str, Any]:
-    over = plant.over_policies
-    return {
-        "optima": plant.optima.tolist(),
-        "best_reference": plant.best_reference.name,
-        "over_policies": None if over is None else over._asdict(),
-        "rows": [_row(measure, plant, row) for row in plant.rows],
-    }
-
-
-def _row(measure: Measure, plant: PlantResult, row: Row) -> dict[str, Any]:
-    share, outcome = plant.share(row, measure), row.outcome
-    return {
-        "name": row.name,
-        "learned": row.learned,
-        "measure": row.score._asdict(),
-        "against_optimum": None if share is None else share._asdict(),
-        "first_ahead_by": plant.ahead(row)._asdict(),
-        "left": int(outcome.left.sum()),
-        "home": int(outcome.home.sum()),
-        "values": row.values.tolist(),
-        "end_angle": outcome.angle.tolist(),
-        "end_velocity": outcome.velocity.tolist(),
-    }
+    measure = settings.measure
+    kept = {name: getattr(settings, name) for name in ("parameters", "ranges", "draws", "seed")}
+    of_measure = {"measure": measure.name, "measure_is": measure.label, "unit": UNIT[measure.against]}
+    conditions = msgspec.structs.asdict(settings.conditions)
+    return {**of_measure, **to_json({**kept, "conditions": conditions, "plants": results})}
 
 
 def grid_outcomes(trained: Trained) -> dict[str, Outcome]:

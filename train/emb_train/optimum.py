@@ -22,11 +22,12 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EULER, EXACT, Plant
 from emb_bench.design.problem import Problem, make_problem
 from emb_bench.design.search import search
+from emb_bench.information.symmetric import Floats
 from emb_bench.output import replacing
 from emb_bench.sim.open_loop import feedback
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
-from emb_train.envs.measure import Floats, Measure
+from emb_train.play import Measure
 
 FIRST_STARTS = 24  # Coarse searches for the brake in the middle
 STARTS = 3  # Coarse searches for each other brake, besides the warm start
@@ -34,15 +35,15 @@ SEED = 0  # Seed of the searches
 GENERATION = 5  # Number of the search itself: what an earlier one found is not taken for the best that is known
 
 
-def searchable(plant: Plant) -> str | None:
-    """The plant for the search: the same mechanics behind ideal instruments; None if not one of the thesis's.
+def searchable(plant: Plant) -> str:
+    """The plant for the search: the same mechanics behind ideal instruments; "" if not one of the thesis's.
 
     With the parameters known and nothing to react to, instruments cost nothing: for a plant that has some, it is what
     could be reached without them.
     """
     if plant.mechanics.solver == EULER:
         return "euler"
-    return "exact" if plant.mechanics.solver == EXACT and is_plain(plant.mechanics) else None
+    return "exact" if plant.mechanics.solver == EXACT and is_plain(plant.mechanics) else ""
 
 
 def optima(

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from emb_bench.config.bench import Bench
 from emb_runtime.errors import EmbError
-from emb_train.envs.env import EmbExcitationVectorEnv
+from emb_train.env import EmbExcitationVectorEnv
 
 Count = Annotated[int, msgspec.Meta(ge=1, le=2**31)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]

@@ -17,8 +17,7 @@ from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import make_law
-from emb_train.envs.batch import Batch
-from emb_train.envs.conditions import BENCH_CONDITIONS, Conditions
+from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Conditions
 
 BENCH = load_bench()
 LAW = make_law(BENCH)

@@ -18,13 +18,9 @@ from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.records import CurrentCommand, Reason
-from emb_train.envs.batch import Batch
-from emb_train.envs.closed_loop import delayed
-from emb_train.envs.conditions import Conditions, longest_loss
-from emb_train.envs.critic_view import critic_size
-from emb_train.envs.excitations import Played
-from emb_train.envs.play import fresh_draws, play
+from emb_train.closed_loop import Batch, Conditions, delayed, longest_loss
 from emb_train.evaluate import references
+from emb_train.play import Played, fresh_draws, play
 
 BENCH = load_bench()
 SHORT = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=60))
@@ -167,7 +163,7 @@ def test_the_critic_sees_what_an_experiment_has_of_its_own() -> None:
     batch.experiments.lost[0] = np.arange(61) == 3
     for u in (1.5, -3.0, 6.0):
         batch.advance(np.array([u]))
-    told = batch.critic_observation()[0, critic_size(4) :]
+    told = batch.critic_observation()[0, -8:]
     assert told[:2].tolist() == [0.5, 0.0]  # its delay of at most 4, and that the sample has not arrived
     assert told[2] == pytest.approx(batch.x[0, 3] / 6.0)
     assert told[3:] == pytest.approx([1.0, -0.5, 0.25, 0.0, 0.0])

@@ -11,10 +11,9 @@ import pytest
 from emb_bench.config.bench import load_bench
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
-from emb_train.envs.conditions import Conditions
-from emb_train.structured.stored import stored
-from emb_train.structured.task import TASKS
-from emb_train.structured.trial import Trials
+from emb_train.closed_loop import Conditions
+from emb_train.reference import stored
+from emb_train.trial import TASKS, Trials
 
 BENCH = load_bench()
 FOUR = TASKS["four-d"]

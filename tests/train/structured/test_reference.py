@@ -20,23 +20,23 @@ from emb_runtime.errors import UsageError
 from emb_runtime.estimator.kalman import MISFIT, follow, make_model, start
 from emb_runtime.estimator.speed_loop import scale_of
 from emb_train.cli import parser
-from emb_train.envs.batch import Batch
-from emb_train.envs.conditions import Conditions
-from emb_train.envs.play import Draw, fresh_draws, play
-from emb_train.names import reference_names
-from emb_train.structured.evolution import BATCH
-from emb_train.structured.law import (
+from emb_train.closed_loop import Batch, Conditions
+from emb_train.evolve import BATCH
+from emb_train.play import Draw, fresh_draws, play
+from emb_train.presets import reference_names
+from emb_train.reference import (
     PRODUCTS,
     TERMS,
+    Following,
     box_of,
     features,
     of_features,
+    read_text,
     set_reference,
+    stored,
     wanted_current,
 )
-from emb_train.structured.played import Following
-from emb_train.structured.stored import read_text, stored
-from emb_train.structured.trial import Trials
+from emb_train.trial import Task, Trials
 
 BENCH = load_bench()
 PM50 = BENCH.range_set("pm50")
@@ -168,7 +168,7 @@ def test_a_brake_that_is_not_the_filters_is_noticed() -> None:
 def test_references_for_delays_beat_a_constant_speed_and_come_home() -> None:
     for name, least in (("four-d-exact-delay-quadratic", 99.5), ("four-e-exact-delay-quadratic", 22.0)):
         kept = stored(name)
-        task = kept.asked()
+        task = Task.of(kept)
         assert (kept.plant, task.conditions.command_delay) == ("exact", (0, 2))
         (outcome,) = task.trials(BENCH, task.draws(BENCH, 3, 24)).play(kept.scale(BENCH), kept.array()[None])
         assert task.score(outcome).mean() > least  # constant-speed:turn=0.15 is worth 96.8 (D) without a delay

@@ -21,9 +21,8 @@ import numpy as np
 from emb_bench.config.bench import Bench
 from emb_bench.information.symmetric import Floats
 from emb_runtime.estimator.speed_loop import Scale
-from emb_train.envs.measure import mean_score
-from emb_train.envs.play import begin_all
-from emb_train.structured.task import Task
+from emb_train.play import begin_all, mean_score
+from emb_train.trial import Task
 
 TUNING_SEED = 1_000_000  # Brakes to tune on have seeds from here on; those of evaluations are smaller
 SLOW = 0.1  # Of full speed: a level below it is changed by that much less
@@ -43,7 +42,7 @@ JUDGED = 1024  # Brakes on which the result is compared with what it began with
 class Tuned:
     """Result of a search."""
 
-    table: Floats  # See :func:`emb_train.structured.law.set_reference`
+    table: Floats  # See :func:`emb_train.reference.set_reference`
     score: float  # Mean over the brakes that it was judged on
     steps: int  # Steps that were made, fewer than asked for after a Ctrl-C
 

@@ -1,35 +1,115 @@
-"""Whole experiments under a structured excitation, compiled: estimator, reference, loop, shield, brake, information.
+"""Tasks of a reference, and whole compiled experiments in which it is tried: estimator, speed loop, shield, brake.
 
-The step is :func:`emb_train.envs.closed_loop.advance_one`, so that what is tuned here is what the environment plays.
+The step is :func:`emb_train.closed_loop.advance_one`, so that what is learned here is what the environment plays. The
+shield covers the whole set of brakes, or is the runtime's learning shield.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
-from emb_bench.config.plants import DEFAULT_PLANT, EULER
+from emb_bench.config.plants import DEFAULT_PLANT, EULER, Plant
 from emb_bench.information.symmetric import Floats, unpack
-from emb_runtime.config.bench import Ranges
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, LearntModel, Ranges
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.kalman import MISFIT, Four, Model, State, believed, deviations, follow, make_model, start
 from emb_runtime.estimator.speed_loop import Scale, share_after
-from emb_runtime.learning.known import known
+from emb_runtime.learning.assumptions import Assumptions, assumptions_of, make_assumptions
+from emb_runtime.learning.bounded import hear, lose
+from emb_runtime.learning.bounded import start as start_learning
+from emb_runtime.learning.known import Known, known
 from emb_runtime.learning.law import law_for, middle
-from emb_train.envs.batch import Batch
-from emb_train.envs.closed_loop import Experiments, Setup, advance_one, with_law
-from emb_train.envs.conditions import BENCH_CONDITIONS, Bools, Conditions
-from emb_train.envs.play import Draw, Outcome, begin_all, joined
-from emb_train.structured.law import FEATURES, PRODUCTS, Box, box_of, features, wanted_current
-from emb_train.structured.learning import Learning, Shield, begin, holds, listen, make_learning, miss
+from emb_runtime.safety.shield_design import DesignInputs, design_inputs
+from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Bools, Conditions, Experiments, Setup, advance_one, with_law
+from emb_train.play import MEASURES, Draw, Measure, Outcome, begin_all, fresh_draws, joined
+from emb_train.reference import FEATURES, PRODUCTS, Box, Shield, Stored, box_of, features, wanted_current
+
+
+class Learning(NamedTuple):
+    """Prior knowledge of a learning shield; numbers only."""
+
+    learns: bool
+    inputs: DesignInputs  # Of the bench
+    nominal: BrakeParameters  # Brake that the parameters are relative to
+    assumptions: Assumptions
+
+
+def make_learning(bench: Bench, shield: Shield, plant: Plant, delay: int) -> Learning:
+    """Prior knowledge of the shield, which takes the brakes for what they are: Euler's, or ones that stick.
+
+    Raises:
+        BenchFileError: an assumption does not hold on this bench.
+        UsageError: one does not hold for the brakes.
+    """
+    learns = shield == "bounded"
+    if learns and not can_learn(bench, plant, delay):
+        raise UsageError(
+            "a shield that learns needs fresh frames, no lag, an encoder without an offset, a velocity that is "
+            "measured and the braking envelope"
+        )
+    model: LearntModel = "euler" if plant.mechanics.solver == EULER else "flow"
+    declared = bench.shield._replace(learn=learns, model=model)
+    bench = replace(bench, shield=declared)
+    assumptions = make_assumptions(bench) if learns else assumptions_of(bench)
+    return Learning(learns, design_inputs(bench), bench.brake, assumptions)
+
+
+def can_learn(bench: Bench, plant: Plant, delay: int) -> bool:
+    """Returns True if a shield can learn: its model has no delay, lag, offset or observer, and the drive has to brake.
+
+    It matters whether the shield covers one, the plant has it or it is drawn.
+    """
+    shield, between = bench.shield, plant.instruments
+    late = max(shield.frame_age[1], between.command_delay, between.measurement_delay, delay) > 0
+    lagging = max(shield.current_lag, plant.mechanics.current_lag) > 0.0
+    off = between.encoder_offset != 0.0
+    return not (late or lagging or off or between.observer_bandwidth > 0.0 or shield.envelope == "coasting")
+
+
+def begin(learning: Learning) -> Floats:
+    """The state before the first sample."""
+    return np.array(start_learning(learning.assumptions))
+
+
+def listen(learning: Learning, state: Any, angle: float, velocity: float, applied: float) -> None:
+    """Take in a sample, in place; arguments as of :func:`emb_runtime.learning.bounded.hear`."""
+    hear(learning.assumptions, state, angle, velocity, applied)
+
+
+def miss(learning: Learning, state: Any) -> None:
+    """Go on by a period of which nothing is known, in place."""
+    lose(learning.assumptions, state)
+
+
+def holds(nominal: BrakeParameters, possible: Known, brake: Any, angle: float, velocity: float) -> bool:
+    """Returns True if the true parameters, angle and velocity are among what is known to be possible.
+
+    Args:
+        nominal: brake that the parameters are relative to.
+        possible: what is known.
+        brake: true parameters, a row of :class:`emb_runtime.config.bench.BrakeParameters`, shape [6].
+        angle: true [rad].
+        velocity: true [rad/s].
+    """
+    k_m, k_1, t_c, f_v = brake[2] / nominal.k_m, brake[3] / nominal.k_1, brake[4] / nominal.T_c, brake[5] / nominal.f_v
+    return bool(
+        possible.k_m_low <= k_m <= possible.k_m_high
+        and possible.k_1_low <= k_1 <= possible.k_1_high
+        and possible.t_c_low <= t_c <= possible.t_c_high
+        and possible.f_v_low <= f_v <= possible.f_v_high
+        and possible.angle_low <= angle <= possible.angle_high
+        and possible.velocity_low <= velocity <= possible.velocity_high
+    )
+
 
 CHUNK = 64  # Experiments that a thread plays at a time
 ANY_PRECISION: Four = (math.inf, math.inf, math.inf, math.inf)
@@ -80,8 +160,8 @@ class Trials(Batch):
 
         Raises:
             BenchFileError: the bench has no such plant, or the shield cannot hold the limits.
-            UsageError: J or γ vary in these ranges; see :class:`emb_train.envs.batch.Batch` and
-                :func:`emb_train.structured.learning.make_learning`.
+            UsageError: J or γ vary in these ranges; see :class:`emb_train.closed_loop.Batch` and
+                :func:`emb_train.trial.make_learning`.
         """
         super().__init__(bench, ranges, parameters, len(draws), plant, conditions)
         self.learning = make_learning(self.bench, shield, self._plant, conditions.command_delay[1])
@@ -98,7 +178,7 @@ class Trials(Batch):
 
         Args:
             scale: of the references.
-            tables: of the references, see :func:`emb_train.structured.law.set_reference`, shape [C, 2 n − 1, TERMS].
+            tables: of the references, see :func:`emb_train.reference.set_reference`, shape [C, 2 n − 1, TERMS].
         """
         count = len(self.k)
         each = [np.tile(table, (count, 1, 1)) for table in np.asarray(tables, np.float64)]
@@ -266,3 +346,101 @@ def _add(total: Any, f: Four, weight: float) -> None:
     for at in range(len(PRODUCTS)):
         i, j = PRODUCTS[at]
         total[1 + FEATURES + at] += weight * f[i] * f[j]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task, as it is tuned for and as it is evaluated."""
+
+    name: str  # One of :data:`emb_train.presets.TASKS`, which says what it is
+    parameters: tuple[str, ...]  # Parameters whose information counts
+    ranges: str  # Set of the bench that the brakes are drawn from
+    shield_ranges: str  # Set of the bench that the shield covers; it contains ``ranges``
+    criterion: str  # Name of a measure, see :data:`emb_train.play.MEASURES`
+    plant: str = DEFAULT_PLANT  # Name of the bench's plant that the brakes are
+    shield: Shield = "worst case"  # For all of that set at any time, or for what has been learnt of the brake
+    command_delay: tuple[int, int] = (0, 0)  # Least and most samples that a command waits, drawn for each experiment
+    precision: Four = ANY_PRECISION
+    """Relative deviations of k_m, k_1, T_c and f_v: where these are asked for, the time until they are reached counts,
+    and nothing else."""
+    begin: tuple[float, ...] = (1.0, -1.0, -0.007, 0.3, 0.61)
+    """Blind reference that learning begins with: levels, then switches, found by CMA-ES from many places."""
+
+    @classmethod
+    def of(cls, kept: Stored) -> Task:
+        """The task that a reference was tuned for."""
+        return replace(TASKS[kept.task], plant=kept.plant, shield=kept.shield, command_delay=kept.command_delay)
+
+    @property
+    def measure(self) -> Measure:
+        """Measure of an experiment."""
+        return MEASURES[self.criterion]
+
+    @property
+    def conditions(self) -> Conditions:
+        """Conditions in which it is trained and played."""
+        return Conditions(
+            shield_ranges=self.shield_ranges, information=self.measure.kind, command_delay=self.command_delay
+        )
+
+    def draws(self, bench: Bench, seed: int, count: int) -> list[Draw]:
+        """Brakes and noise."""
+        return fresh_draws(bench.range_set(self.ranges), seed, count)
+
+    def trials(self, bench: Bench, draws: list[Draw]) -> Trials:
+        """Experiments with these brakes behind this task's shield.
+
+        Raises:
+            BenchFileError: the shield cannot guarantee the limits for its set, or the bench lacks a set or the plant.
+            UsageError: the shield does not cover the brakes.
+        """
+        ranges = bench.range_set(self.ranges)
+        return Trials(bench, ranges, self.parameters, draws, self.plant, self.conditions, self.shield, self.precision)
+
+    def score(self, outcome: Outcome) -> Floats:
+        """The criterion of each experiment, or minus its time until the precision, shape [N]; higher is better."""
+        if isinstance(outcome, ReportedOutcome) and self.precision != ANY_PRECISION:
+            return -outcome.known
+        return self.measure.values(outcome.matrices)
+
+
+_FOUR = Task(
+    name="four-d",
+    parameters=PARAMETER_NAMES,
+    ranges="pm50",
+    shield_ranges="envelope",
+    criterion="D",
+)
+_CREEP_FIRST = (-0.2, -0.007, 1.0, -1.0, 0.005, 0.94, -0.23, 0.02, 0.21, 0.42, 0.71, 0.96, 0.965)
+"""A probe, then k_1 and f_v by a creep, two full strokes, and what is left of the time."""
+TASKS: Mapping[str, Task] = {
+    task.name: task
+    for task in (
+        Task(
+            name="viscous",
+            parameters=("f_v",),
+            ranges="viscous",
+            shield_ranges="viscous",
+            criterion="weighted",
+            begin=(1.0, -1.0, -0.006, 0.375, 0.9),
+        ),
+        Task(
+            name="viscous-stiffness",
+            parameters=("k_1", "f_v"),
+            ranges="viscous-stiffness",
+            shield_ranges="viscous-stiffness",
+            criterion="weighted",
+            begin=(1.0, -1.0, -0.007, 0.336, 0.92),
+        ),
+        _FOUR,
+        replace(_FOUR, name="four-e", criterion="E", begin=_CREEP_FIRST),
+        replace(_FOUR, name="four-a", criterion="A", begin=_CREEP_FIRST),
+        replace(
+            _FOUR,
+            name="four-time",
+            precision=(0.0065, 0.0065, 0.0065, 0.0065),
+            begin=(-0.2, 1.0, -1.0, 0.032, 0.3),
+        ),
+    )
+}
+"""By name."""

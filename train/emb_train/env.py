@@ -3,10 +3,10 @@
 * **Action**, shape [1]: the requested current as a part of the bench's limit, −1..1. The shield has the last word.
 * **Observation**, shape [3]: measured angle [rad], measured velocity [rad/s], step (thesis Table 4.2, actor), raw;
   under conditions in which the actor sees everything (5.2), the critic's observation without the sensitivities.
-* ``info["critic"]``: the critic's observation, see :func:`emb_train.envs.critic_view.describe`.
+* ``info["critic"]``: the critic's observation, see :meth:`emb_train.closed_loop.Batch.critic_observation`.
 * ``info["heard"]``: True if this observation is a new one. Where samples get lost
-  (see :class:`emb_train.envs.conditions.Conditions`) it is the last one with the step going on, and the action that
-  answers it has no effect.
+  (see :class:`emb_train.closed_loop.Conditions`) it is the last one with the step going on, and the action that answers
+  it has no effect.
 * **Reward**: see :mod:`emb_train.rewards`.
 * **End**: leaving the limits and reaching the horizon are both terminal. The experiment is the horizon long by design
   and the step is observed, so nothing is truncated and nothing is bootstrapped there.
@@ -30,11 +30,11 @@ from numpy.typing import NDArray
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
+from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
-from emb_train.envs.batch import Batch
-from emb_train.envs.conditions import BENCH_CONDITIONS, MEASURED, Conditions
-from emb_train.rewards import OUTWARD, Floats, Reward, Transition, Turn, information_increment, require_defined
+from emb_train.closed_loop import BENCH_CONDITIONS, MEASURED, Batch, Conditions
+from emb_train.rewards import OUTWARD, Reward, Transition, Turn, information_increment, require_defined
 
 ENV_ID = "EmbExcitation-v0"
 SCALED = 100.0  # Bound of an observation in scales of order one
@@ -56,7 +56,7 @@ class Scoring:
         """One sample period with the requested currents [A], shape [N]; its rewards, shape [N].
 
         Raises:
-            UsageError: see :meth:`emb_train.envs.batch.Batch.advance`.
+            UsageError: see :meth:`emb_train.closed_loop.Batch.advance`.
         """
         batch, turn, rules = self._batch, self._turn, self._batch.setup.rules
         before, velocity = batch.m.copy(), batch.x[:, 1].copy()

@@ -1,0 +1,528 @@
+"""N experiments side by side, one sample period after the other: shield, instruments, brake and Fisher information.
+
+:func:`advance` is the one definition of a step; a :class:`Batch` and the trials of a reference run it compiled.
+
+Time: an experiment begins with the measurement y_0. The current that answers y_k is shielded with y_k and acts during
+[k, k + 1], or later by the plant's command delay. The Fisher information is that of angle and velocity with the bench's
+noise, whatever the plant's instruments make of it.
+
+A sample may be lost (:class:`Conditions`), as on the bench: nothing is sent in its period, the node brakes by itself,
+the last sample received stays, and a requested current has no effect.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.brake.motion import SENSITIVE, STATES, no_sensitivity
+from emb_bench.compiled import compiled
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import DEFAULT_PLANT, LONGEST_DELAY, Instruments, Mechanics, Plant
+from emb_bench.information.fisher import Kind, weights_of
+from emb_bench.information.symmetric import Floats, add_increment, packed_size
+from emb_bench.sim.closed_loop import pass_period, sent_current
+from emb_bench.sim.instruments import MEMORY, command, measure, settle
+from emb_runtime.config.bench import OLDEST_FRAME, PARAMETER_NAMES, BrakeParameters, Ranges
+from emb_runtime.errors import UsageError
+from emb_runtime.records import Reason
+from emb_runtime.safety.sensor_monitor import CONFIRMED, judge, largest_current
+from emb_runtime.safety.sensor_monitor import MEMORY as MONITOR
+from emb_runtime.safety.sensor_monitor import begin as begin_monitor
+from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
+from emb_runtime.safety.shield import PAST, damped_current
+from emb_runtime.safety.shield_design import ShieldLaw, make_law
+
+MEASURED: Literal["measured"] = "measured"
+EVERYTHING: Literal["everything"] = "everything"
+MOST_LOST = 0.5  # Largest probability that a sample is lost
+
+Bools = NDArray[np.bool_]
+
+
+class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Conditions in which an experiment of the training may differ from one on the bench."""
+
+    shielded: bool = True  # True if the shield is between actor and brake; without it an action is clipped, no more
+    shield_ranges: str | None = None  # Set of the bench that the shield covers; None for the one that the bench names
+    horizon: int = 0  # Steps in one experiment; 0 for the bench's
+    observes: Literal["measured", "everything"] = MEASURED
+    """Observation of the actor: ``measured`` angle, velocity and step, or ``everything`` (x₁, x₂, k, θ, the FIM)."""
+    information: Kind = "weighted"  # Fisher information that is collected: the thesis's, or the physical one
+    command_delay: tuple[int, int] = (0, 0)
+    """Least and most samples that a command waits beside the plant's own delay, drawn for each experiment."""
+    frame_loss: tuple[float, float] = (0.0, 0.0)
+    """Least and greatest probability with which a sample does not arrive, drawn for each experiment: then nothing is
+    sent, and the node brakes. The first sample always arrives, and never as many in a row are lost as end a run."""
+
+    def __post_init__(self) -> None:
+        """Refuse what does not exist.
+
+        Raises:
+            UsageError: a range or the horizon is out of its bounds.
+        """
+        for name, most in (("command_delay", OLDEST_FRAME), ("frame_loss", MOST_LOST)):
+            low, high = getattr(self, name)
+            if not 0 <= low <= high <= most:  # written so that NaN fails
+                raise UsageError(f"{name}: expected least and most, from 0 to {most:g}, got {low:g}, {high:g}")
+        if self.horizon < 0:
+            raise UsageError(f"horizon: expected steps, or 0 for the bench's, got {self.horizon}")
+        if self.horizon and self.shielded:
+            raise UsageError("horizon: the shield plans for the bench's; only an experiment without it has another")
+
+    @property
+    def varies(self) -> bool:
+        """True if experiments have a delay or losses of their own."""
+        return self.command_delay[1] > 0 or self.frame_loss[1] > 0.0
+
+    def observation_size(self, count: int) -> int:
+        """Length of the actor's observation if the information of this many parameters is collected."""
+        return 3 if self.observes == MEASURED else 3 + count + packed_size(count)
+
+    def applied(self, bench: Bench) -> Bench:
+        """The bench with this horizon, and a shield for this set of brakes that covers the drawn delays as well.
+
+        It covers what the bench's shield covers or what is drawn, not the sum of both: right for a plant without a
+        delay of its own. It plans for lost frames anyway.
+        """
+        timing = replace(bench.timing, horizon=self.horizon or bench.timing.horizon)
+        shield = bench.shield._replace(ranges=self.shield_ranges or bench.shield.ranges)
+        if self.shielded and self.varies:
+            (least, most), (low, high) = shield.frame_age, self.command_delay
+            shield = shield._replace(frame_age=(min(least, low), max(most, high)))
+        return replace(bench, timing=timing, shield=shield)
+
+    def drawn(self, rng: np.random.Generator, samples: int, longest: int) -> tuple[int, Bools]:
+        """Draws what one experiment has of its own.
+
+        Args:
+            rng: draws the same number of times, whatever varies.
+            samples: of the experiment, the first and the last included.
+            longest: as many samples in a row may be lost, see :func:`longest_loss`.
+
+        Returns:
+            Samples that its commands wait, and which samples do not arrive, shape [samples].
+        """
+        delay = int(rng.integers(self.command_delay[0], self.command_delay[1] + 1))
+        lost = rng.random(samples) < rng.uniform(*self.frame_loss)
+        lost[[0, -1]] = False  # the first begins the experiment, the last only ends it
+        sample = np.arange(samples)
+        in_a_row = sample - np.maximum.accumulate(np.where(lost, 0, sample))
+        return delay, lost & (in_a_row % (longest + 1) != 0)
+
+
+BENCH_CONDITIONS = Conditions()
+
+
+def longest_loss(bench: Bench) -> int:
+    """Samples in a row that may be lost without an end of the run: neither the node nor the loop gives up [samples]."""
+    node = math.ceil(bench.node.watchdog / bench.timing.sample_time - 1e-9)
+    return max(min(node, bench.watch.stop_missed) - 1, 0)
+
+
+Integers = NDArray[np.int64]
+
+LOST = int(Reason.MISSED)  # Reason that stands for a lost sample
+
+
+class Rules(NamedTuple):
+    """The constants of an experiment; floats and integers only."""
+
+    shielded: bool  # True if the shield has the last word; else the requested current is clipped to the limit
+    sample_time: float  # [s]
+    horizon: int  # Steps in one experiment
+    angle_low: float  # [rad]
+    angle_high: float  # [rad]
+    velocity: float  # Largest speed [rad/s]
+    angle_weight: float  # Of the angle in the FIM, see :func:`emb_bench.information.fisher.weights_of`
+    velocity_weight: float  # Of the velocity
+    damping_velocity: float  # Of the node that brakes by itself [rad/s]; infinite for one that lets go
+
+
+class Setup(NamedTuple):
+    """Constants that experiments side by side share; it compiles."""
+
+    law: ShieldLaw  # Law of the shield; its limit of the current holds also without a shield
+    whole: ShieldLaw
+    """Law for the whole set, by which the sensors are judged; another than ``law`` where the shield learns."""
+    thresholds: SensorThresholds
+    """Of the sensor monitor: until the motion has shown its sign, it limits the current to a first move."""
+    rules: Rules
+    mechanics: Mechanics  # Mechanics of the brakes
+    instruments: Instruments  # Instruments between the brakes and the bus
+    chosen: Integers  # Indices in ``PARAMETERS`` of the n parameters whose information is collected, shape [n]
+
+
+def make_setup(
+    bench: Bench, law: ShieldLaw, plant: Plant, parameters: Sequence[str], kind: Kind, shielded: bool
+) -> Setup:
+    """The setup of experiments on a bench that collect this Fisher information of these parameters."""
+    timing, limits = bench.timing, bench.limits
+    damping = bench.node.damping_velocity if bench.node.stop == "damped" else math.inf
+    rules = Rules(
+        shielded,
+        timing.sample_time,
+        timing.horizon,
+        *limits.angle,
+        limits.velocity,
+        *weights_of(bench, kind),
+        damping,
+    )
+    thresholds = sensor_thresholds(bench, law)
+    return Setup(law, law, thresholds, rules, plant.mechanics, plant.instruments, no_sensitivity(parameters)[0])
+
+
+def with_law(setup: Setup, law: ShieldLaw) -> Setup:
+    """The setup with another law of the shield; compiled code has no ``_replace``."""
+    return Setup(law, setup.whole, setup.thresholds, setup.rules, setup.mechanics, setup.instruments, setup.chosen)
+
+
+class Experiments(NamedTuple):
+    """N experiments with n parameters: their brakes, their states, and the errors and losses of all their samples.
+
+    Arrays only, so that it compiles; functions change them in place.
+    """
+
+    brakes: Floats  # Rows of :class:`BrakeParameters`, shape [N, 6]
+    delay: Integers  # Samples that each experiment's commands wait beside its plant's delay, shape [N]
+    x: Floats
+    """True states, see :mod:`emb_bench.brake.motion`: angle [rad], velocity [rad/s] and two more, shape [N, 4]."""
+    s: Floats  # Sensitivities of all four to the relative parameters, shape [N, n, 4]
+    m: Floats  # Packed FIM, shape [N, n (n + 1) / 2]
+    memory: Floats  # Of the instruments, shape [N, MEMORY]
+    y: Floats  # Last received measured angle and velocity, shape [N, 2]
+    applied: Floats  # The current that acted in the period before, as the node last reported it [A], shape [N]
+    past: Floats  # The last sent currents, newest first [A], shape [N, PAST]; 0 where nothing was sent
+    k: Integers  # Step, shape [N]
+    noise: Floats  # Of the sensors for all samples of the experiment, shape [N, horizon + 1, 2]
+    late: Floats  # Lateness with which each sample is taken [s], shape [N, horizon + 1]
+    lost: Bools  # Mask of the samples that do not arrive, shape [N, horizon + 1]
+    reasons: Integers
+    """Reasons why the last current is not the requested one: :class:`emb_runtime.records.Reason` bits, shape [N]."""
+    violated: Bools  # Mask of the brakes outside their limits, shape [N]
+    monitor: Floats
+    """Memory of the sensor monitor, which is asked only until it confirms the polarity, shape [N, MONITOR]."""
+
+
+def no_experiments(count: int, n: int, steps: int) -> Experiments:
+    """N experiments with n parameters that are over: each has to begin before its first step."""
+    return Experiments(
+        brakes=np.zeros((count, len(BrakeParameters._fields))),
+        delay=np.zeros(count, np.int64),
+        x=np.zeros((count, STATES)),
+        s=np.zeros((count, n, SENSITIVE)),
+        m=np.zeros((count, packed_size(n))),
+        memory=np.zeros((count, MEMORY)),
+        y=np.zeros((count, 2)),
+        applied=np.zeros(count),
+        past=np.zeros((count, PAST)),
+        k=np.full(count, steps),
+        noise=np.zeros((count, steps + 1, 2)),
+        late=np.zeros((count, steps + 1)),
+        lost=np.zeros((count, steps + 1), np.bool_),
+        reasons=np.zeros(count, np.int64),
+        violated=np.zeros(count, np.bool_),
+        monitor=np.zeros((count, MONITOR)),
+    )
+
+
+def delayed(instruments: Instruments, delay: int) -> Instruments:
+    """The plant's instruments with the commands later by some samples; compiled code has no ``_replace``."""
+    return Instruments(
+        instruments.command_delay + delay,
+        instruments.measurement_delay,
+        instruments.encoder_offset,
+        instruments.clock_jitter,
+        instruments.observer_bandwidth,
+    )
+
+
+def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
+    """One sample period of all experiments, in place."""
+    for i in range(experiments.k.shape[0]):
+        advance_one(setup, experiments, i, float(wanted[i]))
+
+
+def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -> None:
+    """One sample period of experiment ``i``, in place; arguments as for :func:`advance`."""
+    brakes, delay, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated, monitor = experiments
+    rules = setup.rules
+    p = BrakeParameters(
+        float(brakes[i, 0]),
+        float(brakes[i, 1]),
+        float(brakes[i, 2]),
+        float(brakes[i, 3]),
+        float(brakes[i, 4]),
+        float(brakes[i, 5]),
+    )
+    instruments = delayed(setup.instruments, int(delay[i]))
+    y1, y2 = float(y[i, 0]), float(y[i, 1])
+    u1, u2, u3, u4, u5 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2]), float(past[i, 3]), float(past[i, 4])
+    sent, asked = 0.0, math.nan
+    if lost[i, k[i]]:
+        reasons[i] = LOST
+    else:
+        most = largest_current(setup.whole, setup.thresholds, monitor[i], setup.law.current)
+        asked, reasons[i] = sent_current(
+            setup.law, rules.shielded, y1, y2, wanted, (u1, u2, u3, u4, u5), int(k[i]), most
+        )
+        sent = 0.0 if math.isnan(asked) else asked
+    current = command(instruments, memory[i], asked)
+    if math.isnan(current):
+        current = damped_current(float(x[i, 1]), setup.law.current, rules.damping_velocity)
+    k[i] += 1
+    errors = (float(noise[i, k[i], 0]), float(noise[i, k[i], 1]), float(late[i, k[i]]))
+    y1, y2 = pass_period(
+        setup.mechanics, instruments, p, rules.sample_time, current, errors, x[i], setup.chosen, s[i], memory[i]
+    )
+    add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
+    past[i, 0], past[i, 1], past[i, 2], past[i, 3], past[i, 4] = sent, u1, u2, u3, u4
+    if not lost[i, k[i]]:
+        y[i, 0], y[i, 1], applied[i] = y1, y2, current
+        if monitor[i, CONFIRMED] == 0.0:
+            periods = 1
+            while lost[i, k[i] - periods]:
+                periods += 1
+            judge(
+                setup.whole, setup.thresholds, monitor[i], periods * rules.sample_time, y1, y2,
+                not math.isnan(asked), float(past[i, min(periods, PAST) - 1]), current,
+            )  # fmt: skip
+    inside = rules.angle_low <= x[i, 0] <= rules.angle_high and abs(x[i, 1]) <= rules.velocity
+    violated[i] = not inside
+
+
+class Batch:
+    """N experiments that advance together.
+
+    Attributes:
+        setup: what they have in common.
+        experiments: all of them; the following are some of its arrays.
+        brakes: shape [N, 6].
+        x: true states, shape [N, 4].
+        y: last received measurements, shape [N, 2].
+        m: packed FIMs, of the conditions' kind, shape [N, n (n + 1) / 2].
+        k: steps, shape [N].
+        past: last sent currents, newest first, shape [N, PAST].
+        reasons: why the last sent current is not the requested one, shape [N].
+        violated: True where the brake is outside its limits after the last step, shape [N].
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        ranges: Ranges,
+        parameters: Sequence[str],
+        count: int,
+        plant: str = DEFAULT_PLANT,
+        conditions: Conditions = BENCH_CONDITIONS,
+    ) -> None:
+        """Prepare arrays; every row needs a :meth:`begin` before the first step.
+
+        Args:
+            bench: plant, limits, noise, timing, shield.
+            ranges: where the parameters of each episode are drawn from.
+            parameters: whose information is collected, in the order of ``PARAMETER_NAMES``.
+            count: N.
+            plant: which of the bench's plants.
+            conditions: shield or none, how many steps, which information.
+
+        Raises:
+            BenchFileError: the bench has no such plant, or no such set for the shield, or the shield cannot hold the
+                limits there, as under a lag and a delay together.
+            UsageError: a parameter is unknown or out of order, a brake of these ranges is not covered by the shield, or
+                the plant has a delay of its own beside a drawn one.
+        """
+        if not parameters or tuple(p for p in PARAMETER_NAMES if p in parameters) != tuple(parameters):
+            raise UsageError(
+                f"expected some of {', '.join(PARAMETER_NAMES)} in this order, got {', '.join(parameters)}"
+            )
+        require_covered(bench, ranges, conditions)
+        self.bench = bench = conditions.applied(bench)
+        self.conditions = conditions
+        self.parameters = tuple(parameters)
+        self._ranges = ranges
+        self._plant = bench.plant(plant)
+        self.setup = make_setup(
+            bench, make_law(bench), self._plant, parameters, conditions.information, conditions.shielded
+        )
+        require_possible(self._plant, conditions)
+        self._deviations = np.array([bench.noise.angle, bench.noise.velocity])
+        self._advance = compiled(advance)
+        e = self.experiments = no_experiments(count, len(parameters), self.setup.rules.horizon)
+        self.brakes, self.x, self.y, self.m, self.k = e.brakes, e.x, e.y, e.m, e.k
+        self.past, self.reasons, self.violated = e.past, e.reasons, e.violated
+        self._columns = [BrakeParameters._fields.index(name) for name in parameters]
+        low, high = np.array(ranges.low)[self._columns], np.array(ranges.high)[self._columns]
+        self._middle, self._half = 0.5 * (low + high), np.where(high > low, 0.5 * (high - low), 1.0)
+        self.critic_size = self.critic_observation().shape[1]
+        self.observation_size = conditions.observation_size(len(parameters))
+
+    def begin(self, i: int, rng: np.random.Generator, brake: BrakeParameters | None = None) -> None:
+        """Begin a new experiment in row ``i``: at rest at the origin.
+
+        Args:
+            i: row.
+            rng: draws the uncertain parameters first (also if ``brake`` is given), then the noise of all samples, then
+                the jitter of their instants if there is any, then delay and losses if they vary.
+            brake: the brake to use instead of a drawn one.
+        """
+        e = self.experiments
+        parameters = rng.uniform(self._ranges.low, self._ranges.high)
+        e.brakes[i] = parameters if brake is None else brake
+        e.noise[i] = rng.standard_normal(e.noise.shape[1:]) * self._deviations
+        jitter = self._plant.instruments.clock_jitter
+        if jitter > 0.0:
+            e.late[i] = rng.normal(0.0, jitter, e.late.shape[1])
+        if self.conditions.varies:
+            e.delay[i], e.lost[i] = self.conditions.drawn(rng, e.lost.shape[1], longest_loss(self.bench))
+        e.x[i] = 0.0
+        instruments = delayed(self._plant.instruments, int(e.delay[i]))
+        settle(instruments, e.memory[i], 0.0)
+        errors = (float(error) for error in (e.late[i, 0], *e.noise[i, 0]))
+        e.y[i] = measure(instruments, e.memory[i], self.setup.rules.sample_time, 0.0, 0.0, 0.0, *errors)
+        for of_the_past in (e.applied, e.s, e.m, e.past, e.k, e.reasons, e.violated):
+            of_the_past[i] = 0
+        begin_monitor(e.monitor[i], *e.y[i].tolist())
+
+    def advance(self, wanted: Floats) -> None:
+        """One sample period with the requested currents [A], shape [N]; one that is not finite counts as 0 A.
+
+        Raises:
+            UsageError: the shape is another, or a row was not begun or has reached the horizon. The compiled step would
+                not notice: it does not check its indices.
+        """
+        if wanted.shape != self.k.shape:
+            raise UsageError(
+                f"expected one current for each of the {len(self.k)} experiments, got shape {wanted.shape}"
+            )
+        if (self.k >= self.setup.rules.horizon).any():
+            raise UsageError("expected experiments that go on, got one that is over or was not begun: call reset first")
+        self._advance(self.setup, self.experiments, wanted)
+
+    @property
+    def terminated(self) -> Bools:
+        """Mask of the experiments that are over: horizon reached or limits left, shape [N]. Both are true terminals."""
+        return self.violated | (self.k >= self.setup.rules.horizon)
+
+    @property
+    def home(self) -> Bools:
+        """Mask of the brakes whose angle and velocity are those of home, inside the limits, shape [N]."""
+        shield_ = self.bench.shield
+        at_home = (np.abs(self.x[:, 0]) <= shield_.home_angle) & (np.abs(self.x[:, 1]) <= shield_.home_velocity)
+        return at_home & ~self.violated
+
+    @property
+    def heard(self) -> Bools:
+        """Mask of the experiments whose newest sample has arrived, shape [N]; in others a current has no effect now."""
+        heard: Bools = ~self.experiments.lost[np.arange(len(self.k)), self.k]
+        return heard
+
+    def observation(self) -> NDArray[np.float32]:
+        """Observation of the actor, by the conditions: :meth:`actor_observation`, or Table 4.2 without measurements.
+
+        Returns:
+            Shape [N, observation_size].
+        """
+        if self.conditions.observes != EVERYTHING:
+            return self.actor_observation()
+        return self.critic_observation()[:, : self.observation_size].copy()
+
+    def actor_observation(self) -> NDArray[np.float32]:
+        """Measured angle [rad], measured velocity [rad/s], step; raw, shape [N, 3]."""
+        out = np.empty((len(self.k), 3), np.float32)
+        out[:, :2] = self.y
+        out[:, 2] = self.k
+        return out
+
+    def seen(self) -> NDArray[np.float32]:
+        """Observation of an excitation: the actor's three and the current that acted in the last period [A], [N, 4].
+
+        NaN but for the step where the sample was lost: on the bench no policy is called then.
+        """
+        seen = np.column_stack((self.y, self.k, self.experiments.applied)).astype(np.float32)
+        for column in (0, 1, 3):
+            seen[~self.heard, column] = np.nan
+        return seen
+
+    def info(self) -> dict[str, NDArray[Any]]:
+        """Outputs of an environment beside the observation, each with N as its first dimension; all of them copies."""
+        return {
+            "critic": self.critic_observation(),
+            "current": self.past[:, 0].copy(),
+            "reasons": self.reasons.copy(),
+            "fim": self.m.copy(),
+            "violated": self.violated.copy(),
+            "home": self.home,
+            "heard": self.heard,
+        }
+
+    def critic_observation(self) -> NDArray[np.float32]:
+        """Observation of the critic: the true state in fixed scales of order one, shape [N, critic_size].
+
+        Thesis Table 4.2 (x_1, x_2, k, θ, FIM) and the sensitivities: without them the next increment of the FIM is not
+        a function of the state, which would not be Markov. Where experiments vary beside the brake, also the delay of
+        the commands, whether the sample was received, the current in the motor, and the last sent currents, which may
+        still be on their way.
+        """
+        e, limits = self.experiments, self.bench.limits
+        outputs = np.array([limits.angle[1], limits.velocity])
+        parts = [
+            e.x[:, :2] / outputs,
+            e.k[:, None] / self.bench.timing.horizon,
+            (e.brakes[:, self._columns] - self._middle) / self._half,
+            0.1 * np.copysign(np.log1p(np.abs(e.m)), e.m),
+            (4.0 * e.s[:, :, :2] / outputs).reshape(len(self.k), 2 * len(self._columns)),
+        ]
+        if self.conditions.varies:
+            delay = max(self.conditions.command_delay[1], 1)
+            parts += [
+                e.delay[:, None] / delay,
+                self.heard[:, None],
+                e.x[:, 3:] / limits.current,
+                e.past / limits.current,
+            ]
+        return np.concatenate(parts, axis=1, dtype=np.float32)
+
+
+def require_possible(plant: Plant, conditions: Conditions) -> None:
+    """Check that a plant can have the delay that is drawn.
+
+    Raises:
+        UsageError: it is longer than the instruments' memory, or comes on top of a delay of the plant, and the shield
+            covers only one of them.
+    """
+    own, drawn = plant.instruments.command_delay + plant.instruments.measurement_delay, conditions.command_delay[1]
+    if conditions.shielded and own > 0 and drawn > 0:
+        raise UsageError(
+            f"the plant '{plant.name}' has a delay of its own, and the shield covers that or the drawn one, not their "
+            "sum: draw none, or choose another plant"
+        )
+    if (most := plant.instruments.command_delay + drawn) > LONGEST_DELAY:
+        raise UsageError(
+            f"command_delay: with that of the plant '{plant.name}' at most {LONGEST_DELAY} samples, got {most}"
+        )
+
+
+def require_covered(bench: Bench, ranges: Ranges, conditions: Conditions = BENCH_CONDITIONS) -> None:
+    """Check that the shield, if there is one, holds the limits for every brake of these ranges.
+
+    Raises:
+        UsageError: it does not; the message names the parameter and both ranges.
+        BenchFileError: the bench has no set of the name that the conditions have for the shield.
+    """
+    if not conditions.shielded:
+        return
+    bench = conditions.applied(bench)
+    box = bench.range_set(bench.shield.ranges)
+    for name in box.uncovered(ranges.low, ranges.high):
+        raise UsageError(
+            f"the set of ranges '{ranges.name}' has {name} from {getattr(ranges.low, name):g} to "
+            f"{getattr(ranges.high, name):g}, the shield's set '{box.name}' covers {getattr(box.low, name):g} to "
+            f"{getattr(box.high, name):g}: narrow the first or widen the second in the bench file"
+        )

@@ -1,0 +1,247 @@
+"""Excitations played on given brakes with given noise, and measures of the information that they collect.
+
+The brakes are drawn, or lie on the fixed grid of the thesis. The shield has the last word over every excitation.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+from typing import Literal, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import DEFAULT_PLANT
+from emb_bench.excitation import reference
+from emb_bench.information.criteria import Criterion, Name
+from emb_bench.information.fisher import Kind
+from emb_bench.information.symmetric import Floats, unpack
+from emb_bench.numbers import LEVEL, Score
+from emb_runtime.config.bench import BrakeParameters, Ranges
+from emb_runtime.errors import PolicyRefusedError
+from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Bools, Conditions
+from emb_train.rewards import PRIOR
+
+ANGLE, VELOCITY, STEP, APPLIED = range(4)
+"""Columns of the observation: angle [rad], velocity [rad/s], step, current that acted in the period before [A]."""
+
+Seen = NDArray[np.float32]
+Currents = NDArray[np.float64]
+
+
+class Excitation(ABC):
+    """Source of current requests, for N experiments side by side."""
+
+    def begin(self, count: int) -> None:  # noqa: B027  # one without memory has nothing to do
+        """Begin N experiments anew."""
+
+    @abstractmethod
+    def __call__(self, seen: Seen) -> Currents:
+        """Requested currents [A], shape [N], for observations of shape [N, 4].
+
+        Where a sample was lost, all but the step is NaN. Then the state does not change, and the answer does not
+        count.
+        """
+
+
+class Played(Excitation):
+    """Currents that are known beforehand, whatever is measured."""
+
+    def __init__(self, currents: Sequence[float] | Currents) -> None:
+        """Play these currents [A], one for each step, shape [T]; of each experiment its own, shape [N, T]."""
+        self._currents = np.array(currents, np.float64)
+
+    def __call__(self, seen: Seen) -> Currents:
+        """See :class:`Excitation`."""
+        step = seen[:, STEP].astype(np.int64)
+        wanted: Currents = self._currents[(np.arange(len(step)), step) if self._currents.ndim > 1 else step]
+        return wanted
+
+
+class Law(Excitation):
+    """A reference excitation that answers one measurement at a time, such as constant-speed."""
+
+    def __init__(self, law: reference.Law) -> None:
+        self._law = law
+
+    def __call__(self, seen: Seen) -> Currents:
+        """See :class:`Excitation`."""
+        return np.array([self._law(angle, velocity, int(step)) for angle, velocity, step, _ in seen.tolist()])
+
+
+def reference_excitation(excited: reference.Excitation) -> Excitation:
+    """One of :mod:`emb_bench.excitation.reference`, for many experiments."""
+    return Law(excited.law) if excited.currents is None else Played(excited.currents)
+
+
+Results = TypeVar("Results", bound="Outcome")
+
+STREAM = 0x65766C
+"""Spawn key of the evaluation's random numbers: training has none, and its validations have another one."""
+
+
+class Draw(NamedTuple):
+    """One brake and the noise that is measured on it."""
+
+    seed: int | np.random.SeedSequence  # Of the noise
+    brake: BrakeParameters
+
+
+def fresh_draws(ranges: Ranges, seed: int, count: int) -> list[Draw]:
+    """Brakes drawn from ranges, and their noise; draw i depends on ``seed`` and i alone."""
+    seeds = [np.random.SeedSequence(seed, spawn_key=(STREAM, i)) for i in range(count)]
+    return [
+        Draw(s, BrakeParameters(*np.random.default_rng(s).uniform(ranges.low, ranges.high).tolist())) for s in seeds
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Final results of N experiments. One that leaves the limits is stopped there, as on the bench."""
+
+    matrices: Floats
+    """Fisher information without a prior, relative to the true parameters, shape [N, n, n]. Of an experiment that left
+    the limits: that before it left them."""
+    left: Bools  # Mask of the experiments that left the limits, shape [N]
+    home: Bools  # Mask of the experiments that ended at home without having left the limits, shape [N]
+    angle: Floats  # At the end [rad], shape [N]
+    velocity: Floats  # At the end [rad/s], shape [N]
+
+
+def play(
+    bench: Bench,
+    ranges: Ranges,
+    parameters: Sequence[str],
+    excitation: Excitation,
+    draws: Sequence[Draw],
+    plant: str = DEFAULT_PLANT,
+    conditions: Conditions = BENCH_CONDITIONS,
+) -> Outcome:
+    """Play one excitation, through the shield unless the conditions have none.
+
+    Raises:
+        PolicyRefusedError: the excitation requests no finite current, where the runtime stops.
+        UsageError, BenchFileError: see :class:`emb_train.closed_loop.Batch`.
+    """
+    batch = Batch(bench, ranges, parameters, len(draws), plant, conditions)
+    begin_all(batch, draws)
+    m, end, left = batch.m.copy(), batch.x[:, :2].copy(), np.zeros(len(draws), np.bool_)
+    for _ in followed(batch, excitation):
+        end = np.where(left[:, None], end, batch.x[:, :2])
+        left |= batch.violated
+        m = np.where(left[:, None], m, batch.m)
+    return Outcome(unpack(m, len(parameters)), left, batch.home & ~left, end[:, 0], end[:, 1])
+
+
+def joined(parts: Sequence[Results]) -> Results:
+    """Results of all experiments of these parts, in their order."""
+    kind = type(parts[0])
+    return kind(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(kind)))
+
+
+def begin_all(batch: Batch, draws: Sequence[Draw]) -> None:
+    """Begin the experiments of a batch, one for each draw."""
+    for i, draw in enumerate(draws):
+        batch.begin(i, np.random.default_rng(draw.seed), draw.brake)
+
+
+def followed(batch: Batch, excitation: Excitation) -> Iterator[Seen]:
+    """Let the experiments of a batch that have begun follow an excitation to the horizon.
+
+    Yields:
+        After each step, the excitation's observation before it, see :meth:`emb_train.closed_loop.Batch.seen`.
+
+    Raises:
+        PolicyRefusedError: it requests no finite current, where the runtime stops.
+    """
+    excitation.begin(len(batch.k))
+    left = np.zeros(len(batch.k), np.bool_)
+    for k in range(batch.setup.rules.horizon):
+        seen = batch.seen()
+        wanted = excitation(seen)
+        if not np.isfinite(wanted[~left & batch.heard]).all():
+            raise PolicyRefusedError(
+                f"expected finite currents, got another at step {k}, not finite: this actor cannot be played"
+            )
+        batch.advance(wanted)
+        left |= batch.violated
+        yield seen
+
+
+GRID = 40  # Brakes on the grid, as in the thesis (5.2.3)
+
+
+def grid_draws(ranges: Ranges, parameter: str, seed: int) -> list[Draw]:
+    """Brakes with ``parameter`` equally spaced over its range, both ends included; the others at mid-range.
+
+    Brake i has noise from ``seed + i``.
+    """
+    values = np.linspace(getattr(ranges.low, parameter), getattr(ranges.high, parameter), GRID)
+    return [Draw(seed + i, middle_of(ranges)._replace(**{parameter: float(v)})) for i, v in enumerate(values)]
+
+
+def middle_of(ranges: Ranges) -> BrakeParameters:
+    """The brake in the middle of the ranges."""
+    return BrakeParameters(*(0.5 * (a + b) for a, b in zip(ranges.low, ranges.high, strict=True)))
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A number for a Fisher information matrix; more is better."""
+
+    name: str  # Name on the command line
+    label: str  # Formula or description of the number, for people
+    criterion: Name  # Criterion whose optimum is searched for
+    kind: Kind  # Of Fisher information
+    prior: float  # Added to the diagonal
+    against: Literal["difference", "log-ratio", "ratio"]
+    """Comparison of a value with the optimum: by a difference in nat, by the ratio of which both are logarithms, or
+    by their ratio."""
+
+    def goal(self, size: int) -> Criterion:
+        """Criterion that a design for ``size`` parameters optimises; its φ is the logarithm of what counts here."""
+        return Criterion(self.criterion, tuple(range(size)))
+
+    def values(self, matrices: Floats) -> Floats:
+        """Of matrices without a prior, shape [N, n, n] to [N]."""
+        size = matrices.shape[-1]
+        phi = self.goal(size).phi(matrices + self.prior * np.eye(size))
+        return phi if self.against != "ratio" else np.exp(phi)
+
+    def shares(self, values: Floats, optima: Floats) -> Floats:
+        """Of the optimum, for each draw: the difference in nat (0 at the optimum) for D, else the share (1 there)."""
+        if self.against == "difference":
+            return values - optima
+        if self.against == "log-ratio":
+            return np.asarray(np.exp(values - optima))
+        return values / optima
+
+
+MEASURES: Mapping[str, Measure] = MappingProxyType(
+    {
+        m.name: m
+        for m in (
+            Measure("D", "ln det(M + 12 I)", "D", "physical", PRIOR, "difference"),
+            Measure("A", "-ln tr (M + 12 I)^-1", "A", "physical", PRIOR, "log-ratio"),
+            Measure("E", "ln lambda_min(M + 12 I)", "E", "physical", PRIOR, "log-ratio"),
+            Measure("weighted", "lambda_min of the thesis's weighted M", "E", "weighted", 0.0, "ratio"),
+        )
+    }
+)
+"""By name. ``weighted`` is, for one parameter, the thesis's weighted information itself."""
+
+
+def mean_score(values: Floats) -> Score:
+    """Mean of independent values with Student's 95 % interval for it; one value has no interval (NaN)."""
+    from scipy.stats import t as student  # takes a second to import
+
+    centre, count = float(np.mean(values)), len(values)
+    if count < 2:
+        return Score(centre, math.nan, math.nan)
+    half = float(student.ppf(0.5 + 0.5 * LEVEL, count - 1) * np.std(values, ddof=1) / math.sqrt(count))
+    return Score(centre, centre - half, centre + half)
