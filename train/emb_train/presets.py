@@ -34,7 +34,7 @@ def _file() -> dict[str, Any]:
 
 
 def preset_summaries() -> dict[str, str]:
-    """What each preset learns, by its name."""
+    """A line on each preset, by name: what it learns."""
     return {name: record["summary"] for name, record in sorted(_file()["preset"].items())}
 
 
