@@ -1,4 +1,4 @@
-"""``emb-replay export``: a topic of a log as a table, or a picture of the run."""
+"""``emb-replay export``: a topic of a log as a table, a picture of the run, or its brake as a model of MuJoCo."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from emb_bench.export.mjcf import write_mjcf
 from emb_bench.export.picture import ENDINGS, draw_run
 from emb_bench.logs.columns import Column
 from emb_bench.logs.log import UNIX_TIME, RunLog, read_log
@@ -110,17 +111,19 @@ def write_csv(log: RunLog, topic: str, path: Path) -> str:
 
 
 TABLES = {"csv": write_csv, "parquet": write_parquet}  # Formats of one topic as a table
-FORMATS = (*TABLES, "plot")
+FORMATS = (*TABLES, "plot", "mjcf")
+MODEL_ENDINGS = (".xml", ".mjcf")
 CYCLE = "/cycle"
 
-HELP = "a topic of the log as CSV or Parquet, or a picture of the run"
+HELP = "a topic of the log as CSV or Parquet, a picture of the run, or the brake for MuJoCo"
 DESCRIPTION = """\
 Write a part of a log for another tool.
 
   csv parquet  one topic as a table, with units: the control cycles, or --topic
   plot         a picture of the run, PNG, SVG or PDF by the ending of FILE
+  mjcf         the brake as a model of MuJoCo, .xml, with the parameters that --theta names
 
-FILE ends as its format is called. The frames on the bus go to BLF, ASC and others by can_logconvert LOG FILE.
+A table's FILE ends as its format is called. The frames on the bus go to BLF, ASC and others by can_logconvert LOG FILE.
 """
 
 
@@ -130,6 +133,11 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--to", choices=FORMATS, required=True, help="what to write")
     p.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="file to make; never overwritten")
     p.add_argument("--topic", metavar="TOPIC", help=f"for {' and '.join(TABLES)}: which one (default: {CYCLE})")
+    p.add_argument(
+        "--theta", metavar="THETA",
+        help="for mjcf: parameters of the brake: log for the running estimate, nominal, true, name=value,..., or the "
+        "JSON of an estimate or report (default: log, and nominal where it has no estimate)",
+    )  # fmt: skip
     p.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -142,11 +150,18 @@ def run(args: argparse.Namespace) -> int:
     """
     if args.topic is not None and args.to not in TABLES:
         raise UsageError(f"--topic: expected with --to {' or '.join(TABLES)}, got it with --to {args.to}")
-    endings = ENDINGS if args.to == "plot" else (f".{args.to}",)
+    if args.theta is not None and args.to != "mjcf":
+        raise UsageError(f"--theta: expected with --to mjcf, got it with --to {args.to}")
+    endings = {"plot": ENDINGS, "mjcf": MODEL_ENDINGS}.get(args.to, (f".{args.to}",))
     if args.out.suffix.lower() not in endings:
         raise UsageError(f"{args.out}: expected a file that ends in {', '.join(endings)} with --to {args.to}")
     log = read_log(args.log)
-    written = draw_run(log, args.out) if args.to == "plot" else TABLES[args.to](log, args.topic or CYCLE, args.out)
+    if args.to == "plot":
+        written = draw_run(log, args.out)
+    elif args.to == "mjcf":
+        written = write_mjcf(log, args.theta or "", args.out)
+    else:
+        written = TABLES[args.to](log, args.topic or CYCLE, args.out)
     if args.json:
         show(as_json({"log": str(args.log), "file": str(args.out), "holds": written, "missing": log.missing}))
     else:

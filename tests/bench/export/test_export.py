@@ -9,14 +9,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from emb_bench.cli.replay import main
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.export.export import FORMATS
+from emb_bench.export.mjcf import mjcf
 from emb_bench.export.picture import broken, draw_run
 from emb_bench.logs.log import RunLog, read_log
+from emb_runtime.config.bench import load_bench
 from emb_runtime.records import CycleRecord, RunState
 
 from tests.bench.conftest import Replay  # isort: skip
@@ -118,6 +122,32 @@ def test_a_picture_says_what_is_in_it(path: Path, tmp_path: Path, monkeypatch: p
         assert f">{word}<" in text
     assert "cut.mcap" in text
     assert "the log is NOT complete" in text
+
+
+def test_mujoco_moves_the_exported_brake_as_the_log_has_it(simulate: Simulate, tmp_path: Path) -> None:
+    path = write_log(tmp_path / "long.mcap", simulate(square, steps=300), steps=300)
+    out, record = tmp_path / "brake.xml", read_experiment(read_log(path))
+    assert export(path, "--to", "mjcf", "-o", out, "--theta", "f_v=3e-5") == 0
+    assert mujoco.MjModel.from_xml_path(str(out)).joint("motor").damping[0] == 3e-5
+    assert export(path, "--to", "mjcf", "-o", tmp_path / "true.xml", "--theta", "true") == 0
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "true.xml"))
+    data, steps = mujoco.MjData(model), round(1e-3 / model.opt.timestep)
+    for current, (angle, velocity) in zip(record.currents, record.samples, strict=True):
+        data.ctrl[0] = current
+        mujoco.mj_step(model, data, steps)
+        assert data.qpos[0] == pytest.approx(angle, abs=0.02)
+        assert data.qvel[0] == pytest.approx(velocity, abs=5.0)
+    assert record.samples[:, 0].max() > 5.0  # it has moved
+
+
+def test_the_clamp_of_an_exported_brake_pushes_only_in_contact() -> None:
+    brake = load_bench().brake
+    model = mujoco.MjModel.from_xml_string(mjcf(load_bench(), brake))
+    data = mujoco.MjData(model)
+    for angle in (-5.0, 20.0, 90.0):
+        data.qpos[0] = angle
+        mujoco.mj_forward(model, data)
+        assert data.qfrc_passive[0] == pytest.approx(-brake.gamma * brake.k_1 * max(angle, 0.0), rel=1e-12)
 
 
 def test_no_line_is_drawn_through_periods_that_were_missed() -> None:

@@ -1,0 +1,81 @@
+"""A brake as a model of MuJoCo (MJCF): one joint that turns, driven by a current [A].
+
+J is the joint's armature, f_v its damping, T_c its friction loss, k_m the gear of the motor. The clamping force [N] is
+that of a tendon whose length is the travel of the clamp, γ times the angle, and which is slack below contact. MuJoCo's
+friction loss is a soft constraint that acts from step to step: a reversal is as precise as the step.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from emb_bench.experiment.theta import read_theta
+from emb_bench.logs.log import RunLog
+from emb_bench.output import new_file
+from emb_runtime.config.bench import Bench, BrakeParameters
+
+STEPS = 10  # Of the simulation, per sample time
+
+_TEXT = """\
+<!-- Made by emb-excite. Units: rad, s, A, N, N·m, kg·m². Read with mujoco.MjModel.from_xml_path. -->
+<mujoco model="brake">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="{step:.12g}" integrator="RK4" gravity="0 0 0">
+    <flag contact="disable"/>
+  </option>
+  <worldbody>
+    <body name="motor">
+      <inertial pos="0 0 0" mass="1e-3" diaginertia="1e-12 1e-12 1e-12"/>
+      <joint name="motor" type="hinge" axis="0 0 1" armature="{p.J!r}" damping="{p.f_v!r}" frictionloss="{p.T_c!r}"
+             solreffriction="{time_constant:.12g} 1" solimpfriction="0.9999 0.9999 0.001"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="clamp" stiffness="{stiffness!r}" springlength="-1 0">
+      <joint joint="motor" coef="{p.gamma!r}"/>
+    </fixed>
+  </tendon>
+  <actuator>
+    <motor name="current" joint="motor" gear="{p.k_m!r}" ctrlrange="-{current!r} {current!r}"/>
+  </actuator>
+  <sensor>
+    <jointpos name="angle" joint="motor"/>
+    <jointvel name="velocity" joint="motor"/>
+  </sensor>
+</mujoco>
+"""
+
+
+def mjcf(bench: Bench, brake: BrakeParameters) -> str:
+    """The text of the model.
+
+    Args:
+        bench: knows the sample time and the largest current.
+        brake: its parameters.
+    """
+    step = bench.timing.sample_time / STEPS
+    return _TEXT.format(
+        p=brake, step=step, time_constant=2.0 * step, stiffness=brake.k_1 / brake.gamma, current=bench.limits.current
+    )
+
+
+def write_mjcf(log: RunLog, theta: str, path: Path) -> str:
+    """The brake of a log as a model.
+
+    Args:
+        log: the log.
+        theta: which parameters, as :func:`emb_bench.experiment.theta.read_theta` takes them.
+        path: file to make.
+
+    Returns:
+        A description of the file's content.
+
+    Raises:
+        UsageError: the parameters cannot be read, or the file exists or cannot be written.
+        LogError: the log has no bench.
+    """
+    name, brake, _ = read_theta(theta, log, log.bench)
+    text = mjcf(log.bench, brake)
+    with new_file(path) as file:
+        file.write(text.encode())
+    return f"a model of MuJoCo, parameters: {name}"
