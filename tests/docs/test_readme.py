@@ -1,4 +1,4 @@
-"""The pages at the root of the repository: short, their links lead somewhere, and the example runs."""
+"""The example of the README runs; what several files say of the project is the same in each."""
 
 from __future__ import annotations
 
@@ -8,26 +8,10 @@ import sys
 import tomllib
 from pathlib import Path
 
-import pytest
 import yaml
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-
-
-def test_the_readme_stays_short() -> None:
-    assert len(README.read_text(encoding="utf-8").splitlines()) <= 150
-
-
-@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md"])
-def test_links_lead_to_files(page: str) -> None:
-    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", (ROOT / page).read_text(encoding="utf-8")):
-        assert (ROOT / target).is_file(), target
-
-
-def test_pictures_are_small() -> None:
-    for path in (ROOT / "docs" / "images").iterdir():
-        assert path.stat().st_size < 150 * 1024, path
 
 
 def test_the_example_of_the_readme_runs(tmp_path: Path) -> None:

@@ -1,35 +1,44 @@
-"""A docstring begins with what a thing is or does, not with a question that the reader has to answer."""
+"""``tools.style`` finds what it is for, and nothing in this tree."""
 
 from __future__ import annotations
 
-import ast
-from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
+from tools import style
 
-ROOT = Path(__file__).parents[2]
-FOLDERS = ("runtime", "bench", "train", "export", "studies", "tools", "examples", "benchmarks")
-RIDDLES = ("What", "How", "Whether", "Who", "Which", "Where", "When", "Why", "The same")
+PLANTED = '''
+"""Of no use."""
+from functools import cached_property
+
+class A:
+    """A thing."""
+
+    x: int
+    """Whether it is so."""
+
+    @cached_property
+    def twice(self):
+        """How it is done."""
+        try:
+            pass
+        except ValueError as err:
+            pass
+        except KeyError as err:
+            pass
+'''
 
 
-def docstrings(path: Path) -> Iterator[tuple[int, str]]:
-    """Line and text of each string that documents a module, class, function or attribute."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-            for child in node.body:
-                if isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant):
-                    yield child.lineno, str(child.value.value).strip()
+def test_each_rule_finds_what_breaks_it(tmp_path: Path) -> None:
+    (tmp_path / "planted.py").write_text(PLANTED)
+    (tmp_path / "README.md").write_text("[one](planted.py#a) [two](missing.md) [three](https://a.b/c)" + " " * 20_000)
+    found = [line.removeprefix(f"{tmp_path}/").partition(": ")[0] for line in (
+        *style.docstring_problems(tmp_path / "planted.py"),
+        *style.compiled_problems(tmp_path / "planted.py"),
+        *style.link_problems(tmp_path / "README.md"),
+        *style.size_problems(tmp_path),
+    )]  # fmt: skip
+    assert sorted(found) == ["README.md", "README.md", *(f"planted.py:{line}" for line in (11, 12, 13, 9))]
 
 
-@pytest.mark.parametrize("folder", FOLDERS)
-def test_no_docstring_begins_as_a_question(folder: str) -> None:
-    files = list((ROOT / folder).rglob("*.py"))
-    assert files
-    found = [
-        f"{path.relative_to(ROOT)}:{line}: {text.splitlines()[0]}"
-        for path in files
-        for line, text in docstrings(path)
-        if text.startswith(tuple(f"{word} " for word in RIDDLES))
-    ]
-    assert not found, "\n".join(found)
+def test_this_tree_breaks_no_rule() -> None:
+    assert not list(style.problems(style.ROOT))
