@@ -8,15 +8,14 @@ from pathlib import Path
 from emb_runtime.errors import EXIT_DONE
 from emb_runtime.system.terminal import as_json, show
 
-HELP = "a recording of another machine (CSV, Parquet, MATLAB, MDF, CAN log) as a log, by a map file"
+HELP = "a recording of another machine (CSV, Parquet, MATLAB, MDF) as a log, by a map file"
 DESCRIPTION = """\
 Read a recording that was not made by emb-run, and write it as a log that fim, estimate, report and campaign read. The
 map file says which column is what, in which unit, and what is known of the machine: docs/howto/recordings-of-others.md.
 
   csv parquet  columns by their names
-  matlab       variables; struct.field, in version 7.3 group/data too
+  matlab       variables up to version 7; struct.field too
   mdf          channels, with their own times (ASAM MDF 3 and 4)
-  can          Message.Signal of any DBC, in candump, BLF, ASC and TRC logs
 
 What the recording lacks, such as a velocity or a measured current, is said here and by every command that reads it.
 """

@@ -23,10 +23,9 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     "parquet": (".parquet",),
     "matlab": (".mat",),
     "mdf": (".mf4", ".mdf", ".dat"),
-    "can": (".log", ".blf", ".asc", ".trc"),
 }
 """Kinds of files, and the endings by which they are known."""
-OWN_TIMES = ("mdf", "can")  # Kinds of files whose values have times
+TIMED = "mdf"  # Kind of files whose values have times
 MEASURED_UNITS: Mapping[str, Mapping[str, float]] = {
     "angle": {**ANGLE, **LENGTH},
     "velocity": {**ANGULAR_SPEED, **SPEED},
@@ -80,13 +79,12 @@ class Signals(msgspec.Struct, frozen=True, kw_only=True):
 class Source(msgspec.Struct, frozen=True, kw_only=True):
     """The file of a recording."""
 
-    kind: Annotated[
-        Literal["", "csv", "parquet", "matlab", "mdf", "can"], Meta(description=f"one of {', '.join(KINDS)}")
-    ] = ""  # By its ending if it is not given
+    kind: Annotated[Literal["", "csv", "parquet", "matlab", "mdf"], Meta(description=f"one of {', '.join(KINDS)}")] = (
+        ""  # By its ending if it is not given
+    )
     delimiter: Literal[",", ";", " ", "|", "tab"] = ","  # Between columns of a CSV file
     decimal: Literal[".", ","] = "."  # Decimal mark in a CSV file
     skip: Annotated[int, Meta(ge=0, le=1000)] = 0  # Lines of a CSV file after its head that are no numbers
-    dbc: str = ""  # DBC file of a CAN log, beside the map
 
 
 class Timing(msgspec.Struct, frozen=True, kw_only=True):
@@ -262,11 +260,9 @@ class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):
         if not kind:
             endings = ", ".join(ending for some in KINDS.values() for ending in some)
             raise UsageError(f"{recording}: expected a file that ends in {endings}, or [file] kind in the map")
-        if kind == "can" and not self.file.dbc:
-            raise UsageError(f"{recording}: expected [file] dbc in the map: a CAN log is read with the DBC of its bus")
-        if kind in OWN_TIMES and self.timing.column:
+        if kind == TIMED and self.timing.column:
             raise UsageError(f"[timing] column: a file of kind {kind} has times of its own: leave it out")
-        if kind not in OWN_TIMES and not self.timing.column and not self.timing.sample_time:
+        if kind != TIMED and not self.timing.column and not self.timing.sample_time:
             raise UsageError("[timing]: missing: column and unit of the time, or sample_time in s")
         return kind
 

@@ -1,4 +1,7 @@
-"""Columns of foreign files: CSV, Parquet, MATLAB, MDF and CAN logs. Each library is imported when it is needed."""
+"""Samples of foreign files (CSV, Parquet, MATLAB, MDF) on a grid, in our units, and what a recording lacks.
+
+Each library is imported when it is needed.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,13 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.config.machine import FORCE, LENGTH, SPEED
-from emb_bench.config.plants import Instruments
-from emb_bench.recordings.map_file import KINDS, MEASURED_UNITS, OWN_TIMES, RecordingMap, Signal, Source
+from emb_bench.recordings.map_file import MEASURED_UNITS, TIMED, RecordingMap, Signal, Source
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.input_file import open_regular
@@ -35,16 +35,14 @@ class Column(NamedTuple):
     time: Floats | None  # Of each value [s], shape (n,); None where the format has no times of its own
 
 
-def read_columns(path: Path, kind: str, source: Source, folder: Path, names: Sequence[str]) -> dict[str, Column]:
+def read_columns(path: Path, kind: str, source: Source, names: Sequence[str]) -> dict[str, Column]:
     """Named columns of a file.
 
     Args:
         path: of the file.
         kind: of the file, a key of ``KINDS``.
         source: its form.
-        folder: that its DBC file is in.
-        names: of columns; ``struct.field`` inside MATLAB structures, ``group/data`` in MATLAB 7.3, ``Message.Signal``
-            in CAN logs.
+        names: of columns; ``struct.field`` inside MATLAB structures.
 
     Raises:
         UsageError: the file cannot be read, is not of its kind, or lacks a column; or a library is missing.
@@ -53,9 +51,8 @@ def read_columns(path: Path, kind: str, source: Source, folder: Path, names: Seq
     readers: Mapping[str, tuple[str, str, Callable[[], Iterator[tuple[str, Any, Any]]]]] = {
         "csv": ("CSV", "pyarrow", lambda: _csv(path, source, names)),
         "parquet": ("Parquet", "pyarrow", lambda: _parquet(path, names)),
-        "matlab": ("MATLAB", "scipy and h5py", lambda: _matlab(path, names)),
+        "matlab": ("MATLAB", "scipy", lambda: _matlab(path, names)),
         "mdf": ("MDF", "asammdf", lambda: _mdf(path, names)),
-        "can": ("a CAN log", "python-can", lambda: _can(path, folder / source.dbc, names)),
     }
     title, library, read = readers[kind]
     found = {}
@@ -154,11 +151,7 @@ def _arrow(
 def _matlab(path: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
     from scipy import io
 
-    try:
-        content = io.loadmat(path, squeeze_me=True, struct_as_record=False, simplify_cells=True)
-    except NotImplementedError:  # version 7.3 is HDF5
-        yield from _hdf5(path, names)
-        return
+    content = io.loadmat(path, squeeze_me=True, struct_as_record=False, simplify_cells=True)
     for name in names:
         value: Any = content
         for part in name.split("."):
@@ -166,17 +159,6 @@ def _matlab(path: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
             _require_one(path, name, found, [key for key in content if not key.startswith("__")])
             value = found[0]
         yield name, value, None
-
-
-def _hdf5(path: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        for name in names:
-            place = file.get(name.replace(".", "/"))
-            found = [place] if isinstance(place, h5py.Dataset) else []
-            _require_one(path, name, found, [key for key in file if not key.startswith("#")])
-            yield name, found[0][()], None
 
 
 def _mdf(path: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
@@ -188,49 +170,6 @@ def _mdf(path: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
             _require_one(path, name, file.channels_db.get(name, ()), known)
             signal = file.get(name)
             yield name, signal.samples, signal.timestamps
-
-
-def _can(path: Path, dbc: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
-    import cantools
-    from can.io.player import MESSAGE_READERS
-
-    with _errors_in_one_line(dbc, "a DBC", "cantools"):
-        try:
-            bus: Any = cantools.database.load_file(str(dbc), strict=False)
-        except OSError as err:
-            raise UsageError(f"{dbc}: cannot read the DBC: {err.strerror}") from err
-    wanted = _messages(dbc, names, bus)
-    rows: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
-    suffix = path.suffix.lower()
-    reader: Any = MESSAGE_READERS[suffix if suffix in KINDS["can"] else ".log"]
-    with open_regular(path) as data:  # ours, and closed whatever a reader does
-        for frame in reader(data if suffix == ".blf" else TextIOWrapper(data, "utf-8", "replace")):
-            message, signals = wanted.get((frame.arbitration_id, frame.is_extended_id), (None, ()))
-            if message is None or frame.is_error_frame or frame.is_remote_frame or len(frame.data) < message.length:
-                continue
-            decoded = message.decode(bytes(frame.data), decode_choices=False)
-            for name, signal in signals:
-                if signal in decoded:  # a multiplexed one is in some frames only
-                    rows[name].append((float(decoded[signal]), float(frame.timestamp)))
-    for name in names:
-        if not rows[name]:
-            raise UsageError(f"{path}: no frame has {name}: expected the DBC of this bus, and its log")
-        values, times = zip(*rows[name], strict=True)
-        yield name, values, times
-
-
-def _messages(dbc: Path, names: Sequence[str], bus: Any) -> dict[tuple[int, bool], tuple[Any, list[tuple[str, str]]]]:
-    """Messages by identifier, with the columns that they hold and the signals of these."""
-    by_name = {f"{message.name}.{signal.name}": message for message in bus.messages for signal in message.signals}
-    found: dict[tuple[int, bool], tuple[Any, list[tuple[str, str]]]] = {}
-    for name in names:
-        message = by_name.get(name)
-        if message is None:
-            choices = ", ".join(sorted(by_name)[:NAMED])
-            raise UsageError(f"{dbc}: no signal is called {name!r}; it has: {choices}")
-        key = (message.frame_id, message.is_extended_frame)
-        found.setdefault(key, (message, []))[1].append((name, name.partition(".")[2]))
-    return found
 
 
 SLOWEST, FASTEST = 300.0, 2000.0  # Bandwidths of the observer that derives a velocity [rad/s]
@@ -422,10 +361,8 @@ def _lacks(wanted: RecordingMap, kind: str, bandwidth: float, lost: int) -> tupl
         said.append("the recording has no measured current: what acted is taken to be what was commanded")
     if wanted.signals.command is None:
         said.append("the recording has no commands: what acted is the mean of the measured current over each period")
-    if not wanted.timing.column and kind not in OWN_TIMES:
+    if not wanted.timing.column and kind != TIMED:
         said.append("the recording has no times: its rows are taken to be one sample time apart")
-    if kind == "can":
-        said.append("the times are those of the receiver, jitter of the bus included")
     if not lost:
         return tuple(said)
     return (*said, f"{lost} samples are lost: what acted in the periods before them is not known to have acted")

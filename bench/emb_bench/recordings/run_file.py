@@ -9,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 
 import numpy as np
+import tomlkit
 
 from emb_bench.config.bench import Systematic, parse_bench
 from emb_bench.config.plants import IMPORTED_PLANT
@@ -18,7 +19,6 @@ from emb_bench.recordings.map_file import RecordingMap, read_map
 from emb_bench.recordings.readers import Recorded, read_columns, recorded
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import load_layout
-from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.records import CycleRecord, NodeState, RunState, RunType
 from emb_runtime.system.input_file import open_regular
@@ -43,7 +43,7 @@ def import_recording(path: Path, map_path: Path, out: Path) -> Recorded:
     wanted, map_text = read_map(map_path)
     kind, timing = wanted.kind_of(path), wanted.timing
     names = [signal.column for signal in wanted.signals.given.values()] + ([timing.column] if timing.column else [])
-    columns = read_columns(path, kind, wanted.file, map_path.parent, names)
+    columns = read_columns(path, kind, wanted.file, names)
     found = recorded(columns, wanted, kind, str(path))
     text = bench_of(found, wanted)
     parse_bench(text, f"{map_path}: the bench file made of it", analysis=True)
@@ -56,14 +56,38 @@ def import_recording(path: Path, map_path: Path, out: Path) -> Recorded:
 
 
 def bench_of(found: Recorded, wanted: RecordingMap) -> str:
-    """Text of the machine's bench file."""
-    reach = (
-        float(found.angle.min()),
-        float(found.angle.max()),
-        float(np.abs(found.velocity).max()),
-        float(np.abs(found.applied).max()),
-    )
-    return bench_text(wanted, found.sample_time, int(found.step[-1]), found.noise, reach, found.bandwidth)
+    """Text of the bench file of a machine for analysis, from its map and its samples."""
+    machine = wanted.machine
+    low, high = float(found.angle.min()), float(found.angle.max())
+    speed, current = float(np.abs(found.velocity).max()), float(np.abs(found.applied).max())
+    slack = 0.5 * (high - low) + 1.0
+    brake = {"J": 1.0, "gamma": 1.0, "k_m": 1.0, "k_1": 0.0, "T_c": 1.0, "f_v": 1.0} | machine.parameters
+    plant = {name: 0.0 for name in machine.unknown if name not in brake}
+    document = {
+        "schema": 1,
+        "name": wanted.name,
+        "machine": {
+            "unknown": [*machine.unknown],
+            "nuisances": [*machine.nuisances],
+            "between": wanted.between,
+            **({"window": machine.window} if machine.window else {}),
+            **({"travel": machine.travel} if machine.travel else {}),
+            "units": wanted.shown,
+        },
+        "brake": brake,
+        "limits": {
+            "current": 2.0 * current + 1e-6,
+            "angle": [min(low - slack, -1.0), max(high + slack, 1.0)],
+            "velocity": 3.0 * speed + 1.0,
+        },
+        "noise": {"angle": found.noise[0], "velocity": found.noise[1]},
+        "timing": {"sample_time": found.sample_time, "horizon": int(found.step[-1])},
+        "systematic": dict.fromkeys(Systematic.__dataclass_fields__, 0.0),  # what a map can say of a bench is exact
+        "plants": {
+            IMPORTED_PLANT: plant | ({"observer_bandwidth": found.bandwidth} if found.bandwidth else {}),
+        },
+    }
+    return f"# A machine for the analysis of recordings: nothing is driven with it.\n{tomlkit.dumps(document)}"
 
 
 def write_run(found: Recorded, name: str, texts: dict[str, str], source: dict[str, str], out: Path) -> None:
@@ -133,75 +157,3 @@ def _cycles(found: Recorded) -> list[CycleRecord]:
             )
         )
     return cycles
-
-
-def bench_text(
-    wanted: RecordingMap,
-    sample_time: float,
-    horizon: int,
-    noise: tuple[float, float],
-    reach: tuple[float, float, float, float],
-    bandwidth: float,
-) -> str:
-    """Text of the bench file.
-
-    Args:
-        wanted: the map.
-        sample_time: [s].
-        horizon: periods.
-        noise: standard deviations of angle [rad] and velocity [rad/s].
-        reach: lowest and highest angle [rad], largest speed [rad/s], largest current [A].
-        bandwidth: of the observer that made the velocity [rad/s]; 0 if it was measured.
-    """
-    low, high, speed, current = reach
-    slack = 0.5 * (high - low) + 1.0
-    machine = wanted.machine
-    own = {"J": 1.0, "gamma": 1.0, "k_m": 1.0, "k_1": 0.0, "T_c": 1.0, "f_v": 1.0} | machine.parameters
-    by_direction = [name for name in machine.unknown if name not in own]
-    lines = [
-        "# A machine for the analysis of recordings: nothing is driven with it.",
-        "schema = 1",
-        f"name = {_text(wanted.name)}",
-        "",
-        "[machine]",
-        f"unknown = {_list(machine.unknown)}",
-        f"nuisances = {_list(machine.nuisances)}",
-        *([f"window = {machine.window!r}  # s"] if machine.window else []),
-        f"between = {_text(wanted.between)}",
-        *([f"travel = {machine.travel!r}  # m/rad"] if machine.travel else []),
-        "",
-        "[machine.units]",
-        *(f"{key} = {_text(unit)}" for key, unit in wanted.shown.items()),
-        "",
-        "[brake]",
-        *(f"{key} = {own[key]!r}" for key in ("J", "gamma", *PARAMETER_NAMES)),
-        "",
-        "[limits]",
-        f"current = {2.0 * current + 1e-6!r}",
-        f"angle = [{min(low - slack, -1.0)!r}, {max(high + slack, 1.0)!r}]",
-        f"velocity = {3.0 * speed + 1.0!r}",
-        "",
-        "[noise]",
-        f"angle = {noise[0]!r}",
-        f"velocity = {noise[1]!r}",
-        "",
-        "[timing]",
-        f"sample_time = {sample_time!r}",
-        f"horizon = {horizon}",
-        "",
-        "[systematic]  # what a map can say of a bench is exact",
-        *(f"{key} = 0.0" for key in Systematic.__dataclass_fields__),
-        "",
-        f"[plants.{IMPORTED_PLANT}]",
-        *([f"observer_bandwidth = {bandwidth!r}"] if bandwidth else []),
-        *(f"{key} = 0.0" for key in by_direction),
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _text(value: str) -> str:
-    return json.dumps(value, ensure_ascii=False)  # a JSON string of printable characters is a TOML string
-
-
-def _list(values: tuple[str, ...]) -> str:
-    return json.dumps(list(values))

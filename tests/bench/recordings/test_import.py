@@ -74,51 +74,22 @@ def test_what_a_recording_lacks_is_said_by_the_import_and_by_whoever_reads_it(
         assert any(lack in line for line in experiment.missing)
 
 
-DBC = """\
-VERSION ""
-BU_: drive
-BO_ 32 Motion: 8 drive
- SG_ Position : 7|32@0- (0.0001,0) [0|0] "rev" drive
- SG_ Speed : 39|32@0- (0.001,0) [0|0] "rpm" drive
-BO_ 33 Command: 4 drive
- SG_ Torque : 0|32@1- (0.00001,0) [0|0] "Nm" drive
-"""
-
-
-def test_a_can_log_is_read_with_any_dbc_and_frames_are_paired_by_their_times(tmp_path: Path) -> None:
-    import cantools
-
-    bus = cantools.database.load_string(DBC)
-    assert isinstance(bus, cantools.database.Database)
-    (tmp_path / "drive.dbc").write_text(DBC)
-    lines, angles, torques = [], [], []
-    for k in range(60):
-        position, torque = 0.01 * k, 0.02 * (k % 7)
-        motion = bus.encode_message("Motion", {"Position": position, "Speed": 60.0 * position})
-        command = bus.encode_message("Command", {"Torque": torque})
-        lines.append(f"({100.0 + 0.01 * k + 0.001 * (k % 3):.6f}) can0 020#{motion.hex().upper()}")
-        lines.append(f"({100.0 + 0.01 * k + 0.0045:.6f}) can0 021#{command.hex().upper()}")
-        angles.append(2.0 * np.pi * position)
-        torques.append(torque)
-    (tmp_path / "drive.log").write_text("\n".join(lines) + "\n")
-    text = """\
+TURNING = """\
 schema = 1
-name = "a drive on a bus"
-[file]
-dbc = "drive.dbc"
+name = "a drive that turns"
 [timing]
 sample_time = 0.01
 [signals.angle]
-column = "Motion.Position"
+column = "position"
 unit = "rev"
 noise = 0.0001
 [signals.velocity]
-column = "Motion.Speed"
+column = "speed"
 unit = "rpm"
 noise = 0.1
 sign = -1
 [signals.command]
-column = "Command.Torque"
+column = "torque"
 unit = "Nm"
 delay = -0.0045
 [machine]
@@ -128,13 +99,23 @@ J = 1e-4
 T_c = 0.01
 f_v = 1e-4
 """
-    experiment = read_experiment(read_log(imported(tmp_path, tmp_path / "drive.log", text)))
-    np.testing.assert_allclose(experiment.all_samples[:, 0], angles, atol=1e-3)
-    np.testing.assert_allclose(experiment.all_samples[:, 1], -np.array(angles), atol=1e-3)
-    np.testing.assert_allclose(experiment.currents, torques[:-1], atol=1e-4)
-    # The frames came up to 2 ms late; their own stamps say so.
+
+
+def test_signals_with_times_of_their_own_are_paired_by_these(tmp_path: Path) -> None:
+    asammdf = pytest.importorskip("asammdf")
+    k = np.arange(60)
+    turns, torques, times = 0.01 * k, 0.02 * (k % 7), 0.01 * k + 0.001 * (k % 3)
+    columns = {"position": (turns, times), "speed": (60.0 * turns, times), "torque": (torques, 0.01 * k + 0.0045)}
+    with asammdf.MDF() as file:
+        for name, (values, stamps) in columns.items():
+            file.append(asammdf.Signal(values, stamps, name=name))
+        file.save(tmp_path / "drive.mf4")
+    experiment = read_experiment(read_log(imported(tmp_path, tmp_path / "drive.mf4", TURNING)))
+    np.testing.assert_allclose(experiment.all_samples, 2.0 * np.pi * np.stack([turns, -turns], axis=1), atol=1e-9)
+    np.testing.assert_allclose(experiment.currents, torques[:-1], atol=1e-9)
+    # The samples came up to 2 ms late; their own stamps say so.
     assert experiment.late is not None
-    np.testing.assert_allclose(experiment.late, np.array([1e-3 * (k % 3) for k in range(1, 60)]), atol=1e-6)
+    np.testing.assert_allclose(experiment.late, times[1:] - 0.01 * k[1:], atol=1e-6)
 
 
 def test_a_linear_command_is_the_mean_of_what_lies_between_its_stamps(tmp_path: Path) -> None:
