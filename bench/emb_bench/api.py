@@ -169,7 +169,7 @@ def fisher_information(
         nuisance: unknowns besides (default: none).
         prior: name of ranges in the bench file in which the parameters are known to lie (default: none).
         theta: where to evaluate: 'log' for the running estimate in the log, 'nominal', 'true' of a
-            simulated brake, 'name=value,...', a TOML file, or the JSON of an estimate or report (default: log, and
+            simulated brake, 'name=value,...', or the JSON of an estimate or report (default: log, and
             nominal where it has no estimate).
         bench: bench file (default: the one in the log).
 

@@ -22,9 +22,9 @@ from emb_bench.brake.motion import SENSITIVE, STATES
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Instruments, Mechanics
-from emb_bench.sim.closed_loop import pass_period
 from emb_bench.sim.instruments import MEMORY as INSTRUMENTS_MEMORY
 from emb_bench.sim.instruments import command, settle
+from emb_bench.sim.simulated_brake import pass_period
 from emb_runtime.config.bench import BrakeParameters, Ranges
 from emb_runtime.safety.sensor_monitor import (
     DOWN_FROM,

@@ -27,8 +27,8 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, LONGEST_DELAY, Instruments, Mechanics, Plant
 from emb_bench.information.fisher import Kind, weights_of
 from emb_bench.information.symmetric import Floats, add_increment, packed_size
-from emb_bench.sim.closed_loop import pass_period, sent_current
 from emb_bench.sim.instruments import MEMORY, command, measure, settle
+from emb_bench.sim.simulated_brake import pass_period, sent_current
 from emb_runtime.config.bench import OLDEST_FRAME, PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import UsageError
 from emb_runtime.records import Reason

@@ -5,21 +5,18 @@ A file is made from the data sheet's; each number that is not the sheet's has it
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from typing import Any
 
 import tomlkit
 
-from emb_bench.commission.records import CurrentCheck, Findings, Identification, Rest
+from emb_bench.commission.records import CurrentCheck, Findings, Identification
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.config.plants import SHORTEST_LAG
-from emb_runtime.config.bench import LEARNING, PARAMETER_NAMES, Noise
+from emb_runtime.config.bench import LEARNING, PARAMETER_NAMES
 from emb_runtime.config.toml_text import parse_toml
 from emb_runtime.errors import BenchFileError
-from emb_runtime.learning.assumptions import make_assumptions
 from emb_runtime.safety.shield_design import make_law
 
 SHEET, MEASURED = "sheet", "measured"  # Names of the sets of ranges
@@ -30,40 +27,22 @@ WIDENED_MISFIT = 0.25  # Share where the residuals contradict every model
 UNEXPLAINED = 9.0  # Mean square of the residuals, in variances of the noise at rest, from which on nothing is explained
 NOISE_WIDENED = 1.2  # Factor from a standard deviation that was measured to the one that is written
 LAG_WIDENED = 1.25  # Factor from the interval of the current loop's time constant to the bound that is written
-LEARNING_SHARE = 0.5  # Least share of the angle that is given up for a shield that may learn
 NARROWEST, STEP_DOWN = 10.0, 5.0  # Least upper angle limit that is tried, and by how much each try is lower [rad]
 SHEETS = "the data sheet's"
 
 
-def working_text(sheet: Bench, *, learns: bool = False) -> str:
+def working_text(sheet: Bench) -> str:
     """Bench file that the steps run with: the data sheet's, its angle as wide as a shield can be made for its ranges.
 
     Args:
         sheet: bench file with the data sheet's ranges in the set of its shield.
-        learns: with the learning shield; the node's bench identity is the same.
 
     Raises:
         BenchFileError: there is no shield for these ranges.
     """
     document, origins = _of_sheet(sheet), dict[str, str]()
-    highest, kind = _highest_angle(document), "a shield"
-    with suppress(BenchFileError):
-        covered = _highest_angle(_learning(document))
-        if covered >= LEARNING_SHARE * highest:
-            highest, kind = covered, "a learning shield"
-    _limit_angle(document, origins, highest, f"{kind} covers its ranges")
-    if learns:
-        document["shield"]["learn"] = True
-        origins["shield.learn"] = "the experiments so far do not contradict what it assumes"
+    _limit_angle(document, origins)
     return _toml(document, origins)
-
-
-def learning_possible(work: Bench) -> bool:
-    """True if the learning shield covers the ranges of a bench."""
-    with suppress(BenchFileError):
-        _require_shield(_learning(_of_sheet(work)))
-        return True
-    return False
 
 
 def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
@@ -81,28 +60,28 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
     assert rest is not None
     assert current is not None
     assert one is not None
-    document, origins = _of_sheet(sheet), dict[str, str]()
+    document = _of_sheet(sheet)
     how = f"output error, model {one.model}, {logs['experiments']}"
-    measured = measured_ranges(sheet, one)
-    document["ranges"][MEASURED] = {name: list(measured[name]) for name in PARAMETER_NAMES}
+    origins = dict.fromkeys(("limits.current", "limits.angle", "limits.velocity"), SHEETS)
+    measured = document["ranges"][MEASURED] = {n: list(pair) for n, pair in measured_ranges(sheet, one).items()}
     for name, (low, high) in measured.items():
         document["brake"][name] = _rounded(min(max(one.values[name], low), high))
         origins[f"brake.{name}"] = how
         origins[f"ranges.{MEASURED}.{name}"] = _origin_of_range(sheet, one, name, (low, high))
-    noise = _written_noise(one, rest)
-    document["noise"] = {"angle": noise.angle, "velocity": noise.velocity}
-    for name, at_rest, moving in (
-        ("angle", rest.noise.angle, one.noise.angle),
-        ("velocity", rest.noise.velocity, one.noise.velocity),
-    ):
+    for name in ("angle", "velocity"):
+        at_rest, moving = getattr(rest.noise, name), getattr(one.noise, name)
+        document["noise"][name] = _rounded(NOISE_WIDENED * max(at_rest, moving), up=True)
         origins[f"noise.{name}"] = (
             f"at rest {at_rest:.3g} ({logs['rest']}), in motion {moving:.3g} (residuals); the larger times "
             f"{NOISE_WIDENED:g}"
         )
     age = current.delay + current.uncertain + one.measurement_delay
     lag = min(sheet.shield.current_lag, _rounded(LAG_WIDENED * one.current_lag[1], up=True))
-    frame_age = [min(age, sheet.shield.frame_age[0]), age]
-    document["shield"] |= {"ranges": MEASURED, "frame_age": frame_age, "current_lag": lag}
+    document["shield"] |= {
+        "ranges": MEASURED,
+        "frame_age": [min(age, sheet.shield.frame_age[0]), age],
+        "current_lag": lag,
+    }
     origins["shield.frame_age"] = (
         f"commands {current.delay} samples late by the node's reports ({logs['current']}), measurements "
         f"{one.measurement_delay} by the best fit"
@@ -115,9 +94,8 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
     )
     origins["shield.break_away"] = origins["shield.f_l"] = f"{SHEETS} bound: not measured by itself"
     origins["systematic.offset"] = f"contact found at {one.contact[0]:.4g} to {one.contact[1]:.4g} rad"
-    origins |= dict.fromkeys(("limits.current", "limits.angle", "limits.velocity"), SHEETS)
     document.setdefault("plants", {})[MEASURED] = _plant(one, current)
-    _limit_angle(document, origins, _highest_angle(document), "a shield covers the ranges")
+    _limit_angle(document, origins)
     return _toml(document, origins)
 
 
@@ -239,13 +217,6 @@ def _by_play(sheet: Bench, one: Identification) -> float:
     return 0.5 * one.features.get("play", 0.0) * sheet.brake.gamma * steepest
 
 
-def _written_noise(one: Identification, rest: Rest) -> Noise:
-    return Noise(
-        _rounded(NOISE_WIDENED * max(rest.noise.angle, one.noise.angle), up=True),
-        _rounded(NOISE_WIDENED * max(rest.noise.velocity, one.noise.velocity), up=True),
-    )
-
-
 def _range(sheet: Bench, name: str) -> tuple[float, float]:
     ends = sheet.range_set(sheet.shield.ranges)
     return getattr(ends.low, name), getattr(ends.high, name)
@@ -272,41 +243,31 @@ def _of_sheet(sheet: Bench) -> dict[str, Any]:
     return document
 
 
-def _learning(document: Mapping[str, Any]) -> dict[str, Any]:
-    return {**document, "shield": {**document["shield"], "learn": True}}
-
-
-def _limit_angle(document: dict[str, Any], origins: dict[str, str], highest: float, why: str) -> None:
-    if highest < (own := document["limits"]["angle"][1]):
-        document["limits"]["angle"][1] = highest
-        origins["limits.angle"] = f"{own:g} rad by the data sheet; the largest for which {why}"
-
-
-def _highest_angle(document: Mapping[str, Any]) -> float:
-    """Largest upper angle limit, up to the document's, for which there is a shield.
+def _limit_angle(document: dict[str, Any], origins: dict[str, str]) -> None:
+    """Lower the upper angle limit of a document to the largest for which there is a shield.
 
     Raises:
         BenchFileError: there is none; of the document's own limit, what the shield cannot guarantee there.
     """
-    trial = copy.deepcopy(dict(document))
-    low, own = trial["limits"]["angle"]
+    low, own = document["limits"]["angle"]
+    problem = _shield_problem(document)
+    if problem is None:
+        return
+    for steps in range(1, int((own - NARROWEST) / STEP_DOWN) + 1):
+        document["limits"]["angle"] = [low, own - steps * STEP_DOWN]
+        if _shield_problem(document) is None:
+            origins["limits.angle"] = f"{own:g} rad by the data sheet; the largest for which a shield covers the ranges"
+            return
+    raise problem
+
+
+def _shield_problem(document: Mapping[str, Any]) -> BenchFileError | None:
+    """What a shield cannot guarantee for a document; None if it guarantees all."""
     try:
-        _require_shield(trial)
-        return float(own)
-    except BenchFileError:
-        for steps in range(1, int((own - NARROWEST) / STEP_DOWN) + 1):
-            trial["limits"]["angle"] = [low, own - steps * STEP_DOWN]
-            with suppress(BenchFileError):
-                _require_shield(trial)
-                return float(own - steps * STEP_DOWN)
-        raise
-
-
-def _require_shield(document: Mapping[str, Any]) -> None:
-    bench = parse_bench(tomlkit.dumps(document), "the bench of a commissioning")
-    make_law(bench)
-    if bench.shield.learn:
-        make_assumptions(bench)
+        make_law(parse_bench(tomlkit.dumps(document), "the bench of a commissioning"))
+    except BenchFileError as err:
+        return err
+    return None
 
 
 def _toml(document: Mapping[str, Any], origins: Mapping[str, str]) -> str:

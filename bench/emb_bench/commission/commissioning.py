@@ -6,32 +6,27 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import onnx
-
 from emb_bench.commission import examination
 from emb_bench.commission.bench_file import WRITTEN, found_text, measured_ranges, working_text
+from emb_bench.commission.policy import policy_file
 from emb_bench.commission.records import Findings, Identification, Kind, Step
-from emb_bench.commission.steps import WIDENING, judged, next_step, suspected
+from emb_bench.commission.steps import EXPERIMENTS, FULL, STEPS, judged, suspected
 from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.toml_text import parse_toml
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, SafetyStopError, UsageError
-from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, SAMPLE, Contract, PolicyLimits, Vector
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system import terminal
 
-WORKING, LEARNING_FILE, FOUND = "working.toml", "working-learning.toml", "bench.toml"
-"""Names of the bench files in the folder."""
+WORKING, FOUND = "working.toml", "bench.toml"  # Names of the bench files in the folder
 RECENT = 2  # Experiments that the parameters are estimated from: each is larger and tells more than those before it
-MOST_ATTEMPTS = 100  # Logs of one step
-OUTSIDE = {Fault.OUT_OF_LIMITS.name, Fault.MOTION_OUTSIDE_SET.name, Fault.SET_CONTRADICTED.name}
+OUTSIDE = {Fault.OUT_OF_LIMITS.name, Fault.MOTION_OUTSIDE_SET.name}
 """Results by which the brake may lie outside of the data sheet's ranges."""
 SIMULATED = ("sim", "sim-drive")  # Buses whose brake is made anew for each run
 
@@ -108,11 +103,11 @@ class Commissioning:
         """
         work = self._bench(WORKING, working_text(self._sheet))
         found = Findings()
-        while (step := next_step(self._sheet, work, found, list(self._logs))) is not None:
-            bench = self._bench_of(step, work, found)
-            log = self._completed(step) or self._run(step, bench, found)
-            self._logs[step.name] = log
-            finding = self._examine(step, log, found)
+        for name, make in STEPS.items():
+            bench = self._found_bench(found) if name == FULL else work
+            step = make(bench, found)
+            self._logs[name] = self._completed(name) or self._run(step, bench, found)
+            finding = self._examine(step, found)
             found = judged(step, finding, self._sheet, found)
             self._say(f"  found: {finding or 'nothing to object to'}")
         one = found.identified
@@ -141,38 +136,36 @@ class Commissioning:
             raise UsageError(f"{path}: cannot write the bench file: {err.strerror}") from err
         return load_bench(path)
 
-    def _bench_of(self, step: Step, work: Bench, found: Findings) -> Bench:
-        if step.final:
-            used = " and ".join(path.name for path in self._experiments())
-            logs = {"rest": self._logs["1-listen"].name, "current": self._logs["3-current"].name, "experiments": used}
-            return self._bench(FOUND, found_text(self._sheet, found, logs))
-        return self._bench(LEARNING_FILE, working_text(self._sheet, learns=True)) if step.learns else work
+    def _found_bench(self, found: Findings) -> Bench:
+        used = " and ".join(path.name for path in self._experiments())
+        logs = {"rest": self._logs["1-listen"].name, "current": self._logs["3-current"].name, "experiments": used}
+        return self._bench(FOUND, found_text(self._sheet, found, logs))
 
     def _experiments(self) -> list[Path]:
         """Logs of the latest experiments with the data sheet's ranges."""
-        return [self._logs[name] for name, *_ in WIDENING if name in self._logs][-RECENT:]
+        return [self._logs[name] for name in EXPERIMENTS if name in self._logs][-RECENT:]
 
-    def _attempts(self, step: Step) -> list[Path]:
-        names = [step.name, *(f"{step.name}-attempt{number}" for number in range(2, MOST_ATTEMPTS))]
-        return [self._folder / f"{name}.mcap" for name in names]
+    def _attempts(self, name: str) -> list[Path]:
+        """Logs of a step that are there, and last the one that its next run makes."""
+        paths = [self._folder / f"{name}.mcap"]
+        while paths[-1].exists():
+            paths.append(self._folder / f"{name}-attempt{len(paths) + 1}.mcap")
+        return paths
 
-    def _completed(self, step: Step) -> Path | None:
-        """The log of a step that was completed before."""
-        there = [path for path in self._attempts(step) if path.exists()]
-        return next((path for path in there if examination.ended(path) == "DONE"), None)
+    def _completed(self, name: str) -> Path | None:
+        return next((path for path in self._attempts(name)[:-1] if examination.ended(path) == "DONE"), None)
 
     # --- runs -------------------------------------------------------------------------------------------------------
 
     def _run(self, step: Step, bench: Bench, found: Findings) -> Path:
         self._say(f"{step.name}: {step.purpose}\n  relies on {step.rests_on}")
-        path = self._folder / (FOUND if step.final else LEARNING_FILE if step.learns else WORKING)
+        path = self._folder / (FOUND if step.kind is Kind.FULL else WORKING)
         if bench.identity_hash != self._identity:
             self._identity = bench.identity_hash
             identity = bench_identity(bench.identity_hash)
             self._say(f"  the node has to be set up for {path}, bench identity {identity:#06x}")
-        policy = self._folder / f"{step.name}.onnx"
+        policy, log = self._folder / f"{step.name}.onnx", self._attempts(step.name)[-1]
         policy.write_bytes(policy_file(step, bench))
-        log = next(path for path in self._attempts(step) if not path.exists())
         arguments = ["--iface", simulated(self._iface, self._sheet, self._runs), "--bench", str(path)]
         arguments += ["--policy", str(policy), "--log", str(log), "--duration", repr(step.duration)]
         self._runs += 1
@@ -186,7 +179,8 @@ class Commissioning:
             document["exit_code"] or EXIT_SAFETY_STOP,
         )
 
-    def _examine(self, step: Step, log: Path, found: Findings) -> object:
+    def _examine(self, step: Step, found: Findings) -> object:
+        log = self._logs[step.name]
         match step.kind:
             case Kind.REST:
                 return examination.at_rest(log)
@@ -197,7 +191,7 @@ class Commissioning:
         assert found.rest is not None
         if step.kind is Kind.FIRST_MOVE:
             return examination.first_move(log, found.rest.noise)
-        logs = [log] if step.final else self._experiments()
+        logs = [log] if step.kind is Kind.FULL else self._experiments()
         return examination.identify(logs, self._sheet, found.rest.noise, found.identified)
 
 
@@ -208,7 +202,6 @@ def emb_run(arguments: Sequence[str]) -> Mapping[str, Any]:
         StepFailedError: it printed no document; it has said why.
     """
     code = "import sys; from emb_runtime.system.entry import emb_run; sys.exit(emb_run())"
-    before = {number: signal.getsignal(number) for number in terminal.ENDING}
     process = subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, text=True)
     ended: list[int] = []
 
@@ -216,10 +209,8 @@ def emb_run(arguments: Sequence[str]) -> Mapping[str, Any]:
         ended.append(number)
         process.send_signal(number)
 
+    before = {n: signal.signal(n, end) for n in terminal.ENDING if signal.getsignal(n) is not signal.SIG_IGN}
     try:
-        for number, handler in before.items():
-            if handler is not signal.SIG_IGN:
-                signal.signal(number, end)
         printed = process.communicate()[0]
     finally:
         for number, handler in before.items():
@@ -268,74 +259,3 @@ def _failure(document: Mapping[str, Any]) -> tuple[str, bool]:
         if one["result"] != "done":
             return f"{name}{one['result']}: {one['detail'] or one['cause']}", one["result"] in OUTSIDE
     return "it was ended before its time", False
-
-
-GRAPH = """
-<ir_version: 10, opset_import: ["" : 20]>
-commissioning (float[1, 3] inputs) => (float[1, 1] outputs)
-<
-  float[1] lowest = {{{lowest}}}, float[1] highest = {{{highest}}}, float[1] fastest = {{{speed}}},
-  float[1] slowest = {{-{speed}}}, float[1] least = {{{least}}}, float[1] most = {{{most}}}, float[1] zero = {{0}},
-  float[1] rate = {{{rate}}},
-  float[{count}] currents = {{{currents}}},
-  int64[1] first = {{0}}, int64[1] second = {{1}}, int64[1] third = {{2}}, int64 begin = {{0}}, int64 last = {{{last}}}
->
-{{
-  angle = Gather <axis = 1> (inputs, first)
-  velocity = Gather <axis = 1> (inputs, second)
-  time = Gather <axis = 1> (inputs, third)
-  step = Mul (time, rate)
-  whole = Round (step)
-  number = Cast <to = 7> (whole)
-  place = Clip (number, begin, last)
-  wanted = Gather <axis = 0> (currents, place)
-  above = Greater (angle, highest)
-  fast_up = Greater (velocity, fastest)
-  no_more_up = Or (above, fast_up)
-  upper = Where (no_more_up, zero, most)
-  below = Less (angle, lowest)
-  fast_down = Less (velocity, slowest)
-  no_more_down = Or (below, fast_down)
-  lower = Where (no_more_down, zero, least)
-  raised = Max (wanted, lower)
-  outputs = Min (raised, upper)
-}}
-"""
-"""The current of the step, cut to zero on the side that leads out of the window."""
-
-
-def policy_file(step: Step, bench: Bench) -> bytes:
-    """The policy of a step, for a bench: its current, but none that drives the brake farther out of the window."""
-    currents = np.asarray(step.currents or (0.0,), np.float32)
-    limit, window = bench.limits.current, step.window
-    text = GRAPH.format(
-        lowest=window.lowest,
-        highest=window.highest,
-        speed=window.speed,
-        rate=1.0 / bench.timing.sample_time,
-        least=-limit,
-        most=limit,
-        count=len(currents),
-        currents=_numbers(currents.tolist()),
-        last=len(currents) - 1,
-    )
-    model = onnx.parser.parse_model(text)
-    model.metadata_props.add(key=CONTRACT_KEY, value=_contract(currents.tolist(), step, bench).to_json())
-    return model.SerializeToString()
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return ", ".join(f"{value:.9g}" for value in values)  # nine digits tell single precision exactly
-
-
-def _contract(currents: list[float], step: Step, bench: Bench) -> Contract:
-    places = [k * (len(currents) - 1) // (MIN_VECTORS - 1) for k in range(MIN_VECTORS)]
-    return Contract(
-        kind="current",
-        inputs=SAMPLE,
-        limits=PolicyLimits(bench.limits.current, bench.limits.angle, bench.limits.velocity),
-        sample_time=bench.timing.sample_time,
-        horizon=bench.timing.horizon,
-        vectors=tuple(Vector((0.0, 0.0, k * bench.timing.sample_time), (currents[k],)) for k in places),
-        provenance={"commissioning": step.name},
-    )

@@ -54,7 +54,7 @@ def ended(log: Path) -> str:
 
 
 def at_rest(log: Path) -> Rest:
-    """Noise, period and jitter of the samples while the brake rests, and the node's clock."""
+    """Noise, period and jitter of the samples while the brake rests."""
     opened = read_log(log)
     layout = opened.layout
     angles, velocities = opened.signals(layout.angle.name), opened.signals(layout.velocity.name)
@@ -63,15 +63,12 @@ def at_rest(log: Path) -> Rest:
         raise LogError(f"{log}: expected at least {FEWEST} samples at rest, got {len(angle)}")
     wrap = layout.device_time_period_ns * 1e-9
     stamps = np.unwrap(np.asarray(angles["DeviceTime"], np.float64), period=wrap)
-    host = np.asarray(angles["publish_time"], np.float64)
     steps = np.round(np.diff(stamps) / np.median(np.diff(stamps)))
     grid = np.concatenate([[0.0], np.cumsum(steps)])
-    slope, start = np.polyfit(grid, stamps, 1)
-    ratio = float(np.polyfit((host - host[0]) * 1e-9, stamps - stamps[0], 1)[0])
+    period, start = np.polyfit(grid, stamps, 1)
     found = noise_at_rest(angle, velocity, opened.drive)
     noise = Noise(max(found.angle, QUIET_ANGLE), max(found.velocity, QUIET_VELOCITY))
-    jitter = float(np.std(stamps - start - slope * grid))
-    return Rest(noise, float(slope), jitter, ratio, float(np.mean(angle)))
+    return Rest(noise, float(period), float(np.std(stamps - start - period * grid)))
 
 
 def current(log: Path) -> CurrentCheck:

@@ -17,6 +17,7 @@ class Kind(StrEnum):
     CURRENT = "current"  # Sign, scale and latency of the reported current, with too little to move the brake
     FIRST_MOVE = "first move"  # Signs and scales of the sensors, and the current that moves the brake
     EXPERIMENT = "experiment"  # Parameters
+    FULL = "full"  # Parameters again, with the bench file that was found
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,7 @@ class Step:
     limit: float  # Largest current that may leave [A]; 0 for none but 0 A
     duration: float  # [s]
     window: Window
-    currents: tuple[float, ...] = ()  # Wanted current by sample [A]; after the last one it stays
-    learns: bool = False  # With the learning shield
-    final: bool = False  # With the bench file that was found
+    currents: tuple[float, ...] = (0.0,)  # Wanted current by sample [A]; after the last one it stays
 
 
 @dataclass(frozen=True)
@@ -51,8 +50,6 @@ class Rest:
     noise: Noise  # Standard deviations
     period: float  # Of the samples by the node's clock [s]
     jitter: float  # Standard deviation of the samples about their grid, by the node's clock [s]
-    clock_ratio: float  # Node's time over the computer's
-    angle: float  # Mean [rad]
 
     def __str__(self) -> str:
         return (

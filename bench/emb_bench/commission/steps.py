@@ -1,75 +1,154 @@
-"""Steps of a commissioning, one after the other: each from what those before it have found.
-
-A pure state machine: :func:`next_step` gives what is to be done, :func:`judged` compares a finding with the data sheet.
-"""
+"""Steps of a commissioning, each from what those before it have found, and their comparison with the data sheet."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
-from emb_bench.commission.bench_file import (
-    contradiction,
-    learning_possible,
-    measured_ranges,
-    not_inside,
-    outside,
-)
-from emb_bench.commission.records import (
-    CurrentCheck,
-    Findings,
-    FirstMove,
-    Identification,
-    Kind,
-    Rest,
-    Step,
-    Window,
-)
+from emb_bench.commission.bench_file import contradiction, measured_ranges, not_inside, outside
+from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Kind, Rest, Step, Window
 from emb_bench.config.bench import Bench
 from emb_runtime.errors import BenchFileError, SafetyStopError
 
 LISTENING = 4.0  # Time to listen [s]: the noise is to be known better than by the residuals of an experiment
-CHAIN = 0.2  # Duration of the run with 0 A [s]
-CURRENT_CHECK = 0.2  # Duration of the check of the current [s]
-BELOW = 0.5  # Current of that check, as a share of the least that could move any brake of the data sheet
+SHORT = 0.2  # Duration of the runs that move nothing [s]
+BELOW = 0.5  # Current of the check of the current, as a share of the least that could move any brake of the data sheet
 FIRST_MOVE = 1.3  # Largest current of the first move, in multiples of what moves every brake of the data sheet
 MOVES = 1.3  # Current of the free stroke, in multiples of what moved this one
+REACH = 0.7  # Share of the upper angle limit that an experiment goes to
+FULL_SPEED = 0.8  # Share of the speed limit of the last run
 SCALE_ERROR = 0.2  # By which reported and commanded current, or angle and velocity, may differ in scale
 LAG_ERROR = 0.05  # By which the time constant of the current loop may exceed the data sheet's
 NOISE_EXCESS = 1.1  # Noise at rest over the data sheet's, at most: a deviation of 1000 samples is known to 3 %
 AT_REST = 8.0  # Standard deviations of the angle's noise within which the brake has not moved
-WIDENING = (
-    ("5-free-stroke", "the free stroke and the contact", 1.0, 30.0, 0.4, 5.0),
-    ("6-small", "a small experiment", 2.0, 80.0, 0.6, 12.0),
-    ("7-medium", "a medium experiment", 3.5, 200.0, 0.7, 30.0),
-    ("8-large", "a large experiment", math.inf, 400.0, 0.7, math.inf),
-)
-"""Name, words, current in multiples of that of the free stroke, speed [rad/s], share of the free stroke, angle."""
 AT_BORDER = 0.1  # Share of a border of the data sheet within which a parameter may be what is wrong there
-REACH = 0.7  # Share of the upper angle limit that an experiment goes to
 NEARLY = 1.5  # Mean square of the residuals, in variances of the noise at rest, up to which a model almost fits
-FULL_SPEED = 0.8  # Share of the speed limit of the last run
-FULL = "9-full"
 AGAIN = "and begin again in another folder"
+SIGNS = (1, -1, 1, 1, -1, -1, 1, -1, -1, 1)  # of the check of the current, five samples each
+SHARES = ((1.0, 0.12), (-1.0, 0.12), (0.7, 0.1), (-0.7, 0.1), (1.0, 0.08), (0.5, 0.06), (-1.0, 0.14))
+"""Currents of an experiment, out and back, as shares of its limit, and the share of its samples for each."""
 
 
-def next_step(sheet: Bench, work: Bench, found: Findings, done: Sequence[str]) -> Step | None:
-    """The next step; None after the last one.
+class Experiment(NamedTuple):
+    """Limits of an experiment with the data sheet's ranges."""
 
-    Args:
-        sheet: bench file with the data sheet's ranges.
-        work: bench file that the steps run with.
-        found: so far.
-        done: names of the completed steps.
-    """
-    for step in (_listen(work), _chain(work), _current(work), _first_move(work)):
-        if step.name not in done:
-            return step
-    for row in WIDENING:
-        if row[0] not in done:
-            return _experiment(work, found, *row)
-    return None if FULL in done else _full(sheet)
+    words: str
+    multiple: float  # Current in multiples of that of the free stroke
+    speed: float  # [rad/s]
+    stroke: float  # Share of the free stroke, on the side away from the pads
+    highest: float  # Angle [rad]
+
+
+EXPERIMENTS = {
+    "5-free-stroke": Experiment("the free stroke and the contact", 1.0, 30.0, 0.4, 5.0),
+    "6-small": Experiment("a small experiment", 2.0, 80.0, 0.6, 12.0),
+    "7-medium": Experiment("a medium experiment", 3.5, 200.0, 0.7, 30.0),
+    "8-large": Experiment("a large experiment", math.inf, 400.0, 0.7, math.inf),
+}
+
+
+def break_away(bench: Bench) -> tuple[float, float]:
+    """Least and greatest current that moves some brake of a bench's set from the origin [A]."""
+    box = bench.range_set(bench.shield.ranges)
+    return box.low.T_c / box.high.k_m, bench.shield.break_away * box.high.T_c / box.low.k_m
+
+
+# --- the steps ------------------------------------------------------------------------------------------------------
+
+
+def _listen(name: str, work: Bench, _: Findings) -> Step:
+    window = Window(*work.limits.angle, work.limits.velocity)
+    return Step(name, Kind.REST, "listen, send nothing", "nothing", 0.0, LISTENING, window)
+
+
+def _chain(name: str, work: Bench, _: Findings) -> Step:
+    window = Window(*work.limits.angle, work.limits.velocity)
+    return Step(name, Kind.CHAIN, "the whole chain with 0 A", "noise and clock at rest", 0.0, SHORT, window)
+
+
+def _current(name: str, work: Bench, _: Findings) -> Step:
+    amplitude = BELOW * break_away(work)[0]
+    return Step(
+        name,
+        Kind.CURRENT,
+        f"sign, scale and latency of the current with {1e3 * amplitude:.0f} mA, which moves no brake of the data sheet",
+        "least friction and strongest motor of the data sheet",
+        amplitude,
+        SHORT,
+        Window(-work.shield.home_angle, work.shield.home_angle, work.shield.home_velocity),
+        4 * tuple(amplitude * sign for sign in SIGNS for _ in range(5)),
+    )
+
+
+def _first_move(name: str, work: Bench, _: Findings) -> Step:
+    most = min(FIRST_MOVE * break_away(work)[1], work.limits.current)
+    fifth = work.timing.horizon // 5
+    ramp = [most * (k + 1) / fifth for k in range(fifth)]
+    return Step(
+        name,
+        Kind.FIRST_MOVE,
+        f"a current that rises to {most:.2f} A at most until the brake moves, in either direction",
+        "greatest friction and weakest motor of the data sheet; sign and scale of the current",
+        most,
+        work.timing.duration,
+        Window(-1.0, 1.0, 10.0),
+        (*ramp, *[0.0] * (fifth // 5), *[-value for value in ramp], 0.0),
+    )
+
+
+def _experiment(name: str, work: Bench, found: Findings) -> Step:
+    row, move, one = EXPERIMENTS[name], found.first_move, found.identified
+    assert move is not None
+    limit = min(row.multiple * (MOVES * max(move.up, move.down)), work.limits.current)
+    window = Window(row.stroke * work.limits.angle[0], min(row.highest, REACH * work.limits.angle[1]), row.speed)
+    return Step(
+        name,
+        Kind.EXPERIMENT,
+        f"{row.words}: {limit:.2f} A, {window.lowest:.1f} to {window.highest:.1f} rad, {window.speed:g} rad/s",
+        "the currents of the first move" if one is None else f"the estimate so far (model {one.model})",
+        limit,
+        work.timing.duration,
+        window,
+        _alternating(limit, work.timing.horizon),
+    )
+
+
+def _full(name: str, bench: Bench, _: Findings) -> Step:
+    limits = bench.limits
+    window = Window(0.7 * limits.angle[0], REACH * limits.angle[1], FULL_SPEED * limits.velocity)
+    return Step(
+        name,
+        Kind.FULL,
+        f"an experiment with the bench file that was found: {limits.current:g} A, up to {window.highest:.0f} rad and "
+        f"{window.speed:.0f} rad/s",
+        "all of it",
+        limits.current,
+        bench.timing.duration,
+        window,
+        _alternating(limits.current, bench.timing.horizon),
+    )
+
+
+def _alternating(current: float, horizon: int) -> tuple[float, ...]:
+    return (*(current * share for share, part in SHARES for _ in range(round(part * horizon))), 0.0)
+
+
+FULL = "9-full"
+STEPS: Mapping[str, Callable[[Bench, Findings], Step]] = {
+    "1-listen": partial(_listen, "1-listen"),
+    "2-zero": partial(_chain, "2-zero"),
+    "3-current": partial(_current, "3-current"),
+    "4-first-move": partial(_first_move, "4-first-move"),
+    **{name: partial(_experiment, name) for name in EXPERIMENTS},
+    FULL: partial(_full, FULL),
+}
+"""The steps in their order: each of the bench file that it runs with and of what was found before it."""
+
+
+# --- comparison with the data sheet: comparisons are this way round for NaN ------------------------------------------
 
 
 def judged(step: Step, finding: object, sheet: Bench, found: Findings) -> Findings:
@@ -95,7 +174,7 @@ def judged(step: Step, finding: object, sheet: Bench, found: Findings) -> Findin
         case FirstMove():
             _judge_first_move(finding, sheet)
             return replace(found, first_move=finding)
-        case Identification() if step.final:
+        case Identification() if step.kind is Kind.FULL:
             _judge_last(finding, found, sheet)
         case Identification():
             _judge_ranges(finding, sheet, is_first=found.identified is None)
@@ -116,115 +195,6 @@ def suspected(sheet: Bench, found: Findings) -> str:
     if one is not None and (names := not_inside(sheet, one, AT_BORDER)):
         return f"{contradiction(sheet, one, names)}; or {others}"
     return f"no parameter that was found lies near a border of [ranges.{sheet.shield.ranges}]: {others}"
-
-
-def break_away(bench: Bench) -> tuple[float, float]:
-    """Least and greatest current that moves some brake of a bench's set from the origin [A]."""
-    box = bench.range_set(bench.shield.ranges)
-    return box.low.T_c / box.high.k_m, bench.shield.break_away * box.high.T_c / box.low.k_m
-
-
-# --- the steps ------------------------------------------------------------------------------------------------------
-
-
-def _listen(work: Bench) -> Step:
-    window = Window(*work.limits.angle, work.limits.velocity)
-    return Step("1-listen", Kind.REST, "listen, send nothing", "nothing", 0.0, LISTENING, window)
-
-
-def _chain(work: Bench) -> Step:
-    window = Window(*work.limits.angle, work.limits.velocity)
-    return Step("2-zero", Kind.CHAIN, "the whole chain with 0 A", "noise and clock at rest", 0.0, CHAIN, window)
-
-
-def _current(work: Bench) -> Step:
-    amplitude = BELOW * break_away(work)[0]
-    pattern = [amplitude * sign for sign in (1, -1, 1, 1, -1, -1, 1, -1, -1, 1) for _ in range(5)]
-    return Step(
-        "3-current",
-        Kind.CURRENT,
-        f"sign, scale and latency of the current with {1e3 * amplitude:.0f} mA, which moves no brake of the data sheet",
-        "least friction and strongest motor of the data sheet",
-        amplitude,
-        CURRENT_CHECK,
-        Window(-work.shield.home_angle, work.shield.home_angle, work.shield.home_velocity),
-        tuple(pattern * 4),
-    )
-
-
-def _first_move(work: Bench) -> Step:
-    most = min(FIRST_MOVE * break_away(work)[1], work.limits.current)
-    quarter = work.timing.horizon // 5
-    ramp = [most * (k + 1) / quarter for k in range(quarter)]
-    return Step(
-        "4-first-move",
-        Kind.FIRST_MOVE,
-        f"a current that rises to {most:.2f} A at most until the brake moves, in either direction",
-        "greatest friction and weakest motor of the data sheet; sign and scale of the current",
-        most,
-        work.timing.duration,
-        Window(-1.0, 1.0, 10.0),
-        (*ramp, *[0.0] * (quarter // 5), *[-value for value in ramp], 0.0),
-    )
-
-
-def _experiment(
-    work: Bench, found: Findings, name: str, words: str, multiple: float, speed: float, stroke: float, highest: float
-) -> Step:
-    move, one = found.first_move, found.identified
-    assert move is not None
-    limit = min(multiple * (MOVES * max(move.up, move.down)), work.limits.current)
-    window = Window(stroke * work.limits.angle[0], min(highest, REACH * work.limits.angle[1]), speed)
-    rests_on = "the currents of the first move" if one is None else f"the estimate so far (model {one.model})"
-    learns = _assumptions_hold(found, work) and learning_possible(work)
-    return Step(
-        name,
-        Kind.EXPERIMENT,
-        f"{words}: {limit:.2f} A, {window.lowest:.1f} to {window.highest:.1f} rad, {speed:g} rad/s",
-        rests_on + ("; with the learning shield, as it contradicts nothing that this assumes" if learns else ""),
-        limit,
-        work.timing.duration,
-        window,
-        _alternating(limit, work.timing.horizon),
-        learns=learns,
-    )
-
-
-def _full(sheet: Bench) -> Step:
-    limits = sheet.limits
-    window = Window(0.7 * limits.angle[0], REACH * limits.angle[1], FULL_SPEED * limits.velocity)
-    return Step(
-        FULL,
-        Kind.EXPERIMENT,
-        f"an experiment with the bench file that was found: {limits.current:g} A, up to {window.highest:.0f} rad and "
-        f"{window.speed:.0f} rad/s",
-        "all of it",
-        limits.current,
-        sheet.timing.duration,
-        window,
-        _alternating(limits.current, sheet.timing.horizon),
-        final=True,
-    )
-
-
-def _alternating(current: float, horizon: int) -> tuple[float, ...]:
-    """Currents of both signs and several sizes, out and back, in about four fifths of an experiment."""
-    shares = ((1.0, 0.12), (-1.0, 0.12), (0.7, 0.1), (-0.7, 0.1), (1.0, 0.08), (0.5, 0.06), (-1.0, 0.14))
-    currents = [current * share for share, part in shares for _ in range(round(part * horizon))]
-    return (*currents, 0.0)
-
-
-def _assumptions_hold(found: Findings, work: Bench) -> bool:
-    """True if nothing that was found contradicts what the learning shield assumes."""
-    one = found.identified
-    if one is None or found.current is None:
-        return False
-    late = found.current.delay + one.measurement_delay
-    plain = one.fits and late == 0 and one.current_lag[1] == 0.0 and not one.features
-    return plain and not not_inside(work, one)
-
-
-# --- comparison with the data sheet: comparisons are this way round for NaN ------------------------------------------
 
 
 def _require(condition: bool, message: str) -> None:

@@ -34,9 +34,8 @@ from emb_bench.brake.euler import sign, stiffness
 from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Mechanics
-from emb_bench.sim.closed_loop import clipped, sent_current
 from emb_bench.sim.open_loop import feedback
-from emb_bench.sim.simulated_brake import parse_assignments
+from emb_bench.sim.simulated_brake import clipped, parse_assignments, sent_current
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.control.actor import Actor
 from emb_runtime.errors import UsageError

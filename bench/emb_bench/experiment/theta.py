@@ -1,4 +1,4 @@
-"""Parameters to evaluate a record at: nominal, true, given one by one, or of a file, such as an estimate's JSON."""
+"""Parameters to evaluate a record at: nominal, true, given one by one, or of the JSON of an estimate."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import RunLog
 from emb_bench.sim.simulated_brake import check_near_nominal, parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
-from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
 from emb_runtime.config.typed import shown
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.system.input_file import read_text
@@ -29,8 +28,8 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
 
     Args:
         choice: ``log`` for the last running estimate in the log, empty for that or nominal where there is none,
-            ``nominal``, ``true``, ``name=value,name=value``, a TOML file with the same, or the JSON of an estimate or
-            a report; the others are nominal.
+            ``nominal``, ``true``, ``name=value,name=value``, or the JSON of an estimate or a report; the others are
+            nominal.
         log: may contain the true ones.
         bench: contains the nominal ones.
 
@@ -79,17 +78,11 @@ def _from_file(path: str, log: RunLog, bench: Bench) -> tuple[dict[str, float], 
         UsageError: the file cannot be read, or has other contents.
     """
     try:
-        if path.endswith(".json"):
-            return _estimated(json.loads(read_text(path, MAX_JSON_BYTES)), log, bench)
-        values = parse_toml(read_text(path, MAX_TOML_BYTES))
-        for name in values:
-            if name not in PARAMETER_NAMES:
-                raise ValueError(f"{shown(name)}: expected one of {', '.join(PARAMETER_NAMES)}")
-        return {name: _number(value, name, "a positive number") for name, value in values.items()}, NO_ERRORS
+        return _estimated(json.loads(read_text(path, MAX_JSON_BYTES)), log, bench)
     except OSError as err:
         raise UsageError(f"--theta: expected nominal, true, name=value or a file; {path}: {err.strerror}") from err
     except UnicodeDecodeError as err:
-        raise UsageError(f"{path}: expected TOML or JSON: not UTF-8 text") from err
+        raise UsageError(f"{path}: expected JSON: not UTF-8 text") from err
     except (ValueError, RecursionError) as err:
         raise UsageError(f"{path}: {err}") from err
 

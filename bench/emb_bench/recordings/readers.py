@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.config.machine import FORCE, LENGTH, SPEED
+from emb_bench.config.plants import Instruments
 from emb_bench.recordings.map_file import MEASURED_UNITS, TIMED, RecordingMap, Signal, Source
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_runtime.errors import EmbError, UsageError

@@ -155,13 +155,9 @@ def test_what_a_measurement_delay_hides_counts_for_nothing(bench: Bench, log: Lo
     assert series["late"][1:] == pytest.approx(series["exact"][:-1])
 
 
-def test_parameters_from_a_file_replace_nominal_ones(tmp_path: Path, path: Path, replay: Replay) -> None:
-    file = tmp_path / "theta.toml"
-    file.write_text("f_v = 4e-5\n")
-    from_file, true = replay.document("fim", path, "--theta", file), replay.document("fim", path, "--theta", "true")
-    assert from_file["physical"] == true["physical"]
-    assert from_file["theta"]["name"] == "theta.toml"
-    assert replay.document("fim", path, "--theta", "f_v=4e-5")["physical"] == true["physical"]
+def test_given_parameters_replace_nominal_ones(path: Path, replay: Replay) -> None:
+    given, true = (replay.document("fim", path, "--theta", theta)["physical"] for theta in ("f_v=4e-5", "true"))
+    assert given == true
 
 
 def test_parameters_from_an_estimate_replace_nominal_ones(tmp_path: Path, path: Path, replay: Replay) -> None:
@@ -302,6 +298,13 @@ def test_info_says_when_a_log_is_cut(path: Path, replay: Replay) -> None:
     cut = replay.text("info", path)
     assert cut.startswith("WARNING")
     assert "NOT complete" in cut
+
+
+def test_given_parameters_are_checked(path: Path, replay: Replay) -> None:
+    for value in ("x", "-1.0", "nan", "inf", "1.0", "true"):
+        assert "f_v" in replay.refused("fim", path, "--theta", f"f_v={value}")
+    for text in ("k_1=0", "J=1.0", "f_v="):
+        replay.refused("fim", path, "--theta", text)
 
 
 @pytest.mark.parametrize("name", ["rubber", "all", "", "\x1b[31m"])

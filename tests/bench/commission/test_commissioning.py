@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -29,7 +30,7 @@ from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import Noise, shipped_bench_text
 from emb_runtime.errors import EmbError
-from tests.bench.commission.test_steps import sheet_text
+from tests.bench.commission.test_steps import identification, sheet_text, with_interval
 from tests.drives import EXAMPLES
 from tests.runtime.operating import Sim
 
@@ -189,7 +190,7 @@ def test_a_run_that_was_not_completed_is_done_again_under_another_name(tmp_path:
 
 def test_a_motion_of_no_brake_of_the_data_sheet_ends_it_with_what_to_look_at_and_its_exit_code(tmp_path: Path) -> None:
     fine = {"result": "done", "detail": "", "cause": "", "exit_code": 3, "homing": {}}
-    for fault in ("OUT_OF_LIMITS", "MOTION_OUTSIDE_SET", "SET_CONTRADICTED"):
+    for fault in ("OUT_OF_LIMITS", "MOTION_OUTSIDE_SET"):
         failed = {**fine, "result": fault, "cause": "the brake moves as none"}
         for document in (failed, {**fine, "homing": {"before": failed}}):
             with pytest.raises(StepFailedError, match=rf"{fault}: the brake moves.*; no parameter that was") as ended:
@@ -198,6 +199,20 @@ def test_a_motion_of_no_brake_of_the_data_sheet_ends_it_with_what_to_look_at_and
     with pytest.raises(StepFailedError, match="begin again in the same folder") as ended:
         commissioning(tmp_path, lambda _: {**fine, "result": "NO_NODE", "exit_code": 4}).run()
     assert ended.value.exit_code == 4
+
+
+def test_a_motion_of_no_brake_near_a_border_of_the_data_sheet_ends_it_with_the_range_to_widen(
+    done: tuple[Path, Commissioned], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for path in done[0].iterdir():
+        if path.name != "bench.toml" and not path.name.startswith(("8-", "9-")):
+            shutil.copy(path, tmp_path)
+    document = {"result": "MOTION_OUTSIDE_SET", "detail": "", "cause": "the brake moves as none", "exit_code": 3}
+    for name, shares in (("k_m", (1.991, 2.0)), ("T_c", (0.49, 0.52))):  # one ends at a border, one lies across it
+        found = with_interval(identification(sheet()), name, shares)
+        monkeypatch.setattr(examination, "identify", lambda *_, found=found: found)
+        with pytest.raises(StepFailedError, match=rf"8-large was not completed: .* widen {name} in \[ranges\.wide\]"):
+            commissioning(tmp_path, partial(_gives, document)).run()
 
 
 def test_a_start_that_a_few_samples_at_rest_tell_is_not_taken_for_exact(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import onnx
 import pytest
 
-from emb_bench.commission.commissioning import policy_file
+from emb_bench.commission.policy import policy_file
 from emb_bench.commission.records import Kind, Step, Window
 from emb_bench.config.bench import load_bench
 from emb_runtime.estimator.estimator import Estimator

@@ -12,12 +12,11 @@ from emb_bench.commission.bench_file import (
     MEASURED,
     SHEET,
     found_text,
-    learning_possible,
     measured_ranges,
     working_text,
 )
 from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Kind, Rest, Step
-from emb_bench.commission.steps import WIDENING, break_away, judged, next_step, suspected
+from emb_bench.commission.steps import EXPERIMENTS, STEPS, break_away, judged, suspected
 from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_runtime.config.bench import PARAMETER_NAMES, Noise, shipped_bench_text
 from emb_runtime.errors import BenchFileError, EmbError
@@ -47,7 +46,7 @@ def work(sheet: Bench) -> Bench:
     return parse_bench(working_text(sheet), "working")
 
 
-REST = Rest(Noise(8e-4, 0.9), 1e-3, 1e-7, 1.0, 0.0)
+REST = Rest(Noise(8e-4, 0.9), 1e-3, 1e-7)
 CURRENT = CurrentCheck(0, 1.0, 1e-4, 1e-3)
 MOVE = FirstMove(0.75, 0.72, 1.0)
 
@@ -76,29 +75,26 @@ def found(sheet: Bench, **changed: object) -> Findings:
     return replace(Findings(REST, CURRENT, MOVE, identification(sheet)), **changed)  # type: ignore[arg-type]
 
 
-def all_steps(sheet: Bench, work: Bench, findings: Findings) -> list[Step]:
-    steps: list[Step] = []
-    while (step := next_step(sheet, work, findings, [s.name for s in steps])) is not None:
-        steps.append(step)
-    return steps
+def all_steps(work: Bench, findings: Findings) -> list[Step]:
+    return [make(work, findings) for make in STEPS.values()]
 
 
 def test_nothing_is_sent_before_the_sensors_are_known_and_each_experiment_may_do_more(
     sheet: Bench, work: Bench
 ) -> None:
-    steps = all_steps(sheet, work, found(sheet))
+    steps = all_steps(work, found(sheet))
     assert [step.kind for step in steps[:4]] == [Kind.REST, Kind.CHAIN, Kind.CURRENT, Kind.FIRST_MOVE]
     assert steps[0].limit == steps[1].limit == 0.0
     experiments = steps[4:]
-    assert len(experiments) == len(WIDENING) + 1
+    assert len(experiments) == len(EXPERIMENTS) + 1
     for before, after in itertools.pairwise(experiments):
         assert after.limit >= before.limit
         assert after.window.speed >= before.window.speed
         assert after.window.highest >= before.window.highest
         assert after.window.lowest <= before.window.lowest
-    assert [step.final for step in steps] == [False] * (len(steps) - 1) + [True]
+    assert [step.kind for step in experiments] == [Kind.EXPERIMENT] * len(EXPERIMENTS) + [Kind.FULL]
     for step in steps:
-        assert max(map(abs, step.currents), default=0.0) <= step.limit + 1e-12
+        assert max(map(abs, step.currents)) <= step.limit + 1e-12
         assert len(step.currents) <= work.timing.horizon
         assert work.limits.angle[0] <= step.window.lowest
         assert step.window.highest <= sheet.limits.angle[1]
@@ -108,36 +104,14 @@ def test_the_current_check_moves_no_brake_of_the_data_sheet_and_the_first_move_e
     sheet: Bench, work: Bench
 ) -> None:
     least, most = break_away(work)
-    steps = all_steps(sheet, work, found(sheet))
+    steps = all_steps(work, found(sheet))
     assert steps[2].limit < least
     assert steps[3].limit > most
     assert steps[2].limit == pytest.approx(0.06, abs=0.001)  # 5.2e-3 N·m / 0.0434 N·m/A / 2
 
 
-def test_the_learning_shield_is_used_once_what_it_assumes_is_not_contradicted(sheet: Bench, work: Bench) -> None:
-    late = identification(sheet, measurement_delay=1)
-    curved = identification(sheet, features={"quadratic": 1e-3})
-    plain = identification(sheet)
-    for one, learns in (
-        (plain, True),
-        (late, False),
-        (curved, False),
-        (None, False),
-        *((with_interval(plain, name, shares), False) for name in PARAMETER_NAMES for shares in ACROSS),
-        *((with_interval(plain, name, (1.9, 1.99)), True) for name in PARAMETER_NAMES),
-    ):
-        steps = all_steps(sheet, work, found(sheet, identified=one)) if one else []
-        first = next_step(
-            sheet, work, found(sheet, identified=one), [s.name for s in all_steps(sheet, work, found(sheet))[:4]]
-        )
-        assert first is not None
-        assert first.learns is learns
-        assert all(step.learns is learns for step in steps[4:-1])
-        assert not any(step.learns for step in steps[:4])
-
-
 def test_what_contradicts_the_data_sheet_ends_it(sheet: Bench, work: Bench) -> None:
-    step = all_steps(sheet, work, found(sheet))[0]
+    step = all_steps(work, found(sheet))[0]
     for finding, words in (
         (replace(REST, noise=Noise(2e-3, 1.0)), "angle scatters"),
         (replace(REST, noise=Noise(1e-3, 1.3)), "velocity scatters"),
@@ -157,7 +131,7 @@ def test_what_contradicts_the_data_sheet_ends_it(sheet: Bench, work: Bench) -> N
 
 
 def test_what_agrees_with_the_data_sheet_is_kept_and_the_rest_stays(sheet: Bench, work: Bench) -> None:
-    steps = all_steps(sheet, work, found(sheet))
+    steps = all_steps(work, found(sheet))
     findings = Findings()
     for step, finding in zip(steps, (REST, None, CURRENT, MOVE, identification(sheet)), strict=False):
         findings = judged(step, finding, sheet, findings)
@@ -183,7 +157,7 @@ def test_no_range_is_written_that_does_not_hold_the_interval(sheet: Bench) -> No
 
 
 def test_an_interval_outside_of_a_range_ends_it_and_one_across_a_border_does_not(sheet: Bench, work: Bench) -> None:
-    step = all_steps(sheet, work, found(sheet))[4]
+    step = all_steps(work, found(sheet))[4]
     for name in PARAMETER_NAMES:
         for shares in AWAY:
             with pytest.raises(BenchFileError, match=rf"widen {name} in \[ranges\.wide\]"):
@@ -196,7 +170,7 @@ def test_an_interval_outside_of_a_range_ends_it_and_one_across_a_border_does_not
 def test_an_almost_fitting_model_far_outside_of_the_data_sheet_ends_it_from_the_second_experiment_on(
     sheet: Bench, work: Bench
 ) -> None:
-    step = all_steps(sheet, work, found(sheet))[5]
+    step = all_steps(work, found(sheet))[5]
     one = identification(sheet, fits=False, ratio=0.95, objections=("correct J in the bench file",))
     for share in (5.0, 0.2):
         outside = with_interval(one, "f_v", (0.95 * share, 1.05 * share))
@@ -228,7 +202,7 @@ def test_where_the_brake_moves_as_none_of_the_set_the_parameter_to_widen_is_name
 
 def test_the_last_run_must_not_contradict_the_file(sheet: Bench, work: Bench) -> None:
     findings = found(sheet)
-    last = all_steps(sheet, work, findings)[-1]
+    last = all_steps(work, findings)[-1]
     one = identification(sheet)
     moved = replace(one, intervals={**one.intervals, "T_c": (0.012, 0.013)})
     with pytest.raises(EmbError, match=r"T_c is 0\.012"):
@@ -239,16 +213,14 @@ def test_the_last_run_must_not_contradict_the_file(sheet: Bench, work: Bench) ->
 # --- bench files ----------------------------------------------------------------------------------------------------
 
 
-def test_the_working_bench_has_the_data_sheets_ranges_and_a_learning_shield(sheet: Bench, work: Bench) -> None:
+def test_the_working_bench_has_the_data_sheets_ranges_and_a_shield_for_them(sheet: Bench, work: Bench) -> None:
     assert work.range_set(work.shield.ranges).low == sheet.range_set("wide").low
     assert work.shield.ranges == SHEET
     assert work.limits.angle[1] < 100.0  # the weakest motor does not hold the stiffest spring farther
     make_law(work)
     assert not work.shield.learn
-    assert learning_possible(work)
-    learning = parse_bench(working_text(sheet, learns=True), "learning")
-    assert learning.shield.learn
-    assert learning.identity_hash == work.identity_hash
+    bare = parse_bench(sheet_text() + "\n[plants.bare]\n", "sheet")
+    assert "bare" in parse_bench(working_text(bare), "working").plants  # a table without an entry is kept
 
 
 def test_a_data_sheet_without_any_shield_is_refused_with_the_reason() -> None:
@@ -357,16 +329,3 @@ def test_jitter_and_lag_that_were_found_are_in_the_plant_of_the_file() -> None:
     bench = parse_bench(found_text(lagging, short, LOGS), "found")
     assert bench.plants[MEASURED].mechanics.current_lag == 0.0
     assert bench.shield.current_lag >= 1.9e-5
-
-
-def test_a_table_without_an_entry_is_kept() -> None:
-    bare = parse_bench(sheet_text() + "\n[plants.bare]\n", "sheet")
-    assert "bare" in parse_bench(working_text(bare), "working").plants
-
-
-def test_the_learning_shield_is_left_out_where_it_does_not_cover_the_data_sheet() -> None:
-    for text in (sheet_text(break_away="1.3"), sheet_text(2.1)):  # not at all; near home only
-        stiff = parse_bench(text, "sheet")
-        work = parse_bench(working_text(stiff), "working")
-        assert not learning_possible(work)
-        assert not any(step.learns for step in all_steps(stiff, work, found(stiff)))

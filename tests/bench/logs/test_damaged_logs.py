@@ -158,13 +158,21 @@ def test_a_chunk_that_unpacks_to_gigabytes_is_left_out_in_little_memory(path: Pa
     told = b"".join(honest.compress(piece) for _ in range(256)) + honest.flush()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     clean = path.read_bytes()
-    for packed, size in ((bomb, 2 << 30), (bomb, 2**63), (bomb, 1000), (told, 256 << 20), (told, 1000)):
+    for packed, size, words in (
+        *(
+            (packed, size, "it claims to unpack from")
+            for packed, size in ((bomb, 2 << 30), (bomb, 2**63), (told, 256 << 20))
+        ),
+        (bomb, 1000, "is damaged"),
+        (told, 1000, "its frame claims to unpack to"),
+    ):
         path.write_bytes(clean)
         spliced(path, chunk(b"", size=size, packed=packed))
         found = judge(path, whole)
         assert found is not None
         assert found.said
         assert "the chunk at byte" in found.log.missing
+        assert words in found.log.missing
         assert found.numbers == whole.numbers
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 128 * 1024  # KiB
 

@@ -9,7 +9,7 @@ import pytest
 
 from emb_bench import api
 from emb_bench.config.bench import load_bench
-from emb_bench.sim.closed_loop import sent_current
+from emb_bench.sim.simulated_brake import sent_current
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.safety.command_limits import LEFT
 from emb_runtime.safety.sensor_monitor import CONFIRMED, OBEYS, largest_current
