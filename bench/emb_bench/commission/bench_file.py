@@ -262,7 +262,7 @@ def _limit_angle(document: dict[str, Any], origins: dict[str, str]) -> None:
 
 
 def _shield_problem(document: Mapping[str, Any]) -> BenchFileError | None:
-    """What a shield cannot guarantee for a document; None if it guarantees all."""
+    """Reason why there is no shield for a document; None if there is one."""
     try:
         make_law(parse_bench(tomlkit.dumps(document), "the bench of a commissioning"))
     except BenchFileError as err:
