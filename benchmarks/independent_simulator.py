@@ -65,6 +65,7 @@ class Brake:
     torque_walk: float = 0.0  # Standard deviation of a random walk of the load [N·m per √s]
     encoder_step: float = 0.0
     """Step of the angle that an encoder shows, its noise before the rounding; an observer sees it too [rad]."""
+    angle_scale: float = 0.0  # Relative error of the angle's scale
 
     def numbers(self) -> Floats:
         """All of them in one row, as the integration takes them."""
@@ -217,7 +218,9 @@ class _Sensors:
         self.gains = np.array([1.0 - abs(pole) ** 2, (1.0 + abs(pole) ** 2 - 2.0 * pole.real) / self.t_s])
 
     def shown(self, x: float, v: float) -> Floats:
-        true = np.array([x + self.brake.encoder_offset, v * (1.0 + self.brake.velocity_gain)])
+        true = np.array(
+            [x * (1.0 + self.brake.angle_scale) + self.brake.encoder_offset, v * (1.0 + self.brake.velocity_gain)]
+        )
         sample = true + self.sigma * self.rng.standard_normal(2)
         if self.brake.encoder_step > 0.0:
             sample[0] = round(sample[0] / self.brake.encoder_step) * self.brake.encoder_step

@@ -81,6 +81,7 @@ ESTIMATE = "a38226b: the estimate is the runtime's, no longer rounded to single 
 DOUBLE = "8c3e4e84: estimates in double precision: a current is a step of its signal off here and there"
 FITS = "8c3e4e84: of a bench only limits and sample time decide whether a policy is refused"
 WINDOWS = "8dba46e: windows begin at a state whose squares fell"
+TOTAL = "the total allows for inertia and the scale of the angle, and its parts add in quadrature; no value changes"
 GATEWAY = "emb-gateway: a mapped drive is armed before the run: noise of other samples, no counts of its node"
 EXPLAINED: dict[str, str] = {
     "runs/stiff/says/*": REST,
@@ -98,6 +99,12 @@ EXPLAINED: dict[str, str] = {
     "logs/aborted/*": REST,
     "info/aborted/says/*": REST,
     "estimate/emps windows/says/*": WINDOWS,
+    "estimate/*/says/parameters/*/deviation": TOTAL,
+    "estimate/*/says/parameters/*/interval_95*": TOTAL,
+    "estimate/*/says/parameters/*/left_open*": TOTAL,
+    "estimate/*/says/systematic/*/deviation": TOTAL,
+    "campaign/all/says/parameters/*/estimate/*": TOTAL,
+    "campaign/all/says/campaigns/*/means/*": TOTAL,
     "campaign/all/says/misfit": SUMMARY,
     "campaign/all/says/parameters/*/cramer_rao": SUMMARY,
     "demo/fim/numbers": "the text of fim has half of the 95 % interval in place of standard deviations",

@@ -9,7 +9,7 @@ import numpy as np
 from emb_bench.analysis.constancy import constancy
 from emb_bench.brake.quantities import quantity
 from emb_bench.estimate.methods import method_of
-from emb_bench.estimate.records import NORMAL_95, Estimate
+from emb_bench.estimate.records import Estimate
 
 LEVEL = 0.001  # Chance that a parameter of one and the same brake is said to differ, for all parameters together
 
@@ -40,7 +40,7 @@ def apart(e: Estimate) -> tuple[Differing, ...]:
     for name in e.asked.params:
         at = [next(i for i, u in enumerate(one.unknowns) if u.name == name) for one in alone]
         values = [float(one.values[i]) for one, i in zip(alone, at, strict=True)]
-        deviations = [0.5 * np.ptp(one.intervals()[i]) / NORMAL_95 for one, i in zip(alone, at, strict=True)]
+        deviations = [float((one.between_runs() * one.scale)[i]) for one, i in zip(alone, at, strict=True)]
         if not np.isfinite(deviations).all():
             continue
         p_value = constancy(values, deviations).p_value

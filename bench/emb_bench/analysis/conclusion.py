@@ -99,7 +99,7 @@ def conclude(
     if not (e.validation.fits and predicts):
         certain = Standing.BIASED if e.method == "rls" else Standing.IF_MODEL_RIGHT
     found = []
-    columns = (e.unknowns, e.shown, e.labels, e.values.tolist(), e.intervals().tolist(), e.deviations().tolist())
+    columns = (e.unknowns, e.shown, e.labels, e.values.tolist(), e.intervals().tolist(), e.between_runs().tolist())
     noise = (noise_deviations(e).tolist(), e.scale.tolist())
     for unknown, shown, label, value, (low, high), deviation, own, scale in zip(*columns, *noise, strict=True):
         finding, one = findings.get(label), of_profile.get(label)

@@ -1,6 +1,7 @@
 """Change of the parameters since an earlier estimate.
 
-Two estimates differ by chance, by as much as their deviations; a parameter has drifted if it differs by more. With
+Two estimates differ by chance, by as much as their deviations, of which errors that both share (inertia, scale of the
+angle) are no part; a parameter has drifted if it differs by more. With
 k parameters compared at once each has to pass the quantile for 1 - 0.05/k (Bonferroni), so that nothing is called a
 drift in 95 % of campaigns in which nothing has changed. A model that did not fit, or another one, moves parameters too:
 then the change is reported as one that may be the model's.
@@ -32,7 +33,8 @@ class Entry(msgspec.Struct, frozen=True):
 
     value: float
     deviation_relative: bool
-    deviation: Annotated[float, msgspec.Meta(ge=0.0)] | None = None  # Relative or in the value's unit; None: unknown
+    deviation_between_runs: Annotated[float, msgspec.Meta(ge=0.0)] | None = None
+    """Relative or in the value's unit; None: unknown."""
 
     def __post_init__(self) -> None:
         """Refuse a share of nothing."""
@@ -42,7 +44,7 @@ class Entry(msgspec.Struct, frozen=True):
     @property
     def absolute(self) -> float:
         """Standard deviation in the value's unit; inf if it was not identified."""
-        spread = math.inf if self.deviation is None else self.deviation
+        spread = math.inf if self.deviation_between_runs is None else self.deviation_between_runs
         return spread * abs(self.value) if self.deviation_relative else spread
 
 
@@ -129,7 +131,7 @@ def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
     limit = float(special.ndtri(1.0 - 0.5 * LEVEL / len(common)))
     since = tuple(_printable(record.name) for record in last.records)
     doubts, model = _doubts(now, last), _printable(last.model)
-    deviations = now.deviations()
+    deviations = now.between_runs()
     found = []
     for i in common:
         name, relative, (_, unit, factor) = now.labels[i], now.unknowns[i].relative, now.shown[i]

@@ -107,7 +107,7 @@ class ModelChoice:
         """Changes of the parameters of interest if ``other`` were right instead of the best model."""
         e, found = self.best.estimate, []
         theirs = dict(zip(other.estimate.unknowns, other.estimate.values.tolist(), strict=True))
-        columns = (e.unknowns, e.values.tolist(), e.deviations().tolist(), e.scale.tolist())
+        columns = (e.unknowns, e.values.tolist(), e.between_runs().tolist(), e.scale.tolist())
         for unknown, value, deviation, size in zip(*columns, strict=True):
             if unknown.name in e.asked.params and unknown in theirs:
                 change = (theirs[unknown] - value) / size if size > 0.0 else math.nan

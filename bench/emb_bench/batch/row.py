@@ -75,6 +75,7 @@ class Parameter:
     low: float | None = column("lower end of the 95 % interval", "SI")
     high: float | None = column("upper end of the 95 % interval", "SI")
     deviation: float | None = column("standard deviation of the estimate", RELATIVE)
+    between_runs: float | None = column("the same without errors that all runs on one bench share", RELATIVE)
     repeatability: float | None = column("half of the 95 % interval that the sensors' noise alone would leave", "SI")
     true: float | None = column("what was simulated", "SI")
     error_sigmas: float | None = column("estimate less what was simulated, in its standard deviation", "1")

@@ -203,7 +203,7 @@ def _usable(rows: Sequence[Row], name: str) -> list[Parameter]:
         for row in rows
         if row.fits
         for p in row.parameters
-        if p.name == name and p.identified and p.deviation is not None and 0.0 < p.deviation < math.inf
+        if p.name == name and p.identified and p.between_runs is not None and 0.0 < p.between_runs < math.inf
     ]
 
 
@@ -214,7 +214,7 @@ def _constancy(used: Sequence[Parameter]) -> Constancy:
 def _deviations(used: Sequence[Parameter]) -> list[float]:
     """Standard deviations in SI units; shares are of one number, so that what came out small weighs no more."""
     scale = abs(float(np.median([p.estimate or 0.0 for p in used]))) if used[0].relative else 1.0
-    return [scale * (p.deviation or 0.0) for p in used]
+    return [scale * (p.between_runs or 0.0) for p in used]
 
 
 def _folders(rows: Sequence[Row], options: Options) -> tuple[Folder, ...]:

@@ -71,6 +71,8 @@ class Systematic:
     """Current that acts beyond what the node reports; a friction that depends on the direction looks the same [A]."""
     delay: NotNegative = 0.3  # By which commands act late, or samples early [samples]
     velocity_gain: NotNegative = 0.02  # Relative error of the velocity's scale
+    inertia: NotNegative = 0.01  # Relative error of J, which all four parameters share
+    angle_scale: NotNegative = 0.003  # Relative error of the angle's scale, which k_m and T_c share
     held: NotNegative = 0.02  # Relative error of each parameter that is held at its nominal value
     quadratic: NotNegative = 1e-4  # Quadratic share of the stiffness that the plant lacks [1/rad]
     cubic: NotNegative = 1e-6  # Cubic share of the stiffness that the plant lacks [1/rad²]

@@ -17,6 +17,12 @@ from emb_bench.brake.motion import Floats
 Interval = tuple[float, float]
 
 
+def unnoticed(biases: Floats) -> Floats:
+    """Root mean square bias of each unknown from those by each effect, shape (effects, unknowns)."""
+    total: Floats = np.sqrt(np.sum(biases**2, axis=0))
+    return total
+
+
 def deviations(bound: Floats, unnoticed: Floats, sandwich: Floats, *, fits: bool) -> Floats:
     """Standard deviations by rules 1 to 3, shape (unknowns,).
 

@@ -44,8 +44,8 @@ class Method(ABC):
             LogError: there are too few samples.
         """
         asked, caveats = self.asked, tuple[str, ...]()
-        if asked.systematic and not self.systematic:
-            asked, caveats = replace(asked, systematic={}), (IDEAL_SENSORS,)
+        if (asked.systematic or asked.allowed) and not self.systematic:
+            asked, caveats = replace(asked, systematic={}, allowed={}), (IDEAL_SENSORS,)
         if absent := [name for name in asked.names if getattr(self.bench.brake, name, 1.0) == 0.0]:
             others = () if self.bench.machine is None else self.bench.machine.unknown
             raise UsageError(

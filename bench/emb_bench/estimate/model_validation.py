@@ -117,7 +117,18 @@ def examine(
     )
     low, high = expected.tolist()
     return ModelValidation(
-        chi2, freedom, (low, high), chi2_p, whiteness, independence, scores.suspects, suspected, together, alarms, notes
+        chi2=chi2,
+        freedom=freedom,
+        expected=(low, high),
+        chi2_p=chi2_p,
+        whiteness=whiteness,
+        independence=independence,
+        suspects=scores.suspects,
+        budget=scores.budget,
+        suspected=suspected,
+        together=together,
+        alarms=alarms,
+        notes=notes,
     )
 
 

@@ -363,19 +363,26 @@ class Problem:
         known, their_rows = self.known(z)
         return np.concatenate([*residuals, known]), np.concatenate([*rows, their_rows])
 
-    def known(self, z: Floats) -> tuple[Floats, Floats]:
-        """Residuals of what is no sample, and their derivatives: each record's start if it is unknown, the prior."""
-        residuals, rows = [], []
+    def rests(self) -> dict[int, list[int]]:
+        """Numbers of the records whose angle at rest is a measurement, with the elements of z that it depends on."""
+        found = {}
         for i, record in enumerate(self.records):
             touched = [c for c in self.columns(i) if self.unknowns[c].name in ("x1_0", "offset")]
             if touched and record.slack > 0.0:
-                row = np.zeros((1, len(z)))
-                row[0, touched] = -1.0 / record.slack
-                free = any(self.unknowns[c].name == "offset" for c in touched)
-                unseen = 0.0 if free else self.plant.instruments.encoder_offset
-                shown = sum(float(z[c]) for c in touched) + unseen
-                residuals.append(np.array([(record.angle - shown) / record.slack]))
-                rows.append(row)
+                found[i] = touched
+        return found
+
+    def known(self, z: Floats) -> tuple[Floats, Floats]:
+        """Residuals of what is no sample, and their derivatives: each record's start if it is unknown, the prior."""
+        residuals, rows = [], []
+        for i, touched in self.rests().items():
+            record, row = self.records[i], np.zeros((1, len(z)))
+            row[0, touched] = -1.0 / record.slack
+            free = any(self.unknowns[c].name == "offset" for c in touched)
+            unseen = 0.0 if free else self.plant.instruments.encoder_offset
+            shown = sum(float(z[c]) for c in touched) + unseen
+            residuals.append(np.array([(record.angle - shown) / record.slack]))
+            rows.append(row)
         mean, inverse = self.belief
         believed = np.flatnonzero(inverse)
         residuals.append((mean - z)[believed] * inverse[believed])

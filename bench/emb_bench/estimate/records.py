@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,16 +14,20 @@ from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS, scale
 from emb_bench.brake.quantities import Quantity, quantity
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import ASYMMETRIES, EXACT, Plant
-from emb_bench.estimate.intervals import deviations
+from emb_bench.estimate.intervals import deviations, unnoticed
 from emb_bench.experiment.evaluation import Question, SystematicErrors
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
-from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator import estimate
 
 SYSTEMATIC = SystematicErrors._fields
 """Systematic errors that are estimated along by default, each with the prior of the bench file."""
+DRIFTS = tuple(f"{name}_drift" for name in PARAMETER_NAMES)
+"""Linear changes of the parameters, as shares of them from the begin of a run to its end."""
+ANGLE_SCALE = "angle_scale"  # Relative error of the angle's scale
+OF_THE_BENCH = ("J", ANGLE_SCALE)  # Effects that all runs on one bench share
 FACTOR = 10.0  # Brakes beyond nominal by this factor are not searched
 METHODS: Mapping[str, str] = {
     "oem": "output error",
@@ -63,6 +67,8 @@ class EstimationProblem(Question):
     """Lowest and highest value that is searched, by name [SI units]; what is not named has bounds of its own."""
     systematic: Mapping[str, float] = field(default_factory=dict)
     """Systematic errors that are estimated along: standard deviation of the prior, by name; inf without a prior."""
+    allowed: Mapping[str, float] = field(default_factory=dict)
+    """Effects that are not estimated and that the total allows for: standard deviation of the prior, by name."""
     window: float = 0.0
     """Length of the windows of the method ``windows`` [s]; 0 for what the bench says, or the records choose."""
     between: str = ""
@@ -126,16 +132,20 @@ def has_time_for_a_delay(plant: Plant) -> bool:
 
 
 def with_systematic(asked: EstimationProblem, bench: Bench, plant: Plant) -> EstimationProblem:
-    """The problem with the systematic errors that the bench cannot exclude and the plant can have."""
-    known = {name: float(getattr(bench.systematic, name)) for name in SYSTEMATIC}
+    """The problem with what the bench cannot exclude and the plant can have: estimated along, or allowed for."""
+    known: dict[str, float] = asdict(bench.systematic)
     timed = has_time_for_a_delay(plant) and "current_lag" not in asked.names
     observed = plant.instruments.observer_bandwidth > 0.0  # its velocity is no measurement of its own
-    possible = {
-        name: deviation
-        for name, deviation in known.items()
-        if deviation > 0.0 and (name != "delay" or timed) and not (name == "velocity_gain" and observed)
-    }
-    return replace(asked, systematic={n: d for n, d in possible.items() if n not in asked.names})
+    excluded = (set() if timed else {"delay"}) | ({"velocity_gain"} if observed else set())
+    possible = {name: known[name] for name in SYSTEMATIC if known[name] > 0.0 and name not in excluded}
+    known |= dict.fromkeys(PARAMETER_NAMES, known["held"]) | dict.fromkeys(DRIFTS, known["drift"])
+    known["J"] = known["inertia"]
+    effects = {*PARAMETERS, *DRIFTS, ANGLE_SCALE}
+    return replace(
+        asked,
+        systematic={n: d for n, d in possible.items() if n not in asked.names},
+        allowed={n: d for n, d in known.items() if d > 0.0 and n in effects and n not in {*possible, *asked.names}},
+    )
 
 
 def has_no_feature(plant: Plant) -> bool:
@@ -223,9 +233,14 @@ class Suspect:
     value: float  # First-order estimate, in the unknown's unit; relative for a parameter
     sigmas: float
     p_value: float = 1.0  # Chance of as much of it if the model is right
-    moves: tuple[float, ...] = ()
-    """By how much what the record leaves open of it moves each unknown: relative, or in the unknown's unit. Of a drift
-    also by how much the parameter itself is another at the begin and at the end."""
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """Entry of the uncertainty budget: an effect that is not estimated."""
+
+    name: str
+    bias: tuple[float, ...]  # Root mean square of the bias of each unknown: relative, or in the unknown's unit
 
 
 @dataclass(frozen=True)
@@ -239,6 +254,7 @@ class ModelValidation:
     whiteness: Mapping[str, Whiteness]  # By output
     independence: Mapping[str, Independence]  # By output
     suspects: tuple[Suspect, ...]  # Most suspicious first
+    budget: tuple[Contribution, ...]  # Effects that the total allows for
     suspected: tuple[Suspect, ...]  # Those that an alarm is about
     together: Independence | None  # Test of all suspects together; its correlation and lag are zero
     alarms: tuple[str, ...]  # Reasons for which the model does not fit; empty if it may
@@ -303,18 +319,22 @@ class Estimate:
         return deviations
 
     def deviations(self) -> Floats:
-        """Standard deviations by the rules of :mod:`emb_bench.estimate.intervals`."""
+        """Total standard deviations, by the rules of :mod:`emb_bench.estimate.intervals`."""
         return deviations(self.cramer_rao(), self.open(), self.robust(), fits=self.validation.fits)
 
-    def open(self) -> Floats:
-        """Standard deviations of what the worst of the suspects may have moved each unknown by; 0 without any."""
-        moves = [suspect.moves for suspect in self.validation.suspects if suspect.moves]
-        return np.max(moves, axis=0) if moves else np.zeros(len(self.unknowns))
+    def between_runs(self) -> Floats:
+        """Deviations of values that are compared: the total without errors that all runs on one bench share."""
+        return deviations(self.cramer_rao(), self.open(OF_THE_BENCH), self.robust(), fits=self.validation.fits)
 
-    def left_open_by(self, i: int) -> Suspect | None:
-        """The suspect that may have moved unknown ``i`` most without being noticed; None without any."""
-        found = [suspect for suspect in self.validation.suspects if suspect.moves and suspect.moves[i] > 0.0]
-        return max(found, key=lambda suspect: suspect.moves[i], default=None)
+    def open(self, shared: Sequence[str] = ()) -> Floats:
+        """Root mean square bias of each unknown by effects that are not estimated, but those ``shared``."""
+        parts = [one.bias for one in self.validation.budget if one.name not in shared]
+        return unnoticed(np.array(parts).reshape(-1, len(self.unknowns)))
+
+    def left_open_by(self, i: int) -> Contribution | None:
+        """The largest entry of the uncertainty budget of unknown ``i``; None without any."""
+        found = [one for one in self.validation.budget if one.bias[i] > 0.0]
+        return max(found, key=lambda one: one.bias[i], default=None)
 
     def intervals(self) -> Floats:
         """Gaussian 95 % intervals in SI units, shape (unknowns, 2)."""

@@ -5,15 +5,16 @@ is estimated, are standard normal if the model is right. What an effect adds is 
 and a secant from its null value where it has a threshold there. An effect that can only be positive is suspected on
 that side only.
 
-The same numbers say what an effect that was *not* noticed may have done. It moves the estimate, and the rest of it that
-the record leaves open has the mean square of its posterior, with the prior of the bench file and ``PRESENT`` as the
-probability that the brake has it at all. Where a filter found a disturbance, drifts may be larger, by ``DISTURBED``.
+The same numbers give the uncertainty budget: what an effect that is not estimated may have moved each unknown by. Its
+size has a Gaussian posterior, from the prior of the bench file and the residuals. A constant that is never exact counts
+in full; an effect that a brake may not have at all, with the probability ``PRESENT``. Where a filter found a
+disturbance, drifts may be larger, by ``DISTURBED``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -22,19 +23,18 @@ from scipy import special
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import PARAMETERS, SI, Parameter
 from emb_bench.brake.quantities import Quantity, quantity
-from emb_bench.config.bench import Systematic
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import EXACT, Mechanics
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Suspect, has_time_for_a_delay
+from emb_bench.estimate.records import ANGLE_SCALE, DRIFTS, Contribution, Suspect, has_time_for_a_delay
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 SLOW = 30.0  # Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]
 
 _PLANT = PARAMETERS["play"].remedy
 
-PRESENT = 1.0 / 3.0
-"""Probability, before any record, that the brake has the one effect that its interval has to allow for."""
+NEVER_EXACT = ("J", ANGLE_SCALE, *PARAMETER_NAMES)  # Constants that are wrong by something in every brake
+PRESENT = 1.0 / 6.0  # Probability, before any record, that a brake has a certain one of all other effects
 
 DISTURBED = 10.0
 """Factor of what is known of drifts before a record in which something disturbs the brake: it may be a drift, which the
@@ -89,8 +89,6 @@ class Simulated:
         return self.problem.predict(self.z, record).shown
 
 
-DRIFTS = tuple(f"{name}_drift" for name in PARAMETER_NAMES)
-"""Linear changes of the parameters, as shares of them from the begin of a run to its end."""
 _COOL = "keep the motor cool, or use a shorter run"
 _CLAMP = "clamp some times before the run, or use a shorter one"
 _WARM = "begin when all that moves is warm, or use a shorter run"
@@ -114,6 +112,7 @@ class Scores:
     """All suspects, and the test of them together."""
 
     suspects: tuple[Suspect, ...]  # Most suspicious first
+    budget: tuple[Contribution, ...]  # Effects that the total allows for
     statistic: float  # χ² of the residuals in the space of all the effects together
     rank: int
     p_value: float
@@ -258,34 +257,37 @@ def score(
     if problem.bench.brake.k_1 == 0.0:
         every = {name: column for name, column in every.items() if name not in OF_THE_SPRING}
     pseudo = np.linalg.pinv(jacobian / _lengths(jacobian)) / _lengths(jacobian)[:, None]
-    known = _deviations_before(problem, DISTURBED if disturbed else 1.0)
+    priors = _priors(problem, DISTURBED if disturbed else 1.0)
     scale = np.abs(problem.scale(z))
-    found, beside_all = [], []
-    for name, column in every.items():
+    found, beside_all, budget = [], [], []
+    untested = {ANGLE_SCALE: _angle_scaled(problem, z, shown)} if ANGLE_SCALE in priors else {}
+    for name, column in (every | untested).items():
         whole = np.zeros(len(errors))
         whole[: len(column)] = column
         beside = whole - model @ (model.T @ whole)
         length = float(np.linalg.norm(beside))
         if length <= _DEPENDENT * float(np.linalg.norm(whole)):
+            length, beside = 0.0, np.zeros(len(errors))
+        if name in priors:
+            # What drifts is fitted as it is in the middle of a run, and meant from the begin to the end.
+            ends = np.array([0.5 if f"{u.name}_drift" == name else 0.0 for u in problem.unknowns])
+            bias = (np.abs(pseudo @ whole) / scale + ends) * _size(name, priors[name], length, float(beside @ errors))
+            budget.append(Contribution(name, tuple(bias.tolist())))
+        if length == 0.0 or name in untested:
             continue
         if name not in ALONE:
             beside_all.append(beside / length)
         amount, sigmas = float(beside @ errors) / length**2, float(beside @ errors) / length
         away = sigmas / max(ratio, 1.0) ** 0.5
         p = float(special.ndtr(-away) if EFFECTS[name].positive else 2.0 * special.ndtr(-abs(away)))
-        before = known.get(name, 0.0)
-        share = before**2 / (before**2 + length**-2)
-        rest = (PRESENT * (share * length**-2 + (share * amount) ** 2)) ** 0.5
-        # What drifts is fitted as it is in the middle of a run, and meant from the begin to the end.
-        ends = np.array([0.5 if f"{u.name}_drift" == name else 0.0 for u in problem.unknowns])
-        moves = (np.abs(pseudo @ whole) / scale + ends) * rest
-        found.append(Suspect(name, amount, sigmas / max(ratio, 1e-300) ** 0.5, p, tuple(moves.tolist())))
+        found.append(Suspect(name, amount, sigmas / max(ratio, 1e-300) ** 0.5, p))
     if not found:
-        return Scores((), 0.0, 0, 1.0)
+        return Scores((), tuple(budget), 0.0, 0, 1.0)
     left, values, _ = np.linalg.svd(np.stack(beside_all, axis=1), full_matrices=False)
     kept = left[:, values > 1e-3]
     statistic, rank = float(np.sum((kept.T @ errors) ** 2)), kept.shape[1]
-    return Scores(_ranked(found), statistic, rank, float(special.chdtrc(rank, statistic / max(ratio, 1.0))))
+    p_value = float(special.chdtrc(rank, statistic / max(ratio, 1.0)))
+    return Scores(_ranked(found), tuple(budget), statistic, rank, p_value)
 
 
 def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
@@ -309,21 +311,43 @@ def _lengths(jacobian: Floats) -> Floats:
     return result
 
 
-def _deviations_before(problem: Problem, drifting: float) -> dict[str, float]:
-    """Standard deviations before any record of what the interval has to allow for, if anything is to be allowed for.
+def _angle_scaled(problem: Problem, z: Floats, shown: Shown) -> Floats:
+    """Column of an error of the angle's scale: samples of all records, then angles at rest before them.
 
-    Those of drifts are ``drifting`` times what the bench file says.
+    A velocity by an observer follows the angle.
     """
-    if not problem.asked.systematic:
-        return {}
-    bench = problem.bench.systematic
-    known = {entry.name: float(getattr(bench, entry.name)) for entry in fields(Systematic) if entry.name in EFFECTS}
-    known |= dict.fromkeys(DRIFTS, drifting * bench.drift)
-    return known | {name: bench.held for name in PARAMETER_NAMES if name not in problem.asked.names}
+    parts, observed = [], problem.plant.instruments.observer_bandwidth > 0.0
+    offsets = [problem.opening(z, i, ()).offset for i in range(len(problem.records))]
+    for i, offset in enumerate(offsets):
+        shift = (shown.motion(i) - [offset, 0.0]) * [1.0, observed]
+        parts.append(shown.whitened(i, 1e-6 * shift).ravel() / 1e-6)
+    rests = [(problem.records[i].angle - offsets[i]) / problem.records[i].slack for i in problem.rests()]
+    return np.concatenate([*parts, rests])
 
 
-def shown_as(s: Suspect, machine: Machine | None) -> Quantity:
-    """Name and unit of a suspect as they are shown; no unit for what is relative."""
+def _priors(problem: Problem, drifting: float) -> dict[str, float]:
+    """Standard deviations before any record of what the total allows for; drifts ``drifting`` times the bench's."""
+    return {n: d * (drifting if n in DRIFTS else 1.0) for n, d in problem.asked.allowed.items()}
+
+
+def _size(name: str, prior: float, length: float, score: float) -> float:
+    """Root mean square of an effect by its posterior.
+
+    Args:
+        name: of the effect.
+        prior: standard deviation before any record.
+        length: root of the information on it beside all that is estimated.
+        score: product of its column beside all that is estimated with the residuals.
+    """
+    variance = 1.0 / (prior**-2 + length**2)
+    probability = 1.0 if name in NEVER_EXACT else PRESENT
+    return float((probability * (variance + (variance * score) ** 2)) ** 0.5)
+
+
+def shown_as(s: Suspect | Contribution, machine: Machine | None) -> Quantity:
+    """Name and unit of an effect as they are shown; no unit for what is relative."""
+    if s.name == ANGLE_SCALE:
+        return Quantity("angle scale", "", 1.0)
     if s.name in DRIFTS:
         parameter = s.name.removesuffix("_drift")
         return Quantity(f"{quantity(machine, parameter).name}_drift", "", 1.0)

@@ -285,15 +285,13 @@ def _finished(
 
 def _validated(cut: Sequence[Problem], at: Point, weights: Sequence[Floats]) -> ModelValidation:
     """Tests of the model on windows spread over the records."""
-    p, count = len(at.shared), len(cut)
+    count = len(cut)
     few_enough = max(JUDGED // len(cut[0].records[0].currents), 2)
     chosen = sorted({round(k) for k in np.linspace(0, count - 1, min(count, few_enough)).tolist()})
     few = replace(cut[0], records=tuple(cut[i].records[0] for i in chosen))
     z, roots = np.concatenate([at.shared, at.starts[chosen].T.ravel()]), [weights[i] for i in chosen]
     errors, jacobian = few.jacobian(z, roots)
-    found = examine(few, z, roots, by_record(errors, roots), jacobian, errors=errors)
-    suspects = {s.name: replace(s, moves=s.moves[:p]) for s in found.suspects}
-    return replace(found, suspects=tuple(suspects.values()), suspected=tuple(suspects[s.name] for s in found.suspected))
+    return examine(few, z, roots, by_record(errors, roots), jacobian, errors=errors)
 
 
 def _residuals(problem: Problem, cut: Sequence[Problem], at: Point, weights: Sequence[Floats]) -> tuple[Floats, ...]:

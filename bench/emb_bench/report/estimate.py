@@ -10,7 +10,7 @@ import numpy as np
 from emb_bench.analysis.study import Study, file_names
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import METHODS, Estimate
-from emb_bench.estimate.suspects import explained, shown_as
+from emb_bench.estimate.suspects import explained
 from emb_bench.information.identifiability import schur_complement
 from emb_bench.numbers import signed
 from emb_bench.report import sentences as say
@@ -68,7 +68,7 @@ def _limits(study: Study) -> Iterator[str]:
     by: dict[str, list[str]] = {}
     for i in e.wanted():
         if (suspect := e.left_open_by(i)) is not None and e.open()[i] > e.cramer_rao()[i]:
-            by.setdefault(shown_as(suspect, e.bench.machine).name, []).append(e.labels[i])
+            by.setdefault(say.limit(suspect, e), []).append(e.labels[i])
     if by:
         yield "limited by  " + ", ".join(f"{name} ({', '.join(labels)})" for name, labels in by.items())
     if tested := e.validation.suspects:
@@ -229,6 +229,7 @@ def _parameters(study: Study) -> dict[str, dict[str, Any]]:
             "interval_95": c.interval,
             "deviation": used,
             "deviation_relative": unknown.relative,
+            "deviation_between_runs": factor * e.between_runs()[i],
             "cramer_rao": bound,
             "sandwich": robust,
             "left_open": model,

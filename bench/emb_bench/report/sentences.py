@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.profile import OpenSide, Profile
     from emb_bench.analysis.recommendation import Recommendation
     from emb_bench.analysis.study import Study
-    from emb_bench.estimate.records import Estimate
+    from emb_bench.estimate.records import Contribution, Estimate
     from emb_bench.experiment.evaluation import Evaluation
     from emb_bench.information.identifiability import Direction, Finding, Identifiability
     from emb_bench.report.content import Content, Run
@@ -126,6 +126,15 @@ def models(study: Study) -> str:
         f"{names} and {found[-1].name} {fit}, and the records do not tell them apart (weights {weights}): the "
         f"intervals cover {every}"
     )
+
+
+def limit(effect: Contribution, e: Estimate) -> str:
+    """Effect that limits an interval most, with the prior of one that all runs share."""
+    from emb_bench.estimate.records import OF_THE_BENCH
+    from emb_bench.estimate.suspects import shown_as
+
+    name, shared = shown_as(effect, e.bench.machine).name, effect.name in OF_THE_BENCH
+    return f"{name}, known to {spread(e.asked.allowed[effect.name], True)}" if shared else name
 
 
 # ---- parameters ----

@@ -30,7 +30,7 @@ def now(bench: Bench) -> Estimate:
 
 
 def entry(value: float, deviation: float | None, relative: bool = True) -> dict[str, Any]:
-    return {"value": value, "deviation": deviation, "deviation_relative": relative}
+    return {"value": value, "deviation_between_runs": deviation, "deviation_relative": relative}
 
 
 def earlier(e: Estimate, **shifts: float) -> Earlier:
@@ -40,7 +40,7 @@ def earlier(e: Estimate, **shifts: float) -> Earlier:
 
 def document(e: Estimate, **shifts: float) -> dict[str, Any]:
     """The same estimate with some values so many standard deviations of the difference away."""
-    rows = zip(e.labels, e.values.tolist(), e.deviations().tolist(), strict=True)
+    rows = zip(e.labels, e.values.tolist(), e.between_runs().tolist(), strict=True)
     return {
         "model": "exact",
         "model_fits": True,
@@ -118,15 +118,15 @@ def test_a_report_is_read_as_the_estimate_in_it(tmp_path: Path, now: Estimate) -
 
 def test_a_file_that_is_no_estimate_is_refused_in_one_line(tmp_path: Path) -> None:
     def stated(value: str) -> str:
-        return f'{{"parameters":{{"k_m":{{"value":{value},"deviation":0.1,"deviation_relative":true}}}}}}'
+        return f'{{"parameters":{{"k_m":{{"value":{value},"deviation_between_runs":0.1,"deviation_relative":true}}}}}}'
 
     values = ('"0.02"', "null", "true", "NaN", "1e999", "1" + 400 * "0", "1" + 5000 * "0", "0")
     path = tmp_path / "last.json"
     for content in (
         *("", "[1, 2]", "{}", '{"parameters":{}}', '{"parameters":[1]}', '{"parameters":{"k_m":3}}'),
         *map(stated, values),
-        '{"parameters":{"k_m":{"value":1,"deviation":-1,"deviation_relative":true}}}',
-        '{"parameters":{"k_m":{"value":1,"deviation":1}}}',
+        '{"parameters":{"k_m":{"value":1,"deviation_between_runs":-1,"deviation_relative":true}}}',
+        '{"parameters":{"k_m":{"value":1,"deviation_between_runs":1}}}',
         *("[" * 100_000, "\udcff", '{"parameters":{"k\\nm\\u001b[2J":3}}'),
     ):
         path.write_bytes(content.encode("utf-8", "surrogateescape"))
@@ -154,7 +154,9 @@ JSON = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
     max_leaves=6,
 )
-ENTRY = st.fixed_dictionaries({}, optional=dict.fromkeys(("value", "deviation", "deviation_relative"), JSON))
+ENTRY = st.fixed_dictionaries(
+    {}, optional=dict.fromkeys(("value", "deviation_between_runs", "deviation_relative"), JSON)
+)
 PARAMETERS = JSON | st.dictionaries(st.sampled_from(PARAMETER_NAMES), JSON | ENTRY, max_size=3)
 
 

@@ -78,7 +78,7 @@ def test_what_another_model_would_change_is_its_value_less_that_of_the_first(ben
     for i, change in enumerate(found.changes(found.candidates[1])):
         assert change.name == PARAMETER_NAMES[i]
         assert change.percent == pytest.approx(100.0 * (other.values[i] / first.values[i] - 1.0))
-        assert change.deviations == pytest.approx(change.percent / 100.0 / first.deviations()[i])
+        assert change.deviations == pytest.approx(change.percent / 100.0 / first.between_runs()[i])
     assert all(change.percent == 0.0 for change in found.changes(found.best))
 
 

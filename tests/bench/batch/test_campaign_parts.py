@@ -209,7 +209,7 @@ def test_a_run_counts_once_and_the_whole_log_or_the_one_that_holds_most_of_it_is
 def test_a_misfit_is_named_and_has_no_part_in_the_mean() -> None:
     rows = [
         Row(".", ".", f"{n}.mcap", None, start_time=n, fits=n < 3, model="exact", complete=True, exit_reason="DONE",
-            parameters=(Parameter("f_v", True, 2.3e-3, value, 0.9 * value, 1.1 * value, 1e-6),))
+            parameters=(Parameter("f_v", True, 2.3e-3, value, 0.9 * value, 1.1 * value, 1e-6, 1e-6),))
         for n, value in enumerate([2.98e-5, 2.99e-5, 3.1e-5, 5e-5])
     ]  # fmt: skip
     found = summarise(rows, Options(params=("f_v",)), "r.parquet")

@@ -17,7 +17,7 @@ OPTIONS = Options(params=("k_m",))
 
 
 def row(number: int, value: float, *, fits: bool = True) -> Row:
-    estimate = Parameter("k_m", True, DEVIATION, value, value, value, DEVIATION)
+    estimate = Parameter("k_m", True, DEVIATION, value, value, value, DEVIATION, DEVIATION)
     return Row(
         "root",
         "day",

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from emb_bench.estimate.intervals import deviations, interval, union
+from emb_bench.estimate.intervals import deviations, interval, union, unnoticed
+
+
+def test_biases_by_several_effects_add_in_quadrature_and_none_is_zero() -> None:
+    assert unnoticed(np.array([[3.0, 0.0], [4.0, 2.0]])).tolist() == [5.0, 2.0]
+    assert unnoticed(np.zeros((0, 2))).tolist() == [0.0, 0.0]
 
 
 def test_deviations_add_an_unnoticed_bias_and_are_no_less_than_the_sandwich_of_a_model_that_does_not_fit() -> None:

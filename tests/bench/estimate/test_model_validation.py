@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from emb_bench.estimate.records import NORMAL_95, Estimate, EstimationProblem, w
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES
 
-from tests.bench.measurements import coloured, currents_of, fit, record  # isort: skip
+from tests.bench.measurements import coloured, currents_of, errors_in_sigmas, fit, record  # isort: skip
 
 WRONG = tuple(name for name in load_bench().plants if name != "exact")
 EXCITATIONS = ("chirp", "constant-speed:turn=0.15")
@@ -149,14 +150,59 @@ def test_an_interval_says_what_it_allows_for_most_and_holds_the_truth_where_fish
     plant = bench.plant("exact")
     loose = replace(plant, mechanics=plant.mechanics._replace(play=0.05))
     data = record(bench, loose, currents_of(bench, "chirp"), seed=1)
-    e = fit(bench, plant, [data], with_systematic(EstimationProblem(), bench, plant), method=method)
+    e = fit(bench, plant, [data], with_systematic(EstimationProblem(), scaled(bench, 0.0, 0.0), plant), method=method)
     i = e.labels.index("T_c")
     assert e.validation.fits
-    suspect = e.left_open_by(i)
-    assert suspect is not None
-    assert suspect.name == "play"
-    assert suspect.moves[i] == e.open()[i] > 3.0 * e.cramer_rao()[i]
+    effect = e.left_open_by(i)
+    assert effect is not None
+    assert effect.name == "play"
+    assert e.open()[i] >= effect.bias[i] > 3.0 * e.cramer_rao()[i]
     error = abs(e.theta.T_c / bench.brake.T_c - 1.0)
     assert NORMAL_95 * e.cramer_rao()[i] < error < NORMAL_95 * e.deviations()[i]
     trusted = fit(bench, plant, [data], method=method)
     assert trusted.left_open_by(i) is None
+
+
+def scaled(bench: Bench, inertia: float, angle: float) -> Bench:
+    return replace(bench, systematic=replace(bench.systematic, inertia=inertia, angle_scale=angle))
+
+
+@pytest.mark.parametrize(("method", "plant"), [("oem", "exact"), ("pem", "exact"), ("oem", "observer")])
+def test_what_no_record_can_know_enters_the_total_as_the_equation_of_motion_says(
+    bench: Bench, method: str, plant: str
+) -> None:
+    """J ω' = k_m i - γ k_1 x - T_c - f_v ω: only ratios to J show; with angles a times as large, k_m/a and T_c/a."""
+    model, bench = bench.plant(plant), scaled(bench, 0.02, 0.005)
+    data = record(bench, model, currents_of(bench, "chirp"), seed=1)
+    e = fit(bench, model, [data], with_systematic(EstimationProblem(), bench, model), method=method)
+    found = {one.name: dict(zip(e.labels, one.bias, strict=True)) for one in e.validation.budget}
+    for name, expected in {
+        "J": {"k_m": 0.02, "k_1": 0.02, "T_c": 0.02, "f_v": 0.02},
+        "angle_scale": {"k_m": 0.005, "k_1": 0.0, "T_c": 0.005, "f_v": 0.0}
+        | ({"velocity_gain": 0.005} if plant == "exact" else {}),
+    }.items():
+        for label, bias in expected.items():
+            assert found[name][label] == pytest.approx(bias, rel=0.05, abs=2e-5), (name, label)
+    known = [i for i, label in enumerate(e.labels) if label in PARAMETER_NAMES]
+    both = [math.hypot(found["J"][name], found["angle_scale"][name]) for name in PARAMETER_NAMES]
+    assert e.deviations()[known] == pytest.approx(np.hypot(e.between_runs()[known], both), rel=1e-6)
+    trusted = fit(bench, model, [data], method=method)
+    assert trusted.validation.budget == ()
+    assert trusted.values[known] == pytest.approx(e.values[known], rel=2e-3)
+
+
+def test_an_angle_that_is_shown_too_large_is_inside_every_interval_and_not_blamed_on_the_velocity(bench: Bench) -> None:
+    plant = bench.plant("exact")
+    data = record(bench, plant, currents_of(bench, "chirp"), seed=1)
+    e = fit(
+        bench,
+        plant,
+        [replace(data, samples=data.samples * [1.003, 1.0])],
+        with_systematic(EstimationProblem(), bench, plant),
+    )
+    assert e.validation.fits
+    off, i = e.theta.k_m / bench.brake.k_m - 1.0, e.labels.index("velocity_gain")
+    assert off == pytest.approx(0.003, rel=0.1)
+    assert (np.abs(errors_in_sigmas(e, bench.brake)) < 1.0).all()
+    assert e.values[i] == pytest.approx(-0.003, rel=0.1)
+    assert e.deviations()[i] > 0.0029
