@@ -17,10 +17,9 @@ from mcap.writer import Writer
 from emb_bench.experiment.evaluation import Evaluation, Question, evaluate
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
-from emb_bench.logs.columns import message_class
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import RunLog, read_log
-from emb_bench.logs.mcap_file import MAGIC
+from emb_bench.logs.mcap_file import MAGIC, message_class
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EmbError, LogError
 from emb_runtime.log import mcap_schema

@@ -279,7 +279,7 @@ COMMANDS: Mapping[str, tuple[Command | str, Mapping[int, str]]] = {
         OF_A_LOG | {6: "the log is not a log, or not one message in it can be saved"},
     ),
     "export": ("emb_bench.export.export", OF_A_LOG),
-    "import": ("emb_bench.cli.import_recording", ANY),
+    "import": ("emb_bench.recordings.run_file", ANY),
     "live": (
         "emb_bench.cli.live",
         {0: "ended by Ctrl-C, or the one log is over", 2: ANY[2], 6: "the one log is not a log, or is damaged"},

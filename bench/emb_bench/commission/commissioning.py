@@ -13,9 +13,8 @@ from typing import Any
 
 from emb_bench.commission import examination
 from emb_bench.commission.bench_file import WRITTEN, found_text, measured_ranges, working_text
-from emb_bench.commission.policy import policy_file
 from emb_bench.commission.records import Findings, Identification, Kind, Step
-from emb_bench.commission.steps import EXPERIMENTS, FULL, STEPS, judged, suspected
+from emb_bench.commission.steps import EXPERIMENTS, FULL, STEPS, judged, policy_file, suspected
 from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import PARAMETER_NAMES

@@ -20,9 +20,8 @@ from emb_bench.config.plants import Instruments, Mechanics, Plant
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, EstimationProblem, with_systematic
-from emb_bench.experiment.cycles import step_of
 from emb_bench.experiment.experiment import Booleans, Experiment, Floats
-from emb_bench.experiment.from_log import read_experiment
+from emb_bench.experiment.from_log import read_experiment, step_of
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Noise, Ranges
 from emb_runtime.drives.mapping import Mapping as DriveMapping

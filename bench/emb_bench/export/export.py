@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from emb_bench.export.mjcf import write_mjcf
 from emb_bench.export.picture import ENDINGS, draw_run
-from emb_bench.logs.columns import Column
 from emb_bench.logs.log import UNIX_TIME, RunLog, read_log
+from emb_bench.logs.mcap_file import Column
 from emb_bench.output import new_file
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.system.terminal import as_json, show

@@ -16,8 +16,7 @@ from typing import Any, BinaryIO, Protocol
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
-from emb_bench.logs.columns import message_class
-from emb_bench.logs.mcap_file import DAMAGE, LARGEST, MAGIC, MOST_CARRIED, Chunk, unpack_chunk
+from emb_bench.logs.mcap_file import DAMAGE, LARGEST, MAGIC, MOST_CARRIED, Chunk, message_class, unpack_chunk
 from emb_runtime.errors import LogError
 from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.log.mcap_schema import CYCLE, ESTIMATE, SAFETY, deviation_of

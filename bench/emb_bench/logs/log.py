@@ -21,8 +21,17 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from emb_bench.config.bench import Bench, parse_bench
-from emb_bench.logs.columns import Column, columns, describe, message_class
-from emb_bench.logs.mcap_file import DAMAGE, Chunk, McapFile, message_of, unpack_chunk
+from emb_bench.logs.mcap_file import (
+    DAMAGE,
+    Chunk,
+    Column,
+    McapFile,
+    columns,
+    describe,
+    message_class,
+    message_of,
+    unpack_chunk,
+)
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.drives.mapping import PROPERTIES, MappingError

@@ -5,8 +5,8 @@ from __future__ import annotations
 import onnx
 import pytest
 
-from emb_bench.commission.policy import policy_file
 from emb_bench.commission.records import Kind, Step, Window
+from emb_bench.commission.steps import policy_file
 from emb_bench.config.bench import load_bench
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.policy.policy import Policy, load_policy

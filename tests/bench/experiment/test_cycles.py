@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from emb_bench.config.bench import Bench
-from emb_bench.experiment.cycles import UNKNOWN, control_cycles, samples_before
+from emb_bench.experiment.from_log import UNKNOWN, control_cycles, samples_before
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.receiver import Reception

@@ -10,10 +10,9 @@ import pytest
 
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
-from emb_bench.experiment.cycles import LOST, Samples
 from emb_bench.experiment.evaluation import Fit, ModelEvaluator
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.experiment.from_log import currents_by_charge, read_experiment
+from emb_bench.experiment.from_log import LOST, Samples, currents_by_charge, read_experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.sim.transport import SimTransport
 from emb_runtime.can.e2e import NO_COUNTER

@@ -9,7 +9,7 @@ from google.protobuf.message import DecodeError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_bench.logs.columns import columns
+from emb_bench.logs.mcap_file import columns
 from emb_runtime.log.mcap_schema import Field, Topic
 
 ALL = Topic(
