@@ -18,7 +18,7 @@ from collections import Counter
 from pathlib import Path
 
 from emb_bench import api
-from tests.fuzz.hostile_files import LONGEST, MOST_MEMORY, draw, judge
+from tests.fuzz.hostile_files import LOG_COMMANDS, LONGEST, MOST_MEMORY, Hostile, draw, judge
 
 
 def main() -> int:
@@ -36,6 +36,8 @@ def main() -> int:
         folder = Path(name)
         api.simulate(folder / "honest.mcap")
         honest = (folder / "honest.mcap").read_bytes()
+        for command in LOG_COMMANDS:  # compiles what they run: its time is not the file's
+            judge(Hostile("log", ".mcap", honest, command), folder)
         for seed in range(args.seed, args.seed + args.count):
             hostile = draw(seed, honest)
             judged = judge(hostile, folder)

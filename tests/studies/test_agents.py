@@ -66,6 +66,7 @@ def made(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Trainings:
     return Trainings(folder, BENCH, (0, 1), None, lambda _: None)
 
 
+@pytest.mark.slow
 def test_every_target_has_statements_of_its_own_trainings_which_are_made_once(
     folder: Path, made: Trainings, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -85,6 +85,7 @@ def test_with_systematic_errors_estimated_along_a_model_grows_beside_an_offset_o
         assert low < getattr(bench.brake, unknown.name) < high
 
 
+@pytest.mark.slow
 def test_a_lag_leaves_no_delay_to_be_estimated_along(bench: Bench) -> None:
     plant, data = bench.plant("exact"), record(bench, bench.plant("lag"), currents_of(bench, "chirp"), seed=3)
     asked = with_systematic(EstimationProblem(), bench, plant)

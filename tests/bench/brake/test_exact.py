@@ -59,7 +59,7 @@ def differentiable(x0: tuple[float, float]) -> list[str]:
 def test_sensitivities_are_the_finite_differences_of_the_flow_through_every_event() -> None:
     happened, compared = Counter[str](), Counter[str]()
 
-    @settings(max_examples=2000, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+    @settings(max_examples=600, deadline=None, suppress_health_check=list(HealthCheck), database=None)
     @given(cases())
     def property_holds(case: Case) -> None:
         states, s = marched(EXACT, *case)
@@ -76,8 +76,8 @@ def test_sensitivities_are_the_finite_differences_of_the_flow_through_every_even
             assert (worst <= allowed).all(), (name, worst, allowed)
 
     property_holds()
-    assert min(happened[kind] for kind in ("reversed", "stuck", "released", "contact_made", "contact_left")) > 60
-    assert compared["smooth"] > 12000
+    assert min(happened[kind] for kind in ("reversed", "stuck", "released", "contact_made", "contact_left")) > 18
+    assert compared["smooth"] > 3600
     assert compared["set aside"] < 0.002 * compared["smooth"]
 
 

@@ -299,7 +299,9 @@ def test_the_same_seed_finds_the_same_design_on_any_number_of_threads() -> None:
     assert one.coarse != other.coarse
 
 
-@pytest.mark.parametrize(("params", "kind"), [(TWO, "physical"), (("f_v",), "weighted")])
+@pytest.mark.parametrize(
+    ("params", "kind"), [(TWO, "physical"), pytest.param(("f_v",), "weighted", marks=pytest.mark.slow)]
+)
 def test_other_seeds_find_a_design_that_is_worth_the_same(params: tuple[str, ...], kind: Kind) -> None:
     goal = criterion("D", params)
     p = replace(make_problem(BENCH, goal, params, model="euler", kind=kind), horizon=60)

@@ -66,6 +66,7 @@ def test_friction_by_direction_is_found_where_it_is_asked_for() -> None:
     assert not symmetric.validation.fits
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_truth_of_a_machine_under_a_disturbance_that_is_not_white() -> None:
     covered = []
     for seed in range(3):
@@ -152,6 +153,7 @@ def test_a_record_chooses_the_course_of_the_command_that_was_simulated(straight:
         assert found[name][0] == pytest.approx(true, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_course_that_the_record_does_not_tell_is_covered_by_the_intervals() -> None:
     data = record(Machine(disturbance=1.0), 4.0)
     e = fitted(data, text=OPEN)

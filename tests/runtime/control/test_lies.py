@@ -164,7 +164,7 @@ def test_a_clock_that_is_fast_or_slow_is_noticed_at_two_periods_and_sooner_where
         assert moving.detected <= at_rest.detected
 
 
-@pytest.mark.parametrize("ppm", [-400, -200, 200, 400])
+@pytest.mark.parametrize("ppm", [-400, 400])
 def test_two_quartzes_are_never_blamed_however_long_the_experiment(ppm: int) -> None:
     seen = run(Lie(clock=1.0 + ppm * 1e-6, begin=0.0), law=lambda *_: 0.0, steps=12_000)
     assert seen.outcome.fault is None, seen.outcome.detail
