@@ -1,18 +1,20 @@
-"""False alarms of the motion balance: the figures of docs/explanation/sensor-monitor.md.
+"""False alarms of the motion balance and of the rest after it: the figures of docs/explanation/sensor-monitor.md.
 
     python -m tests.searches.motion_balance [--experiments 300000] [--seed 1]
 
 Plays honest experiments with every plant of the bench, with brakes of the shield's set, noise, lost samples and
 commands, jitter and delays, as tests/searches/sensor_monitor.py draws them; policies are the shipped actor, that of
 ``--quick``, and those drawn there; an experiment has 500, 250 or 100 samples. For each plant: alarms, and the largest
-unexplained velocity and distance of the spring's origin as shares of what is allowed.
+unexplained velocity and distance of the spring's origin as shares of what is allowed. Then the node stops the brake, as
+late as its watchdog lets it: the longest time until it is idle (NOT_AT_REST beyond 1.5 s), and how often the velocity
+that it then measures is taken for a motion.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,17 +26,22 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Instruments, Mechanics
 from emb_bench.sim.instruments import MEMORY as INSTRUMENTS_MEMORY
 from emb_bench.sim.instruments import command, settle
+from emb_bench.sim.node import REST_TIME, REST_TRAVEL
 from emb_bench.sim.simulated_brake import pass_period
+from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.control.loop import STOP_LISTEN_NS
 from emb_runtime.estimator.kalman import Model, follow, make_model, start
 from emb_runtime.estimator.speed_loop import Scale
 from emb_runtime.safety.motion_balance import MEMORY as BALANCE_MEMORY
 from emb_runtime.safety.motion_balance import (
+    REST_SAMPLES,
     BalanceModel,
     allowance,
     balance_model,
     begin,
     origin,
+    steady_motion,
     take,
     unexplained,
 )
@@ -52,7 +59,19 @@ CHUNK = 1000
 ACTORS = ("four-d-exact-quadratic", "four-time-exact-quadratic")
 LENGTHS = (500, 500, 250, 100)
 PLANTS = {**COVERED, "play": {}}
-LARGEST, JUDGED, ORIGIN = range(3)  # Columns of a row of results
+LARGEST, JUDGED, ORIGIN, REST, FIRST_VELOCITY = range(5)  # Columns of a row of results; REST in periods
+COLUMNS = FIRST_VELOCITY + REST_SAMPLES
+STATUS_PERIODS = 100  # Most samples that a node at rest sends until its status says why it stopped
+
+
+class Stop(NamedTuple):
+    """What the node does by itself once a run has ended."""
+
+    late: int  # Periods until it stops: no stop frame came
+    current_step: float  # [A]
+    rest_travel: float  # [rad]
+    rest_periods: int  # Periods within the travel after which it is idle
+    listened: int  # Periods in which the loop listens for that
 
 
 def fly(
@@ -67,9 +86,10 @@ def fly(
     table: Floats,
     scripted: bool,
     script: Script,
+    stop: Stop,
     out: Floats,
 ) -> None:
-    """Play each experiment of a script to its end, whatever the monitor or the balance says."""
+    """Play each experiment of a script to its end, whatever the monitor or the balance says, and to its rest."""
     ts = law.sample_time
     memory, sums, instrument = np.zeros(MEMORY), np.zeros(BALANCE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
     x, reference = np.zeros(STATES), np.zeros(table.shape[0])
@@ -128,6 +148,56 @@ def fly(
         out[m, JUDGED] = last > 0.0
         place, most = origin(balance, sums)
         out[m, ORIGIN] = abs(place) / most if last > 0.0 else 0.0
+        halt(law, mechanics, instruments, p, stop, m, script, x, instrument, out[m])
+
+
+def halt(
+    law: ShieldLaw,
+    mechanics: Mechanics,
+    instruments: Instruments,
+    p: BrakeParameters,
+    stop: Stop,
+    m: int,
+    script: Script,
+    x: Floats,
+    instrument: Floats,
+    row: Floats,
+) -> None:
+    """Let the node brake until it is idle, and measure on until it has said why it stopped."""
+    place, resting, idle, newest, n = x[0], 0, -1, 0, script.losses.shape[1]
+    for k in range(stop.listened):
+        u = damped_current(x[1], law.current, law.damping_velocity)
+        u = round(u / stop.current_step) * stop.current_step if idle < 0 else 0.0
+        e = script.errors[m, n - k % n]
+        _, velocity = pass_period(
+            mechanics,
+            instruments,
+            p,
+            law.sample_time,
+            u,
+            (e[0], e[1], e[2]),
+            x,
+            np.zeros(0, np.int64),
+            np.zeros((0, SENSITIVE)),
+            instrument,
+        )
+        if script.losses[m, n - 1 - k % n] != SAMPLE_LOST:
+            row[FIRST_VELOCITY + newest % REST_SAMPLES] = velocity
+            newest += 1
+        if k < stop.late:
+            place = x[0]
+        elif abs(x[0] - place) > stop.rest_travel:
+            place, resting = x[0], 0
+        else:
+            resting += 1
+        if idle < 0 and resting >= stop.rest_periods:
+            idle = k + 1
+        if idle >= 0 and k + 1 - idle >= m % STATUS_PERIODS:
+            break
+    row[REST] = stop.listened + 1 if idle < 0 else idle
+    kept = row[FIRST_VELOCITY:].copy()
+    for i in range(REST_SAMPLES):  # oldest first
+        row[FIRST_VELOCITY + i] = kept[(newest + i) % REST_SAMPLES]
 
 
 def results(bench: Bench, plant: str, count: int, rng: np.random.Generator) -> Floats:
@@ -136,12 +206,19 @@ def results(bench: Bench, plant: str, count: int, rng: np.random.Generator) -> F
     law, chosen = make_law(case), case.plant(plant)
     prior = bench.range_set(bench.prior)
     model, box = make_model(bench, prior, sticks=True), box_of(bench, prior)
+    stop = Stop(
+        late=math.ceil(case.node.watchdog / law.sample_time - 1e-9),
+        current_step=load_layout().command.signal("Current").factor,
+        rest_travel=REST_TRAVEL,
+        rest_periods=math.ceil(REST_TIME / law.sample_time - 1e-9),
+        listened=int(STOP_LISTEN_NS / 1e9 / law.sample_time),
+    )
     rows = []
     for turn in range(0, count, CHUNK):
         script = draw(rng, case, min(CHUNK, count - turn), plant)
         script.errors[:, :, 2] = chosen.instruments.clock_jitter * rng.standard_normal(script.errors.shape[:2])
         actor = stored(ACTORS[int(rng.integers(len(ACTORS)))])
-        out = np.zeros((len(script.brakes), 3))
+        out = np.zeros((len(script.brakes), COLUMNS))
         arguments: tuple[Any, ...] = (
             law._replace(steps=int(rng.choice(LENGTHS))),
             sensor_thresholds(case, law),
@@ -154,6 +231,7 @@ def results(bench: Bench, plant: str, count: int, rng: np.random.Generator) -> F
             actor.array(),
             bool(rng.integers(2)),
             script,
+            stop,
             out,
         )
         compiled(fly)(*arguments)
@@ -168,21 +246,33 @@ def main() -> None:
     p.add_argument("--seed", type=int, default=1, help="0 is the one that the thresholds were chosen with")
     arguments = p.parse_args()
     bench, rng = load_bench(), np.random.default_rng(arguments.seed)
-    each, alarms, judged, total = max(arguments.experiments // len(PLANTS), 1), 0, 0, 0
-    print("| plant | experiments | judged | alarms | share allowed | level of 1e-6 | of the origin | level |")
-    print("|---|---|---|---|---|---|---|---|", flush=True)
+    each, totals = max(arguments.experiments // len(PLANTS), 1), {"unexplained": 0, "not at rest": 0, "in motion": 0}
+    judged = total = 0
+    print(
+        "| plant | experiments | judged | alarms | share allowed | level of 1e-6 | of the origin | level | "
+        "longest until idle [s] | not idle | in motion |"
+    )
+    print("|---" * 11 + "|", flush=True)
     for plant in PLANTS:
         r = results(bench, plant, each, rng)
         share, origins = r[:, LARGEST], r[:, ORIGIN]
         found, used = int(np.count_nonzero((share > 1.0) | (origins > 1.0))), int(np.count_nonzero(r[:, JUDGED]))
-        alarms, judged, total = alarms + found, judged + used, total + len(r)
+        longest = int(STOP_LISTEN_NS / 1e9 / bench.timing.sample_time)
+        restless = int(np.count_nonzero(r[:, REST] > longest))
+        moving = sum(steady_motion([*map(float, v)], bench.noise.velocity) != 0.0 for v in r[:, FIRST_VELOCITY:])
+        for name, count in zip(totals, (found, restless, moving), strict=True):
+            totals[name] += count
+        judged, total = judged + used, total + len(r)
         print(
             f"| {plant} | {len(r)} | {used} | {found} | {share.max():.2f} | {tail(share):.2f} | "
-            f"{origins.max():.2f} | {tail(origins):.2f} |",
+            f"{origins.max():.2f} | {tail(origins):.2f} | {r[:, REST].max() * bench.timing.sample_time:.3f} | "
+            f"{restless} | {moving} |",
             flush=True,
         )
-    low, high = stats.binomtest(alarms, total).proportion_ci(method="exact")
-    print(f"\n{alarms} of {total} ({judged} judged): {low:.1e} to {high:.1e} at 95 % (Clopper and Pearson)")
+    print(f"\n{judged} of {total} experiments are judged by the balance")
+    for name, count in totals.items():
+        low, high = stats.binomtest(count, total).proportion_ci(method="exact")
+        print(f"{name}: {count} of {total}, {low:.1e} to {high:.1e} at 95 % (Clopper and Pearson)")
 
 
 if __name__ == "__main__":
