@@ -31,7 +31,7 @@ from onnx import helper
 from emb_bench.logs.mcap_file import MAGIC
 from emb_runtime.config.bench import load_bench, shipped_bench_text
 from emb_runtime.policy.contract import CONTRACT_KEY
-from emb_runtime.policy.operators import FIXED
+from emb_runtime.policy.onnx_file import FIXED
 from tests.actors import constant_actor, reference_actor
 
 LONGEST = 5.0  # Time that a command may take with a file that it refuses, or that has little in it [s]

@@ -15,7 +15,7 @@ from emb_bench.commission.records import CurrentCheck, Findings, Identification
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.config.plants import SHORTEST_LAG
 from emb_runtime.config.bench import LEARNING, PARAMETER_NAMES
-from emb_runtime.config.toml_text import parse_toml
+from emb_runtime.config.typed import parse_toml
 from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.shield_design import make_law
 

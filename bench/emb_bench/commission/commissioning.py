@@ -18,7 +18,7 @@ from emb_bench.commission.steps import EXPERIMENTS, FULL, STEPS, judged, policy_
 from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.config.toml_text import parse_toml
+from emb_runtime.config.typed import parse_toml
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, SafetyStopError, UsageError
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system import terminal

@@ -14,8 +14,7 @@ import emb_runtime.config.bench as driven
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import ASYMMETRIES, BUILT_IN, Plant, read_plant
 from emb_runtime.config.bench import PARAMETER_NAMES, REMEDY, checked_bench, parse_document, read_bench_text
-from emb_runtime.config.toml_text import parse_toml
-from emb_runtime.config.typed import SMALLEST, NotNegative, read
+from emb_runtime.config.typed import SMALLEST, NotNegative, parse_toml, read
 from emb_runtime.errors import BenchFileError
 
 AROUND = 3.0  # Factor around its nominal parameters within which searches for those of a machine begin

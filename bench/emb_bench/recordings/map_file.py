@@ -13,8 +13,7 @@ from emb_bench.brake.parameters import UNITS
 from emb_bench.brake.quantities import LINEAR, in_motor_coordinates
 from emb_bench.config.machine import ANGLE, ANGULAR_SPEED, CURRENT, FORCE, LENGTH, PARAMETERS, SPEED, TIME, TORQUE
 from emb_runtime.config import typed
-from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
-from emb_runtime.config.typed import FieldError
+from emb_runtime.config.typed import MAX_TOML_BYTES, FieldError, parse_toml
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
 

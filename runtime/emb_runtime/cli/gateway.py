@@ -14,9 +14,8 @@ from emb_runtime.can.interfaces import open_transport, same_bus
 from emb_runtime.can.messages import bench_identity, load_layout
 from emb_runtime.can.transport import is_private
 from emb_runtime.config.bench import load_bench
-from emb_runtime.drives.bench_fit import require_fit
 from emb_runtime.drives.gateway import Gateway
-from emb_runtime.drives.mapping import PROPERTIES, Mapping
+from emb_runtime.drives.mapping import PROPERTIES, Mapping, require_fit
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.drives.node import report
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError, SafetyStopError, UsageError

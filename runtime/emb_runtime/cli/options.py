@@ -16,9 +16,8 @@ from emb_runtime.can.interfaces import same_bus
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
-from emb_runtime.drives.bench_fit import require_fit
-from emb_runtime.drives.lock_step import drive_file
-from emb_runtime.drives.mapping import Mapping
+from emb_runtime.drives.gateway import drive_file
+from emb_runtime.drives.mapping import Mapping, require_fit
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import BenchFileError, PolicyRefusedError, UsageError
 from emb_runtime.estimator.estimator import estimated

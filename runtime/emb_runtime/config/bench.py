@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
 import msgspec
 from msgspec import Meta
 
-from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
-from emb_runtime.config.typed import SMALLEST, FieldError, Positive, read, struct_of
+from emb_runtime.config.typed import MAX_TOML_BYTES, SMALLEST, FieldError, Positive, parse_toml, read, struct_of
 from emb_runtime.errors import BenchFileError
 from emb_runtime.system.input_file import read_text
 

@@ -15,8 +15,7 @@ from msgspec import Meta, Struct
 from emb_runtime.can.codec import parse
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import LONGEST_NODE_WATCHDOG
-from emb_runtime.config.toml_text import MAX_TOML_BYTES, parse_toml
-from emb_runtime.config.typed import read, shown
+from emb_runtime.config.typed import MAX_TOML_BYTES, parse_toml, read, shown
 from emb_runtime.drives.mapping import (
     PROPERTIES,
     Commanded,
@@ -28,8 +27,7 @@ from emb_runtime.drives.mapping import (
     State,
     Step,
 )
-from emb_runtime.drives.protection import DATA_IDS, MODULI, Protection
-from emb_runtime.drives.signals import Field, make_field, raw_value
+from emb_runtime.drives.signals import DATA_IDS, MODULI, Field, Protection, make_field, raw_value
 from emb_runtime.errors import FrameError
 from emb_runtime.system.input_file import read_text
 

@@ -1,7 +1,7 @@
 """A policy: one ONNX file that gives a current from a sample, or a reference from the estimate.
 
 A file is of unknown origin: it is bounded in size, must stand alone (no other file, no control flow), must be made of
-operators whose work is the same for every sample (:mod:`emb_runtime.policy.operators`), must have exactly the input and
+operators whose work is the same for every sample (:mod:`emb_runtime.policy.onnx_file`), must have exactly the input and
 the output of its contract, must fit the bench, and must reproduce its test vectors before :func:`load_policy` returns
 it. Its currents are still clipped, shielded and guarded.
 """
@@ -18,8 +18,7 @@ from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.speed_loop import follow_reference, scale_of
 from emb_runtime.policy.contract import CONTRACT_KEY, ROUNDING, SAMPLE, VECTOR_TOLERANCE, Contract, read_contract
 from emb_runtime.policy.inference import Inference
-from emb_runtime.policy.onnx_file import Graph, read_graph
-from emb_runtime.policy.operators import require_bounded
+from emb_runtime.policy.onnx_file import Graph, read_graph, require_bounded
 from emb_runtime.system.input_file import open_regular
 
 MAX_FILE_BYTES = 4 * 1024 * 1024  # A policy is a few to hundreds of kilobytes

@@ -10,14 +10,17 @@ import base64
 import os
 import pickle
 import signal
+import sys
+import time
 from pathlib import Path
 
 from emb_runtime.config.bench import Bench
-from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.errors import EmbError, PolicyRefusedError, UsageError
 from emb_runtime.policy.policy import Policy, load_policy, read_policy
-from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
+from emb_runtime.system import child_process
+from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child, confine, end_with
 
-PROGRAM = "emb_runtime.policy.trial_process"
+PROGRAM = "emb_runtime.policy.trial"
 MEMORY = 256 << 20  # Memory that a file may take to be loaded and asked [bytes]
 
 MULTIPLE = 10.0
@@ -81,3 +84,33 @@ def _try(data: bytes, bench: Bench) -> None:
     else:
         reason = str(answer.get("refused") or f"it could not be tried: {answer.get('error')}")
     raise PolicyRefusedError(reason)
+
+
+def main(arguments: list[str]) -> int:
+    """Try one policy. Returns the exit status."""
+    document = child_process.read_document(int(arguments[0]))
+    end_with(document["parent"])
+    import onnxruntime  # noqa: F401  # so that it is part of the time that is measured
+
+    from emb_runtime.policy.policy import load_policy
+
+    bench = pickle.loads(base64.b64decode(document["bench"]))  # from the parent, which made it
+    data = base64.b64decode(document["policy"])
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)  # what a library has to say when it fails is not for the user
+    seconds = document["multiple"] * time.process_time()
+    confine(document["memory"], seconds)
+    child_process.answer({"ready": seconds})
+    try:
+        load_policy(data, bench)
+    except EmbError as err:
+        child_process.answer({"refused": str(err)})
+    except MemoryError:
+        child_process.answer({"refused": f"loading it takes more than {document['memory'] >> 20} MiB of memory"})
+    else:
+        child_process.answer({"accepted": True})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -6,8 +6,7 @@ import random
 
 import e2e
 
-from emb_runtime.drives.protection import Protection, crc8_h2f
-from emb_runtime.drives.signals import Field
+from emb_runtime.drives.signals import Field, Protection, crc8_h2f
 
 
 def field(name: str, start: int, length: int, big_endian: bool = False) -> Field:
