@@ -1,4 +1,4 @@
-"""Documents of unknown origin, read into records by msgspec: types, bounds, no unknown key.
+"""Documents of unknown origin, read into records: TOML and JSON, types, bounds, no unknown key.
 
 A record is a frozen ``msgspec.Struct`` or dataclass whose fields carry their bounds, ``Annotated[float, Meta(gt=0)]``.
 An error is one line: document, key, what was expected, what came.
@@ -6,11 +6,12 @@ An error is one line: document, key, what was expected, what came.
 
 from __future__ import annotations
 
+import functools
 import math
-import re
 import tomllib
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, TypeVar, get_type_hints
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import inspect
@@ -23,11 +24,9 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 LONGEST_VALUE = 120  # Characters of a foreign value that a message repeats
-_PLACE = re.compile(r" - at `(key` in `)?\$([^`]*)`$")
-_STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
+MAX_TOML_BYTES = 64 * 1024  # A bench file has a few KiB
+MAX_DOTS = 500  # Most dots in a line: for a key of n parts tomllib takes time and memory that grow with n²
 _RECORDS = (inspect.StructType, inspect.DataclassType)
-_LISTS = (inspect.ListType, inspect.VarTupleType)
-
 
 Keys = tuple[str | int, ...]  # Keys and indices that lead to a value
 
@@ -77,17 +76,15 @@ def read(
     Raises:
         EmbError: of the given kind: a key is missing or unknown, or a value has another type or is out of bounds.
     """
-    info = inspect.type_info(kind)
-    check = _Check(longest_text, smallest)
+    keys: Keys = ()
+    reader = _Reader(longest_text, smallest)
     try:
-        check.walk(document, info, ())
-        if check.missing:
-            raise _RefusedError((), _missing(check.missing, remedy))
-        return msgspec.convert(document, kind)
+        record = reader.convert(document, kind, ())
+        if not reader.missing:
+            return cast("Record", record)
+        reason = _missing(reader.missing, remedy)
     except _RefusedError as err:
         keys, reason = err.keys, str(err)
-    except msgspec.ValidationError as err:
-        keys, reason = _explain(kind, document, err)
     place = key_text((*at, *keys))
     raise error(f"{source}: {place}: {reason}" if place else f"{source}: {reason}")
 
@@ -108,6 +105,27 @@ def struct_of(*kinds: type[Any], **others: tuple[Any, Any]) -> Any:
     )
 
 
+def parse_toml(text: str) -> dict[str, Any]:
+    """The document of a text that nobody vouches for, read within bounds of time and memory.
+
+    Raises:
+        ValueError: the text is not TOML, or too large; the message says what is wrong with it.
+    """
+    if text.startswith("\ufeff"):
+        raise ValueError("it begins with a byte-order mark: save it as UTF-8 without one")
+    if len(text) > MAX_TOML_BYTES:
+        raise ValueError(f"expected at most {MAX_TOML_BYTES} characters, got {len(text)}")
+    for number, line in enumerate(text.split("\n"), 1):
+        if (dots := line.count(".")) > MAX_DOTS:
+            raise ValueError(f"line {number}: expected at most {MAX_DOTS} dots, got {dots}")
+    try:
+        return tomllib.loads(text)
+    except RecursionError as err:
+        raise ValueError("not valid TOML: nested too deeply") from err
+    except ValueError as err:  # TOMLDecodeError, and what tomllib lets through
+        raise ValueError(f"not valid TOML: {err}") from err
+
+
 def key_text(keys: Keys) -> str:
     """The place of a value, as ``plants.rough.f_l`` or ``sequences[3].action``."""
     text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys).removeprefix(".")
@@ -123,137 +141,122 @@ def shown(value: object) -> str:
     return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."
 
 
-class _Check:
-    """Looks for unknown keys, texts that are not printable and numbers that are not finite, which msgspec takes."""
+@functools.cache
+def _fields(kind: type[Any]) -> dict[str, tuple[Any, bool]] | None:
+    """Type of each field of a record, and whether it is required; None of another type."""
+    info = inspect.type_info(kind)
+    if not isinstance(info, _RECORDS):
+        return None
+    hints = get_type_hints(kind, include_extras=True)
+    return {field.name: (hints[field.name], field.required) for field in info.fields}
+
+
+class _Reader:
+    """Converts tables and lists part by part; msgspec converts each value in them."""
 
     def __init__(self, longest_text: int, smallest: float) -> None:
         self._longest_text = longest_text
         self._smallest = smallest
-        self.missing: list[tuple[Keys, inspect.Type]] = []  # Required keys that are not there
+        self.missing: list[tuple[Keys, Any]] = []  # Required keys that are not there; then no record is made
 
-    def walk(self, value: object, kind: inspect.Type | None, keys: Keys) -> None:
-        """Raises _RefusedError at the first such value."""
+    def convert(self, value: Any, kind: Any, keys: Keys) -> Any:
+        """A value as a type has it.
+
+        Raises:
+            _RefusedError: it does not fit.
+        """
+        plain = get_args(kind)[0] if get_origin(kind) is Annotated else kind
+        if get_origin(plain) in (Union, UnionType):
+            kind = plain = next((one for one in get_args(plain) if _takes(one, value)), kind)
+        if plain is Any:
+            return value
+        if isinstance(value, dict) and (fields := _fields(plain)) is not None:
+            return self._record(value, plain, fields, keys)
+        if isinstance(value, dict) and get_origin(plain) in (dict, Mapping):
+            named, inner = get_args(plain)
+            return {self._key(key, named, keys): self.convert(v, inner, (*keys, key)) for key, v in value.items()}
+        if isinstance(value, list) and get_origin(plain) in (list, tuple):
+            return self._list(value, kind, get_args(plain), keys)
+        self._check_text_or_number(value, kind, keys)
+        return _by_msgspec(value, kind, keys)
+
+    def _record(self, value: dict[str, Any], kind: Any, fields: dict[str, tuple[Any, bool]], keys: Keys) -> Any:
+        for key in value:
+            if key not in fields:
+                raise _RefusedError((*keys, key), f"unknown key; expected some of {', '.join(sorted(fields))}")
+        self.missing += [((*keys, n), hint) for n, (hint, required) in fields.items() if required and n not in value]
+        converted = {key: self.convert(inner, fields[key][0], (*keys, key)) for key, inner in value.items()}
+        if self.missing:
+            return None
+        try:
+            return kind(**converted)
+        except FieldError as err:
+            raise _RefusedError((*keys, err.key), str(err)) from err
+
+    def _key(self, key: str, kind: Any, keys: Keys) -> str:
+        try:
+            return cast("str", msgspec.convert(key, kind))
+        except msgspec.ValidationError:
+            wanted = _wanted(inspect.type_info(kind))
+            raise _RefusedError((*keys, key), f"unknown key; expected {wanted}") from None
+
+    def _list(self, value: list[Any], kind: Any, kinds: tuple[Any, ...], keys: Keys) -> Any:
+        if kinds[-1] is ... or len(kinds) == 1:
+            kinds = (kinds[0],) * len(value)
+        if len(kinds) == len(value):
+            value = [self.convert(v, k, (*keys, i)) for i, (v, k) in enumerate(zip(value, kinds, strict=True))]
+        return value if self.missing else _by_msgspec(value, kind, keys)  # which looks at the length
+
+    def _check_text_or_number(self, value: object, kind: Any, keys: Keys) -> None:
+        """Refuse texts that are not printable and numbers that are not finite, which msgspec takes."""
         if isinstance(value, str):
             if not value or not value.isprintable() or len(value) > self._longest_text:
                 wanted = f"expected a printable text of 1 to {self._longest_text} characters"
                 raise _RefusedError(keys, f"{wanted}, got {shown(value)}")
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            if (problem := _number_problem(value, self._smallest)) and _matching(kind, value) is not None:
-                raise _RefusedError(keys, problem)
-        elif isinstance(value, dict | list) and (kind := _matching(kind, value)) is not None:
-            if isinstance(kind, _RECORDS) and isinstance(value, dict):
-                self._compare_keys(value, kind, keys)
-            for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
-                self.walk(inner, _inner(kind, key), (*keys, key))
-
-    def _compare_keys(
-        self, value: Mapping[str, object], kind: inspect.StructType | inspect.DataclassType, keys: Keys
-    ) -> None:
-        known = {field.encode_name: field for field in kind.fields}
-        for key in value:
-            if key not in known:
-                raise _RefusedError((*keys, key), f"unknown key; expected some of {', '.join(sorted(known))}")
-        self.missing += [((*keys, n), f.type) for n, f in known.items() if f.required and n not in value]
+        elif isinstance(value, int | float) and not isinstance(value, bool) and _is_number(inspect.type_info(kind)):
+            _refuse_size(value, self._smallest, keys)
 
 
-def _missing(missing: list[tuple[Keys, inspect.Type]], remedy: str) -> str:
+def _takes(kind: Any, value: object) -> bool:
+    """True if a member of a union is the one for such a table or list, or has no parts and takes the value."""
+    if isinstance(value, dict):
+        return get_origin(kind) in (dict, Mapping) or (isinstance(kind, type) and _fields(kind) is not None)
+    if isinstance(value, list):
+        return get_origin(kind) in (list, tuple)
+    return False
+
+
+def _by_msgspec(value: object, kind: Any, keys: Keys) -> Any:
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError:
+        raise _RefusedError(keys, f"expected {_wanted(inspect.type_info(kind))}, got {shown(value)}") from None
+
+
+def _missing(missing: list[tuple[Keys, Any]], remedy: str) -> str:
     names = ", ".join(key_text(keys) for keys, _ in missing)
-    wanted = f": expected {_wanted(missing[0][1])}" if len(missing) == 1 else ""
+    wanted = f": expected {_wanted(inspect.type_info(missing[0][1]))}" if len(missing) == 1 else ""
     return f"{names}: missing{wanted}; {remedy}"
 
 
-def _number_problem(value: float, smallest: float) -> str:
+def _is_number(kind: inspect.Type) -> bool:
+    if isinstance(kind, inspect.Metadata):
+        return _is_number(kind.type)
+    if isinstance(kind, inspect.UnionType):
+        return any(map(_is_number, kind.types))
+    return isinstance(kind, inspect.FloatType | inspect.IntType)
+
+
+def _refuse_size(value: float, smallest: float, keys: Keys) -> None:
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        return "expected a finite number"
+        raise _RefusedError(keys, "expected a finite number")
     if number and smallest and not smallest <= abs(number) <= 1.0 / smallest:
-        return f"expected 0 or a size from {smallest:g} to {1.0 / smallest:g}, got {number:g}"
-    return ""
-
-
-def _matching(kind: inspect.Type | None, value: object) -> inspect.Type | None:
-    """The type without its metadata, or the member of a union that such a value is read as; None if none is."""
-    if isinstance(kind, inspect.Metadata):
-        return _matching(kind.type, value)
-    if isinstance(kind, inspect.UnionType):
-        return next((found for member in kind.types if (found := _matching(member, value)) is not None), None)
-    wanted: tuple[type[inspect.Type], ...]
-    if isinstance(value, dict):
-        wanted = (*_RECORDS, inspect.DictType)
-    elif isinstance(value, list):
-        wanted = (*_LISTS, inspect.TupleType)
-    else:
-        wanted = (inspect.FloatType, inspect.IntType)
-    return kind if isinstance(kind, wanted) else None
-
-
-def _inner(kind: inspect.Type | None, key: str | int) -> inspect.Type | None:
-    """Type of an entry of a record, mapping, list or tuple; None for one that there is not."""
-    if isinstance(kind, _RECORDS):
-        return next((field.type for field in kind.fields if field.encode_name == key), None)
-    if isinstance(kind, inspect.DictType):
-        return kind.value_type
-    if isinstance(kind, _LISTS):
-        return kind.item_type
-    if isinstance(kind, inspect.TupleType) and isinstance(key, int) and key < len(kind.item_types):
-        return kind.item_types[key]
-    return None
-
-
-def _explain(kind: type[Any], document: object, err: msgspec.ValidationError) -> tuple[Keys, str]:
-    """Place and reason of msgspec's error."""
-    keys = _place(kind, document, err)
-    if isinstance(err.__cause__, FieldError):
-        return (*keys, err.__cause__.key), str(err.__cause__)
-    here: inspect.Type | None = inspect.type_info(kind)
-    container: inspect.Type | None = None
-    value: Any = document
-    for key in keys:
-        container = _matching(here, value)
-        here, value = _inner(container, key), value[key]
-    if "at `key` in" in str(err) and isinstance(container, inspect.DictType):
-        return keys, f"unknown key; expected {_wanted(container.key_type)}"
-    return keys, f"expected {_wanted(here)}, got {shown(value)}"
-
-
-def _place(kind: type[Any], document: Any, err: msgspec.ValidationError) -> Keys:
-    """Keys to the value that msgspec refuses. For a key of a mapping it writes ``[...]``: then each is tried alone."""
-    keys: list[str | int] = []
-    value = document
-    of_key, place = found.groups() if (found := _PLACE.search(str(err))) else (None, "")
-    for name, index in _STEP.findall(place + ("[...]" if of_key else "")):
-        key: str | int = name or index
-        if index == "...":
-            key = next(
-                (k for k, v in value.items() if _refused(kind, _changed(document, keys, {k: v})) == str(err)), index
-            )
-            if key == index:
-                return tuple(keys)
-        elif index:
-            key = int(index)
-        keys.append(key)
-        value = value[key]
-    return tuple(keys)
-
-
-def _refused(kind: type[Any], document: object) -> str:
-    try:
-        msgspec.convert(document, kind)
-    except msgspec.ValidationError as err:
-        return str(err)
-    return ""
-
-
-def _changed(document: Any, keys: list[str | int], value: object) -> object:
-    """The document with another value at a place."""
-    if not keys:
-        return value
-    copy = document.copy()
-    copy[keys[0]] = _changed(document[keys[0]], keys[1:], value)
-    return copy
+        wanted = f"expected 0 or a size from {smallest:g} to {1.0 / smallest:g}"
+        raise _RefusedError(keys, f"{wanted}, got {number:g}")
 
 
 _NOUNS: Mapping[type, str] = {
@@ -265,7 +268,7 @@ _NOUNS: Mapping[type, str] = {
 }
 
 
-def _wanted(kind: inspect.Type | None) -> str:
+def _wanted(kind: inspect.Type) -> str:
     """A type in words."""
     if isinstance(kind, inspect.Metadata):
         return str((kind.extra_json_schema or {}).get("description") or _wanted(kind.type))
@@ -279,7 +282,7 @@ def _wanted(kind: inspect.Type | None) -> str:
         return f"a whole number{_bounds(kind)}"
     if isinstance(kind, inspect.TupleType):
         return f"[{', '.join(_wanted(item) for item in kind.item_types)}]"
-    if isinstance(kind, _LISTS):
+    if isinstance(kind, inspect.ListType | inspect.VarTupleType):
         least, most = kind.min_length or 0, kind.max_length
         return f"a list of {least} to {most} entries" if most is not None else f"a list of at least {least} entries"
     return _NOUNS.get(type(kind), "a value")
@@ -290,29 +293,3 @@ def _bounds(kind: inspect.FloatType | inspect.IntType) -> str:
         return f" from {kind.ge:g} to {kind.le:g}"
     bounds = (("from", kind.ge), ("above", kind.gt), ("at most", kind.le), ("below", kind.lt))
     return ",".join(f" {words} {value:g}" for words, value in bounds if value is not None)
-
-
-MAX_TOML_BYTES = 64 * 1024  # A bench file has a few KiB
-MAX_DOTS = 500  # Most dots in a line: for a key of n parts tomllib takes time and memory that grow with n²
-_MARK = "\ufeff"
-
-
-def parse_toml(text: str) -> dict[str, Any]:
-    """The document.
-
-    Raises:
-        ValueError: the text is not TOML, or too large; the message says what is wrong with it.
-    """
-    if text.startswith(_MARK):
-        raise ValueError("it begins with a byte-order mark: save it as UTF-8 without one")
-    if len(text) > MAX_TOML_BYTES:
-        raise ValueError(f"expected at most {MAX_TOML_BYTES} characters, got {len(text)}")
-    for number, line in enumerate(text.split("\n"), 1):
-        if (dots := line.count(".")) > MAX_DOTS:
-            raise ValueError(f"line {number}: expected at most {MAX_DOTS} dots, got {dots}")
-    try:
-        return tomllib.loads(text)
-    except RecursionError as err:
-        raise ValueError("not valid TOML: nested too deeply") from err
-    except ValueError as err:  # TOMLDecodeError, and what tomllib lets through
-        raise ValueError(f"not valid TOML: {err}") from err

@@ -1,4 +1,4 @@
-"""The gateway between two buses: a drive on one, its software node on the other."""
+"""The gateway between two buses: a drive on one, its software node on the other; or both simulated, in lock-step."""
 
 from __future__ import annotations
 

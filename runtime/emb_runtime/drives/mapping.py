@@ -1,6 +1,6 @@
-"""A drive as its mapping file describes it: what the signals of its own DBC are to a brake, as frozen records.
+"""A drive as its mapping file describes it: what the signals of its own DBC are to a brake, and its fit to a bench.
 
-:mod:`emb_runtime.drives.mapping_file` reads them.
+:mod:`emb_runtime.drives.mapping_file` reads the records.
 """
 
 from __future__ import annotations

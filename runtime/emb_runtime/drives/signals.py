@@ -1,6 +1,8 @@
-"""Signals of a DBC as bits of a payload: read bit by bit, by no code that writes them.
+"""Signals of a DBC as bits of a payload, and checksums: read bit by bit, by no code that writes them.
 
 cantools encodes what leaves and decodes what comes; the second guard reads what leaves by these functions alone.
+Sources of the checksums: AUTOSAR "Specification of SW-C End-to-End Communication Protection Library" (profiles 1, 2, 5)
+and "Specification of CRC Routines"; for XOR and sum the DBC files of cars, which differ in a start value only.
 """
 
 from __future__ import annotations

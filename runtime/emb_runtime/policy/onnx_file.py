@@ -1,6 +1,9 @@
 """Reading of an ONNX file by the runtime itself, before ONNX Runtime sees it.
 
-The ``onnx`` package is not part of the base install, and needs more than what stands here.
+The ``onnx`` package is not part of the base install, and needs more than what stands here. A policy may be made of
+operators whose work is the same for every sample: the shape of each result follows from the shapes of the inputs and
+from numbers in the file, never from what is measured. So the work of a graph is what it was when its test vectors were
+replayed: there are no inputs for which it loops, or an array grows.
 """
 
 from __future__ import annotations

@@ -87,12 +87,15 @@ def _try(data: bytes, bench: Bench) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Try one policy. Returns the exit status."""
+    """The process that tries one policy; gives its exit status.
+
+    ``python -m emb_runtime.policy.trial DOCUMENT_FD``, started by :func:`admit_policy` and by nobody else. It answers
+    on standard output, one JSON object per line: ``ready`` with the processor time that the file may take [s], then
+    ``accepted``, or ``refused`` with the reason.
+    """
     document = child_process.read_document(int(arguments[0]))
     end_with(document["parent"])
     import onnxruntime  # noqa: F401  # so that it is part of the time that is measured
-
-    from emb_runtime.policy.policy import load_policy
 
     bench = pickle.loads(base64.b64decode(document["bench"]))  # from the parent, which made it
     data = base64.b64decode(document["policy"])

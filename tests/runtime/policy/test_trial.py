@@ -50,9 +50,9 @@ def test_the_reason_of_a_refusal_is_the_one_that_the_process_found() -> None:
 def tried_with(folder: Path, monkeypatch: pytest.MonkeyPatch, load_policy: str, before: str = "pass") -> None:
     """Have policies tried by a process with another ``load_policy``, given as code, in the place of ONNX Runtime."""
     (folder / "tried.py").write_text(
-        f"{before}\nimport sys\nfrom emb_runtime.policy import policy, trial_process\nfrom_file = policy.load_policy\n"
+        f"{before}\nimport sys\nfrom emb_runtime.policy import trial\nfrom_file = trial.load_policy\n"
         f"def load_policy(*arguments):\n    {load_policy}\n"
-        "policy.load_policy = load_policy\nsys.exit(trial_process.main(sys.argv[1:]))\n"
+        "trial.load_policy = load_policy\nsys.exit(trial.main(sys.argv[1:]))\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(folder))
     monkeypatch.setattr(trial, "PROGRAM", "tried")
