@@ -76,7 +76,7 @@ night: $(VENV)/.dev
 	$(BIN)/python -m tests.searches.sensor_monitor --experiments 100000
 	$(BIN)/python -m tests.searches.fuzz
 	$(BIN)/python -m tests.searches.hostile_files --count 2000
-	$(BIN)/python benchmarks/compiled_core.py
+	$(BIN)/python tools/compare_core.py
 	$(BIN)/python -m tests.mutation
 
 # The compiled core lies beside the sources afterwards. Beyond the values, which are compared bit for bit, the compiler may
@@ -84,7 +84,7 @@ night: $(VENV)/.dev
 compiled: $(VENV)/.dev
 	@mkdir -p build && rm -f build/compiled.mcap build/python.mcap
 	$(BIN)/python -m tools.compile_core
-	$(BIN)/python benchmarks/compiled_core.py --inputs 20000
+	$(BIN)/python tools/compare_core.py --inputs 20000
 	EMB_CORE=compiled $(BIN)/emb-run --iface sim --log build/compiled.mcap
 	EMB_CORE=python $(BIN)/emb-run --iface sim --log build/python.mcap
 	$(BIN)/python .ci/same_run.py build/compiled.mcap build/python.mcap

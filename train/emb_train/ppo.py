@@ -141,11 +141,19 @@ class DeployedActor(nn.Module):
         return self.limit * torch.clamp(self.actor(observation), -1.0, 1.0)
 
 
+class Tanh(nn.Module):
+    """tanh x = 2 σ(2 x) − 1: torch takes several times as long for its own, a fifth of a training."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Of each element."""
+        return 2.0 * torch.sigmoid(2.0 * x) - 1.0
+
+
 def perceptron(inputs: int, hidden: Sequence[int], gain: float, bias: float) -> nn.Sequential:
     """Linear layers with tanh between them and one output; orthogonal start, ``gain`` and ``bias`` for the last one."""
     layers: list[nn.Module] = []
     for width in hidden:
-        layers += [linear(inputs, width, math.sqrt(2.0), 0.0), nn.Tanh()]
+        layers += [linear(inputs, width, math.sqrt(2.0), 0.0), Tanh()]
         inputs = width
     return nn.Sequential(*layers, linear(inputs, 1, gain, bias))
 
@@ -315,13 +323,17 @@ def improve(
     returns = (advantages + values[:-1]).flatten()
     advantages = advantages.flatten()
     advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    columns = (seen, actions, states, torch.stack((old, advantages, returns), 1))
+    samples, widths = torch.cat(columns, 1), [column.shape[1] for column in columns]  # one gather, not six
     records: list[list[float]] = []
     for epoch in range(ppo.epochs):
-        for some in torch.split(torch.randperm(len(old), generator=generator), ppo.minibatch):
-            log_ratio = actor.log_density(seen[some], actions[some]) - old[some]
-            policy_loss = surrogate(log_ratio, advantages[some], ppo.clip)
+        for some in torch.split(samples[torch.randperm(len(old), generator=generator)], ppo.minibatch):
+            seen, actions, states, rest = torch.split(some, widths, 1)
+            before, advantage, value = rest.unbind(1)
+            log_ratio = actor.log_density(seen, actions) - before
+            policy_loss = surrogate(log_ratio, advantage, ppo.clip)
             descend(optimisers[0], actor, policy_loss - ppo.entropy * actor.entropy(), ppo.max_gradient)
-            value_loss = 0.5 * (critic(states[some]) - returns[some]).square().mean()  # eq. 4.46
+            value_loss = 0.5 * (critic(states) - value).square().mean()  # eq. 4.46
             descend(optimisers[1], critic, value_loss, ppo.max_gradient)
             if epoch == ppo.epochs - 1:
                 with torch.no_grad():

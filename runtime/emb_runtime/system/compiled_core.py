@@ -1,7 +1,7 @@
 """The compiled core: the modules of the cycle as machine code, in place of their sources.
 
 A wheel for one kind of processor has them beside the sources, from which mypyc compiled them
-(``tools/compile_core.py``); whoever builds it compares both, bit for bit (``benchmarks/compiled_core.py``). Nothing
+(``tools/compile_core.py``); whoever builds it compares both, bit for bit (``tools/compare_core.py``). Nothing
 imports them by itself: :func:`choose`, which ``emb-run`` calls before it imports anything else, puts a finder in front
 of Python's own. Every other command works with the sources.
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 import emb_runtime
-from benchmarks.compiled_core import bits
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system.compiled_core import MANIFEST, identity
+from tools.compare_core import bits
 
 ROOT = Path(__file__).parents[3]
 SOURCES = Path(emb_runtime.__file__).parent
@@ -119,7 +119,7 @@ def test_a_core_that_differs_in_one_bit_is_found_by_the_comparison(installed: Pa
     for content, code, said in ((text, 0, "the same, bit for bit"), (changed, 1, ": compiled ")):
         add_core(installed, content)
         options = ("--inputs", "1500", "--only", "command limits")
-        done = run(installed, "benchmarks/compiled_core.py", *options)
+        done = run(installed, "tools/compare_core.py", *options)
         assert done.returncode == code, done.stderr
         assert said in done.stdout
         shutil.rmtree(installed / "emb_runtime" / "native")

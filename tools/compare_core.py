@@ -1,7 +1,7 @@
 """Equality of the compiled core and its sources, bit for bit, on a million drawn inputs of each function.
 
     python -m tools.compile_core                               # first: it takes about a minute
-    python benchmarks/compiled_core.py [--inputs 1000000] [--seed 1] [--only NAME]
+    python tools/compare_core.py [--inputs 1000000] [--seed 1] [--only NAME]
 
 Among the inputs are the edges (zeros of both signs, infinities, NaN, subnormals) and any pattern of 64 bits; what a
 function raises is compared as well, and one NaN is as good as another. Each core runs in processes of its own, which
