@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from emb_bench.config.bench import load_bench
-from emb_bench.excitation.reference import EXCITATIONS
+from emb_bench.excitation import EXCITATIONS
 from emb_bench.output import replacing
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.policy.policy import load_policy

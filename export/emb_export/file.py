@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from emb_bench.config.bench import Bench
-from emb_bench.excitation.reference import parse_excitation
+from emb_bench.excitation import parse_excitation
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES, Ranges
 from emb_runtime.errors import PolicyRefusedError, UsageError

@@ -10,7 +10,7 @@ from emb_bench.brake.euler import sensitivity_step
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import F_V, K_1
 from emb_bench.config.bench import Bench
-from emb_bench.excitation.reference import Response, parse_excitation, run_excitation
+from emb_bench.excitation import Response, parse_excitation, run_excitation
 from emb_bench.information.criteria import criteria
 from emb_bench.information.fisher import information_over_time, thesis_weights
 from emb_bench.sim.open_loop import simulate
@@ -20,7 +20,7 @@ FIGURE = "sec-6.1"
 PARAMS = ("f_v", "k_1")
 FASTEST = "constant-speed:turn=0.2"
 EXCITATIONS = (FASTEST, "square", "chirp", "multisine")
-"""Texts for :func:`emb_bench.excitation.reference.parse_excitation`."""
+"""Texts for :func:`emb_bench.excitation.parse_excitation`."""
 HELD = (30.0, 60.0, 90.0)  # rad
 FREE = 300  # Samples of an experiment without a return (section 5.2)
 ROUNDING = 1e-9

@@ -19,7 +19,7 @@ import pytest
 import torch
 
 from emb_bench.config.bench import Bench, load_bench
-from emb_bench.excitation.reference import excitation
+from emb_bench.excitation import excitation
 from emb_export import emb_export, file
 from emb_export.export import main
 from emb_export.file import answers, reference_file

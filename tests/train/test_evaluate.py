@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from emb_bench.config.bench import load_bench, parse_bench
 from emb_bench.design.problem import Problem, make_problem
-from emb_bench.excitation.reference import parse_excitation, run_excitation
+from emb_bench.excitation import parse_excitation, run_excitation
 from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import fisher
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text

@@ -17,7 +17,7 @@ from torch import nn
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import EULER
 from emb_bench.documents import to_json
-from emb_bench.excitation.reference import ACTOR, COMPARED, parse_excitation
+from emb_bench.excitation import ACTOR, COMPARED, parse_excitation
 from emb_bench.information.symmetric import Floats
 from emb_bench.numbers import Score
 from emb_bench.report.text import WIDTH, Table

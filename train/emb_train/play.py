@@ -15,9 +15,9 @@ from typing import Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench import excitation as reference
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT
-from emb_bench.excitation import reference
 from emb_bench.information.criteria import Criterion, Name
 from emb_bench.information.fisher import Kind
 from emb_bench.information.symmetric import Floats, unpack
@@ -75,7 +75,7 @@ class Law(Excitation):
 
 
 def reference_excitation(excited: reference.Excitation) -> Excitation:
-    """One of :mod:`emb_bench.excitation.reference`, for many experiments."""
+    """One of :mod:`emb_bench.excitation`, for many experiments."""
     return Law(excited.law) if excited.currents is None else Played(excited.currents)
 
 

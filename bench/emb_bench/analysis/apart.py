@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_bench.analysis.constancy import constancy
-from emb_bench.brake.quantities import quantity
+from emb_bench.brake.parameters import quantity
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.records import Estimate
 

@@ -48,7 +48,7 @@ class Conclusion:
 
     label: str
     value: float  # In ``unit``
-    unit: str  # SI, or of the machine that is no brake (:func:`emb_bench.brake.quantities.quantity`)
+    unit: str  # SI, or of the machine that is no brake (:func:`emb_bench.brake.parameters.quantity`)
     interval: tuple[float, float]
     """95 %: of the profile if output error has one and fits, else of the estimate; infinite where open. In ``unit``."""
     repeatability: float

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.quantities import quantity
+from emb_bench.brake.parameters import quantity
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate
 from emb_bench.information.criteria import criteria

@@ -20,7 +20,7 @@ from emb_bench.config.bench import Bench
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Estimate, Unknown
-from emb_bench.excitation.reference import parse_excitation, run_excitation
+from emb_bench.excitation import parse_excitation, run_excitation
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.criteria import criteria
 from emb_bench.information.identifiability import GROSS, Spectrum, combination, schur_complement
@@ -54,7 +54,7 @@ CANDIDATES = (
 class Recommendation:
     """One more run and what it would bring."""
 
-    excitation: str  # Text for :func:`emb_bench.excitation.reference.parse_excitation`, defaults left out
+    excitation: str  # Text for :func:`emb_bench.excitation.parse_excitation`, defaults left out
     direction: str  # Combination of unknowns that the records identify worst, as a sum
     before: Mapping[str, float]
     """Least standard deviations now, by label, relative or in the unknown's unit; inf if not identified."""

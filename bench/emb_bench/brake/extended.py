@@ -30,7 +30,18 @@ import math
 from typing import Any
 
 from emb_bench.brake.exact import late_start
-from emb_bench.brake.friction import acceleration_from_rest, decay, parting_acceleration, sliding_torque, static_torque
+from emb_bench.brake.forces import (
+    acceleration_from_rest,
+    clamping_force,
+    decay,
+    edge_ahead,
+    parting_acceleration,
+    sliding_torque,
+    static_torque,
+    stop_limit,
+    stop_rate,
+    travel,
+)
 from emb_bench.brake.parameters import CONTACT, DELAY, PLAY
 from emb_bench.brake.runge_kutta import (
     Slide,
@@ -44,7 +55,6 @@ from emb_bench.brake.runge_kutta import (
     step,
     vary,
 )
-from emb_bench.brake.stiffness import clamping_force, edge_ahead, stop_limit, stop_rate, travel
 from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
 

@@ -1,7 +1,7 @@
 """One step of a brake that slides: its motion, and the variational equations along it.
 
 The equation of motion is J x2' = k_m i − γ F_cl − σ T_f with the direction σ of motion, F_cl and T_f of
-:mod:`emb_bench.brake.stiffness` and :mod:`emb_bench.brake.friction`, and the motor's current i, which approaches the
+:mod:`emb_bench.brake.forces`, and the motor's current i, which approaches the
 commanded one u with the time constant ``current_lag``. A step has one σ, one side of contact and one law of the
 stop, so that everything in it is smooth.
 
@@ -16,9 +16,16 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from emb_bench.brake.friction import decay, sliding_share, sliding_slope, sliding_torque
+from emb_bench.brake.forces import (
+    clamping_force,
+    clamping_share,
+    clamping_slopes,
+    decay,
+    sliding_share,
+    sliding_slope,
+    sliding_torque,
+)
 from emb_bench.brake.parameters import COMMAND, CONTACT, CURRENT_LAG, CURRENT_OFFSET, DELAY, K_M, PAST_COMMAND, J
-from emb_bench.brake.stiffness import clamping_force, clamping_share, clamping_slopes
 from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
 
@@ -31,7 +38,7 @@ class Slide(NamedTuple):
     direction: float  # Of motion, 1.0 or −1.0
     x1: float  # Angle at the start [rad]
     x2: float  # Velocity at the start [rad/s]
-    w: float  # Position of the stop at the start, see :mod:`emb_bench.brake.stiffness`
+    w: float  # Position of the stop at the start, see :mod:`emb_bench.brake.forces`
     rate: float  # Its slope along the angle [1/rad]
     loaded: float  # 1.0 in contact, else 0.0
     i: float  # Current at the start [A]

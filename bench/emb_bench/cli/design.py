@@ -64,7 +64,7 @@ def _design(args: argparse.Namespace) -> None:
 
         write(report, args.output)
     if args.plot is not None:
-        from emb_bench.design.figure import draw
+        from emb_bench.design.report import draw
 
         draw(report, args.plot)
     from emb_bench.report.design import text

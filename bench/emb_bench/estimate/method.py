@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
-from emb_bench.brake.quantities import command, quantity
+from emb_bench.brake.parameters import command, quantity
 from emb_bench.config.bench import Bench
 from emb_bench.config.machine import CURRENT
 from emb_bench.config.plants import Plant

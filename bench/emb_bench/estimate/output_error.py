@@ -10,6 +10,11 @@ follows the measured brake (:mod:`emb_bench.estimate.search`).
 **The start.** A record whose start cannot be distinguished from rest at the origin starts there; any other starts where
 it was measured. If ``x1_0`` or ``offset`` is unknown, the mean of the samples at rest before the experiment is one
 more measurement, of x1_0 + offset. With ``offset`` alone the brake is taken to have rested at the true origin.
+
+**Outliers.** The error of a sample is compared with the median of those around it. What a model lacks bends the errors
+of many samples alike and shows in the median as well; a single wrong sample does not. One that is further off than
+``APART`` is left out, angle and velocity together: a loss that is quadratic up to there and constant beyond. Where more
+samples are than ``MOST`` of all, none is left out: then the noise or the model is not as the bench file says.
 """
 
 from __future__ import annotations
@@ -20,18 +25,21 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import LEVEL, examine
-from emb_bench.estimate.outliers import APART, few, outliers
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End, Estimate, ModelValidation
 from emb_bench.estimate.search import EVALUATIONS, minimise, released
 from emb_bench.information.identifiability import Spectrum
 from emb_runtime.errors import UsageError
 
+APART = 8.0  # Distance from the neighbours from which on a sample is an outlier, in standard deviations
+AROUND = 5  # Neighbours on each side
+MOST = 0.01  # Largest share of the samples that is left out
 SAME = 1.0  # Searches whose weighted sums of squares differ by less ended in the same minimum: a shift of one sigma
 REWEIGHTED = 3  # Rounds in which the weights follow the motion, where the clock jitters
 LEFT_OUT = 3  # Most times that outliers are looked for
@@ -82,6 +90,32 @@ def _without_outliers(problem: Problem, z: Floats, weights: Sequence[Floats]) ->
     if not few(found):
         return problem
     return replace(problem, records=tuple(r.lose(mask) for r, mask in zip(problem.records, found, strict=True)))
+
+
+def outliers(residuals: Floats, counts: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask of the samples of a record that lie apart from their neighbours, shape (n,).
+
+    Args:
+        residuals: in standard deviations, shape (n, 2).
+        counts: True where an output of a sample counts, shape (n, 2).
+    """
+    found = np.zeros(len(residuals), np.bool_)
+    for errors, counted in zip(residuals.T, counts.T, strict=True):
+        at = np.flatnonzero(counted)
+        if len(at) <= 2 * AROUND:
+            continue
+        padded = np.pad(errors[at], AROUND, mode="reflect")
+        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * AROUND + 1)
+        apart = np.abs(errors[at] - np.median(windows, axis=1))
+        usual = 1.4826 * float(np.median(apart))  # of Gaussian noise, its standard deviation
+        found[at[apart > APART * max(usual, 1.0)]] = True
+    return found
+
+
+def few(found: Sequence[NDArray[np.bool_]]) -> bool:
+    """Returns True if there are outliers, and so few that they can be left out."""
+    count = sum(int(mask.sum()) for mask in found)
+    return 0 < count <= max(1.0, MOST * sum(len(mask) for mask in found))
 
 
 def of_losses(problem: Problem) -> tuple[str, ...]:

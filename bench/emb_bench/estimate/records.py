@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import Floats, is_plain
-from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS, scale
-from emb_bench.brake.quantities import Quantity, quantity
+from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS, Quantity, quantity, scale
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import ASYMMETRIES, EXACT, Plant
 from emb_bench.estimate.intervals import deviations, unnoticed

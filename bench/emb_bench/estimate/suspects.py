@@ -21,8 +21,7 @@ import numpy as np
 from scipy import special
 
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.parameters import PARAMETERS, SI, Parameter
-from emb_bench.brake.quantities import Quantity, quantity
+from emb_bench.brake.parameters import PARAMETERS, SI, Parameter, Quantity, quantity
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import EXACT, Mechanics
 from emb_bench.estimate.prediction import Problem

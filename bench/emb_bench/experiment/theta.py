@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from emb_bench.brake.parameters import SI
-from emb_bench.brake.quantities import Quantity, quantity
+from emb_bench.brake.parameters import SI, Quantity, quantity
 from emb_bench.config.bench import Bench
 from emb_bench.experiment.evaluation import NO_ERRORS, SystematicErrors
 from emb_bench.logs.estimates import last_estimate

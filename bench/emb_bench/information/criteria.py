@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from emb_bench.brake.quantities import renamed
+from emb_bench.brake.parameters import renamed
 from emb_bench.config.machine import Machine
 from emb_bench.information.identifiability import TOUCHED, Spectrum, schur_complement, unit_vector
 from emb_bench.information.symmetric import (

@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.brake.parameters import PARAMETERS, UNITS
-from emb_bench.brake.quantities import quantity, renamed
+from emb_bench.brake.parameters import PARAMETERS, UNITS, quantity, renamed
 from emb_bench.config.machine import Machine
 from emb_bench.information.symmetric import SINGULAR, Floats
 from emb_runtime.errors import UsageError

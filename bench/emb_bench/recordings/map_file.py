@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from emb_bench.brake.parameters import UNITS
-from emb_bench.brake.quantities import LINEAR, in_motor_coordinates
+from emb_bench.brake.parameters import LINEAR, UNITS, in_motor_coordinates
 from emb_bench.config.machine import ANGLE, ANGULAR_SPEED, CURRENT, FORCE, LENGTH, PARAMETERS, SPEED, TIME, TORQUE
 from emb_runtime.config import typed
 from emb_runtime.config.typed import MAX_TOML_BYTES, FieldError, parse_toml

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from emb_bench.analysis.growth import Growth
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.quantities import angle, command, velocity
+from emb_bench.brake.parameters import angle, command, velocity
 from emb_bench.estimate.model_validation import OUTPUTS
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.figures import COLOURS, DASHED, GREY, log_scale, svg

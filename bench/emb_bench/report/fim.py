@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.brake.parameters import UNITS
-from emb_bench.brake.quantities import quantity
+from emb_bench.brake.parameters import UNITS, quantity
 from emb_bench.config.machine import CURRENT
 from emb_bench.documents import to_json
 from emb_bench.experiment.evaluation import KINDS, Evaluation, Fit, Question, default_model, evenly

@@ -10,7 +10,7 @@ from emb_bench.analysis.recommendation import HELPS, PRECISE, advise
 from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.records import Estimate, EstimationProblem
-from emb_bench.excitation.reference import parse_excitation, run_excitation
+from emb_bench.excitation import parse_excitation, run_excitation
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import fisher
 from emb_runtime.config.bench import PARAMETER_NAMES

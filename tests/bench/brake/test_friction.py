@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_bench.brake.friction import (
+from emb_bench.brake.forces import (
     acceleration_from_rest,
     decay,
     decay_slope,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from emb_bench.brake.forces import clamping_force, clamping_share, clamping_slopes, edge_ahead, stop_rate
 from emb_bench.brake.parameters import CONTACT, CUBIC, HYSTERESIS, K_1, K_M, PLAY, QUADRATIC
-from emb_bench.brake.stiffness import clamping_force, clamping_share, clamping_slopes, edge_ahead, stop_rate
 from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import load_bench
 

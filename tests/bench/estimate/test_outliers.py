@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.outliers import few, outliers
+from emb_bench.estimate.output_error import few, outliers
 from emb_bench.experiment.experiment import Experiment
 
 from tests.bench.measurements import currents_of, fit, record  # isort: skip

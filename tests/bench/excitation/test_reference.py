@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.config.bench import Bench, load_bench
-from emb_bench.excitation.reference import (
+from emb_bench.excitation import (
     EXCITATIONS,
     Excitation,
     Response,
@@ -213,7 +213,7 @@ def test_an_excitation_cannot_be_changed() -> None:
 
 
 def test_the_module_is_imported_on_the_base_install() -> None:
-    code = "import sys, emb_bench.excitation.reference; print(*sorted(sys.modules))"
+    code = "import sys, emb_bench.excitation; print(*sorted(sys.modules))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert not {name.partition(".")[0] for name in out.split()} & {"scipy", "numba", "matplotlib", "torch"}
 

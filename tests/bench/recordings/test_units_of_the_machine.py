@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from emb_bench.brake.quantities import angle, command, quantity, velocity
+from emb_bench.brake.parameters import angle, command, quantity, velocity
 from emb_bench.cli.replay import main
 from emb_bench.config.machine import Machine as Kind
 from emb_bench.config.machine import Units

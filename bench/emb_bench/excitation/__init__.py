@@ -1,1 +1,0 @@
-"""Reference excitations and candidates: currents to compare a learned excitation with."""
