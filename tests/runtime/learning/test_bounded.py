@@ -54,14 +54,6 @@ def holds(now: Known, p: BrakeParameters, x: float, v: float) -> bool:
     return inside and now.angle_low <= x <= now.angle_high and now.velocity_low <= v <= now.velocity_high
 
 
-def test_before_the_first_sample_the_set_is_the_one_known_beforehand() -> None:
-    a = assumed("flow")
-    now = known(start(a))
-    assert (now.k_m_low, now.k_1_low, now.t_c_low, now.f_v_low) == a.low
-    assert (now.k_m_high, now.k_1_high, now.t_c_high, now.f_v_high) == a.high
-    assert not now.falsified
-
-
 @pytest.mark.parametrize("model", ["euler", "flow"])
 @settings(max_examples=25)
 @given(
@@ -94,19 +86,6 @@ def test_whatever_moves_the_brake_and_errs_within_bounds_the_truth_stays_possibl
             u = wanted if abs(v) < 450.0 else -math.copysign(6.0, v)
             x, v = next_state(model, p, x, v, u)
             k += 1
-
-
-def test_a_brake_that_is_driven_both_ways_is_soon_known_much_better() -> None:
-    a = assumed("flow")
-    state, p = start(a), BENCH.brake
-    x = v = u = 0.0
-    for k in range(300):
-        hear(a, state, x, v, u)
-        u = 6.0 if k % 100 < 50 else -6.0
-        x, v = next_state("flow", p, x, v, u)
-    now = known(state)
-    assert now.k_m_high - now.k_m_low < 0.1
-    assert now.velocity_high - now.velocity_low < 0.75 * 2.0 * a.velocity_noise
 
 
 @settings(max_examples=200)

@@ -359,14 +359,14 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
         ("drives/wire_guard.py", "self._send"),  # the second guard
         ("drives/arming.py", "self._send"),  # the node's own method, which hands each frame to the second guard
         ("drives/gateway.py", "drive_bus.send"),  # handed to the node, and by it to the second guard
-        ("drives/lock_step.py", "bus.send"),
+        ("drives/gateway.py", "bus.send"),
         ("drives/gateway.py", "self._node_bus.send"),  # samples and status of the node, to the loop
         ("drives/mapping_file.py", "of.send"),  # a key of the file
     }
     owner = (folder / "drives" / "node.py").read_text(encoding="utf-8")
     assert "WireGuard(mapping, bench.limits.current, send)" in owner
-    for opener in ("gateway.py", "lock_step.py"):
-        assert "bus.send)" in (folder / "drives" / opener).read_text(encoding="utf-8")
+    opener = (folder / "drives" / "gateway.py").read_text(encoding="utf-8")
+    assert opener.count("bus.send)") == 2  # of two buses, and in lock-step
     session = (folder / "cli" / "session.py").read_text(encoding="utf-8")
     assert "Guard(plan.layout, plan.bench, bus.transport.send" in session
 
