@@ -26,8 +26,7 @@ OTHERS_BITS = worst_bits(8)  # Bits of a foreign frame, counted as one of 8 byte
 
 def planned_load(bench: Bench, layout: Layout, drive: DriveMapping | None) -> float:
     """Worst-case share of the bus that a run takes, 1.0 being all of it: of a mapped drive's own, if there is one."""
-    bitrate = bench.can.bitrate
-    return layout.bus_load(bitrate) if drive is None else drive.bus_load(bench.timing.sample_time, bitrate)
+    return layout.bus_load(bench.can.bitrate) if drive is None else drive.bus_load(bench.timing.sample_time)
 
 
 @dataclass(frozen=True)

@@ -237,7 +237,7 @@ def _bus_load(f: Findings) -> CheckResult:
     of_drive = ""
     if f.drive is not None:  # that it fits was checked with the mapping file
         load = planned_load(f.bench, f.layout, f.drive)
-        of_drive = f"{load:.0%} of the drive's bus at worst by its DBC at {bitrate} bit/s (can.bitrate)"
+        of_drive = f"{load:.0%} of the drive's bus at worst by its DBC at {f.drive.bitrate} bit/s (its can.bitrate)"
     if of_drive and f.in_process:  # in lock-step there is no other bus
         return CheckResult("bus load", of_drive, expected)
     planned = f.layout.bus_load(bitrate)

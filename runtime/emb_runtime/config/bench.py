@@ -53,6 +53,7 @@ LearntModel = Literal["flow", "euler"]  # A brake that sticks, or one under forw
 ParameterName = Literal["k_m", "k_1", "T_c", "f_v"]
 PARAMETER_NAMES = get_args(ParameterName)  # The parameters that are identified, in the thesis's order (eq. 4.3).
 
+Bitrate = Annotated[int, Meta(ge=125_000, le=1_000_000)]
 Age = Annotated[int, Meta(ge=0, le=OLDEST_FRAME)]
 
 
@@ -178,7 +179,7 @@ class Node:
 class Can:
     """The bus."""
 
-    bitrate: Annotated[int, Meta(ge=125_000, le=1_000_000)]  # [bit/s]
+    bitrate: Bitrate  # Of the bus that the node is on; a mapped drive's own has its mapping file [bit/s]
     mapping: Annotated[str, Meta(pattern="^[0-9a-f]{64}$", description="a SHA-256, 64 digits in lower case")] = ""
     """SHA-256 of the mapping of a drive, and its DBC: no other one is taken then. Empty where the file names none."""
 

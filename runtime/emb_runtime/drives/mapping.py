@@ -121,6 +121,7 @@ class Mapping:
 
     name: str
     polled: bool  # The drive answers each command, and sends nothing by itself
+    bitrate: int  # Of the drive's bus [bit/s]
     pair_within: float  # Longest time between the messages of one sample [s]
     messages: Dictionary[str, MessageInfo]  # Those that are used, by name
     angle: Measured
@@ -161,20 +162,19 @@ class Mapping:
         measured = (self.angle, self.velocity, self.current)
         return frozenset(one.message for one in measured if one is not None)
 
-    def bus_load(self, sample_time: float, bitrate: int) -> float:
+    def bus_load(self, sample_time: float) -> float:
         """Worst-case share of the drive's bus that a run takes, 1.0 being all of it.
 
         Sensor messages and command come each sample; what says the state alone comes as often as it is believed.
 
         Args:
             sample_time: [s].
-            bitrate: [bit/s].
         """
         each = sum(self.messages[name].worst_bits for name in (*self.sensor_messages, self.command.message))
         load = each / sample_time
         if self.state is not None and self.state.message not in self.sensor_messages:
             load += self.messages[self.state.message].worst_bits / self.state.timeout
-        return load / bitrate
+        return load / self.bitrate
 
 
 def mapping_hash(text: str, dbc_text: str) -> str:
@@ -230,9 +230,9 @@ def require_fit(mapping: Mapping, bench: Bench) -> None:
             f"{mapping.watchdog:g} s and lets go: the brake may reach {worst:.4g} rad/s, and bears "
             f"{mapping.end_stop_speed:g} rad/s; narrow the bench's limits"
         )
-    if (load := mapping.bus_load(bench.timing.sample_time, bench.can.bitrate)) > HIGHEST_BUS_LOAD:
-        raise BenchFileError(
-            f"can.bitrate: at {bench.can.bitrate} bit/s the drive's frames take {load:.0%} of its bus at worst, "
+    if (load := mapping.bus_load(bench.timing.sample_time)) > HIGHEST_BUS_LOAD:
+        raise MappingError(
+            f"{mapping.name}: can.bitrate: at {mapping.bitrate} bit/s its frames take {load:.0%} of its bus at worst, "
             f"expected at most {HIGHEST_BUS_LOAD:.0%}"
         )
     least = 1 if mapping.polled else 0

@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 
 from emb_runtime.can.codec import parse
 from emb_runtime.can.messages import load_layout
-from emb_runtime.config.bench import LONGEST_NODE_WATCHDOG
+from emb_runtime.config.bench import LONGEST_NODE_WATCHDOG, Bitrate
 from emb_runtime.config.typed import MAX_TOML_BYTES, parse_toml, read, shown
 from emb_runtime.drives.mapping import (
     PROPERTIES,
@@ -133,6 +133,7 @@ Sequence = Annotated[tuple[_Step, ...], Meta(max_length=MOST_STEPS)]
 class _Can(Struct, kw_only=True):
     dbc: str
     exchange: Literal["broadcast", "poll"]
+    bitrate: Bitrate = 1_000_000  # [bit/s]
     pair_within: Annotated[float, Meta(gt=0, le=0.1)]  # Longest time between the messages of one sample [s]
     signals: _Signals
     arm: Sequence = ()
@@ -213,6 +214,7 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
     made = Mapping(
         name=file.name,
         polled=can.exchange == "poll",
+        bitrate=can.bitrate,
         pair_within=can.pair_within,
         messages=reader.used,
         angle=reader.measured(signals.angle, "can.signals.angle"),

@@ -17,7 +17,7 @@ class SampleTimes:
 
     Args:
         mapping: the drive.
-        bench: sample time, bit rate, and the age of frames that the shield assumes.
+        bench: sample time, and the age of frames that the shield assumes.
     """
 
     def __init__(self, mapping: Mapping, bench: Bench) -> None:
@@ -26,7 +26,7 @@ class SampleTimes:
         self._period_ns = bench.timing.sample_time_ns
         bits = max(mapping.messages[name].worst_bits for name in mapping.sensor_messages)
         bits += mapping.messages[mapping.command.message].worst_bits
-        self._bus_ns = 0 if mapping.polled else round(bits / bench.can.bitrate * 1e9)
+        self._bus_ns = 0 if mapping.polled else round(bits / mapping.bitrate * 1e9)
         self._grid_ns: float | None = None
         self._first_ns = self._asked_ns = self._measured_ns = 0
         self.largest_age_ns = 0

@@ -17,6 +17,7 @@ from emb_runtime.cli.main import main
 from emb_runtime.config.bench import parse_bench
 from emb_runtime.drives.gateway import open_mapped
 from emb_runtime.drives.mapping import PROPERTIES, require_fit
+from emb_runtime.drives.node import Phase
 from emb_runtime.errors import BusError, UsageError
 from emb_runtime.records import Frame
 from tests.actors import constant_actor
@@ -66,6 +67,20 @@ def test_a_run_on_a_mapped_drive_is_a_run_and_its_information_that_of_our_node(
         for log, model in (("run", "late-command" if name == "mit" else "exact"), ("node", None))
     )
     assert math.expm1((mapped - ours) / 4.0) == pytest.approx(0.0, abs=0.01)  # per parameter
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_over_the_gateway_s_two_buses_a_run_is_done_and_the_drive_stays_armed_for_the_next(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus, emb_run = runner(name, tmp_path, capsys, monkeypatch)
+    bus.over_gateway = True
+    document = emb_run.document()
+    assert (document["result"], document["answered"], document["not_obeyed"]) == ("done", 500, 0)
+    node = bus.transport.node
+    assert (node.counts.obeyed, node.guard.rejected, node.times.too_late) == (500, 0, "")
+    assert node.phase is Phase.READY
+    within_limits(bus)
 
 
 def test_the_log_has_the_mapping_and_reruns(odrive: tuple[MappedBus, EmbRun], tmp_path: Path) -> None:
@@ -165,9 +180,7 @@ def test_the_age_of_answers_is_measured_and_one_beyond_the_declared_named(
         assert not bus.transport.node.times.too_late
     (folder := tmp_path / "slow").mkdir()
     bus, emb_run = runner("odrive", folder, capsys, monkeypatch)
-    slow = late_bench().replace("bitrate = 1000000", "bitrate = 520000")
-    (folder / "late.toml").write_text(slow)
-    (folder / "actor.onnx").write_bytes(constant_actor(parse_bench(slow, "slow.toml")))
+    bus.edit("[can]", "[can]\nbitrate = 520000")
     bus.change = lambda frame: frame._replace(time_ns=frame.time_ns - 700_000)
     emb_run.document("--zero")
     late = "1.14 periods after its measurement, shield.frame_age = [0, 1] declares less: declare [0, 2]"
@@ -210,9 +223,9 @@ def test_a_mapping_that_does_not_fit_the_bench_is_refused_before_anything_is_sen
         ("mit", "", "", "frame_age     = [1, 1]", "frame_age = [0, 1]", "a mapped drive does not answer by sample"),
         # Bits by hand, in each ms: an 11-bit frame of 8, 6, 4 bytes has at most 135, 115, 95; a 29-bit one of 8 and 4
         # 160 and 120. The ODrive's heartbeat of 8 bytes is believed for a quarter of a second.
-        ("odrive", "", "", "bitrate = 1000000", "bitrate = 456000", "take 80% of its bus at worst"),
-        ("vesc", "", "", "bitrate = 1000000", "bitrate = 549000", "take 80% of its bus at worst"),
-        ("mit", "", "", "bitrate = 1000000", "bitrate = 312000", "take 80% of its bus at worst"),
+        ("odrive", "[can]", "[can]\nbitrate = 456000", "", "", "take 80% of its bus at worst"),
+        ("vesc", "[can]", "[can]\nbitrate = 549000", "", "", "take 80% of its bus at worst"),
+        ("mit", "[can]", "[can]\nbitrate = 312000", "", "", "take 80% of its bus at worst"),
     ):
         text = late_bench(polled=drive == "mit")
         assert bench_old in text
@@ -223,8 +236,10 @@ def test_a_mapping_that_does_not_fit_the_bench_is_refused_before_anything_is_sen
         with pytest.raises(UsageError, match=re.escape(reason)):
             require_fit(bus.mapping, bench)
     for drive, bitrate in (("odrive", 458_000), ("vesc", 551_000), ("mit", 314_000)):
-        text = late_bench(polled=drive == "mit").replace("bitrate = 1000000", f"bitrate = {bitrate}")
-        require_fit(MappedBus(drive, text, tmp_path).mapping, parse_bench(text, "bench.toml"))
+        text = late_bench(polled=drive == "mit")
+        bus = MappedBus(drive, text, tmp_path)
+        bus.edit("[can]", f"[can]\nbitrate = {bitrate}")
+        require_fit(bus.mapping, parse_bench(text, "bench.toml"))
 
 
 def test_options_that_name_no_drive_and_bus_are_refused(odrive: tuple[MappedBus, EmbRun], tmp_path: Path) -> None:
