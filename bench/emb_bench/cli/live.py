@@ -13,11 +13,11 @@ from emb_bench.live.serve import HOST, PORT, Server
 from emb_runtime.errors import EXIT_DONE, LogError, UsageError
 from emb_runtime.system.terminal import mention, show
 
-HELP = "shows runs while they go on, in Foxglove or Lichtblick, or in lines"
+HELP = "shows runs while they go on: on a page in the browser, in Foxglove, or in lines"
 DESCRIPTION = """\
-Follow the logs that appear in a folder, as they are written: for viewers, over the Foxglove WebSocket protocol (open
-the address as a connection, and the layout of the documentation), or in lines of text. It only reads files:
-the runs do not know of it. Ctrl-C ends it. emb-run --live does the same for one run.
+Follow the logs that appear in a folder, as they are written: on a page of the browser, for Foxglove and Lichtblick over
+the Foxglove WebSocket protocol (open the address as a connection, with the layout of the documentation), or in lines of
+text. It only reads files, and a run is the same with it and without. Ctrl-C ends it. emb-run --live shows one run.
 """
 
 
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     viewer: Viewer = server or Lines(show)
     one = bool(args.place.suffix) and not args.place.is_dir()
     logs = NewLogs(args.place.parent, glob.escape(args.place.name), old=True) if one else NewLogs(args.place)
-    where = f" at {server.address}" if server is not None else ""
+    where = f": {server.addresses}" if server is not None else ""
 
     def wait() -> bool:
         time.sleep(POLL)

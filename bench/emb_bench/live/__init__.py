@@ -1,1 +1,1 @@
-"""A run shown while it goes on: its log is followed as it grows, served to viewers, or told line by line."""
+"""A run shown while it goes on: its log is read as it grows, and served to browsers and viewers or printed in lines."""

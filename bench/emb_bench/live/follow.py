@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, Protocol
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
+from emb_bench.logs.log import read_log
 from emb_bench.logs.mcap_file import DAMAGE, LARGEST, MAGIC, MOST_CARRIED, Chunk, message_class, unpack_chunk
 from emb_runtime.errors import LogError
 from emb_runtime.estimator.estimate import NORMAL_95
@@ -111,6 +112,9 @@ class Viewer(Protocol):
     def add(self, chunk: Chunk) -> None:
         """Take a chunk."""
 
+    def end(self, reason: str) -> None:
+        """The log is whole: the run's exit reason."""
+
 
 def follow(
     logs: NewLogs,
@@ -138,6 +142,7 @@ def follow(
             # A run that was killed leaves a log that has no end.
             for chunk in chunks(path, lambda: wait() and not logs.waiting):
                 viewer.add(chunk)
+            viewer.end(read_log(path).exit_reason)
         except LogError as err:
             complain(err)
         goes_on &= not once
@@ -147,6 +152,34 @@ EVERY = 25  # Samples from one line to the next
 TOLD = (CYCLE.name, ESTIMATE, SAFETY.name)
 RUNNING = (RunState.ACTIVE, RunState.HOMING)
 SHIELD = Reason.LIMITED | Reason.RETURNING | Reason.LEFT
+
+
+class Decoder:
+    """The messages of one log that a reader without a viewer is shown: cycles, estimates and transitions."""
+
+    def __init__(self) -> None:
+        self._schemas: dict[int, mcap.Schema] = {}
+        self._classes: dict[int, tuple[str, Any]] = {}
+        self.units: dict[str, str] = {}  # Of the estimated parameters
+
+    def messages(self, chunk: Chunk) -> Iterator[tuple[str, Any]]:
+        """Topic and content of each message in a chunk.
+
+        Raises:
+            TypeError, KeyError, ValueError, google.protobuf.message.DecodeError: its schemas or messages are damaged.
+        """
+        for record in chunk.described:
+            if isinstance(record, mcap.Schema):
+                self._schemas[record.id] = record
+            elif record.topic in TOLD and record.schema_id in self._schemas:
+                schema = self._schemas[record.schema_id]
+                self._classes[record.id] = (record.topic, message_class(schema.name, schema.data))
+                if record.topic == ESTIMATE:
+                    self.units = dict(json.loads(record.metadata.get("units", "{}")))
+        for message in chunk.messages():
+            if message.channel_id in self._classes:
+                topic, factory = self._classes[message.channel_id]
+                yield topic, factory.FromString(message.data)
 
 
 class Lines:
@@ -164,31 +197,18 @@ class Lines:
 
     def begin(self) -> None:
         """Another log begins."""
-        self._schemas: dict[int, mcap.Schema] = {}
-        self._classes: dict[int, tuple[str, Any]] = {}
+        self._decoder = Decoder()
         self._estimate: Any = None
-        self._units: dict[str, str] = {}
         self._shielded = self._samples = 0
         self._start_ns = -1
 
-    def add(self, chunk: Chunk) -> None:
-        """Tell what is in a chunk.
+    def end(self, reason: str) -> None:
+        """Its last transition is a line already."""
 
-        Raises:
-            TypeError, KeyError, ValueError, google.protobuf.message.DecodeError: its schemas or messages are damaged.
-        """
-        for record in chunk.described:
-            if isinstance(record, mcap.Schema):
-                self._schemas[record.id] = record
-            elif record.topic in TOLD and record.schema_id in self._schemas:
-                schema = self._schemas[record.schema_id]
-                self._classes[record.id] = (record.topic, message_class(schema.name, schema.data))
-                if record.topic == ESTIMATE:
-                    self._units = dict(json.loads(record.metadata.get("units", "{}")))
-        for message in chunk.messages():
-            if message.channel_id in self._classes:
-                topic, factory = self._classes[message.channel_id]
-                self._take(topic, factory.FromString(message.data))
+    def add(self, chunk: Chunk) -> None:
+        """Print what is in a chunk."""
+        for topic, message in self._decoder.messages(chunk):
+            self._take(topic, message)
 
     def _take(self, topic: str, message: Any) -> None:
         if topic == ESTIMATE:
@@ -211,15 +231,20 @@ class Lines:
         yield sent
         yield f"shield {100 * self._shielded // self._samples:3d} %"
         if self._estimate is not None:
-            yield from _known(self._estimate, self._units)
+            yield from _known(self._estimate, self._decoder.units)
+
+
+def intervals(estimate: Any) -> Iterator[tuple[str, float, float]]:
+    """Name, value and half of the 95 % interval of each parameter in an estimate."""
+    names = [field.name for field in estimate.DESCRIPTOR.fields]
+    for name in names:
+        if deviation_of(name) in names:
+            yield name, getattr(estimate, name), NORMAL_95 * getattr(estimate, deviation_of(name))
 
 
 def _known(estimate: Any, units: Mapping[str, str]) -> Iterator[str]:
     """Each parameter's value with its unit, and its 95 % interval, as a part of it."""
-    names = [field.name for field in estimate.DESCRIPTOR.fields]
-    for name in names:
-        if deviation_of(name) in names:
-            value, deviation = getattr(estimate, name), getattr(estimate, deviation_of(name))
-            part = NORMAL_95 * deviation / abs(value) if value else math.inf
-            known = f"{value:.4g} {units.get(name, '')}".rstrip()
-            yield f"{name} {known} ± {100 * part:.2g} % (95 %)" if part < 10.0 else f"{name} ?"
+    for name, value, half in intervals(estimate):
+        part = half / abs(value) if value else math.inf
+        known = f"{value:.4g} {units.get(name, '')}".rstrip()
+        yield f"{name} {known} ± {100 * part:.2g} % (95 %)" if part < 10.0 else f"{name} ?"

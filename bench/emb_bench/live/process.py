@@ -32,7 +32,7 @@ def main(arguments: list[str]) -> int:
         child_process.answer({"error": str(err)})
         return 1
     logs = NewLogs(Path(document["folder"]), document["pattern"])
-    child_process.answer({"ready": viewer.address if isinstance(viewer, Server) else ""})
+    child_process.answer({"ready": viewer.addresses if isinstance(viewer, Server) else ""})
     follow(logs, viewer, _wait, _complain)
     if isinstance(viewer, Server):
         viewer.close()

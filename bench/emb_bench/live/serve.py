@@ -1,4 +1,4 @@
-"""The chunks of logs for Foxglove and Lichtblick, over the Foxglove WebSocket protocol.
+"""The chunks of logs for a page in a browser, and for Foxglove and Lichtblick over the Foxglove WebSocket protocol.
 
 Source: https://github.com/foxglove/ws-protocol, ``docs/spec.md``; only what a server needs that sends and obeys nobody.
 
@@ -18,11 +18,13 @@ import struct
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final
 
 from mcap import records as mcap
 
+from emb_bench.live.page import SUBPROTOCOL, Page, html
 from emb_bench.logs.mcap_file import Chunk
 from emb_runtime.errors import UsageError
 
@@ -43,6 +45,12 @@ ORIGINS: Final = (
     re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d{1,5})?"),
 )
 """Origins of the pages that may connect."""
+PAGE_HEADERS: Final = {
+    "Content-Type": "text/html; charset=utf-8",
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
+    "connect-src 'self' ws:; frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+}
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 MESSAGE: Final = struct.Struct("<BIQ")  # Opcode 1, number of the subscription, time [ns]; the payload follows
 
@@ -60,8 +68,12 @@ class Viewer:
 
     def say(self, **document: Any) -> None:
         """Send a document, before the messages that wait."""
+        self.send(json.dumps(document))
+
+    def send(self, *texts: str) -> None:
+        """Send texts, before the messages that wait."""
         with self._news:
-            self._said.append(json.dumps(document))
+            self._said.extend(texts)
             self._news.notify()
 
     def log(self, channel: int, time_ns: int, data: bytes) -> None:
@@ -133,6 +145,8 @@ class Server:
         self._host = host
         self._lock = threading.Lock()
         self._viewers: set[Viewer] = set()
+        self._pages: set[Viewer] = set()
+        self._page = Page()
         self._channels: dict[tuple[str, bytes], dict[str, Any]] = {}
         self._made = 0
         self._schemas: dict[int, mcap.Schema] = {}
@@ -144,15 +158,16 @@ class Server:
                 host,
                 port,
                 origins=ORIGINS,  # type: ignore[arg-type]
-                process_request=self._refuse_foreign,
-                subprotocols=SUBPROTOCOLS,  # type: ignore[arg-type]
+                process_request=self._page_or_refusal,
+                subprotocols=(*SUBPROTOCOLS, SUBPROTOCOL),  # type: ignore[arg-type]
                 compression=None,
                 logger=silent,
             )
         except (OSError, OverflowError) as err:
             raise UsageError(f"the server cannot listen at {host}:{port}: {err}") from err
-        self.address = f"ws://{host}:{self._server.socket.getsockname()[1]}"
-        """Address for a viewer."""
+        place = f"{host}:{self._server.socket.getsockname()[1]}"
+        self.address = f"ws://{place}"  # For a viewer
+        self.addresses = f"http://{place} in a browser, {self.address} in Foxglove"
         self._thread = threading.Thread(target=self._server.serve_forever)
         self._thread.start()
 
@@ -160,6 +175,17 @@ class Server:
         """Another log begins: its numbers of channels and schemas are its own."""
         self._schemas.clear()
         self._of_log.clear()
+        self._to_pages(self._page.begin)
+
+    def end(self, reason: str) -> None:
+        """The log is whole: the run's exit reason."""
+        self._to_pages(lambda: self._page.end(reason))
+
+    def _to_pages(self, made: Callable[[], str]) -> None:
+        with self._lock:  # a page that comes meanwhile gets it once
+            text = made()
+            for page in self._pages:
+                page.send(text)
 
     def add(self, chunk: Chunk) -> None:
         """Serve the messages of a chunk. Their time is the one at which they happened, not that of their writing."""
@@ -173,6 +199,7 @@ class Server:
             time.sleep(SUBSCRIBING)
         with self._lock:
             viewers = tuple(self._viewers)
+        self._to_pages(lambda: self._page.add(chunk))
         for message in chunk.messages() if viewers else ():
             if (channel := self._of_log.get(message.channel_id)) is not None:
                 for viewer in viewers:
@@ -207,23 +234,34 @@ class Server:
 
     def _view(self, connection: ServerConnection) -> None:
         viewer = Viewer(connection)
-        viewer.say(op="serverInfo", name="emb-excite", capabilities=[], supportedEncodings=[], metadata={})
+        of_its_kind = self._pages if connection.subprotocol == SUBPROTOCOL else self._viewers
         with self._lock:
-            if self._channels:
-                viewer.say(op="advertise", channels=[*self._channels.values()])
-            self._viewers.add(viewer)
+            if of_its_kind is self._pages:
+                viewer.send(*self._page.so_far)
+            else:
+                viewer.say(op="serverInfo", name="emb-excite", capabilities=[], supportedEncodings=[], metadata={})
+                if self._channels:
+                    viewer.say(op="advertise", channels=[*self._channels.values()])
+            of_its_kind.add(viewer)
         try:
             viewer.listen()
         finally:
             with self._lock:
-                self._viewers.discard(viewer)
+                of_its_kind.discard(viewer)
 
-    def _refuse_foreign(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Refuse a request by a name that is not this computer's; an address cannot be another's name."""
+    def _page_or_refusal(self, connection: ServerConnection, request: Request) -> Response | None:
+        """The page for a browser; a refusal of a name that is not this computer's. An address is nobody else's name."""
         named = request.headers.get_all("Host")
-        if len(named) == 1 and _is_ours(named[0], self._host):
+        if len(named) != 1 or not _is_ours(named[0], self._host):
+            return connection.respond(HTTPStatus.FORBIDDEN, "connect to this computer by its address or as localhost\n")
+        if "Upgrade" in request.headers:
             return None
-        return connection.respond(HTTPStatus.FORBIDDEN, "connect to this computer by its address or as localhost\n")
+        if request.path != "/":
+            return connection.respond(HTTPStatus.NOT_FOUND, "the page is at /\n")
+        response = connection.respond(HTTPStatus.OK, html())
+        response.headers.pop("Content-Type")  # a second value would be added to it
+        response.headers.update(PAGE_HEADERS)
+        return response
 
 
 def _is_ours(named: str, host: str) -> bool:

@@ -1,17 +1,21 @@
 from __future__ import annotations
 
+import http.client
 import json
 import os
 import random
 import re
+import shutil
 import signal
 import socket
 import struct
 import subprocess
 import sys
 import time
+import urllib.request
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +33,7 @@ from emb_bench.logs.log import read_log
 from emb_bench.logs.mcap_file import HEADER, Chunk
 from emb_runtime.cli import main as emb_run
 from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, LogError, UsageError
+from emb_runtime.estimator.estimator import UNITS
 
 SECONDS = 20.0
 
@@ -133,6 +138,8 @@ def test_a_log_that_is_damaged_or_ends_early_does_not_keep_the_next_one_back(shi
     assert [len(log) > 0 for log in told.logs] == [False, True, True]
     assert sum(len(chunk.at) for chunk in told.logs[2]) == messages_of(shipped).total()
     assert len(wrong) == 1
+    assert told.reasons[0].startswith("unknown")
+    assert told.reasons[1:] == ["DONE"]
 
 
 class Told:
@@ -140,12 +147,16 @@ class Told:
 
     def __init__(self) -> None:
         self.logs: list[list[Chunk]] = []
+        self.reasons: list[str] = []
 
     def begin(self) -> None:
         self.logs.append([])
 
     def add(self, chunk: Chunk) -> None:
         self.logs[-1].append(chunk)
+
+    def end(self, reason: str) -> None:
+        self.reasons.append(reason)
 
 
 def test_the_lines_say_what_is_in_the_log(shipped: Path) -> None:
@@ -225,6 +236,67 @@ def server() -> Iterator[Server]:
     served.close()
 
 
+class Browser:
+    """A page in Chromium, asked over its DevTools protocol."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket = socket
+
+    def value(self, expression: str) -> Any:
+        """Value of an expression of JavaScript in the page."""
+        parameters = {"expression": expression, "returnByValue": True}
+        self._socket.send(json.dumps({"id": 1, "method": "Runtime.evaluate", "params": parameters}))
+        return json.loads(self._socket.recv(SECONDS))["result"]["result"].get("value")
+
+    def wait(self, expression: str) -> None:
+        """Wait until an expression is true."""
+        deadline = time.monotonic() + SECONDS
+        while not self.value(expression):
+            assert time.monotonic() < deadline, expression
+            time.sleep(0.02)
+
+
+@contextmanager
+def browser_at(server: Server, profile: Path) -> Iterator[Browser]:
+    """The page of a server in Chromium."""
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0", f"--user-data-dir={profile}"]
+    command = ["chromium", *flags, server.address.replace("ws:", "http:")]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            at = next(line.split()[-1] for line in process.stderr if "DevTools listening" in line)
+            with urllib.request.urlopen(f"http://{at.split('/')[2]}/json/list", timeout=SECONDS) as answered:
+                (page,) = [page for page in json.load(answered) if page["type"] == "page"]
+            with connect(page["webSocketDebuggerUrl"], max_size=None) as socket:
+                yield Browser(socket)
+        finally:
+            process.terminate()
+            process.communicate(timeout=SECONDS)
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
+def test_the_page_in_a_browser_shows_every_sample_and_estimate(shipped: Path, tmp_path: Path, server: Server) -> None:
+    log = read_log(shipped)
+    cycles, last, wrong = log.cycles["step"] >= 0, log.tables["/estimate"], list[LogError]()
+    whole = f"cycles.length === {cycles.sum()} && document.title.startsWith('DONE')"
+    with browser_at(server, tmp_path / "early") as page:
+        page.wait("document.getElementById('state').textContent === 'waiting for a run'")
+        for _ in range(2):  # the second log takes the place of the first
+            follow(NewLogs(shipped.parent, shipped.name, old=True), server, never, wrong.append, once=True)
+            page.wait(whole)
+        assert page.value("cycles.map(c => c.angle)") == log.cycles["angle"][cycles].tolist()
+        assert page.value("estimates.length") == log.counts["/estimate"]
+        page.wait("document.querySelectorAll('canvas').length === 4")
+        rows = page.value("[...document.querySelectorAll('#estimate tr')].map(r => r.innerText.split('\\t'))")
+        assert [row[0] for row in rows] == [f"{name} [{unit}]" for name, unit in UNITS.items()]
+        for name, (_, value, half, relative) in zip(UNITS, rows, strict=True):
+            assert float(value) == pytest.approx(last[name][-1], rel=1e-5)
+            assert float(half) == pytest.approx(1.96 * last[f"{name}_deviation"][-1], rel=0.06)
+            assert float(relative.removesuffix(" %")) == pytest.approx(100 * float(half) / float(value), rel=0.06)
+    with browser_at(server, tmp_path / "late") as page:
+        page.wait(whole)
+
+
 PORT = "{port}"
 PROTOCOL: list[Any] = ["foxglove.sdk.v1"]
 FOREIGN = {
@@ -267,6 +339,19 @@ def test_a_page_from_elsewhere_and_a_name_that_is_not_ours_are_refused(server: S
             status = answer(server, *(f"{name.title()}: {value}" for name, value in sent.items()))
             assert ("403" in status) == refused, f"{row}: {status}"
             assert ("101" in status) != refused, f"{row}: {status}"
+
+
+def test_the_page_is_served_by_our_name_only_and_loads_nothing_from_elsewhere(server: Server) -> None:
+    for host, path, status in (("localhost", "/", 200), ("evil.example", "/", 403), ("127.0.0.1", "/favicon.ico", 404)):
+        asked = http.client.HTTPConnection(server.address.removeprefix("ws://"), timeout=SECONDS)
+        asked.request("GET", path, headers={"Host": host})
+        answered = asked.getresponse()
+        assert answered.status == status
+        assert (b"<html" in answered.read()) == (status == 200)
+        if status == 200:
+            assert answered.headers["Content-Type"] == "text/html; charset=utf-8"
+            assert answered.headers["Content-Security-Policy"].startswith("default-src 'none'")
+        asked.close()
 
 
 def test_a_handshake_with_two_names_or_two_origins_is_refused(server: Server) -> None:

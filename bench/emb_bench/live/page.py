@@ -1,0 +1,83 @@
+"""A page for a browser that shows a run while it goes on: ``page.html``, and the JSON that is sent to it.
+
+The page is one file of plain HTML, CSS and JavaScript without a build or a library: NiceGUI and Panel would bring a web
+framework of more than twenty packages to a bench computer for four curves and a table.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from importlib import resources
+from typing import Any
+
+from emb_bench.live.follow import RUNNING, SHIELD, Decoder, intervals
+from emb_bench.logs.mcap_file import Chunk
+from emb_runtime.log.mcap_schema import ESTIMATE, SAFETY
+
+SUBPROTOCOL = "emb-excite.page"
+KEPT = 600  # Chunks that a page which comes later gets; a chunk has 0.1 s
+
+
+def html() -> str:
+    """The page."""
+    return resources.files("emb_bench.live").joinpath("page.html").read_text(encoding="utf-8")
+
+
+class Page:
+    """One log after the other as the messages that the page takes."""
+
+    def __init__(self) -> None:
+        self.begin()
+
+    @property
+    def so_far(self) -> list[str]:
+        """Messages of the present log, the beginning first."""
+        return [json.dumps({"begin": True}), *self._sent]
+
+    def begin(self) -> str:
+        """Another log begins."""
+        self._sent: deque[str] = deque(maxlen=KEPT)
+        self._decoder = Decoder()
+        self._start_ns = -1
+        return self.so_far[0]
+
+    def add(self, chunk: Chunk) -> str:
+        """Samples, estimates and transitions of a chunk; times in seconds since the experiment began."""
+        said: dict[str, Any] = {"cycles": [], "estimates": [], "events": []}
+        for topic, message in self._decoder.messages(chunk):
+            if topic == SAFETY.name:
+                said["events"].append(f"{message.code} {message.text}")
+            elif topic == ESTIMATE:
+                rows = [(name, _number(value), _number(half)) for name, value, half in intervals(message)]
+                said["estimates"].append({"step": message.step, "rows": rows})
+            elif message.state in RUNNING:
+                said["cycles"].append(self._cycle(message))
+        return self._keep({**said, "units": self._decoder.units})
+
+    def end(self, reason: str) -> str:
+        """The log is whole: the run's exit reason."""
+        return self._keep({"result": reason})
+
+    def _cycle(self, c: Any) -> dict[str, float | None]:
+        if self._start_ns < 0:
+            self._start_ns = c.receive_time_ns
+        return {
+            "step": c.step,
+            "time": 1e-9 * (c.receive_time_ns - self._start_ns),
+            "shield": bool(c.reasons & SHIELD),
+            "angle": _number(c.angle),
+            "velocity": _number(c.velocity),
+            "requested": _number(c.policy_current),
+            "sent": _number(c.sent_current),
+            "applied": _number(c.applied_current),
+        }
+
+    def _keep(self, said: dict[str, Any]) -> str:
+        self._sent.append(json.dumps(said))
+        return self._sent[-1]
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
