@@ -25,8 +25,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the simulator is a neighbour
 
-from benchmarks.coverage import share
 from benchmarks.independent_simulator import Brake, brake_of, simulate, started
+from benchmarks.interval_coverage import share
 from emb_bench.analysis.model_choice import choose_model, model_of
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench, load_bench

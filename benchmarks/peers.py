@@ -35,7 +35,7 @@ from scipy import optimize, stats
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.coverage import share
+from benchmarks.interval_coverage import share
 from emb_bench import api
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.export.mjcf import STEPS, mjcf

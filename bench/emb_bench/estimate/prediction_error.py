@@ -7,8 +7,8 @@ disturbed is chosen by maximum restricted likelihood; where nothing disturbs it,
 
 For a given disturbance the innovations are minimised with the gains held (:func:`emb_bench.estimate.search.converge`);
 their information is that of the innovations with the gains held, too. That the disturbance is itself an estimate is
-left out of it; intervals still cover (``benchmarks/coverage.py --case disturbance``). Every search begins under a
-strong disturbance, where there are few local minima, and takes what it found there to the likely one.
+left out of it; intervals still cover (``benchmarks/interval_coverage.py --case disturbance``). Every search begins
+under a strong disturbance, where there are few local minima, and takes what it found there to the likely one.
 """
 
 from __future__ import annotations

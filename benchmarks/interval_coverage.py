@@ -1,6 +1,6 @@
 """Coverage of the intervals, and errors of the model: noticed, named, or at least inside the intervals?
 
-    python benchmarks/coverage.py --case total [--draws 400] [--seed 1] [--method oem] [--systematic bench]
+    python benchmarks/interval_coverage.py --case total [--draws 400] [--seed 1] [--method oem] [--systematic bench]
 
 Records of random brakes within ±50 % under random excitations, from ``benchmarks.independent_simulator``, which shares
 no code with the estimators. The cases are ``CASES``:
