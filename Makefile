@@ -73,9 +73,14 @@ night: $(VENV)/.dev
 	$(HIL)
 	$(BIN)/python .ci/hil_ran.py build/hil.xml
 	$(BIN)/python -m tests.searches.shield --episodes 20000
+	$(BIN)/python -m tests.searches.learning_shield --episodes 5000
+	$(BIN)/python -m tests.searches.learning_shield --episodes 1000 --break all
 	$(BIN)/python -m tests.searches.sensor_monitor --experiments 100000
 	$(BIN)/python -m tests.searches.fuzz
 	$(BIN)/python -m tests.searches.hostile_files --count 2000
+	$(BIN)/python -m tests.searches.damaged_logs
+	$(BIN)/python -m tests.searches.interrupt
+	$(BIN)/python -m tests.searches.mapped_drives
 	$(BIN)/python tools/compare_core.py
 	$(BIN)/python -m tests.mutation
 

@@ -118,6 +118,6 @@ def test_an_excitation_is_designed_learned_and_exported(tmp_path: Path) -> None:
     bench.write_text(shipped_bench_text().replace("horizon     = 500", "horizon     = 50"), encoding="utf-8")
     fixed = ["--bench", bench, "--starts", "1", "--params", "k_m,T_c", "--model", "euler"]
     done(system, "emb-design", *fixed, "-o", tmp_path / "design.csv")
-    done(system, "emb-train", "--preset", "single-viscous", "--bench", bench, "--steps", "1", "--out", tmp_path / "run")
+    done(system, "emb-train", "ppo", "single-viscous", "--bench", bench, "--steps", "1", "--out", tmp_path / "run")
     done(system, "emb-export", tmp_path / "run", "--out", tmp_path / "actor.onnx")
     assert (tmp_path / "actor.onnx").stat().st_size > 1000

@@ -10,6 +10,7 @@ induction steps, measures what a freewheeling node would do, and what each envel
 from __future__ import annotations
 
 import argparse
+import sys
 import timeit
 from dataclasses import replace
 from typing import Any
@@ -81,18 +82,19 @@ def bench_for(ranges: str = "envelope", **declared: Any) -> Bench:
     )
 
 
-def report(label: str, found: Found) -> None:
-    """One line of a table of :func:`table`."""
+def report(label: str, found: Found) -> bool:
+    """One line of a table of :func:`table`; whether a limit was passed, or a brake that lost no command is not home."""
     r, told = found.rows, found.obeyed
+    away = int((~found.home[told]).sum())
     line = (
         f"{label:44s} {len(r):8d} {int(found.violated.sum()):9d}   {r[:, LOWEST].min():7.2f} {r[:, HIGHEST].max():7.2f}"
     )
     line += f"   {r[:, SLOWEST].min():7.1f} {r[:, FASTEST].max():6.1f}"
     if told.any():
-        away = int((~found.home[told]).sum())
         line += f"   {away:6d}/{int(told.sum()):<7d} {np.abs(r[told, END_ANGLE]).max():6.3f}"
         line += f" {np.abs(r[told, END_VELOCITY]).max():6.2f}"
     print(line, flush=True)
+    return bool(found.violated.any()) or away > 0
 
 
 def table(title: str) -> None:
@@ -104,58 +106,63 @@ def table(title: str) -> None:
     )
 
 
-def show_search(n: int, seed: int) -> None:
-    """The law under its own assumptions."""
+def show_search(n: int, seed: int) -> bool:
+    """The law under its own assumptions; whether it fails."""
     table("Search with the law's own assumptions (half of the episodes lose commands)")
     found = search(bench_for(), n, seed)
-    report("envelope", found)
+    fails = report("envelope", found)
     for name in ("pm50", "viscous", "viscous-stiffness", "known"):
-        report(name, search(bench_for(name), n // 5, seed))
+        fails |= report(name, search(bench_for(name), n // 5, seed))
     for name, declared in EXTENSIONS.items():
-        report(f"envelope, {name}", search(bench_for(**declared), n // 5, seed, freewheel="coasting" in name))
+        fails |= report(f"envelope, {name}", search(bench_for(**declared), n // 5, seed, freewheel="coasting" in name))
     table("Brakes that are not the model, half by the bench's own solver: without the bound and with it")
     for plant, declared in PLANTS.items():
         report(f"{plant}, nothing declared", search(bench_for(), n // 5, seed, plant=plant))
         if declared:
-            report(f"{plant}, declared", search(bench_for(**declared), n // 5, seed, plant=plant))
+            fails |= report(f"{plant}, declared", search(bench_for(**declared), n // 5, seed, plant=plant))
     print("\nHome in spite of lost commands (envelope), share of episodes:")
     print("  " + ", ".join(f"{d} {found.home[found.of(d)].mean():.3f}" for d in DROPS))
+    return fails
 
 
-def show_climbs(n: int, seed: int) -> None:
-    """Hill climbing: 50 chains each."""
+def show_climbs(n: int, seed: int) -> bool:
+    """Hill climbing, 50 chains each; whether one passes a limit, or none does where the margin is left out."""
     print(
         "\nHill climbing, least margin of all chains (angle [rad], or speed [10 rad/s]); negative: a limit was passed"
     )
-    chains = 50
+    chains, fails = 50, False
     for name, declared in {"envelope": {}, **EXTENSIONS}.items():
         margins = climb(bench_for(**declared), chains, n // chains, seed)
         print(f"  {name:36s} {chains * (n // chains):7d} episodes   {margins.min():7.3f}")
+        fails |= bool(margins.min() < 0.0)
     law = make_law(bench_for())
     careless = law._replace(bottom=law.bottom - 0.3, top=law.top + 0.3)
     margins = climb(bench_for(), chains, n // chains, seed, law=careless)
     print(f"  {'without angle margin':36s} {chains * (n // chains):7d} episodes   {margins.min():7.3f}")
+    return fails or bool(margins.min() >= 0.0)
 
 
-def show_broken(n: int, seed: int) -> None:
-    """Each assumption broken in turn."""
+def show_broken(n: int, seed: int) -> bool:
+    """Each assumption broken in turn; whether a search does not find one."""
     bench = bench_for()
     law = make_law(bench)
     table("Search with an assumption broken (violations must be found)")
     careless = law._replace(bottom=law.bottom - 0.3, top=law.top + 0.3)
-    report("brake outside the set (viscous, envelope)", search(bench_for("viscous"), n, seed, truth="envelope"))
-    report("no angle margin", search(bench, n, seed, law=careless))
-    report("frames one period late", search(bench, n, seed, ages=(0, 1)))
+    finds = report("brake outside the set (viscous, envelope)", search(bench_for("viscous"), n, seed, truth="envelope"))
+    finds &= report("no angle margin", search(bench, n, seed, law=careless))
+    finds &= report("frames one period late", search(bench, n, seed, ages=(0, 1)))
     found = search(bench, n, seed, drops=("killed",), freewheel=True)
-    report("freewheel after a kill", found)
+    finds &= report("freewheel after a kill", found)
     for stop, column, limit in (("lower", LOWEST, -10.0), ("upper", HIGHEST, 100.0)):
         hit = found.rows[:, column] < limit if limit < 0.0 else found.rows[:, column] > limit
         speed = found.rows[hit, LAST_SPEED].max() if hit.any() else 0.0
         print(f"  freewheel: {hit.mean():.1%} of the kills run into the {stop} stop, with up to {speed:.0f} rad/s")
+    return not finds
 
 
-def show_induction(n: int, seed: int) -> None:
-    """States of the safe set that one step takes out of it."""
+def show_induction(n: int, seed: int) -> bool:
+    """States of the safe set that one step takes out of it; whether there are any."""
+    outside = 0
     print("\nOne step of the induction: states of the safe set that leave it")
     for name in ("envelope", "pm50", "viscous", "viscous-stiffness"):
         bench = bench_for(name)
@@ -169,6 +176,7 @@ def show_induction(n: int, seed: int) -> None:
             brakes = draw_brakes(rng, bench.range_set(name), len(failed))
             tried += compiled(induction)(law, excess, chatter, brakes, rng.random((len(failed), 10)), failed)
             left += int(failed.sum())
+        outside += left
         print(f"  {name:20s} {left} of {tried}; margin used: damped stop {excess:.3f} rad, chatter {chatter:.3f} rad")
     for name, declared, kept, width in (
         ("current_lag 2 ms", {"current_lag": 0.002}, lagging_induction, 16),
@@ -179,7 +187,9 @@ def show_induction(n: int, seed: int) -> None:
         failed = np.zeros(min(n, 1_000_000), dtype=np.bool_)
         brakes = draw_brakes(rng, bench.range_set("envelope"), len(failed))
         tried = compiled(kept)(make_law(bench), brakes, rng.random((len(failed), width)), failed)
+        outside += int(failed.sum())
         print(f"  {name:20s} {int(failed.sum())} of {tried}")
+    return outside > 0
 
 
 def flown(
@@ -272,20 +282,21 @@ def cost(law: ShieldLaw, angle: float, velocity: float, k: int) -> float:
     return min(timer.repeat(repeat=9, number=2000)) / 2000 * 1e6
 
 
-def main() -> None:
-    """Print all figures."""
+def main() -> int:
+    """Print all figures; 1 if the shield fails, or a search that must find what is broken does not."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=20_000, help="of the main search; the others have a fifth")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     n, seed = arguments.episodes, arguments.seed
-    show_search(n, seed)
-    show_climbs(n // 5, seed)
-    show_broken(max(n // 5, 1), seed)
-    show_induction(20 * n, seed)
+    fails = show_search(n, seed)
+    fails |= show_climbs(n // 5, seed)
+    fails |= show_broken(max(n // 5, 1), seed)
+    fails |= show_induction(20 * n, seed)
     show_information(seed)
     show_speed(max(n // 20, 1), seed)
+    return 1 if fails else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
