@@ -18,7 +18,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 TORCH := $(shell grep '^torch==' constraints.txt)
 WORKERS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
-.PHONY: help demo test hil night compiled lint coverage mutation mutation-changed package bench docs clean
+.PHONY: help demo test pytest hil night compiled lint coverage mutation mutation-changed package bench docs clean
 
 help:
 	@sed -n '/^$$/q; s/^# //p' Makefile
@@ -56,7 +56,11 @@ lint: $(VENV)/.dev
 PYTEST := $(BIN)/python -m pytest
 PARALLEL := --numprocesses=$(WORKERS) --dist=worksteal --ignore=tests/hil
 
-test: lint
+# mypy takes one processor for a minute: the tests begin beside it.
+test: $(VENV)/.dev
+	$(MAKE) --jobs=2 --no-print-directory lint pytest
+
+pytest: $(VENV)/.dev
 	$(PYTEST) $(PARALLEL) -m 'not slow'
 
 # The plays in one worker, since one kernel plays them all; emb-hil itself in the other.

@@ -39,7 +39,7 @@ def test_the_laws_of_parts_have_their_lemmas(key: str) -> None:
     assert refused(key) == ""
 
 
-@pytest.mark.parametrize("key", ["M1a", "M1b", "M2", "M3a", "M3b", "M3c"])
+@pytest.mark.parametrize("key", ["M1a", "M1b", "M2", "M3a", "M3b", pytest.param("M3c", marks=pytest.mark.slow)])
 def test_so_have_those_of_a_bench_that_declares_a_model_error(key: str) -> None:
     assert refused(key, declared(model_error=700.0)) == ""
 
