@@ -233,7 +233,6 @@ def estimate(
     starts: int = STARTS,
     seed: int = 0,
     profile: bool = False,
-    bootstrap: int = 0,
     hold_out: Source | Sequence[Source] = (),
     last: str | Path | None = None,
     bench: str | Path | None = None,
@@ -254,9 +253,8 @@ def estimate(
         bounds: where to search, as k_m=0.01:0.1 (default: nominal/10 to nominal*10).
         window: length of the windows [s], with method windows (default: what the map says, or 0.5).
         starts: local searches (default: 8).
-        seed: of where they begin, and of draws (default: 0).
+        seed: of where they begin (default: 0).
         profile: likelihood profiles of all parameters (default: of those that are identified badly).
-        bootstrap: draw the logs so many times again, from 3 logs (default: 0).
         hold_out: log that is predicted, not estimated from; may be given more than once.
         last: JSON of an earlier estimate or report, to say what has changed since.
         bench: bench file (default: the one in the first log).
@@ -282,7 +280,12 @@ def estimate(
 
 
 def report(
-    runs: Source | Sequence[Source], output: str | Path, *, acceptance: str | Path | None = None, **options: Any
+    runs: Source | Sequence[Source],
+    output: str | Path,
+    *,
+    acceptance: str | Path | None = None,
+    junit: str | Path | None = None,
+    **options: Any,
 ) -> Content:
     """One page about runs of one brake, to hand over, and a JSON file beside it; both are replaced if they exist.
 
@@ -291,6 +294,7 @@ def report(
         output: page to write, .html or .htm.
         acceptance: TOML file with an [acceptance] table: tolerances, drift, budgets; each is passed, failed, or not
             decided.
+        junit: XML file to write with the results of the acceptance criteria as test cases.
         options: of :func:`estimate`; ``profile`` is on.
 
     Returns:
@@ -308,18 +312,20 @@ def report(
     given = bound.arguments
     files = [*_listed(runs), *_listed(given["hold_out"]), given["last"], acceptance]
     _check_page(page, beside, [entry.path if isinstance(entry, RunLog) else Path(entry) for entry in files if entry])
+    require_place("--junit", None if junit is None else Path(junit), (".xml",))
+    if junit is not None and acceptance is None:
+        raise UsageError("--junit: expected it with --acceptance")
     options_of = _study_options(given)
     try:
         import matplotlib  # noqa: F401
     except ImportError as err:
         raise UsageError("a report needs matplotlib: pip install 'emb-excite[bench]'") from err
-    from emb_bench.analysis.acceptance import read_criteria
+    from emb_bench.analysis import acceptance as test
     from emb_bench.report.content import gather
-    from emb_bench.report.document import document
-    from emb_bench.report.page import report_page
+    from emb_bench.report.page import document, report_page
 
     before = _last(given["last"])
-    criteria = None if acceptance is None else read_criteria(Path(acceptance))
+    criteria = None if acceptance is None else test.read_criteria(Path(acceptance))
     say_if_compiling()
     with replacing(page) as new_page, replacing(beside) as new_numbers:
         logs, left_out = _usable(_listed(runs))
@@ -331,6 +337,9 @@ def report(
         content = gather(its, logs, left_out, options_of(its), made_by, held_out=unseen, last=before, criteria=criteria)
         new_numbers.write_text(as_json(document(content)) + "\n", encoding="utf-8")
         new_page.write_text(report_page(content), encoding="utf-8")
+        if junit is not None and content.acceptance is not None:
+            with replacing(Path(junit)) as new_cases:
+                new_cases.write_text(test.junit(content.acceptance), encoding="utf-8")
     return content
 
 
@@ -507,7 +516,7 @@ def _study_options(given: Mapping[str, Any]) -> Callable[[Bench], StudyOptions]:
     Raises:
         UsageError: an option is wrong, or scipy and numba are missing.
     """
-    _check({f"--{name}": (given[name], least) for name, least in (("starts", 1), ("seed", 0), ("bootstrap", 0))})
+    _check({f"--{name}": (given[name], least) for name, least in (("starts", 1), ("seed", 0))})
     if not (given["window"] == 0.0 or 1e-3 <= given["window"] <= 3600.0):
         raise UsageError(f"--window: expected a time from 0.001 to 3600 s, got {given['window']:g}")
     from emb_bench.estimate.records import EstimationProblem
@@ -530,7 +539,6 @@ def _study_options(given: Mapping[str, Any]) -> Callable[[Bench], StudyOptions]:
             given["starts"],
             given["seed"],
             given["profile"],
-            given["bootstrap"],
             given["grow"],
             given["systematic"] == "bench",
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,7 +34,6 @@ _SVG: Any = {
     "figure.facecolor": "none",
     "axes.facecolor": "none",
 }
-_SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def require_place(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
@@ -110,20 +108,6 @@ def svg(draw: Callable[[Any], None], rows: int, columns: int, size: tuple[float,
         canvas: Any = FigureCanvasSVG(figure)
         canvas.print_svg(file, metadata={"Date": None, "Creator": None})
     return file.getvalue()
-
-
-def log_scale(axis: Any) -> None:
-    """A logarithmic scale for an axis (``axes.xaxis`` or ``axes.yaxis``), marked at powers of ten in plain text.
-
-    matplotlib's own marks are mathematical text and, with those between the powers, three quarters of a figure's time.
-    """
-    from matplotlib.ticker import FuncFormatter
-
-    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
-    axis.set_major_formatter(
-        FuncFormatter(lambda value, _: f"10{str(round(math.log10(value))).translate(_SUPERSCRIPTS)}")
-    )
-    axis.minorticks_off()
 
 
 @contextmanager

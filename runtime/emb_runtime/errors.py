@@ -15,6 +15,7 @@ EXIT_POLICY_REFUSED = 5
 EXIT_LOG = 6  # Exit code of a log that cannot be read, or was not written to its end
 EXIT_CANNOT_TELL = 7  # Exit code of a check that what is known neither passes nor fails
 EXIT_UNEXPLAINED = 8  # Exit code of a run whose measurements no one brake explains
+EXIT_OUTSIDE = 9  # Exit code with --strict of a brake outside of the ranges for which the limits are guaranteed
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell has it
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emb_bench.batch.find import find
+from emb_bench.batch.campaign import find
 from emb_bench.logs.log import read_log
 from emb_bench.rerun import rerun
 from emb_runtime.can.messages import Layout

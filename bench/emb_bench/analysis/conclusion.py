@@ -1,4 +1,4 @@
-"""Conclusion on each parameter: value, interval, identified or not, and the run that would help.
+"""Conclusion on each parameter: value, interval, identified or not.
 
 **What counts as identified**, here and in every command that estimates: the Fisher information identifies it
 (:mod:`emb_bench.information.criteria`), and its 95 % interval is closed, does not contain zero and does not come from
@@ -18,11 +18,12 @@ import numpy as np
 
 from emb_bench.analysis.drift import Drift
 from emb_bench.analysis.profile import Profile
-from emb_bench.analysis.recommendation import HELPS, PRECISE, Recommendation
+from emb_bench.analysis.recommendation import PRECISE
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.intervals import interval as with_profile
 from emb_bench.estimate.records import NORMAL_95, Estimate, Unknown
 from emb_bench.information.identifiability import GROSS, Finding, Spectrum
+from emb_runtime.config.bench import PARAMETER_NAMES
 
 
 class Standing(StrEnum):
@@ -32,14 +33,6 @@ class Standing(StrEnum):
     BIASED = "identified, but biased"
     IF_MODEL_RIGHT = "identified if the model is right"
     NOT_IDENTIFIED = "NOT identified"
-
-
-class Help(StrEnum):
-    """Further run for a parameter: not needed, one that identifies it better, or none that does."""
-
-    NOT_NEEDED = "not needed"
-    ONE_RUN = "one run"
-    NONE = "none"
 
 
 @dataclass(frozen=True)
@@ -58,10 +51,9 @@ class Conclusion:
     why_not: str  # Reason that it is not identified; empty if it is
     arbitrary: bool  # True if the records fit any value as well as this one
     traded_with: tuple[str, ...]  # Parameters whose errors make up for an error of this one
-    help: Help
-    run: str = ""  # With ``Help.ONE_RUN``: the excitation
-    deviation_after: float = math.inf  # Standard deviation after that run, relative or in the parameter's unit
     drift: Drift | None = None
+    outside: tuple[float, float] | None = None
+    """Range, in ``unit``, for which the shield guarantees the limits, if the whole interval lies outside of it."""
 
     @property
     def identified(self) -> bool:
@@ -71,14 +63,13 @@ class Conclusion:
     @property
     def notable(self) -> bool:
         """Returns True if there is more to say than the value, its interval, and that it is identified."""
-        wanted = self.help is not Help.NOT_NEEDED or bool(self.why_not or self.traded_with)
-        return wanted or self.arbitrary or (self.drift is not None and self.drift.drifted)
+        drifted = self.drift is not None and self.drift.drifted
+        return bool(self.why_not or self.traded_with) or self.arbitrary or drifted
 
 
 def conclude(
     e: Estimate,
     profiles: Sequence[Profile],
-    advice: Sequence[Recommendation],
     drifts: Sequence[Drift],
     *,
     predicts: bool = True,
@@ -88,7 +79,6 @@ def conclude(
     Args:
         e: the estimate.
         profiles: at least those that :func:`emb_bench.analysis.profile.profiles` selects.
-        advice: recommended runs, best first.
         drifts: changes since an earlier estimate.
         predicts: True if the estimate predicts what it was not fitted to.
     """
@@ -112,7 +102,6 @@ def conclude(
         why_not = "; ".join(_doubts(e, unknown, label, deviation, interval, finding, one))
         weak = finding is not None and deviation > PRECISE * GROSS.get(unknown.name, 1.0)
         of_interest = unknown.name in e.asked.params
-        kind, run, after = _help(e, label, advice, not why_not) if of_interest else (Help.NOT_NEEDED, "", math.inf)
         found.append(
             Conclusion(
                 label=label,
@@ -125,13 +114,20 @@ def conclude(
                 why_not=why_not,
                 arbitrary=not math.isfinite(deviation),
                 traded_with=tuple(finding.traded_with) if finding is not None and weak else (),
-                help=kind,
-                run=run,
-                deviation_after=after,
                 drift=changes.get(label),
+                outside=_range_left(e, unknown, interval),
             )
         )
     return tuple(found)
+
+
+def _range_left(e: Estimate, unknown: Unknown, interval: tuple[float, float]) -> tuple[float, float] | None:
+    """Range of a parameter in the shield's set, SI units; None if some of the interval lies in it."""
+    if e.bench.machine is not None or unknown.name not in PARAMETER_NAMES:
+        return None
+    ranges = e.bench.range_set(e.bench.shield.ranges)
+    low, high = (float(getattr(end, unknown.name)) for end in (ranges.low, ranges.high))
+    return (low, high) if interval[1] < low or interval[0] > high else None
 
 
 def noise_deviations(e: Estimate) -> Floats:
@@ -171,12 +167,3 @@ def _doubts(
     if not said and unknown.relative and interval[0] <= 0.0 <= interval[1]:
         said.append("its interval contains zero")
     return said
-
-
-def _help(e: Estimate, label: str, advice: Sequence[Recommendation], identified: bool) -> tuple[Help, str, float]:
-    """The first recommended run that improves this parameter: its excitation and the deviation after it."""
-    for one in advice:
-        before, after = one.before.get(label, 0.0), one.after.get(label, math.inf)
-        if after <= HELPS * before and not math.isinf(after):
-            return Help.ONE_RUN, one.excitation, after
-    return (Help.NOT_NEEDED if identified or e.method == "rls" else Help.NONE), "", math.inf

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.analysis.apart import Differing, apart
-from emb_bench.analysis.bootstrap import Bootstrap, bootstrap
 from emb_bench.analysis.conclusion import Conclusion, conclude
 from emb_bench.analysis.drift import Drift, Earlier, drifts
 from emb_bench.analysis.held_out import HeldOut, leave_one_out
@@ -22,6 +20,7 @@ from emb_bench.analysis.model_choice import ModelChoice, choose_model, fit_from
 from emb_bench.analysis.model_growth import ModelGrowth, grow_model, grow_with_errors
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.recommendation import Recommendation, advise
+from emb_bench.analysis.several_runs import Differing, apart
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY, Plant
 from emb_bench.estimate.intervals import union
@@ -45,6 +44,7 @@ from emb_bench.logs.log import RunLog
 from emb_bench.numbers import amount
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
+from emb_runtime.safety.state_machine import FAULTS, Fault
 
 SHOWN = 3  # Most suspected effects that are named
 
@@ -59,6 +59,24 @@ class ModelStanding(StrEnum):
 
 
 @dataclass(frozen=True)
+class Stop:
+    """End of a run for another reason than completion."""
+
+    log: str  # Name of the log
+    reason: str
+    detail: str
+    periods: int  # Of the experiment that are in the log
+    planned: int
+    cause: str  # What the reason means; empty if it is no fault of a run
+    advice: str
+
+    @property
+    def aborted(self) -> bool:
+        """Returns True if the experiment itself was cut short."""
+        return self.periods < self.planned
+
+
+@dataclass(frozen=True)
 class StudyOptions:
     """Method and extent of a study."""
 
@@ -68,10 +86,9 @@ class StudyOptions:
     """Name of a plant of the bench, or ``all`` for the one that explains the logs best; without, the one that was
     simulated, or the exact one where logs name none."""
     starts: int = STARTS
-    seed: int = 0  # Seed of the starting points of searches, and of the bootstrap
+    seed: int = 0  # Seed of the starting points of searches
     profiles: bool = False
     """True for profiles of all shared unknowns, False for only those whose verdict may depend on one."""
-    draws: int = 0  # Draws of the bootstrap over runs; no bootstrap if 0
     grow: bool = False  # True to add the features that the logs ask for to the model
     systematic: bool = True  # True to estimate the bench's systematic errors along
 
@@ -94,14 +111,13 @@ class Study:
     """Parameters of the simulated brake, if known and the same in all logs of the estimate."""
     profiles: tuple[Profile, ...]
     """Profiles of the unknowns that the records share: all, or those whose verdict may depend on one."""
-    bootstrap: Bootstrap | None
     held_out: tuple[HeldOut, ...]  # Predictions of the logs held out
     left_out: tuple[HeldOut, ...]  # Prediction of each record from the others; empty for a single record
     advice: tuple[Recommendation, ...]
     """Recommended runs, best first; empty if all parameters are identified well, or no run would help."""
     drifts: tuple[Drift, ...]
     conclusions: tuple[Conclusion, ...]
-    stopped: tuple[str, ...]  # Reasons for which runs ended before their time; empty if none did
+    stopped: tuple[Stop, ...]  # Ends of the runs that were stopped
     choice: ModelChoice | None = None  # Models that were compared; None if one was given
     growth: ModelGrowth | None = None  # The path to the model; None if it was not grown
     apart: tuple[Differing, ...] = ()  # Parameters in which logs differ that each fit alone; empty if they fit together
@@ -177,6 +193,16 @@ class Study:
         return ModelStanding.FITS if self.predicts else ModelStanding.DOES_NOT_PREDICT
 
     @property
+    def aborted(self) -> bool:
+        """Returns True if no experiment came to its planned end: a cause is to be found before any value is used."""
+        return len(self.stopped) == len(self.logs) and all(stop.aborted for stop in self.stopped)
+
+    @property
+    def outside(self) -> tuple[Conclusion, ...]:
+        """Parameters outside of the ranges for which the shield guarantees the limits."""
+        return tuple(c for c in self.conclusions if c.outside is not None)
+
+    @property
     def unidentified(self) -> tuple[str, ...]:
         """Parameters of interest that are not identified."""
         return tuple(c.label for c in self.conclusions if c.of_interest and not c.identified)
@@ -233,10 +259,13 @@ def make_study(
     experiments: list[Experiment] = []
     warnings: list[str] = []
     notes: list[str] = []
+    stops: list[Stop] = []
     for log, shown in zip(all_logs, names, strict=True):
         experiment, said = _read(log, bench, shown)
         said += [] if method_of(wanted.method).gaps else _hidden(experiment)
         experiments.append(experiment)
+        stop = stop_of(log, experiment, shown)
+        stops += [stop] if stop is not None and log in logs else []
         of_which = f"{shown}: " if len(all_logs) > 1 else ""
         warnings += [of_which + warning for warning in said]
         notes += [of_which + note for note in experiment.notes]
@@ -282,17 +311,16 @@ def make_study(
         model_reason=why,
         truth=_truth(logs),
         profiles=found,
-        bootstrap=bootstrap(e, draws=wanted.draws, seed=wanted.seed) if wanted.draws else None,
         held_out=predicted,
         left_out=left_out,
         advice=advice,
         drifts=changes,
         conclusions=covering(
-            conclude(e, found, advice, changes, predicts=_predicts(predicted, left_out)),
+            conclude(e, found, changes, predicts=_predicts(predicted, left_out)),
             [e.unknowns[i] for i in e.wanted()],
             choice,
         ),
-        stopped=tuple(dict.fromkeys(log.exit_reason for log in logs if was_stopped(log))),
+        stopped=tuple(stops),
         choice=choice,
         growth=growth,
         apart=apart(e) if wanted.method == "oem" else (),
@@ -363,9 +391,17 @@ def file_names(paths: Sequence[Path]) -> list[str]:
     return [path.name if counts[path.name] == 1 else str(path) for path in paths]
 
 
-def was_stopped(log: RunLog) -> bool:
-    """Returns True if the log has a reason for the end of the run other than completion."""
-    return log.end.get("exit_reason", DONE) != DONE
+def stop_of(log: RunLog, experiment: Experiment | None, name: str) -> Stop | None:
+    """End of a run that was stopped; None if the log has no other reason for its end than completion."""
+    if log.end.get("exit_reason", DONE) == DONE:
+        return None
+    reason, (periods, planned) = (
+        log.exit_reason,
+        (0, 0) if experiment is None else (experiment.periods, experiment.planned),
+    )
+    fault = FAULTS[Fault[reason]] if reason in Fault.__members__ else None
+    about = ("", "") if fault is None else (fault.cause, fault.advice)
+    return Stop(name, reason, log.end.get("detail", ""), periods, planned, *about)
 
 
 def _read(log: RunLog, bench: Bench, name: str) -> tuple[Experiment, list[str]]:
@@ -373,9 +409,7 @@ def _read(log: RunLog, bench: Bench, name: str) -> tuple[Experiment, list[str]]:
     experiment = read_experiment(log, bench, name)
     said = [log.missing] if log.missing else []
     missing = experiment.missing
-    if was_stopped(log):
-        why = ": ".join(part for part in (log.exit_reason, log.end.get("detail")) if part)
-        said.append(f"the run was stopped ({why}) after {experiment.periods} of {experiment.planned} samples")
+    if log.end.get("exit_reason", DONE) != DONE:  # which is reported as the run's end
         missing = tuple(line for line in missing if not line.startswith("the experiment ends after"))
     return experiment, [*said, *missing]
 

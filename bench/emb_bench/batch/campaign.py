@@ -1,24 +1,39 @@
-"""A campaign: many logs, each evaluated on its own, a file of rows, a summary, and a figure."""
+"""A campaign: many logs, each evaluated on its own, a file of rows, a summary, and a figure.
+
+Logs are shared out to processes or to Ray: one that dies, or takes too long, costs its own log and no other.
+"""
 
 from __future__ import annotations
 
+import faulthandler
+import os
+import signal
 import sys
 import time
-from collections.abc import Generator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
+from datetime import UTC, datetime
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePath
 
-from emb_bench.batch.distribute import in_processes, on_ray
 from emb_bench.batch.evaluate import evaluate_one
-from emb_bench.batch.find import find
 from emb_bench.batch.row import ENDINGS as ROWS
-from emb_bench.batch.row import Options, Row, write_rows
+from emb_bench.batch.row import Options, Row, Source, failed, write_rows
 from emb_bench.batch.summary import Campaign, mark_copies, summarise
-from emb_bench.figures import ENDINGS, require_place
+from emb_bench.estimate.records import NORMAL_95
+from emb_bench.figures import COLOURS, ENDINGS, drawn, require_place
 from emb_bench.output import Progress, replacing, say_if_compiling
+from emb_bench.parallel import Lost, shared_out, shared_out_on_ray
 from emb_runtime.errors import UsageError
+from emb_runtime.records import HOMING_LOG, LISTEN_ONLY_LOG
 from emb_runtime.system.realtime import processors
+
+SUFFIX = ".mcap"
+PASSED_OVER = (HOMING_LOG + SUFFIX, LISTEN_ONLY_LOG + SUFFIX)  # Logs of emb-run that hold no experiment
+OUT_OF_TIME = -signal.SIGALRM if hasattr(signal, "SIGALRM") else 1
+"""Exit code of a process whose time for a log is up: that signal ends it, or what Windows has instead."""
+WIDTH, HEIGHT = 8.0, 2.2  # Of one parameter [inch]
+Evaluate = Callable[[Source], Row]  # A function that another process can import; a ``functools.partial`` of one as well
 
 
 def run_campaign(
@@ -64,8 +79,6 @@ def run_campaign(
         write_rows(beside, output.suffix, rows, options)
     found = summarise(rows, options, str(output))
     if plot is not None:
-        from emb_bench.batch.figure import draw
-
         draw(found, plot)
     return found
 
@@ -81,3 +94,160 @@ def _in_order(count: int, numbered: Generator[tuple[int, Row], None, None]) -> l
     finally:
         progress.end()
     return [rows[number] for number in range(count)]
+
+
+def find(paths: Sequence[Path]) -> list[Source]:
+    """The logs in files and folders, sorted; one that is reached twice is taken once.
+
+    A folder that cannot be listed, and what is called ``*.mcap`` and is no file, are in the list with their trouble.
+
+    Args:
+        paths: a file is a log whatever its name; a folder is searched for ``*.mcap``, with the folders in it, and
+            ways home and mere listening are passed over.
+
+    Raises:
+        UsageError: a path does not exist, or there is no log in all of them.
+    """
+    found: list[Source] = []
+    for path in sorted(set(paths), key=str):
+        if path.is_dir():
+            found += _inside(path)
+        elif os.path.lexists(path):
+            found.append(_source(path.parent, path, ""))
+        else:
+            raise UsageError(f"{path}: expected a log or a folder with logs, and there is none")
+    seen: set[str] = set()
+    logs = []
+    for source in sorted(found, key=lambda s: (s.root, s.log)):
+        real = os.path.realpath(source.path)
+        if real not in seen:
+            logs.append(source)
+        seen.add(real)
+    if not logs:
+        raise UsageError(f"no *{SUFFIX} in {', '.join(map(str, paths))}")
+    return logs
+
+
+def _inside(root: Path) -> Iterator[Source]:
+    """Follow links to folders as well, each folder once, so that a loop of them ends."""
+    visited: set[str] = set()
+    unlisted: list[OSError] = []
+    for folder, folders, files in os.walk(root, onerror=unlisted.append, followlinks=True):
+        real = os.path.realpath(folder)
+        if real in visited:
+            folders.clear()
+            continue
+        visited.add(real)
+        folders.sort()
+        for name in files:
+            if name.lower().endswith(SUFFIX) and not name.lower().endswith(PASSED_OVER):
+                yield _source(root, Path(folder, name), "")
+    for err in unlisted:
+        yield _source(root, Path(err.filename), f"the folder cannot be listed: {err.strerror}")
+
+
+def _source(root: Path, path: Path, trouble: str) -> Source:
+    relative = PurePath(os.path.relpath(path, root))
+    if not trouble and path.exists() and not path.is_file():
+        trouble = "expected a file, and it is none"  # opening a pipe would wait for ever
+    return Source(str(path), str(root), relative.as_posix(), relative.parent.as_posix(), trouble)
+
+
+def in_processes(
+    evaluate: Evaluate, sources: Sequence[Source], jobs: int, time_limit: float
+) -> Generator[tuple[int, Row], None, None]:
+    """Evaluates logs in processes of this machine.
+
+    Args:
+        evaluate: makes a row of a log.
+        sources: the logs.
+        jobs: processes at a time.
+        time_limit: longest time for one log [s].
+
+    Yields:
+        Each log's number and row, as they come.
+    """
+    with closing(shared_out(partial(_in_time, evaluate, time_limit), sources, jobs)) as rows:
+        for number, row in rows:
+            yield number, _failed(sources[number], row, time_limit) if isinstance(row, Lost) else row
+
+
+def on_ray(
+    evaluate: Evaluate, sources: Sequence[Source], jobs: int | None, time_limit: float, address: str
+) -> Generator[tuple[int, Row], None, None]:
+    """Evaluates logs on Ray, one task for each; each is opened where its task runs, under the same path.
+
+    Args:
+        evaluate: makes a row of a log.
+        sources: the logs.
+        jobs: tasks at a time; None is one for each processor.
+        time_limit: longest time for one log [s].
+        address: of a cluster's head, or ``LOCAL``.
+
+    Yields:
+        Each log's number and row, as they come.
+
+    Raises:
+        UsageError: Ray is not installed, does not start, or is not at this address.
+    """
+    in_time = partial(_in_time, evaluate, time_limit)
+    for number, row in shared_out_on_ray(in_time, sources, jobs, address, "emb-replay campaign"):
+        if isinstance(row, Lost):
+            why = f"it {row.how}: out of memory, a fault, or longer than {time_limit:g} s"
+            row = failed(sources[number], f"{sources[number].path}: the process that evaluated it ended ({why})")
+        yield number, row
+
+
+def _in_time(evaluate: Evaluate, time_limit: float, source: Source) -> Row:
+    with limited_to(time_limit):
+        return evaluate(source)
+
+
+def _failed(source: Source, lost: Lost, time_limit: float) -> Row:
+    if lost.exit_code == OUT_OF_TIME and lost.seconds >= time_limit:
+        return failed(source, f"{source.path}: not evaluated within {time_limit:g} s")
+    return failed(source, f"{source.path}: the process that evaluated it {lost.how}")
+
+
+@contextmanager
+def limited_to(seconds: float) -> Iterator[None]:
+    """End this process with ``OUT_OF_TIME`` if what is inside takes longer; compiled code ends as well."""
+    if not hasattr(signal, "setitimer"):
+        with Path(os.devnull).open("w") as nowhere:
+            faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
+            try:
+                yield
+            finally:
+                faulthandler.cancel_dump_traceback_later()
+        return
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+def draw(c: Campaign, path: Path) -> None:
+    """Draws the parameters that have a trend, each with the 95 % intervals of the runs and of the trend.
+
+    Raises:
+        UsageError: matplotlib is missing, or the file cannot be written.
+    """
+    shown = {name: p for name, p in c.parameters.items() if p.trend is not None}
+    title = "Parameters over the campaign, ± 95 %" if shown else "No parameter has enough runs for a trend"
+    rows = max(len(shown), 1)
+    with drawn(path, rows, 1, title, (WIDTH, HEIGHT * rows), sharex=True) as axes:
+        for (name, p), axis in zip(shown.items(), axes[:, 0], strict=False):
+            if p.trend is not None:
+                times = [datetime.fromtimestamp(start * 1e-9, UTC) for start in p.trend.start_times]
+                half = [NORMAL_95 * deviation for deviation in p.trend.deviations]
+                low, high = p.trend.walk.ends.T
+                axis.fill_between(times, low, high, color=COLOURS[1], alpha=0.25, linewidth=0.0)
+                axis.plot(times, p.trend.walk.values, color=COLOURS[1], label="random walk through all runs")
+                alone = {"fmt": "o", "color": COLOURS[0], "capsize": 2.5, "markersize": 3.5, "linewidth": 1.0}
+                axis.errorbar(times, p.trend.values, half, label="each run alone", **alone)
+                axis.set_ylabel(f"{name} [{p.unit}]")
+        axes[-1, 0].set_xlabel("time [UTC]")
+        if shown:
+            axes[0, 0].legend(ncols=2)
+        axes[-1, 0].tick_params(axis="x", labelrotation=20.0)

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import faulthandler
 import hashlib
 import math
-import os
-import signal
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,8 +25,6 @@ from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.input_file import open_regular
 
 FIRST = 50  # Samples whose noise distinguishes a run from any other
-OUT_OF_TIME = -signal.SIGALRM if hasattr(signal, "SIGALRM") else 1
-"""Exit code of a process whose time for a log is up: that signal ends it, or what Windows has instead."""
 
 
 def evaluate_one(source: Source, options: Options) -> Row:
@@ -44,24 +38,6 @@ def evaluate_one(source: Source, options: Options) -> Row:
     except Exception as err:  # no log may cost the others theirs, and a fault of ours is reported like one of the log
         return replace(row, error=one_line(f"{source.path}: {type(err).__name__}: {err}"))
     return replace(row, error=None)
-
-
-@contextmanager
-def limited_to(seconds: float) -> Iterator[None]:
-    """End this process with ``OUT_OF_TIME`` if what is inside takes longer; compiled code ends as well."""
-    if not hasattr(signal, "setitimer"):
-        with Path(os.devnull).open("w") as nowhere:
-            faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
-            try:
-                yield
-            finally:
-                faulthandler.cancel_dump_traceback_later()
-        return
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
@@ -175,7 +151,7 @@ def _of_the_estimate(e: Estimate, evaluation: Evaluation, truth: BrakeParameters
     bounds = evaluation.fisher("physical").cramer_rao()
     parameters = []
     deviations = [(float(e.deviations()[i]), float(e.between_runs()[i])) for i in e.wanted()]
-    conclusions = conclude(e, profiles(e, of_all=False), (), ())
+    conclusions = conclude(e, profiles(e, of_all=False), ())
     for i, said, (deviation, between) in zip(e.wanted(), conclusions, deviations, strict=True):
         name, factor = e.unknowns[i].name, e.shown[i].factor  # the columns of all rows are in SI units
         value, low, high, noise = (shown / factor for shown in (said.value, *said.interval, said.repeatability))
@@ -190,6 +166,7 @@ def _of_the_estimate(e: Estimate, evaluation: Evaluation, truth: BrakeParameters
         "chi2_per_freedom": e.validation.ratio,
         "alarms": e.validation.alarms,
         "caveats": e.caveats,
+        "outside": tuple(said.label for said in conclusions if said.outside is not None),
         "parameters": tuple(parameters),
     }
 

@@ -132,6 +132,7 @@ class Row:
     chi2_per_freedom: float | None = column("chi2/n of the residuals at the estimate", "1")
     alarms: tuple[str, ...] | None = column("why the model does not explain the record")
     caveats: tuple[str, ...] | None = column("what to know about the method on this record")
+    outside: tuple[str, ...] | None = column("parameters outside of the ranges for which the limits are guaranteed")
     parameters: tuple[Parameter, ...] = ()  # In the order of the question; one column for each field of each
 
 

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.analysis.constancy import Constancy, constancy
-from emb_bench.analysis.random_walk import RandomWalk, random_walk
+from emb_bench.analysis.several_runs import Constancy, RandomWalk, constancy, random_walk
 from emb_bench.batch.row import NONE, Options, Parameter, Row, is_relative, unit_of
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE, NORMAL_95
@@ -85,6 +84,7 @@ class Campaign:
     stopped: tuple[Row, ...]
     incomplete: int
     misfit: tuple[Row, ...]  # Logs that the model does not fit
+    outside: tuple[Row, ...]  # Logs of brakes for which the limits were not guaranteed
     violating: int
     start_time: tuple[int, int] | None  # Of the first and of the last run [ns]; None if none has a date
     method: str
@@ -113,6 +113,7 @@ def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
         stopped=tuple(row for row in counted if row.exit_reason not in (None, DONE)),
         incomplete=sum(not row.complete for row in good),
         misfit=tuple(row for row in good if not _fits(row)),
+        outside=tuple(row for row in counted if row.outside),
         violating=sum(bool(row.violations) for row in good),
         start_time=(min(starts), max(starts)) if starts else None,
         method=options.method,
@@ -124,9 +125,9 @@ def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
 
 def document(c: Campaign) -> dict[str, Any]:
     """The summary as plain data; of single logs the names, and what is said of them."""
-    found: dict[str, Any] = to_json(replace(c, failed=(), copies=(), stopped=(), misfit=()))
-    told = ("root", "log", "error", "copy_of", "exit_reason", "model")
-    for name in ("failed", "copies", "stopped", "misfit"):
+    found: dict[str, Any] = to_json(replace(c, failed=(), copies=(), stopped=(), misfit=(), outside=()))
+    told = ("root", "log", "error", "copy_of", "exit_reason", "model", "outside")
+    for name in ("failed", "copies", "stopped", "misfit", "outside"):
         found[name] = [{key: getattr(row, key) for key in told} for row in getattr(c, name)]
     return found
 
@@ -241,10 +242,12 @@ def text(c: Campaign, *, verbose: bool = False) -> str:
         f"{c.result}: {c.evaluated} of {c.logs} logs evaluated, {c.incomplete} incomplete, {c.violating} beyond a "
         f"limit of the bench, {len(c.misfit)} not explained by the model ({', '.join(c.models)})"
     )
+    outside = ((row.log, ", ".join(row.outside or ())) for row in c.outside[:SHOWN])
+    lines += listed("OUTSIDE: ", (f"{log}: {names}: the limits were not guaranteed" for log, names in outside))
     lines += ["", *parameter_table(c).lines()]
     if c.method != NONE:
-        lines += wrapped("Medians of all runs; mean: weighted by information. " + INTERVALS, 0)
-    lines += ["", *listed("", filter(None, (_agreement(name, p) for name, p in c.parameters.items())))]
+        lines += wrapped("Medians of all runs. " + INTERVALS, 0)
+    lines += ["", *listed("", _agreement(c))]
     lines += [*listed("NOTE: ", _notes(c)), *_more(c.misfit, "fits")]
     return "\n".join([*lines, *(_trends(c) if verbose else ()), *(_means(c) if verbose else ())]).rstrip()
 
@@ -254,28 +257,22 @@ def _more(rows: Sequence[Row], column: str) -> list[str]:
     return [f"  and {left} more: column '{column}' of the result"] if left > 0 else []
 
 
-def _agreement(name: str, p: ParameterSummary) -> str:
-    """Agreement of the runs on a parameter; empty for a single run, and without estimates."""
-    if p.estimate is None:
-        return ""
-    found = p.estimate.constancy
-    if found.runs < 2:
-        return ""
-    if found.constant:
-        return f"{name}: the runs agree ({p_value(found.p_value)})"
-    return (
-        f"{name}: the runs do NOT agree ({p_value(found.p_value)}): they scatter {found.scatter:.3g} times as much as "
-        "their uncertainties allow"
-    )
+def _agreement(c: Campaign) -> Iterator[str]:
+    """Agreement of the runs on each parameter that several identify."""
+    tests = {name: p.estimate.constancy for name, p in c.parameters.items() if p.estimate is not None}
+    several = {name: test for name, test in tests.items() if test.runs > 1}
+    if agreed := [f"{name} ({p_value(test.p_value)})" for name, test in several.items() if test.constant]:
+        yield f"the runs agree on {', '.join(agreed)}"
+    for name, test in several.items():
+        if not test.constant:
+            yield f"{name}: the runs do NOT agree ({p_value(test.p_value)}); scatter {test.scatter:.3g} times as stated"
 
 
 def _notes(c: Campaign) -> Iterator[str]:
     yield from (f"{row.log} is a copy of {row.copy_of}: the run counts once" for row in c.copies)
     unused = "" if c.method == NONE else ", and it is not in the means"
     yield from (f"{row.log}: the model '{row.model}' does not fit{unused}" for row in c.misfit[:SHOWN])
-    yield from (
-        f"{row.log} was stopped ({row.exit_reason}); it counts where it identifies a parameter" for row in c.stopped
-    )
+    yield from (f"{row.log} was stopped ({row.exit_reason}) and counts where it identifies" for row in c.stopped)
     if len(c.models) > 1:
         yield "the runs are of different models: use --model, or name the logs of one"
 

@@ -21,7 +21,15 @@ from emb_runtime.errors import UsageError
 from emb_runtime.system.terminal import as_json
 
 Function = Callable[..., Any]
-METAVARS = {"bench": "FILE", "last": "FILE", "acceptance": "FILE", "plot": "FILE", "output": "FILE", "ray": "ADDRESS"}
+METAVARS = {
+    "bench": "FILE",
+    "last": "FILE",
+    "acceptance": "FILE",
+    "plot": "FILE",
+    "output": "FILE",
+    "junit": "FILE",
+    "ray": "ADDRESS",
+}
 """Words of ``--help`` for the values of options; without, those of the type."""
 LISTS = ("runs", "paths", "hold_out")  # Arguments that may be given several times
 
@@ -134,7 +142,7 @@ def _verdict(text: str) -> str:
     for line in text.splitlines():
         if line.startswith("    ") and lines:
             lines[-1] += f" {line.strip()}"
-        elif lines and not lines[-1].startswith(("WARNING", "NOTE")):
+        elif lines and not lines[-1].startswith(("WARNING", "NOTE", "OUTSIDE")):
             break
         else:
             lines.append(line)

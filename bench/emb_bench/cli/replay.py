@@ -26,6 +26,7 @@ from emb_runtime.errors import (
     EXIT_CHECK_FAILED,
     EXIT_DONE,
     EXIT_LOG,
+    EXIT_OUTSIDE,
     EXIT_USAGE,
     EmbError,
     LogError,
@@ -33,6 +34,7 @@ from emb_runtime.errors import (
 from emb_runtime.system.terminal import complain
 
 if TYPE_CHECKING:
+    from emb_bench.analysis.study import Study
     from emb_bench.report.content import Content
 
 METHODS = """\
@@ -66,7 +68,13 @@ def _estimate(args: argparse.Namespace) -> int:
     from emb_bench.report.estimate import document, text
 
     answer(args, lambda: document(study), lambda verbose: text(study, verbose=verbose))
-    return EXIT_CHECK_FAILED if args.strict and not (study.holds and study.identified) else EXIT_DONE
+    return _strict(study) if args.strict else EXIT_DONE
+
+
+def _strict(study: Study | None) -> int:
+    if study is None or study.stopped or not (study.holds and study.identified):
+        return EXIT_CHECK_FAILED
+    return EXIT_OUTSIDE if study.outside else EXIT_DONE
 
 
 def _report(args: argparse.Namespace) -> int:
@@ -87,9 +95,7 @@ def _accepted(content: Content, *, strict: bool) -> int:
     if content.acceptance is not None:
         codes = {"pass": EXIT_DONE, "fail": EXIT_CHECK_FAILED, "cannot tell": EXIT_CANNOT_TELL}
         return codes[content.acceptance.result.value]
-    study = content.study
-    good = study is not None and study.holds and study.identified and not content.stopped
-    return EXIT_DONE if good else EXIT_CHECK_FAILED
+    return EXIT_CHECK_FAILED if content.stops else _strict(content.study)
 
 
 def _campaign(args: argparse.Namespace) -> int:
@@ -188,15 +194,17 @@ OF_A_LOG = ANY | {6: "the log is not a log, or too damaged to say anything true 
 
 OF_A_RUN = OF_A_LOG | {2: f"{ANY[2]}, the log of a run that only listened (--read-only)"}
 
-CHECKED = "the model does not fit, does not predict a log, or a parameter is not identified"
+CHECKED = "a run was stopped, the model does not fit, does not predict a log, or a parameter is not identified"
+OUTSIDE = "with --strict: the brake is outside of the ranges for which the limits are guaranteed"
 COMMANDS: Mapping[str, tuple[Command | str, Mapping[int, str]]] = {
     "fim": (
         _command(
             api.fisher_information,
             _fim,
-            "Intervals are half of the 95 % interval by sensor noise alone (the Cramer-Rao bound):\n"
-            "no method can do better from this record. With -v the criteria over time, and the\n"
-            "information as the thesis weights it.\n",
+            "Intervals are the Cramer-Rao bound of sensors that have noise and no systematic error: no\n"
+            "method can do better. emb-replay estimate also estimates the systematic errors of the\n"
+            "bench file, so that its repeatability is larger. With -v the criteria over time, and\n"
+            "the information as the thesis weights it.\n",
         ),
         OF_A_RUN,
     ),
@@ -208,9 +216,10 @@ COMMANDS: Mapping[str, tuple[Command | str, Mapping[int, str]]] = {
             "and the next step. Of several logs, each is also predicted from the others.\n"
             f"{METHODS}\nunknowns for --nuisance, besides the parameters:\n"
             + "".join(f"  {name:17} {row.about}\n" for name, row in PARAMETERS.items() if row.about),
-            strict=f"exit with 1 if {CHECKED}",
+            strict=f"exit with 1 if {CHECKED}; else with {EXIT_OUTSIDE} if the brake is outside of the shield's ranges",
         ),
-        OF_A_RUN | {1: f"with --strict: {CHECKED}", 6: f"{OF_A_LOG[6]}; or too short for the unknowns"},
+        OF_A_RUN
+        | {1: f"with --strict: {CHECKED}", EXIT_OUTSIDE: OUTSIDE, 6: f"{OF_A_LOG[6]}; or too short for the unknowns"},
     ),
     "report": (
         _command(
@@ -220,8 +229,7 @@ COMMANDS: Mapping[str, tuple[Command | str, Mapping[int, str]]] = {
             "the screen and on paper. A log that cannot be used is named and left out; a run without\n"
             f"an experiment is reported without an estimate.\n{UNKNOWNS}",
             strict=f"exit with {EXIT_CHECK_FAILED} if a criterion failed, else {EXIT_CANNOT_TELL} if one is not "
-            f"decided; without --acceptance with {EXIT_CHECK_FAILED} if a run was stopped, the model does not fit or "
-            "predict, or a parameter is not identified",
+            f"decided; without --acceptance as emb-replay estimate does",
         ),
         OF_A_LOG
         | {
@@ -230,6 +238,7 @@ COMMANDS: Mapping[str, tuple[Command | str, Mapping[int, str]]] = {
             "stderr); with --strict: not accepted",
             7: "with --strict: the page is written, and not every criterion can be decided",
             6: "not one log can be used, or one that is held out cannot",
+            EXIT_OUTSIDE: OUTSIDE,
             130: "Ctrl-C: nothing is written",
         },
     ),

@@ -1,4 +1,4 @@
-"""Content of a report, from the logs: the runs, the files left out and the study; and its JSON document."""
+"""Content of a report, from the logs: the runs, the files left out and the study."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from emb_bench.analysis.acceptance import Acceptance, Criteria, Result, RunFacts, judge
 from emb_bench.analysis.drift import Earlier
-from emb_bench.analysis.growth import Growth, growth
-from emb_bench.analysis.study import Study, StudyOptions, begun_with, make_study, was_stopped
+from emb_bench.analysis.model_choice import problem_of
+from emb_bench.analysis.study import Stop, Study, StudyOptions, begun_with, make_study, stop_of
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.prediction import too_few
-from emb_bench.estimate.records import DONE
+from emb_bench.estimate.prediction import Problem, too_few
+from emb_bench.estimate.records import DONE, Estimate
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs import timing
@@ -49,7 +49,8 @@ class Run:
     timing: Timing | None  # None if the log has no control cycles
     residuals: NDArray[np.float64] | None = None
     """In standard deviations, NaN where lost, shape (n, 2); none without an estimate."""
-    growth: Growth | None = None
+    predicted: NDArray[np.float64] | None = None
+    """Angle [rad] and velocity [rad/s] that the model predicts at the estimate, shape (n, 2)."""
     alone: Study | None = None
     """Study of this run by itself, where there are several; None if there is one, or it has no part in the estimate."""
 
@@ -67,14 +68,9 @@ class Run:
             raise LogError(f"{self.log.path}: {err.strerror}") from err
 
     @property
-    def stopped(self) -> bool:
-        """Returns True if the log has a reason for the run's end other than completion."""
-        return was_stopped(self.log)
-
-    @property
-    def why_stopped(self) -> str:
-        """Reason for the run's end, with its detail."""
-        return ": ".join(part for part in (self.log.exit_reason, self.log.end.get("detail", "")) if part)
+    def stop(self) -> Stop | None:
+        """Its end, if the run was stopped."""
+        return stop_of(self.log, self.experiment, self.name)
 
     @property
     def name(self) -> str:
@@ -145,7 +141,7 @@ class Content:
     @property
     def tone(self) -> str:
         """Colour of the verdict: ``good``, ``bad`` or ``care``."""
-        if self.stopped:
+        if self.stops or self.outside:
             return "bad"
         if self.acceptance is not None:
             return {Result.PASS: "good", Result.FAIL: "bad", Result.CANNOT_TELL: "care"}[self.acceptance.result]
@@ -164,9 +160,26 @@ class Content:
         ]
 
     @property
-    def stopped(self) -> list[Run]:
-        """Runs that were stopped, those without an estimate included."""
-        return [run for run in self.runs if run.stopped]
+    def number(self) -> str:
+        """Number of the report: the same logs have the same."""
+        return hashlib.sha256("".join(run.log_sha256 for run in self.runs).encode()).hexdigest()[:10].upper()
+
+    @property
+    def stops(self) -> list[Stop]:
+        """Ends of the runs that were stopped, those without an estimate included."""
+        return [run.stop for run in self.runs if run.stop is not None]
+
+    @property
+    def outside(self) -> list[tuple[str, Study]]:
+        """Studies, of single runs if there are several, of a brake for which the limits were not guaranteed."""
+        alone = [(run.name, run.alone) for run in self.runs if run.alone is not None]
+        studies = alone or ([] if self.study is None else [(self.reported[0].name, self.study)])
+        return [(name, study) for name, study in studies if study.outside]
+
+    @property
+    def shown(self) -> Study | None:
+        """The study, if its values are to be used: not if every experiment was cut short."""
+        return None if self.study is not None and self.study.aborted else self.study
 
 
 def gather(
@@ -199,7 +212,7 @@ def gather(
     experiments = [_experiment(log, bench, wanted) for log in logs]
     used = [log for log, (_, why_not) in zip(logs, experiments, strict=True) if not why_not]
     study = make_study(bench, used, wanted, held_out=held_out, last=last) if used else None
-    single = replace(wanted, profiles=False, draws=0)
+    single = replace(wanted, profiles=False)
     runs = []
     for log, (experiment, why_not) in zip(logs, experiments, strict=True):
         number = None if why_not else used.index(log)
@@ -249,9 +262,14 @@ def _run(
     if study is None or number is None:
         return Run(log, bench, experiment, why_not, punctual)
     e = study.estimate
-    # With a start for each window there is no prediction of the whole run, nor an information that grows over it.
-    grown = None if e.method == "windows" else growth(e, number)
-    return Run(log, bench, experiment, why_not, punctual, e.residuals[number], grown)
+    # With a start for each window there is no prediction of the whole run.
+    predicted = None if e.method == "windows" else _predicted(e, number)
+    return Run(log, bench, experiment, why_not, punctual, e.residuals[number], predicted)
+
+
+def _predicted(e: Estimate, number: int) -> NDArray[np.float64]:
+    whole, problem = problem_of(e), Problem(e.bench, e.plant, e.asked, (e.records[number],))
+    return problem.predict((e.values / whole.units)[whole.columns(number)], 0).shown
 
 
 @dataclass(frozen=True)
@@ -270,7 +288,7 @@ class StopSamples:
 
 def stop_samples(run: Run) -> StopSamples | None:
     """The samples after the last cycle of a stopped run; None if it was not stopped, or its log has none."""
-    if not run.stopped:
+    if run.stop is None:
         return None
     try:
         cycles = run.log.cycles

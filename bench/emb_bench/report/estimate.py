@@ -22,8 +22,11 @@ NOTICED = 2.0  # Standard deviations from which on an effect that is no alarm is
 
 def text(study: Study, *, verbose: bool = False) -> str:
     """Verdict, parameters, what limits them, next step; with ``verbose`` the evidence, too."""
+    lines = [*stops(study), *listed("", say.outside(study)), *listed("WARNING: ", study.warnings)]
+    if study.aborted and not verbose:
+        return "\n".join([*lines, "next: find the cause before the next run   (-v: values until the stop)"])
     lines = [
-        *listed("WARNING: ", study.warnings),
+        *lines,
         *wrapped(say.headline(study)),
         *listed("  - ", _against(study)),
         *listed("NOTE: ", _notes(study)),
@@ -36,6 +39,13 @@ def text(study: Study, *, verbose: bool = False) -> str:
         *_next(study),
     ]
     return "\n".join([*lines, *(_evidence(study) if verbose else ())])
+
+
+def stops(study: Study) -> Iterator[str]:
+    """Lines on the runs that were stopped: cause and advice."""
+    for stop in study.stopped:
+        yield from wrapped(say.stopped(stop))
+        yield from facts(("  cause", stop.cause), ("  advice", stop.advice))
 
 
 def _against(study: Study) -> Iterator[str]:
@@ -83,9 +93,8 @@ def _next(study: Study) -> list[str]:
     """The next step, or several to choose from."""
     found = [*say.remedies(study), *(say.recommendation(r) for r in study.advice[:1])]
     if study.stopped:
-        found = [say.warned(study)]
-    logs = " ".join(file_names(study.logs)[:3]) + (" ..." if len(study.logs) > 3 else "")
-    found = found or [f"emb-replay report {logs} -o report.html   (-v: the evidence)"]
+        found = ["find the cause of the stop before the next run"]
+    found = found or [f"emb-replay report {say.logs_of(study)} -o report.html   (-v: the evidence)"]
     return listed("next: ", found) if len(found) == 1 else ["next", *listed("  - ", found)]
 
 
@@ -108,9 +117,9 @@ def _evidence(study: Study) -> Iterator[str]:
     yield ""
     correlation, pairs = tables.correlation(e)
     found: list[Table | None] = [
-        *(tables.growth_path(study), tables.models(study), tables.errors(study), tables.deviations(study)),
+        *(tables.growth_path(study), tables.models(study), tables.errors(study), tables.budget(study)),
         *(tables.residual_tests(study), tables.suspects(e), tables.systematic(e), tables.predicted(study)),
-        *(correlation, tables.bootstrap(study), tables.minima(study)),
+        *(correlation, tables.minima(study)),
     ]
     for table in found:
         yield from [] if table is None else table.text("  ")
@@ -171,14 +180,23 @@ def document(study: Study) -> dict[str, Any]:
             _fields(p, "label", "values", "rise", "shape") | {"interval_95": p.interval}
             for p in (own.scaled(e.factor(own.label)) for own in study.profiles)
         ],
-        "bootstrap": _bootstrap(study),
         "starts": [
             _fields(end, "cost", "converged", "evaluations")
             | {"values": _shown(e, end.values), "from": _shown(e, end.start)}
             for end in e.ends
         ],
     }
-    of_study = ("warnings", "notes", "model_reason", "model_fits", "predicts", "identified", "conclusions", "drifts")
+    of_study = (
+        "stopped",
+        "warnings",
+        "notes",
+        "model_reason",
+        "model_fits",
+        "predicts",
+        "identified",
+        "conclusions",
+        "drifts",
+    )
     found |= _fields(study, *of_study, "held_out", "left_out", "apart", "advice")
     document: dict[str, Any] = to_json(found | _fields(e, "caveats", "process_noise", "load_noise", "theta"))
     return document
@@ -199,19 +217,6 @@ def _systematic(e: Estimate) -> dict[str, Any]:
         label: {"value": value, "deviation": deviation, "deviation_before": e.asked.systematic[unknown.name]}
         for unknown, label, value, deviation in zip(e.unknowns, e.labels, e.values, e.deviations(), strict=True)
         if unknown.name in e.asked.systematic
-    }
-
-
-def _bootstrap(study: Study) -> dict[str, Any] | None:
-    b = study.bootstrap
-    if b is None:
-        return None
-    factors = np.array([study.estimate.factor(label) for label in b.labels])
-    return {
-        **_fields(b, "labels", "failed"),
-        "draws": len(b.values) + b.failed,
-        "intervals_95": dict(zip(b.labels, b.intervals * factors[:, None], strict=True)),
-        "deviations": dict(zip(b.labels, b.deviations * factors, strict=True)),
     }
 
 

@@ -1,22 +1,23 @@
-"""Figures of one run."""
+"""Figures of the page: motion and currents of a run, residuals, uncertainty of an estimate."""
 
 from __future__ import annotations
 
-from functools import partial
+import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from emb_bench.analysis.growth import Growth
+from emb_bench.analysis.profile import LEVEL, Profile
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import angle, command, velocity
 from emb_bench.estimate.model_validation import OUTPUTS
+from emb_bench.estimate.records import Estimate
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.figures import COLOURS, DASHED, GREY, log_scale, svg
-from emb_bench.logs.timing import Timing
+from emb_bench.figures import COLOURS, DASHED, GREY, svg
+from emb_bench.numbers import SMALL
 from emb_bench.report.content import ActiveCycles, Run, StopSamples
-from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.records import Reason
 
 WIDE = 8.6  # Width of a figure that fills the page [inch]
@@ -163,9 +164,10 @@ def motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) -> 
             axis.axhline(0.0, **FAINT)
             axis.plot(1e3 * time, measured[:, i], ".", color=COLOURS[4], markersize=3.5, label="measured")
             seen = measured[np.isfinite(measured[:, i]), i]
-            if run.growth is not None:
-                predicted = factors[i] * run.growth.shown[:, i]
-                axis.plot(1e3 * run.growth.time, predicted, color=COLOURS[1], label="predicted", linewidth=1)
+            if run.predicted is not None:
+                shown = factors[i] * run.predicted[:, i]
+                at = 1e3 * period * np.arange(1, len(shown) + 1)
+                axis.plot(at, shown, color=COLOURS[1], label="predicted", linewidth=1)
             if after is not None and cycles is not None:
                 when, values = (after.angle, after.velocity)[i]
                 axis.plot(1e3 * when, values, ".", color=GREY, markersize=3.0, label="while stopping")
@@ -180,7 +182,7 @@ def motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) -> 
             axis.set_xlabel("time [ms]")
             axis.set_xlim(0.0, 1e3 * last)
 
-        predicted = ", and predicted by the model at the estimate" if run.growth is not None else ""
+        predicted = ", and predicted by the model at the estimate" if run.predicted is not None else ""
         panels.append(Panel(svg(draw, 1, 1, (PANEL, 2.6)), f"{name.capitalize()} over time: measured{predicted}"))
     return panels
 
@@ -213,108 +215,104 @@ def _measured(errors: Floats) -> list[tuple[int, str]]:
     return [(i, name) for i, name in enumerate(OUTPUTS) if np.isfinite(errors[:, i]).any()]
 
 
-def information(growth: Growth) -> list[Panel]:
-    """Log det and Cramér-Rao bounds over time, and the share of each part of the run."""
-    time = 1e3 * growth.time
+# ---- uncertainty of an estimate ----
 
-    def over_time(axis: Any) -> None:
-        axis.set_xlim(0.0, float(time[-1]))
-        axis.set_xlabel("time [ms]")
+ELLIPSES = 6  # Most unknowns whose ellipses are drawn; more would be too small to read
+JOINT_95 = math.sqrt(-2.0 * math.log(0.05))
+"""Standard deviations of the ellipse that holds 95 % of a Gaussian in the plane: χ² with two degrees of freedom."""
+ACROSS = 4  # Most panels side by side
+_POWERS = (-2, 5)  # of ten, beyond which the axis has a common one: its numbers would touch
 
-    def log_det(axes: Any) -> None:
-        axes[0, 0].plot(time, np.where(np.isfinite(growth.log_det), growth.log_det, np.nan), color=COLOURS[0])
-        axes[0, 0].set_title("log det of the physical information")
-        over_time(axes[0, 0])
 
-    def deviations(axes: Any) -> None:
-        axis, bounds = axes[0, 0], np.where(np.isfinite(growth.deviations), growth.deviations, np.nan)
-        for i, label in enumerate(growth.labels):
-            unit, scale = growth.units[i] or "%", 1.0 if growth.units[i] else 100.0
-            style = ("-", "--", ":")[i // len(COLOURS) % 3]
-            axis.plot(time, scale * bounds[:, i], style, color=COLOURS[i % len(COLOURS)], label=f"{label} [{unit}]")
-        if np.isfinite(bounds).any():
-            log_scale(axis.yaxis)
-            ends = bounds[-1] * [1.0 if unit else 100.0 for unit in growth.units]
-            finite = ends[np.isfinite(ends)]
-            if len(finite):
-                axis.set_ylim(0.5 * float(finite.min()), max(1e2, 2.0 * float(finite.max())))
-        axis.set_title("least deviation of an estimate")
-        axis.legend(ncols=2 if len(growth.labels) > 3 else 1, loc="upper right")
-        over_time(axis)
+def axis_unit(e: Estimate, i: int) -> tuple[float, str]:
+    """Factor and unit for distances of an unknown from its estimate: of its value in ppm or percent, or in its unit."""
+    if not e.unknowns[i].relative:
+        return e.shown[i].factor, e.shown[i].unit
+    factor, unit = (1e6, "ppm") if 3.0 * float(e.deviations()[i]) < SMALL else (100.0, "%")
+    return factor / float(e.scale[i]), unit
 
-    return [
-        Panel(svg(log_det, 1, 1, (PANEL, 2.5)), "Growth over time of the log det of the information"),
-        Panel(svg(deviations, 1, 1, (PANEL, 2.5)), "Cramér-Rao bounds of all unknowns over time"),
-        Panel(
-            svg(lambda axes: _parts(axes[0, 0], growth), 1, 1, (PANEL, 2.5)),
-            "Share of each part of the run in the information on each unknown",
-        ),
+
+def ellipse(covariance: Floats) -> Floats:
+    """Border of the region that holds 95 % of a Gaussian at the origin, as 181 points.
+
+    Args:
+        covariance: shape (2, 2), positive semidefinite.
+
+    Returns:
+        Shape (181, 2).
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0.0, 2.0 * math.pi, 181)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    result: Floats = JOINT_95 * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return result
+
+
+def drawable(e: Estimate) -> list[int]:
+    """The unknowns of which ellipses can be drawn: shared, asked for, with a finite deviation, up to ``ELLIPSES``."""
+    deviations = e.deviations()
+    return [i for i in e.shared() if i in e.wanted() and math.isfinite(deviations[i]) and deviations[i] > 0.0][
+        :ELLIPSES
     ]
 
 
-def learnt(run: Run, steps: NDArray[np.int64], numbers: Floats) -> list[Panel]:
-    """Ranges of the parameters that the shield left as possible over time.
-
-    Args:
-        run: its bench gives the sample time.
-        steps: see :func:`emb_bench.logs.estimates.learnt_history`.
-        numbers: the same.
-    """
-    time = 1e3 * run.bench.timing.sample_time * steps
+def ellipses(e: Estimate, truth: BrakeParameters | None) -> bytes:
+    """Confidence ellipses of each pair, around the estimate; a cross where the truth is, if that is known."""
+    chosen = drawable(e)
+    units = [axis_unit(e, i) for i in range(len(e.labels))]
+    scale = np.array([factor for factor, _ in units])
+    spread = e.deviations() * scale * e.scale
+    correlation = e.correlation()
+    size = len(chosen) - 1
 
     def draw(axes: Any) -> None:
-        axis = axes[0, 0]
-        for i, name in enumerate(PARAMETER_NAMES):
-            low, high = numbers[:, 2 * i], numbers[:, 2 * i + 1]
-            axis.fill_between(time, low, high, color=COLOURS[i], alpha=0.25, linewidth=0.0)
-            for end, label in ((low, name), (high, "")):
-                axis.plot(time, end, color=COLOURS[i], linewidth=1.0, label=label)
-        axis.set_title("possible parameters, relative to nominal")
-        axis.legend(ncols=4, loc="upper right", columnspacing=0.8, handlelength=1.2)
-        axis.set_xlim(0.0, float(time[-1]) or 1.0)
-        axis.set_xlabel("time [ms]")
+        for row in range(size):
+            for column in range(size):
+                axis = axes[row, column]
+                if column > row:
+                    axis.set_visible(False)
+                    continue
+                x, y = chosen[column], chosen[row + 1]
+                pair = np.array([x, y])
+                border = ellipse(correlation[np.ix_(pair, pair)] * np.outer(spread[pair], spread[pair]))
+                axis.fill(border[:, 0], border[:, 1], facecolor="#0072B222", edgecolor=COLOURS[0], linewidth=1.1)
+                axis.plot(0.0, 0.0, "o", color=COLOURS[0], markersize=3.5)
+                if truth is not None and all(hasattr(truth, e.unknowns[i].name) for i in pair):
+                    true = np.array([getattr(truth, e.unknowns[i].name) for i in pair])
+                    axis.plot(*((true - e.values[pair]) * scale[pair]), "x", color=COLOURS[1], markersize=7, mew=1.8)
+                axis.locator_params(axis="y", nbins=4)
+                axis.locator_params(axis="x", nbins=3)
+                axis.ticklabel_format(style="sci", scilimits=_POWERS)
+                if row == size - 1:
+                    axis.set_xlabel(f"{e.labels[x]} [{units[x][1]}]")
+                if column == 0:
+                    axis.set_ylabel(f"{e.labels[y]} [{units[y][1]}]")
 
-    shows = "Ranges of the four parameters that the shield left as possible, over time"
-    return [Panel(svg(draw, 1, 1, (PANEL, 2.7)), shows)]
-
-
-def _parts(axis: Any, growth: Growth) -> None:
-    """A map: parts of the run across, unknowns down, the share in percent."""
-    shares = 100.0 * growth.parts.T
-    borders = 1e3 * growth.borders
-    axis.pcolormesh(borders, np.arange(len(shares) + 1), shares, cmap="Blues", vmin=0.0, vmax=100.0, edgecolors="white")
-    middle = 0.5 * (borders[1:] + borders[:-1])
-    for row, values in enumerate(shares.tolist()):
-        for at, value in zip(middle.tolist(), values, strict=True):
-            if value >= 0.5:
-                colour = "white" if value > 55.0 else "#1b1f24"
-                axis.text(at, row + 0.5, f"{value:.0f}", ha="center", va="center", fontsize=7.5, color=colour)
-    axis.set_yticks(np.arange(len(shares)) + 0.5, growth.labels)
-    axis.set_ylim(len(shares), 0.0)
-    axis.grid(visible=False)
-    axis.set_xlabel("time [ms]")
-    axis.set_title("share of each part of the run [%]")
+    return svg(draw, size, size, (WIDE, {1: 3.2, 2: 5.0}.get(size, 0.75 * WIDE)))
 
 
-def times(t: Timing) -> list[Panel]:
-    """Histograms of the times from sample to command and from sample to sample."""
-    period = 1e6 * t.period
-    middle = float(np.median(period)) if len(period) else 0.0
+def profiles(found: Sequence[Profile], e: Estimate) -> bytes:
+    """Rise of χ² over the distance from the estimate, beside the parabola that the Fisher information stands for."""
+    columns, rows = min(len(found), ACROSS), -(-len(found) // ACROSS)
 
-    def histogram(axes: Any, values: Floats, label: str, colour: str) -> None:
-        axis = axes[0, 0]
-        axis.hist(values, bins=40, color=colour)
-        log_scale(axis.yaxis)
-        axis.axvline(float(np.median(values)), **DASHED)
-        axis.set_xlabel(label)
-        axis.set_ylabel("count")
+    def draw(axes: Any) -> None:
+        for axis in axes.flat[len(found) :]:
+            axis.set_visible(False)
+        for n, (axis, profile) in enumerate(zip(axes.flat, found, strict=False)):
+            i = e.labels.index(profile.label)
+            factor, unit = axis_unit(e, i)
+            sigma = float(e.cramer_rao()[i] * e.scale[i]) * factor
+            x = (profile.values - e.values[i]) * factor
+            axis.axhline(LEVEL, **DASHED)
+            if 0.0 < sigma < math.inf:
+                along = np.linspace(float(x.min()), float(x.max()), 120)
+                axis.plot(along, (along / sigma) ** 2, color=COLOURS[4], linewidth=1.0)
+            axis.plot(x, profile.rise, ".-", color=COLOURS[0], markersize=4)
+            axis.set_ylim(-0.4, max(8.0, 1.2 * LEVEL))
+            if n % ACROSS == 0:
+                axis.set_ylabel("rise of chi2")
+            axis.set_xlabel(f"{profile.label} [{unit}]")
+            axis.locator_params(axis="x", nbins=3)
+            axis.ticklabel_format(axis="x", style="sci", scilimits=_POWERS)
 
-    panels = []
-    for values, label, colour in (
-        (1e6 * t.response, "sensor to command [µs]", COLOURS[0]),
-        (period - middle, f"sample to sample, minus {middle:.0f} µs [µs]", COLOURS[2]),
-    ):
-        if len(values):
-            drawn = svg(partial(histogram, values=values, label=label, colour=colour), 1, 1, (PANEL, 2.4))
-            panels.append(Panel(drawn, f"Histogram of the times from {label.removesuffix(' [µs]')}"))
-    return panels
+    return svg(draw, rows, columns, (WIDE, 2.3 * rows))

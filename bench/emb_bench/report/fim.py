@@ -79,11 +79,12 @@ def text(e: Evaluation, *, verbose: bool = False) -> str:
     if not e.fisher("weighted").matrix.any():  # which has no prior
         return "\n".join([*doubts, "no information: the record does not depend on any of these parameters", *lines])
     verdict = e.verdict().shown(e.bench.machine)
-    bound = "best possible repeatability" if e.question.prior is None else "best possible, with the prior"
-    head = wrapped(f"{bound}: half of the 95 % interval (k=2), by sensor noise alone")
+    prior = "" if e.question.prior is None else ", with the prior"
+    head = wrapped(f"best possible ± 95 % (k=2){prior}, if the sensors have noise and no systematic error")
     rows = [[f.name, _half(f), say.finding(f)] for f in verdict.findings]
     head += [*(row.rstrip() for row in Table("", ("", "", ""), rows, words=(0, 2)).lines("  ")[1:])]
     head += listed("  ", say.directions(verdict))
+    head += wrapped("repeatability in emb-replay estimate is larger: systematic errors are estimated as well", 0)
     final = e.fisher("physical").criteria().shown(e.bench.machine)
     shown = f"log det {final.log_det:.6g}, smallest eigenvalue {final.lambda_min:.4g}, condition {final.condition:.4g}"
     lines = [*head, "", *lines, *facts(("information", shown))]
@@ -155,7 +156,7 @@ def models_text(evaluations: Sequence[Evaluation]) -> str:
         rows.append([e.plant.name, _fits(e.fit), *sizes, *(f"{half:.4g}" for half in halves)])
     header = ["model", "fits", "angle", "velocity", "log det"]
     header += [f"{shown[name].name} [{shown[name].unit if name in UNITS else '%'}]" for name in names]
-    title = "residuals in sigma; best possible repeatability (half of the 95 % interval, k=2, by sensor noise alone)"
+    title = "residuals in sigma; best possible ± 95 % (k=2), if the sensors have noise and no systematic error"
     lines += [*_heading(first), *_unknowns(first.question), "", *wrapped(title, 0)]
     lines += Table("", header, rows, words=(0, 1)).lines()
     if any(e.fit.loose for e in evaluations):

@@ -10,7 +10,7 @@ import base64
 import functools
 import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -19,22 +19,24 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from emb_bench import numbers
-from emb_bench.analysis.growth import Growth
 from emb_bench.analysis.study import Study
 from emb_bench.config.bench import QUANTILES
+from emb_bench.documents import to_json
 from emb_bench.estimate.records import METHODS
-from emb_bench.logs.estimates import learnt_history, learnt_ranges
-from emb_bench.logs.timing import INTERVALS, Timing, quantiles
+from emb_bench.logs import timing
+from emb_bench.logs.estimates import last_learnt
+from emb_bench.logs.info import info_document
+from emb_bench.logs.timing import INTERVALS, quantiles
 from emb_bench.numbers import percent, plain, seconds, signed
-from emb_bench.report import certainty, figures, sentences, tables
+from emb_bench.report import figures, sentences, tables
 from emb_bench.report.content import REASONS, ActiveCycles, Content, Run, StopSamples, stop_samples
+from emb_bench.report.estimate import document as estimate_document
 from emb_bench.report.figures import Panel
 from emb_bench.report.text import Table
 from emb_bench.report.trend import panels as trend_panels
 from emb_bench.report.trend import table as run_table
 from emb_bench.report.trend import trends
 from emb_runtime.errors import BenchFileError, LogError
-from emb_runtime.log.mcap_schema import LEARNT
 from emb_runtime.safety.end_stop import end_stop_speed
 
 EVENTS = 200  # Most safety events that are shown; report.json has them all
@@ -54,10 +56,9 @@ class View:
     after: StopSamples | None
     motion: list[Panel]
     obeyed: bool
-    learnt: tuple[list[Panel], dict[str, list[float]]] | None
+    learnt: dict[str, list[float]]  # Ranges of the parameters, relative to nominal
     residuals: Table | None
-    information: tuple[list[Panel], Table, Table] | None
-    timing: tuple[Table, list[Panel]] | None
+    timing: Table | None
     safety: Safety | None
     counts: Table
     settings: list[tuple[str, str]]
@@ -82,14 +83,16 @@ def report_page(content: Content) -> str:
         LogError: a log cannot be read any more.
     """
     several = len(content.runs) > 1
-    views = [view(run, f"run-{n}-" if several else "") for n, run in enumerate(content.runs, 1)]
+    # Of an experiment that was cut short no value is used, nor a prediction with it.
+    shown = [replace(run, predicted=None, residuals=None) if content.shown is None else run for run in content.runs]
+    views = [view(run, f"run-{n}-" if several else "") for n, run in enumerate(shown, 1)]
     found = trends(content.estimated) if len(content.estimated) > 1 else []
     return (
         environment()
         .get_template("page.html.j2")
         .render(
             content=content,
-            study=content.study,
+            study=content.shown,
             views=views,
             acceptance=tables.acceptance_table(content.acceptance),
             runs=run_table(content.runs, found) if several else None,
@@ -98,36 +101,32 @@ def report_page(content: Content) -> str:
             tested=_tested(content),
             reasons=REASONS,
             terms=sentences.TERMS,
-            **({} if content.study is None else _of_study(content, content.study)),
+            **({} if content.shown is None else _of_study(content.shown)),
         )
     )
 
 
-def _of_study(content: Content, study: Study) -> dict[str, Any]:
+def _of_study(study: Study) -> dict[str, Any]:
     """Tables and figures of the estimate, by their names in the template."""
     e = study.estimate
     correlation, pairs = tables.correlation(e)
-    runs = [(run.name, run.growth) for run in content.estimated if run.growth is not None]
     checks = (tables.residual_tests(study), tables.suspects(e), tables.systematic(e), tables.predicted(study))
     return {
         "parameters": tables.parameters(study),
-        "gains": [tables.gain(r) for r in study.advice],
         "checks": (*checks, tables.models(study), tables.growth_path(study)),
         "drifts": tables.drifts(study) if study.drifts else None,
-        "contributions": tables.contributions(study, runs) if len(runs) > 1 else None,
-        "deviations": tables.deviations(study),
-        "ellipses": certainty.ellipses(e, study.truth) if len(certainty.drawable(e)) > 1 else None,
+        "budget": tables.budget(study),
+        "ellipses": figures.ellipses(e, study.truth) if len(figures.drawable(e)) > 1 else None,
         "correlation": correlation,
         "pairs": pairs,
-        "profiles": certainty.profiles(study.profiles, e) if study.profiles else None,
-        "bootstrap": tables.bootstrap(study),
+        "profiles": figures.profiles(study.profiles, e) if study.profiles else None,
         "minima": tables.minima(study),
     }
 
 
 def view(run: Run, prefix: str = "") -> View:
     """Tables and figures of one run."""
-    log, growth = run.log, run.growth
+    log = run.log
     cycles, after = _cycles(run), stop_samples(run)
     end, driven = log.end, not log.imported
     attached = [[n, str(len(data)), hashlib.sha256(data).hexdigest()] for n, data in log.attachments.items()]
@@ -138,10 +137,9 @@ def view(run: Run, prefix: str = "") -> View:
         after=after,
         motion=_motion(run, cycles, after),
         obeyed=cycles is not None and figures.applied_as_sent(run, cycles),
-        learnt=_learnt(run) if log.counts.get(LEARNT.name) else None,
+        learnt=last_learnt(log),
         residuals=None if run.residuals is None else _residuals(run.residuals),
-        information=None if growth is None else (figures.information(growth), *_information(growth)),
-        timing=_timing(run) if driven else None,
+        timing=_intervals(run) if driven else None,
         safety=_safety(run) if driven else None,
         counts=Table("Messages in the file", ["topic", "messages"], [[t, str(n)] for t, n in log.counts.items()]),
         settings=[(key.removeprefix(SETTING), value) for key, value in end.items() if key.startswith(SETTING)],
@@ -150,46 +148,55 @@ def view(run: Run, prefix: str = "") -> View:
     )
 
 
-def _tested(content: Content) -> list[tuple[str, str]] | Table:
-    """Device, bench, operator, versions and hashes, as the logs have them."""
-    names = ["device serial", "operator", "bench", "recorded", "recorded by", "policy SHA-256", "log SHA-256"]
+def _tested(content: Content) -> tuple[list[tuple[str, str]], Table | None]:
+    """Device, conditions, versions and hashes, as the logs have them: what all runs share, and a table of the rest."""
     columns = [_identity(run) for run in content.runs]
-    if any(run.log.drive_files is not None for run in content.runs):
-        names = [*names, "drive", "which lacks, accepted by name"]
-        columns = [[*own, *_drive(run)] for own, run in zip(columns, content.runs, strict=True)]
-    if len(columns) == 1:
-        return [*zip(names, columns[0], strict=True), ("evaluated by", content.made_by)]
+    alike = {name: len({own[name] for own in columns}) == 1 for name in columns[0]}
+    facts = [(name, columns[0][name]) for name, same in alike.items() if same]
+    facts += [("evaluated by", content.made_by), ("report number", content.number)]
+    names = [name for name, same in alike.items() if not same]
+    if not names:
+        return facts, None
     cut = [SHORT_HASH if "SHA" in name else LONGEST for name in names]
     rows = [
-        [run.name, *(value[:most] for value, most in zip(own, cut, strict=True))]
+        [run.name, *(own[name][:most] for name, most in zip(names, cut, strict=True))]
         for run, own in zip(content.runs, columns, strict=True)
     ]
-    title = f"Evaluated by {content.made_by}. Of each SHA-256 the first {SHORT_HASH} digits; the evidence has all"
-    return Table(title, ["run", *names], rows, words=range(len(names) + 1))
+    title = f"Of each SHA-256 the first {SHORT_HASH} digits; the evidence has all"
+    return facts, Table(title, ["run", *names], rows, words=range(len(names) + 1))
 
 
-def _identity(run: Run) -> list[str]:
-    entries = run.log.run
-    bench = entries.get("bench_name", "")
-    if bench and (digest := entries.get("bench_hash", "")):
-        bench = f"{bench}, SHA-256 {digest[:SHORT_HASH]}"
-    found = (
-        entries.get("device_serial", ""),
-        entries.get("operator", ""),
-        bench,
-        run.began,
-        entries.get("tool", ""),
-        entries.get("policy_sha256", ""),
-        run.log_sha256,
-    )
-    return [value[:LONGEST] or "not recorded" for value in found]
+def _identity(run: Run) -> dict[str, str]:
+    """Device, conditions, versions and hashes of one run."""
+    entries, limits, noise = run.log.run, run.bench.limits, run.bench.noise
+    name, digest = entries.get("bench_name", ""), entries.get("bench_hash", "")[:SHORT_HASH]
+    found = {
+        "device serial": entries.get("device_serial") or "not recorded (emb-run --serial)",
+        "operator": entries.get("operator") or "not recorded (emb-run --operator)",
+        "recorded": run.began,
+        "recorded by": entries.get("tool", ""),
+        "bench": f"{name}, SHA-256 {digest}" if name and digest else name,
+        "conditions": f"{plain(1e3 * run.bench.timing.sample_time)} ms sample time; noise {plain(noise.angle)} rad, "
+        f"{plain(noise.velocity)} rad/s; limits {plain(limits.angle[0])} to {plain(limits.angle[1])} rad, "
+        f"{plain(limits.velocity)} rad/s, {plain(limits.current)} A",
+        "policy SHA-256": entries.get("policy_sha256", ""),
+        "log SHA-256": run.log_sha256,
+    }
+    if run.log.imported:
+        del found["conditions"]
+    return {key: value[:LONGEST] or "not recorded" for key, value in (found | _drive(run)).items()}
 
 
-def _drive(run: Run) -> list[str]:
+def _drive(run: Run) -> dict[str, str]:
+    """A mapped drive, and what it lacks."""
     found = run.log.metadata.get("emb.drive", {})
-    drive = f"{found['name']}, SHA-256 of the mapping {found['sha256'][:SHORT_HASH]}" if found else ""
+    if not found:
+        return {}
     lacks = "; ".join(f"{name}: {lost}" for name, lost in run.log.drive_lacks.items())
-    return [value[:LONGEST] or "none" for value in (drive, lacks)]
+    return {
+        "drive": f"{found['name']}, SHA-256 of the mapping {found['sha256'][:SHORT_HASH]}",
+        "it lacks": lacks or "none",
+    }
 
 
 def _motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) -> list[Panel]:
@@ -200,11 +207,6 @@ def _motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) ->
     elif cycles is not None:
         drawn.append(figures.excitation(run, cycles, after))
     return drawn if run.residuals is None else [*drawn, figures.residuals(run, run.residuals)]
-
-
-def _learnt(run: Run) -> tuple[list[Panel], dict[str, list[float]]]:
-    steps, numbers = learnt_history(run.log)
-    return figures.learnt(run, steps, numbers), learnt_ranges(numbers)
 
 
 def _cycles(run: Run) -> ActiveCycles | None:
@@ -226,32 +228,11 @@ def _residuals(errors: np.ndarray) -> Table:
     return Table("In numbers", header, rows)
 
 
-def _information(g: Growth) -> tuple[Table, Table]:
-    """Tables of the information by sensor and by part of the run."""
-    sensors = [
-        [label, percent(angle), percent(velocity)]
-        for label, (angle, velocity) in zip(g.labels, g.outputs.tolist(), strict=True)
-    ]
-    parts = [
-        [f"{1e3 * begin:.0f} to {1e3 * end:.0f} ms", signed(gain), *map(percent, shares)]
-        for begin, end, gain, shares in zip(g.borders, g.borders[1:], g.gains.tolist(), g.parts.tolist(), strict=False)
-    ]
-    gains = "Information by part of the run; the gain counts from where all parameters are identified"
-    return (
-        Table("Information by sensor", ["parameter", "from the angle", "from the velocity"], sensors),
-        Table(gains, ["part of the run", "gain of log det", *(f"share of {n}" for n in g.labels)], parts),
-    )
-
-
-def _timing(run: Run) -> tuple[Table, list[Panel]] | None:
-    """Intervals of the loop and their figures; None if no sample was answered."""
+def _intervals(run: Run) -> Table | None:
+    """Intervals of the loop; None if no sample was answered."""
     t = run.timing
     if t is None or not len(t.response):
         return None
-    return _intervals(t), [] if t.simulated else figures.times(t)
-
-
-def _intervals(t: Timing) -> Table:
     rows = []
     for key, words in INTERVALS.items():
         values = t.interval(key)
@@ -315,3 +296,49 @@ def _printable(value: Any) -> Any:
 
 def _data_uri(svg: bytes) -> str:
     return "data:image/svg+xml;base64," + base64.b64encode(svg).decode("ascii")
+
+
+def document(content: Content) -> dict[str, Any]:
+    """JSON document with the content of the page; numbers may be infinite."""
+    study = content.study
+    found: dict[str, Any] = to_json(
+        {
+            "number": content.number,
+            "made_by": content.made_by,
+            "acceptance": None if content.acceptance is None else content.acceptance.document(),
+            "model_fits": None if study is None else study.model_fits,
+            "predicts": None if study is None else study.predicts,
+            "why_no_estimate": content.why_not,
+            "left_out": [{"log": entry.path, "why": entry.words} for entry in content.left_out],
+            "estimate": None if study is None else estimate_document(study),
+            "runs": [_run_document(run, study) for run in content.runs],
+        }
+    )
+    return found
+
+
+def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "began": run.began,
+        "simulated": run.simulated,
+        "why_not_estimated": run.why_not,
+        "sha256": run.log_sha256,
+        "info": info_document(run.log),
+        "timing": None if run.timing is None else timing.document(run.timing),
+    }
+    x, alone = run.experiment, run.alone
+    if x is not None:
+        named = ("planned", "command_delay", "missing", "notes")
+        found["experiment"] = {name: getattr(x, name) for name in named} | {
+            "periods": len(x.currents),
+            "measured": x.measured.sum(),
+            "braked_periods": x.braked,
+            "applied_current": x.currents,
+            "angle": x.all_samples[:, 0],
+            "velocity": x.all_samples[:, 1],
+        }
+    if alone is not None:
+        found["alone"] = {"model_fits": alone.model_fits, "conclusions": alone.conclusions}
+    if run.residuals is not None:
+        found["residuals"] = {"angle": run.residuals[:, 0], "velocity": run.residuals[:, 1]}
+    return found

@@ -12,7 +12,7 @@ from emb_bench.config.bench import COUNTED, QUANTILE_NAMES
 from emb_bench.figures import COLOURS, GREY, drawn
 from emb_bench.logs.log import IMPORT, RunLog
 from emb_bench.logs.timing import INTERVALS, BudgetCheck, Timing, document, judge, quantiles, timing
-from emb_bench.numbers import NOTHING, around, percent, seconds
+from emb_bench.numbers import NOTHING, around, percent, plain, seconds
 from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE, LogError
 from emb_runtime.estimator.estimate import NORMAL_95
@@ -96,8 +96,8 @@ def _largest(largest: Mapping[str, float] | None) -> str:
     if largest is None:
         return ""
     return (
-        f"angle {largest['angle_min']:.3f} to {largest['angle_max']:.3f} rad, speed {largest['speed']:.1f} rad/s, "
-        f"current {largest['current']:.3f} A"
+        f"angle {plain(largest['angle_min'], 4)} to {plain(largest['angle_max'], 4)} rad, "
+        f"speed {largest['speed']:.1f} rad/s, current {largest['current']:.3f} A"
     )
 
 

@@ -17,21 +17,20 @@ if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.model_choice import Candidate
     from emb_bench.analysis.profile import OpenSide, Profile
     from emb_bench.analysis.recommendation import Recommendation
-    from emb_bench.analysis.study import Study
+    from emb_bench.analysis.study import Stop, Study
     from emb_bench.estimate.records import Contribution, Estimate
     from emb_bench.experiment.evaluation import Evaluation
     from emb_bench.information.identifiability import Direction, Finding, Identifiability
     from emb_bench.report.content import Content, Run
 
 INTERVALS = (
-    "95 % intervals (k=2). Repeatability: sensor noise alone. Total: also systematic errors and what the record "
-    "cannot exclude."
+    "± 95 % (k=2). Repeatability: scatter of further runs by sensor noise. Total: also systematic errors and effects "
+    "that the record cannot exclude."
 )
-
 
 TERMS = {
     "sigma": "standard deviation",
-    "repeatability": "half of the 95 % interval by sensor noise alone: the scatter of further runs",
+    "repeatability": "half of the 95 % interval by sensor noise: the scatter of further runs",
     "total": "half of the 95 % interval, also with systematic errors and effects that the record cannot exclude",
     "chi2/n": "mean square of the residuals in sigmas, near 1 if the model is right",
     "identified": "the 95 % interval is closed, excludes zero and ends at no border of the search",
@@ -79,9 +78,9 @@ def headline(study: Study) -> str:
 def verdict(content: Content) -> str:
     """A report in one line: why a run was stopped, whether the brake was accepted, or whether the model fits."""
     acceptance = content.acceptance
-    if content.stopped:
-        more = f", and {len(content.stopped) - 1} more" if len(content.stopped) > 1 else ""
-        return f"{'NOT ACCEPTED. ' if acceptance else ''}STOPPED: {stopped(content.stopped[0])}{more}"
+    if content.stops:
+        more = f", and {len(content.stops) - 1} more" if len(content.stops) > 1 else ""
+        return f"{'NOT ACCEPTED. ' if acceptance else ''}{stopped(content.stops[0])}{more}"
     if acceptance is not None:
         count, result = len(acceptance.results), acceptance.result
         names = ", ".join(one.name for one in acceptance.of(result))
@@ -102,9 +101,23 @@ ONLY_ALONE = (
 )
 
 
-def stopped(run: Run) -> str:
+def stopped(stop: Stop) -> str:
     """That a run did not come to its planned end, and why."""
-    return f"{run.name}: the run was stopped: {run.why_stopped}"
+    after = f" after {stop.periods} of {stop.planned} samples" if stop.planned else ""
+    return f"STOPPED: {stop.log}{after}: {': '.join(filter(None, (stop.reason, stop.detail)))}"
+
+
+def outside(study: Study) -> list[str]:
+    """Parameters outside of the ranges for which the shield guarantees the limits."""
+    found = []
+    for c in study.outside:
+        low, high = c.outside or (math.nan, math.nan)
+        ranges = f"ranges.{study.estimate.bench.shield.ranges} ({plain(low, 4)} to {plain(high, 4)})"
+        found.append(
+            f"OUTSIDE: {c.label} = {amount(c.value, c.interval, c.unit)} lies outside {ranges}: the limits were not "
+            "guaranteed. Look for what is wrong, or widen the range."
+        )
+    return found
 
 
 def apart(study: Study) -> str:
@@ -141,7 +154,7 @@ def limit(effect: Contribution, e: Estimate) -> str:
 
 
 def conclusion(c: Conclusion) -> str:
-    """Value, interval and standing of a parameter, and what would help."""
+    """Value, interval and standing of a parameter."""
     said = [amount(c.value, c.interval, c.unit), c.standing.value + (f": {c.why_not}" if c.why_not else "")]
     return "; ".join([*said, *details(c)])
 
@@ -151,10 +164,6 @@ def details(c: Conclusion) -> list[str]:
     said = ["any other value fits as well"] if c.arbitrary else []
     if c.traded_with:
         said.append(f"trades off with {', '.join(c.traded_with)}")
-    if c.help == "one run":
-        said.append(f"one more run of {c.run} would reduce its deviation to {deviation(c.deviation_after, c.label, 2)}")
-    if c.help == "none":
-        said.append("no reference excitation identifies it")
     return [*said, drift(c.drift)] if c.drift is not None else said
 
 
@@ -239,21 +248,28 @@ def recommendation(r: Recommendation) -> str:
     return f"one more run of {r.excitation} would bring {brings} (standard deviation{'s' * (len(r.wanting) > 1)})"
 
 
+def logs_of(study: Study) -> str:
+    """Logs of a study as arguments of a command."""
+    from emb_bench.analysis.study import file_names
+
+    return " ".join(file_names(study.logs)[:3]) + (" ..." if len(study.logs) > 3 else "")
+
+
 def remedies(study: Study) -> list[str]:
     """Remedies for a model that does not fit or predict; empty where nothing is wrong."""
     from emb_bench.estimate.suspects import shown_as
 
-    e = study.estimate
+    e, again = study.estimate, f"emb-replay estimate {logs_of(study)}"
     if study.biased:
-        return ["use another method: --method oem"]
+        return [f"use another method: {again} --method oem"]
     if study.model_fits and not study.predicts:
         return ["find out what differs between the runs: the brake, its homing (--nuisance offset), or use --model"]
     if study.apart:
-        return ["estimate from each log alone: emb-replay campaign LOGS -o FILE"]
+        return [f"estimate from each log alone: emb-replay campaign {logs_of(study)} -o rows.csv"]
     if study.model_fits:
         return []
     if e.bench.machine is None:
-        found = ["find a model that explains the record: --model all, or --grow"]
+        found = [f"find a model that explains the record: {again} --model all, or --grow"]
     elif "viscous_asymmetry" not in e.asked.names:
         found = ["let friction depend on the direction: --params with viscous_asymmetry, or by_direction in the map"]
     else:
@@ -263,11 +279,6 @@ def remedies(study: Study) -> list[str]:
     if e.method == "oem":
         found.append("if no model explains the record, something may disturb the brake: --method pem")
     return found
-
-
-def warned(study: Study) -> str:
-    """A warning not to drive again before the cause of a stop is found; empty where no run was stopped."""
-    return f"a run was stopped ({', '.join(study.stopped)}): find out why before the next one" if study.stopped else ""
 
 
 def impact(run: Run, speed: float | None, why_not: str) -> str:

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
 from emb_bench.analysis.acceptance import Acceptance, Result
-from emb_bench.analysis.growth import Growth
-from emb_bench.analysis.recommendation import Recommendation
 from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import UNITS
-from emb_bench.estimate.records import NORMAL_95, Estimate
+from emb_bench.estimate.records import NORMAL_95, OF_THE_BENCH, Estimate
 from emb_bench.estimate.suspects import shown_as
-from emb_bench.information.criteria import criteria
 from emb_bench.information.identifiability import TRADED_OFF
-from emb_bench.numbers import NOTHING, amount, around, chance, percent, plain, share, signed, spread
-from emb_bench.report.sentences import deviation, drift
+from emb_bench.numbers import NOTHING, SMALL, amount, around, chance, percent, plain, share, signed
+from emb_bench.report.sentences import drift, limit
 from emb_bench.report.text import Cell, Table
 
 TONES = {Result.PASS: "good", Result.FAIL: "bad", Result.CANNOT_TELL: "care"}  # Colours of results
@@ -138,37 +134,28 @@ def growth_path(study: Study) -> Table | None:
     return Table("Growth of the model; changes of BIC and of the held-out log density", header, rows, words=(0, 2, 6))
 
 
-def deviations(study: Study) -> Table:
-    """Standard deviations by each method that gives them."""
-    e, boot = study.estimate, study.bootstrap
-    names = [e.labels[i] for i in e.shared() if e.unknowns[i].name in e.asked.params]
-    weak = dict(criteria(e.information, e.labels, names).weakest) if len(names) > 1 else {}
-    header = ["parameter", "total", "by Fisher", "by residuals"]
-    moved = e.open()
-    header += ["model"] if moved.any() else []
-    header += ["bootstrap"] if boot is not None else []
-    header += ["weakest"] if weak else []
-    rows = []
-    columns = (e.unknowns, e.shown, e.labels, e.values.tolist(), e.deviations(), e.cramer_rao(), e.robust())
-    for unknown, shown, label, value, *found in zip(*columns, *([moved] if moved.any() else []), strict=True):
-        if unknown.name in e.asked.along:
-            continue
-        factor = 1.0 if unknown.relative else shown.factor
-        row = [label, *(spread(float(d) * factor, unknown.relative) for d in found)]
-        if (suspect := e.left_open_by(e.labels.index(label))) is not None:
-            row[-1] += f" ({shown_as(suspect, e.bench.machine).name})"
-        if boot is not None:
-            size = abs(value) if unknown.relative else 1.0
-            known = label in boot.labels
-            own = float(boot.deviations[boot.labels.index(label)]) / size if known else math.nan
-            row.append(spread(own * factor, unknown.relative) if known else NOTHING)
-        if weak:
-            row.append(percent(weak[label] ** 2) if label in weak else NOTHING)
-        rows.append(row)
-    title = "Standard deviations"
-    title += "; model: largest undetected effect (named)" if moved.any() else ""
-    title += "; weakest: share in the worst-determined combination" if weak else ""
-    return Table(title, header, rows)
+def budget(study: Study) -> Table:
+    """Contributions to the uncertainty of each parameter."""
+    e, rows = study.estimate, []
+    bound, other, every = e.cramer_rao(), e.open(OF_THE_BENCH), e.open()
+    columns = (bound, np.sqrt(np.maximum(every**2 - other**2, 0.0)), other, e.robust())
+    for i, c in zip(e.wanted(), study.conclusions, strict=True):
+        factor = NORMAL_95 * e.shown[i].factor * float(e.scale[i])
+        jointly, shared, effects, residuals = (factor * float(column[i]) for column in columns)
+        systematic = math.sqrt(max(jointly**2 - c.repeatability**2, 0.0)) if math.isfinite(jointly) else math.inf
+        systematic = systematic if systematic > SMALL * jointly else 0.0  # what is left is rounding
+        halves = [c.repeatability, systematic, shared, effects, 0.5 * (c.interval[1] - c.interval[0]), residuals]
+        size = c.value if e.unknowns[i].relative else 0.0
+        largest = e.left_open_by(i)
+        rows.append(
+            [c.label, *(_half(half, size) for half in halves), NOTHING if largest is None else limit(largest, e)]
+        )
+    header = ["parameter", "noise", "sensors", "J, angle", "effects", "total", "by residuals", "largest"]
+    title = (
+        "Uncertainty budget, each half of a 95 % interval (k=2): sensor noise, systematic errors of the sensors, "
+        "inertia and scale of the angle, effects that the record cannot exclude; by the scatter of the residuals"
+    )
+    return Table(title, header, rows, words=(0, 7))
 
 
 def residual_tests(study: Study) -> Table:
@@ -253,28 +240,6 @@ def minima(study: Study) -> Table | None:
     return Table("Local minima, best first", header, rows) if rows else None
 
 
-def bootstrap(study: Study) -> Table | None:
-    """Intervals by the bootstrap over runs."""
-    b = study.bootstrap
-    if b is None:
-        return None
-    factors = np.array([study.estimate.factor(label) for label in b.labels])
-    columns = (b.labels, (b.intervals * factors[:, None]).tolist(), (b.deviations * factors).tolist())
-    rows = [
-        [label, f"{plain(low, 4)} to {plain(high, 4)}", plain(own, 2)]
-        for label, (low, high), own in zip(*columns, strict=True)
-    ]
-    draws = len(b.values) + b.failed
-    failed = f"; {b.failed} did not end in a minimum and do not count" if b.failed else ""
-    return Table(f"Bootstrap over runs, {draws} draws{failed}", ["parameter", "95 % interval", "sigma"], rows)
-
-
-def gain(r: Recommendation) -> Table:
-    """Deviations before and after a recommended run."""
-    rows = [[n, deviation(r.before[n], n), deviation(r.after[n], n)] for n in r.before if n in r.after]
-    return Table("Standard deviations", ["parameter", "now", "with one such run more"], rows)
-
-
 def drifts(study: Study) -> Table:
     """Values of an earlier estimate and of this one."""
     rows = []
@@ -293,21 +258,3 @@ def drifts(study: Study) -> Table:
         )
     header = ["parameter", "last", "now", "change", "sigma", "drifted", ""]
     return Table("Values ± 95 %", header, rows, words=(0, 5, 6))
-
-
-def contributions(study: Study, runs: Sequence[tuple[str, Growth]]) -> Table:
-    """Information of each run by itself, and its share in the information on each unknown alone."""
-    e = study.estimate
-    names = [e.labels[i] for i in e.shared() if i in e.wanted()]
-    amounts = np.array([[g.samples[i, i] for i in map(g.labels.index, names)] for _, g in runs])
-    shares = amounts / np.where(amounts.sum(axis=0) > 0.0, amounts.sum(axis=0), 1.0)
-    rows = []
-    for (name, g), own in zip(runs, shares.tolist(), strict=True):
-        alone = criteria(g.samples, g.labels, g.params)
-        rows.append([name, plain(alone.log_det, 5), plain(alone.lambda_min), *map(percent, own)])
-    if asked := [e.labels[i] for i in e.shared() if e.unknowns[i].name in e.asked.params]:
-        joint = criteria(e.information, e.labels, asked)
-        rows.append(["all together", plain(joint.log_det, 5), plain(joint.lambda_min), *("" for _ in names)])
-    header = ["run", "log det", "smallest eigenvalue", *(f"share of {name}" for name in names)]
-    title = "Fisher information of each run alone, and its share in the information on each unknown"
-    return Table(title, header, rows)

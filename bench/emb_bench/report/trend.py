@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.analysis.conclusion import Conclusion
-from emb_bench.analysis.constancy import Constancy, constancy
+from emb_bench.analysis.several_runs import Constancy, constancy
 from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import NORMAL_95

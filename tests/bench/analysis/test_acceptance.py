@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import msgspec
 import pytest
@@ -171,7 +172,11 @@ def test_the_command_says_the_result_first_and_has_an_exit_code_for_each(
     assert '"result": "cannot tell"' in said("good.mcap", "drift.k_m = 0.1", 7, "--strict")
     assert 'class="banner care" role="alert">CANNOT TELL: 1 of 3' in page.read_text(encoding="utf-8")
     assert "criteria not decided: drift of k_m" in page.read_text(encoding="utf-8")
-    assert '"result": "fail"' in said("good.mcap", "parameters.f_v.relative = 0.1", 0)
+    cases = ("--junit", str(tmp_path / "cases.xml"))
+    assert '"result": "fail"' in said("good.mcap", "parameters.f_v.relative = 0.1", 0, *cases)
     said("aborted.mcap", "model_fit = false", 1, "--strict")
     assert 'class="banner bad" role="alert">NOT ACCEPTED. STOPPED: ' in page.read_text(encoding="utf-8")
     assert str(page) in replay.refused("report", folder / "good.mcap", "-o", page, "--acceptance", page)
+    suite = ElementTree.parse(tmp_path / "cases.xml").getroot()  # our own
+    assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("3", "1", "0")
+    assert [case.get("name") for case in suite if case.find("failure") is not None] == ["f_v"]

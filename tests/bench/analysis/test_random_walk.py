@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from emb_bench.analysis.constancy import constancy
-from emb_bench.analysis.random_walk import FEWEST, random_walk, smoothed
+from emb_bench.analysis.several_runs import FEWEST, constancy, random_walk, smoothed
 
 WALKS = (0.0, 0.3, 1.0, 3.0)  # Of the simulated number, in the deviation of a measurement, per root of an hour
 

@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyarrow import parquet
 
-from emb_bench.analysis.constancy import DIFFERENT, constancy
-from emb_bench.batch.find import find
+from emb_bench.analysis.several_runs import DIFFERENT, constancy
+from emb_bench.batch.campaign import find
 from emb_bench.batch.row import Options, Parameter, Row, Source, failed, write_rows
 from emb_bench.batch.summary import mark_copies, summarise, text
 from emb_bench.output import Progress, StatusLine, replacing

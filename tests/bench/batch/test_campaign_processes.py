@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from emb_bench import ONE_THREAD
-from emb_bench.batch.distribute import in_processes
+from emb_bench.batch.campaign import in_processes
 from emb_bench.batch.row import Row, Source
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emb_bench.batch.figure import draw
+from emb_bench.batch.campaign import draw
 from emb_bench.batch.row import Options, Parameter, Row
 from emb_bench.batch.summary import Campaign, document, summarise, text
 from emb_runtime.errors import UsageError

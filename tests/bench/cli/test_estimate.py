@@ -81,7 +81,6 @@ def test_what_is_not_identified_has_no_interval_and_is_named_with_its_combinatio
     got = replay.document(path, "--nuisance", "J", "--starts", "2")
     assert not got["identified"]
     assert all(found["interval_95"] == [None, None] for found in got["parameters"].values())
-    assert [c["help"] for c in got["conclusions"]] == ["none"] * 4 + ["not needed"]
     (flat,) = got["directions"]
     assert flat["deviation"] is None
     assert [flat["shares"][name] for name in (*PARAMETER_NAMES, "J")] == pytest.approx([5**-0.5] * 5, rel=1e-3)
@@ -161,11 +160,9 @@ def test_strict_fails_where_the_model_does_not_fit_or_predict_or_something_is_no
         replay.text(path, "--strict", "--starts", "1", *arguments, code=1)
 
 
-def test_profiles_and_the_bootstrap_come_when_asked_for(three: list[Path], replay: Replay) -> None:
-    got = replay.document(*three, "--profile", "--bootstrap", "20", "--starts", "1")
+def test_profiles_come_when_asked_for(three: list[Path], replay: Replay) -> None:
+    got = replay.document(*three, "--profile", "--starts", "1")
     assert [(p["label"], p["shape"]) for p in got["profiles"]] == [(name, "closed") for name in PARAMETER_NAMES]
-    assert (got["bootstrap"]["draws"], got["bootstrap"]["failed"]) == (20, 0)
-    assert list(got["bootstrap"]["intervals_95"]) == list(PARAMETER_NAMES)
     for conclusion, profile in zip(got["conclusions"], got["profiles"], strict=True):
         (low, high), (first, last) = conclusion["interval"], profile["interval_95"]
         assert low <= first < last <= high  # it allows for suspects that were not noticed, too
@@ -173,7 +170,7 @@ def test_profiles_and_the_bootstrap_come_when_asked_for(three: list[Path], repla
     for conclusion, profile in zip(ideal["conclusions"], ideal["profiles"], strict=True):
         assert conclusion["interval"] == profile["interval_95"]
     plain = replay.document(three[0], "--starts", "1")
-    assert (plain["profiles"], plain["bootstrap"]) == ([], None)
+    assert plain["profiles"] == []
 
 
 def test_the_answer_is_short_unless_it_is_asked_for_more(path: Path, replay: Replay) -> None:

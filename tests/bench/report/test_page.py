@@ -13,7 +13,7 @@ from scipy import stats
 
 from emb_bench.figures import svg
 from emb_bench.numbers import around, between, chance, percent, plain, seconds, share, share_between
-from emb_bench.report.certainty import ellipse
+from emb_bench.report.figures import ellipse
 from emb_bench.report.page import environment
 from emb_bench.report.text import Cell, Table
 
