@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -20,9 +19,3 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
         bench = short_bench(folder)
         assert main(["ppo", "single-viscous", "--bench", str(bench), "--out", str(folder / "run")]) == 0
     return folder / "run"
-
-
-@pytest.fixture
-def copied(finished: Path, tmp_path: Path) -> Path:
-    """A copy of it, which a test may change."""
-    return shutil.copytree(finished, tmp_path / "run")

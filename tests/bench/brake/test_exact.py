@@ -21,8 +21,6 @@ BENCH = load_bench()
 BRAKE = BENCH.brake
 BOX = BENCH.range_set("pm50")
 
-WITHOUT_DELAY = tuple(name for name in ALL if name != "delay")  # whose unit is the period
-
 Case = tuple[BrakeParameters, Floats, tuple[float, float]]
 
 

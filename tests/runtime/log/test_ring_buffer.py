@@ -32,7 +32,6 @@ from emb_runtime.log.ring_buffer import (
 )
 from emb_runtime.records import CycleRecord, Frame
 
-INT32 = st.integers(-(2**31), 2**31 - 1)
 INT64 = st.integers(-(2**63), 2**63 - 1)
 
 PRODUCER = """
