@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import random
 from collections import deque
 from collections.abc import Callable
@@ -19,8 +18,10 @@ from emb_runtime.errors import BusError
 from emb_runtime.estimator.estimator import Estimator, estimated
 from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.log.ring_buffer import (
+    Attachment,
     EventRecord,
     LearntRecord,
+    LogHeader,
     Record,
 )
 from emb_runtime.records import Frame
@@ -45,18 +46,20 @@ def write_trace(
 ) -> Path:
     """Write a log as the recorder would, with the trailer of emb-run."""
     begin_ns = next(record.time_ns for record in records if isinstance(record, EventRecord))
-    files = [["bench.toml", "application/toml", base64.b64encode(bench.text.encode()).decode()]]
+    files = [Attachment("bench.toml", "application/toml", bench.text.encode())]
     if policy:
-        files.append(["policy.onnx", "application/octet-stream", base64.b64encode(policy).decode()])
-    header = {
-        "start_ns": begin_ns,
-        "wall_offset_ns": WALL,
-        "dbc": layout.text,
-        "metadata": {"emb.run": {"steps": str(steps), "purpose": "experiment", "limit": "6.0", **identity}},
-        "estimates": [list(quantity) for quantity in estimated(bench)],
-        "attachments": files,
-        "learns": any(isinstance(record, LearntRecord) for record in records),
-    }
+        files.append(Attachment("policy.onnx", "application/octet-stream", policy))
+    header = LogHeader(
+        start_ns=begin_ns,
+        wall_offset_ns=WALL,
+        simulated=True,
+        dbc=layout.text,
+        messages=layout.descriptions,
+        metadata={"emb.run": {"steps": str(steps), "purpose": "experiment", "limit": "6.0", **identity}},
+        estimates=estimated(bench),
+        attachments=files,
+        learns=any(isinstance(record, LearntRecord) for record in records),
+    )
     with path.open("wb") as file:
         writer = LogWriter(file, header)
         for n, record in enumerate(records):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,16 @@ from emb_runtime.can.messages import load_layout
 from emb_runtime.cli.summary import trailer
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.log.recorder_process import LogWriter
-from emb_runtime.log.ring_buffer import Direction, EventRecord, FrameRecord, Level, LineRecord, Record
+from emb_runtime.log.ring_buffer import (
+    Attachment,
+    Direction,
+    EventRecord,
+    FrameRecord,
+    Level,
+    LineRecord,
+    LogHeader,
+    Record,
+)
 
 from tests.conftest import SimRun  # isort: skip
 
@@ -33,17 +42,19 @@ def write_log(
     """
     records = sorted(_records(run), key=lambda item: item[0])
     wall = WALL if begun_ns is None else begun_ns - records[0][0]
-    header: dict[str, Any] = {
-        "start_ns": records[0][0],
-        "wall_offset_ns": wall,
-        "dbc": load_layout().text,
-        "metadata": {
+    header = LogHeader(
+        start_ns=records[0][0],
+        wall_offset_ns=wall,
+        simulated=True,
+        dbc=load_layout().text,
+        messages=load_layout().descriptions,
+        metadata={
             "emb.run": {"steps": str(steps), "iface": "sim", "purpose": "experiment", "limit": "6.0"},
             "emb.truth": {name: str(value) for name, value in run.transport.truth.items()},
         },
-        "estimates": [],
-        "attachments": [["bench.toml", "application/toml", base64.b64encode(shipped_bench_text().encode()).decode()]],
-    } | changes
+        attachments=[Attachment("bench.toml", "application/toml", shipped_bench_text().encode())],
+    )
+    header = replace(header, **changes)
     with path.open("wb") as file:
         writer = LogWriter(file, header)
         for n, (time_ns, record) in enumerate(records):

@@ -28,7 +28,7 @@ from typing import IO, Any
 
 from emb_bench.hil.guest import JOB_FILE, RUNNING, SIGNAL_FILE
 from emb_bench.hil.supervise import ParentDeathWatch
-from emb_runtime.cli.run_metadata import SLOW_MARK
+from emb_runtime.cli.summary import SLOW_MARK
 from emb_runtime.errors import BusError
 
 PROGRAM = "linux.uml"

@@ -19,7 +19,7 @@ from mcap.opcode import Opcode
 from emb_bench.logs.log import read_log
 from emb_bench.logs.mcap_file import DAMAGE, LARGEST, MAGIC, MOST_CARRIED, Chunk, message_class, unpack_chunk
 from emb_runtime.errors import LogError
-from emb_runtime.estimator.estimate import NORMAL_95
+from emb_runtime.estimator.estimate import LOST, NORMAL_95
 from emb_runtime.log.mcap_schema import CYCLE, ESTIMATE, SAFETY, deviation_of
 from emb_runtime.records import Reason, RunState
 from emb_runtime.system.input_file import open_regular
@@ -214,6 +214,8 @@ class Lines:
         if topic == ESTIMATE:
             self._estimate = message
         elif topic == SAFETY.name:
+            if message.code == LOST:
+                self._estimate = None
             self._tell(f"{'':8}{message.code}: {message.text}")
         elif message.state in RUNNING:
             if self._start_ns < 0:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import base64
 import hashlib
 import json
 from importlib import metadata
@@ -22,6 +21,7 @@ from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import load_layout
 from emb_runtime.errors import EXIT_DONE
 from emb_runtime.log.recorder_process import LogWriter
+from emb_runtime.log.ring_buffer import Attachment, LogHeader
 from emb_runtime.records import CycleRecord, NodeState, RunState, RunType
 from emb_runtime.system.input_file import open_regular
 from emb_runtime.system.terminal import as_json, show
@@ -145,12 +145,13 @@ def write_run(found: Recorded, name: str, texts: dict[str, str], source: dict[st
         UsageError: it exists, or cannot be written.
     """
     steps = str(int(found.step[-1]))
-    header = {
-        "dbc": load_layout().text,
-        "wall_offset_ns": 0,
-        "start_ns": 0,
-        "estimates": [],
-        "metadata": {
+    header = LogHeader(
+        start_ns=0,
+        wall_offset_ns=0,
+        simulated=False,
+        dbc=load_layout().text,
+        messages=load_layout().descriptions,
+        metadata={
             "emb.run": {
                 "tool": f"emb-excite {metadata.version('emb-excite')}",
                 "purpose": str(RunType.EXPERIMENT),
@@ -160,8 +161,8 @@ def write_run(found: Recorded, name: str, texts: dict[str, str], source: dict[st
             },
             IMPORT: {**source, "lacks": json.dumps(list(found.lacks), ensure_ascii=False)},
         },
-        "attachments": [(file, "application/toml", base64.b64encode(text.encode())) for file, text in texts.items()],
-    }
+        attachments=[Attachment(file, "application/toml", text.encode()) for file, text in texts.items()],
+    )
     with new_file(out) as file:
         writer = LogWriter(file, header)
         for record in _cycles(found):

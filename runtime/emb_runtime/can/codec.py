@@ -12,7 +12,9 @@ from collections.abc import Iterator, Mapping, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from importlib.util import find_spec
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 from emb_runtime.can import e2e
 from emb_runtime.errors import FrameError
@@ -141,42 +143,45 @@ class Message:
 
 
 def worst_bits(length: int, *, extended: bool = False) -> int:
-    """Most bits that a frame takes on the bus, bit stuffing and interframe space included.
+    """Most bits that a frame of a payload [bytes] takes on the bus, bit stuffing and interframe space included.
 
     With an 11-bit identifier 34 + 8n bits can be stuffed, with one of 29 bits 54 + 8n, one after every four at worst,
     and 13 cannot (Davis, Burns, Bril, Lukkien: "Controller Area Network (CAN) schedulability analysis", 2007, eq. 1
     and 2).
-
-    Args:
-        length: payload [bytes].
-        extended: its identifier has 29 bits.
     """
     return (80 if extended else 55) + 10 * length
 
 
+def from_description(found: Mapping[str, Any]) -> Message:
+    """The message that :attr:`emb_runtime.can.messages.Layout.descriptions` describes, in another process."""
+    signals = [
+        Signal(**{**signal, "choices": {int(value): name for value, name in signal["choices"].items()}})
+        for signal in found["signals"]
+    ]
+    return Message(**{**found, "signals": tuple(signals)})
+
+
 @contextmanager
-def _without(module: str) -> Iterator[None]:
-    """Importing cantools imports python-can, and that asammdf with pandas if it is there: seconds, for nothing here."""
-    if module in sys.modules:
+def _database_only() -> Iterator[None]:
+    """Import ``cantools.database`` without its package, whose imports (python-can) take a tenth of a second."""
+    if "cantools" in sys.modules:
         yield
         return
-    sys.modules[module] = None  # type: ignore[assignment]  # Python's own mark for what is not to be found
+    package = ModuleType("cantools")
+    spec = find_spec("cantools")
+    package.__path__ = list((spec and spec.submodule_search_locations) or ())
+    sys.modules["cantools"] = package
     try:
         yield
     finally:
-        del sys.modules[module]
+        del sys.modules["cantools"]
 
 
 def parse(text: str) -> Database:
-    """Read the text of a DBC file.
+    """Read the text of a DBC file; raises FrameError if it is none."""
+    import textparser  # here, for only a process that speaks CAN needs it
 
-    Raises:
-        FrameError: it is none.
-    """
-    # A quarter of a second of imports that only a process which speaks CAN needs.
-    import textparser
-
-    with _without("asammdf"):
+    with _database_only():
         from cantools.database.can import Database
         from cantools.database.errors import Error
 
@@ -189,12 +194,9 @@ def parse(text: str) -> Database:
 
 
 def generate(database: Database, name: str, expected: Set[str]) -> Message:
-    """The description of one message of a DBC.
+    """The description of one message of a DBC, whose signals are ``CRC`` and those expected.
 
-    Args:
-        database: the DBC.
-        name: of the message.
-        expected: names of its signals but ``CRC``; the DBC may place all but the counter anywhere.
+    The DBC may place all but the counter anywhere.
 
     Raises:
         FrameError: there is no such message, or not as this protocol needs it.

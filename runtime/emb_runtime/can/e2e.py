@@ -37,11 +37,6 @@ def _advance(state: int, data: bytes) -> int:
     return state
 
 
-def crc8_j1850(data: bytes) -> int:
-    """CRC-8 SAE J1850: start value and final XOR 0xFF; 0x4B for ``b"123456789"``."""
-    return _advance(0xFF, data) ^ 0xFF
-
-
 def profile1_start(data_id: int) -> int:
     """The CRC register after the data id (0..65535), low byte first: what a codec computes once per message.
 
@@ -51,12 +46,7 @@ def profile1_start(data_id: int) -> int:
 
 
 def protect(start: int, body: bytes) -> bytes:
-    """The CRC byte followed by the body: payload bytes 1 and up, the counter among them.
-
-    Args:
-        start: :func:`profile1_start` of the message's data id.
-        body: what the CRC covers besides the data id.
-    """
+    """The CRC byte followed by the body: payload bytes 1 and up; ``start`` is that of the message's data id."""
     return bytes((_advance(start, body),)) + body
 
 
@@ -79,9 +69,6 @@ class LeakyCount:
 
     Full after ``tolerated`` bad ones in a row, or after about WEIGHT tolerated / ((1 + WEIGHT) d - 1) events if a share
     d of them, more than a fifth, is bad. It saturates, so that a burst is forgiven in bounded time.
-
-    Args:
-        tolerated: bad ones in a row that are too many.
     """
 
     def __init__(self, tolerated: int) -> None:

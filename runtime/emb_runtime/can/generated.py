@@ -42,9 +42,6 @@ def generate_codec(message: Message, record: type[Any], fields: tuple[Field, ...
         message: its description.
         record: named tuple that a frame is decoded to; its fields, but fixed ones, are the arguments of the encoder.
         fields: of the record, in order: every signal but the CRC, once.
-
-    Raises:
-        FrameError: a signal cannot carry the choices or the fixed value of its field.
     """
     coded = [_Coded(message.signal(field.signal), field, f"v{at}") for at, field in enumerate(fields)]
     for c in coded:

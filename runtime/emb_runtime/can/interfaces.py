@@ -34,8 +34,7 @@ def open_transport(iface: str, bench: Bench, identifiers: tuple[int, ...] | None
         iface: ``can0`` or ``vcan0`` for SocketCAN; ``NAME`` or ``NAME:OPTIONS`` of a registered transport, ``sim``
             among them; ``BACKEND:CHANNEL`` for python-can.
         bench: handed to registered transports; its bitrate to python-can.
-        identifiers: the only 11-bit identifiers that a SocketCAN socket should pass on; None for all frames, empty for
-            none.
+        identifiers: the only 11-bit identifiers that a SocketCAN socket should pass on; None for all frames.
 
     Raises:
         UsageError: there is no such backend.
@@ -62,11 +61,7 @@ def same_bus(one: str, other: str) -> bool:
 
 
 def require_linux(iface: str) -> None:
-    """Refuse a bus on another system.
-
-    Raises:
-        UsageError: this is one.
-    """
+    """Refuse a bus on another system."""
     if not HAS_CHILD_PROCESSES:
         raise UsageError(f"--iface {iface}: a bus needs Linux, for the processes that watch and record; sim does not")
 
@@ -82,18 +77,7 @@ class PythonCan:
     obtained: Mapping[str, str] = {}
 
     def __init__(self, backend: str, channel: str, bitrate: int, clock: Clock) -> None:
-        """Open the bus.
-
-        Args:
-            backend: python-can's name of the interface.
-            channel: the backend's name of the channel.
-            bitrate: for backends that set it [bit/s].
-            clock: for deadlines and arrival times.
-
-        Raises:
-            UsageError: no such backend.
-            BusError: the backend cannot open the channel.
-        """
+        """Open a channel of a backend, both by python-can's names; the bitrate is for backends that set it."""
         import can  # a quarter of a second that a raw socket does not need
 
         self.name = f"{backend}:{channel}"

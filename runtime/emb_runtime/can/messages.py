@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from enum import IntEnum
 from functools import cache
 from importlib import resources
@@ -33,7 +33,7 @@ __all__ = [
     "load_layout",
 ]
 
-CHARGE: Final = "EMB_Charge"  # Name of an optional message, which the layouts of older logs do not have
+CHARGE: Final = "EMB_Charge"  # Name of the message that a node need not send
 CHARGE_VERSION: Final = 1  # Version of the charge message
 
 
@@ -134,7 +134,7 @@ class Layout:
     angle: Message
     velocity: Message
     status: Message
-    charge: Message | None  # Optional: a node may send it, and a layout of an older log does not know it
+    charge: Message  # A node may send it
     device_time_period_ns: int  # Period after which the device time wraps [ns]
     encode_command_fields: Callable[[int, int, float, bool], Frame]
     encode_angle: Callable[[int, float, int], Frame]
@@ -147,28 +147,18 @@ class Layout:
     decode_status: Callable[[Frame], StatusFrame]
 
     def encode_command(self, command: CurrentCommand) -> Frame:
-        """The command frame.
-
-        Raises:
-            FrameError: the current is not finite or beyond the DBC's range, or a counter is not in 0..14.
-        """
+        """The command frame; raises FrameError for a current that is not finite or beyond the DBC's range."""
         return self.encode_command_fields(*command)
 
     @property
     def known(self) -> tuple[Message, ...]:
         """All messages, the optional one included."""
-        required = tuple(self.messages.values())
-        return required if self.charge is None else (*required, self.charge)
+        return *self.messages.values(), self.charge
 
-    def decode_any(self, frame: Frame) -> tuple[str, dict[str, float]] | None:
-        """Message name and signal values of a valid frame of ours; None for every other frame."""
-        for message in self.known:
-            if frame.identifier == message.identifier:
-                try:
-                    return message.name, message.decode(frame)
-                except FrameRejectedError:
-                    return None
-        return None
+    @property
+    def descriptions(self) -> list[dict[str, Any]]:
+        """All messages as plain data, for a process that is not to read the DBC."""
+        return [asdict(message) for message in self.known]
 
     def current_within(self, limit: float) -> float:
         """The largest current that a command can carry and that is not beyond a limit [A]."""
@@ -176,11 +166,7 @@ class Layout:
         return math.floor(limit / step + 1e-6) * step  # a limit of whole steps may be no whole number of them in floats
 
     def bus_load(self, bitrate: int) -> float:
-        """Worst-case share of the bus that ``messages`` take at their cycle times, 1.0 being all of it.
-
-        Args:
-            bitrate: [bit/s].
-        """
+        """Worst-case share of the bus that ``messages`` take at their cycle times and a bitrate; 1.0 is all of it."""
         return sum(m.worst_bits / m.cycle_time for m in self.messages.values()) / bitrate
 
 
@@ -210,9 +196,7 @@ def _shipped_layout() -> Layout:
 
 def _generate(text: str) -> Layout:
     database = parse(text)
-    has_charge = any(message.name == CHARGE for message in database.messages)
-    names = [name for name in _FIELDS if name != CHARGE or has_charge]
-    messages = {name: generate(database, name, {field.signal for field in _FIELDS[name][1]}) for name in names}
+    messages = {name: generate(database, name, {field.signal for field in _FIELDS[name][1]}) for name in _FIELDS}
     time = messages["EMB_Angle"].signal("DeviceTime")
     step_ns = round(time.factor * 1e9)
     if step_ns < 1 or not math.isclose(step_ns * 1e-9, time.factor, rel_tol=1e-9):
@@ -225,8 +209,8 @@ def _generate(text: str) -> Layout:
         raise FrameError("DBC: expected the attribute EmbProtocolVersion; this file is not a layout of this bench")
     version = int(attributes["EmbProtocolVersion"].value)
     codecs = {name: generate_codec(message, *_fields(name, version)) for name, message in messages.items()}
-    command, angle, velocity, status = list(codecs.values())[:4]
-    charge = messages.pop(CHARGE, None)
+    command, angle, velocity, status, charge = codecs.values()
+    optional = messages.pop(CHARGE)
     return Layout(
         text=text,
         protocol_version=version,
@@ -235,13 +219,13 @@ def _generate(text: str) -> Layout:
         angle=messages["EMB_Angle"],
         velocity=messages["EMB_Velocity"],
         status=messages["EMB_Status"],
-        charge=charge,
+        charge=optional,
         device_time_period_ns=step_ns * (time.mask + 1),
         encode_command_fields=command.encode,
         encode_angle=angle.encode,
         encode_velocity=velocity.encode,
         encode_status=status.encode,
-        encode_charge=codecs[CHARGE].encode if charge else _no_charge,
+        encode_charge=charge.encode,
         decode_command=command.decode,
         decode_angle=angle.decode,
         decode_velocity=velocity.decode,
@@ -252,10 +236,6 @@ def _generate(text: str) -> Layout:
 def _fields(name: str, version: int) -> tuple[type[Any], tuple[Field, ...]]:
     record, fields = _FIELDS[name]
     return record, tuple(replace(f, fixed=version) if f.signal == "ProtocolVersion" else f for f in fields)
-
-
-def _no_charge(*_: object) -> Frame:
-    raise FrameError(f"DBC: no message {CHARGE}: expected a layout that has it")
 
 
 def _check_choices(message: Message, name: str, enum: type[IntEnum]) -> None:

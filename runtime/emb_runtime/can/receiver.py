@@ -99,13 +99,7 @@ def fresh_ns(message: Message) -> int:
 
 
 class Reception:
-    """Takes every frame that was on the bus, and gives the samples.
-
-    Args:
-        layout: the bus layout.
-        bench: noise, ranges and limits, which say what is plausible, and how many rejections are too many.
-        on_rejected: told what was rejected and why, in words.
-    """
+    """Takes every frame that was on the bus, and gives the samples; each rejected frame is told with the reason."""
 
     def __init__(self, layout: Layout, bench: Bench, on_rejected: Callable[[Frame, str], None]) -> None:
         self._layout = layout
@@ -148,11 +142,7 @@ class Reception:
         return "angle and velocity frames came, but no velocity next after the angle with its counter: that goes first"
 
     def inhibit_reason(self, now_ns: int) -> str:
-        """Reason why no current may be commanded now; "" if one may.
-
-        Args:
-            now_ns: now, monotonic [ns].
-        """
+        """Reason why no current may be commanded now [ns]; "" if one may."""
         # The stamps are the wall clock's, translated: a small step of that clock may put one just ahead of now.
         ahead_ns = -self._period_ns
         for state in self.states:

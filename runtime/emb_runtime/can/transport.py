@@ -119,14 +119,9 @@ class SocketCan:
         open_socket: Callable[[], socket.socket] = _raw_socket,
         wait_readable: Callable[[int, float], bool] = _wait_readable,
     ) -> None:
-        """Open and bind the socket.
+        """Open and bind the socket of a network interface.
 
-        Args:
-            interface: network interface, ``can0`` or ``vcan0``.
-            clock: for deadlines and for translating time stamps.
-            identifiers: the only 11-bit identifiers the kernel should pass on; None for all frames, empty for none.
-            open_socket: makes the unbound socket.
-            wait_readable: waits for a descriptor, at most so many seconds.
+        The kernel passes on these 11-bit identifiers only; all frames for None, none for an empty tuple.
 
         Raises:
             BusError: this kernel has no CAN, or the interface does not exist or is down.

@@ -7,16 +7,18 @@ import statistics
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from emb_runtime.can.codec import worst_bits
 from emb_runtime.can.messages import Layout, StatusFrame
 from emb_runtime.can.receiver import Reception
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.start_conditions import READY_PAIRS
-from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.system.clock import Clock
+
+if TYPE_CHECKING:
+    from emb_runtime.drives.mapping import Mapping as DriveMapping
 
 ENOUGH_PAIRS = 200  # Sensor pairs from which a standard deviation is known to within a twentieth
 RECENT_PAIRS = 1000  # Pairs that the scatter is taken from
@@ -57,13 +59,7 @@ class BusStatistics:
 
 
 class BusMonitor:
-    """Monitor of a bus: takes its frames, and counts.
-
-    Args:
-        layout: the bus layout.
-        bench: says what is plausible, and how fast the bus is.
-        on_rejected: called with each rejected frame and the reason, in words.
-    """
+    """Monitor of a bus: takes its frames, and counts. Each rejected frame is told with the reason."""
 
     def __init__(self, layout: Layout, bench: Bench, on_rejected: Callable[[Frame, str], None]) -> None:
         self._layout = layout
@@ -172,15 +168,12 @@ def listen(
 
     Args:
         monitor: takes the frames.
-        receive: gives the next frame, or None at a deadline (monotonic [ns]).
+        receive: gives the next frame, or None at a deadline.
         clock: the time that those deadlines are on.
         period_ns: the sampling period [ns].
         deadline_ns: monotonic [ns].
-        enough: whether a sample that was in hand at a time (monotonic [ns]) is as it should be.
-        stop_requested: whether the operator wants an end.
-
-    Raises:
-        BusError: the bus is lost.
+        enough: True if a sample that was in hand at a time (monotonic [ns]) is as it should be.
+        stop_requested: True if the operator wants an end.
     """
     begin_ns = now_ns = clock.now_ns()
     ready = 0

@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
+import glob
+import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from emb_runtime.can.interfaces import open_transport
-from emb_runtime.cli import listen_only, summary
-from emb_runtime.cli.live import shown
-from emb_runtime.cli.options import Ask, Plan, Stage, log_folder, log_path, parser, prepare
+from emb_runtime.cli import summary
+from emb_runtime.cli.options import Ask, Plan, Stage, log_folder, log_path, names_a_file, parser, prepare
 from emb_runtime.cli.preflight import CheckResult, RefusedError, Verdict, table
 from emb_runtime.cli.repeat import campaign, experiment
-from emb_runtime.cli.session import Bus, Console
+from emb_runtime.cli.session import Bus, Console, listen_only, unpinned
 from emb_runtime.config.bench import shipped_bench_text
-from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError
+from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError, UsageError
 from emb_runtime.records import LISTEN_ONLY_LOG
+from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 from emb_runtime.system.terminal import ARM_QUESTION, StopRequest, as_json, complain, confirmed, mention, show
 
 LISTEN_NS = 50_000_000  # Time between two looks at the keyboard [ns]
+VIEWERS = "emb_runtime.viewers"  # Entry-point group of the modules that show a run: ``live``, and its ``report``
+VIEWER_TIMEOUT = 10.0  # Longest wait for the process to be ready [s]
 
 
 class Operator:
-    """Operator: sees the pre-flight, and is asked once before anything is armed.
-
-    Args:
-        plan: says whether to ask, and how to print.
-        stop_requested: whether an end is wanted.
-    """
+    """Operator: sees the pre-flight, and is asked once before anything is armed."""
 
     def __init__(self, plan: Plan, stop_requested: StopRequest) -> None:
         self._plan = plan
@@ -95,10 +97,63 @@ def main(argv: list[str] | None = None) -> int:
         return complain("emb-run", err)
 
 
+@contextmanager
+def shown(plan: Plan) -> Iterator[None]:
+    """While this lasts, another process shows the growing logs of a plan, where ``--live`` asks for that."""
+    if plan.live is None:
+        yield
+        return
+    if not HAS_CHILD_PROCESSES:
+        raise UsageError("--live: needs Linux; emb-replay live shows a run from another terminal")
+    entries = list(metadata.entry_points(group=VIEWERS, name="live"))
+    if not entries:
+        raise UsageError("--live: nothing is installed that shows a run; emb_bench does")
+    one = names_a_file(plan.log)
+    document = {
+        "folder": str(plan.log.parent if one else plan.log),
+        "pattern": f"{glob.escape(plan.log.stem)}*{glob.escape(plan.log.suffix)}" if one else "*.mcap",
+        "port": None if plan.live == "lines" else int(plan.live),
+    }
+    try:
+        child = Child("live", entries[0].value, document, [])
+    except OSError as err:
+        raise UsageError(f"--live: cannot start its process: {err.strerror}") from err
+    try:
+        answer = child.answer(VIEWER_TIMEOUT)
+        if "ready" not in answer:
+            raise UsageError(f"--live: {answer.get('error', 'its process gave no answer')}")
+        if answer["ready"]:
+            mention(f"live at {answer['ready']}")
+        yield
+    finally:
+        child.end()
+
+
 def _experiment(plan: Plan, console: Console) -> int:
+    reporter = None if plan.report is None else _reporter(plan.report)
     done = experiment(plan, plan.iface, log_path(plan.log), console)
     show(as_json(done.document) if plan.json else summary.text(done.document, plan.verbose))
+    if reporter is not None and done.document["log"] is not None:
+        reported = _report(reporter, done.document["log"], plan)
+        return done.exit_code or reported
     return done.exit_code
+
+
+def _reporter(page: Path) -> str:
+    """Module whose command ``report`` writes a page; asked for before the run."""
+    entries = list(metadata.entry_points(group=VIEWERS, name="report"))
+    if not entries:
+        raise UsageError("--report: nothing is installed that writes a page; emb_bench does: emb-excite[bench]")
+    if not page.absolute().parent.is_dir():
+        raise UsageError(f"--report: {page.absolute().parent} is no folder")
+    return entries[0].value
+
+
+def _report(module: str, log: str, plan: Plan) -> int:
+    """Have a process without the real-time settings of this one estimate, and write the page; its exit code."""
+    with unpinned(plan):
+        command = [sys.executable, "-P", "-m", module, "report", log, "--output", str(plan.report)]
+        return subprocess.run(command, stdout=sys.stderr if plan.json else None, check=False).returncode
 
 
 def _campaign(plan: Plan, console: Console) -> int:
@@ -117,11 +172,12 @@ def _read(plan: Plan, console: Console) -> int:
     path = log_path(plan.log, LISTEN_ONLY_LOG)
     transport, clock = open_transport(plan.iface, plan.bench)
     try:
-        read = listen_only.read(plan, Bus(plan.iface, transport, clock), path, console)
+        document, lines = listen_only(plan, Bus(plan.iface, transport, clock), path, console)
     finally:
         transport.close()
-    show(as_json(listen_only.document(plan, plan.iface, read)) if plan.json else listen_only.text(read))
-    return read.exit_code
+    show(as_json(document) if plan.json else summary.listen_text(document, lines))
+    exit_code: int = document["exit_code"]
+    return exit_code
 
 
 def _write_bench(path: Path) -> int:

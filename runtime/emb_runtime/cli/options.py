@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from emb_runtime.can.interfaces import same_bus
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
-from emb_runtime.drives.gateway import drive_file
-from emb_runtime.drives.mapping import Mapping, require_fit
-from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import BenchFileError, PolicyRefusedError, UsageError
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.learning.assumptions import make_assumptions
@@ -26,6 +24,10 @@ from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from emb_runtime.system import realtime
+from emb_runtime.system.terminal import one_line
+
+if TYPE_CHECKING:
+    from emb_runtime.drives.mapping import Mapping
 
 LONGEST_READING = 86_400.0  # Longest ``--read-only`` [s]
 MOST_RUNS = 10_000
@@ -62,6 +64,8 @@ exit codes:
   5  the policy was refused: damaged, or made for another bench
   6  the experiment was completed, but its log is not whole (disk full, recorder killed)
   8  no one brake explains what the node reported: a sensor, its zero, the reported current, or the drive is wrong
+  9  with --strict: the experiment was completed, and the brake's estimate lies outside the ranges of the bench file, so
+     that the limits were not guaranteed
   With --repeat: that of the first run that failed.
 
 examples:
@@ -139,6 +143,8 @@ class Plan:
     live: str | None  # Port at which the run is shown, or ``lines``
     json: bool
     verbose: bool
+    strict: bool = False  # An estimate outside the ranges is no success
+    report: Path | None = None  # Page to write after the run
     drive: MappedDrive | None = None  # The node is its gateway
     operator: str = ""  # Name of who makes the run; empty if that was not said
     serial: str = ""  # Serial number of the device; empty if that was not said
@@ -191,6 +197,14 @@ def parser() -> argparse.ArgumentParser:
         "--live", nargs="?", const=str(LIVE_PORT), metavar="PORT|lines",
         help="show the run while it goes on, from a process of its own: to Foxglove or Lichtblick at this port "
         f"(default: {LIVE_PORT}; needs the extra [live]), or in lines on standard error",
+    )  # fmt: skip
+    what.add_argument(
+        "--report", type=Path, metavar="FILE.html",
+        help="after the run, estimate the parameters and write the page, as emb-replay report does (needs emb_bench)",
+    )  # fmt: skip
+    what.add_argument(
+        "--strict", action="store_true",
+        help="exit code 9 if the estimate lies outside the ranges of the bench file, for which the limits hold",
     )  # fmt: skip
     what.add_argument("--operator", default="", metavar="NAME", help="who makes the run, for the log and its report")
     what.add_argument("--serial", default="", metavar="TEXT", help="serial number of the device, for the log")
@@ -247,13 +261,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def prepare(args: argparse.Namespace) -> Plan:
-    """Check the options, and read bench and policy.
-
-    Raises:
-        UsageError: an argument has no sensible value, or a file cannot be read.
-        BenchFileError: the bench file is refused.
-        PolicyRefusedError: the policy is.
-    """
+    """Check the options, and read bench and policy."""
     bench, layout = load_bench(args.bench), load_layout()
     stage, limit = _stage(args, bench)
     steps, listen = _duration(args, bench)
@@ -269,6 +277,9 @@ def prepare(args: argparse.Namespace) -> Plan:
     if stage is Stage.READ_ONLY and (args.stop_when is not None or args.quick):
         option = "--stop-when" if args.stop_when is not None else "--quick"
         raise UsageError(f"--read-only: runs no experiment that {option} could end")
+    if args.report is not None and (stage is Stage.READ_ONLY or args.repeat > 1):
+        option = "--read-only" if stage is Stage.READ_ONLY else "--repeat"
+        raise UsageError(f"--report: one experiment has a page, and {option} makes none or many: emb-replay report")
     if stage is Stage.ZERO and args.home:
         raise UsageError("--zero: no brake comes home with 0 A; turn it by hand, or use --limit")
     if args.repeat > 1 and names_a_file(args.log):
@@ -307,14 +318,23 @@ def prepare(args: argparse.Namespace) -> Plan:
         live=_live(args.live),
         json=args.json,
         verbose=args.verbose,
+        strict=args.strict,
+        report=args.report,
         drive=_drive(args.iface, args.drive, bench),
-        operator=_label("--operator", args.operator),
-        serial=_label("--serial", args.serial),
+        operator=one_line(args.operator, LONGEST_LABEL),
+        serial=one_line(args.serial, LONGEST_LABEL),
     )
 
 
 def _drive(iface: str, given: str | None, bench: Bench) -> MappedDrive | None:
-    file, bus = drive_file(iface), ""
+    scheme, _, mapped = iface.partition(":")
+    if given is None and scheme != "map":
+        return None
+    # Only here: most runs have no mapped drive, and each waits for the imports.
+    from emb_runtime.drives.mapping import require_fit
+    from emb_runtime.drives.mapping_file import load_mapping
+
+    file, bus = Path(mapped.rpartition("@")[0]) if scheme == "map" else None, ""
     if given is not None:
         name, at, bus = given.rpartition("@")
         if not (name and at and bus) or file is not None:
@@ -324,32 +344,14 @@ def _drive(iface: str, given: str | None, bench: Bench) -> MappedDrive | None:
                 f"--drive '{given}': expected another bus than --iface, whose identifiers differ in meaning"
             )
         file = Path(name)
-    if file is None:
-        return None
+    assert file is not None
     mapping = load_mapping(file)
     require_fit(mapping, bench)
     return MappedDrive(mapping, bus)
 
 
-def _label(option: str, text: str) -> str:
-    """A text for the log's metadata.
-
-    Raises:
-        UsageError: it is too long, or cannot be printed.
-    """
-    if len(text) > LONGEST_LABEL or not text.isprintable():
-        raise UsageError(
-            f"{option}: expected a printable text of at most {LONGEST_LABEL} characters, got {text[:40]!r}"
-        )
-    return text
-
-
 def names_a_file(path: Path) -> bool:
-    """Returns True for a file to write, False for a folder of files: anything without a suffix is a folder.
-
-    Raises:
-        UsageError: the path cannot be looked at.
-    """
+    """Returns True for a file to write, False for a folder of files: anything without a suffix is a folder."""
     try:
         return bool(path.suffix) and not path.is_dir()
     except OSError as err:
@@ -358,14 +360,7 @@ def names_a_file(path: Path) -> bool:
 
 @contextmanager
 def log_folder(wanted: Path) -> Iterator[None]:
-    """The folder for the logs; where it was made for nothing, it is removed again.
-
-    Args:
-        wanted: as given by the user.
-
-    Raises:
-        UsageError: it cannot be made.
-    """
+    """The folder for the logs that the user wants; where it was made for nothing, it is removed again."""
     folder = wanted.parent if names_a_file(wanted) else wanted
     try:
         made = [path for path in (folder, *folder.parents) if not path.exists()]
@@ -385,15 +380,7 @@ def log_folder(wanted: Path) -> Iterator[None]:
 
 
 def log_path(wanted: Path, ending: str = "") -> Path:
-    """Path of the next log; the time names it where the user did not.
-
-    Args:
-        wanted: as given by the user.
-        ending: of the name, where the time names it.
-
-    Raises:
-        UsageError: the file exists: logs are never overwritten.
-    """
+    """Path of the next log, which must not exist; the time names it, with this ending, where the user did not."""
     path = wanted
     if not names_a_file(wanted):
         name = time.strftime("%Y%m%d-%H%M%S") + f"-{time.time_ns() // 1_000_000 % 1000:03d}"

@@ -11,16 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import zip_longest
-from textwrap import wrap
+from textwrap import shorten, wrap
 from typing import Any
 
-from emb_runtime.can.messages import Layout, bench_identity
+from emb_runtime.can.messages import bench_identity
 from emb_runtime.cli.bus_monitor import BusStatistics, planned_load
-from emb_runtime.cli.options import Stage
-from emb_runtime.config.bench import Bench
+from emb_runtime.cli.options import Plan, Stage
 from emb_runtime.control.start_conditions import StartConditions
-from emb_runtime.drives.mapping import PROPERTIES
-from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_SAFETY_STOP, BenchFileError, EmbError, UsageError
 from emb_runtime.safety.end_stop import released_speed
 from emb_runtime.safety.state_machine import FAULTS, Fault
@@ -46,14 +43,7 @@ class Verdict(StrEnum):
 
 
 class RefusedError(EmbError):
-    """The run ends before anything was sent.
-
-    Args:
-        message: why.
-        exit_code: what the command ends with.
-        lines: the pre-flight as far as it came.
-        fault: what it would have been in a run, if there is such a thing.
-    """
+    """The run ends before anything was sent; with the pre-flight as far as it came, and the fault if it is one."""
 
     def __init__(
         self, message: str, exit_code: int, lines: Sequence[CheckResult] = (), fault: Fault | None = None
@@ -89,40 +79,30 @@ class CheckResult:
 class Findings:
     """Findings that the checks look at."""
 
-    bench: Bench
-    layout: Layout
-    end_stop_speed: float  # End-stop speed after a loss of all commands at the worst moment [rad/s]
-    stage: Stage
-    limit: float  # [A]
-    duration: float  # Duration of the run [s]
+    plan: Plan
     start_conditions: StartConditions
+    duration: float  # Duration of the run [s]
+    heard: BusStatistics
     bus: str  # Interface, in words
     in_process: bool  # Only this process can be on it
-    heard: BusStatistics
-    policy: Mapping[str, str] | None  # Properties of the policy; None where none decides
+    end_stop_speed: float  # End-stop speed after a loss of all commands at the worst moment [rad/s]
     needed: int  # Expected size of the log [bytes]
     free: int  # Free space on its disk [bytes]
     watchdog: str  # Watchdog, in words; empty for none
     core: Core  # Compiled or not
-    drive: DriveMapping | None  # The mapped drive, where it is one
-    serial: str  # Serial number that the operator gave; empty for none
     realtime: Mapping[str, str] | None
     """Real-time settings, see :func:`emb_runtime.system.realtime.obtain`; None where none were asked for."""
 
 
 def check(findings: Findings) -> tuple[CheckResult, ...]:
     """Run every check, in the order of the table."""
-    learns = findings.bench.shield.learn and not findings.start_conditions.anywhere
-    special = (*((_drive,) if findings.drive else ()), *((_learning,) if learns else ()))
+    learns = findings.plan.bench.shield.learn and not findings.start_conditions.anywhere
+    special = (*((_drive,) if findings.plan.drive else ()), *((_learning,) if learns else ()))
     return tuple(look(findings) for look in (*CHECKS, *special))
 
 
 def refuse(lines: Sequence[CheckResult]) -> None:
-    """End here if a line is refused.
-
-    Raises:
-        RefusedError: one is; the first one says why.
-    """
+    """Raise RefusedError if a line is refused; the first one says why."""
     for line in lines:
         if line.verdict is Verdict.REFUSED:
             advice = "" if line.fault is None else f"; {FAULTS[line.fault].advice}"
@@ -151,11 +131,11 @@ def _stage(f: Findings) -> CheckResult:
     says = {
         Stage.READ_ONLY: "nothing leaves",
         Stage.ZERO: "only 0 A leaves",
-        Stage.LIMITED: f"at most {f.limit:g} A leaves",
-        Stage.FULL: f"up to {f.limit:g} A",
+        Stage.LIMITED: f"at most {f.plan.limit:g} A leaves",
+        Stage.FULL: f"up to {f.plan.limit:g} A",
     }
     where = "" if not f.start_conditions.anywhere else ", on the way home"
-    return CheckResult("stage", f"{f.stage}{where}: {says[f.stage]}, for {f.duration:g} s", "as asked for")
+    return CheckResult("stage", f"{f.plan.stage}{where}: {says[f.plan.stage]}, for {f.duration:g} s", "as asked for")
 
 
 def _interface(f: Findings) -> CheckResult:
@@ -169,7 +149,7 @@ def _interface(f: Findings) -> CheckResult:
 
 def _node(f: Findings) -> CheckResult:
     status = f.heard.status
-    identity = f"protocol {f.layout.protocol_version}, bench {bench_identity(f.bench.identity_hash):#06x}"
+    identity = f"protocol {f.plan.layout.protocol_version}, bench {bench_identity(f.plan.bench.identity_hash):#06x}"
     if not f.heard.frames:
         return _faulty("node", Fault.NO_NODE, "nothing heard", identity)
     if why := f.start_conditions.mismatch(status):
@@ -180,7 +160,7 @@ def _node(f: Findings) -> CheckResult:
 
 
 def _state(f: Findings) -> CheckResult:
-    sample, home = f.heard.sample, f.bench.shield
+    sample, home = f.heard.sample, f.plan.bench.shield
     expected = f"IDLE, within {home.home_angle:g} rad and {home.home_velocity:g} rad/s of the origin"
     if f.start_conditions.anywhere:
         expected = "IDLE, inside the limits"
@@ -196,7 +176,7 @@ def _state(f: Findings) -> CheckResult:
 
 
 def _rate(f: Findings) -> CheckResult:
-    heard, period = f.heard, f.bench.timing.sample_time
+    heard, period = f.heard, f.plan.bench.timing.sample_time
     expected = f"a sample each {period * 1e3:g} ms, none missing or rejected"
     if not math.isfinite(heard.period):
         return _faulty("samples", Fault.NO_NODE, f"{heard.pairs} sensor pairs", expected)
@@ -208,7 +188,7 @@ def _rate(f: Findings) -> CheckResult:
         return _faulty("samples", Fault.FRAMES_REJECTED, found, expected)
     if abs(heard.period / period - 1.0) > RATE_TOLERANCE:
         return _faulty("samples", Fault.NODE_NOT_READY, found, expected)
-    if f.stage is Stage.READ_ONLY and lost > MOST_MISSING:
+    if f.plan.stage is Stage.READ_ONLY and lost > MOST_MISSING:
         return CheckResult(
             "samples", found, f"{expected}; at most {MOST_MISSING:.0%}", Verdict.REFUSED, EXIT_CHECK_FAILED
         )
@@ -216,10 +196,10 @@ def _rate(f: Findings) -> CheckResult:
 
 
 def _noise(f: Findings) -> CheckResult:
-    heard, noise = f.heard, f.bench.noise
+    heard, noise = f.heard, f.plan.bench.noise
     expected = (
         f"at most {SCATTER_TOLERANCE:g} times {noise.angle:g} rad and {noise.velocity:g} rad/s; the shield reckons "
-        f"with {f.bench.shield.noise_sigmas:g} times that"
+        f"with {f.plan.bench.shield.noise_sigmas:g} times that"
     )
     if not (math.isfinite(heard.angle_scatter) and math.isfinite(heard.velocity_scatter)):
         return _line("noise at rest", "not known: no samples at rest", expected, good=False)
@@ -232,15 +212,16 @@ def _noise(f: Findings) -> CheckResult:
 
 
 def _bus_load(f: Findings) -> CheckResult:
-    bitrate, command = f.bench.can.bitrate, f.layout.command
+    bitrate, command = f.plan.bench.can.bitrate, f.plan.layout.command
     expected = f"at most {HIGHEST_BUS_LOAD:.0%}"
     of_drive = ""
-    if f.drive is not None:  # that it fits was checked with the mapping file
-        load = planned_load(f.bench, f.layout, f.drive)
-        of_drive = f"{load:.0%} of the drive's bus at worst by its DBC at {f.drive.bitrate} bit/s (its can.bitrate)"
+    if f.plan.drive is not None:  # that it fits was checked with the mapping file
+        drive = f.plan.drive.mapping
+        load = planned_load(f.plan.bench, f.plan.layout, drive)
+        of_drive = f"{load:.0%} of the drive's bus at worst by its DBC at {drive.bitrate} bit/s (its can.bitrate)"
     if of_drive and f.in_process:  # in lock-step there is no other bus
         return CheckResult("bus load", of_drive, expected)
-    planned = f.layout.bus_load(bitrate)
+    planned = f.plan.layout.bus_load(bitrate)
     found = f"{planned:.0%} at worst by the DBC at {bitrate} bit/s (can.bitrate), {f.heard.load:.0%} heard"
     found += f", {f.heard.others} frames of others" if f.heard.others else ""
     found += f"; {of_drive}" if of_drive else ""
@@ -258,7 +239,7 @@ def _disk(f: Findings) -> CheckResult:
 
 
 def _shield(f: Findings) -> CheckResult:
-    shield, node = f.bench.shield, f.bench.node
+    shield, node = f.plan.bench.shield, f.plan.bench.node
     # That the argument holds for this set was checked when the law was made.
     speed = f.end_stop_speed
     end = f"at worst into an end stop with {speed:.3g} rad/s" if speed else "which reaches no end stop"
@@ -270,12 +251,12 @@ def _shield(f: Findings) -> CheckResult:
 
 
 def _slew(f: Findings) -> CheckResult:
-    if not f.limit:
+    if not f.plan.limit:
         return CheckResult("slew", "no current leaves", "none needed")
-    period, slew = f.bench.timing.sample_time, f.bench.guard.slew
-    reversal = 2.0 * f.limit / slew
+    period, slew = f.plan.bench.timing.sample_time, f.plan.bench.guard.slew
+    reversal = 2.0 * f.plan.limit / slew
     expected = f"at most {period * 1e3:g} ms: the shield reckons with any current at once"
-    found = f"{f.limit:g} A to {-f.limit:g} A in {reversal * 1e3:.3g} ms (guard.slew)"
+    found = f"{f.plan.limit:g} A to {-f.plan.limit:g} A in {reversal * 1e3:.3g} ms (guard.slew)"
     if good := reversal <= period * (1.0 + 1e-9):
         return _line("slew", found, expected, good)
     late = f"; the way home may be {(reversal - period) * 1e3:.3g} ms late, and the node brake in its place"
@@ -283,16 +264,18 @@ def _slew(f: Findings) -> CheckResult:
 
 
 def _policy(f: Findings) -> CheckResult:
-    if f.policy is None:
+    policy = f.plan.policy
+    if policy is None or f.plan.stage is Stage.READ_ONLY or f.start_conditions.anywhere:
         return CheckResult("policy", "none decides", "none")
-    made = f", {f.policy['provenance']}" if f.policy["provenance"] else ""
-    beyond = f.policy["beyond"]
-    found = f"{f.policy['kind']}, sha256 {f.policy['sha256'][:12]}{made}{beyond and f'; {beyond}'}"
-    return _line("policy", found, "made for such a bench, its test vectors reproduced", not beyond)
+    provenance = ", ".join(f"{name} {value}" for name, value in policy.contract.provenance.items())
+    made = shorten(provenance, 80, placeholder=" …")
+    parts = (f"{policy.contract.kind}, sha256 {policy.sha256[:12]}", made)
+    found = "; ".join((", ".join(filter(None, parts)), *policy.warnings))
+    return _line("policy", found, "made for such a bench, its test vectors reproduced", not policy.warnings)
 
 
 def _watchdog(f: Findings) -> CheckResult:
-    if f.in_process or f.stage is Stage.READ_ONLY:
+    if f.in_process or f.plan.stage is Stage.READ_ONLY:
         return CheckResult(
             "watchdog", "none needed", "none: nobody else can see this bus" if f.in_process else "none: nothing leaves"
         )
@@ -301,7 +284,7 @@ def _watchdog(f: Findings) -> CheckResult:
 
 def _realtime(f: Findings) -> CheckResult:
     if f.realtime is None:
-        none_needed = f.in_process or f.stage is Stage.READ_ONLY
+        none_needed = f.in_process or f.plan.stage is Stage.READ_ONLY
         return _line("real time", "not asked for", "not needed" if none_needed else "all settings", none_needed)
     settings = {name.replace("_", " "): value for name, value in f.realtime.items()}
     lacking = {name: value for name, value in settings.items() if value.startswith("not obtained")}
@@ -315,23 +298,26 @@ def _core(f: Findings) -> CheckResult:
 
 
 def _drive(f: Findings) -> CheckResult:
-    assert f.drive is not None
-    lacks = "; ".join(f"{name} ({PROPERTIES[name]})" for name in f.drive.lost)
-    speed = released_speed(f.bench, f.drive.watchdog)
-    named = f"{f.drive.sha256[:12]}, as the bench file names it"
-    if not f.bench.can.mapping:
-        named = f'not named by the bench file (can.mapping = "{f.drive.sha256}")'
-    serial = f", serial number {f.serial} by the operator" if f.serial else ""
-    found = f"{f.drive.name}{serial}, mapping {named}, time-out {f.drive.watchdog:g} s; host or cable lost at the "
+    from emb_runtime.drives.mapping import PROPERTIES  # here, for most runs have no mapped drive
+
+    assert f.plan.drive is not None
+    drive = f.plan.drive.mapping
+    lacks = "; ".join(f"{name} ({PROPERTIES[name]})" for name in drive.lost)
+    speed = released_speed(f.plan.bench, drive.watchdog)
+    named = f"{drive.sha256[:12]}, as the bench file names it"
+    if not f.plan.bench.can.mapping:
+        named = f'not named by the bench file (can.mapping = "{drive.sha256}")'
+    serial = f", serial number {f.plan.serial} by the operator" if f.plan.serial else ""
+    found = f"{drive.name}{serial}, mapping {named}, time-out {drive.watchdog:g} s; host or cable lost at the "
     found += (
-        f"worst moment, and let go: below {speed:.4g} rad/s, the brake bears {f.drive.end_stop_speed:g}; lacks {lacks}"
+        f"worst moment, and let go: below {speed:.4g} rad/s, the brake bears {drive.end_stop_speed:g}; lacks {lacks}"
     )
     expected = "all of it accepted by name in the mapping file; the shield assumes shield.frame_age, and a host and a "
     return CheckResult("drive", found, f"{expected}cable that are not lost", Verdict.WARNING)
 
 
 def _learning(f: Findings) -> CheckResult:
-    shield = f.bench.shield
+    shield = f.plan.bench.shield
     found = (
         f"model {shield.model}, model error {shield.model_error:g} rad/s², current error {shield.current_error:g} A, "
         f"sensor errors within {shield.noise_sigmas:g} deviations"

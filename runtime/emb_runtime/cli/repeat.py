@@ -33,13 +33,9 @@ class ExperimentResult:
 
 
 def experiment(plan: Plan, iface: str, path: Path, console: Console) -> ExperimentResult:
-    """Run one experiment, and bring the brake home before and after it where that is asked for and needed.
+    """Run one experiment on a bus, and bring the brake home before and after it where that is asked for and needed.
 
-    Args:
-        plan: what is to be run.
-        iface: the bus.
-        path: of the log, which must not exist; those of the ways home are called alike.
-        console: the operator.
+    The log must not exist; those of the ways home are called alike.
 
     Raises:
         RefusedError: the pre-flight or the operator refused; nothing was sent.
@@ -61,7 +57,7 @@ def experiment(plan: Plan, iface: str, path: Path, console: Console) -> Experime
                 return ExperimentResult(homing["before"], way.exit_code, False, truth)
         ran = conduct(plan, bus, RunType.EXPERIMENT, path, console)
         document = summary.document(plan, iface, ran) | {"homing": homing}
-        exit_code, goes_on = ran.exit_code, ran.outcome.fault is None
+        exit_code, goes_on = document["exit_code"], ran.outcome.fault is None
         if plan.home and may_go_home(ran.outcome) and not console.stop_requested():
             way_code = _go_home(plan, bus, path, console, homing)
             exit_code, goes_on = exit_code or way_code, way_code == EXIT_DONE
@@ -71,12 +67,7 @@ def experiment(plan: Plan, iface: str, path: Path, console: Console) -> Experime
 
 
 def campaign(plan: Plan, console: Console, report: Callable[[int, dict[str, Any]], None]) -> tuple[int, Counter[str]]:
-    """Run one experiment after the other.
-
-    Args:
-        plan: what is to be run.
-        console: the operator.
-        report: called with each run's number from 1 and its document.
+    """Run one experiment after the other, and report each with its number from 1 and its document.
 
     Returns:
         The exit code of the first run that failed, and how often each result came.

@@ -12,15 +12,14 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from textwrap import shorten
+from typing import Any
 
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.transport import Transport, is_private
 from emb_runtime.cli.bus_monitor import BusMonitor, BusStatistics, is_alarming, listen
-from emb_runtime.cli.options import Plan, Stage
-from emb_runtime.cli.preflight import CheckResult, Findings, check, interrupted, refuse
-from emb_runtime.cli.run_metadata import header, log_bytes
-from emb_runtime.cli.summary import RunResult, trailer
+from emb_runtime.cli.options import Plan
+from emb_runtime.cli.preflight import CheckResult, Findings, RefusedError, check, interrupted, refuse
+from emb_runtime.cli.summary import RunResult, header, heard_document, listen_document, log_bytes, trailer
 from emb_runtime.control.actor import Actor, Still, homing_steps
 from emb_runtime.control.core import Core
 from emb_runtime.control.loop import Loop
@@ -28,15 +27,16 @@ from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Level
-from emb_runtime.policy.policy import Policy
 from emb_runtime.records import Frame, RunType, SensorSample
 from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import Unwatched
+from emb_runtime.safety.state_machine import Event, Fault, StateMachine, timeouts
 from emb_runtime.safety.watchdog import WatchdogHandle
 from emb_runtime.system import compiled_core, realtime
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES
 from emb_runtime.system.clock import Clock
+from emb_runtime.system.terminal import as_json
 
 
 @dataclass(frozen=True)
@@ -75,14 +75,7 @@ class Console:
 
 
 def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Console) -> RunResult:
-    """Run the experiment, or a way home.
-
-    Args:
-        plan: what is to be run.
-        bus: open, with the node on it.
-        run_type: which of the two.
-        path: of the log, which must not exist.
-        console: the operator.
+    """Run the experiment, or a way home, on an open bus with a new log.
 
     Raises:
         RefusedError: the pre-flight or the operator refused; nothing was sent.
@@ -160,12 +153,7 @@ def drop_backlog(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
 def observe(
     plan: Plan, bus: Bus, start_conditions: StartConditions, stop_requested: Callable[[], bool]
 ) -> BusStatistics:
-    """Listen until a run may begin, or for as long as the bench says.
-
-    Raises:
-        RefusedError: the operator wants an end.
-        BusError: the bus is lost.
-    """
+    """Listen until a run may begin, or for as long as the bench says."""
     monitor = BusMonitor(plan.layout, plan.bench, lambda _frame, _why: None)
     deadline_ns = bus.clock.now_ns() + round(plan.bench.watch.start_timeout * 1e9)
 
@@ -189,65 +177,32 @@ def findings(
     watchdog: WatchdogHandle | None = None,
     obtained: dict[str, str] | None = None,
 ) -> Findings:
-    """Findings for the pre-flight.
-
-    Args:
-        plan: what is to be run.
-        bus: where.
-        start_conditions: what the node must show.
-        heard: the bus statistics.
-        duration: of the run [s].
-        path: of the log.
-        watchdog: who watches over the loop.
-        obtained: real-time settings; None where none were asked for.
-    """
-    decides = plan.stage is not Stage.READ_ONLY and not start_conditions.anywhere
+    """Findings for the pre-flight; the real-time settings are None where none were asked for."""
     watched = ""
     if watchdog is not None:
         priority = watchdog.realtime.get("scheduler", "ordinary scheduling")
         watched = f"process {watchdog.pid}, heartbeat {plan.bench.watch.heartbeat * 1e3:g} ms, {priority}"
     settings = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in bus.transport.obtained.items())
     return Findings(
-        bench=plan.bench,
-        layout=plan.layout,
-        end_stop_speed=end_stop_speed(plan.bench),
-        stage=plan.stage,
-        limit=plan.limit,
-        duration=duration,
+        plan=plan,
         start_conditions=start_conditions,
+        duration=duration,
+        heard=heard,
         bus=f"{bus.transport.name}{', in lock-step' if bus.simulated else ''}{', ' if settings else ''}{settings}",
         in_process=bus.in_process,
-        heard=heard,
-        policy=_about(plan.policy) if decides and plan.policy is not None else None,
+        end_stop_speed=end_stop_speed(plan.bench),
         needed=log_bytes(plan, duration),
         free=shutil.disk_usage(path.parent).free,
         watchdog=watched,
         core=compiled_core.running(),
-        drive=plan.drive.mapping if plan.drive is not None else None,
-        serial=plan.serial,
         realtime=obtained,
     )
-
-
-def _about(policy: Policy) -> dict[str, str]:
-    """Properties of a policy, in words."""
-    provenance = ", ".join(f"{name} {value}" for name, value in policy.contract.provenance.items())
-    return {
-        "sha256": policy.sha256,
-        "kind": policy.contract.kind,
-        "beyond": "; ".join(policy.warnings),
-        "provenance": shorten(provenance, 80, placeholder=" …"),
-    }
 
 
 def start_recorder(
     plan: Plan, bus: Bus, run_type: RunType, path: Path, lines: tuple[CheckResult, ...], steps: int
 ) -> Recorder:
-    """Start the recorder.
-
-    Raises:
-        UsageError: the log cannot be written.
-    """
+    """Start the recorder; raises UsageError where the log cannot be written."""
     try:
         return Recorder.start(path, header(plan, bus.iface, bus.transport, bus.clock, run_type, lines, steps))
     except LogError as err:
@@ -300,3 +255,62 @@ def paced_receive(bus: Bus, recorder: Recorder) -> Callable[[int], Frame | None]
         return receive(deadline_ns)
 
     return wait_and_receive
+
+
+def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dict[str, Any], tuple[CheckResult, ...]]:
+    """Listen for as long as was asked for, and log all that comes; nothing is ever sent.
+
+    Returns:
+        The result as a document, and the pre-flight of what was heard.
+    """
+    recorder = start_recorder(plan, bus, RunType.LISTEN_ONLY, path, (), 0)
+    clock = bus.clock
+    end = {"exit_reason": Fault.INTERNAL.name, "detail": "the listening ended before its time"}
+    try:
+        push_clock(recorder, clock)
+        machine = StateMachine(timeouts(plan.bench), recorder.push_event)
+        machine.handle_event(Event.PREPARED, clock.now_ns())
+        monitor = BusMonitor(
+            plan.layout, plan.bench, lambda _, why: recorder.push_event(clock.now_ns(), "FRAME_REJECTED", why)
+        )
+        refused: RefusedError | None = None
+        try:
+            _log_frames(plan, bus, recorder, monitor, machine, console.stop_requested)
+        except BusError as err:
+            refused = RefusedError(str(err), err.exit_code, fault=Fault.BUS_LOST)
+        heard = monitor.statistics()
+        start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=False)
+        lines = check(findings(plan, bus, start_conditions, heard, plan.listen, path))
+        try:
+            refuse(lines if refused is None else ())
+        except RefusedError as err:
+            refused = err
+        if refused is not None and refused.fault is not None:
+            machine.fail(refused.fault, str(refused), clock.now_ns())
+        push_clock(recorder, clock)
+        reason = "DONE" if refused is None else "REFUSED" if refused.fault is None else refused.fault.name
+        end = {"exit_reason": reason, "detail": str(refused or ""), "heard": as_json(heard_document(heard))}
+        end["preflight"] = as_json([line.document() for line in lines])
+    finally:
+        log = recorder.finish(end)
+    return listen_document(plan, bus.iface, heard, lines, refused, log), lines
+
+
+def _log_frames(
+    plan: Plan,
+    bus: Bus,
+    recorder: Recorder,
+    monitor: BusMonitor,
+    machine: StateMachine,
+    stop_requested: Callable[[], bool],
+) -> None:
+    """Take every frame until the time is over, or the operator has heard enough."""
+    receive, now_ns = paced_receive(bus, recorder), bus.clock.now_ns()
+    deadline_ns = now_ns + round(plan.listen * 1e9)
+    while now_ns < deadline_ns and not stop_requested():
+        frame = receive(min(deadline_ns, now_ns + 10 * plan.bench.timing.sample_time_ns))
+        now_ns = bus.clock.now_ns()
+        if frame is not None:
+            recorder.push_frame(frame)
+            if monitor.take(frame) is not None:
+                machine.handle_event(Event.PAIR, frame.time_ns)

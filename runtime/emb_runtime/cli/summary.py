@@ -1,29 +1,41 @@
-"""Summary of a run: for the log's trailer, as JSON, and in words."""
+"""What is said of a run: in its log's header and trailer, as JSON, and in words."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
+import platform
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from importlib import metadata
+from typing import Any
 
-from emb_runtime.cli.preflight import CheckResult, RefusedError
-from emb_runtime.config.bench import Bench
+from emb_runtime.can.transport import Transport
+from emb_runtime.cli.bus_monitor import BusStatistics, planned_load
+from emb_runtime.cli.options import Plan
+from emb_runtime.cli.preflight import CheckResult, RefusedError, table
+from emb_runtime.config.bench import LEARNING, Bench
 from emb_runtime.control.result import Outcome
-from emb_runtime.errors import EXIT_DONE, EXIT_LOG, BusError, EmbError
+from emb_runtime.errors import EXIT_DONE, EXIT_LOG, EXIT_OUTSIDE, BusError, EmbError
 from emb_runtime.estimator import estimate
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.learning.learner import ranges_of
 from emb_runtime.log.recorder import RecorderResult
+from emb_runtime.log.ring_buffer import Attachment, LogHeader
 from emb_runtime.records import RunType
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.safety.watchdog import WatchdogResult
+from emb_runtime.system import compiled_core
+from emb_runtime.system.clock import Clock
 
-if TYPE_CHECKING:
-    from emb_runtime.cli.options import Plan
+ESTIMATE_RATE = 25_000  # Log rate of each parameter that is estimated [bytes per second]
+LEARNT_RATE = 150_000  # Log rate of what the shield learns [bytes per second]
+LOG_RATE = 500_000  # Log rate of a run at 1 kHz, with room to spare: measured are 250 to 310 kB [bytes per second]
 
-
+SLOW_MARK = "EMB_SLOW"  # In the environment where a kernel's time runs slowly: how many times (``emb-hil --slow``)
 BORDER = 1e-6  # Share of a range's end that counts as the end
 LOG_INCOMPLETE = "LOG_INCOMPLETE"  # Result of a run that was completed and not recorded
 
@@ -50,16 +62,99 @@ class RunResult:
         return EXIT_DONE
 
 
+def header(
+    plan: Plan,
+    iface: str,
+    transport: Transport,
+    clock: Clock,
+    run_type: RunType,
+    lines: Sequence[CheckResult],
+    steps: int,
+) -> LogHeader:
+    """Header of a log: versions, bench, policy, bus, and what the pre-flight found; 0 steps where none is answered."""
+    bench, policy = plan.bench, plan.policy
+    slow = os.environ.get(SLOW_MARK)
+    mapping = plan.drive.mapping if plan.drive is not None else None
+    records = {
+        "emb.run": {
+            "tool": f"emb-excite {metadata.version('emb-excite')}",
+            "command": shlex.join(sys.argv).encode("utf-8", "replace").decode(),
+            "iface": iface,
+            "purpose": str(run_type),
+            "stage": str(plan.stage),
+            "limit": repr(plan.limit),
+            "steps": str(steps),
+            "bench_name": bench.name,
+            "bench_hash": bench.identity_hash,
+            "dbc_protocol": str(plan.layout.protocol_version),
+            "bus_load_worst": f"{planned_load(bench, plan.layout, mapping):.4f}",
+            "core": compiled_core.running().text,
+            "python": platform.python_version(),
+            "onnxruntime": metadata.version("onnxruntime"),
+            "numpy": metadata.version("numpy"),
+            "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
+        }
+        | ({"time": f"{slow} times slower than the computer's"} if slow else {})
+        | {name: text for name, text in (("operator", plan.operator), ("device_serial", plan.serial)) if text}
+        | {f"bus_{name}": value for name, value in transport.obtained.items()},
+    }
+    attachments = [Attachment("bench.toml", "application/toml", bench.text.encode())]
+    estimates: Sequence[estimate.Quantity] = ()
+    if run_type is RunType.EXPERIMENT:
+        assert policy is not None
+        records["emb.run"] |= {
+            "policy_sha256": policy.sha256,
+            "policy_kind": policy.contract.kind,
+            "policy_provenance": json.dumps(dict(policy.contract.provenance), sort_keys=True),
+        }
+        if plan.stop_condition is not None:
+            records["emb.run"]["stop_when"] = plan.stop_condition.text
+        estimates = estimated(bench)
+        attachments.append(Attachment("policy.onnx", "application/octet-stream", policy.data))
+    if lines:
+        records["emb.preflight"] = {
+            line.what: f"{line.verdict}: {line.found} (expected {line.expected})" for line in lines
+        }
+    learns = run_type is RunType.EXPERIMENT and bench.shield.learn
+    if learns:
+        records["emb.run"] |= {key: str(getattr(bench.shield, key)) for key in LEARNING if key != "learn"}
+    if mapping is not None:
+        records["emb.drive"] = {"name": mapping.name, "lost": ", ".join(mapping.lost), "sha256": mapping.sha256}
+        attachments += [
+            Attachment("drive.toml", "application/toml", mapping.text.encode()),
+            Attachment("drive.dbc", "text/plain", mapping.dbc_text.encode()),
+        ]
+    truth = transport.truth
+    if truth is not None:
+        records["emb.truth"] = {name: str(value) for name, value in truth.items()}
+    return LogHeader(
+        start_ns=clock.now_ns(),
+        wall_offset_ns=clock.wall_offset_ns(),
+        simulated=truth is not None,
+        dbc=plan.layout.text,
+        messages=plan.layout.descriptions,
+        metadata=records,
+        attachments=tuple(attachments),
+        estimates=estimates,
+        learns=learns,
+        drive_bus=plan.drive.bus if plan.drive is not None else "",
+    )
+
+
+def log_bytes(plan: Plan, duration: float) -> int:
+    """Size of a log of so many seconds, with its attachments [bytes]."""
+    carried = len(plan.bench.text) + len(plan.layout.text)
+    rate = LOG_RATE + LEARNT_RATE * plan.bench.shield.learn
+    if plan.policy is not None:
+        carried += len(plan.policy.data)
+        rate += ESTIMATE_RATE * len(estimated(plan.bench))
+    return carried + round(rate * duration * 1e-3 / plan.bench.timing.sample_time)
+
+
 def trailer(
     outcome: Outcome | None, obtained: Mapping[str, str], watchdog: WatchdogResult | None = None
 ) -> dict[str, str]:
-    """Trailer of the log: the outcome.
-
-    Args:
-        outcome: of the loop; None where it gave none.
-        obtained: the real-time settings.
-        watchdog: what became of it, if there was one.
-    """
+    """Trailer of the log: the outcome, None where the loop gave none, with real-time settings and watchdog."""
     settings = {f"rt_{name}": value for name, value in obtained.items()}
     if watchdog is not None:
         settings |= watchdog.trailer()
@@ -78,12 +173,14 @@ def _entry(value: object) -> str:
 
 def facts(outcome: Outcome) -> dict[str, Any]:
     """Facts of an outcome that the log's trailer and the document have; None for one that there is not."""
+    judged = outcome.unexplained <= outcome.allowed < math.inf
     return {
         **asdict(outcome.counters),
         "rejections": dict(outcome.rejections),
         "bus_error_classes": dict(outcome.bus_errors),
         "learnt": None if outcome.learnt is None else ranges_of(outcome.learnt),
-        **motion(outcome),
+        "unexplained": outcome.unexplained if judged else None,  # by any one brake [rad/s]
+        "unexplained_allowed": outcome.allowed if judged else None,
         "goal_reached": outcome.goal_reached,
         "home": outcome.home,
         "node_at_rest": outcome.node_at_rest,
@@ -107,7 +204,9 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
     """A run's outcome as plain data."""
     outcome, fault = ran.outcome, ran.outcome.fault
     assert plan.policy is not None
-    result = result_facts(fault, ran.exit_code, outcome.detail)
+    beyond = outside(plan.bench, outcome.estimate)
+    exit_code = EXIT_OUTSIDE if plan.strict and beyond and ran.exit_code == EXIT_DONE else ran.exit_code
+    result = result_facts(fault, exit_code, outcome.detail)
     if fault is None and not ran.log.complete:
         result |= {"result": LOG_INCOMPLETE, "cause": "the log is not whole", "detail": ran.log.error}
         result |= {"advice": "the brake and the node did what they should; the run must be made again for its data"}
@@ -123,7 +222,7 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         **facts(outcome),
         "learnt": {} if outcome.learnt is None else ranges_of(outcome.learnt),
         "estimate": estimate.by_name(estimated(plan.bench), outcome.estimate),
-        "outside": outside(plan.bench, outcome.estimate),
+        "outside": beyond,
         "goal_s": outcome.goal_ns * 1e-9 if outcome.goal_reached else None,
         "end_angle": outcome.end_angle,
         "end_velocity": outcome.end_velocity,
@@ -152,15 +251,6 @@ def outside(bench: Bench, numbers: Sequence[float]) -> dict[str, tuple[float, fl
     return found
 
 
-def motion(outcome: Outcome) -> dict[str, float | None]:
-    """Velocity that no one brake explains, and what of it is allowed [rad/s]; None where nothing was judged."""
-    judged = outcome.unexplained <= outcome.allowed < math.inf
-    return {
-        "unexplained": outcome.unexplained if judged else None,
-        "unexplained_allowed": outcome.allowed if judged else None,
-    }
-
-
 def refusal(err: EmbError, iface: str) -> dict[str, Any]:
     """The outcome of a run that was refused before anything was sent, as plain data."""
     refused = err if isinstance(err, RefusedError) else None
@@ -174,13 +264,19 @@ def refusal(err: EmbError, iface: str) -> dict[str, Any]:
 def text(s: Mapping[str, Any], details: bool = False) -> str:
     """A :func:`document` for a person: the answer and what was unusual; every count with ``details``."""
     early = f", ended early: enough is known after {s['goal_s']:.3f} s" if s["goal_reached"] else ""
-    lines = [f"done: {s['answered']} of {s['steps']} samples answered, {'home' if s['home'] else 'NOT HOME'}{early}"]
+    done = f"done, OUTSIDE THE RANGES ({', '.join(s['outside'])})" if s["outside"] else "done"
+    lines = [f"{done}: {s['answered']} of {s['steps']} samples answered, {'home' if s['home'] else 'NOT HOME'}{early}"]
     if s["result"] != "done":
         where = " on the way home" if s["purpose"] == RunType.HOMING else ""
         why = f"{s['cause']}: {s['detail']}" if s["detail"] else s["cause"]
         ended = "NOT RECORDED" if s["result"] == LOG_INCOMPLETE else "STOPPED"
         lines = [f"{ended}{where} ({s['result']}): {why}", f"  → {s['advice']}"]
-    lines += [f"  way home   {name} the experiment: {way_home(way)}" for name, way in s["homing"].items()]
+    lines += [
+        f"  OUTSIDE    {name} = {value:.4g} is at or beyond the border of ranges.{ranges} ({low:.4g} to {high:.4g}): "
+        "the limits were not guaranteed; look for what is wrong, or widen the range"
+        for name, (value, low, high, ranges) in s["outside"].items()
+    ]
+    lines += [f"  way home   {name} the experiment: {brief(way)}" for name, way in s["homing"].items()]
     if s["stage"] != "full":
         lines.append(f"  stage      {s['stage']}, at most {s['limit']:g} A")
     if s["pairs"]:
@@ -208,11 +304,7 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
 
 def _unusual(s: Mapping[str, Any]) -> list[str]:
     """Lines on what an undisturbed run does not have."""
-    lines = [
-        f"  OUTSIDE    {name} = {value:.4g} is at or beyond the border of ranges.{ranges} ({low:.4g} to {high:.4g}): "
-        "the limits were not guaranteed; look for what is wrong, or widen the range"
-        for name, (value, low, high, ranges) in s["outside"].items()
-    ]
+    lines = []
     if s["bus_errors"]:
         classes = ", ".join(f"{name} ({count})" for name, count in s["bus_error_classes"].items())
         lines.append(f"  bus errors {s['bus_errors']} reports: {classes}")
@@ -231,21 +323,13 @@ def _unusual(s: Mapping[str, Any]) -> list[str]:
 
 
 def brief(s: Mapping[str, Any]) -> str:
-    """A :func:`document` or a :func:`refusal` in one line."""
+    """A :func:`document` or a :func:`refusal`, of an experiment or of a way home, in one line."""
     if s["result"] != "done":
         return ", ".join(filter(None, (f"{s['result']}: {s['detail'] or s['cause']}", s["log"])))
     ways = "".join(f", a way home {name}" for name in s["homing"])
     whole = "" if s["log_complete"] else ", log INCOMPLETE"
     where = "home" if s["home"] else "not home"
     return f"done: {s['answered']} of {s['steps']} answered, {where}{ways}, {s['log']}{whole}"
-
-
-def way_home(s: Mapping[str, Any]) -> str:
-    """The :func:`document` of a way home in some words."""
-    if s["log"] is None:
-        return f"{s['result']}: {s['detail']}"
-    how = "home" if s["home"] else f"{s['result']} ({s['detail'] or s['cause']})"
-    return f"{how}, {s['last_angle']:.3f} rad after {s['duration_s']:.2f} s, {s['log']}"
 
 
 def result_facts(fault: Fault | None, exit_code: int, detail: str) -> dict[str, Any]:
@@ -289,3 +373,53 @@ def _motion(s: Mapping[str, Any]) -> str:
 
 def _stop_reason(name: str | None) -> str:
     return " (it has not reported its stop reason)" if name is None else f" (its stop reason: {name})"
+
+
+def heard_document(heard: BusStatistics) -> dict[str, Any]:
+    """Bus statistics as plain data."""
+    fields = asdict(heard)
+    for name in ("status", "sample"):
+        if (record := getattr(heard, name)) is not None:
+            fields[name] = {key: getattr(value, "name", value) for key, value in record._asdict().items()}
+    return fields
+
+
+def listen_document(
+    plan: Plan,
+    iface: str,
+    heard: BusStatistics,
+    lines: Sequence[CheckResult],
+    refused: RefusedError | None,
+    log: RecorderResult,
+) -> dict[str, Any]:
+    """Result of ``--read-only`` as plain data; ``refused`` says why a run could not begin."""
+    complete = EXIT_DONE if log.complete else EXIT_LOG
+    fault, detail, exit_code = (refused.fault, str(refused), refused.exit_code) if refused else (None, "", complete)
+    result = {"result": "REFUSED"} if refused and fault is None else {}
+    return {
+        **result_facts(fault, exit_code, detail),
+        **result,
+        "purpose": str(RunType.LISTEN_ONLY),
+        "stage": str(plan.stage),
+        "iface": iface,
+        "bench": plan.bench.name,
+        "heard": heard_document(heard),
+        "preflight": [line.document() for line in lines],
+        **log_facts(log),
+    }
+
+
+def listen_text(s: Mapping[str, Any], lines: Sequence[CheckResult]) -> str:
+    """A :func:`listen_document` for a person, with its pre-flight."""
+    heard = s["heard"]
+    begin = f"a run could NOT begin ({s['result']}): {s['detail']}" if s["detail"] else "a run could begin"
+    said = [begin, table(lines), f"  heard for {heard['duration']:.3f} s"]
+    for name, count in heard["frames"].items():
+        rejected = sum(heard["rejections"].get(name, {}).values())
+        rate = heard["rates"].get(name, 0.0)
+        said.append(f"    {name:<13} {count:8} frames, {rate:7.1f} per second, {rejected} rejected")
+    if heard["others"]:
+        said.append(f"    others        {heard['others']:8} frames")
+    missing = "" if s["log_complete"] else f", INCOMPLETE: {s['log_error']}"
+    said.append(f"  log       {s['log']} ({s['log_messages']} messages{missing})")
+    return "\n".join(said)

@@ -47,7 +47,19 @@ HOME_PAIRS: Final = 50  # Valid pairs in a row, at home, that end a way home
 UNSTEADY: Final = "its samples come earlier and earlier by its own clock: they had piled up, or that clock is fast"
 """Reason why a node is not ready."""
 SILENT_WAIT: Final = 10  # Periods after which a driver that waits for the node asks again for the operator's wish
-IN_CONTROL: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
+# What each cycle asks for, by a name of its own: in Python 3.11 a member of an enumeration takes as long as a call.
+SILENT: Final = RunState.SILENT
+ARMED: Final = RunState.ARMED
+STOPPING: Final = RunState.STOPPING
+OVER: Final = RunState.OVER
+IN_CONTROL: Final = (ARMED, RunState.ACTIVE, RunState.HOMING)
+ENDING: Final = (STOPPING, OVER)
+IDLE: Final = NodeState.IDLE
+OBEYING: Final = NodeState.ACTIVE
+UNFIT: Final = (NodeState.STOPPING, NodeState.FAULT)
+RX: Final = Direction.RX
+TX: Final = Direction.TX
+PAIR: Final = Event.PAIR
 COVERAGE: Final = 0.8
 """Share of an experiment's periods that must have had a sample and a command that acted: the rest may be what the leaky
 counts let pass."""
@@ -168,7 +180,7 @@ class Core:
     @property
     def running(self) -> bool:
         """Returns True until the run has been completed or has failed."""
-        return self.state not in (RunState.STOPPING, RunState.OVER)
+        return self.state not in ENDING
 
     @property
     def at_rest(self) -> bool:
@@ -178,7 +190,7 @@ class Core:
     @property
     def deadline_ns(self) -> int:
         """Time until which the next frames are waited for, monotonic [ns]."""
-        if self.state is RunState.SILENT:
+        if self.state is SILENT:
             return min(self._give_up_ns, self._now_ns + SILENT_WAIT * self._period_ns)
         return self._deadline_ns
 
@@ -196,19 +208,14 @@ class Core:
         self._machine.handle_event(Event.PREPARED, now_ns)
 
     def take(self, frames: Sequence[Frame], now_ns: int) -> Proposal | None:
-        """Take the frames of one read, in their order; gives a command for the newest sample among them.
-
-        Args:
-            frames: all that had come.
-            now_ns: time at which they were in hand, monotonic [ns].
-        """
+        """Take the frames of one read, in hand at a monotonic time [ns]; gives a command for the newest sample."""
         self._now_ns = now_ns
         newest: SensorSample | None = None
         for left, frame in enumerate(frames, 1 - len(frames)):
-            said = Direction.TX if frame.own else Direction.RX, frame, now_ns if left == 0 else 0
+            said = TX if frame.own else RX, frame, now_ns if left == 0 else 0
             self.records.append(tuple.__new__(FrameRecord, said))
             try:
-                newest = self._take(frame, newest) if self.state is not RunState.OVER else None
+                newest = self._take(frame, newest) if self.state is not OVER else None
             except StopError as stop:
                 self._fail(stop.fault, stop.detail)
                 newest = None
@@ -216,7 +223,7 @@ class Core:
             return None
         try:
             self._check_bus()
-            if self.state is RunState.SILENT:
+            if self.state is SILENT:
                 self._wait_for_node()
                 return None
             return None if newest is None else self._propose(newest)
@@ -225,12 +232,7 @@ class Core:
         return None
 
     def commit(self, proposal: Proposal, now_ns: int) -> Frame | None:
-        """Frame that answers a sample; None if it is left unanswered, and the node brakes.
-
-        Args:
-            proposal: from :meth:`take`.
-            now_ns: time at which it was decided, monotonic [ns].
-        """
+        """Frame that answers a sample, decided at a monotonic time [ns]; None if it is left to the node."""
         sample, step, _, decision = proposal
         self._decide_ns = now_ns
         if self._may_answer(sample, decision, now_ns):
@@ -245,12 +247,9 @@ class Core:
         return None
 
     def sent(self, proposal: Proposal, now_ns: int, lost: str = "") -> None:
-        """Record the cycle of a committed command.
+        """Record the cycle of a command that was handed to the bus at a monotonic time [ns].
 
-        Args:
-            proposal: of the command.
-            now_ns: time at which the guard had handed it to the bus, monotonic [ns].
-            lost: reason why the bus had no room for it. Sent later, it would answer an old sample.
+        Where the bus had no room for it, ``lost`` says so: sent later, it would answer an old sample.
         """
         sample, step, wanted, decision = proposal
         if lost:
@@ -274,7 +273,7 @@ class Core:
         """Count that no frame came until :attr:`deadline_ns`."""
         self._now_ns = now_ns
         try:
-            if self.state is RunState.SILENT:
+            if self.state is SILENT:
                 self._wait_for_node()
             elif self.running:
                 self._miss()
@@ -356,7 +355,7 @@ class Core:
         if sample is None:
             return newest
         if self.state not in IN_CONTROL:
-            if self.state is RunState.SILENT:
+            if self.state is SILENT:
                 self._judge_node(sample)
             return None
         if newest is not None:  # overtaken: the node obeys an answer to its newest sample only
@@ -379,9 +378,9 @@ class Core:
         if sample is None:
             return None
         before, self._last = self._last, sample
-        self._machine.handle_event(Event.PAIR, sample.receive_time_ns)
+        self._machine.handle_event(PAIR, sample.receive_time_ns)
         state = self.state
-        if state is RunState.STOPPING:
+        if state is STOPPING:
             self._watch_rest(sample)
             return sample
         self._end = sample
@@ -398,10 +397,10 @@ class Core:
             self._machine.note(Fault.BUS_ERRORS, ", ".join(self._reception.bus_errors), frame.time_ns)
 
     def _watch_rest(self, sample: SensorSample) -> None:
-        if sample.node_state is not NodeState.ACTIVE and not self._stopped:
+        if sample.node_state is not OBEYING and not self._stopped:
             self._stopped = True
             self._reception.status = None  # its reason was that of another stop
-        self._rests = sample.node_state is NodeState.IDLE
+        self._rests = sample.node_state is IDLE
         self._rest_velocities.append(sample.velocity)
 
     def _check_bus(self) -> None:
@@ -468,7 +467,7 @@ class Core:
         """Decide on a command for a sample, the first of the run or a later one."""
         # Before its device time says which step it is, or that it is the last one. A stamp may be just ahead of now.
         self.guard.judge_time(sample, max(self._now_ns, sample.receive_time_ns))
-        if self.state is RunState.ARMED:
+        if self.state is ARMED:
             self._begin(sample)
         else:
             returns = self.homing or self._condition_met
@@ -527,7 +526,7 @@ class Core:
         """Leave the run if the brake or the node is not where it must be."""
         if outside := self._bounds.outside(sample):
             raise StopError(Fault.OUT_OF_LIMITS, outside)
-        if sample.node_state in (NodeState.STOPPING, NodeState.FAULT):
+        if sample.node_state in UNFIT:
             raise StopError(Fault.NODE_STOPPED, f"the node's state is {sample.node_state.name}")
         if changed := self._changed(sample):
             raise StopError(Fault.NODE_CHANGED, changed)
@@ -547,8 +546,8 @@ class Core:
     def _changed(self, sample: SensorSample) -> str:
         """Property of the node that has changed since the run began, in words; empty if none has."""
         # Until it has obeyed the first command it may be idle: the first ones may be lost.
-        self._was_active |= sample.node_state is NodeState.ACTIVE
-        if sample.node_state is NodeState.IDLE and (self._was_active or sample.command_counter != NO_COUNTER):
+        self._was_active |= sample.node_state is OBEYING
+        if sample.node_state is IDLE and (self._was_active or sample.command_counter != NO_COUNTER):
             return "the node's state is IDLE after it has obeyed a command of this run"
         status = self._reception.status
         if status is self._status:
@@ -690,11 +689,7 @@ class Core:
             self._machine.note(stop.fault, stop.detail, sample.receive_time_ns)
 
     def _learn(self, sample: SensorSample, periods: int) -> None:
-        """Hear a sample; where it contradicts what the shield takes for granted, nothing that it learnt is to be used.
-
-        Raises:
-            StopError: it does.
-        """
+        """Take in a sample; one that contradicts what the shield assumes ends the run."""
         if self._reversed is not None:
             return
         self._learner.hear(sample, periods)
@@ -703,28 +698,12 @@ class Core:
             raise StopError(Fault.SET_CONTRADICTED, "" if before is None else f"until then {words(before)} of nominal")
 
     def _record(self, sample: SensorSample, step: int, reasons: int, missed: int, answer: Answer = NO_ANSWER) -> None:
-        self.records.append(
-            CycleRecord(
-                step=step,
-                state=self.state,
-                reasons=int(reasons),
-                counter=sample.counter,
-                command_counter=answer.command_counter,
-                missed=missed,
-                node_state=sample.node_state,
-                angle=sample.angle,
-                velocity=sample.velocity,
-                applied_current=sample.applied_current,
-                policy_current=answer.wanted,
-                clipped_current=answer.clipped,
-                sent_current=answer.sent,
-                device_time_ns=sample.device_time_ns,
-                receive_time_ns=sample.receive_time_ns,
-                wake_time_ns=self._now_ns,
-                decide_time_ns=answer.decide_ns,
-                send_time_ns=answer.send_ns,
-            )
-        )
+        command_counter, wanted, clipped, sent, decide_ns, send_ns = answer
+        counter, angle, velocity, device_ns, receive_ns, applied, _, node_state = sample
+        of_cycle = step, self.state, int(reasons), counter, command_counter, missed, node_state
+        values = angle, velocity, applied, wanted, clipped, sent
+        times = device_ns, receive_ns, self._now_ns, decide_ns, send_ns
+        self.records.append(tuple.__new__(CycleRecord, of_cycle + values + times))
 
 
 def latest_answer_ns(bench: Bench) -> int:

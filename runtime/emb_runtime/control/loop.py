@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Final, cast
 
 from emb_runtime.can.transport import TransmitQueueFullError
-from emb_runtime.control.core import Core, Proposal
+from emb_runtime.control.core import SILENT, Core, Proposal
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError, PolicyRefusedError
 from emb_runtime.log.ring_buffer import Level, LineRecord, Record
@@ -51,11 +51,7 @@ class Loop:
         self._failures: list[tuple[str, BaseException]] = []  # steps of the stop that failed, not yet recorded
 
     def run(self) -> Outcome:
-        """Arm, run, stop. Whatever happens, what was armed ends with stop frames.
-
-        Raises:
-            BaseException: raised by something that was called, and no Exception: after the stop.
-        """
+        """Arm, run, stop. Whatever happens, what was armed ends with stop frames; no Exception is raised after them."""
         core = self.core
         try:
             core.begin(self._read_clock())
@@ -110,7 +106,7 @@ class Loop:
             return Fault.WATCHDOG_TRIPPED
         if self.stop_requested():
             return Fault.INTERRUPTED
-        if self.core.state is not RunState.SILENT:
+        if self.core.state is not SILENT:
             self.pulse.beat(now_ns)
             if not self.pulse.watched(now_ns):
                 return Fault.WATCHDOG_LOST

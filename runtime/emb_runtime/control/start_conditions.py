@@ -11,11 +11,7 @@ READY_PAIRS = 10  # Valid pairs in a row, idle and where the run may begin, befo
 
 
 class Bounds:
-    """The bench's limits and its home, widened for a measurement by the bench's noise.
-
-    Args:
-        bench: the bench.
-    """
+    """The bench's limits and its home, widened for a measurement by the bench's noise."""
 
     def __init__(self, bench: Bench) -> None:
         noise, shield, limits = bench.noise, bench.shield, bench.limits
@@ -40,14 +36,7 @@ class Bounds:
 
 
 class StartConditions:
-    """Conditions that a node must meet before a run may begin.
-
-    Args:
-        bench: the bench.
-        layout: the bus layout.
-        bounds: limits and home of the bench.
-        anywhere: the brake need not be at home: the run is to bring it there.
-    """
+    """Conditions that a node must meet before a run may begin; with ``anywhere`` the brake need not be at home."""
 
     def __init__(self, bench: Bench, layout: Layout, bounds: Bounds, *, anywhere: bool) -> None:
         self.bench = bench
@@ -58,13 +47,7 @@ class StartConditions:
         """Bench identity that the node's status must report."""
 
     def not_ready(self, status: StatusFrame | None, sample: SensorSample, now_ns: int) -> str:
-        """Reason why the run may not begin at this sample; empty if it may.
-
-        Args:
-            status: the node's latest, if it has sent one.
-            sample: the newest one.
-            now_ns: time at which the sample was in hand, monotonic [ns].
-        """
+        """Reason why the run may not begin at the newest sample, in hand at a monotonic time [ns]; empty if it may."""
         if now_ns - sample.receive_time_ns > OLDEST_SAMPLE_PERIODS * self.bench.timing.sample_time_ns:
             return "its samples are read too late, this computer is too slow"  # or catching up with what had piled up
         return self.mismatch(status) or self.not_at_rest(sample)

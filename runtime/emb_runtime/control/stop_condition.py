@@ -20,11 +20,7 @@ class StopCondition:
     parts: tuple[tuple[int, float], ...]  # Indices among them, and the bound of each relative deviation; 0.01 is 1 %
 
     def reached(self, estimate: Sequence[float]) -> bool:
-        """Returns True if all have fallen below their bounds. A deviation of zero is no knowledge, but an error.
-
-        Args:
-            estimate: values, then standard deviations.
-        """
+        """Returns True if all deviations, which follow the values, are below their bounds. One of zero is an error."""
         count = len(self.names)
         return all(0.0 < estimate[count + at] < part * abs(estimate[at]) for at, part in self.parts)
 
@@ -38,15 +34,7 @@ class StopCondition:
 
 
 def parse_stop_condition(text: str, estimates: Sequence[Quantity]) -> StopCondition:
-    """Read a stop condition such as ``k_1=1%,f_v=5%``.
-
-    Args:
-        text: names and percentages.
-        estimates: what is estimated.
-
-    Raises:
-        UsageError: it is none, or names what is not estimated.
-    """
+    """Read a stop condition such as ``k_1=1%,f_v=5%`` on what is estimated."""
     names = tuple(quantity.name for quantity in estimates)
     if not names:
         raise UsageError("--stop-when: the bench's [estimator] leaves no parameter open: leave it out")

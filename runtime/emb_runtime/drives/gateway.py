@@ -7,7 +7,6 @@ import select
 from collections import deque
 from collections.abc import Callable
 from collections.abc import Mapping as Dictionary
-from pathlib import Path
 
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
@@ -239,12 +238,6 @@ class LockStepDrive:
     def close(self) -> None:
         """See :meth:`Transport.close`."""
         self._bus.close()
-
-
-def drive_file(iface: str) -> Path | None:
-    """Mapping file in an ``--iface map:FILE@BUS``; None in any other."""
-    name, _, options = iface.partition(":")
-    return Path(options.rpartition("@")[0]) if name == "map" else None
 
 
 def open_mapped(options: str, bench: Bench) -> tuple[LockStepDrive, Clock]:

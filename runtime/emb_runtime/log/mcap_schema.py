@@ -210,24 +210,14 @@ FIXED_TOPICS = (CAN_RX, CAN_TX, CYCLE, SAFETY, CLOCK, LOG)
 
 
 def message_topic(name: str, identifier: int, fields: Sequence[Field]) -> Topic:
-    """The decoded topic of one DBC message.
-
-    Args:
-        name: the message's name in the DBC.
-        identifier: its CAN identifier.
-        fields: its signals.
-    """
+    """The decoded topic of one DBC message, by its name, its CAN identifier and its signals."""
     clean = re.sub(r"\W", "_", name)
     notes = {"dbc_message": name, "can_id": f"0x{identifier:X}"}
     return Topic(f"/emb/{name}", f"emb.dbc.{clean}", tuple(fields), notes)
 
 
 def estimate_topic(estimates: Sequence[tuple[str, str]]) -> Topic:
-    """The topic of the running estimate.
-
-    Args:
-        estimates: names and units, in their order.
-    """
+    """The topic of the running estimate of quantities with these names and units."""
     fields = [Field("step", "int64")]
     for name, unit in estimates:
         fields += [Field(name, "double", unit), Field(deviation_of(name), "double", unit)]

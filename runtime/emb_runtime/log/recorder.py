@@ -8,14 +8,14 @@ Start the recorder before any real-time setting is made, or its process inherits
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import importlib
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
+
+from msgspec import to_builtins
 
 from emb_runtime.errors import LogError
 from emb_runtime.log.ring_buffer import (
@@ -25,6 +25,7 @@ from emb_runtime.log.ring_buffer import (
     FrameRecord,
     Level,
     LineRecord,
+    LogHeader,
     Record,
     Ring,
     pack,
@@ -34,29 +35,6 @@ from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 
 START_TIMEOUT: Final = 30.0  # Longest wait for the recorder process to have the file on disk [s]
 FINISH_TIMEOUT: Final = 30.0  # Longest wait for it to write what is left and close the file [s]
-
-
-class Attachment(NamedTuple):
-    """A file inside the log."""
-
-    name: str
-    media_type: str
-    data: bytes
-
-
-@dataclass(frozen=True)
-class LogHeader:
-    """Identity of a run, known before it begins."""
-
-    start_ns: int  # The clock's monotonic time now [ns]
-    wall_offset_ns: int  # Offset from monotonic to Unix time [ns]; fixed for the whole log, so that it has one epoch
-    simulated: bool  # The clock does not follow the computer's: records are stamped as written when they happened
-    dbc: str  # Text of the DBC: it decodes the frames, and travels as the attachment ``emb.dbc``
-    metadata: Mapping[str, Mapping[str, str]]  # Metadata records by name; ``emb.run`` has the run's identity
-    attachments: Sequence[Attachment] = ()  # Further files: ``policy.onnx``, ``bench.toml``
-    estimates: Sequence[tuple[str, str]] = ()  # Names and units of what is estimated
-    learns: bool = False  # The shield learns which brakes are possible
-    drive_bus: str = ""  # Bus of a mapped drive, whose frames the recorder reads by itself; "" for none
 
 
 class RecorderResult(NamedTuple):
@@ -108,21 +86,15 @@ class Recorder:
     def start(
         cls, path: str | Path, header: LogHeader, slots: int = 1 << 14, timeout: float = START_TIMEOUT
     ) -> Recorder:
-        """Start the recorder process and wait until the file exists and its first chunk is on disk.
-
-        Args:
-            path: the file to make; one that exists is never overwritten.
-            header: what is known before the run.
-            slots: records that the ring holds, a power of two.
-            timeout: longest wait [s].
+        """Start the recorder process and wait until the new file's first chunk is on disk; slots are a power of two.
 
         Raises:
-            LogError: the file cannot be made, or the process did not start in time.
+            LogError: the file exists or cannot be made, or the process did not start in time.
         """
         path = Path(path)
         try:
             ring = Ring.create(slots)
-            document = _document(path, header)
+            document = {"path": str(path), "parent": os.getpid(), "header": to_builtins(header)}
             child: Child | _WriterHere = (
                 Child("recorder", "emb_runtime.log.recorder_process", document, [ring.fd])
                 if HAS_CHILD_PROCESSES
@@ -161,13 +133,7 @@ class Recorder:
         self.push(FrameRecord(Direction.TX if frame.own else Direction.RX, frame))
 
     def push_event(self, time_ns: int, code: str, text: str) -> None:
-        """Record something that the safety chain did.
-
-        Args:
-            time_ns: monotonic [ns].
-            code: a short, stable name, at most 40 bytes.
-            text: the same for a person; cut beyond about 190 bytes.
-        """
+        """Record what the safety chain did at a monotonic time [ns]: a stable name, and the same for a person."""
         self.push(EventRecord(time_ns, code, text))
 
     def push_log(self, time_ns: int, level: Level, text: str) -> None:
@@ -179,14 +145,9 @@ class Recorder:
         self.push(ClockRecord(monotonic_ns, wall_ns))
 
     def finish(self, trailer: Mapping[str, str], timeout: float = FINISH_TIMEOUT) -> RecorderResult:
-        """Have the rest written and the file closed; ends the process in any case.
+        """Have the rest written and the file closed; ends the process in any case. A failure is in the result.
 
-        Args:
-            trailer: what is known after the run (``exit_reason``, counters); becomes the metadata ``emb.end``.
-            timeout: longest wait [s].
-
-        Returns:
-            What became of the log; a failure is told there, never raised.
+        The trailer, with what is known after the run, becomes the metadata ``emb.end``.
         """
         with contextlib.suppress(OSError):  # if the process is gone, what it last said follows
             self._child.tell(trailer)
@@ -201,19 +162,3 @@ class Recorder:
         if not error and lost:
             error = f"{lost} records did not fit into the ring"
         return RecorderResult(self.path, int(answer.get("messages", 0)), size, lost, not error, error)
-
-
-def _document(path: Path, header: LogHeader) -> dict[str, object]:
-    return {
-        "path": str(path),
-        "parent": os.getpid(),
-        "start_ns": header.start_ns,
-        "wall_offset_ns": header.wall_offset_ns,
-        "simulated": header.simulated,
-        "dbc": header.dbc,
-        "metadata": {name: dict(entries) for name, entries in header.metadata.items()},
-        "estimates": [list(estimate) for estimate in header.estimates],
-        "learns": header.learns,
-        "drive_bus": header.drive_bus,
-        "attachments": [[a.name, a.media_type, base64.b64encode(a.data).decode()] for a in header.attachments],
-    }

@@ -8,7 +8,6 @@ and then the file is finished all the same.
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import io
 import json
@@ -18,18 +17,17 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import mcap
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
+from msgspec import convert
 
-from emb_runtime.can.codec import Signal
-from emb_runtime.can.interfaces import open_transport
-from emb_runtime.can.messages import load_layout
+from emb_runtime.can.codec import FrameRejectedError, Signal, from_description
+from emb_runtime.can.messages import CHARGE
 from emb_runtime.can.transport import Transport
-from emb_runtime.config.bench import parse_bench
 from emb_runtime.errors import BusError, EmbError, LogError
 from emb_runtime.log import mcap_schema
 from emb_runtime.log.ring_buffer import (
@@ -40,6 +38,7 @@ from emb_runtime.log.ring_buffer import (
     FrameRecord,
     LearntRecord,
     LineRecord,
+    LogHeader,
     Record,
     Ring,
     unpack,
@@ -63,57 +62,48 @@ _FRAME_TOPICS = {Direction.RX: mcap_schema.CAN_RX, Direction.TX: mcap_schema.CAN
 
 
 class LogWriter:
-    """Turns records into MCAP messages. Writes to what it is given, reads no clock.
+    """Turns records into MCAP messages. Writes to what it is given, reads no clock."""
 
-    Args:
-        output: where the file goes.
-        header: the document that :mod:`emb_runtime.log.recorder` sends, see there.
-    """
-
-    def __init__(self, output: BinaryIO, header: Mapping[str, Any]) -> None:
-        self._layout = load_layout(header["dbc"])
-        self._offset = int(header["wall_offset_ns"])
+    def __init__(self, output: BinaryIO, header: LogHeader) -> None:
+        self._messages = {message.identifier: message for message in map(from_description, header.messages)}
+        self._offset = header.wall_offset_ns
         self._mcap = Writer(output, chunk_size=CHUNK, compression=CompressionType.ZSTD, enable_data_crcs=True)
-        self._mcap.start(profile="", library=f"emb-excite/{version('emb-excite')} mcap-python/{version('mcap')}")
+        tool = header.metadata.get(RUN, {}).get("tool", "emb-excite").replace(" ", "/")
+        self._mcap.start(profile="", library=f"{tool} mcap-python/{mcap.__version__}")
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._sequences: dict[int, int] = {}
         self.messages = 0  # Messages written
         self.undecoded = 0  # Frames that are no valid frame of ours: they are in the log as they were on the bus only
-        begin = self._offset + int(header["start_ns"])
-        for name, entries in header["metadata"].items():
-            self._mcap.add_metadata(name, entries)
-        self._attach(begin, "emb.dbc", "text/plain", self._layout.text.encode())
-        for name, media_type, data in header["attachments"]:
-            self._attach(begin, name, media_type, base64.b64decode(data))
+        begin = self._offset + header.start_ns
+        for name, entries in header.metadata.items():
+            self._mcap.add_metadata(name, dict(entries))
+        self._attach(begin, "emb.dbc", "text/plain", header.dbc.encode())
+        for attachment in header.attachments:
+            self._attach(begin, *attachment)
         for topic in mcap_schema.FIXED_TOPICS:
             self._register(topic)
-        self._estimate = mcap_schema.estimate_topic(header["estimates"])
-        if header["estimates"]:
+        self._estimate = mcap_schema.estimate_topic(header.estimates)
+        if header.estimates:
             self._register(self._estimate)
-        if header.get("learns"):
+        if header.learns:
             self._register(mcap_schema.LEARNT)
-        if header.get("drive_bus"):
+        if header.drive_bus:
             self._register(mcap_schema.DRIVE)
         self._decoded = {
             message.name: mcap_schema.message_topic(
                 message.name, message.identifier, [_field(s) for s in message.signals]
             )
-            for message in self._layout.known
+            for message in self._messages.values()
         }
-        for name in self._layout.messages:
+        for name in self._decoded.keys() - {CHARGE}:
             self._register(self._decoded[name])
         # A chunk needs a message to be written, and whoever reads a cut file needs this chunk.
-        self.write(ClockRecord(int(header["start_ns"]), begin), begin)
+        self.write(ClockRecord(header.start_ns, begin), begin)
         self.flush()
 
     def write(self, record: Record, log_time: int) -> None:
-        """Write one record, and what it decodes to.
-
-        Args:
-            record: from the ring; its times are monotonic.
-            log_time: Unix time of writing [ns].
-        """
+        """Write one record of monotonic times, and what it decodes to, at a Unix time [ns]."""
         match record:
             case FrameRecord():
                 self._write_frame(record, log_time)
@@ -154,14 +144,16 @@ class LogWriter:
     def _write_frame(self, record: FrameRecord, log_time: int) -> None:
         direction, frame, read_ns = record
         self._add(_FRAME_TOPICS[direction], log_time, frame.time_ns, _frame_values(frame, read_ns))
-        if decoded := self._layout.decode_any(frame):
-            name, signals = decoded
-            topic = self._decoded[name]
-            if topic.name not in self._channels:  # of an optional message
-                self._register(topic)
-            self._add(topic, log_time, frame.time_ns, signals)
-        else:
+        try:
+            message = self._messages[frame.identifier]
+            signals = message.decode(frame)
+        except (KeyError, FrameRejectedError):
             self.undecoded += 1
+            return
+        topic = self._decoded[message.name]
+        if topic.name not in self._channels:  # of an optional message
+            self._register(topic)
+        self._add(topic, log_time, frame.time_ns, signals)
 
     def _write_estimate(self, time_ns: int, step: int, numbers: tuple[float, ...], log_time: int) -> None:
         half = len(numbers) // 2
@@ -212,15 +204,15 @@ def _field(signal: Signal) -> mcap_schema.Field:
 class Recording:
     """One recording: the ring at one end, the file at the other."""
 
-    def __init__(self, ring: Ring, header: Mapping[str, Any], output: BinaryIO) -> None:
+    def __init__(self, ring: Ring, document: Mapping[str, Any], output: BinaryIO) -> None:
+        header = convert(document["header"], LogHeader)
         self._ring = ring
-        self._parent = int(header["parent"])
-        self._simulated = bool(header["simulated"])
-        self._offset = int(header["wall_offset_ns"])
-        self._now = int(header["start_ns"]) + self._offset
+        self._parent = int(document["parent"])
+        self._simulated, self._offset = header.simulated, header.wall_offset_ns
+        self._now = header.start_ns + header.wall_offset_ns
         self._inbox = b""
         self._output = output
-        self._path = Path(header["path"])
+        self._path = Path(document["path"])
         self._drive_bus = _open_drive_bus(header)
         self.writer = LogWriter(output, header)
         self.lost = 0  # Records that could not be written
@@ -331,11 +323,15 @@ class Recording:
             self.lost += 1
 
 
-def _open_drive_bus(header: Mapping[str, Any]) -> Transport | None:
-    if not header.get("drive_bus"):
+def _open_drive_bus(header: LogHeader) -> Transport | None:
+    if not header.drive_bus:
         return None
-    (bench,) = (data for name, _, data in header["attachments"] if name == "bench.toml")
-    return open_transport(header["drive_bus"], parse_bench(base64.b64decode(bench).decode(), "bench.toml"))[0]
+    # Only here: each run waits for the imports of this process.
+    from emb_runtime.can.interfaces import open_transport
+    from emb_runtime.config.bench import parse_bench
+
+    (bench,) = (attachment.data for attachment in header.attachments if attachment.name == "bench.toml")
+    return open_transport(header.drive_bus, parse_bench(bench.decode(), "bench.toml"))[0]
 
 
 def _time(record: Record) -> int:
@@ -350,13 +346,9 @@ def _time(record: Record) -> int:
             return record.time_ns
 
 
-def begin(ring: Ring, header: Mapping[str, Any]) -> Recording:
-    """Make the file, with its first chunk.
-
-    Raises:
-        LogError: why that cannot be, in one line.
-    """
-    path = Path(header["path"])
+def begin(ring: Ring, document: Mapping[str, Any]) -> Recording:
+    """Make the file, with its first chunk; raises LogError where that cannot be."""
+    path = Path(document["path"])
     try:
         output = io.BufferedWriter(io.FileIO(path, "xb"))
     except FileExistsError as err:
@@ -364,7 +356,7 @@ def begin(ring: Ring, header: Mapping[str, Any]) -> Recording:
     except OSError as err:
         raise LogError(err.strerror or str(err)) from err
     try:
-        return Recording(ring, header, output)
+        return Recording(ring, document, output)
     except (OSError, EmbError) as err:
         os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())  # what could not be written is not tried again
         path.unlink(missing_ok=True)
@@ -377,9 +369,9 @@ def main(arguments: list[str]) -> int:
     child_process.leave_ending_to_parent()
     step_back()
     ring_fd, header_fd = map(int, arguments)
-    header = child_process.read_document(header_fd)
+    document = child_process.read_document(header_fd)
     try:
-        recording = begin(Ring(ring_fd), header)
+        recording = begin(Ring(ring_fd), document)
     except LogError as err:
         child_process.answer({"error": str(err)})
         return 1

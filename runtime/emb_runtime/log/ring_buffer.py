@@ -5,7 +5,8 @@ it, in the shared memory, so that both sides can read the count. Python promises
 processes on every processor, so each slot carries a checksum seeded with its index: a slot whose parts are not all
 visible yet reads as not written yet, and is read again later. A torn record can therefore not come out.
 
-The second half of the module is what travels: the records, each as MessagePack after a type byte.
+The second half of the module is what travels: the header of the log, and the records, each as MessagePack after a type
+byte.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ import mmap
 import os
 import struct
 import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, cast
 
 from msgspec import msgpack
 
@@ -32,6 +35,7 @@ _HEAD_AT: Final = 8
 _TAIL_AT: Final = 16
 _DROPPED_AT: Final = 24
 _SLOT_HEAD: Final = struct.Struct("<IHBx")  # checksum, length, kind
+_SLOT: Final = struct.Struct(f"<IHBx{MAX_PAYLOAD}s")  # the same, and the payload
 
 
 def _checksum(index: int, kind: int, payload: bytes) -> int:
@@ -41,13 +45,7 @@ def _checksum(index: int, kind: int, payload: bytes) -> int:
 class Ring:
     """One end of the ring. Exactly one process pushes and exactly one pops.
 
-    Args:
-        fd: file descriptor of the shared memory, from :meth:`create` or inherited from the creator; -1 where it is
-            memory of this process alone.
-        memory: such memory, mapped.
-
-    Raises:
-        ValueError: the memory is not a ring of this version.
+    The shared memory is that of a file descriptor; -1 with memory of this process alone.
     """
 
     def __init__(self, fd: int, memory: mmap.mmap | None = None) -> None:
@@ -71,14 +69,8 @@ class Ring:
     def create(cls, slots: int = 1 << 14) -> Ring:
         """A new, empty ring in anonymous shared memory; every page is touched, so that no push faults one in.
 
-        Where there are no processes of our own, both ends are in this one.
-
-        Args:
-            slots: how many records fit; a power of two. The default holds about 2 s of a 1 kHz run in 4 MiB.
-
-        Raises:
-            ValueError: ``slots`` is no power of two.
-            OSError: the system has no memory for it.
+        The slots are a power of two; the default holds about 2 s of a 1 kHz run in 4 MiB. Without processes of our own
+        both ends are in this one.
         """
         if slots < 1 or slots & (slots - 1):
             raise ValueError(f"expected a power of two of slots, got {slots}")
@@ -93,18 +85,7 @@ class Ring:
         return cls(fd, memory)
 
     def push(self, kind: int, payload: bytes) -> bool:
-        """Append one record (producer only).
-
-        Args:
-            kind: a type byte.
-            payload: at most :data:`MAX_PAYLOAD` bytes.
-
-        Returns:
-            False if the ring was full: the record is dropped and counted.
-
-        Raises:
-            ValueError: the payload is too long.
-        """
+        """Append one record by its type byte (producer only); False if the ring was full: it is dropped and counted."""
         head = self._head
         if head - self._words[_TAIL_AT] >= self.slots:
             self._words[_DROPPED_AT] += 1
@@ -113,8 +94,7 @@ class Ring:
         if length > MAX_PAYLOAD:
             raise ValueError(f"a record has at most {MAX_PAYLOAD} bytes, got {length}")
         at = _HEADER + (head & self._mask) * SLOT
-        _SLOT_HEAD.pack_into(self._memory, at, _checksum(head, kind, payload), length, kind)
-        self._view[at + 8 : at + 8 + length] = payload
+        _SLOT.pack_into(self._memory, at, _checksum(head, kind, payload), length, kind, payload)
         self._head = head + 1
         self._words[_HEAD_AT] = head + 1  # published last
         return True
@@ -153,6 +133,30 @@ class Ring:
             os.close(self.fd)
 
 
+class Attachment(NamedTuple):
+    """A file inside the log."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+@dataclass(frozen=True)
+class LogHeader:
+    """Identity of a run, known before it begins."""
+
+    start_ns: int  # The clock's monotonic time now [ns]
+    wall_offset_ns: int  # From monotonic to Unix time [ns]; fixed for the whole log, so that it has one epoch
+    simulated: bool  # The clock does not follow the computer's: records are written when they happened
+    dbc: str  # Text of the DBC: it decodes the frames, and travels as the attachment ``emb.dbc``
+    metadata: Mapping[str, Mapping[str, str]]  # Metadata records by name; ``emb.run`` has the run's identity
+    messages: Sequence[Mapping[str, Any]] = ()  # ``Layout.descriptions`` of that DBC: these are decoded
+    attachments: Sequence[Attachment] = ()  # Further files: ``policy.onnx``, ``bench.toml``
+    estimates: Sequence[tuple[str, str]] = ()  # Names and units of what is estimated
+    learns: bool = False  # The shield learns which brakes are possible
+    drive_bus: str = ""  # Bus of a mapped drive, whose frames the recorder reads by itself; "" for none
+
+
 class Direction(IntEnum):
     """Direction of a frame."""
 
@@ -185,6 +189,10 @@ class EventRecord(NamedTuple):
     code: str  # A short, stable name
     text: str  # Description for a person
 
+    def clipped(self) -> EventRecord:
+        """The record with texts that fit into a slot."""
+        return self._replace(code=_clipped(self.code, _MAX_CODE), text=_clipped(self.text, _MAX_EVENT_TEXT))
+
 
 class ClockRecord(NamedTuple):
     """One reading of both clocks."""
@@ -199,6 +207,10 @@ class LineRecord(NamedTuple):
     time_ns: int  # Monotonic [ns]
     level: Level
     text: str
+
+    def clipped(self) -> LineRecord:
+        """The record with a text that fits into a slot."""
+        return self._replace(text=_clipped(self.text, _MAX_LINE))
 
 
 class EstimateRecord(NamedTuple):
@@ -221,6 +233,7 @@ Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | LineRecord | Es
 
 RECORDS: Final = (FrameRecord, CycleRecord, EventRecord, ClockRecord, LineRecord, EstimateRecord, LearntRecord)
 """Types of the records; a type's place is its type byte in the ring."""
+TEXTS: Final = (EventRecord, LineRecord)
 KINDS: Final = {record: kind for kind, record in enumerate(RECORDS)}
 
 _MAX_CODE: Final = 40  # Bytes of an event's code
@@ -233,21 +246,14 @@ _DECODERS: Final = tuple(msgpack.Decoder(record) for record in RECORDS)
 
 def pack(record: Record) -> tuple[int, bytes]:
     """Type byte and payload of a record: MessagePack of its fields. Texts beyond the slot are cut."""
-    if isinstance(record, EventRecord):
-        time_ns, code, text = record
-        record = EventRecord(time_ns, _clipped(code, _MAX_CODE), _clipped(text, _MAX_EVENT_TEXT))
-    elif isinstance(record, LineRecord):
-        record = record._replace(text=_clipped(record.text, _MAX_LINE))
-    return KINDS[type(record)], _ENCODER.encode(record)
+    kind = KINDS[type(record)]
+    if isinstance(record, TEXTS):
+        record = record.clipped()
+    return kind, _ENCODER.encode(record)
 
 
 def unpack(kind: int, payload: bytes) -> Record:
-    """Unpacks a record of :func:`pack`.
-
-    Raises:
-        IndexError: ``kind`` is unknown.
-        msgspec.DecodeError: the payload is no such record.
-    """
+    """The record of a :func:`pack`."""
     return cast(Record, _DECODERS[kind].decode(payload))
 
 

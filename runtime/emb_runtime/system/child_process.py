@@ -13,7 +13,6 @@ import math
 import os
 import select
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -30,22 +29,13 @@ _PR_SET_PDEATHSIG = 1
 
 
 class Child:
-    """A running process ``python -m MODULE FD... DOCUMENT_FD``.
-
-    Args:
-        name: what it is, for messages.
-        module: to run; its ``__main__`` gets the file descriptors as arguments.
-        document: what it must know; JSON.
-        fds: further file descriptors for it, as arguments.
-        inherited: further file descriptors that it keeps, named in the document.
-
-    Raises:
-        OSError: it cannot be started.
-    """
+    """A running process ``python -m MODULE FD... DOCUMENT_FD``, which inherits further file descriptors."""
 
     def __init__(
         self, name: str, module: str, document: Mapping[str, Any], fds: Sequence[int], inherited: Sequence[int] = ()
     ) -> None:
+        import subprocess  # not in the process itself, whose start the runtime waits for
+
         self._name = name
         self._answers = b""
         # The document goes through memory of its own: a pipe could fill up, and block, while the process boots.
@@ -127,11 +117,12 @@ class Child:
             assert pipe is not None
             with contextlib.suppress(OSError):  # what the pipe still held has nowhere to go
                 pipe.close()
-        try:
-            self._process.wait(END_TIMEOUT)
-        except subprocess.TimeoutExpired:
+        deadline = time.monotonic() + END_TIMEOUT
+        while self.alive and time.monotonic() < deadline:
+            time.sleep(0.001)
+        if self.alive:
             self._process.kill()
-            self._process.wait()
+        self._process.wait()
 
 
 def _ending(code: int) -> str:
@@ -163,25 +154,17 @@ def answer(document: Mapping[str, Any]) -> None:
 
 
 def end_with(parent: int) -> None:
-    """End this process when the one that started it ends.
-
-    Args:
-        parent: its process id.
-    """
+    """End this process when the one with this id, which started it, ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, *map(ctypes.c_ulong, (signal.SIGKILL, 0, 0, 0)))
     if os.getppid() != parent:  # it was gone before
         os._exit(1)
 
 
 def confine(memory: int, seconds: float) -> None:
-    """Limit this process for good: it handles what nobody vouches for. It keeps the rights of its user.
+    """Limit this process for good to so many bytes and so much processor time [s] more.
 
-    The limits are against files that take too much, not against ones that take over the process, and hold for each
-    process: a copy that it makes of itself has them anew.
-
-    Args:
-        memory: bytes that it may take besides those that it has.
-        seconds: processor time that it may take besides what it has taken; rounded up to whole seconds.
+    It keeps the rights of its user. The limits are against files that take too much, not against ones that take over
+    the process, and hold for each process: a copy that it makes of itself has them anew.
     """
     import resource  # Linux only, as all of this
 

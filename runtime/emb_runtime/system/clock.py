@@ -84,11 +84,7 @@ class SteppedClock:
         return self._now_ns
 
     def advance_to(self, time_ns: int) -> None:
-        """Move time on, never back.
-
-        Raises:
-            ValueError: the time lies in the past.
-        """
+        """Move time on, never back."""
         if time_ns < self._now_ns:
             raise ValueError(f"time cannot go back: it is {self._now_ns} ns, asked for {time_ns} ns")
         self._now_ns = time_ns
@@ -107,12 +103,7 @@ class TimeUnwrapper:
         self._arrival_ns = 0
 
     def unwrap(self, stamp_ns: int, arrival_ns: int) -> int:
-        """Unwrapped device time [ns]; the first stamp is taken as it is.
-
-        Args:
-            stamp_ns: wrapped device time, 0..period [ns].
-            arrival_ns: when the frame that carried it was received, monotonic [ns].
-        """
+        """Unwrapped device time [ns] of a stamp, 0..period, that arrived at a monotonic time [ns]."""
         if self._device_ns is None:
             device_ns = stamp_ns
         else:

@@ -66,11 +66,7 @@ def running() -> Core:
 
 
 def choose() -> None:
-    """Take the compiled core if one is installed for this interpreter and these sources, unless ``EMB_CORE`` forbids.
-
-    Raises:
-        UsageError: ``EMB_CORE`` is neither ``python`` nor ``compiled``.
-    """
+    """Take the compiled core if one is installed for these sources, unless ``EMB_CORE`` forbids."""
     global _running
     wanted = os.environ.get(CHOICE, "")
     if wanted not in ("", "python", "compiled"):
@@ -85,11 +81,7 @@ def choose() -> None:
 
 
 def take_or_end() -> None:
-    """Take the compiled core, as ``EMB_CORE=compiled`` asks.
-
-    Raises:
-        SystemExit: there is none to take; standard error says why.
-    """
+    """Take the compiled core, as ``EMB_CORE=compiled`` asks, or end this process."""
     try:
         take()
     except CoreError as err:
@@ -97,11 +89,7 @@ def take_or_end() -> None:
 
 
 def take() -> None:
-    """Have the modules of the core imported compiled from now on, in this process.
-
-    Raises:
-        CoreError: there is none for this interpreter and these sources, or it cannot be loaded.
-    """
+    """Have the modules of the core imported compiled from now on; raises CoreError if there is none."""
     global _running
     finder = _Finder(_files())
     sys.meta_path.insert(0, finder)
@@ -116,11 +104,7 @@ def take() -> None:
 
 
 def _files() -> dict[str, str]:
-    """Files of the compiled modules by name, the library that holds their code among them.
-
-    Raises:
-        CoreError: there are none, or they are of another interpreter, processor or other sources.
-    """
+    """Files of the compiled modules by name, the library that holds their code among them."""
     try:
         found = json.loads((FOLDER / MANIFEST).read_text(encoding="utf-8"))
         files: dict[str, str] = found["files"]
@@ -133,11 +117,7 @@ def _files() -> dict[str, str]:
 
 
 def identity(modules: Iterable[str]) -> list[str]:
-    """Interpreter, processor, and hash of the sources of modules.
-
-    Raises:
-        OSError: a source cannot be read.
-    """
+    """Interpreter, processor, and hash of the sources of modules."""
     digest = hashlib.sha256()
     for name in sorted(modules):
         digest.update(name.encode() + b"\0")

@@ -24,14 +24,11 @@ def start(
     """Run the ``main`` of a module; a Ctrl-C in its imports just ends the process: nothing is open yet.
 
     Args:
-        module: where it is; imported here.
-        message: what to say of a Ctrl-C in ``main`` that nobody has taken, unless the exception says it.
+        module: imported here.
+        message: said of a Ctrl-C in ``main`` that nobody has taken, unless the exception says it.
         interrupted: exit code for it.
         prepare: called before the import.
         takes_signals: ``main`` does; until then a Ctrl-C ends the process as in the imports.
-
-    Returns:
-        The exit code.
     """
     _prepare_streams()
     handler = signal.getsignal(signal.SIGINT)
@@ -42,6 +39,7 @@ def start(
             prepare()
         gc.disable()  # imports leave no garbage to search for
         main: Callable[[], int] = importlib.import_module(module).main
+        gc.freeze()
         gc.enable()
         if not takes_signals:
             signal.signal(signal.SIGINT, handler)

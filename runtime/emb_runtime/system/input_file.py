@@ -27,11 +27,7 @@ _FLAGS = functools.reduce(operator.or_, (getattr(os, name, 0) for name in _WANTE
 
 
 def open_regular(path: str | Path) -> io.BufferedReader:
-    """A regular file, open for reading.
-
-    Raises:
-        OSError: it cannot be opened, or is something else; ``strerror`` says what.
-    """
+    """A regular file, open for reading; raises OSError for anything else."""
     try:
         return io.BufferedReader(io.FileIO(path, "rb", opener=_opened))
     except ValueError as err:  # a zero byte in the name
@@ -49,15 +45,7 @@ def _opened(path: str, _flags: int) -> int:
 
 
 def read_bytes(path: str | Path, most: int) -> bytes:
-    """Content of a regular file.
-
-    Args:
-        path: of the file.
-        most: its largest size [bytes].
-
-    Raises:
-        OSError: it cannot be read, is no regular file, or is larger; ``strerror`` says what.
-    """
+    """Content of a regular file of at most so many bytes; raises OSError for anything else."""
     with open_regular(path) as file:
         data = file.read(most + 1) or b""  # None where a file of the kernel's own would let us wait
     if len(data) > most:
@@ -66,10 +54,5 @@ def read_bytes(path: str | Path, most: int) -> bytes:
 
 
 def read_text(path: str | Path, most: int) -> str:
-    """Text of a regular file in UTF-8; see :func:`read_bytes`.
-
-    Raises:
-        OSError: see there.
-        UnicodeDecodeError: it is not UTF-8.
-    """
+    """Text of a regular file in UTF-8; see :func:`read_bytes`."""
     return read_bytes(path, most).decode("utf-8")

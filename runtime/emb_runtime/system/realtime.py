@@ -23,14 +23,9 @@ _awake: int | None = None  # Its descriptor
 
 
 def obtain(cpu: int | None = None, priority: int = PRIORITY) -> dict[str, str]:
-    """Ask for real-time behaviour. Call it last before the loop: after warm-up, and after every child was started.
+    """Ask for real-time behaviour, and give what was obtained, or why not, per setting.
 
-    Args:
-        cpu: pin to this processor; None leaves the affinity alone.
-        priority: of SCHED_FIFO, 1..99.
-
-    Returns:
-        What was obtained, or why not, per setting.
+    Call it last before the loop: after warm-up, and after every child was started. None leaves the affinity alone.
     """
     return {
         "garbage_collector": _freeze_garbage(),

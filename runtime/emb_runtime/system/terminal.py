@@ -42,11 +42,9 @@ def one_line(text: str, most: int = LONGEST_STRING) -> str:
 
 
 def show(text: str, dressed: Callable[[str], str] = str) -> None:
-    """Print a result; a reader that has had enough (``| head``) is no error.
+    """Print a result, dressed with colours; a reader that has had enough (``| head``) is no error.
 
-    Args:
-        text: the result; of the characters that control a terminal only newlines reach it.
-        dressed: gives what is printed of it, with colours.
+    Of the characters that control a terminal only newlines in the text reach it.
 
     Raises:
         UsageError: standard output takes nothing: it is closed, or the disk behind it is full.
@@ -107,12 +105,7 @@ def typed_line() -> str | None:
 def confirmed(question: str, stop_requested: Callable[[], bool], wait: Callable[[], object]) -> bool:
     """Ask a question on the terminal; True if the operator answers y, False for any other answer or an end.
 
-    An answer to an earlier question, or to none, does not count.
-
-    Args:
-        question: in one line.
-        stop_requested: True if the operator wants an end.
-        wait: called as long as there is no answer.
+    An answer to an earlier question, or to none, does not count. As long as there is no answer, ``wait`` is called.
     """
     forget_typed()
     mention(question)

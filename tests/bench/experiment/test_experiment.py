@@ -159,8 +159,6 @@ def test_a_charge_that_cannot_be_is_not_believed(bench: Bench, layout: Layout) -
         told = currents_by_charge(samples, bench, layout)
         assert told.tolist()[2] == pytest.approx(expected, abs=1e-6, nan_ok=True)
         assert np.isnan(np.delete(told, 2)).all()
-    samples.charge[[1, 3]] = 0.0, 3e-3
-    assert np.isnan(currents_by_charge(samples, bench, replace(layout, charge=None))).all()
 
 
 def test_a_brake_that_rests_off_the_origin_starts_where_it_rests(tmp_path: Path, simulate: Simulate) -> None:

@@ -33,7 +33,10 @@ from emb_bench.logs.log import read_log
 from emb_bench.logs.mcap_file import HEADER, Chunk
 from emb_runtime.cli import main as emb_run
 from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, LogError, UsageError
+from emb_runtime.estimator.estimate import LOST
 from emb_runtime.estimator.estimator import UNITS
+from emb_runtime.log.mcap_schema import CYCLE, ESTIMATE, SAFETY, estimate_topic
+from emb_runtime.records import RunState
 
 SECONDS = 20.0
 
@@ -157,6 +160,18 @@ class Told:
 
     def end(self, reason: str) -> None:
         self.reasons.append(reason)
+
+
+def test_an_estimate_that_was_lost_is_not_shown_as_the_present_one() -> None:
+    said: list[str] = []
+    lines, estimate = Lines(said.append, every=1), estimate_topic([("k_m", "N·m/A")])
+    cycle = CYCLE.factory(state=RunState.ACTIVE, step=3, sent_current=1.0)
+    lines._take(ESTIMATE, estimate.factory(step=2, k_m=0.02, k_m_deviation=1e-4))
+    lines._take(CYCLE.name, cycle)
+    lines._take(SAFETY.name, SAFETY.factory(code=LOST, text="not finite"))
+    lines._take(CYCLE.name, cycle)
+    assert ["k_m" in line for line in said] == [True, False, False]
+    assert LOST in said[1]
 
 
 def test_the_lines_say_what_is_in_the_log(shipped: Path) -> None:

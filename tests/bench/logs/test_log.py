@@ -16,7 +16,8 @@ from emb_bench.logs.can_files import McapReader
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import load_layout
 from emb_runtime.errors import LogError, UsageError
-from emb_runtime.log.recorder import LogHeader, Recorder
+from emb_runtime.log.recorder import Recorder
+from emb_runtime.log.ring_buffer import Attachment, LogHeader
 from emb_runtime.records import CycleRecord
 
 from tests.bench.damaged import rewritten  # isort: skip
@@ -192,8 +193,8 @@ def test_what_a_log_should_carry_and_does_not_is_said(tmp_path: Path, run: SimRu
     nan = dict.fromkeys(["J", "gamma", "k_m", "k_1", "T_c", "f_v"], "nan")
     rows: tuple[tuple[dict[str, Any], str, str], ...] = (
         ({"attachments": []}, "bench", "carries no bench.toml"),
-        ({"attachments": [["bench.toml", "", "eHg="]]}, "bench", "not valid TOML"),
-        ({"attachments": [["bench.toml", "", "/w=="]]}, "bench", "not UTF-8"),
+        ({"attachments": [Attachment("bench.toml", "", b"xx")]}, "bench", "not valid TOML"),
+        ({"attachments": [Attachment("bench.toml", "", b"\xff")]}, "bench", "not UTF-8"),
         ({"metadata": {"emb.truth": {"f_v": "1"}}}, "truth", "true parameters"),
         ({"metadata": {"emb.truth": nan}}, "truth", "not positive"),
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 import re
 import shutil
@@ -38,7 +37,7 @@ from emb_bench.report.page import document, report_page, view
 from emb_bench.report.sentences import drift
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import EXIT_OUTSIDE
-from emb_runtime.log.ring_buffer import EventRecord, Level, LineRecord
+from emb_runtime.log.ring_buffer import Attachment, EventRecord, Level, LineRecord
 from emb_runtime.records import CycleRecord
 from emb_runtime.safety.state_machine import FAULTS, Fault
 
@@ -99,7 +98,7 @@ def test_one_run_has_all_its_sections_verdict_first(report: Report) -> None:
 def test_the_report_says_what_a_loss_of_all_commands_would_do(folder: Path, report: Report, simulate: Simulate) -> None:
     assert "the node brakes, and no brake of the set 'envelope' reaches an end stop" in " ".join(report.reader.texts)
     lets_go = shipped_bench_text().replace('stop             = "damped"', 'stop             = "freewheel"')
-    bench = ["bench.toml", "application/toml", base64.b64encode(lets_go.encode()).decode()]
+    bench = Attachment("bench.toml", "application/toml", lets_go.encode())
     path = write_log(folder / "loose.mcap", simulate(square, options="plant=exact"), attachments=[bench])
     loose = " ".join(make(folder / "loose.html", path, "--starts", "1").reader.texts)
     speed = re.search(r"the node lets go, and a brake of the set may hit an end stop with (\d+) rad/s", loose)
@@ -273,7 +272,7 @@ def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate
         path / "<img src=x onerror=alert(4)>.mcap",
         run,
         metadata={"emb.run": {"iface": HOSTILE, HOSTILE: HOSTILE}, HOSTILE: {HOSTILE: "x" * 10_000}},
-        attachments=[[HOSTILE, "text/plain", ""]],
+        attachments=[Attachment(HOSTILE, "text/plain", b"")],
     )
     bench = folder / "bench.toml"
     assert main(["info", str(log)]) == 0

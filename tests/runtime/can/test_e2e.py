@@ -9,27 +9,15 @@ from hypothesis import strategies as st
 from emb_runtime.can.e2e import (
     COUNTER_MODULUS,
     NO_COUNTER,
-    WEIGHT,
     CounterCheck,
     LeakyCount,
     check,
-    crc8_j1850,
     next_counter,
     profile1_start,
     protect,
 )
 
 COUNTERS = st.integers(0, COUNTER_MODULUS - 1)
-
-
-def test_the_crc_has_the_check_value_of_its_standard() -> None:
-    assert crc8_j1850(b"123456789") == 0x4B
-    assert crc8_j1850(b"") == 0x00
-
-
-@given(st.binary(max_size=64))
-def test_the_crc_equals_an_independent_library(data: bytes) -> None:
-    assert crc8_j1850(data) == e2e.crc.calculate_crc8(data)
 
 
 @given(st.integers(0, 0xFFFF), st.binary(min_size=1, max_size=7))
@@ -56,36 +44,6 @@ def test_counters_run_from_0_to_14_and_never_reach_the_invalid_one() -> None:
     assert NO_COUNTER not in seen
 
 
-def test_the_first_counter_is_accepted_whatever_it_is() -> None:
-    for counter in range(COUNTER_MODULUS):
-        counter_check = CounterCheck(5)
-        assert counter_check.step(counter) == 1
-        assert counter_check.last == counter
-
-
-@given(COUNTERS, st.integers(1, COUNTER_MODULUS - 1))
-def test_a_step_says_how_far_the_counter_moved(first: int, steps: int) -> None:
-    counter_check = CounterCheck(5)
-    counter_check.step(first)
-    assert counter_check.step((first + steps) % COUNTER_MODULUS) == steps
-    assert counter_check.errors == 0
-
-
-def test_a_repeated_counter_is_an_error() -> None:
-    counter_check = CounterCheck(5)
-    counter_check.step(4)
-    assert counter_check.step(4) == 0
-    assert counter_check.errors == WEIGHT
-
-
-def test_a_rejected_frame_does_not_update_the_stored_counter() -> None:
-    counter_check = CounterCheck(5)
-    counter_check.step(4)
-    counter_check.reject()
-    assert counter_check.last == 4
-    assert counter_check.step(5) == 1
-
-
 @pytest.mark.parametrize("counter", [-1, NO_COUNTER, 100])
 def test_an_invalid_counter_is_refused_and_changes_nothing(counter: int) -> None:
     counter_check = CounterCheck(5)
@@ -103,25 +61,13 @@ def test_the_error_count_leaks_saturates_and_follows_its_law(tolerated: int, eve
         if event is None:
             counter_check.reject()
         else:
-            counter_check.step(event)
+            steps = 1 if last is None else (event - last) % COUNTER_MODULUS
+            assert counter_check.step(event) == steps
         if event is None or event == last:
             errors = min(errors + 4, 4 * tolerated)
         else:
             last, errors = event, max(errors - 1, 0)
         assert (counter_check.last, counter_check.errors) == (last, errors)
-
-
-def test_four_good_frames_forgive_one_bad_one_and_a_burst_is_forgiven_in_bounded_time() -> None:
-    counter_check = CounterCheck(5)
-    for _ in range(1000):
-        counter_check.reject()
-    assert counter_check.errors == 20
-    for counter in range(COUNTER_MODULUS):
-        counter_check.step(counter)
-    assert counter_check.errors == 5
-    for counter in range(5):
-        counter_check.step(counter)
-    assert counter_check.errors == 0
 
 
 @given(st.integers(1, 20), st.lists(st.booleans()))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import random
 import struct
@@ -14,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from emb_runtime.can.codec import from_description
 from emb_runtime.can.e2e import check
 from emb_runtime.can.generated import Codec, Field, generate_codec
 from emb_runtime.can.messages import (
@@ -347,20 +349,6 @@ def test_a_decoded_value_out_of_range_is_rejected_for_it() -> None:
         assert fault_of(message, frame) is Fault.RANGE
 
 
-def test_any_valid_frame_of_ours_decodes_to_its_name_and_values() -> None:
-    for name, (_, _, frame) in GOLDEN.items():
-        assert LAYOUT.decode_any(frame) == (name, DATABASE.decode_message(name, frame.data, decode_choices=False))
-
-
-def test_frames_of_others_and_damaged_ones_decode_to_nothing() -> None:
-    frame = GOLDEN["EMB_Angle"][2]
-    assert LAYOUT.decode_any(frame._replace(identifier=0x123)) is None
-    assert LAYOUT.decode_any(frame._replace(extended=True)) is None
-    assert LAYOUT.decode_any(frame._replace(data=frame.data[:-1])) is None
-    assert LAYOUT.decode_any(frame._replace(data=frame.data[:-1] + b"\xff")) is None
-    assert LAYOUT.decode_any(Frame(0x40, bytes(8), error=True)) is None
-
-
 def test_the_description_says_what_the_dbc_says() -> None:
     assert list(LAYOUT.messages) == ["EMB_Command", "EMB_Angle", "EMB_Velocity", "EMB_Status"]
     assert [m.name for m in LAYOUT.known] == [*LAYOUT.messages, "EMB_Charge"]
@@ -381,20 +369,7 @@ def test_the_charge_is_rounded_to_its_step_and_wraps() -> None:
         theirs = DATABASE.decode_message("EMB_Charge", frame.data, scaling=False)
         assert theirs["Charge"] == round(charge / 2e-7) % 2**40
         assert (theirs["Counter"], theirs["Version"]) == (9, 1)
-        assert LAYOUT.decode_any(frame) == ("EMB_Charge", DATABASE.decode_message("EMB_Charge", frame.data))
-
-
-def test_a_layout_of_before_the_charge_is_read_as_ever() -> None:
-    older = "\n\n".join(part for part in LAYOUT.text.split("\n\n") if not part.startswith("BO_ 255"))
-    older = "\n".join(line for line in older.split("\n") if " 255 " not in line.partition("[")[0])
-    layout = load_layout(older)
-    assert layout.charge is None
-    assert layout.messages == LAYOUT.messages
-    assert layout.known == tuple(LAYOUT.messages.values())
-    assert layout.protocol_version == LAYOUT.protocol_version == 1
-    assert layout.decode_any(GOLDEN["EMB_Charge"][2]) is None
-    with pytest.raises(FrameError, match="no message EMB_Charge: expected a layout that has it"):
-        layout.encode_charge(0, 0.0)
+        assert LAYOUT.charge.decode(frame) == DATABASE.decode_message("EMB_Charge", frame.data)
 
 
 def test_the_command_wins_every_arbitration() -> None:
@@ -415,7 +390,8 @@ def test_the_dbc_may_place_the_signals_elsewhere() -> None:
     assert moved.decode_velocity(frame) == LAYOUT.decode_velocity(GOLDEN["EMB_Velocity"][2])
 
 
-def test_the_layout_reads_back_from_its_own_text() -> None:
+def test_the_layout_reads_back_from_its_own_text_and_each_message_from_its_description() -> None:
+    assert tuple(map(from_description, json.loads(json.dumps(LAYOUT.descriptions)))) == LAYOUT.known
     again = load_layout(LAYOUT.text)
     assert (again.messages, again.charge, again.text) == (LAYOUT.messages, LAYOUT.charge, LAYOUT.text)
     assert again.encode_command(COMMAND) == GOLDEN["EMB_Command"][2]

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from emb_runtime.can.codec import Fault
 from emb_runtime.can.messages import Layout, StopReason, load_layout
-from emb_runtime.can.receiver import Reception, Rejection
+from emb_runtime.can.receiver import BUS_OFF, UNKNOWN, WITHOUT_DETAILS, Reception, Rejection, classify
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.records import CurrentCommand, Frame, NodeState, SensorSample
-from tests.independent import DATABASE, protected
+from tests.independent import DATABASE, protected, read
 
 MS = 1_000_000
 IDLE = NodeState.IDLE
@@ -82,18 +82,6 @@ def test_device_time_does_not_wrap_for_the_reader(node: Node, harness: Harness) 
     assert {b.device_time_ns - a.device_time_ns for a, b in pairwise(samples)} == {1 * MS}
 
 
-def test_a_velocity_frame_without_its_angle_makes_no_sample(node: Node, harness: Harness) -> None:
-    first, second, third = node.pair(), node.pair(), node.pair()
-    assert len(harness.take(*first, second[1], *third)) == 2
-    assert len(harness.take(third[0])) == 0
-
-
-def test_a_repeated_pair_makes_no_second_sample(node: Node, harness: Harness) -> None:
-    pair = node.pair()
-    assert len(harness.take(*pair, *pair)) == 1
-    assert harness.reception.rejected == 2
-
-
 def test_a_node_that_sends_the_velocity_first_is_told_what_its_frames_lack(node: Node, harness: Harness) -> None:
     assert harness.reception.pairing_problem == ""
     first = node.pair()
@@ -107,11 +95,6 @@ def test_a_node_that_sends_the_velocity_first_is_told_what_its_frames_lack(node:
     assert "that goes first" in harness.reception.pairing_problem
     harness.take(*node.pair())
     assert harness.reception.pairing_problem == ""
-
-
-def test_frames_of_two_pairs_are_never_mixed(node: Node, harness: Harness) -> None:
-    first, second = node.pair(), node.pair()
-    assert harness.take(first[0], second[1]) == []
 
 
 @pytest.mark.parametrize("which", [0, 1])
@@ -420,7 +403,7 @@ def test_a_second_commander_or_too_many_rejections_remove_permission(bench: Benc
 def test_random_frames_never_make_a_sample_or_raise(content: list[tuple[int, bytes]]) -> None:
     layout = load_layout()
     harness = Harness(load_bench(), layout)
-    valid = {layout.decode_any(Frame(i, d)) is not None for i, d in content}
+    valid = {read(Frame(i, d)) is not None for i, d in content}
     samples = harness.take(*(Frame(i, d) for i, d in content))
     assert not samples or True in valid
 
@@ -437,3 +420,44 @@ def test_whatever_is_lost_doubled_or_swapped_every_sample_is_a_true_pair_in_orde
     times = [s.device_time_ns for s in samples]
     assert times == sorted(set(times))
     assert all(s.counter == s.device_time_ns // MS % 15 for s in samples)
+
+
+# --- error frames, as <linux/can/error.h> says ----------------------------------------------------------------------
+
+
+def reported(identifier: int, payload: str = "00 00 00 00 00 00 00 00") -> set[str]:
+    return set(classify(Frame(identifier, bytes.fromhex(payload), error=True)))
+
+
+def test_each_kind_is_read_from_its_bit() -> None:
+    for identifier, payload, kinds in [
+        (0x001, "00 00 00 00 00 00 00 00", {"transmission timed out"}),
+        (0x002, "0c 00 00 00 00 00 00 00", {"arbitration lost"}),  # lost at bit 12
+        (0x004, "00 00 00 00 00 00 00 00", {WITHOUT_DETAILS}),
+        (0x004, "00 01 00 00 00 00 00 00", {"controller's receive buffer overflowed"}),
+        (0x004, "00 02 00 00 00 00 00 00", {"controller's transmit buffer overflowed"}),
+        (0x004, "00 04 00 00 00 00 00 00", {"many receive errors (warning level)"}),
+        (0x004, "00 08 00 00 00 00 00 00", {"many transmit errors (warning level)"}),
+        (0x004, "00 10 00 00 00 00 00 00", {"error passive by receive errors"}),
+        (0x004, "00 20 00 00 00 00 00 00", {"error passive by transmit errors"}),
+        (0x004, "00 40 00 00 00 00 00 00", {"error active again"}),
+        (0x008, "00 00 04 03 00 00 00 00", {"protocol violation"}),  # bit stuffing, at the start of the frame
+        (0x010, "00 00 00 00 04 00 00 00", {"transceiver problem"}),  # CAN_H has no wire
+        (0x020, "00 00 00 00 00 00 00 00", {"no acknowledgement"}),
+        (0x040, "00 00 00 00 00 00 00 00", {BUS_OFF}),
+        (0x080, "00 00 00 00 00 00 00 00", {"bus error"}),
+        (0x100, "00 00 00 00 00 00 00 00", {"controller restarted"}),
+        (0x200, "00 00 00 00 00 00 07 09", set()),  # the error counters, and nothing wrong
+        (0x400, "00 00 00 00 00 00 00 00", {UNKNOWN}),
+        # What sja1000 says when nobody acknowledges: a bus error in the acknowledge slot, 128 and 0 errors so far.
+        (0x28C, "00 20 80 19 00 00 80 00", {"error passive by transmit errors", "protocol violation", "bus error"}),
+    ]:
+        assert reported(identifier, payload) == kinds, hex(identifier)
+
+
+@given(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8))
+def test_any_error_frame_reports_each_of_its_bits_once(identifier: int, data: bytes) -> None:
+    kinds = classify(Frame(identifier, data, error=True))
+    assert len(set(kinds)) == len(kinds)
+    assert kinds or identifier & 0x200
+    assert (BUS_OFF in kinds) == bool(identifier & 0x40)

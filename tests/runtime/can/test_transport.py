@@ -313,17 +313,9 @@ def test_frames_that_came_before_the_interface_went_down_are_given_and_do_not_me
 
 def test_a_waiting_frame_is_one_system_call_and_no_wait() -> None:
     rig = Rig()
-    rig.socket.arrives(0x100, b"\x01\x02", at_ns=-5_000)
-    assert rig.bus.receive(10**9) == Frame(0x100, b"\x01\x02", time_ns=-5_000)
+    rig.socket.arrives(0x100, b"\x01\x02", at_ns=123_456_789_012_345_679)
+    assert rig.bus.receive(10**9) == Frame(0x100, b"\x01\x02", time_ns=123_456_789_012_345_679)
     assert (rig.socket.reads, rig.waits) == (1, [])
-
-
-def test_time_stamps_are_whole_nanoseconds_on_the_monotonic_clock() -> None:
-    rig = Rig()
-    rig.socket.arrives(0x100, at_ns=123_456_789_012_345_679)
-    frame = rig.bus.receive(0)
-    assert frame is not None
-    assert frame.time_ns == 123_456_789_012_345_679
 
 
 def test_the_drop_count_lasts_until_the_kernel_tells_another() -> None:
@@ -379,19 +371,6 @@ def test_a_wait_lasts_until_the_deadline_and_no_longer() -> None:
     assert rig.waits == [pytest.approx(600e-6)]
 
 
-def test_a_frame_that_comes_while_waiting_is_given_at_once() -> None:
-    rig = Rig()
-
-    def arrive() -> None:
-        rig.clock.advance_to(300_000)
-        rig.socket.arrives(0x100, at_ns=290_000)
-
-    rig.script.append(arrive)
-    frame = rig.bus.receive(1_000_000)
-    assert frame is not None
-    assert frame.time_ns == 290_000
-
-
 def test_waking_without_a_frame_waits_for_the_rest_of_the_time() -> None:
     rig = Rig()
     rig.script.append(lambda: rig.clock.advance_to(700_000))
@@ -399,7 +378,7 @@ def test_waking_without_a_frame_waits_for_the_rest_of_the_time() -> None:
     assert rig.waits == [pytest.approx(1e-3), pytest.approx(300e-6)]
 
 
-@pytest.mark.parametrize("step_ns", [-3_600_000_000_000, -50_000_000, 50_000_000, 3_600_000_000_000])
+@pytest.mark.parametrize("step_ns", [-3_600_000_000_000, -50_000_000, 0, 50_000_000, 3_600_000_000_000])
 def test_a_wall_clock_that_steps_is_noticed_and_does_not_move_arrival_times(step_ns: int) -> None:
     rig = Rig()
 
@@ -416,12 +395,6 @@ def test_a_wall_clock_that_steps_is_noticed_and_does_not_move_arrival_times(step
     frame = rig.bus.receive(0)
     assert frame is not None
     assert frame.time_ns == 295_000
-
-
-def test_closing_gives_the_socket_back() -> None:
-    rig = Rig()
-    rig.bus.close()
-    assert rig.socket.closed
 
 
 def test_a_real_wait_sees_what_is_readable_and_what_is_not() -> None:

@@ -15,10 +15,8 @@ from pathlib import Path
 import pytest
 
 from emb_bench.logs.log import read_log
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, shipped_bench_text
 from emb_runtime.errors import EXIT_LOG
-from emb_runtime.log.recorder import Recorder, RecorderResult
-from emb_runtime.policy.contract import MIN_VECTORS, Vector
 from tests.actors import constant_actor
 from tests.runtime.operating import Edited, EmbRun, Sim
 
@@ -59,38 +57,6 @@ def test_the_shipped_actor_is_the_default_and_the_summary_is_for_people(
     assert len(list(tmp_path.glob("run-*.mcap"))) == 1
 
 
-def test_the_same_seed_gives_the_same_decisions(emb_run: EmbRun, tmp_path: Path) -> None:
-    cycles = []
-    for name in ("a", "b"):
-        path = tmp_path / f"{name}.mcap"
-        emb_run.text("--iface", "sim:seed=7", "--log", str(path))
-        log = read_log(path)
-        cycles.append([list(log.cycles[column][:500]) for column in ("step", "angle", "velocity", "sent_current")])
-    assert cycles[0] == cycles[1]
-
-
-@pytest.mark.parametrize(("later", "code"), [(float("nan"), "POLICY_NOT_FINITE"), (1e9, "POLICY_BEYOND_CONTRACT")])
-def test_a_policy_that_goes_mad_in_the_middle_is_stopped_and_nothing_illegal_was_sent(
-    emb_run: EmbRun, tmp_path: Path, bench: Bench, later: float, code: str
-) -> None:
-    path = tmp_path / "mad.onnx"
-    path.write_bytes(constant_actor(bench, 6.0, later))
-    assert emb_run.document("--policy", str(path), code=3)["result"] == code
-    log = emb_run.log()
-    assert max(abs(c) for c in log.signals("EMB_Command")["Current"]) <= 6.0
-    assert list(log.signals("EMB_Command")["Enable"][-3:]) == [0, 0, 0]
-
-
-@pytest.mark.parametrize("current", [float("nan"), 1e9])
-def test_a_policy_whose_vectors_are_mad_is_refused_before_arming(
-    emb_run: EmbRun, tmp_path: Path, bench: Bench, current: float
-) -> None:
-    path = tmp_path / "mad.onnx"
-    vectors = tuple(Vector((0.0, 0.0, 1e-3 * n), (1.0,)) for n in range(MIN_VECTORS))
-    path.write_bytes(constant_actor(bench, current, vectors=vectors))
-    emb_run.refused("test vector 0", "--policy", str(path), code=5)
-
-
 def test_a_folder_for_logs_that_was_made_for_nothing_is_not_left(emb_run: EmbRun, tmp_path: Path, actor: Path) -> None:
     emb_run.text("--log", str(tmp_path / "a" / "b"), "--iface", "nocan99", code=4)
     assert list(tmp_path.iterdir()) == [actor]
@@ -108,30 +74,11 @@ def test_a_bench_whose_bus_cannot_carry_it_is_refused(emb_run: EmbRun, edited: E
     assert not list(tmp_path.glob("*.mcap"))
 
 
-def test_a_log_that_is_not_whole_is_no_success(emb_run: EmbRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    finish = Recorder.finish
-
-    def lose_one(recorder: Recorder, trailer: dict[str, str]) -> RecorderResult:
-        return finish(recorder, trailer)._replace(complete=False, error="writing failed: No space left on device")
-
-    monkeypatch.setattr(Recorder, "finish", lose_one)
-    assert "INCOMPLETE: writing failed" in emb_run.text(code=6)
-
-
 def test_a_simulation_longer_than_the_ring_is_logged_whole(emb_run: EmbRun, actor: Path, edited: Edited) -> None:
     bench = edited("horizon     = 500", "horizon     = 8000")
     actor.write_bytes(constant_actor(load_bench(Path(bench))))
     emb_run.text("--bench", bench)
     assert len(emb_run.log().cycles["step"]) == 8001
-
-
-def test_a_reader_that_has_had_enough_is_no_error(tmp_path: Path, actor: Path) -> None:
-    command = [*EMB_RUN, "--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--json"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert process.stdout is not None
-    process.stdout.close()
-    _, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (0, b"")
 
 
 def test_a_full_disk_behind_standard_output_is_one_line(tmp_path: Path, actor: Path) -> None:
@@ -149,16 +96,34 @@ def test_the_shipped_bench_is_written_for_editing(emb_run: EmbRun, tmp_path: Pat
     assert path.read_text() == shipped_bench_text()
 
 
-def test_the_help_documents_every_exit_code() -> None:
+def test_the_help_documents_every_exit_code_and_every_key_of_the_simulated_bus() -> None:
     out = subprocess.run([*EMB_RUN, "--help"], capture_output=True, text=True, check=True).stdout
-    for code in range(7):
-        assert f"\n  {code}  " in out
-
-
-def test_the_help_names_every_key_of_the_simulated_bus() -> None:
-    out = subprocess.run([*EMB_RUN, "--help"], capture_output=True, text=True, check=True).stdout
+    assert all(f"\n  {code}  " in out for code in range(7))
     said = out.partition("the simulated bus:")[2].partition("exit codes:")[0]
     assert all(key in said for key in ("sim:KEY=VALUE", "seed", "plant", *PARAMETER_NAMES))
+
+
+def test_a_run_ends_with_its_page_where_that_is_asked_for_and_possible(
+    emb_run: EmbRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = tmp_path / "page.html"
+    ran: list[list[str]] = []
+
+    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[bytes]:
+        ran.append(command)
+        return subprocess.CompletedProcess(command, 7)
+
+    monkeypatch.setattr("emb_runtime.cli.main.subprocess.run", run)
+    emb_run.document("--report", str(page), code=7)
+    (command,) = ran
+    assert command[2:] == ["-m", "emb_bench.cli.replay", "report", str(tmp_path / "run.mcap"), "--output", str(page)]
+    (tmp_path / "run.mcap").unlink()
+    emb_run.refused("is no folder", "--report", str(tmp_path / "none" / "page.html"))
+    for option in (["--read-only"], ["--repeat", "2", "--log", str(tmp_path)]):
+        emb_run.refused(f"--report: one experiment has a page, and {option[0]}", "--report", str(page), *option)
+    monkeypatch.setattr("emb_runtime.cli.main.metadata.entry_points", lambda **_: [])
+    emb_run.refused("nothing is installed that writes a page", "--report", str(page))
+    assert not (tmp_path / "run.mcap").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -13,7 +13,7 @@ import pytest
 from emb_bench.sim.transport import open_sim
 from emb_runtime.can.messages import Layout, StatusFrame, StopReason, load_layout
 from emb_runtime.cli.bus_monitor import ENOUGH_PAIRS, BusMonitor, BusStatistics, listen
-from emb_runtime.cli.options import Stage
+from emb_runtime.cli.options import MappedDrive, Stage, parser, prepare
 from emb_runtime.cli.preflight import CHECKS, CheckResult, Findings, RefusedError, Verdict, check, refuse, table
 from emb_runtime.config.bench import Bench, parse_bench
 from emb_runtime.control.start_conditions import Bounds, StartConditions
@@ -57,42 +57,57 @@ def heard(bench: Bench, layout: Layout) -> BusStatistics:
     )
 
 
-@pytest.fixture
-def findings(bench: Bench, layout: Layout, heard: BusStatistics) -> Findings:
-    """Everything as it should be, on a real bus."""
+@pytest.fixture(scope="module")
+def healthy() -> Findings:
+    """Everything as it should be, on a real bus, but for what was heard."""
+    plan = prepare(parser().parse_args(["--iface", "can0"]))
     return Findings(
-        bench=bench,
-        layout=layout,
-        end_stop_speed=0.0,
-        stage=Stage.FULL,
-        limit=6.0,
+        plan=plan,
+        start_conditions=StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=False),
         duration=0.5,
-        start_conditions=StartConditions(bench, layout, Bounds(bench), anywhere=False),
+        heard=None,  # type: ignore[arg-type]  # see the next fixture
         bus="can0, receive buffer 8388608 bytes",
         in_process=False,
-        heard=heard,
-        policy={"sha256": "ab" * 32, "kind": "current", "beyond": "", "provenance": ""},
+        end_stop_speed=0.0,
         needed=400_000,
         free=1 << 33,
         watchdog="process 4711, heartbeat 5 ms, FIFO 90",
         core=Core(compiled=True, text="compiled (mypyc, x86-64)"),
-        drive=None,
-        serial="",
         realtime={"scheduler": "FIFO 80", "memory_lock": "current and future pages"},
     )
+
+
+@pytest.fixture
+def findings(healthy: Findings, heard: BusStatistics) -> Findings:
+    return replace(healthy, heard=heard)
+
+
+def planned(findings: Findings, **changes: Any) -> Findings:
+    return replace(findings, plan=replace(findings.plan, **changes))
+
+
+def edited(findings: Findings, old: str, new: str) -> Bench:
+    assert old in findings.plan.bench.text
+    return parse_bench(findings.plan.bench.text.replace(old, new), "edited")
+
+
+def hears(findings: Findings, **changes: Any) -> Findings:
+    return replace(findings, heard=replace(findings.heard, **changes))
 
 
 def lines_of(findings: Findings) -> dict[str, CheckResult]:
     return {line.what: line for line in check(findings)}
 
 
-def test_a_compiled_core_that_is_not_taken_is_a_warning_with_its_reason(findings: Findings) -> None:
-    refused = Core(
-        compiled=False, text="Python", warning="the compiled core is not taken: it was compiled from another"
-    )
-    line = lines_of(replace(findings, core=refused))["core"]
-    assert line.verdict is Verdict.WARNING
-    assert line.found == f"Python; {refused.warning}"
+def refused_by(findings: Findings) -> RefusedError:
+    with pytest.raises(RefusedError) as refused:
+        refuse(check(findings))
+    return refused.value
+
+
+SLOW_BUS = "bitrate = 1000000", "bitrate = 250000"
+NOTHING: dict[str, Any] = {"frames": {}, "status": None, "sample": None}
+READING: dict[str, Any] = {"watchdog": "", "realtime": None}
 
 
 def test_a_bench_that_is_as_it_should_be_is_ok_in_every_line(findings: Findings) -> None:
@@ -102,196 +117,137 @@ def test_a_bench_that_is_as_it_should_be_is_ok_in_every_line(findings: Findings)
     refuse(lines)
 
 
-NOT_READY = Fault.NODE_NOT_READY
-REFUSED: dict[str, tuple[dict[str, Any], str, Fault]] = {
-    "nothing heard": ({"frames": {}, "status": None, "sample": None}, "node", Fault.NO_NODE),
-    "no status": ({"status": None}, "node", NOT_READY),
-    "another protocol": ({"status": STATUS._replace(protocol_version=2)}, "node", NOT_READY),
-    "another bench": ({"status": STATUS._replace(bench_identity=0x1234)}, "node", NOT_READY),
-    "no valid pair": ({"sample": None, "pairs": 0}, "node state", Fault.NO_NODE),
-    "in its safe stop": ({"sample": SAMPLE._replace(node_state=NodeState.STOPPING)}, "node state", NOT_READY),
-    "away from home": ({"sample": SAMPLE._replace(angle=2.0)}, "node state", NOT_READY),
-    "moving": ({"sample": SAMPLE._replace(velocity=-40.0)}, "node state", NOT_READY),
-    "another rate": ({"period": 1.02e-3}, "samples", NOT_READY),
-    "no rate": ({"period": math.nan, "pairs": 1}, "samples", Fault.NO_NODE),
-    "damaged frames": (
-        {"rejections": {"EMB_Angle": {"CRC": 90}}, "distrusted": True},
-        "samples",
-        Fault.FRAMES_REJECTED,
-    ),
-    "another commander": ({"commanded": True}, "interface", Fault.FOREIGN_COMMAND),
-}
+def test_what_was_heard_that_refuses_does_so_with_its_error_and_the_first_line_counts(findings: Findings) -> None:
+    not_ready = Fault.NODE_NOT_READY
+    rows: list[tuple[dict[str, Any], str, Fault]] = [
+        (NOTHING, "node", Fault.NO_NODE),
+        ({"status": None}, "node", not_ready),
+        ({"status": STATUS._replace(protocol_version=2)}, "node", not_ready),
+        ({"status": STATUS._replace(bench_identity=0x1234)}, "node", not_ready),
+        ({"sample": None, "pairs": 0}, "node state", Fault.NO_NODE),
+        ({"sample": SAMPLE._replace(node_state=NodeState.STOPPING)}, "node state", not_ready),
+        ({"sample": SAMPLE._replace(angle=2.0)}, "node state", not_ready),
+        ({"sample": SAMPLE._replace(velocity=-40.0)}, "node state", not_ready),
+        ({"period": 1.02e-3}, "samples", not_ready),
+        ({"period": math.nan, "pairs": 1}, "samples", Fault.NO_NODE),
+        ({"rejections": {"EMB_Angle": {"CRC": 90}}, "distrusted": True}, "samples", Fault.FRAMES_REJECTED),
+        ({"commanded": True}, "interface", Fault.FOREIGN_COMMAND),
+    ]
+    for changes, what, fault in rows:
+        refused = refused_by(replace(hears(findings, **changes), free=0))  # nor is there room for the log
+        exit_code = EXIT_BUS if fault is Fault.NO_NODE else EXIT_SAFETY_STOP
+        assert (refused.fault, refused.exit_code) == (fault, exit_code), changes
+        assert str(refused).startswith(f"pre-flight, {what}: ")
+        assert refused.lines == check(replace(hears(findings, **changes), free=0))
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_was_heard_that_refuses_does_so_with_its_error(
-    findings: Findings, heard: BusStatistics, name: str
-) -> None:
-    changes, what, fault = REFUSED[name]
-    lines = check(replace(findings, heard=replace(heard, **changes)))
-    with pytest.raises(RefusedError) as refused:
+def test_what_this_computer_or_the_bench_file_lacks_for_any_run_is_a_usage_error(findings: Findings) -> None:
+    slow = planned(findings, bench=edited(findings, *SLOW_BUS))
+    for found, what in ((replace(findings, free=399_999), "disk"), (slow, "bus load")):
+        refused = refused_by(found)
+        assert (refused.exit_code, refused.fault) == (EXIT_USAGE, None)
+        assert what in str(refused)
+
+
+def test_what_only_warns_stands_in_its_line_alone(findings: Findings) -> None:
+    core = Core(compiled=False, text="Python", warning="the compiled core is not taken: it was compiled from another")
+    rows: list[tuple[Findings, str, str]] = [
+        (hears(findings, bus_errors={"no acknowledgement": 3}), "interface", "no acknowledgement (3)"),
+        (hears(findings, dropped=7), "interface", "7 frames dropped by the kernel"),
+        (hears(findings, missing=2), "samples", "2 missing"),
+        (hears(findings, missing=170), "samples", "170 missing"),
+        (hears(findings, rejections={"EMB_Angle": {"CRC": 1}}), "samples", "EMB_Angle: CRC (1)"),
+        (hears(findings, angle_scatter=2.1e-3), "noise at rest", "0.0021 rad"),
+        (hears(findings, velocity_scatter=2.1), "noise at rest", "2.1 rad/s"),
+        (hears(findings, velocity_scatter=math.nan), "noise at rest", "not known"),
+        (hears(findings, load=0.72, others=500), "bus load", "72% heard, 500 frames of others"),
+        (replace(findings, free=3_000_000), "disk", "3 MiB free"),
+        (replace(findings, watchdog=""), "watchdog", "NONE"),
+        (replace(findings, realtime={"scheduler": "not obtained: no"}), "real time", "scheduler: not obtained: no"),
+        (replace(findings, realtime=None), "real time", "not asked for"),
+        (replace(findings, end_stop_speed=214.0), "shield", "214 rad/s"),
+        (replace(findings, core=core), "core", f"Python; {core.warning}"),
+    ]
+    for found, what, said in rows:
+        lines = check(found)
+        assert [line.what for line in lines if line.verdict is not Verdict.OK] == [what]
+        assert said in lines_of(found)[what].found
         refuse(lines)
-    assert (refused.value.fault, refused.value.exit_code) == (
-        fault,
-        EXIT_BUS if fault is Fault.NO_NODE else EXIT_SAFETY_STOP,
-    )
-    assert str(refused.value).startswith(f"pre-flight, {what}: ")
-    assert refused.value.lines == lines
 
 
-def test_with_read_only_a_tenth_of_the_samples_missing_is_a_failed_check(
-    findings: Findings, heard: BusStatistics
-) -> None:
-    reading = replace(findings, stage=Stage.READ_ONLY, watchdog="", realtime=None, policy=None)
+def test_with_read_only_a_tenth_of_the_samples_missing_is_a_failed_check(findings: Findings) -> None:
+    reading = planned(replace(findings, **READING), stage=Stage.READ_ONLY, policy=None)
     for missing, verdict in ((20, Verdict.WARNING), (25, Verdict.REFUSED), (170, Verdict.REFUSED)):
-        lines = check(replace(reading, heard=replace(heard, pairs=200, missing=missing)))
-        assert {line.what: line.verdict for line in lines}["samples"] is verdict
-        assert lines_of(replace(findings, heard=replace(heard, missing=missing)))["samples"].verdict is Verdict.WARNING
-    with pytest.raises(RefusedError, match=r"170 missing \(0\.46 of all\).*at most 10%") as refused:
-        refuse(lines)
-    assert (refused.value.exit_code, refused.value.fault) == (EXIT_CHECK_FAILED, None)
+        assert lines_of(hears(reading, missing=missing))["samples"].verdict is verdict
+    refused = refused_by(hears(reading, missing=170))
+    assert "170 missing (0.46 of all)" in str(refused)
+    assert (refused.exit_code, refused.fault) == (EXIT_CHECK_FAILED, None)
 
 
-@pytest.mark.parametrize(
-    ("slew", "limit", "verdict", "found"),
-    [
+def test_a_slew_that_cannot_turn_the_current_round_in_a_period_is_told(findings: Findings) -> None:
+    for slew, limit, verdict, found in (
         (12000.0, 6.0, Verdict.OK, "6 A to -6 A in 1 ms"),
         (11999.0, 6.0, Verdict.WARNING, "6 A to -6 A in 1 ms"),
         (1500.0, 6.0, Verdict.WARNING, "in 8 ms (guard.slew); the way home may be 7 ms late"),
         (1500.0, 0.75, Verdict.OK, "0.75 A to -0.75 A in 1 ms"),
         (1500.0, 0.0, Verdict.OK, "no current leaves"),
-    ],
-)
-def test_a_slew_that_cannot_turn_the_current_round_in_a_period_is_told(
-    findings: Findings, slew: float, limit: float, verdict: Verdict, found: str
-) -> None:
-    bench = parse_bench(findings.bench.text.replace("slew          = 12000.0", f"slew = {slew}"), "t")
-    line = lines_of(replace(findings, bench=bench, limit=limit))["slew"]
-    assert line.verdict is verdict
-    assert found in line.found
+    ):
+        bench = edited(findings, "slew          = 12000.0", f"slew = {slew}")
+        line = lines_of(planned(findings, bench=bench, limit=limit))["slew"]
+        assert line.verdict is verdict
+        assert found in line.found
 
 
-def test_a_brake_that_still_creeps_is_not_taken_for_a_noisy_sensor(findings: Findings, heard: BusStatistics) -> None:
-    line = lines_of(replace(findings, heard=replace(heard, creep=-0.07)))["noise at rest"]
+def test_a_brake_that_still_creeps_is_not_taken_for_a_noisy_sensor(findings: Findings) -> None:
+    line = lines_of(hears(findings, creep=-0.07))["noise at rest"]
     assert line.verdict is Verdict.OK
     assert "the brake is not at rest, it creeps at -0.07 rad/s" in line.found
 
 
-WARNED: dict[str, tuple[dict[str, Any], str]] = {
-    "controller errors": ({"bus_errors": {"no acknowledgement": 3}}, "interface"),
-    "frames dropped": ({"dropped": 7}, "interface"),
-    "missing pairs": ({"missing": 2}, "samples"),
-    "rejected frames": ({"rejections": {"EMB_Angle": {"CRC": 1}}}, "samples"),
-    "a noisy angle": ({"angle_scatter": 2.1e-3}, "noise at rest"),
-    "a noisy velocity": ({"velocity_scatter": 2.1}, "noise at rest"),
-    "no noise known": ({"velocity_scatter": math.nan}, "noise at rest"),
-    "a busy bus": ({"load": 0.72, "others": 500}, "bus load"),
-}
-
-
-@pytest.mark.parametrize("name", WARNED)
-def test_what_was_heard_that_only_warns_stands_in_its_line_alone(
-    findings: Findings, heard: BusStatistics, name: str
-) -> None:
-    changes, what = WARNED[name]
-    lines = check(replace(findings, heard=replace(heard, **changes)))
-    assert [line.what for line in lines if line.verdict is Verdict.WARNING] == [what]
-    refuse(lines)
-
-
-@pytest.mark.parametrize(
-    ("changes", "what"),
-    [
-        ({"free": 3_000_000}, "disk"),
-        ({"watchdog": ""}, "watchdog"),
-        ({"realtime": {"scheduler": "not obtained: Operation not permitted"}}, "real time"),
-        ({"realtime": None}, "real time"),
-        ({"end_stop_speed": 214.0}, "shield"),
-    ],
-)
-def test_what_this_computer_lacks_is_a_warning(findings: Findings, changes: dict[str, Any], what: str) -> None:
-    lines = check(replace(findings, **changes))
-    assert [line.what for line in lines if line.verdict is not Verdict.OK] == [what]
-    refuse(lines)
-
-
-def test_a_disk_too_small_for_the_log_refuses_as_a_usage_error(findings: Findings) -> None:
-    with pytest.raises(RefusedError, match="disk") as refused:
-        refuse(check(replace(findings, free=399_999)))
-    assert (refused.value.exit_code, refused.value.fault) == (EXIT_USAGE, None)
-
-
-def test_the_serial_number_of_a_mapped_drive_is_shown(findings: Findings) -> None:
-    line = lines_of(replace(findings, drive=load_mapping(EXAMPLES / "odrive.toml"), serial="SN 12"))["drive"]
+def test_a_mapped_drive_is_named_with_its_serial_number_and_has_the_load_of_its_bus_judged(findings: Findings) -> None:
+    drive = MappedDrive(load_mapping(EXAMPLES / "odrive.toml"), "")
+    mapped = planned(findings, drive=drive, serial="SN 12")
+    line = lines_of(mapped)["drive"]
     assert line.verdict is Verdict.WARNING
     assert line.found.startswith("ODrive CANSimple, axis 0, serial number SN 12 by the operator, mapping ")
-
-
-def test_a_bit_rate_that_cannot_carry_the_messages_refuses(findings: Findings) -> None:
-    slow = parse_bench(findings.bench.text.replace("bitrate = 1000000", "bitrate = 250000"), "slow")
-    with pytest.raises(RefusedError, match="bus load") as refused:
-        refuse(check(replace(findings, bench=slow)))
-    assert refused.value.exit_code == EXIT_USAGE
-
-
-def test_the_bus_load_is_the_worst_case_of_davis_and_others_worked_out_by_hand(findings: Findings) -> None:
-    # 5 bytes: 34 + 40 stuffable bits, 18 stuff bits, 13 more: 105. 8 bytes: 98 + 24 + 13 = 135.
+    # 5 bytes: 34 + 40 stuffable bits, 18 stuff bits, 13 more: 105. 8 bytes: 98 + 24 + 13 = 135 (Davis and others).
     percent = 100.0 * (1000 * 105 + 2000 * 135 + 10 * 135) / 1e6
-    assert f"{percent:.0f}% at worst" in lines_of(findings)["bus load"].found
-
-
-def test_the_load_of_the_node_s_bus_is_judged_beside_that_of_a_mapped_drive_s(
-    findings: Findings, heard: BusStatistics
-) -> None:
-    mapped = replace(findings, drive=load_mapping(EXAMPLES / "odrive.toml"))
-    assert lines_of(mapped)["bus load"].verdict is Verdict.OK
-    busy = lines_of(replace(mapped, heard=replace(heard, load=0.72, others=500)))["bus load"]
+    for found in (findings, mapped):
+        assert f"{percent:.0f}% at worst" in lines_of(found)["bus load"].found
+    busy = lines_of(hears(mapped, load=0.72, others=500))["bus load"]
     assert busy.verdict is Verdict.WARNING
-    for part in ("38% at worst", "72% heard, 500 frames of others", "% of the drive's bus at worst"):
+    for part in ("72% heard, 500 frames of others", "% of the drive's bus at worst"):
         assert part in busy.found
-    slow = parse_bench(findings.bench.text.replace("bitrate = 1000000", "bitrate = 250000"), "slow")
-    assert lines_of(replace(mapped, bench=slow))["bus load"].verdict is Verdict.REFUSED
-    alone = lines_of(replace(mapped, bench=slow, in_process=True))["bus load"]
+    slow = planned(mapped, bench=edited(findings, *SLOW_BUS))
+    assert lines_of(slow)["bus load"].verdict is Verdict.REFUSED
+    alone = lines_of(replace(slow, in_process=True))["bus load"]
     assert (alone.verdict, "heard" in alone.found) == (Verdict.OK, False)
 
 
 def test_nothing_is_missed_where_nobody_else_is_on_the_bus_or_nothing_leaves(findings: Findings) -> None:
-    alone = replace(findings, in_process=True, watchdog="", realtime=None)
-    reading = replace(findings, stage=Stage.READ_ONLY, watchdog="", realtime=None, policy=None)
+    alone = replace(findings, in_process=True, **READING)
+    reading = planned(replace(findings, **READING), stage=Stage.READ_ONLY, policy=None)
     for these in (alone, reading):
         assert {line.verdict for line in check(these)} == {Verdict.OK}
 
 
-def test_on_the_way_home_the_brake_may_be_anywhere_inside_its_limits(findings: Findings, heard: BusStatistics) -> None:
-    homing = replace(
-        findings,
-        start_conditions=StartConditions(
-            findings.bench, findings.layout, findings.start_conditions.bounds, anywhere=True
-        ),
-    )
+def test_on_the_way_home_the_brake_may_be_anywhere_inside_its_limits(findings: Findings) -> None:
+    bench, layout = findings.plan.bench, findings.plan.layout
+    homing = replace(findings, start_conditions=StartConditions(bench, layout, Bounds(bench), anywhere=True))
     for angle, verdict in ((-10.0, Verdict.OK), (60.0, Verdict.OK), (101.0, Verdict.REFUSED)):
-        turned = replace(homing, heard=replace(heard, sample=SAMPLE._replace(angle=angle)))
+        turned = hears(homing, sample=SAMPLE._replace(angle=angle))
         assert lines_of(turned)["node state"].verdict is verdict
 
 
-def test_the_first_refused_line_is_the_one_that_counts(findings: Findings, heard: BusStatistics) -> None:
-    with pytest.raises(RefusedError, match="pre-flight, node:"):
-        refuse(check(replace(findings, free=0, heard=replace(heard, frames={}, sample=None, status=None))))
-
-
-def test_the_table_has_every_line_with_what_was_found_and_expected(findings: Findings, heard: BusStatistics) -> None:
-    lines = check(replace(findings, heard=replace(heard, missing=2)))
-    text = table(lines)
-    rows = text.splitlines()
-    assert rows[0].split() == ["PRE-FLIGHT", "FOUND", "EXPECTED", "VERDICT"]
-    assert all(any(row.startswith(line.what) for row in rows) for line in lines)
-    assert [row.split()[-1] for row in rows if row.startswith("samples")] == ["warning"]
-    assert max(map(len, rows)) <= 120
-
-
-def test_no_check_fails_on_numbers_that_are_not_finite(findings: Findings, heard: BusStatistics) -> None:
-    odd = replace(heard, period=math.nan, angle_scatter=math.inf, velocity_scatter=math.nan, duration=0.0, load=0.0)
-    assert len(check(replace(findings, heard=odd))) == len(CHECKS)
+def test_the_table_has_every_line_with_what_was_found_and_expected_whatever_the_numbers(findings: Findings) -> None:
+    odd = hears(findings, missing=2, period=math.nan, angle_scatter=math.inf, velocity_scatter=math.nan, duration=0.0)
+    for found, verdict in ((hears(findings, missing=2), "warning"), (odd, "refused")):
+        lines = check(found)
+        rows = table(lines).splitlines()
+        assert rows[0].split() == ["PRE-FLIGHT", "FOUND", "EXPECTED", "VERDICT"]
+        assert all(any(row.startswith(line.what) for row in rows) for line in lines)
+        assert [row.split()[-1] for row in rows if row.startswith("samples")] == [verdict]
+        assert max(map(len, rows)) <= 120
 
 
 # --- listening ------------------------------------------------------------------------------------------------------

@@ -13,10 +13,10 @@ import pytest
 
 from emb_runtime.can.messages import StopReason
 from emb_runtime.cli.preflight import CheckResult, RefusedError
-from emb_runtime.cli.summary import RunResult, brief, document, refusal, text, trailer, way_home
+from emb_runtime.cli.summary import RunResult, brief, document, refusal, text, trailer
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.result import Outcome, RunCounters
-from emb_runtime.errors import BusError, UsageError
+from emb_runtime.errors import EXIT_OUTSIDE, BusError, UsageError
 from emb_runtime.log.recorder import RecorderResult
 from emb_runtime.records import NodeState, RunType
 from emb_runtime.safety.state_machine import FAULTS, Fault
@@ -28,7 +28,7 @@ class Plan:
     """As much of a plan as is told of."""
 
     def __init__(self, bench: Bench) -> None:
-        self.bench, self.stage, self.limit = bench, "full", 6.0
+        self.bench, self.stage, self.limit, self.strict = bench, "full", 6.0, False
         self.policy = SimpleNamespace(contract=contract_for(bench, 1.0))
 
 
@@ -93,11 +93,21 @@ def test_an_undisturbed_run_is_told_in_14_lines_and_one_that_lost_samples_says_s
     assert "12 periods missed" in text(told(counters=replace(whole, missed=12)))
 
 
-@pytest.mark.parametrize(("k_1", "outside"), [(23.0, False), (11.0, True), (34.56, True), (34.5, False)])
-def test_an_estimate_at_the_border_of_the_ranges_or_beyond_is_said(told: Any, k_1: float, outside: bool) -> None:
-    document = told(estimate=(0.02, k_1, 0.01, 2e-5, 1e-5, 0.0004, 1e-5, 1e-7))
-    assert list(document["outside"]) == (["k_1"] if outside else [])
-    assert ("OUTSIDE" in text(document)) == outside
+def test_an_estimate_at_the_border_of_the_ranges_or_beyond_is_said_first_and_with_strict_no_success(
+    bench: Bench, ran: RunResult
+) -> None:
+    for k_1, outside in ((23.0, False), (11.0, True), (34.56, True), (34.5, False)):
+        estimate = (0.02, k_1, 0.01, 2e-5, 1e-5, 0.0004, 1e-5, 1e-7)
+        for strict in (False, True):
+            plan, known = Plan(bench), replace(ran.outcome, estimate=estimate)
+            plan.strict = strict
+            said: Any = document(plan, "can0", replace(ran, outcome=known))  # type: ignore[arg-type]
+            assert list(said["outside"]) == (["k_1"] if outside else [])
+            assert said["exit_code"] == (EXIT_OUTSIDE if outside and strict else 0)
+            first, second, *_ = text(said).splitlines()
+            assert ("OUTSIDE" in first, "the limits were not guaranteed" in second) == (outside, outside)
+            stopped = replace(known, fault=Fault.INTERRUPTED)
+            assert document(plan, "can0", replace(ran, outcome=stopped))["exit_code"] == 3  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("fault", Fault)
@@ -135,9 +145,8 @@ def test_the_ways_home_are_told_with_the_experiment(told: Any) -> None:
     way = told(RunType.HOMING)
     gone = refusal(RefusedError("nobody there", 4, (), Fault.NO_NODE), "can0")
     said = text(told() | {"homing": {"before": way, "after": gone}})
-    assert "way home   before the experiment: home, 0.020 rad after 0.50 s, run.mcap" in said
+    assert "way home   before the experiment: done: 490 of 500 answered, home, run.mcap" in said
     assert "way home   after the experiment: NO_NODE: nobody there" in said
-    assert way_home(told(RunType.HOMING, fault=Fault.NOT_HOME, home=False)).startswith("NOT_HOME (")
     assert text(told(RunType.HOMING, fault=Fault.NOT_HOME)).startswith("STOPPED on the way home (NOT_HOME)")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
+from typing import Any
 
 import pytest
 
@@ -64,102 +65,62 @@ def saying(**changes: float | Callable[[float], float]) -> Callable[[Frame], Fra
     return change
 
 
-Injection = Callable[[Simulate], SimRun]
-INJECTIONS: dict[Fault, Injection] = {}
+Receive = Callable[[Frame | None, SimTransport, SteppedClock], Frame | None]
 
 
-def injects(fault: Fault) -> Callable[[Injection], Injection]:
-    def register(function: Injection) -> Injection:
-        INJECTIONS[fault] = function
-        return function
+def at_period(period: int, action: Callable[[SimTransport], object]) -> Receive:
+    """Does something to the node while it is in one of its sampling periods."""
 
-    return register
-
-
-@injects(Fault.NO_NODE)
-def _silence(simulate: Simulate) -> SimRun:
-    def nothing(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
-        while frame is not None:
-            frame = transport.receive(clock.now_ns())
-        return None
-
-    return simulate(on_receive=nothing)
-
-
-@injects(Fault.NODE_NOT_READY)
-def _away_from_home(simulate: Simulate) -> SimRun:
-    def move(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
-        transport.node.angle = 2.0
-        while frame is not None and transport.node.periods < 5:  # nobody looks while it is moved
-            frame = transport.receive(clock.now_ns() + MS)
+    def receive(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if transport.node.periods == period:
+            action(transport)
         return frame
 
-    return simulate(on_receive=move)
+    return receive
 
 
-@injects(Fault.SENSOR_LOST)
-def _sensor_lost(simulate: Simulate) -> SimRun:
-    return simulate(on_receive=dropping(ANGLE, range(100, 10_000)))
+def moved_unseen(move: Callable[[SimTransport], object]) -> Receive:
+    """Moves the brake in the first five periods, in which nobody looks but for the status."""
 
-
-@injects(Fault.FRAMES_REJECTED)
-def _noise_on_the_line(simulate: Simulate) -> SimRun:
-    return simulate(on_receive=changing(lambda frame: frame._replace(data=frame.data[:4]), VELOCITY, range(100, 110)))
-
-
-@injects(Fault.OUT_OF_LIMITS)
-def _pushed_by_hand(simulate: Simulate) -> SimRun:
-    def push(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
+    def receive(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
         if transport.node.periods < 5:
-            transport.node._x[:2] = -4.0, -450.0
-        # Nobody looks while it is pushed.
+            move(transport)
         while frame is not None and frame.identifier != STATUS and transport.node.periods < 5:
             frame = transport.receive(clock.now_ns() + MS)
         return frame
 
-    return simulate(homing=True, on_receive=push)
+    return receive
 
 
-@injects(Fault.SENSORS_CONTRADICT)
-def _drifting_angle(simulate: Simulate) -> SimRun:
-    def drift(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        late = max(transport.node.periods - 100, 0)
-        return frame and saying(Angle=lambda angle: angle + 0.03 * late)(frame)
-
-    return simulate(on_receive=drift)
+def push(transport: SimTransport) -> None:
+    transport.node._x[:2] = -4.0, -450.0
 
 
-@injects(Fault.MOTION_OUTSIDE_SET)
-def _a_brake_outside_the_set(simulate: Simulate) -> SimRun:
-    return simulate(options="k_m=0.06,f_v=1e-6,T_c=2e-4")
+def away(transport: SimTransport) -> None:
+    transport.node.angle = 2.0
 
 
-@injects(Fault.WRONG_POLARITY)
-def _sensor_with_the_wrong_sign(simulate: Simulate) -> SimRun:
-    return simulate(on_receive=changing(saying(Angle=lambda angle: -angle, Velocity=lambda velocity: -velocity)))
+def nothing(frame: Frame | None, transport: SimTransport, clock: SteppedClock) -> Frame | None:
+    while frame is not None:
+        frame = transport.receive(clock.now_ns())
+    return None
 
 
-@injects(Fault.NODE_STOPPED)
-def _node_stops(simulate: Simulate) -> SimRun:
-    def stop(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if transport.node.periods == 200:
-            transport.node.state = NodeState.STOPPING
-        return frame
-
-    return simulate(on_receive=stop)
+def drift(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+    late = max(transport.node.periods - 100, 0)
+    return frame and saying(Angle=lambda angle: angle + 0.03 * late)(frame)
 
 
-@injects(Fault.NOT_OBEYED)
-def _deaf_node(simulate: Simulate) -> SimRun:
-    def deafen(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        transport.node.receive = lambda frame: None  # type: ignore[method-assign]
-        return frame
-
-    return simulate(on_receive=deafen)
+def stop(transport: SimTransport) -> None:
+    transport.node.state = NodeState.STOPPING
 
 
-@injects(Fault.FOREIGN_COMMAND)
-def _foreign(simulate: Simulate) -> SimRun:
+def deafen(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+    transport.node.receive = lambda frame: None  # type: ignore[method-assign]
+    return frame
+
+
+def intruding() -> Receive:
     once: Iterator[int] = iter([1])
 
     def intrude(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
@@ -167,24 +128,28 @@ def _foreign(simulate: Simulate) -> SimRun:
             return Frame(COMMAND, b"\x00\x00\x00\x00\x00", frame.time_ns)
         return frame
 
-    return simulate(on_receive=intrude)
+    return intrude
 
 
-@injects(Fault.POLICY_NOT_FINITE)
-def _nan(simulate: Simulate) -> SimRun:
-    return simulate(lambda _a, _v, k: math.nan if k == 120 else 4.0)
+def failing(error: type[BusError], *at: int) -> Callable[[Frame], None]:
+    """Fails to send the frames of these numbers."""
+    asked = iter(range(10**9))
+
+    def send(_frame: Frame) -> None:
+        if next(asked) in at:
+            raise error("can0: it does not go")
+
+    return send
 
 
-@injects(Fault.POLICY_BEYOND_CONTRACT)
-def _giant(simulate: Simulate) -> SimRun:
-    return simulate(lambda _a, _v, k: 1e9 if k == 120 else 4.0)
+def asked_often(times: int) -> Callable[[], bool]:
+    asked = iter(range(10**9))
+    return lambda: next(asked) > times
 
 
-@injects(Fault.GUARD_REJECTED)
-def _error_before_the_guard(simulate: Simulate) -> SimRun:
-    guard = Guard(
-        load_layout(), load_bench(), lambda _frame: None, limit=1.0
-    )  # and whatever comes before it allows 6 A
+def an_error_before_the_guard(simulate: Simulate) -> SimRun:
+    """Whatever comes before it allows 6 A."""
+    guard = Guard(load_layout(), load_bench(), lambda _frame: None, limit=1.0)
 
     def on_receive(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
         guard._send = transport.send
@@ -193,35 +158,6 @@ def _error_before_the_guard(simulate: Simulate) -> SimRun:
     run = simulate(lambda _a, _v, k: 0.5 if k < 10 else 4.0, on_receive=on_receive, guard=guard)
     run.sent.extend(f._replace(own=False) for f in run.journal.frames if f.own)
     return run
-
-
-@injects(Fault.BUS_LOST)
-def _bus_lost(simulate: Simulate) -> SimRun:
-    lost: list[int] = []
-
-    def fail(_frame: Frame) -> None:
-        lost.append(1)
-        if len(lost) == 100:
-            raise BusError("vcan0: the interface is down")
-
-    return simulate(on_send=fail)
-
-
-@injects(Fault.INTERRUPTED)
-def _ctrl_c(simulate: Simulate) -> SimRun:
-    asked = iter(range(10**9))
-    return simulate(stop_requested=lambda: next(asked) > 700)
-
-
-@injects(Fault.INTERNAL)
-def _bug(simulate: Simulate) -> SimRun:
-    return simulate(lambda _a, _v, k: 1.0 / (k - 150.0))
-
-
-@injects(Fault.CURRENT_MISMATCH)
-def _weak_drive(simulate: Simulate) -> SimRun:
-    weak = saying(AppliedCurrent=0.5)
-    return simulate(lambda *_: 3.0, on_receive=changing(weak, VELOCITY, range(200, 10_000)))
 
 
 class Pulse(Unwatched):
@@ -249,48 +185,62 @@ class Pulse(Unwatched):
         self.calls.append(False)
 
 
-@injects(Fault.WATCHDOG_TRIPPED)
-def _watchdog_trips(simulate: Simulate) -> SimRun:
-    return simulate(pulse=Pulse(trips_at=1500))
+def later(identifier: int, begin: int, **changes: Any) -> Receive:
+    """Changes what the node says from a sampling period on."""
+    return changing(saying(**changes), identifier, range(begin, 10_000))
 
 
-@injects(Fault.WATCHDOG_LOST)
-def _watchdog_dies(simulate: Simulate) -> SimRun:
-    return simulate(pulse=Pulse(silent_at=150))
+def shortened(frame: Frame) -> Frame:
+    return frame._replace(data=frame.data[:4])
 
 
-@injects(Fault.NOT_HOME)
-def _too_far_away(simulate: Simulate) -> SimRun:
-    return simulate(lambda *_: 0.0, homing=True, steps=30, angle=40.0)
+def reported(frame: Frame) -> Frame:
+    return Frame(0x8, bytes(8), frame.time_ns, error=True)
 
 
-@injects(Fault.DEVICE_TIME)
-def _clock_jumps(simulate: Simulate) -> SimRun:
-    later = saying(DeviceTime=lambda time: time + 0.5)
-    return simulate(on_receive=changing(later, ANGLE, range(200, 10_000)))
-
-
-@injects(Fault.INCOMPLETE)
-def _21_percent_are_missing(simulate: Simulate) -> SimRun:
-    """Too many for an experiment, and within half a second not yet too many for the node to be lost."""
-    return simulate(on_receive=dropping(ANGLE, [n for n in range(20, 10_000) if 21 * n % 100 < 21]))
-
-
-@injects(Fault.NODE_CHANGED)
-def _another_node(simulate: Simulate) -> SimRun:
-    other = saying(BenchIdentity=lambda identity: int(identity) ^ 1)
-    return simulate(on_receive=changing(other, STATUS, range(200, 10_000)))
-
-
-@injects(Fault.SET_CONTRADICTED)
-def _another_brake_than_the_shield_was_told(simulate: Simulate) -> SimRun:
-    return simulate(on_bench=LEARNING, options="plant=euler")
-
-
-@injects(Fault.MOTION_UNEXPLAINED)
-def _a_reported_current_that_is_off(simulate: Simulate) -> SimRun:
-    more = saying(AppliedCurrent=lambda current: current + 0.4)
-    return simulate(lambda _x, _v, step: 6.0 if step // 60 % 2 == 0 else -6.0, on_receive=changing(more, VELOCITY))
+# Too many for an experiment, and within half a second not yet too many for the node to be lost.
+MISSING_21_PERCENT = [n for n in range(20, 10_000) if 21 * n % 100 < 21]
+INJECTIONS: dict[Fault, Callable[[Simulate], SimRun]] = {
+    Fault.NO_NODE: lambda run: run(on_receive=nothing),
+    Fault.NODE_NOT_READY: lambda run: run(on_receive=moved_unseen(away)),
+    Fault.SENSOR_LOST: lambda run: run(on_receive=dropping(ANGLE, range(100, 10_000))),
+    Fault.FRAMES_REJECTED: lambda run: run(on_receive=changing(shortened, VELOCITY, range(100, 110))),
+    Fault.OUT_OF_LIMITS: lambda run: run(homing=True, on_receive=moved_unseen(push)),
+    Fault.SENSORS_CONTRADICT: lambda run: run(on_receive=drift),
+    Fault.MOTION_OUTSIDE_SET: lambda run: run(options="k_m=0.06,f_v=1e-6,T_c=2e-4"),
+    Fault.WRONG_POLARITY: lambda run: run(on_receive=changing(saying(Angle=lambda x: -x, Velocity=lambda v: -v))),
+    Fault.NODE_STOPPED: lambda run: run(on_receive=at_period(200, stop)),
+    Fault.NOT_OBEYED: lambda run: run(on_receive=deafen),
+    Fault.FOREIGN_COMMAND: lambda run: run(on_receive=intruding()),
+    Fault.POLICY_NOT_FINITE: lambda run: run(lambda _a, _v, k: math.nan if k == 120 else 4.0),
+    Fault.POLICY_BEYOND_CONTRACT: lambda run: run(lambda _a, _v, k: 1e9 if k == 120 else 4.0),
+    Fault.GUARD_REJECTED: an_error_before_the_guard,
+    Fault.BUS_LOST: lambda run: run(on_send=failing(BusError, 99)),
+    Fault.INTERRUPTED: lambda run: run(stop_requested=asked_often(700)),
+    Fault.INTERNAL: lambda run: run(lambda _a, _v, k: 1.0 / (k - 150.0)),
+    Fault.CURRENT_MISMATCH: lambda run: run(lambda *_: 3.0, on_receive=later(VELOCITY, 200, AppliedCurrent=0.5)),
+    Fault.WATCHDOG_TRIPPED: lambda run: run(pulse=Pulse(trips_at=1500)),
+    Fault.WATCHDOG_LOST: lambda run: run(pulse=Pulse(silent_at=150)),
+    Fault.NOT_HOME: lambda run: run(lambda *_: 0.0, homing=True, steps=30, angle=40.0),
+    Fault.DEVICE_TIME: lambda run: run(on_receive=later(ANGLE, 200, DeviceTime=lambda time: time + 0.5)),
+    Fault.INCOMPLETE: lambda run: run(on_receive=dropping(ANGLE, MISSING_21_PERCENT)),
+    Fault.NODE_CHANGED: lambda run: run(on_receive=later(STATUS, 200, BenchIdentity=lambda number: int(number) ^ 1)),
+    Fault.SET_CONTRADICTED: lambda run: run(on_bench=LEARNING, options="plant=euler"),
+    Fault.MOTION_UNEXPLAINED: lambda run: run(
+        lambda _x, _v, step: 6.0 if step // 60 % 2 == 0 else -6.0,
+        on_receive=later(VELOCITY, 0, AppliedCurrent=lambda current: current + 0.4),
+    ),
+    Fault.NOT_AT_REST: lambda run: run(on_receive=later(VELOCITY, 520, NodeState=NodeState.FAULT)),
+    # What passes by itself.
+    Fault.SENSOR_LATE: lambda run: run(on_receive=dropping(VELOCITY, range(100, 106))),
+    Fault.SEND_QUEUE_FULL: lambda run: run(on_send=failing(TransmitQueueFullError, 100, 200, 201)),
+    Fault.FRAMES_DROPPED: lambda run: run(
+        on_receive=changing(lambda frame: frame._replace(dropped=7), periods=range(200, 10_000))
+    ),
+    Fault.BUS_ERRORS: lambda run: run(on_receive=changing(reported, VELOCITY, range(200, 203))),
+    Fault.PERMISSION_LOST: lambda run: run(on_receive=dropping(STATUS, range(100, 300))),
+}
+"""A whole run with each fault in it."""
 
 
 def test_a_node_that_sends_the_velocity_first_is_there_and_not_ready(simulate: Simulate) -> None:
@@ -310,12 +260,6 @@ def test_a_node_that_sends_the_velocity_first_is_there_and_not_ready(simulate: S
     assert run.outcome.fault is Fault.NODE_NOT_READY
     assert "no velocity next after the angle with its counter" in run.outcome.detail
     assert run.sent == []
-
-
-@injects(Fault.NOT_AT_REST)
-def _the_node_does_not_let_go(simulate: Simulate) -> SimRun:
-    failed = saying(NodeState=NodeState.FAULT)
-    return simulate(on_receive=changing(failed, VELOCITY, range(520, 10_000)))
 
 
 def test_a_counter_that_skips_every_other_sample_ends_the_run(simulate: Simulate, layout: Layout) -> None:
@@ -338,43 +282,6 @@ def test_a_counter_that_skips_every_other_sample_ends_the_run(simulate: Simulate
     assert run.outcome.fault is Fault.SENSOR_LOST
     assert "by the node's counter" in run.outcome.detail
     assert [(c.enable, c.current) for c in commands(run, layout)[-STOP_FRAMES:]] == [(False, 0.0)] * STOP_FRAMES
-
-
-# --- what passes by itself ------------------------------------------------------------------------------------------
-
-
-@injects(Fault.SENSOR_LATE)
-def _a_pause(simulate: Simulate) -> SimRun:
-    return simulate(on_receive=dropping(VELOCITY, range(100, 106)))
-
-
-@injects(Fault.SEND_QUEUE_FULL)
-def _no_room(simulate: Simulate) -> SimRun:
-    asked = iter(range(10**9))
-
-    def refuse(_frame: Frame) -> None:
-        if next(asked) in (100, 200, 201):
-            raise TransmitQueueFullError("can0: transmit queue full")
-
-    return simulate(on_send=refuse)
-
-
-@injects(Fault.FRAMES_DROPPED)
-def _small_buffer(simulate: Simulate) -> SimRun:
-    return simulate(on_receive=changing(lambda frame: frame._replace(dropped=7), periods=range(200, 10_000)))
-
-
-@injects(Fault.BUS_ERRORS)
-def _bus_errors(simulate: Simulate) -> SimRun:
-    def report(frame: Frame) -> Frame:
-        return Frame(0x8, bytes(8), frame.time_ns, error=True)
-
-    return simulate(on_receive=changing(report, VELOCITY, range(200, 203)))
-
-
-@injects(Fault.PERMISSION_LOST)
-def _no_status(simulate: Simulate) -> SimRun:
-    return simulate(on_receive=dropping(STATUS, range(100, 300)))
 
 
 def test_every_fault_has_an_injection() -> None:
@@ -424,7 +331,7 @@ def test_every_soft_fault_is_told_and_ends_nothing_by_itself(fault: Fault, simul
 
 
 def test_a_command_without_room_is_lost_and_never_sent_later(simulate: Simulate, layout: Layout) -> None:
-    run = _no_room(simulate)
+    run = INJECTIONS[Fault.SEND_QUEUE_FULL](simulate)
     assert (run.outcome.counters.not_taken, run.outcome.counters.unanswered) == (3, 3)
     assert run.journal.codes.count(Fault.SEND_QUEUE_FULL.name) == 3
     sent = commands(run, layout)
@@ -459,7 +366,7 @@ def test_a_watchdog_that_trips_while_the_stop_frames_go_out_is_the_run_s_fault(s
 
 
 def test_the_status_of_the_node_is_missed_after_two_of_its_periods(simulate: Simulate) -> None:
-    run = _no_status(simulate)
+    run = INJECTIONS[Fault.PERMISSION_LOST](simulate)
     lost = next(time_ns for time_ns, code, _ in run.journal.events if code == Fault.PERMISSION_LOST.name)
     last = max(f.time_ns for f in run.journal.frames if f.identifier == STATUS and f.time_ns < lost)
     assert 200 * MS <= lost - last <= 202 * MS

@@ -236,19 +236,6 @@ def test_an_error_in_the_program_leaves_its_traceback_in_the_log(simulate: Simul
     assert any("ZeroDivisionError" in text for _, _, text in run.journal.lines)
 
 
-def test_whatever_breaks_while_stopping_every_stop_frame_is_tried_and_the_run_ends(simulate: Simulate) -> None:
-    def break_down(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        if transport.node.periods > 100:
-            raise OSError("the adapter is gone")
-        return frame
-
-    run = simulate(on_receive=break_down)
-    assert run.outcome.fault is Fault.INTERNAL
-    assert "the adapter is gone" in run.outcome.detail
-    assert len([f for f in run.sent if not f.data[4] & 1]) == STOP_FRAMES
-    assert run.journal.codes[-1] == "OVER"
-
-
 def test_a_node_of_another_bench_or_protocol_is_not_armed(simulate: Simulate, layout: Layout) -> None:
     for changes, reason in (
         ({"BenchIdentity": 0x1234}, "another bench file"),
@@ -258,15 +245,6 @@ def test_a_node_of_another_bench_or_protocol_is_not_armed(simulate: Simulate, la
         assert run.outcome.fault is Fault.NODE_NOT_READY
         assert reason in run.outcome.detail
         assert run.sent == []
-
-
-def test_bus_off_is_a_lost_bus(simulate: Simulate) -> None:
-    def bus_off(frame: Frame) -> Frame:
-        return Frame(0x40, bytes(8), frame.time_ns, error=True)
-
-    run = simulate(on_receive=changing(bus_off, periods=range(200, 201)))
-    assert run.outcome.fault is Fault.BUS_LOST
-    assert "bus-off" in run.outcome.detail
 
 
 def test_what_piled_up_before_the_loop_listened_is_logged_but_not_what_it_arms_on(

@@ -45,15 +45,6 @@ while pushed < int(sys.argv[2]):
 """
 
 
-def test_records_come_out_in_order_across_many_wrap_arounds() -> None:
-    ring = Ring.create(4)
-    for k in range(50):
-        assert ring.push(k, str(k).encode() * (k % 5))
-        assert ring.pop() == (k, str(k).encode() * (k % 5))
-    assert ring.pop() is None
-    ring.close()
-
-
 def test_a_full_ring_drops_the_new_record_and_counts_it_for_both_sides() -> None:
     ring = Ring.create(2)
     other = Ring(os.dup(ring.fd))

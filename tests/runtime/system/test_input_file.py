@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import socket
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 import pytest
 
-from emb_runtime.system import input_file
 from emb_runtime.system.input_file import open_regular, read_bytes, read_text
 
 
@@ -70,32 +65,3 @@ def test_a_link_to_a_regular_file_is_followed(tmp_path: Path) -> None:
     (tmp_path / "real").write_bytes(b"x")
     (tmp_path / "link").symlink_to("real")
     assert read_bytes(tmp_path / "link", 1) == b"x"
-
-
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # the interpreter closes it
-def test_an_interruption_at_whatever_step_stays_one(tmp_path: Path) -> None:
-    """It is no error of a file descriptor that was closed twice, for which the file would be blamed."""
-    path = tmp_path / "given"
-    path.write_bytes(b"there")
-    left = 1
-
-    def interrupt(frame: FrameType, event: str, _value: object) -> Any:
-        nonlocal left
-        frame.f_trace_opcodes = frame.f_globals["__name__"] in (input_file.__name__, "os")
-        if event == "opcode":
-            left -= 1
-            if left == 0:
-                raise KeyboardInterrupt
-        return interrupt
-
-    for step in range(1, 1000):
-        before, left = sys.gettrace(), step
-        try:
-            sys.settrace(interrupt)
-            with contextlib.suppress(KeyboardInterrupt):
-                assert read_bytes(path, 10) == b"there"
-        finally:
-            sys.settrace(before)
-        if left > 0:
-            break
-    assert 50 < step < 999
