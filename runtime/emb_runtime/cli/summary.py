@@ -1,4 +1,4 @@
-"""What is said of a run: in its log's header and trailer, as JSON, and in words."""
+"""Words on a run: in its log's header and trailer, as JSON, and in lines for a person."""
 
 from __future__ import annotations
 
