@@ -59,7 +59,7 @@ thesis's weighted information, for one parameter that information itself. All re
 
 The optimum is what the search of emb-design finds if the brake is known, on the thesis's brakes (euler, exact; a plant
 that differs from exact in its instruments alone is held against exact). It takes minutes for the first brake, a quarter
-of a minute for each other, and is kept in the user's cache.
+of a minute for each other, and is kept in the user's cache. Ctrl-C ends the evaluation: plants that are done are shown.
 """
 
 
@@ -330,7 +330,7 @@ def ppo(arguments: argparse.Namespace) -> int:
 
     from emb_train.evaluate import grid_outcomes, grid_text
     from emb_train.ppo import Metrics
-    from emb_train.training import ACTOR, begin_training, load_preset, load_training, run_training, unfit
+    from emb_train.training import ACTOR, begin_training, load_preset, load_training, run_training
 
     bench, folder = load_bench(arguments.bench), arguments.out
     changes = {"total_steps": arguments.steps, "plant": arguments.plant, "seed": arguments.seed}
@@ -338,8 +338,6 @@ def ppo(arguments: argparse.Namespace) -> int:
     conditions = msgspec.structs.replace(training.conditions, **_varied(arguments))
     training = msgspec.structs.replace(training, conditions=conditions)
     begin_training(folder, training, bench)
-    if conditions.shielded and (said := unfit(bench, bench.range_set(training.ranges))):
-        mention(f"emb-train: this actor cannot be exported for this bench: {said}")
     with progress(training.preset, training.ppo.iterations) as advance:
 
         def note(m: Metrics) -> None:
@@ -383,7 +381,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
         (arguments.out / "evaluation.txt").write_text(table + "\n", encoding="utf-8")
         (arguments.out / "evaluation.json").write_text(record + "\n", encoding="utf-8")
     show(record if arguments.json else table)
-    return EXIT_DONE
+    return EXIT_DONE if len(results) == len(settings.plants) else EXIT_INTERRUPTED
 
 
 def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subject]]:

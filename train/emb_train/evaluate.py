@@ -187,7 +187,7 @@ class PlantResult:
 
 
 def evaluate(bench: Bench, settings: Settings, subjects: Sequence[Subject], tell: Tell) -> dict[str, PlantResult]:
-    """Play all on all plants.
+    """Play all on all plants; after a Ctrl-C, the plants that are done.
 
     Args:
         bench: of all subjects.
@@ -202,16 +202,21 @@ def evaluate(bench: Bench, settings: Settings, subjects: Sequence[Subject], tell
     draws = fresh_draws(ranges, settings.seed, settings.draws)
     brakes = [middle_of(ranges), *(draw.brake for draw in draws[: settings.optimum])]
     excitations = {**{s.name: s.excitation for s in subjects}, **references(bench)}
-    found, known = {}, {"": np.empty(0)}
-    for plant in settings.plants:
-        outcomes = {}
-        for name, excitation in excitations.items():
-            tell(f"plant {plant}: {name}")
-            outcomes[name] = play(bench, ranges, names, excitation, draws, plant, settings.conditions)
-        model = searchable(bench.plant(plant)) if settings.optimum else ""
-        if model not in known:
-            known[model] = optima(bench, measure, names, model, brakes, tell)[1:]
-        found[plant] = result(measure, outcomes, len(subjects), known[model])
+    found: dict[str, PlantResult] = {}
+    known = {"": np.empty(0)}
+    try:
+        for plant in settings.plants:
+            outcomes = {}
+            for name, excitation in excitations.items():
+                tell(f"plant {plant}: {name}")
+                outcomes[name] = play(bench, ranges, names, excitation, draws, plant, settings.conditions)
+            model = searchable(bench.plant(plant)) if settings.optimum else ""
+            if model not in known:
+                known[model] = optima(bench, measure, names, model, brakes, tell)[1:]
+            found[plant] = result(measure, outcomes, len(subjects), known[model])
+    except KeyboardInterrupt:
+        if not found:
+            raise
     return found
 
 

@@ -25,7 +25,6 @@ from safetensors.torch import load, save
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.output import make_empty_folder, replacing
-from emb_runtime.config.bench import Ranges
 from emb_runtime.config.typed import read
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
@@ -35,24 +34,6 @@ from emb_train.env import EmbExcitationVectorEnv
 from emb_train.ppo import Actor, Metrics, Ppo, collect, train
 from emb_train.presets import preset_record
 from emb_train.rewards import REWARDS
-
-
-def unfit(bench: Bench, ranges: Ranges) -> str:
-    """Reason why the bench's shield does not cover these brakes, and what to do; empty if it does."""
-    box = bench.range_set(bench.shield.ranges)
-    uncovered = box.uncovered(ranges.low, ranges.high)
-    if not uncovered:
-        return ""
-    names = [f"{n} from {getattr(ranges.low, n):g} to {getattr(ranges.high, n):g}" for n in uncovered]
-    covers = [f"{n} from {getattr(box.low, n):g} to {getattr(box.high, n):g}" for n in uncovered]
-    middle = {n: 0.5 * (getattr(ranges.low, n) + getattr(ranges.high, n)) for n in ranges.low._fields}
-    brake = [f"{n} = {middle[n]:g} in [brake]" for n in ranges.uncovered(bench.brake, bench.brake)]
-    lines = " and ".join([*brake, f'ranges = "{ranges.name}" in [shield]'])
-    return (
-        f"it is for brakes with {', '.join(names)}, and the bench's shield covers {', '.join(covers)}: make a bench "
-        f"file with emb-run --write-bench FILE, write {lines}, and give it to emb-export and emb-run with --bench FILE"
-    )
-
 
 ACTOR, CONFIGURATION, BENCH, METRICS = "actor.safetensors", "training.json", "bench.toml", "metrics.jsonl"
 LARGEST_FILE = 1 << 26  # [bytes]

@@ -24,7 +24,6 @@ from emb_runtime.safety.shield import NO_PAST, shield
 from emb_runtime.safety.shield_design import make_law
 from emb_train.closed_loop import Batch, Conditions, Experiments, advance
 from emb_train.env import ENV_ID, EmbExcitationEnv, EmbExcitationVectorEnv
-from emb_train.play import GRID, Played, grid_draws, play
 from emb_train.presets import preset_summaries
 from emb_train.rewards import Transition, penalised_increment
 from emb_train.training import load_preset
@@ -219,19 +218,6 @@ def test_the_critic_sees_the_truth_in_scales_of_order_one() -> None:
     np.testing.assert_allclose(seen[-1][:, 2], 499 / 500)
     np.testing.assert_allclose(seen[-1][:, 3], (batch.brakes[:, 5] - 3e-5) / 2e-5, rtol=1e-5)
     np.testing.assert_allclose(seen[-1][:, 4], 0.1 * np.log1p(batch.m[:, 0]), rtol=1e-6)
-
-
-def test_the_training_path_and_the_evaluation_path_are_the_same_path() -> None:
-    ranges = BENCH.range_set("viscous")
-    draws = grid_draws(ranges, "f_v", seed=11)
-    assert (draws[0].brake.f_v, draws[-1].brake.f_v, len(draws)) == (1e-5, 5e-5, GRID)
-    result = play(BENCH, ranges, ("f_v",), Played(np.full(500, 6.0)), draws)
-    env = EmbExcitationVectorEnv(GRID, BENCH)
-    env.reset(seed=11, options={"brakes": [draw.brake for draw in draws]})
-    for _ in range(BENCH.timing.horizon):
-        info = env.step(np.ones((GRID, 1), np.float32))[4]
-    np.testing.assert_array_equal(result.matrices[:, 0, 0], info["final_info"]["fim"][:, 0])
-    assert (result.left.sum(), result.home.sum()) == (0, GRID)
 
 
 def widened(bench: Bench) -> Bench:
