@@ -117,7 +117,7 @@ def rate(path: Path, logs: int) -> bool:
         bench = log.bench
         question = Question(PARAMETER_NAMES)
         experiment = read_experiment(log)
-        found = evaluate(log, experiment, bench, bench.plant("exact"), question, "nominal", bench.brake)
+        (found,) = evaluate(log, experiment, bench, [bench.plant("exact")], question, "nominal", bench.brake)
         told = [found.fisher(kind).criteria().log_det for kind in found.histories]
         times.append(time.process_time() - begin)
         assert found.fit.fits

@@ -205,7 +205,7 @@ def _evaluations(
     theta: str | Path | Mapping[str, float] | None,
     bench: str | Path | None,
 ) -> list[Evaluation]:
-    from emb_bench.experiment.evaluation import Question, bench_for, default_model, evaluate_all
+    from emb_bench.experiment.evaluation import Question, bench_for, default_model, evaluate
     from emb_bench.experiment.from_log import read_experiment
     from emb_bench.experiment.theta import read_theta
 
@@ -215,7 +215,7 @@ def _evaluations(
     question = Question(*_unknowns(params, nuisance, its), None if prior is None else its.range_set(prior))
     plants = list(its.plants.values()) if model == EVERY else [its.plant(model or default_model(log)[0])]
     name, brake, errors = read_theta(_text_of(theta), log, its)
-    return evaluate_all(log, read_experiment(log, its), its, plants, question, name, brake, errors)
+    return evaluate(log, read_experiment(log, its), its, plants, question, name, brake, errors)
 
 
 def estimate(

@@ -70,7 +70,7 @@ def read(path: Path) -> Read | None:
         experiment = read_experiment(log)
         bench = log.bench
         plant, question = bench.plant("exact"), Question(PARAMETER_NAMES)
-        evaluation = evaluate(log, experiment, bench, plant, question, "nominal", bench.brake)
+        (evaluation,) = evaluate(log, experiment, bench, [plant], question, "nominal", bench.brake)
         return Read(log, experiment, evaluation, info_document(log))
     except EmbError as err:
         refused = str(err)

@@ -60,7 +60,7 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
     yield _of_the_experiment(log, experiment, bench) | {"model": plant.name}
     import numba  # noqa: F401  # what is loaded is used, which pays for many logs and not for one
 
-    evaluation = evaluate(log, experiment, bench, plant, question, "nominal", bench.brake)
+    (evaluation,) = evaluate(log, experiment, bench, [plant], question, "nominal", bench.brake)
     yield _of_the_information(evaluation)
     if options.method == NONE:
         return

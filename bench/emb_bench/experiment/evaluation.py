@@ -296,38 +296,24 @@ def evaluate(
     log: RunLog,
     experiment: Experiment,
     bench: Bench,
-    plant: Plant,
-    question: Question,
-    theta_name: str,
-    theta: BrakeParameters,
-    errors: SystematicErrors = NO_ERRORS,
-) -> Evaluation:
-    """Compute both Fisher informations over time, and how well the model fits.
-
-    Args:
-        log: the record.
-        experiment: its content, from :func:`emb_bench.experiment.from_log.read_experiment`.
-        bench: noise, limits and sample time.
-        plant: the model.
-        question: unknown parameters and prior.
-        theta_name: what to call ``theta``.
-        theta: the brake at which the information is computed.
-        errors: systematic errors of the bench there.
-    """
-    return evaluate_all(log, experiment, bench, [plant], question, theta_name, theta, errors)[0]
-
-
-def evaluate_all(
-    log: RunLog,
-    experiment: Experiment,
-    bench: Bench,
     plants: Sequence[Plant],
     question: Question,
     theta_name: str,
     theta: BrakeParameters,
     errors: SystematicErrors = NO_ERRORS,
 ) -> list[Evaluation]:
-    """Evaluate several models, which go through the record together; arguments as for :func:`evaluate`."""
+    """Compute both Fisher informations over time, and how well each model fits; all go through the record together.
+
+    Args:
+        log: the record.
+        experiment: its content, from :func:`emb_bench.experiment.from_log.read_experiment`.
+        bench: noise, limits and sample time.
+        plants: the models.
+        question: unknown parameters and prior.
+        theta_name: what to call ``theta``.
+        theta: the brake at which the information is computed.
+        errors: systematic errors of the bench there.
+    """
     instants = evenly(experiment.periods, INSTANTS)
     evaluators = [
         ModelEvaluator(

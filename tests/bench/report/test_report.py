@@ -165,8 +165,8 @@ def test_the_information_is_that_of_the_fisher_information_at_the_estimate(good:
     log, question = read_log(good), Question(("k_m", "k_1", "T_c", "f_v"))
     study = make_study(log.bench, [log], StudyOptions(EstimationProblem(), starts=2, systematic=False))
     plant, theta = log.bench.plant("exact"), study.estimate.theta
-    history = evaluate(log, read_experiment(log), log.bench, plant, question, "x", theta).histories["physical"]
-    np.testing.assert_allclose(study.estimate.information, history[-1], rtol=1e-6)
+    (found,) = evaluate(log, read_experiment(log), log.bench, [plant], question, "x", theta)
+    np.testing.assert_allclose(study.estimate.information, found.histories["physical"][-1], rtol=1e-6)
 
 
 def test_the_pale_line_of_a_profile_is_the_parabola_of_the_fisher_information(
