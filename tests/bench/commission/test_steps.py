@@ -6,6 +6,8 @@ import itertools
 import math
 from dataclasses import replace
 
+import numpy as np
+import onnx
 import pytest
 
 from emb_bench.commission.bench_file import (
@@ -15,12 +17,17 @@ from emb_bench.commission.bench_file import (
     measured_ranges,
     working_text,
 )
-from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Kind, Rest, Step
-from emb_bench.commission.steps import EXPERIMENTS, STEPS, break_away, judged, suspected
+from emb_bench.commission.examination import noise_in_motion, scatter
+from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Kind, Rest, Step, Window
+from emb_bench.commission.steps import EXPERIMENTS, STEPS, break_away, judged, policy_file, suspected
 from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_runtime.config.bench import PARAMETER_NAMES, Noise, shipped_bench_text
+from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import BenchFileError, EmbError
+from emb_runtime.estimator.estimator import Estimator
+from emb_runtime.policy.policy import Policy, load_policy
 from emb_runtime.safety.shield_design import make_law
+from tests.drives import EXAMPLES
 
 LOGS = {"rest": "1-listen.mcap", "current": "3-current.mcap", "experiments": "7-medium.mcap and 8-large.mcap"}
 
@@ -329,3 +336,72 @@ def test_jitter_and_lag_that_were_found_are_in_the_plant_of_the_file() -> None:
     bench = parse_bench(found_text(lagging, short, LOGS), "found")
     assert bench.plants[MEASURED].mechanics.current_lag == 0.0
     assert bench.shield.current_lag >= 1.9e-5
+
+
+STEP = Step("try", Kind.EXPERIMENT, "", "", 2.0, 0.5, Window(-1.0, 2.0, 30.0), (1.0, 1.0, -1.5, 0.25))
+
+ESTIMATOR = Estimator(load_bench())
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    bench = load_bench()
+    return load_policy(policy_file(STEP, bench), bench)
+
+
+def test_the_file_is_onnx_by_the_reference_checker() -> None:
+    model = onnx.load_from_string(policy_file(STEP, load_bench()))
+    onnx.checker.check_model(model, full_check=True)
+
+
+def test_inside_of_the_window_the_sequence_is_played_and_its_end_stays(policy: Policy) -> None:
+    assert [policy.act(0.5, 1.0, k, ESTIMATOR) for k in range(6)] == [1.0, 1.0, -1.5, 0.25, 0.25, 0.25]
+
+
+@pytest.mark.parametrize(
+    ("angle", "velocity", "step", "wanted"),
+    [
+        (2.5, 0.0, 0, 0.0),  # beyond the upper angle: no more up,
+        (2.5, 0.0, 2, -1.5),  # but down
+        (-1.5, 0.0, 2, 0.0),
+        (-1.5, 0.0, 0, 1.0),
+        (0.0, 31.0, 0, 0.0),
+        (0.0, 31.0, 2, -1.5),
+        (0.0, -31.0, 2, 0.0),
+        (0.0, -31.0, 0, 1.0),
+        (2.5, -31.0, 0, 0.0),
+        (2.5, -31.0, 2, 0.0),
+    ],
+)
+def test_outside_of_it_no_current_drives_farther_out(
+    policy: Policy, angle: float, velocity: float, step: int, wanted: float
+) -> None:
+    assert policy.act(angle, velocity, step, ESTIMATOR) == wanted
+
+
+@pytest.mark.parametrize(
+    ("sigma", "centre"), [(0.3, 0.0), (0.5, 0.0), (0.5, 0.5), (0.8, 0.25), (1.5, 0.5), (1.5, 0.0), (50.0, 0.0)]
+)
+def test_noise_of_less_than_a_step_is_found_wherever_the_brake_rests(sigma: float, centre: float) -> None:
+    step, drawn = 3.4e-3, np.random.default_rng(4).normal(centre, sigma, 4000)
+    for between in (0.0, 0.5):  # zero is one of the values, or lies between two
+        assert scatter(step * (np.round(drawn) + between), step) == pytest.approx(sigma * step, rel=0.1)
+
+
+def test_a_brake_that_shows_one_value_has_little_noise() -> None:
+    assert scatter(np.full(500, 1.7e-3), 3.4e-3) < 1e-3
+
+
+def test_a_signal_without_steps_scatters_as_its_samples_do() -> None:
+    drawn = np.random.default_rng(4).normal(0.0, 1e-3, 500)
+    assert scatter(drawn, 0.0) == pytest.approx(np.std(drawn, ddof=1), rel=1e-12)
+
+
+def test_steps_add_to_the_noise_of_a_brake_that_moves_and_our_own_node_has_none_to_speak_of() -> None:
+    at_rest = Noise(8e-4, 0.6)
+    moving = noise_in_motion(at_rest, load_mapping(EXAMPLES / "mit.toml"))
+    turned = np.random.default_rng(4).uniform(0.0, 10.0, 20_000)
+    step = 9 * 25.0 / 65535  # a gear of 9; the protocol's 16 bits from -12.5 to 12.5 rad
+    shown = step * np.floor((turned + np.random.default_rng(5).normal(0.0, 8e-4, turned.shape)) / step)
+    assert moving.angle == pytest.approx(np.std(shown - turned), rel=0.03)
+    assert noise_in_motion(at_rest, None) == at_rest

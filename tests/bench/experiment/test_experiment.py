@@ -26,6 +26,15 @@ from emb_runtime.system.clock import SteppedClock
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
 from tests.independent import DATABASE  # isort: skip
+import random
+from typing import Any
+
+from emb_bench.experiment.from_log import UNKNOWN, control_cycles, samples_before
+from emb_runtime.can.receiver import Reception
+from emb_runtime.records import RunState, SensorSample
+
+from tests.bench.hostile import HostileBus, drive, write_trace  # isort: skip
+
 
 VELOCITY = 0x101
 
@@ -281,3 +290,110 @@ def test_a_log_without_an_experiment_its_frames_or_a_whole_period_is_refused(
     ):
         with pytest.raises(LogError, match=why):
             recorded(tmp_path, run)
+
+
+N = 23
+ASSUMED = np.where(np.isin(np.arange(N), [3, 7, 8, 9, 22]), 0.5, np.nan)
+
+
+def whole() -> Experiment:
+    samples = np.stack([np.arange(1.0, N + 1), np.arange(N) / 7.0], axis=1)
+    currents, late = np.sin(np.arange(N)), 1e-6 * np.arange(N, dtype=np.float64)
+    return Experiment("x", currents, samples, 0.25, 0.5, 1e-3, False, late, ASSUMED, before=2.0, first=(0.3, 0.6))
+
+
+def test_parts_follow_each_other() -> None:
+    x = whole()
+    parts = [*x.split(8)]
+    assert [part.periods for part in parts] == [8, 8, 7]
+    for name in ("currents", "samples", "late", "assumed"):
+        np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in parts]), getattr(x, name))
+    assert [(p.before, p.angle, p.velocity, p.first) for p in parts] == [
+        (2.0, 0.25, 0.5, (0.3, 0.6)),
+        *((float(x.currents[k - 1]), *x.samples[k - 1], tuple(x.samples[k - 1])) for k in (8, 16)),
+    ]
+    assert [p.slack for p in parts] == [1e-3, 0.0, 0.0]
+    np.testing.assert_array_equal(x.until(9).samples, x.samples[:9])
+
+
+def test_gaps_of_one_period_and_of_several() -> None:
+    x = whole()
+    assert [gap.tolist() for gap in x.gaps] == [[3, 22], [9]]
+    assert np.flatnonzero(x.inside).tolist() == [7, 8]
+    assert x.gap_unknowns == 4
+    assert np.flatnonzero(~x.reported).tolist() == [3, 7, 8, 9, 22]
+    assert x.until(9).gap_unknowns == 3  # a gap that the end cuts to two periods is one of several all the same
+
+
+def test_a_lost_sample_is_no_measurement_and_its_period_stays_known() -> None:
+    x = whole()
+    mask = np.zeros(N, np.bool_)
+    mask[[4, 5]] = True
+    lost = x.lose(mask)
+    assert np.flatnonzero(~lost.measured).tolist() == [4, 5]
+    assert lost.outliers == 2
+    np.testing.assert_array_equal(lost.currents, x.currents)
+    np.testing.assert_array_equal(lost.reported, x.reported)
+    assert len(lost.all_samples) == N + 1
+
+
+def test_a_start_that_may_be_the_origin_is_taken_as_the_origin() -> None:
+    x = Experiment("x", np.zeros(2), np.zeros((2, 2)), 0.203, 0.0, 1e-3, False)
+    assert x.x0() == (0.203, 0.0)
+    assert x.x0(0.2) == (0.0, 0.0)  # within four standard deviations of what the encoder shows there
+    assert x.start(0.2)[0] == 0.203 - 0.2
+
+
+STEPS = 300
+BUSES: dict[str, dict[str, Any]] = {
+    "quiet": {},
+    "lossy": {"lost": 0.02},
+    "noisy": {"damaged": 0.02},
+    "slow": {"slow": 0.1},
+    "all at once": {"lost": 0.01, "damaged": 0.01, "slow": 0.05},
+}
+
+
+def law(_angle: float, _velocity: float, step: float) -> float:
+    return 1.5 + math.sin(0.3 * step)
+
+
+def taken(log: RunLog, layout: Layout, bench: Bench) -> list[SensorSample]:
+    """All samples that the runtime's reception takes from the frames in a log."""
+    reception = Reception(layout, bench, lambda _frame, _why: None)
+    return [sample for frame in log.frames if (sample := reception.take(frame)) is not None]
+
+
+@pytest.mark.parametrize("bus", BUSES)
+@pytest.mark.parametrize("batch", [1, 4 << 20])
+def test_the_samples_are_those_that_the_run_took_from_its_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Bench, layout: Layout, bus: str, batch: int
+) -> None:
+    monkeypatch.setattr("emb_bench.logs.log.BATCH", batch)
+    run = drive(HostileBus(bench, layout, random.Random(len(bus)), **BUSES[bus]), law, STEPS)
+    path = tmp_path / "run.mcap"
+    write_trace(path, run.journal.records, bench, layout, run.outcome, steps=STEPS, flush_every=150)
+    log = read_log(path)
+    every = taken(log, layout, bench)
+    first = next(cycle for cycle in run.journal.cycles if cycle.state == RunState.ACTIVE)
+    begin = next(n for n, sample in enumerate(every) if sample.device_time_ns == first.device_time_ns)
+    rows = [
+        row
+        for step, samples in control_cycles(log, bench, STEPS)
+        for row in zip(*(column.tolist() for column in (step, *samples)), strict=True)
+    ]
+    assert rows
+    assert UNKNOWN not in [row[7] for row in rows]
+    t_s = bench.timing.sample_time_ns
+    assert [(*row[1:3], row[4], row[7]) for row in rows] == [
+        (s.angle, s.velocity, s.applied_current, s.command_counter) for s in every[begin : begin + len(rows)]
+    ]
+    assert [row[3] for row in rows] == [
+        (s.device_time_ns - first.device_time_ns - row[0] * t_s) * 1e-9
+        for s, row in zip(every[begin : begin + len(rows)], rows, strict=True)
+    ]
+    before = samples_before(log, bench, 50)
+    expected = every[: begin + 1][-50:]
+    assert [(s.angle, s.velocity, s.node_state) for s in before] == [
+        (s.angle, s.velocity, s.node_state) for s in expected
+    ]
