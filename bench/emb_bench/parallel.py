@@ -170,9 +170,6 @@ def shared_out_on_ray(
 
     Yields:
         Each piece's number and result, as they come; of a piece whose task was lost, Ray's name for that.
-
-    Raises:
-        UsageError: Ray is not installed, does not start, or is not at this address.
     """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # else Ray reports to its makers that it is used
     try:

@@ -68,12 +68,7 @@ class LeftError(Exception):
 
 
 def read_items(log: RunLog) -> tuple[Item, ...]:
-    """Frames, cycles and events of a log, in the order in which the loop recorded them; times are monotonic [ns].
-
-    Raises:
-        LogError: the log has no bench, layout, clock or control cycles, topics with other fields, or not the beginning
-            of the run.
-    """
+    """Frames, cycles and events of a log, in the order in which the loop recorded them; times are monotonic [ns]."""
     offset_ns, tables = log.wall_offset_ns, log.tables
     ordered: list[tuple[int, Item]] = []
     reads: list[tuple[int, int]] = []
@@ -414,13 +409,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Runs a log's loop again; returns the exit code.
-
-    Raises:
-        UsageError: the file cannot be read, or is a recording of others.
-        LogError: it is no log, or lacks what a rerun needs.
-        PolicyRefusedError: the policy in the log is refused.
-    """
+    """Runs a log's loop again; returns the exit code."""
     log = read_log(args.log)
     if log.imported:
         raise UsageError(f"{args.log}: a recording of others has no loop to run again")
@@ -437,12 +426,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def carried_policy(log: RunLog) -> Policy:
-    """The policy that a log carries, with every check that ``emb-run`` makes.
-
-    Raises:
-        LogError: the log carries none.
-        PolicyRefusedError: it is refused.
-    """
+    """The policy that a log carries, with every check that ``emb-run`` makes."""
     if "policy.onnx" not in log.attachments:
         raise LogError(f"{log.path}: the log carries no policy.onnx, so its decisions cannot be made again")
     from emb_runtime.policy.trial import admit_policy  # takes its time, and no other command needs it
@@ -458,9 +442,6 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
         actor: what decided.
         current_limit: largest current that its contract allows [A].
         stop_condition: of the run, if it had one.
-
-    Raises:
-        LogError: the log lacks what a rerun needs.
     """
     bench, layout, run = log.bench, log.layout, recorded_run(log)
     playback = Playback(log)
@@ -489,12 +470,7 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
 
 
 def recorded_run(log: RunLog) -> Recorded:
-    """Identity of a log's run, as far as the loop depends on it.
-
-    Raises:
-        UsageError: nothing was driven.
-        LogError: it is not that of a run.
-    """
+    """Identity of a log's run, as far as the loop depends on it."""
     require_driven(log)
     try:
         run = msgspec.convert(dict(log.run), Recorded, strict=False)

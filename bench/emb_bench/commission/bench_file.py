@@ -133,9 +133,6 @@ def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float,
 
     The shield takes k_1 as the clamping force over the angle: a curve and a hysteresis that were found widen its range.
     What play takes from the clamping force or adds to it acts as less or more friction.
-
-    Raises:
-        BenchFileError: a range of the data sheet does not hold an interval, so that what is written would not either.
     """
     if names := not_inside(sheet, one):
         raise BenchFileError(contradiction(sheet, one, names))
@@ -244,11 +241,7 @@ def _of_sheet(sheet: Bench) -> dict[str, Any]:
 
 
 def _limit_angle(document: dict[str, Any], origins: dict[str, str]) -> None:
-    """Lower the upper angle limit of a document to the largest for which there is a shield.
-
-    Raises:
-        BenchFileError: there is none; of the document's own limit, what the shield cannot guarantee there.
-    """
+    """Lower the upper angle limit of a document to the largest for which there is a shield."""
     low, own = document["limits"]["angle"]
     problem = _shield_problem(document)
     if problem is None:

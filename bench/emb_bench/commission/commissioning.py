@@ -95,11 +95,7 @@ class Commissioning:
         self._runs = 0
 
     def run(self) -> Commissioned:
-        """All steps that are not done yet.
-
-        Raises:
-            EmbError: a step was refused, was stopped, or contradicts the data sheet.
-        """
+        """All steps that are not done yet."""
         work = self._bench(WORKING, working_text(self._sheet))
         found = Findings()
         for name, make in STEPS.items():

@@ -138,11 +138,7 @@ def identify(logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identific
 
 
 def _of_commands(log: RunLog, late: int) -> tuple[float, float]:
-    """Scale of the reported current, where commands act late by some samples, and its error [A].
-
-    Raises:
-        LogError: there are too few commands and reports.
-    """
+    """Scale of the reported current, where commands act late by some samples, and its error [A]."""
     commands, reports = np.asarray(log.cycles["sent_current"]), np.asarray(log.cycles["applied_current"])
     sent, applied = commands[: len(commands) - 1 - late], reports[1 + late :]
     both = np.isfinite(sent) & np.isfinite(applied)

@@ -368,12 +368,7 @@ def other_sample_time(log: RunLog, bench: Bench) -> float | None:
 
 
 def bench_for(log: RunLog, path: str | Path | None) -> Bench:
-    """The bench file inside a log, or another one with the same sample time.
-
-    Raises:
-        UsageError: the sample times differ.
-        BenchFileError: a file cannot be read.
-    """
+    """The bench file inside a log, or another one with the same sample time."""
     if path is None:
         return log.bench
     bench = load_bench(path, analysis=True)

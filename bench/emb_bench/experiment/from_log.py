@@ -263,9 +263,6 @@ def samples_on_grid(log: RunLog, bench: Bench, planned: int) -> Samples:
         log: the log.
         bench: the sample time.
         planned: periods of the experiment; later samples are left out.
-
-    Raises:
-        LogError: the log has no experiment, or none of which a whole period is left, or contradicts itself.
     """
     steps, buffers = bytearray(), [bytearray() for _ in LOST]  # thousands of small arrays would break up the memory
     for step, samples in control_cycles(log, bench, planned):
@@ -413,9 +410,6 @@ def samples_before(log: RunLog, bench: Bench, count: int) -> list[SensorSample]:
         log: the log.
         bench: limits of plausible samples.
         count: how many, at most.
-
-    Raises:
-        LogError: the frames cannot be decoded.
     """
     layout = log.layout
     frames: deque[Frame] = deque(maxlen=4 * count)

@@ -31,10 +31,6 @@ def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParame
             nominal.
         log: may contain the true ones.
         bench: contains the nominal ones.
-
-    Raises:
-        UsageError: the file cannot be read, or has other contents; a value is far from nominal; or the log does not
-            know the true parameters.
     """
     if choice in ("", LOG):
         values = _running(log, bench)
@@ -71,11 +67,7 @@ def _running(log: RunLog, bench: Bench) -> dict[str, float]:
 
 
 def _from_file(path: str, log: RunLog, bench: Bench) -> tuple[dict[str, float], SystematicErrors]:
-    """Parameters in a file, and systematic errors that were estimated with them.
-
-    Raises:
-        UsageError: the file cannot be read, or has other contents.
-    """
+    """Parameters in a file, and systematic errors that were estimated with them."""
     try:
         return _estimated(json.loads(read_text(path, MAX_JSON_BYTES)), log, bench)
     except OSError as err:
@@ -108,11 +100,7 @@ def _estimated(found: Any, log: RunLog, bench: Bench) -> tuple[dict[str, float],
 
 
 def _errors(along: Mapping[str, Any], records: list[str], log: RunLog, bench: Bench) -> SystematicErrors:
-    """Systematic errors of a log in an estimate of some records; the encoder's offset is each record's own.
-
-    Raises:
-        ValueError: a value is beyond what can be.
-    """
+    """Systematic errors of a log in an estimate of some records; the encoder's offset is each record's own."""
     limits = {"current_offset": bench.limits.current, "delay": 1.0, "velocity_gain": 1.0}
     labels = {name: Quantity(quantity(bench.machine, name).name, "", 1.0) for name in limits}
     if log.path.name in records:
@@ -139,9 +127,6 @@ def _named(entries: Mapping[str, Any], labels: Mapping[str, Quantity], expected:
         entries: each a number, or a table with its ``value``, by label.
         labels: labels and units by our names.
         expected: what a value has to be.
-
-    Raises:
-        ValueError: a value is no number.
     """
     found = {}
     for name, label in labels.items():
@@ -153,11 +138,7 @@ def _named(entries: Mapping[str, Any], labels: Mapping[str, Quantity], expected:
 
 
 def _number(value: object, name: str, expected: str) -> float:
-    """A number of a file.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """A number of a file."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{name}: expected {expected}, got {shown(value)}")
     return float(value)

@@ -69,10 +69,6 @@ def write_parquet(log: RunLog, topic: str, path: Path) -> str:
 
     Returns:
         A description of the file's content.
-
-    Raises:
-        UsageError: the log has no such topic, pyarrow is missing, or the file exists or cannot be written.
-        LogError: the topic cannot be decoded.
     """
     schema, tables = arrow_batches(log, topic)
     from pyarrow import parquet
@@ -88,10 +84,6 @@ def write_csv(log: RunLog, topic: str, path: Path) -> str:
 
     Returns:
         A description of the file's content.
-
-    Raises:
-        UsageError: the log has no such topic, pyarrow is missing, or the file exists or cannot be written.
-        LogError: the topic cannot be decoded.
     """
     schema, tables = arrow_batches(log, topic)
     import pyarrow as pa
@@ -142,12 +134,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Export a log; returns the exit code.
-
-    Raises:
-        UsageError: a wrong argument, a file that cannot be read or written, or a missing extra.
-        LogError: it is no log, or too damaged.
-    """
+    """Export a log; returns the exit code."""
     if args.topic is not None and args.to not in TABLES:
         raise UsageError(f"--topic: expected with --to {' or '.join(TABLES)}, got it with --to {args.to}")
     if args.theta is not None and args.to != "mjcf":

@@ -34,10 +34,6 @@ def draw_run(log: RunLog, path: Path) -> str:
 
     Returns:
         A description of the file's content.
-
-    Raises:
-        UsageError: matplotlib is missing, or the file exists or cannot be written.
-        LogError: the log has no control cycles.
     """
     _require_cycles(log)
     title = f"{log.path.name}: {log.exit_reason}" + ("" if log.complete else " (the log is NOT complete)")
@@ -48,12 +44,7 @@ def draw_run(log: RunLog, path: Path) -> str:
 
 
 def draw_on(log: RunLog, axes: Sequence[Any]) -> None:
-    """Draw a run on ``ROWS`` axes of matplotlib: angle, velocity, currents, reasons, states.
-
-    Raises:
-        UsageError: there are not that many axes.
-        LogError: the log has no control cycles.
-    """
+    """Draw a run on ``ROWS`` axes of matplotlib: angle, velocity, currents, reasons, states."""
     _require_cycles(log)
     cycles = log.cycles
     if len(axes) != ROWS:

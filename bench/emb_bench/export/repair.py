@@ -38,12 +38,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Repair a log; returns the exit code.
-
-    Raises:
-        UsageError: a file cannot be read or written.
-        LogError: it is no log, or nothing in it can be saved.
-    """
+    """Repair a log; returns the exit code."""
     found = repair(args.log, args.out)
     if args.json:
         written = None if found is None else str(args.out)

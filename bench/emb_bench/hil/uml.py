@@ -55,11 +55,7 @@ def cache_directory() -> Path:
 
 
 def compiled(source: Path) -> Path:
-    """Path of the library made from one of the sources. Compiled once per source text, into the cache.
-
-    Raises:
-        BusError: there is no C compiler, or it did not compile.
-    """
+    """Path of the library made from one of the sources. Compiled once per source text, into the cache."""
     library = cache_directory() / f"{source.stem}-{hashlib.sha256(source.read_bytes()).hexdigest()[:16]}.so"
     if set(str(library)) & set(" :"):  # the loader takes either for the end of a name
         raise BusError(f"no library can be loaded from {library}: set XDG_CACHE_HOME to one without blanks")
@@ -138,9 +134,6 @@ def memory_directory(bytes_needed: int) -> Path:
     """Returns the directory for the kernel's memory file: it must have the room and allow PROT_EXEC.
 
     /dev/shm of a container is often 64 MB and mounted noexec; then the directory for temporary files does, slower.
-
-    Raises:
-        BusError: neither is fit.
     """
     refused = []
     for directory in (Path("/dev/shm"), Path(tempfile.gettempdir())):
@@ -166,9 +159,6 @@ def kernel(memory_mb: int, slow: int, state: Path) -> Kernel:
         memory_mb: its memory [MiB].
         slow: seconds of this computer's for each of its own.
         state: its private directory.
-
-    Raises:
-        BusError: it is not installed, or something that it needs is missing; says what to install.
     """
     program = _program()
     environment = {"PATH": os.defpath, "HOME": str(state), "TMPDIR": str(memory_directory(memory_mb << 20))}

@@ -16,11 +16,7 @@ from emb_runtime.log.mcap_schema import ESTIMATE, LEARNT, deviation_of, estimate
 
 
 def quantities(log: RunLog) -> tuple[Quantity, ...]:
-    """Names and units of the estimated quantities; empty if there are none.
-
-    Raises:
-        LogError: the topic has other fields than a step, values, and a deviation for each.
-    """
+    """Names and units of the estimated quantities; empty if there are none."""
     if ESTIMATE not in log.topics:
         return ()
     found = log.describe(ESTIMATE)[2:]  # behind the two times
@@ -34,11 +30,7 @@ def quantities(log: RunLog) -> tuple[Quantity, ...]:
 
 
 def by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
-    """All estimates by their step: values, then standard deviations, in the order of :func:`quantities`.
-
-    Raises:
-        LogError: see :func:`quantities`; or a message cannot be decoded.
-    """
+    """All estimates by their step: values, then standard deviations, in the order of :func:`quantities`."""
     return {step: tuple(numbers) for step, *numbers in _rows(log)}
 
 
@@ -63,20 +55,12 @@ _STEP, *_LEARNT = (field.name for field in LEARNT.fields)
 
 
 def learnt_by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
-    """All sets by their step: the numbers of :func:`emb_runtime.learning.known.numbers`; empty if nothing was learnt.
-
-    Raises:
-        LogError: the topic has other fields, or a message cannot be decoded.
-    """
+    """All learnt sets by their step: the numbers of :func:`emb_runtime.learning.known.numbers`."""
     return {step: tuple(numbers) for step, *numbers in log.rows(LEARNT.name, _STEP, *_LEARNT)}
 
 
 def learnt_history(log: RunLog) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Steps, shape [n], and the numbers at each, shape [n, 13]; nothing if nothing was learnt.
-
-    Raises:
-        LogError: see :func:`learnt_by_step`.
-    """
+    """Steps, shape [n], and the numbers at each, shape [n, 13]; nothing if nothing was learnt."""
     found = learnt_by_step(log)
     return np.array([*found], np.int64), np.array([*found.values()]).reshape(len(found), len(_LEARNT))
 
@@ -92,10 +76,6 @@ def learnt_ranges(numbers: NDArray[np.float64]) -> dict[str, list[float]]:
 
 
 def last_learnt(log: RunLog) -> dict[str, Any]:
-    """The :func:`learnt_ranges` of a log.
-
-    Raises:
-        LogError: see :func:`learnt_by_step`.
-    """
+    """The :func:`learnt_ranges` of a log."""
     last = deque(log.rows(LEARNT.name, *_LEARNT), maxlen=1)
     return learnt_ranges(np.array(last).reshape(-1, len(_LEARNT)))

@@ -181,9 +181,6 @@ class RunLog:
 
         Args:
             wanted: names of fields by topic; topics and fields that the log does not have are left out.
-
-        Raises:
-            LogError: a message cannot be decoded, or the file has changed meanwhile.
         """
         held, size, order = list[Chunk](), 0, 0
         for chunk in self.chunks:
@@ -226,12 +223,7 @@ class RunLog:
             yield from zip(*(part[topic][name].tolist() for name in names), strict=True)
 
     def describe(self, topic: str) -> tuple[Column, ...]:
-        """The columns of a topic: two times, then every field.
-
-        Raises:
-            UsageError: the log has no such topic.
-            LogError: its units are not readable.
-        """
+        """The columns of a topic: two times, then every field."""
         if topic not in self.topics:
             raise UsageError(f"expected a topic of {self.path}, {', '.join(self.topics)}; got {topic!r}")
         try:
@@ -305,11 +297,7 @@ class RunLog:
 
     @property
     def cycles(self) -> Table:
-        """The control cycles, one column per field of CycleRecord.
-
-        Raises:
-            LogError: the log has no such topic.
-        """
+        """The control cycles, one column per field of CycleRecord."""
         self.require("/cycle", CycleRecord._fields)
         return self.tables["/cycle"]
 
@@ -317,9 +305,6 @@ class RunLog:
         """Refuse a log in which one of our topics is missing, or some of its fields are or mean something else.
 
         Of the topic of a DBC message the fields have to be of the ``kind`` that is named.
-
-        Raises:
-            LogError: it is one.
         """
         what = {"/cycle": "the control cycles"}.get(topic, f"the messages of {topic}")
         if topic not in self.topics:
@@ -331,11 +316,7 @@ class RunLog:
             raise LogError(f"{self.path}: {what} have other fields: expected {', '.join(lost)} too")
 
     def signals(self, message: str) -> Table:
-        """The decoded signals of one DBC message, as columns.
-
-        Raises:
-            LogError: the log has no such message.
-        """
+        """The decoded signals of one DBC message, as columns."""
         try:
             return self.tables[f"/emb/{message}"]
         except KeyError:
@@ -343,11 +324,7 @@ class RunLog:
 
     @cached_property
     def wall_offset_ns(self) -> int:
-        """Unix time minus the run's monotonic clock [ns].
-
-        Raises:
-            LogError: the log has no reading of the clocks.
-        """
+        """Unix time minus the run's monotonic clock [ns]."""
         for publish_time, monotonic_ns in self.rows("/clock", "publish_time", "monotonic_ns"):
             return int(publish_time) - int(monotonic_ns)
         raise LogError(f"{self.path}: no reading of the clocks is left")
@@ -383,11 +360,7 @@ class RunLog:
 
     @cached_property
     def layout(self) -> Layout:
-        """The CAN layout of the run.
-
-        Raises:
-            LogError: the log carries no DBC, or a broken one.
-        """
+        """The CAN layout of the run."""
         try:
             return _layout(self._text("emb.dbc"))
         except FrameError as err:
@@ -395,11 +368,7 @@ class RunLog:
 
     @property
     def truth(self) -> BrakeParameters | None:
-        """The brake's true parameters, known for a simulated one; None otherwise.
-
-        Raises:
-            LogError: what the log has of them is incomplete or not a number.
-        """
+        """The brake's true parameters, known for a simulated one; None otherwise."""
         if "emb.truth" not in self.metadata:
             return None
         record = self.metadata["emb.truth"]
@@ -466,11 +435,7 @@ def read_log(path: str | Path) -> RunLog:
 
 
 def require_driven(log: RunLog) -> None:
-    """Refuse the log of a run that only listened.
-
-    Raises:
-        UsageError: it is one.
-    """
+    """Refuse the log of a run that only listened."""
     if log.run.get("purpose") == RunType.LISTEN_ONLY:
         raise UsageError(f"{log.path}: nothing was driven in this log, its run only listened (--read-only)")
 

@@ -93,11 +93,7 @@ def judge(t: Timing, budgets: Budgets) -> list[BudgetCheck]:
 
 
 def timing(log: RunLog) -> Timing:
-    """The timing of the experiment, or the way home, in a log; where there was none, its intervals are empty.
-
-    Raises:
-        LogError: the log has no control cycles or no bench.
-    """
+    """The timing of the experiment, or the way home, in a log; where there was none, its intervals are empty."""
     active = in_control(log.cycles)
     cycles = {name: column[active] for name, column in log.cycles.items()}
     answered = cycles["command_counter"] != NO_COUNTER

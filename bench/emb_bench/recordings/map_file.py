@@ -248,11 +248,7 @@ class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):
         return TIME[self.timing.unit]
 
     def kind_of(self, recording: Path) -> str:
-        """Kind of a recording's file, a key of ``KINDS``.
-
-        Raises:
-            UsageError: neither its ending nor the map tells, or the map lacks what that kind needs.
-        """
+        """Kind of a recording's file, a key of ``KINDS``."""
         by_ending = (kind for kind, endings in KINDS.items() if recording.suffix.lower() in endings)
         kind = str(self.file.kind) or next(by_ending, "")
         if not kind:
@@ -266,11 +262,7 @@ class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def read_map(path: Path) -> tuple[RecordingMap, str]:
-    """A map file, and its text.
-
-    Raises:
-        UsageError: it cannot be read, or has a key that is unknown, of the wrong type or unit, or contradictory.
-    """
+    """A map file, and its text."""
     try:
         text = read_text(path, MAX_TOML_BYTES)
     except OSError as err:
@@ -286,9 +278,6 @@ def parse_map(text: str, source: str) -> RecordingMap:
     Args:
         text: TOML.
         source: what to call it in messages.
-
-    Raises:
-        UsageError: see :func:`read_map`.
     """
     try:
         document = parse_toml(text)

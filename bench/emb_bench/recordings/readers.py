@@ -205,9 +205,6 @@ def recorded(columns: Mapping[str, Column], wanted: RecordingMap, kind: str, sou
         wanted: the map.
         kind: of the file.
         source: what to call the file in messages.
-
-    Raises:
-        UsageError: times run backwards or columns differ in length; too few samples, or too many.
     """
     given, timing = wanted.signals.given, wanted.timing
     clock = columns[timing.column].values * wanted.time_unit if timing.column else None

@@ -50,11 +50,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Import a recording; gives the exit code.
-
-    Raises:
-        UsageError: a file cannot be read or written, the map does not fit it, or a library is missing.
-    """
+    """Import a recording; gives the exit code."""
     found = import_recording(args.recording, args.map, args.output)
     periods, t_s = int(found.step[-1]), found.sample_time
     if args.json:
@@ -77,9 +73,6 @@ def import_recording(path: Path, map_path: Path, out: Path) -> Recorded:
 
     Returns:
         What was written.
-
-    Raises:
-        UsageError: a file cannot be read or written, or the map does not fit the recording.
     """
     wanted, map_text = read_map(map_path)
     kind, timing = wanted.kind_of(path), wanted.timing
@@ -140,9 +133,6 @@ def write_run(found: Recorded, name: str, texts: dict[str, str], source: dict[st
         texts: the bench file and the map, by file name.
         source: name and digest of the recording.
         out: log to make.
-
-    Raises:
-        UsageError: it exists, or cannot be written.
     """
     steps = str(int(found.step[-1]))
     header = LogHeader(

@@ -250,11 +250,7 @@ def fast_loop(periods: int) -> Callable[..., None]:
 
 
 def check_unknowns(params: Sequence[str]) -> None:
-    """Refuses names that are no parameters of a brake or its instruments.
-
-    Raises:
-        UsageError: an unknown name, or one that comes twice.
-    """
+    """Refuses names that are no parameters of a brake or its instruments."""
     for name in params:
         if name not in PARAMETERS:
             raise UsageError(f"'{name}' is no parameter of the brake; expected some of {', '.join(PARAMETERS)}")

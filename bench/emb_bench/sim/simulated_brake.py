@@ -167,9 +167,6 @@ def parse_assignments(text: str, option: str = "") -> dict[str, str]:
     Args:
         text: to be parsed.
         option: begin of a message, which names what was given.
-
-    Raises:
-        UsageError: something is not of that form, or a name comes twice.
     """
     pairs: dict[str, str] = {}
     for item in filter(None, (part.strip() for part in text.split(","))):
@@ -192,9 +189,6 @@ def true_parameters(
         assignments: text by parameter.
         besides: what else could have been given, for the message.
         option: begin of a message, which names what was given.
-
-    Raises:
-        UsageError: an unknown parameter, or a value that is not a positive number.
     """
     theta = bench.brake
     for name, text in assignments.items():
@@ -247,10 +241,6 @@ def read_brake(text: str, bench: Bench, option: str) -> BrakeToSimulate:
             sensors that are not as the bench file says.
         bench: knows the plants.
         option: begin of a message, which names what was given.
-
-    Raises:
-        UsageError: an option is unknown or has no sensible value.
-        BenchFileError: the bench has no such plant.
     """
     given = parse_assignments(text, option)
     plant = with_tables(bench, "bench file").plant(given.pop("plant", DEFAULT_PLANT))

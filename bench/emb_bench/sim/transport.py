@@ -94,10 +94,6 @@ def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
     Args:
         options: see :func:`~emb_bench.sim.simulated_brake.read_brake`.
         bench: knows the plants.
-
-    Raises:
-        UsageError: an option is unknown or has no sensible value.
-        BenchFileError: the bench has no such plant.
     """
     brake = read_brake(options, bench, "sim: ")
     node = BrakeNode(bench, load_layout(), brake.theta, brake.noise, brake.plant, charge=brake.charge)
