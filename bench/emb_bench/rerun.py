@@ -107,14 +107,10 @@ class Playback:
         self._echoed = 0  # frames of those that were found on the bus
         self._stop_echoes = deque(self._recorded_stop_frames())
         self._stops = 0  # stop frames tried
-        self.decisions = 0
-        """Cycle records compared."""
-        self.frames = 0
-        """Sent frames found on the bus."""
-        self.events = 0
-        """Safety events compared."""
-        self.differences: list[Difference] = []
-        """Differences in the order in which they came."""
+        self.decisions = 0  # Cycle records compared
+        self.frames = 0  # Sent frames found on the bus
+        self.events = 0  # Safety events compared
+        self.differences: list[Difference] = []  # Differences in the order in which they came
 
     @property
     def at_end(self) -> bool:

@@ -371,8 +371,7 @@ class _Reports:
         self.topic = f"/emb/{message}"
         self.columns = ("Counter", signal)
         self._signal, self._unknown, self._apart_ns = signal, unknown, apart_ns
-        self.found = False
-        """There was a report for any of the cycles."""
+        self.found = False  # There was a report for any of the cycles
         if self.topic in log.topics:
             log.require(self.topic, self.columns[:1])
             log.require(

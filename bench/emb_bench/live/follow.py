@@ -16,8 +16,17 @@ from typing import Any, BinaryIO, Protocol
 from mcap import records as mcap
 from mcap.opcode import Opcode
 
-from emb_bench.logs.log import read_log
-from emb_bench.logs.mcap_file import DAMAGE, LARGEST, MAGIC, MOST_CARRIED, Chunk, message_class, unpack_chunk
+from emb_bench.logs.log import UNREADABLE, read_log
+from emb_bench.logs.mcap_file import (
+    DAMAGE,
+    LARGEST,
+    MAGIC,
+    MOST_CARRIED,
+    Chunk,
+    message_class,
+    message_of,
+    unpack_chunk,
+)
 from emb_runtime.errors import LogError
 from emb_runtime.estimator.estimate import LOST, NORMAL_95
 from emb_runtime.log.mcap_schema import CYCLE, ESTIMATE, SAFETY, deviation_of
@@ -145,6 +154,8 @@ def follow(
             viewer.end(read_log(path).exit_reason)
         except LogError as err:
             complain(err)
+        except UNREADABLE as err:
+            complain(LogError(f"{path}: its messages are not readable: {message_of(err)}"))
         goes_on &= not once
 
 

@@ -45,8 +45,7 @@ class McapReader(MessageReader):
 
     def __init__(self, file: StringPathLike, **kwargs: Any) -> None:
         self._path = Path(os.fspath(file))
-        self.missing: tuple[str, ...] = ()
-        """Descriptions of the missing parts; known when all of the log has been read."""
+        self.missing: tuple[str, ...] = ()  # Descriptions of the missing parts; known when all of the log has been read
         try:
             self._file = open_regular(self._path)
             self._size = os.fstat(self._file.fileno()).st_size

@@ -64,7 +64,8 @@ TIME = Column("time", "float64", "s")  # Since the first message of the log; all
 UNIX_TIME = Column("unix_time", "int64", "ns")
 
 _OURS = {topic.name: topic for topic in (*FIXED_TOPICS, LEARNT)}
-_UNREADABLE = (DecodeError, TypeError, KeyError, AttributeError, RecursionError, *DAMAGE)
+UNREADABLE = (DecodeError, TypeError, KeyError, AttributeError, RecursionError, *DAMAGE)
+"""Exceptions of descriptors and messages that are damaged, or mean something else."""
 
 
 class Event(NamedTuple):
@@ -205,7 +206,7 @@ class RunLog:
             try:
                 fields = columns(factory, [data for chunk in chunks for data in chunk.payloads(channel)], names)
                 found[topic] = _times(*times) | {"order": np.flatnonzero(index) + order} | fields
-            except _UNREADABLE as err:
+            except UNREADABLE as err:
                 raise LogError(f"{self.path}: the messages of {topic} are not readable: {message_of(err)}") from err
         return found
 
@@ -468,7 +469,7 @@ def _topics(path: Path, contents: McapFile, counts: Mapping[int, int]) -> dict[s
             try:
                 units = channel.metadata.get("units", "{}")
                 topics[channel.topic] = _Topic(number, count, message_class(schema.name, schema.data), units)
-            except _UNREADABLE as err:
+            except UNREADABLE as err:
                 contents.name_missing(f"{count} messages of {channel.topic}, not readable ({message_of(err)})")
     if not topics:
         raise LogError(f"{path}: nothing in this log can be decoded: {'; '.join(contents.missing)}")

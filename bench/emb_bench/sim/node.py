@@ -72,16 +72,12 @@ class BrakeNode(SimulatedBrake):
         self._idle_periods = 0
         self._rest_angle = 0.0
         self._rest_periods = 0
-        self.samples = 0
-        """Samples sent so far."""
+        self.samples = 0  # Samples sent so far
         self.state = NodeState.IDLE
         self.stop_reason = StopReason.NEVER_COMMANDED
-        self.obeyed = 0
-        """Commands obeyed."""
-        self.braked = 0
-        """Periods without an obeyed command while active."""
-        self.rejected = 0
-        """Command frames not obeyed."""
+        self.obeyed = 0  # Commands obeyed
+        self.braked = 0  # Periods without an obeyed command while active
+        self.rejected = 0  # Command frames not obeyed
 
     def receive(self, frame: Frame) -> None:
         """Take one frame from the bus; only a valid, fresh command for this sample is kept."""

@@ -111,12 +111,9 @@ class SimulatedBrake:
         self._theta = theta
         self._noise = noise
         self._t_s: Final = sample_time
-        self.periods = 0
-        """Sampling periods passed, those without a sample (the device was late) included."""
-        self.angle_range = (0.0, 0.0)
-        """Lowest and highest true angle so far [rad]."""
-        self.top_speed = 0.0
-        """Highest true speed so far [rad/s]."""
+        self.periods = 0  # Sampling periods passed, those without a sample (the device was late) included
+        self.angle_range = (0.0, 0.0)  # Lowest and highest true angle so far [rad]
+        self.top_speed = 0.0  # Highest true speed so far [rad/s]
 
     @property
     def angle(self) -> float:

@@ -37,6 +37,7 @@ from emb_runtime.estimator.estimate import LOST
 from emb_runtime.estimator.estimator import UNITS
 from emb_runtime.log.mcap_schema import CYCLE, ESTIMATE, SAFETY, estimate_topic
 from emb_runtime.records import RunState
+from tests.bench.damaged import rewritten, without
 
 SECONDS = 20.0
 
@@ -143,6 +144,15 @@ def test_a_log_that_is_damaged_or_ends_early_does_not_keep_the_next_one_back(shi
     assert len(wrong) == 1
     assert told.reasons[0].startswith("unknown")
     assert told.reasons[1:] == ["DONE"]
+
+
+def test_a_log_whose_messages_lack_a_field_is_named(shipped: Path, tmp_path: Path) -> None:
+    shutil.copy(shipped, tmp_path / "other.mcap")
+    rewritten(tmp_path / "other.mcap", without("/cycle", "reasons"))
+    wrong: list[LogError] = []
+    follow(NewLogs(tmp_path, old=True), Lines(lambda _: None), never, wrong.append)
+    (said,) = map(str, wrong)
+    assert "other.mcap: its messages are not readable: " in said
 
 
 class Told:
