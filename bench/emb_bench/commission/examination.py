@@ -19,7 +19,7 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Instruments, Mechanics, Plant
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate, EstimationProblem, with_systematic
+from emb_bench.estimate.records import NORMAL_95, Estimate, EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Booleans, Experiment, Floats
 from emb_bench.experiment.from_log import read_experiment, step_of
 from emb_bench.logs.log import RunLog, read_log
@@ -251,8 +251,14 @@ def _with_systematic(bench: Bench, e: Estimate) -> Estimate:
 
 
 def _interval(e: Estimate, name: str) -> tuple[float, float]:
-    """Interval of an unknown, over all records that have one of their own [SI]; NaN where it was not estimated."""
-    rows = [row for unknown, row in zip(e.unknowns, e.intervals().tolist(), strict=True) if unknown.name == name]
+    """Interval of an unknown, over all records that have one of their own [SI]; NaN where it was not estimated.
+
+    The shield shares the bench's errors of J and of the scale of the angle: with them the parameters move the brake as
+    it was measured.
+    """
+    half = NORMAL_95 * e.between_runs() * e.scale
+    ends = np.stack([e.values - half, e.values + half], axis=1).tolist()
+    rows = [row for unknown, row in zip(e.unknowns, ends, strict=True) if unknown.name == name]
     return (min(low for low, _ in rows), max(high for _, high in rows)) if rows else (math.nan, math.nan)
 
 

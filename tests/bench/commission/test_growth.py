@@ -61,6 +61,8 @@ def test_a_plain_brake_stays_plain(bench: Bench, tmp_path: Path, simulate: Simul
     found = identified(bench, logs_of(tmp_path, simulate, "exact"))
     assert found.fits
     assert (found.model, found.features, found.jitter) == ("exact", {}, 0.0)
+    low, high = found.intervals["k_m"]
+    assert high - low < bench.systematic.inertia * found.values["k_m"]  # the shield shares the error of J
     assert holds_the_truth(bench, found)
 
 

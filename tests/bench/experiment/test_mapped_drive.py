@@ -71,7 +71,7 @@ def test_parameters_are_known_from_a_log_of_a_drive_that_tells_its_current_coars
     assert truth is not None
     for one in study.conclusions:
         assert one.interval[0] <= getattr(truth, one.label) <= one.interval[1]
-        assert one.interval[1] - one.interval[0] < 0.02 * getattr(truth, one.label)
+        assert one.interval[1] - one.interval[0] < 0.06 * getattr(truth, one.label)  # 0.04 by an inertia known to 1 %
     assert [c.label for c in study.conclusions] == list(PARAMETER_NAMES)
     (note,) = study.notes
     assert f"the command as its bus carried it, {in_samples(late)} late" in note
