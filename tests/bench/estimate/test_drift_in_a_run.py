@@ -8,7 +8,7 @@ import pytest
 from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.records import DRIFTS, EstimationProblem, with_systematic
+from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.estimate.suspects import Simulated, explained, secants
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -104,11 +104,3 @@ def test_the_interval_allows_for_a_drift_that_is_too_small_to_be_noticed(bench: 
     assert abs(errors[0]) > 2.5
     assert abs(errors[1]) < 2.0
     assert found[0].values == pytest.approx(found[1].values)
-
-
-def test_parameters_that_are_constant_are_not_suspected(bench: Bench) -> None:
-    data = record(bench, bench.plant("exact"), currents_of(bench, "multisine"), seed=3)
-    m = fit(bench, "exact", [data], EstimationProblem(nuisances=("x1_0",))).validation
-    assert m.fits
-    assert {s.name for s in m.suspects} >= {*DRIFTS}
-    assert all(abs(s.sigmas) < 4.0 for s in m.suspects if s.name in DRIFTS)

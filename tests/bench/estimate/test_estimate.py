@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import search, start_points
@@ -15,7 +14,7 @@ from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import METHODS, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import fisher, uniform_prior
-from emb_bench.sim.open_loop import held, march, simulate, trajectory
+from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import LogError, UsageError
 
@@ -355,11 +354,8 @@ def test_a_question_that_cannot_be_answered_is_refused() -> None:
             EstimationProblem(names)
 
 
-def test_what_cannot_be_estimated_with_a_model_or_from_so_little_is_refused(bench: Bench) -> None:
+def test_what_cannot_be_estimated_from_so_little_is_refused(bench: Bench) -> None:
     data = exactly(bench)
-    for name in ("euler", "lag"):
-        with pytest.raises(UsageError, match="delay"):
-            fit(bench, name, [data], EstimationProblem(("k_m", "delay")))
     none = replace(data, samples=np.full((500, 2), np.nan))
     for records, starts, message in (([], 1, "one record"), ([data], 0, "1 start")):
         with pytest.raises(UsageError, match=message):
@@ -368,14 +364,3 @@ def test_what_cannot_be_estimated_with_a_model_or_from_so_little_is_refused(benc
         fit(bench, "exact", [none])
     with pytest.raises(UsageError, match="varies in the ranges"):
         EstimationProblem(("k_m",), prior=bench.range_set("viscous"))
-
-
-def test_the_prediction_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
-    problem = problem_of(bench, ("k_m", "delay"), exactly(bench))
-    said = problem.predict(np.array([1.1, 0.25]), 0)
-    chosen, s = no_sensitivity(("k_m", "delay"))
-    p, currents = brake_of(bench, k_m=1.1), problem.records[0].currents
-    mechanics = bench.plant("exact").mechanics
-    states, s = trajectory(march, mechanics, p, held(currents, 0.001, 0.25), chosen, rest(), s)
-    assert said.states.tolist() == states[:, :2].tolist()
-    assert said.sensitivities.tolist() == (s[1:, :, :2] / np.array([[1.0], [0.75]])).tolist()

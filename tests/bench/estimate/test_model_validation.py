@@ -9,7 +9,7 @@ from scipy import stats
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
-from emb_bench.estimate.records import NORMAL_95, Estimate, EstimationProblem, with_systematic
+from emb_bench.estimate.records import DRIFTS, NORMAL_95, Estimate, EstimationProblem, with_systematic
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES
 
@@ -66,7 +66,10 @@ def test_what_the_model_lacks_is_named_with_its_size(bench: Bench, plant: str, n
 
 def test_nothing_is_suspected_of_the_right_model(bench: Bench) -> None:
     suspects = fitted(bench, "exact", text="step:amplitude=1.5").validation.suspects
-    assert {suspect.name for suspect in suspects} >= {"delay", "x1_0", "x2_0", "offset", "contact", "hysteresis"}
+    assert {suspect.name for suspect in suspects} >= {
+        *("delay", "x1_0", "x2_0", "offset", "contact", "hysteresis"),
+        *DRIFTS,
+    }
     assert all(abs(suspect.sigmas) < 4.0 for suspect in suspects)
 
 
@@ -186,6 +189,7 @@ def test_what_no_record_can_know_enters_the_total_as_the_equation_of_motion_says
     known = [i for i, label in enumerate(e.labels) if label in PARAMETER_NAMES]
     both = [math.hypot(found["J"][name], found["angle_scale"][name]) for name in PARAMETER_NAMES]
     assert e.deviations()[known] == pytest.approx(np.hypot(e.between_runs()[known], both), rel=1e-6)
+    assert [finding.name for finding in e.verdict().findings] == list(PARAMETER_NAMES)
     trusted = fit(bench, model, [data], method=method)
     assert trusted.validation.budget == ()
     assert trusted.values[known] == pytest.approx(e.values[known], rel=2e-3)

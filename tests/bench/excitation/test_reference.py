@@ -63,12 +63,6 @@ def drawn(rng: np.random.Generator) -> tuple[BrakeParameters, Floats]:
     return BrakeParameters(*rng.uniform(box.low, box.high).tolist()), errors
 
 
-def shifted(bits: np.ndarray[Any, Any]) -> Floats:
-    """Circular autocorrelation of a ±1 sequence at every shift, by FFT."""
-    spectrum = np.fft.fft(2.0 * bits - 1.0)
-    return np.asarray(np.fft.ifft(spectrum * spectrum.conj()).real)
-
-
 # --- The signals ------------------------------------------------------------------------------------------------------
 
 
@@ -107,14 +101,6 @@ def bits_of(order: int, seed: int) -> Floats:
     """One period of a binary sequence, as zeros and ones."""
     long = replace(BENCH, timing=replace(BENCH.timing, horizon=2**order - 1))
     return currents("prbs", long, order=order, seed=seed, hold=1e-3, amplitude=0.5) + 0.5
-
-
-@pytest.mark.parametrize("order", range(2, 17))
-def test_a_binary_sequence_of_every_order_is_of_maximum_length(order: int) -> None:
-    bits, length = bits_of(order, 1), 2**order - 1
-    assert bits.sum() == 2 ** (order - 1)
-    # Uncorrelated with itself at every shift: no shorter cycle, and no polynomial that is not primitive, has this.
-    assert shifted(bits) == pytest.approx([length] + [-1.0] * (length - 1), abs=1e-6)
 
 
 def test_another_seed_is_another_point_of_the_same_cycle() -> None:
