@@ -6,6 +6,8 @@ nothing that a user can cause ends in a traceback.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 EXIT_DONE = 0
 EXIT_CHECK_FAILED = 1  # Exit code of a check that ran without error and was not passed
 EXIT_USAGE = 2
@@ -17,6 +19,14 @@ EXIT_CANNOT_TELL = 7  # Exit code of a check that what is known neither passes n
 EXIT_UNEXPLAINED = 8  # Exit code of a run whose measurements no one brake explains
 EXIT_OUTSIDE = 9  # Exit code with --strict of a brake outside of the ranges for which the limits are guaranteed
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell has it
+
+
+def near(got: str, names: Iterable[str]) -> str:
+    """A name that may have been meant, for the end of a message; empty if none is near what was given."""
+    from difflib import get_close_matches
+
+    found = get_close_matches(got, list(names), n=1)
+    return f"; did you mean {found[0]}?" if found else ""
 
 
 class EmbError(Exception):

@@ -10,7 +10,7 @@ from pathlib import Path
 from emb_bench.config.bench import load_bench
 from emb_runtime.can.transport import is_private
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
-from emb_runtime.system.terminal import as_json, complain, mention, show
+from emb_runtime.system.terminal import Parser, as_json, complain, mention, show
 
 EPILOG = """\
 Each step is a run of emb-run behind shield, guard and watchdog, with its policy and its log in DIR, and rests on what
@@ -28,7 +28,7 @@ exit codes:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    p = argparse.ArgumentParser(
+    p = Parser(
         prog="emb-commission",
         description="Take an unknown brake into service: from a data sheet's ranges to a bench file.",
         epilog=EPILOG,

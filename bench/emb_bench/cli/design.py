@@ -11,7 +11,7 @@ from emb_bench import api
 from emb_bench.cli.options import add, add_output_options, answer, given, summary
 from emb_bench.figures import ENDINGS, require_place
 from emb_runtime.errors import EXIT_DONE, EmbError
-from emb_runtime.system.terminal import complain
+from emb_runtime.system.terminal import Parser, complain
 
 EPILOG = """\
 The parameters are taken as known: a design measures how good an excitation can be. It
@@ -31,7 +31,7 @@ exit codes:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    p = argparse.ArgumentParser(
+    p = Parser(
         prog="emb-design",
         description=f"{summary(api.design)}.",
         epilog=EPILOG,

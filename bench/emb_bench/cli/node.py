@@ -21,7 +21,7 @@ from emb_runtime.records import Frame
 from emb_runtime.safety import watchdog_process
 from emb_runtime.system import realtime
 from emb_runtime.system.clock import Clock
-from emb_runtime.system.terminal import complain, mention, show
+from emb_runtime.system.terminal import Parser, complain, mention, show
 
 PRIORITY = watchdog_process.PRIORITY + 5
 """Above all of emb-run, where they share one processor: a real node's clock waits for no computer. So a pair of frames
@@ -51,7 +51,7 @@ class Device(Protocol):
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    p = argparse.ArgumentParser(
+    p = Parser(
         prog="emb-node",
         description="A simulated electromechanical brake as a CAN node with its own clock: it measures, obeys fresh, "
         "valid, enabled commands only, brakes each period that has none, and begins a safe stop when they stop coming.",

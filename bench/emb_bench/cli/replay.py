@@ -31,7 +31,7 @@ from emb_runtime.errors import (
     EmbError,
     LogError,
 )
-from emb_runtime.system.terminal import complain
+from emb_runtime.system.terminal import Parser, complain
 
 if TYPE_CHECKING:
     from emb_bench.analysis.study import Study
@@ -325,7 +325,7 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
     Args:
         only: the command that is wanted, where it is known: the others' imports would take longer than many of them.
     """
-    p = argparse.ArgumentParser(
+    p = Parser(
         prog="emb-replay",
         description="Evaluate logs of emb-run.",
         epilog=epilog(TOGETHER) + "\nemb-replay COMMAND --help says what they mean there.\n",

@@ -15,7 +15,7 @@ from emb_bench.config.machine import Machine
 from emb_bench.config.plants import ASYMMETRIES, BUILT_IN, Plant, read_plant
 from emb_runtime.config.bench import PARAMETER_NAMES, REMEDY, checked_bench, parse_document, read_bench_text
 from emb_runtime.config.typed import SMALLEST, NotNegative, parse_toml, read
-from emb_runtime.errors import BenchFileError
+from emb_runtime.errors import BenchFileError, near
 
 AROUND = 3.0  # Factor around its nominal parameters within which searches for those of a machine begin
 DRIVEN = ("ranges", "shield", "watch", "guard", "node", "can")  # Tables that the file of a machine does not have
@@ -110,7 +110,8 @@ class Bench(driven.Bench):
         try:
             return self.plants[name]
         except KeyError:
-            raise BenchFileError(f"no plant is called {name!r}; this bench has: {', '.join(self.plants)}") from None
+            known = f"{', '.join(self.plants)}{near(name, self.plants)}"
+            raise BenchFileError(f"no plant is called {name!r}; this bench has: {known}") from None
 
 
 def load_bench(path: str | Path | None = None, *, analysis: bool = False) -> Bench:

@@ -13,7 +13,7 @@ from emb_bench.hil import uml
 from emb_bench.hil.supervise import EXIT_TIMEOUT, HostCommand, interface, supervise
 from emb_bench.hil.uml import KernelCommand, state_directory
 from emb_runtime.errors import EXIT_BUS, EXIT_USAGE, BusError, EmbError, UsageError
-from emb_runtime.system.terminal import complain
+from emb_runtime.system.terminal import Parser, complain
 
 _USAGE = "emb-hil [--host | --uml] [--root] [--slow N] [--timeout S] [--memory MB] -- COMMAND..."
 _EPILOG = f"""\
@@ -28,7 +28,7 @@ SLOWEST = 1000
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="emb-hil",
         usage=_USAGE,
         description="Run a command where the CAN interface vcan0 exists.",

@@ -37,7 +37,7 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.drives.mapping import PROPERTIES, MappingError
 from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.drives.mapping_file import parse_mapping
-from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError
+from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError, near
 from emb_runtime.log.mcap_schema import FIXED_TOPICS, LEARNT
 from emb_runtime.records import CycleRecord, Frame, RunType
 from emb_runtime.system import terminal
@@ -226,7 +226,9 @@ class RunLog:
     def describe(self, topic: str) -> tuple[Column, ...]:
         """The columns of a topic: two times, then every field."""
         if topic not in self.topics:
-            raise UsageError(f"expected a topic of {self.path}, {', '.join(self.topics)}; got {topic!r}")
+            raise UsageError(
+                f"expected a topic of {self.path}, {', '.join(self.topics)}; got {topic!r}{near(topic, self.topics)}"
+            )
         try:
             return (TIME, UNIX_TIME, *describe(self.topics[topic].factory, self.topics[topic].units))
         except (ValueError, AttributeError, RecursionError) as err:

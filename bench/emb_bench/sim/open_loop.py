@@ -25,7 +25,7 @@ from emb_bench.brake.motion import SENSITIVE, STATES, Floats, Integers, advance,
 from emb_bench.brake.parameters import COMMAND, DELAY, OFFSET, PARAMETERS, PAST_COMMAND, VELOCITY_GAIN
 from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, near
 
 WORTH_COMPILING = 20_000  # Periods from which on loading the compiled functions takes less time than they save
 
@@ -253,7 +253,8 @@ def check_unknowns(params: Sequence[str]) -> None:
     """Refuses names that are no parameters of a brake or its instruments."""
     for name in params:
         if name not in PARAMETERS:
-            raise UsageError(f"'{name}' is no parameter of the brake; expected some of {', '.join(PARAMETERS)}")
+            known = f"{', '.join(PARAMETERS)}{near(name, PARAMETERS)}"
+            raise UsageError(f"'{name}' is no parameter of the brake; expected some of {known}")
     if len(set(params)) < len(params):
         raise UsageError(f"a parameter comes twice in {', '.join(params)}: expected each once")
 

@@ -20,7 +20,7 @@ from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 from emb_bench.sim.instruments import MEMORY, command, measure, settle
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters
 from emb_runtime.config.bench import Noise as SensorNoise
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, near
 from emb_runtime.safety.command_limits import shielded
 from emb_runtime.safety.shield import Past
 from emb_runtime.safety.shield_design import ShieldLaw
@@ -190,8 +190,9 @@ def true_parameters(
     theta = bench.brake
     for name, text in assignments.items():
         if name not in PARAMETER_NAMES:
-            known = ", ".join((*PARAMETER_NAMES, *besides))
-            raise UsageError(f"{option}'{name}' is not a parameter; expected one of {known}")
+            known = (*PARAMETER_NAMES, *besides)
+            said = f"'{name}' is not a parameter; expected one of {', '.join(known)}{near(name, known)}"
+            raise UsageError(f"{option}{said}")
         try:
             value = float(text)
         except ValueError:

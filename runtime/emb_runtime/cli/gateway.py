@@ -22,7 +22,7 @@ from emb_runtime.drives.node import report
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError, SafetyStopError, UsageError
 from emb_runtime.safety.end_stop import released_speed
 from emb_runtime.system import realtime
-from emb_runtime.system.terminal import ARM_QUESTION, StopRequest, as_json, complain, confirmed, mention, show
+from emb_runtime.system.terminal import ARM_QUESTION, Parser, StopRequest, as_json, complain, confirmed, mention, show
 
 PRIORITY = realtime.PRIORITY + 5  # Above the loop's, below its watchdog's
 LOOK = 0.05  # Time between two looks at the keyboard [s]
@@ -44,7 +44,7 @@ exit codes:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    p = argparse.ArgumentParser(
+    p = Parser(
         prog="emb-gateway",
         description=DESCRIPTION,
         epilog=EPILOG,

@@ -24,7 +24,7 @@ from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from emb_runtime.system import realtime
-from emb_runtime.system.terminal import one_line
+from emb_runtime.system.terminal import Parser, one_line
 
 if TYPE_CHECKING:
     from emb_runtime.drives.mapping import Mapping
@@ -152,7 +152,7 @@ class Plan:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    p = argparse.ArgumentParser(
+    p = Parser(
         prog="emb-run",
         usage="emb-run [--iface NAME] [--policy FILE] [--bench FILE] [--log FILE|DIR] [OPTION ...]",
         description=DESCRIPTION,

@@ -19,7 +19,7 @@ import msgspec
 from msgspec import Meta
 
 from emb_runtime.config.typed import MAX_TOML_BYTES, SMALLEST, FieldError, Positive, parse_toml, read, struct_of
-from emb_runtime.errors import BenchFileError
+from emb_runtime.errors import BenchFileError, near
 from emb_runtime.system.input_file import read_text
 
 # Hard ceilings: a bench file can narrow them, never widen them.
@@ -244,7 +244,9 @@ class Bench:
             if name == "nominal":
                 return Ranges(name, self.brake, self.brake)
             known = ", ".join(sorted(self.ranges))
-            raise BenchFileError(f"no set of ranges is called '{name}'; this bench has: {known}") from None
+            raise BenchFileError(
+                f"no set of ranges is called '{name}'; this bench has: {known}{near(name, self.ranges)}"
+            ) from None
 
     def refuse_long_timeouts(self) -> None:
         """Refuse time-outs and counts beyond those with which a brake is driven.

@@ -16,7 +16,7 @@ from typing import Annotated, Any, TypeVar, Union, cast, get_args, get_origin, g
 import msgspec
 from msgspec import inspect
 
-from emb_runtime.errors import EmbError
+from emb_runtime.errors import EmbError, near
 
 Record = TypeVar("Record")
 SMALLEST = 1e-30  # No quantity of a brake is smaller, or larger than its inverse; beyond it arithmetic overflows
@@ -183,7 +183,8 @@ class _Reader:
     def _record(self, value: dict[str, Any], kind: Any, fields: dict[str, tuple[Any, bool]], keys: Keys) -> Any:
         for key in value:
             if key not in fields:
-                raise _RefusedError((*keys, key), f"unknown key; expected some of {', '.join(sorted(fields))}")
+                known = f"{', '.join(sorted(fields))}{near(key, fields)}"
+                raise _RefusedError((*keys, key), f"unknown key; expected some of {known}")
         self.missing += [((*keys, n), hint) for n, (hint, required) in fields.items() if required and n not in value]
         converted = {key: self.convert(inner, fields[key][0], (*keys, key)) for key, inner in value.items()}
         if self.missing:

@@ -6,6 +6,7 @@ control one are written as escape sequences, visibly.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import json
 import math
@@ -15,9 +16,9 @@ import select
 import signal
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
-from emb_runtime.errors import EmbError, UsageError
+from emb_runtime.errors import EmbError, UsageError, near
 
 LONGEST_MESSAGE = 1000  # Characters of an error's message
 LONGEST_STRING = 2000  # Characters of a string from outside
@@ -114,6 +115,33 @@ def confirmed(question: str, stop_requested: Callable[[], bool], wait: Callable[
             return line.strip().lower() in ("y", "yes")
         wait()
     return False
+
+
+class Parser(argparse.ArgumentParser):
+    """A command line whose wrong use is one line, with the option or the command that may have been meant."""
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """The arguments; ends the program with 2 where they are wrong, with 0 after a ``--help``."""
+        found, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"no option or argument {unknown[0]}{near(unknown[0].partition('=')[0], self._known())}")
+        return found
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong in one line, and end the program."""
+        self.exit(UsageError.exit_code, f"{self.prog}: {escaped(message)} (see {self.prog} --help)\n")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            names = [str(choice) for choice in action.choices]
+            expected = f"expected one of {', '.join(names)}, got {value!r}{near(str(value), names)}"
+            raise argparse.ArgumentError(action, expected)
+
+    def _known(self) -> list[str]:
+        """Options, those of sub-commands included."""
+        below = [action.choices for action in self._actions if isinstance(action.choices, dict)]
+        parts = [part for choices in below for part in choices.values() if isinstance(part, Parser)]
+        return [*self._option_string_actions, *(name for part in parts for name in part._known())]
 
 
 def complain(command: str, err: EmbError) -> int:
