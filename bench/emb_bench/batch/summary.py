@@ -17,7 +17,7 @@ from emb_bench.numbers import NOTHING, plain
 from emb_bench.report.sentences import INTERVALS, p_value
 from emb_bench.report.text import Table, listed, wrapped
 
-SHOWN = 20  # Most failed logs, and most campaigns, in the text; the file has them all
+SHOWN = 20  # Most failed logs in the text; the file has them all
 
 
 @dataclass(frozen=True)
@@ -62,17 +62,6 @@ class ParameterSummary:
 
 
 @dataclass(frozen=True)
-class Folder:
-    """The runs of one folder."""
-
-    root: str
-    campaign: str
-    logs: int
-    start_time: int | None  # Of the earliest run [ns]; None if none has a date
-    means: dict[str, Constancy]  # Means of the parameters that a run identifies
-
-
-@dataclass(frozen=True)
 class Campaign:
     """Summary of all logs; copies of a log count only in ``logs``, ``evaluated``, ``incomplete`` and ``misfit``."""
 
@@ -90,7 +79,6 @@ class Campaign:
     method: str
     models: tuple[str, ...]
     parameters: dict[str, ParameterSummary]
-    campaigns: tuple[Folder, ...]  # The earliest first
 
 
 def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
@@ -119,7 +107,6 @@ def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
         method=options.method,
         models=tuple(sorted({row.model for row in good if row.model is not None})),
         parameters={name: _parameter(counted, name) for name in options.names},
-        campaigns=_folders(counted, options),
     )
 
 
@@ -218,20 +205,8 @@ def _deviations(used: Sequence[Parameter]) -> list[float]:
     return [scale * (p.between_runs or 0.0) for p in used]
 
 
-def _folders(rows: Sequence[Row], options: Options) -> tuple[Folder, ...]:
-    inside: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        inside.setdefault((row.root, row.campaign), []).append(row)
-    found = []
-    for (root, campaign), its in inside.items():
-        means = {name: _constancy(used) for name in options.names if (used := _usable(its, name))}
-        start = min((row.start_time for row in its if row.start_time is not None), default=None)
-        found.append(Folder(root, campaign, len(its), start, means))
-    return tuple(sorted(found, key=lambda one: (one.start_time or 0, one.root, one.campaign)))
-
-
 def text(c: Campaign, *, verbose: bool = False) -> str:
-    """Failures, the parameters over all runs, and agreement of the runs; with ``verbose`` trends and folders."""
+    """Failures, the parameters over all runs, and agreement of the runs; with ``verbose`` trends."""
     lines = []
     if c.failed:
         lines += [f"{len(c.failed)} of {c.logs} logs FAILED", *listed("  ", (str(r.error) for r in c.failed[:SHOWN]))]
@@ -249,7 +224,7 @@ def text(c: Campaign, *, verbose: bool = False) -> str:
         lines += wrapped("Medians of all runs. " + INTERVALS, 0)
     lines += ["", *listed("", _agreement(c))]
     lines += [*listed("NOTE: ", _notes(c)), *_more(c.misfit, "fits")]
-    return "\n".join([*lines, *(_trends(c) if verbose else ()), *(_means(c) if verbose else ())]).rstrip()
+    return "\n".join([*lines, *(_trends(c) if verbose else ())]).rstrip()
 
 
 def _more(rows: Sequence[Row], column: str) -> list[str]:
@@ -287,16 +262,6 @@ def _trends(c: Campaign) -> Iterator[str]:
             (value, half), q = p.trend.last, p.trend.walk.walk
             walk = f"walk of {q:.2g} {p.unit} per root of an hour" if q > 0.0 else "no drift found"
             yield f"  {name}  {value:.6g} ± {half:.2g} {p.unit}; {walk}"
-
-
-def _means(c: Campaign) -> Iterator[str]:
-    """Means by folder, where there are several."""
-    found = [one for one in c.campaigns if one.means]
-    if len(found) > 1:
-        yield from ("", "weighted means ± 95 % by folder, the earliest first")
-        for one in found[-SHOWN:]:
-            means = (f"{name} {m.mean:.6g} ± {NORMAL_95 * m.deviation:.2g}" for name, m in one.means.items())
-            yield from wrapped(f"  {one.campaign} ({one.logs}): {', '.join(means)}")
 
 
 def parameter_table(c: Campaign) -> Table:

@@ -10,6 +10,7 @@ import base64
 import functools
 import hashlib
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
 from typing import Any, NamedTuple
@@ -43,7 +44,6 @@ EVENTS = 200  # Most safety events that are shown; report.json has them all
 LONGEST = 2000  # Characters of an event that are shown; report.json has them all
 SHORT_HASH = 16  # Digits of a hash that are shown where there is no room for all
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
-SETTING = "rt_"  # Prefix of the real-time settings among the entries of a run's outcome
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,7 @@ class View:
     residuals: Table | None
     timing: Table | None
     safety: Safety | None
-    counts: Table
-    settings: list[tuple[str, str]]
-    outcome: list[tuple[str, str]]
-    files: Table
+    recorded: list[tuple[str, Mapping[str, str]]]  # Entries of the log, by their titles
 
 
 class Safety(NamedTuple):
@@ -128,8 +125,8 @@ def view(run: Run, prefix: str = "") -> View:
     """Tables and figures of one run."""
     log = run.log
     cycles, after = _cycles(run), stop_samples(run)
-    end, driven = log.end, not log.imported
-    attached = [[n, str(len(data)), hashlib.sha256(data).hexdigest()] for n, data in log.attachments.items()]
+    driven = not log.imported
+    attached = {name: hashlib.sha256(data).hexdigest() for name, data in log.attachments.items()}
     return View(
         run=run,
         prefix=prefix,
@@ -141,10 +138,7 @@ def view(run: Run, prefix: str = "") -> View:
         residuals=None if run.residuals is None else _residuals(run.residuals),
         timing=_intervals(run) if driven else None,
         safety=_safety(run) if driven else None,
-        counts=Table("Messages in the file", ["topic", "messages"], [[t, str(n)] for t, n in log.counts.items()]),
-        settings=[(key.removeprefix(SETTING), value) for key, value in end.items() if key.startswith(SETTING)],
-        outcome=[(key, value) for key, value in end.items() if not key.startswith(SETTING)],
-        files=Table("Files inside the log", ["attached file", "bytes", "SHA-256"], attached, words=(0, 2)),
+        recorded=[*log.metadata.items(), ("attached files, SHA-256", attached)],
     )
 
 

@@ -1,6 +1,6 @@
 """Text of a result on a terminal: aligned tables, lists of facts, verdicts in colour. Needs the base install only.
 
-Tables are also Markdown and, by the templates, HTML.
+Tables are HTML too, by the templates.
 """
 
 from __future__ import annotations
@@ -76,12 +76,6 @@ class Table:
     def text(self, indent: str = "") -> list[str]:
         """Title and aligned lines."""
         return [*textwrap.wrap(self.title, WIDTH), *self.lines(indent), ""]
-
-    def markdown(self) -> list[str]:
-        """Title and rows as Markdown."""
-        rule = "|".join("---" if i in self.words else "---:" for i in range(len(self.header)))
-        rows = [f"| {' | '.join(row)} |" for row in (self.header, *self.rows)]
-        return [f"**{self.title}**", "", rows[0], f"|{rule}|", *rows[1:], ""]
 
 
 def show(text: str) -> None:

@@ -222,8 +222,6 @@ def test_one_process_gives_the_same_bytes_as_two(
 def test_a_number_that_is_not_the_same_in_all_runs_is_named(said: Said) -> None:
     found = {name: p["estimate"]["constancy"]["constant"] for name, p in said.document["parameters"].items()}
     assert found == {"k_m": True, "k_1": True, "T_c": False, "f_v": False}
-    days = {one["campaign"]: one["means"]["f_v"]["mean"] for one in said.document["campaigns"]}
-    assert days["tuesday"] > 1.2 * days["monday"]
 
 
 def test_information_alone_estimates_nothing(

@@ -51,10 +51,9 @@ def test_a_table_names_its_rows_and_columns_for_who_cannot_see_it() -> None:
     assert set(reader.values("aria-label")) == {"two rows"}
 
 
-def test_a_table_is_aligned_text_and_markdown_too() -> None:
+def test_a_table_is_aligned_text_too() -> None:
     table = Table("title", ["name", "n", "what"], [["a", "1", "x"], ["bcdef", "22", "yz"]], words=(0, 2))
     assert table.text() == ["title", "name    n  what", "a       1  x", "bcdef  22  yz", ""]
-    assert table.markdown()[2:] == ["| name | n | what |", "|---|---:|---|", "| a | 1 | x |", "| bcdef | 22 | yz |", ""]
 
 
 def _number(text: str) -> float:
