@@ -123,7 +123,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
     p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
     p.add_argument("--to", choices=FORMATS, required=True, help="what to write")
-    p.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="file to make; never overwritten")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to make; never overwritten")
     p.add_argument("--topic", metavar="TOPIC", help=f"for {' and '.join(TABLES)}: which one (default: {CYCLE})")
     p.add_argument(
         "--theta", metavar="THETA",
@@ -140,17 +140,17 @@ def run(args: argparse.Namespace) -> int:
     if args.theta is not None and args.to != "mjcf":
         raise UsageError(f"--theta: expected with --to mjcf, got it with --to {args.to}")
     endings = {"plot": ENDINGS, "mjcf": MODEL_ENDINGS}.get(args.to, (f".{args.to}",))
-    if args.out.suffix.lower() not in endings:
-        raise UsageError(f"{args.out}: expected a file that ends in {', '.join(endings)} with --to {args.to}")
+    if args.output.suffix.lower() not in endings:
+        raise UsageError(f"{args.output}: expected a file that ends in {', '.join(endings)} with --to {args.to}")
     log = read_log(args.log)
     if args.to == "plot":
-        written = draw_run(log, args.out)
+        written = draw_run(log, args.output)
     elif args.to == "mjcf":
-        written = write_mjcf(log, args.theta or "", args.out)
+        written = write_mjcf(log, args.theta or "", args.output)
     else:
-        written = TABLES[args.to](log, args.topic or CYCLE, args.out)
+        written = TABLES[args.to](log, args.topic or CYCLE, args.output)
     if args.json:
-        show(as_json({"log": str(args.log), "file": str(args.out), "holds": written, "missing": log.missing}))
+        show(as_json({"log": str(args.log), "file": str(args.output), "holds": written, "missing": log.missing}))
     else:
-        show("\n".join([f"WARNING: {log.missing}"] * bool(log.missing) + [f"{args.out}: {written}"]))
+        show("\n".join([f"WARNING: {log.missing}"] * bool(log.missing) + [f"{args.output}: {written}"]))
     return EXIT_DONE

@@ -33,21 +33,23 @@ alone, and nothing is written.
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
     p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
-    p.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="file to make; never overwritten")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to make; never overwritten")
     p.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Repair a log; returns the exit code."""
-    found = repair(args.log, args.out)
+    found = repair(args.log, args.output)
     if args.json:
-        written = None if found is None else str(args.out)
+        written = None if found is None else str(args.output)
         missing, kept = ("", None) if found is None else ("; ".join(found.missing), found.kept)
         show(as_json({"log": str(args.log), "written": written, "missing": missing, "messages": kept}))
     elif found is None:
         show(f"{args.log}: the log is whole, there is nothing to repair, and nothing was written")
     else:
-        show("\n".join([*(f"missing  {what}" for what in found.missing), f"{args.out}: {found.kept} messages saved"]))
+        show(
+            "\n".join([*(f"missing  {what}" for what in found.missing), f"{args.output}: {found.kept} messages saved"])
+        )
     return EXIT_DONE
 
 
