@@ -118,34 +118,6 @@ def _handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "exit_code", "reason"),
-    [
-        (["--iface", "nocan99"], 4, "nocan99"),
-        (["--iface", "sim"], 2, "needs no emb-node"),
-        (["--iface", "vcan0", "--brake", "mass=1"], 2, "not a parameter"),
-        (["--iface", "vcan0", "--brake", "angle_noise=-1"], 2, "angle_noise: expected a standard deviation from 0 on"),
-        (
-            ["--iface", "vcan0", "--brake", "plant=rubber"],
-            2,
-            "no plant is called 'rubber'; this bench has: euler",
-        ),
-        (["--iface", "vcan0", "--bench", "missing.toml"], 2, "missing.toml"),
-        (["--iface", "vcan0", "--brake", "seed=-1"], 2, "seed"),
-        (["--iface", "vcan0", "--duration", "0"], 2, "--duration"),
-    ],
-)
-def test_what_a_user_can_get_wrong_is_one_line(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], exit_code: int, reason: str
-) -> None:
-    assert main([*arguments, "--no-rt"]) == exit_code
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith("emb-node: ")
-    assert err.count("\n") == 1
-    assert reason in err
-
-
 def test_a_node_on_a_bus_of_python_can_ends_after_its_duration(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--iface", "virtual:node", "--duration", "0.2", "--no-rt", "--json"]) == 0
     assert '"obeyed": 0' in capsys.readouterr().out

@@ -66,39 +66,28 @@ def verdicts(replay: Replay, path: Path, code: int = 0) -> dict[str, tuple[Any, 
     return {entry["name"]: (entry["measured"], entry["met"]) for entry in log["budgets"]}
 
 
-def test_a_run_within_its_budgets_is_told_so(write: Write, replay: Replay) -> None:
-    path = write(punctual(), '[budgets]\nmissed = 0\n[budgets.response]\np50 = 4.51e-4\n"p99.9" = 5e-4\n')
-    found = verdicts(replay, path)
-    assert found == {
-        "missed": (0.0, True),
-        "response p50": (pytest.approx(4.5e-4, rel=1e-9), True),
-        "response p99.9": (pytest.approx(4.5e-4, rel=1e-9), True),
-    }
-
-
-def test_a_budget_that_is_passed_by_a_little_is_not_met(write: Write, replay: Replay) -> None:
-    path = write(punctual(), "[budgets.decision]\np50 = 2.99e-4\n[budgets.age]\np50 = 1.01e-4\n")
-    found = verdicts(replay, path, code=1)
-    assert {name: met for name, (_, met) in found.items()} == {"age p50": True, "decision p50": False}
-
-
-def test_the_largest_value_is_judged_by_p100_and_one_outlier_leaves_the_median_alone(
-    write: Write, replay: Replay
-) -> None:
-    cycles = punctual()
-    cycles[50] = cycles[50]._replace(send_time_ns=cycles[50].receive_time_ns + 900_000)
-    found = verdicts(replay, write(cycles, "[budgets.response]\np50 = 4.6e-4\np100 = 8e-4\n"), code=1)
-    assert found["response p50"] == (pytest.approx(4.5e-4, rel=1e-9), True)
-    assert found["response p100"] == (pytest.approx(9e-4, rel=1e-9), False)
-
-
-def test_shares_are_of_the_periods_of_the_samples_and_of_the_commands(write: Write, replay: Replay) -> None:
-    # 20 samples, the last one after 5 periods without any; 4 of them without an answer; 2 of 16 commands came too late.
-    cycles = [unanswered(n, START + n * MS) if n % 5 == 4 else cycle(n, START + n * MS) for n in range(19)]
-    cycles.append(unanswered(24, START + 24 * MS, missed=5))
-    budgets = "[budgets]\nmissed = 0.2\nunanswered = 0.19\nnot_obeyed = 0.125\n"
-    found = verdicts(replay, write(cycles, budgets, not_obeyed=2), code=1)
-    assert found == {"missed": (0.2, True), "unanswered": (0.2, False), "not_obeyed": (0.125, True)}
+def test_each_budget_is_judged_by_its_own_quantile_or_share(write: Write, replay: Replay) -> None:
+    """Punctual cycles; one that answers late; 20 samples, the last one after 5 periods without any, 4 unanswered."""
+    outlier = punctual()
+    outlier[50] = outlier[50]._replace(send_time_ns=outlier[50].receive_time_ns + 900_000)
+    few = [unanswered(n, START + n * MS) if n % 5 == 4 else cycle(n, START + n * MS) for n in range(19)]
+    few.append(unanswered(24, START + 24 * MS, missed=5))
+    response, decision = "[budgets.response]\n", "[budgets.decision]\n"
+    shares = "[budgets]\nmissed = 0.2\nunanswered = 0.19\nnot_obeyed = 0.125\n"
+    table: list[tuple[list[CycleRecord], str, dict[str, tuple[float, bool]]]] = [
+        (punctual(), "[budgets]\nmissed = 0\n", {"missed": (0.0, True)}),
+        (punctual(), f"{response}p50 = 4.51e-4\n'p99.9' = 5e-4\n",
+         {"response p50": (4.5e-4, True), "response p99.9": (4.5e-4, True)}),
+        (punctual(), f"{decision}p50 = 2.99e-4\n", {"decision p50": (3e-4, False)}),
+        (punctual(), "[budgets.age]\np50 = 1.01e-4\n", {"age p50": (1e-4, True)}),
+        (outlier, f"{response}p50 = 4.6e-4\np100 = 8e-4\n",
+         {"response p50": (4.5e-4, True), "response p100": (9e-4, False)}),
+        (few, shares, {"missed": (0.2, True), "unanswered": (0.2, False), "not_obeyed": (0.125, True)}),
+    ]  # fmt: skip
+    for number, (cycles, budgets, expected) in enumerate(table):
+        path = write(cycles, budgets, not_obeyed=2 if cycles is few else 0, name=f"{number}.mcap")
+        found = verdicts(replay, path, code=0 if all(met for _, met in expected.values()) else 1)
+        assert found == {name: (pytest.approx(value, rel=1e-9), met) for name, (value, met) in expected.items()}
 
 
 def test_what_was_not_measured_is_not_met(write: Write, replay: Replay) -> None:
