@@ -162,16 +162,7 @@ def judge(
     why_no_study: str = "",
     last: Earlier | None = None,
 ) -> Acceptance:
-    """Results of all criteria. That each run came to its end and its log is whole is always one of them.
-
-    Args:
-        criteria: what is required.
-        runs: all that were given and could be read.
-        left_out: reason for each log that takes no part, beginning with its name.
-        study: the estimate; None if there is none.
-        why_no_study: reason for that.
-        last: an earlier estimate.
-    """
+    """Results of all criteria. That each run came to its end and its log is whole is always one of them."""
     results = [_completed(run, len(runs) > 1) for run in runs]
     results += [Criterion("all logs used", "yes", "no", Result.FAIL, words) for words in left_out]
     doubt = _doubt(study, why_no_study)

@@ -74,14 +74,7 @@ def conclude(
     *,
     predicts: bool = True,
 ) -> tuple[Conclusion, ...]:
-    """Concludes on each unknown that was asked for.
-
-    Args:
-        e: the estimate.
-        profiles: at least those that :func:`emb_bench.analysis.profile.profiles` selects.
-        drifts: changes since an earlier estimate.
-        predicts: True if the estimate predicts what it was not fitted to.
-    """
+    """Concludes on each unknown that was asked for; needs the profiles that :func:`profile.profiles` selects."""
     findings = {finding.name: finding for finding in e.verdict().findings}
     of_profile = {p.label: p for p in profiles}
     changes = {drift.name: drift for drift in drifts}

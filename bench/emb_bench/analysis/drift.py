@@ -114,10 +114,6 @@ def read_last(path: Path) -> Earlier:
 def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
     """Compare what all records share with an earlier estimate, as far as both have it.
 
-    Args:
-        now: the estimate.
-        last: an earlier one.
-
     Raises:
         UsageError: it has no parameter in common with this one.
     """

@@ -158,14 +158,6 @@ def choose_model(
 ) -> ModelChoice:
     """Fits every plant and ranks them.
 
-    Args:
-        bench: noise, sample time, nominal brake.
-        plants: the models, in any order.
-        records_of: the records as a model takes them.
-        asked: unknowns, and systematic errors; a plant is fitted with those that it can have.
-        starts: local searches of the simplest plant.
-        seed: of the random numbers.
-
     Raises:
         UsageError: there is no record, or too few samples.
     """
@@ -249,10 +241,7 @@ def _asked_of(bench: Bench, plant: Plant, asked: EstimationProblem) -> Estimatio
 def fit_from(problem: Problem, e: Estimate, *, follow: bool = False) -> Fit:
     """Output error, started from where another model ended.
 
-    Args:
-        problem: records, model and unknowns.
-        e: of the other model.
-        follow: True to be led from there by a filter that follows the measured brake, which has few local minima.
+    With ``follow`` a filter leads there, which follows the measured brake and has few local minima.
     """
     return _fit(problem, dict(zip(e.unknowns, e.values.tolist(), strict=True)), follow)
 

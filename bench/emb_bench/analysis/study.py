@@ -234,13 +234,6 @@ def make_study(
 ) -> Study:
     """Estimates from logs, checks the model and draws the conclusions.
 
-    Args:
-        bench: noise, sample time, limits, nominal brake.
-        logs: of one brake, at least one.
-        wanted: method and extent.
-        held_out: logs of the same brake that are predicted, not estimated from.
-        last: an earlier estimate.
-
     Raises:
         UsageError: logs do not go together, one run is given twice, or they are too few for the options.
         LogError: a log lacks what an estimate needs.

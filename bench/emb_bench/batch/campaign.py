@@ -46,16 +46,7 @@ def run_campaign(
     ray: str | None,
     plot: Path | None,
 ) -> Campaign:
-    """Evaluate logs, and write their rows and the figure.
-
-    Args:
-        paths: logs and folders.
-        output: file of rows.
-        options: of the evaluation.
-        jobs: logs at a time; None is one for each processor.
-        time_limit: longest time for one log [s].
-        ray: address of a Ray cluster; None for processes of this machine.
-        plot: figure to write.
+    """Evaluate logs, and write their rows and the figure; the arguments are those of :func:`emb_bench.api.campaign`.
 
     Raises:
         UsageError: there is no log, a library is missing, or a file cannot be written.
@@ -158,12 +149,6 @@ def in_processes(
 ) -> Generator[tuple[int, Row], None, None]:
     """Evaluates logs in processes of this machine.
 
-    Args:
-        evaluate: makes a row of a log.
-        sources: the logs.
-        jobs: processes at a time.
-        time_limit: longest time for one log [s].
-
     Yields:
         Each log's number and row, as they come.
     """
@@ -176,13 +161,6 @@ def on_ray(
     evaluate: Evaluate, sources: Sequence[Source], jobs: int | None, time_limit: float, address: str
 ) -> Generator[tuple[int, Row], None, None]:
     """Evaluates logs on Ray, one task for each; each is opened where its task runs, under the same path.
-
-    Args:
-        evaluate: makes a row of a log.
-        sources: the logs.
-        jobs: tasks at a time; None is one for each processor.
-        time_limit: longest time for one log [s].
-        address: of a cluster's head, or ``LOCAL``.
 
     Yields:
         Each log's number and row, as they come.

@@ -169,12 +169,6 @@ def write_rows(path: Path, ending: str, rows: Sequence[Row], options: Options) -
     Parquet has units in the columns' metadata and the options in the file's. CSV has neither, and the entries of a list
     with ``"; "`` between them. The same rows give the same bytes.
 
-    Args:
-        path: the file.
-        ending: of :data:`ENDINGS`.
-        rows: one for each log.
-        options: of the evaluation.
-
     Raises:
         ImportError: pyarrow is missing.
         OSError: the file cannot be written.

@@ -82,13 +82,7 @@ class Campaign:
 
 
 def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
-    """Summary of a campaign; numbers may be infinite.
-
-    Args:
-        rows: one for each log.
-        options: of their evaluation.
-        result: path of the file with the rows.
-    """
+    """Summary of a campaign; numbers may be infinite."""
     good = [row for row in rows if row.error is None]
     counted = [row for row in good if row.copy_of is None]
     starts = [row.start_time for row in good if row.start_time is not None]

@@ -195,16 +195,6 @@ def gather(
 ) -> Content:
     """Estimates from the logs that have an experiment, and states for each other log why it is not used.
 
-    Args:
-        bench: noise, sample time, limits, nominal brake.
-        logs: of one brake, at least one.
-        left_out: files that are no logs, or too damaged, and why.
-        wanted: method and extent of the study.
-        made_by: name and version of the tool.
-        held_out: logs that are predicted, not estimated from.
-        last: an earlier estimate.
-        criteria: of an acceptance test.
-
     Raises:
         UsageError: logs do not go together, or the options do not suit them.
         LogError: a log that is held out lacks what a prediction needs.

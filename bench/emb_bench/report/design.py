@@ -12,13 +12,7 @@ if TYPE_CHECKING:  # a search for designs takes a second to import
 
 
 def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
-    """Value of the criterion, the limits on the design's own brake, and what the design would tell.
-
-    Args:
-        report: the design.
-        written: name of the file that it is in; empty where it was not written.
-        verbose: add the other brakes that it was simulated on, and all local optima.
-    """
+    """Value of the criterion, the limits on the design's own brake, and what the design would tell."""
     d, own = report.metadata(), report.checks[0]
     nuisances = [name for name in d["params"] if name not in d["of"]]
     brake = f"{d['model']}, {d['kind']} information, {'returns home' if d['returns'] else 'ends anywhere'}"

@@ -188,12 +188,7 @@ def motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) -> 
 
 
 def residuals(run: Run, errors: Floats) -> Panel:
-    """Measured less predicted over time, in standard deviations.
-
-    Args:
-        run: its bench gives the sample time.
-        errors: NaN where lost, shape (n, 2).
-    """
+    """Measured less predicted over time, in standard deviations."""
     time, measured = 1e3 * run.bench.timing.sample_time * np.arange(1, len(errors) + 1), _measured(errors)
 
     def draw(axes: Any) -> None:

@@ -38,12 +38,7 @@ def acceptance_table(acceptance: Acceptance | None) -> Table | None:
 
 
 def parameters(study: Study, *, brief: bool = False) -> Table:
-    """Values with total and repeatability, and whether each is identified.
-
-    Args:
-        study: the study.
-        brief: leave out the distance from the nominal value, and what was simulated.
-    """
+    """Values with total and repeatability, and whether each is identified."""
     e = study.estimate
     header = ["" if brief else "parameter", "value ± total", "total", "repeatability", "identified"]
     header += [] if brief else ["from nominal"]

@@ -41,11 +41,7 @@ class Trend:
 
 
 def trends(runs: Sequence[Run]) -> list[Trend]:
-    """Trends of the parameters of interest.
-
-    Args:
-        runs: in the order in which they are shown, each with its own study.
-    """
+    """Trends of the parameters of interest."""
     studies = [run.alone for run in runs if run.alone is not None]
     return [_trend(studies, c.label) for c in studies[0].conclusions if c.of_interest]
 
