@@ -35,7 +35,7 @@ class Trend:
     less: str  # Reference of the distances, the median of the usable runs; empty for a parameter that is not relative
     unit: str  # Of the distances: ppm or % of the reference, or the parameter's own
     values: NDArray[np.float64]  # Distances, shape (r,)
-    ends: NDArray[np.float64]  # 95 % intervals, infinite where open, shape (r, 2)
+    ends: NDArray[np.float64]  # 95 % intervals without errors that the runs share, shape (r, 2)
     usable: NDArray[np.bool_]  # True where the model holds and the run identifies the parameter, shape (r,)
     agreement: Constancy | None  # Test whether the usable runs measured one number; None for fewer than two
 
@@ -49,8 +49,8 @@ def trends(runs: Sequence[Run]) -> list[Trend]:
 def _trend(studies: Sequence[Study], label: str) -> Trend:
     found = [_conclusion(study, label) for study in studies]
     usable = np.array([c.identified and study.holds for c, study in zip(found, studies, strict=True)])
-    values, ends = np.array([c.value for c in found]), np.array([c.interval for c in found])
-    half = 0.5 * (ends[:, 1] - ends[:, 0])
+    values, half = np.array([c.value for c in found]), np.array([_half(study, label) for study in studies])
+    ends = np.stack([values - half, values + half], axis=1)
     reference = 0.0 if label in UNITS else float(np.median(values[usable] if usable.any() else values))
     factor, unit = 1.0, found[0].unit
     if reference != 0.0:
@@ -62,6 +62,13 @@ def _trend(studies: Sequence[Study], label: str) -> Trend:
     agreement = constancy(values[counted].tolist(), (half[counted] / NORMAL_95).tolist()) if several else None
     less = f"{label} minus {plain(reference, 6)} {found[0].unit}" if reference else ""
     return Trend(label, less, unit, factor * (values - reference), factor * (ends - reference), usable, agreement)
+
+
+def _half(study: Study, label: str) -> float:
+    """Half of the 95 % interval without the errors that all runs share, in the unit that is shown."""
+    e = study.estimate
+    i = e.labels.index(label)
+    return NORMAL_95 * float(e.between_runs()[i] * e.scale[i]) * e.shown[i].factor
 
 
 def _conclusion(study: Study, label: str) -> Conclusion:
@@ -115,8 +122,8 @@ def table(runs: Sequence[Run], found: Sequence[Trend]) -> Table:
             row.append(shown if trend.usable[at] or not run.alone.holds else Cell(f"{shown} (not identified)", "care"))
         rows.append(row)
         at += 1
-    less = [trend.less for trend in found if trend.less]
-    title = "; ".join(["Each run evaluated alone; parameters ± 95 %", ", ".join(less)]).removesuffix("; ")
+    less = ", ".join(trend.less for trend in found if trend.less)
+    title = f"Each run evaluated alone; ± 95 % without errors that the runs share; {less}".removesuffix("; ")
     header = ["run", "recorded [UTC]", "ended", "lost", "fits", *(f"{trend.label} [{trend.unit}]" for trend in found)]
     return Table(title, header, rows, words=(0, 1, 2, 4))
 
