@@ -34,7 +34,16 @@ T = TypeVar("T")
 CRITERIA = ("D", "A", "E", "weighted")
 FORMS = ("blind", "quadratic")
 REFERENCE, BENCH, METRICS = "reference.json", "bench.toml", "metrics.jsonl"  # Files of a folder of results
-EPILOG = "exit codes: 0 done, 1 training diverged, 2 usage, 5 an ONNX file is refused, 130 interrupted (Ctrl-C)"
+EPILOG = """\
+examples:
+  emb-train reference four-d --out mine && emb-export mine/reference.json --out mine/actor.onnx
+  emb-train ppo single-viscous --out run && emb-export run
+  emb-train evaluate mine/actor.onnx four-d-exact-blind --plant exact --optimum 0
+
+Ctrl-C ends a command and keeps the best so far.
+
+exit codes: 0 done, 1 training diverged, 2 usage, 5 an ONNX file is refused, 130 interrupted (Ctrl-C)
+"""
 REFERENCE_EPILOG = """\
 tasks:
 {tasks}
@@ -73,7 +82,10 @@ class _Parser(argparse.ArgumentParser):
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = _Parser(
-        prog="emb-train", description="Learn an excitation for brakes whose parameters are unknown.", epilog=EPILOG
+        prog="emb-train",
+        description="Learn an excitation for brakes whose parameters are unknown.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("--version", action="version", version=f"%(prog)s {version('emb-excite')}")
     commands = p.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -280,6 +292,7 @@ def reference(arguments: argparse.Namespace) -> int:
 
         def note(step: Progress) -> None:
             metrics.write(as_json(step._asdict()) + "\n")
+            metrics.flush()
             advance(f"score {step.score:.6g}, left {step.left}, home {step.home} of {2 * BATCH}")
 
         scale = scale_of(bench, arguments.gain)
