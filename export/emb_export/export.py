@@ -15,7 +15,7 @@ from emb_bench.output import replacing
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.policy.policy import load_policy
 from emb_runtime.safety.shield_design import make_law
-from emb_runtime.system.terminal import complain, show
+from emb_runtime.system.terminal import Parser, complain, show
 from emb_train.presets import reference_names, wrapped
 
 EPILOG = """\
@@ -32,7 +32,7 @@ exit codes: 0 done, 2 usage, 5 the exported file does not compute what it was ma
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    p = argparse.ArgumentParser(
+    p = Parser(
         prog="emb-export",
         description="Write a policy for emb-run as one ONNX file with its contract, and prove that it computes what it "
         "was made of: a reference that follows the running estimate, a sequence of currents, an optimal design, or the "

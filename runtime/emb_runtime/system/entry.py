@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from emb_runtime.errors import EXIT_INTERRUPTED
+from emb_runtime.errors import EXIT_INTERRUPTED, UsageError
 
 
 def start(
@@ -101,11 +101,15 @@ def emb_gateway() -> int:
 
 def emb_run() -> int:
     """``emb-run``: until it opens anything, Ctrl-C just ends it."""
-    from emb_runtime.errors import UsageError
-    from emb_runtime.system import compiled_core
-    from emb_runtime.system.terminal import complain
-
     try:
-        return start("emb_runtime.cli.main", "", prepare=compiled_core.choose, takes_signals=True)
+        return start("emb_runtime.cli.main", "", prepare=_choose_core, takes_signals=True)
     except UsageError as err:
+        from emb_runtime.system.terminal import complain
+
         return complain("emb-run", err)
+
+
+def _choose_core() -> None:
+    from emb_runtime.system import compiled_core  # an import, too
+
+    compiled_core.choose()
