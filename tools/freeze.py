@@ -64,6 +64,7 @@ RENAMED_FROZEN = {"told": "identified"}
 """Frozen keys and their new names, where other frozen documents have the new name already."""
 SUMMARY = "a campaign's JSON has the field names of its records as keys; the file of rows has log det of each"
 VERDICT = "a sentence: the text has it, not the JSON"
+RUN_THAT_HELPS = "36552f31: a run that would help stands once, in advice"
 GONE: dict[str, str] = {
     "campaign/all/says/log_det*": SUMMARY,
     "campaign/all/says/weighted_log_det*": SUMMARY,
@@ -73,6 +74,12 @@ GONE: dict[str, str] = {
     "fim/*/verdict": VERDICT,
     "report/*/verdict": VERDICT,
     "fim/*/normalise_by": "the parameters of an information are always relative to theta",
+    "report/*/says/runs/*/information*": "36552f31: the page has no information over time; fim has it",
+    "estimate/*/bootstrap*": "36552f31: no bootstrap over runs; each record is predicted from the others",
+    "*/conclusions/*/help": RUN_THAT_HELPS,
+    "*/conclusions/*/run": RUN_THAT_HELPS,
+    "*/conclusions/*/deviation_after": RUN_THAT_HELPS,
+    "campaign/all/says/campaigns*": "the rows have the folder of each run",
     "info/*/says/metadata/emb.run/first_*": "14a0cd8: the first move has one limit, so that no log says which",
 }
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, each with the commit that says why."""
@@ -84,6 +91,7 @@ WINDOWS = "8dba46e: windows begin at a state whose squares fell"
 TOTAL = "the total allows for inertia and the scale of the angle, and its parts add in quadrature; no value changes"
 GATEWAY = "emb-gateway: a mapped drive is armed before the run: noise of other samples, no counts of its node"
 EXPLAINED: dict[str, str] = {
+    "estimate/*/warnings": "36552f31: a run that was stopped is in 'stopped', not among the warnings",
     "runs/stiff/says/*": REST,
     "runs/*/says/estimate/*": ESTIMATE,
     "runs/not finite/says/log_messages": ESTIMATE,

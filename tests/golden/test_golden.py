@@ -27,9 +27,9 @@ Say = Callable[..., str]
 PAGES = Path(__file__).parent
 NUMBER = re.compile(r"(?<![\w.])[+−-]?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 UNIQUE = re.compile(
-    r"\b(?:[0-9a-f]{40,64}|[0-9a-f]{16})\b|\d{4}-\d\d-\d\d \d\d:\d\d(:\d\d)?(?: UTC)?|emb-excite [\d.]+"
+    r"\b(?:[0-9a-f]{40,64}|[0-9a-f]{16}|[0-9A-F]{10})\b|\d{4}-\d\d-\d\d \d\d:\d\d(:\d\d)?(?: UTC)?|emb-excite [\d.]+"
 )
-"""Hashes, dates and the version."""
+"""Hashes, numbers of reports, dates and the version."""
 RELATIVE, ABSOLUTE = 0.02, 1e-9
 SHORT = {"fim": 14, "estimate-good": 16, "estimate-aborted": 16, "info": 14, "timing": 14, "campaign": 24, "design": 14}
 """Pages without ``-v``: as wide as a terminal, and at most so many lines."""
