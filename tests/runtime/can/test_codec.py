@@ -15,8 +15,10 @@ import cantools.database
 import pytest
 from cantools.database.can import Database
 
+from emb_runtime.can import codec as codec_module
 from emb_runtime.can.codec import Fault, FrameRejectedError, Message, generate, parse, worst_bits
 from emb_runtime.can.generated import Codec, Field, generate_codec
+from emb_runtime.can.messages import load_layout
 from emb_runtime.errors import FrameError
 from emb_runtime.records import Frame
 from tests.independent import DATABASE, with_crc
@@ -285,6 +287,18 @@ def test_reading_a_dbc_does_not_import_python_can_and_leaves_cantools_whole() ->
     assert int(done.stdout) == len(DATABASE.messages)
 
 
+def test_cantools_without_its_package_is_there_for_an_import_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = sys.modules["cantools"]
+    with codec_module._database_only():
+        assert sys.modules["cantools"] is there
+    assert sys.modules["cantools"] is there
+    monkeypatch.delitem(sys.modules, "cantools")
+    with codec_module._database_only():
+        assert sys.modules["cantools"] is not there
+        assert list(sys.modules["cantools"].__path__) == list(there.__path__)
+    assert "cantools" not in sys.modules
+
+
 @pytest.mark.parametrize("value", [math.nan, 0.1, 3.5, 14.5, 15])
 def test_a_whole_signal_takes_whole_numbers_of_its_range_only(value: float) -> None:
     ours = codec(text_of([PLAIN], 8), [PLAIN])
@@ -317,3 +331,11 @@ def test_whatever_a_dbc_has_wrong_it_is_refused_as_not_readable(right: str, wron
     assert right in text
     with pytest.raises(FrameError, match="DBC: not readable"):
         parse(text.replace(right, wrong))
+
+
+@pytest.mark.parametrize("name", ["EMB_Command", "EMB_Angle", "EMB_Velocity", "EMB_Status"])
+def test_every_bit_that_no_signal_covers_is_reserved_and_no_other(name: str) -> None:
+    source = DATABASE.get_message_by_name(name)
+    covered = {bit for signal in source.signals for bit in range(signal.start, signal.start + signal.length)}
+    message = load_layout().messages[name]
+    assert message.reserved == sum(1 << bit for bit in range(8 * source.length) if bit not in covered)
