@@ -34,7 +34,8 @@ __all__ = [
 ]
 
 CHARGE: Final = "EMB_Charge"  # Name of the message that a node need not send
-CHARGE_VERSION: Final = 1  # Version of the charge message
+GATEWAY: Final = "EMB_Gateway"  # Name of a message that the layouts of logs before it do not have
+OPTIONAL_VERSION: Final = 1  # Version of each of the two
 
 
 class StopReason(IntEnum):
@@ -80,8 +81,19 @@ class ChargeFrame(NamedTuple):
     """Content of the charge message."""
 
     counter: int  # Alive counter of the sample, 0..14
-    version: int  # :data:`CHARGE_VERSION`
+    version: int  # :data:`OPTIONAL_VERSION`
     charge: float  # Integral of the current up to the sample, wrapped [A·s]
+
+
+class GatewayFrame(NamedTuple):
+    """Content of the gateway's message: counts since it started, saturated."""
+
+    counter: int  # Alive counter, 0..14
+    version: int  # :data:`OPTIONAL_VERSION`
+    not_sent: int  # Commands for which the drive's bus had no room
+    braked: int  # Periods without an answer in time, while a run was active
+    not_believed: int  # Frames of the drive that were refused
+    refused: int  # Frames to the drive that the second guard refused
 
 
 _FIELDS: Mapping[str, tuple[type[Any], tuple[Field, ...]]] = {
@@ -114,7 +126,18 @@ _FIELDS: Mapping[str, tuple[type[Any], tuple[Field, ...]]] = {
             Field("BenchIdentity"),
         ),
     ),
-    CHARGE: (ChargeFrame, (Field("Counter"), Field("Version", fixed=CHARGE_VERSION), Field("Charge", wraps=True))),
+    CHARGE: (ChargeFrame, (Field("Counter"), Field("Version", fixed=OPTIONAL_VERSION), Field("Charge", wraps=True))),
+    GATEWAY: (
+        GatewayFrame,
+        (
+            Field("Counter"),
+            Field("Version", fixed=OPTIONAL_VERSION),
+            Field("NotSent", saturates=True),
+            Field("Braked", saturates=True),
+            Field("NotBelieved", saturates=True),
+            Field("Refused", saturates=True),
+        ),
+    ),
 }
 """Record of each message, and the signal of each of its fields; a DBC that has others is not ours."""
 
@@ -135,12 +158,14 @@ class Layout:
     velocity: Message
     status: Message
     charge: Message  # A node may send it
+    gateway: Message | None  # A gateway sends it; None in a log of before
     device_time_period_ns: int  # Period after which the device time wraps [ns]
     encode_command_fields: Callable[[int, int, float, bool], Frame]
     encode_angle: Callable[[int, float, int], Frame]
     encode_velocity: Callable[[int, float, float, NodeState, int], Frame]
     encode_status: Callable[[int, NodeState, StopReason, int, int], Frame]  # The version is the layout's
     encode_charge: Callable[[int, float], Frame]
+    encode_gateway: Callable[[int, int, int, int, int], Frame]
     decode_command: Callable[[Frame], CurrentCommand]
     decode_angle: Callable[[Frame], AngleFrame]
     decode_velocity: Callable[[Frame], VelocityFrame]
@@ -152,8 +177,9 @@ class Layout:
 
     @property
     def known(self) -> tuple[Message, ...]:
-        """All messages, the optional one included."""
-        return *self.messages.values(), self.charge
+        """All messages, those included that need not be sent."""
+        required = (*self.messages.values(), self.charge)
+        return required if self.gateway is None else (*required, self.gateway)
 
     @property
     def descriptions(self) -> list[dict[str, Any]]:
@@ -196,7 +222,9 @@ def _shipped_layout() -> Layout:
 
 def _generate(text: str) -> Layout:
     database = parse(text)
-    messages = {name: generate(database, name, {field.signal for field in _FIELDS[name][1]}) for name in _FIELDS}
+    there = {message.name for message in database.messages}
+    names = [name for name in _FIELDS if name != GATEWAY or name in there]
+    messages = {name: generate(database, name, {field.signal for field in _FIELDS[name][1]}) for name in names}
     time = messages["EMB_Angle"].signal("DeviceTime")
     step_ns = round(time.factor * 1e9)
     if step_ns < 1 or not math.isclose(step_ns * 1e-9, time.factor, rel_tol=1e-9):
@@ -209,8 +237,8 @@ def _generate(text: str) -> Layout:
         raise FrameError("DBC: expected the attribute EmbProtocolVersion; this file is not a layout of this bench")
     version = int(attributes["EmbProtocolVersion"].value)
     codecs = {name: generate_codec(message, *_fields(name, version)) for name, message in messages.items()}
-    command, angle, velocity, status, charge = codecs.values()
-    optional = messages.pop(CHARGE)
+    command, angle, velocity, status, charge = list(codecs.values())[:5]
+    optional, gateway = messages.pop(CHARGE), messages.pop(GATEWAY, None)
     return Layout(
         text=text,
         protocol_version=version,
@@ -220,12 +248,14 @@ def _generate(text: str) -> Layout:
         velocity=messages["EMB_Velocity"],
         status=messages["EMB_Status"],
         charge=optional,
+        gateway=gateway,
         device_time_period_ns=step_ns * (time.mask + 1),
         encode_command_fields=command.encode,
         encode_angle=angle.encode,
         encode_velocity=velocity.encode,
         encode_status=status.encode,
         encode_charge=charge.encode,
+        encode_gateway=codecs[GATEWAY].encode if gateway else _no_gateway,
         decode_command=command.decode,
         decode_angle=angle.decode,
         decode_velocity=velocity.decode,
@@ -236,6 +266,10 @@ def _generate(text: str) -> Layout:
 def _fields(name: str, version: int) -> tuple[type[Any], tuple[Field, ...]]:
     record, fields = _FIELDS[name]
     return record, tuple(replace(f, fixed=version) if f.signal == "ProtocolVersion" else f for f in fields)
+
+
+def _no_gateway(*_: object) -> Frame:
+    raise FrameError(f"DBC: no message {GATEWAY}: expected a layout that has it")
 
 
 def _check_choices(message: Message, name: str, enum: type[IntEnum]) -> None:

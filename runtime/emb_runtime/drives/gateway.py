@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from collections.abc import Mapping as Dictionary
 
+from emb_runtime.can.e2e import COUNTER_MODULUS
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import TransmitQueueFullError, Transport
@@ -47,6 +48,7 @@ class Gateway:
         answers = {(info.extended, info.identifier) for info in sensors}
         self._commands = {(command.extended, command.identifier)} - answers  # a drive may answer under the same one
         self._is_commanded = False  # by another node
+        self._layout, self._counter = load_layout(), 0
 
     def run(self, stop_requested: Callable[[], bool], ready: Callable[[], None], *, arms: bool) -> None:
         """Arm the drive, serve, and let the drive go.
@@ -150,7 +152,18 @@ class Gateway:
                 self._is_commanded = True
             for ours in self.node.take_drive(frame, self._clock.now_ns()):
                 self._pass_on(ours)
+                if ours.identifier == self._layout.status.identifier:
+                    self._pass_on(self._counts())
         self.node.tick(self._clock.now_ns())
+
+    def _counts(self) -> Frame:
+        """The counts for the host's log; they go with each status."""
+        counts, node = self.node.counts, self.node
+        self._counter = (self._counter + 1) % COUNTER_MODULUS
+        not_believed = sum(node.rejected.values())
+        return self._layout.encode_gateway(
+            self._counter, counts.not_sent, counts.braked, not_believed, node.guard.rejected
+        )
 
     def _received(self) -> Frame | None:
         try:

@@ -57,6 +57,8 @@ GOLDEN = {
     ),
     # 0x15: version 1, counter 5. −0.25 A·s / 0.2 µA·s = −1250000, in 40 bits 2^40 − 1250000 = 0xFFFFECED30.
     "EMB_Charge": (0x0FF, "eb 15 30edecffff", LAYOUT.encode_charge(5, -0.25)),
+    # 0x16: version 1, counter 6. 258 = 0x0102 not sent, 772 = 0x0304 braked, 0xABC not believed, above it 0xD refused.
+    "EMB_Gateway": (0x103, "db 16 0201 0403 bcda", LAYOUT.encode_gateway(6, 258, 772, 0xABC, 0xD)),
 }
 
 
@@ -351,7 +353,7 @@ def test_a_decoded_value_out_of_range_is_rejected_for_it() -> None:
 
 def test_the_description_says_what_the_dbc_says() -> None:
     assert list(LAYOUT.messages) == ["EMB_Command", "EMB_Angle", "EMB_Velocity", "EMB_Status"]
-    assert [m.name for m in LAYOUT.known] == [*LAYOUT.messages, "EMB_Charge"]
+    assert [m.name for m in LAYOUT.known] == [*LAYOUT.messages, "EMB_Charge", "EMB_Gateway"]
     for message in MESSAGES:
         theirs = DATABASE.get_message_by_name(message.name)
         assert (message.identifier, message.length) == (theirs.frame_id, theirs.length)
@@ -370,6 +372,21 @@ def test_the_charge_is_rounded_to_its_step_and_wraps() -> None:
         assert theirs["Charge"] == round(charge / 2e-7) % 2**40
         assert (theirs["Counter"], theirs["Version"]) == (9, 1)
         assert LAYOUT.charge.decode(frame) == DATABASE.decode_message("EMB_Charge", frame.data)
+
+
+def test_the_gateway_s_counts_stay_at_their_greatest() -> None:
+    frame = LAYOUT.encode_gateway(14, 65536, 10**6, 4096, 16)
+    theirs = DATABASE.decode_message("EMB_Gateway", frame.data)
+    assert [theirs[name] for name in ("NotSent", "Braked", "NotBelieved", "Refused")] == [65535, 65535, 4095, 15]
+
+
+def test_a_layout_of_before_the_gateway_is_read_as_ever() -> None:
+    older = "\n\n".join(part for part in LAYOUT.text.split("\n\n") if not part.startswith("BO_ 259"))
+    layout = load_layout("\n".join(line for line in older.split("\n") if " 259 " not in line.partition("[")[0]))
+    assert layout.gateway is None
+    assert layout.known == (*LAYOUT.messages.values(), LAYOUT.charge)
+    with pytest.raises(FrameError, match="no message EMB_Gateway: expected a layout that has it"):
+        layout.encode_gateway(0, 0, 0, 0, 0)
 
 
 def test_the_command_wins_every_arbitration() -> None:
@@ -393,7 +410,7 @@ def test_the_dbc_may_place_the_signals_elsewhere() -> None:
 def test_the_layout_reads_back_from_its_own_text_and_each_message_from_its_description() -> None:
     assert tuple(map(from_description, json.loads(json.dumps(LAYOUT.descriptions)))) == LAYOUT.known
     again = load_layout(LAYOUT.text)
-    assert (again.messages, again.charge, again.text) == (LAYOUT.messages, LAYOUT.charge, LAYOUT.text)
+    assert (again.known, again.text) == (LAYOUT.known, LAYOUT.text)
     assert again.encode_command(COMMAND) == GOLDEN["EMB_Command"][2]
 
 

@@ -256,6 +256,18 @@ def test_the_operator_s_end_lets_the_drive_go_and_is_no_error(played: Played) ->
     assert (played.node.phase, played.state, played.asked_states[-1]) == (Phase.OFF, IDLE, IDLE)
 
 
+def test_the_counts_go_to_the_host_with_each_status(played: Played) -> None:
+    played.node.counts.not_sent, played.node.counts.braked, played.node.guard.rejected = 3, 70_000, 2
+    assert run(played, 400) == ["ready"]
+    assert LAYOUT.gateway is not None
+    told = [LAYOUT.gateway.decode(f) for f in played.host.sent if f.identifier == LAYOUT.gateway.identifier]
+    statuses = [f for f in played.host.sent if f.identifier == LAYOUT.status.identifier]
+    assert len(told) == len(statuses) >= 3
+    assert [values["Counter"] for values in told] == [(n + 1) % 15 for n in range(len(told))]
+    counts = {"NotSent": 3, "Braked": 65535, "NotBelieved": 0, "Refused": 2}
+    assert told[0].items() >= {"Version": 1, **counts}.items()
+
+
 def test_listening_sends_nothing(played: Played) -> None:
     assert run(played, 50, arms=False) == ["ready"]
     assert played.drive.sent == []
