@@ -6,9 +6,6 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from emb_bench.logs.log import RunLog
 from emb_runtime.errors import LogError
 from emb_runtime.estimator.estimate import LOST, Quantity, by_name
@@ -59,23 +56,8 @@ def learnt_by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
     return {step: tuple(numbers) for step, *numbers in log.rows(LEARNT.name, _STEP, *_LEARNT)}
 
 
-def learnt_history(log: RunLog) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Steps, shape [n], and the numbers at each, shape [n, 13]; nothing if nothing was learnt."""
-    found = learnt_by_step(log)
-    return np.array([*found], np.int64), np.array([*found.values()]).reshape(len(found), len(_LEARNT))
-
-
-def learnt_ranges(numbers: NDArray[np.float64]) -> dict[str, list[float]]:
-    """The last set, by parameter: its least and greatest value, relative to the nominal brake; empty if there is none.
-
-    Args:
-        numbers: of a :func:`learnt_history`.
-    """
+def last_learnt(log: RunLog) -> dict[str, list[float]]:
+    """The last learnt set, by parameter: its least and greatest value, relative to nominal; empty if there is none."""
     names = [name.removesuffix("_low") for name in _LEARNT[:8:2]]
-    return {name: last[2 * i : 2 * i + 2] for last in numbers[-1:].tolist() for i, name in enumerate(names)}
-
-
-def last_learnt(log: RunLog) -> dict[str, Any]:
-    """The :func:`learnt_ranges` of a log."""
     last = deque(log.rows(LEARNT.name, *_LEARNT), maxlen=1)
-    return learnt_ranges(np.array(last).reshape(-1, len(_LEARNT)))
+    return {name: [*numbers[2 * i : 2 * i + 2]] for numbers in last for i, name in enumerate(names)}
