@@ -51,7 +51,6 @@ ERRORS: Mapping[str, tuple[float, float, float]] = {
     "break_away": (1.003, 1.02, 1.1),  # Static over Coulomb friction, with Stribeck's decay
     "hysteresis": (3e-4, 2e-3, 1e-2),
     "current_lag": (1e-5, 5e-5, 3e-4),  # [s]
-    "coulomb_asymmetry": (1e-3, 1e-2, 5e-2),
     "f_l": (1e-9, 1e-8, 1e-7),  # [m]
 }
 """Errors of the model in three sizes each; keys of ``[plants]`` in a bench file."""
@@ -240,8 +239,8 @@ def main() -> None:
         for seed in range(args.first, args.first + args.logs):
             right, theta, log = drawn(seed, Path(folder))
             outcomes += [judged(program, Fit(log), right, theta) for program in args.programs]
-    if args.results:
-        args.results.write_text("".join(json.dumps(o) + "\n" for o in outcomes))
+            if args.results:
+                args.results.write_text("".join(json.dumps(o) + "\n" for o in outcomes))
     for kind in sorted({(o.program, not o.right_model) for o in outcomes}):
         report([o for o in outcomes if (o.program, not o.right_model) == kind])
 
