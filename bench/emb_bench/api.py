@@ -16,6 +16,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -47,10 +48,45 @@ __all__ = [
     *("simulate", "topic"),
 ]
 
-Run = RunLog
 Source = RunLog | str | Path
 Names = str | Sequence[str]
 PAGES = (".html", ".htm")  # Endings of a report's page
+CYCLE = "/cycle"
+
+
+class Run(RunLog):
+    """An opened log, with what a notebook shows of it."""
+
+    def __getitem__(self, topic: str) -> Mapping[str, Any]:
+        """Columns of a topic as arrays, by name."""
+        return self.tables[topic]
+
+    def to_dataframe(self, name: str = CYCLE) -> Any:
+        """One topic as a pandas frame, see :func:`topic`.
+
+        Raises:
+            UsageError: the run has no such topic, or pyarrow or pandas is missing.
+            LogError: the topic cannot be decoded.
+        """
+        try:
+            return topic(self, name).to_pandas()
+        except ImportError as err:
+            raise UsageError("a frame needs pandas: pip install pandas") from err
+
+    def plot(self) -> Any:
+        """A figure of matplotlib, see :func:`draw`.
+
+        Raises:
+            UsageError: matplotlib is missing.
+            LogError: the run has no control cycles.
+        """
+        try:
+            from matplotlib import pyplot as plt
+        except ImportError as err:
+            raise UsageError("a plot needs matplotlib: pip install 'emb-excite[bench]'") from err
+        figure, axes = plt.subplots(5, sharex=True, figsize=(8.0, 9.5), layout="constrained")
+        draw(self, axes)
+        return figure
 
 
 def simulate(
@@ -107,7 +143,8 @@ def open_run(log: str | Path) -> Run:
         UsageError: the file cannot be read.
         LogError: it is not a log, or too damaged.
     """
-    return read_log(log)
+    opened = read_log(log)
+    return Run(**{field.name: getattr(opened, field.name) for field in fields(RunLog)})
 
 
 def topic(run: Source, name: str) -> Table:
@@ -463,11 +500,11 @@ def _say(text: str) -> None:
         mention(f"{text} ...")
 
 
-def _opened(run: Source) -> Run:
+def _opened(run: Source) -> RunLog:
     return run if isinstance(run, RunLog) else read_log(run)
 
 
-def _driven(run: Source) -> Run:
+def _driven(run: Source) -> RunLog:
     log = _opened(run)
     require_driven(log)
     return log

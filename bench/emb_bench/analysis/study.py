@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from html import escape
@@ -138,19 +138,58 @@ class Study:
 
     def __getitem__(self, label: str) -> Conclusion:
         """Conclusion on a parameter, by its label."""
-        return {c.label: c for c in self.conclusions}[label]
+        return self._by_label[label]
+
+    def __contains__(self, label: object) -> bool:
+        return label in self._by_label
+
+    def __iter__(self) -> Iterator[Conclusion]:
+        return iter(self.conclusions)
+
+    def __len__(self) -> int:
+        return len(self.conclusions)
+
+    @property
+    def _by_label(self) -> dict[str, Conclusion]:
+        return {c.label: c for c in self.conclusions}
+
+    def to_dict(self) -> dict[str, dict[str, Any]]:
+        """Value, ends of the 95 % interval, unit and repeatability of each parameter, by its label."""
+        return {
+            c.label: {"value": c.value, "low": c.interval[0], "high": c.interval[1], "unit": c.unit,
+                      "repeatability": c.repeatability, "identified": c.identified}
+            for c in self.conclusions
+        }  # fmt: skip
+
+    def plot(self) -> Any:
+        """A figure of matplotlib: total interval and repeatability of each parameter, relative to its value.
+
+        Raises:
+            UsageError: matplotlib is missing.
+        """
+        try:
+            from matplotlib import pyplot as plt
+        except ImportError as err:
+            raise UsageError("a plot needs matplotlib: pip install 'emb-excite[bench]'") from err
+        figure, axes = plt.subplots(figsize=(7.0, 1.0 + 0.5 * len(self)), layout="constrained")
+        for row, c in enumerate(self):
+            low, high = (100.0 * (end / c.value - 1.0) for end in c.interval)
+            half = 100.0 * c.repeatability / abs(c.value)
+            axes.plot([low, high], [row, row], color="tab:blue", label="total, 95 %" if row == 0 else None)
+            axes.plot([-half, half], [row, row], color="tab:orange", linewidth=5, label="" if row else "repeatability")
+        axes.set_yticks(range(len(self)), [f"{c.label} = {amount(c.value, c.interval, c.unit)}" for c in self])
+        axes.invert_yaxis()
+        axes.set_xlabel("difference from the estimate [%]")
+        axes.legend()
+        return figure
 
     def to_dataframe(self) -> Any:
-        """A pandas frame with a row for each parameter; ends of intervals and repeatability in the unit of the value.
+        """A pandas frame with a row for each parameter, the columns those of :meth:`to_dict`.
 
         Raises:
             UsageError: pyarrow or pandas is missing.
         """
-        rows = [
-            {"name": c.label, "value": c.value, "low": c.interval[0], "high": c.interval[1], "unit": c.unit,
-             "repeatability": c.repeatability, "identified": c.identified}
-            for c in self.conclusions
-        ]  # fmt: skip
+        rows = [{"name": label, **row} for label, row in self.to_dict().items()]
         try:
             import pyarrow as pa
 

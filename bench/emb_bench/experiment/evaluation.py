@@ -274,6 +274,10 @@ class Evaluation:
         bounds = ", ".join(f"{name} {bound:.3g}" for name, bound in self.fisher("physical").cramer_rao().items())
         return f"<Evaluation of {self.log.path.name}: model '{self.plant.name}'; least deviations {bounds}>"
 
+    def __getitem__(self, name: str) -> float:
+        """Smallest possible standard deviation of a parameter, relative or in its unit (Cramér-Rao)."""
+        return self.fisher("physical").cramer_rao()[name]
+
     def fisher(self, kind: Kind) -> Fisher:
         """The Fisher information of the whole experiment."""
         asked = self.question

@@ -13,6 +13,7 @@ from emb_bench.experiment.theta import read_theta
 from emb_bench.logs.log import RunLog
 from emb_bench.output import new_file
 from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.errors import UsageError
 
 STEPS = 10  # Of the simulation, per sample time
 
@@ -71,9 +72,11 @@ def write_mjcf(log: RunLog, theta: str, path: Path) -> str:
         A description of the file's content.
 
     Raises:
-        UsageError: the parameters cannot be read, or the file exists or cannot be written.
-        LogError: the log has no bench.
+        UsageError: the log is of a machine that is no brake, the parameters cannot be read, or the file exists or
+            cannot be written.
     """
+    if log.bench.machine is not None:
+        raise UsageError(f"{log.path}: expected the log of a brake, got a recording of another machine")
     name, brake, _ = read_theta(theta, log, log.bench)
     text = mjcf(log.bench, brake)
     with new_file(path) as file:

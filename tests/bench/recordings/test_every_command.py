@@ -27,6 +27,7 @@ WORKS: dict[str, tuple[str, ...]] = {
 LACKS: dict[str, tuple[tuple[str, ...], str]] = {
     "timing": (("timing", "RUN"), "no loop whose timing"),
     "rerun": (("rerun", "RUN"), "no loop to run again"),
+    "export --to mjcf": (("export", "RUN", "--to", "mjcf", "-o", "OUT.xml"), "the log of a brake"),
     "estimate --method rls": (("estimate", "RUN", "--method", "rls"), "another method does"),
     "estimate --model all": (("estimate", "RUN", "--model", "all"), "expected --method oem"),
     "estimate --grow": (("estimate", "RUN", "--grow"), "expected --method oem"),
