@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
-from importlib.util import find_spec
+from importlib.metadata import distribution
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -168,8 +168,7 @@ def _database_only() -> Iterator[None]:
         yield
         return
     package = ModuleType("cantools")
-    spec = find_spec("cantools")
-    package.__path__ = list((spec and spec.submodule_search_locations) or ())
+    package.__path__ = [str(distribution("cantools").locate_file("cantools"))]
     sys.modules["cantools"] = package
     try:
         yield
