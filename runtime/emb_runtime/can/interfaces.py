@@ -27,14 +27,17 @@ _MOST_COPIES = 64  # frames that are waited for; a backend that loses one gives 
 _STAMP_SLACK_NS = 50_000  # what floating-point seconds and two readings of the wall clock may be apart
 
 
-def open_transport(iface: str, bench: Bench, identifiers: tuple[int, ...] | None = None) -> tuple[Transport, Clock]:
+def open_transport(
+    iface: str, bench: Bench, identifiers: tuple[int, ...] | None = None, bitrate: int | None = None
+) -> tuple[Transport, Clock]:
     """The transport that a user names, and the clock that its time stamps and deadlines are on.
 
     Args:
         iface: ``can0`` or ``vcan0`` for SocketCAN; ``NAME`` or ``NAME:OPTIONS`` of a registered transport, ``sim``
             among them; ``BACKEND:CHANNEL`` for python-can.
-        bench: handed to registered transports; its bitrate to python-can.
+        bench: handed to registered transports.
         identifiers: the only 11-bit identifiers that a SocketCAN socket should pass on; None for all frames.
+        bitrate: for backends of python-can that set it [bit/s]; None for the bench's.
 
     Raises:
         UsageError: there is no such backend.
@@ -50,7 +53,7 @@ def open_transport(iface: str, bench: Bench, identifiers: tuple[int, ...] | None
     require_linux(iface)
     clock = MonotonicClock()
     if separator and head != "socketcan":
-        return PythonCan(head, tail, bench.can.bitrate, clock), clock
+        return PythonCan(head, tail, bitrate or bench.can.bitrate, clock), clock
     # python-can's own SocketCAN backend cannot tell our echo from a frame of another process on this host.
     return SocketCan(tail or head, clock, identifiers), clock
 

@@ -6,7 +6,6 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from textwrap import dedent
@@ -100,8 +99,7 @@ def _serve(args: argparse.Namespace) -> int:
         raise SafetyStopError("stopped by the operator before anything was sent")
     infos = mapping.messages.values()
     identifiers = None if any(info.extended for info in infos) else tuple(info.identifier for info in infos)
-    of_drive = replace(bench, can=replace(bench.can, bitrate=mapping.bitrate))
-    drive_bus, clock = open_transport(args.drive, of_drive, identifiers)
+    drive_bus, clock = open_transport(args.drive, bench, identifiers, mapping.bitrate)
     try:
         node_bus, _ = open_transport(args.node, bench, (layout.command.identifier,))
         try:

@@ -331,7 +331,7 @@ def _open_drive_bus(header: LogHeader) -> Transport | None:
     from emb_runtime.config.bench import parse_bench
 
     (bench,) = (attachment.data for attachment in header.attachments if attachment.name == "bench.toml")
-    return open_transport(header.drive_bus, parse_bench(bench.decode(), "bench.toml"))[0]
+    return open_transport(header.drive_bus, parse_bench(bench.decode(), "bench.toml"), bitrate=header.drive_bitrate)[0]
 
 
 def _time(record: Record) -> int:

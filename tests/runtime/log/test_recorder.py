@@ -20,7 +20,9 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from msgspec import to_builtins
 
+from emb_runtime.can import interfaces
 from emb_runtime.can.messages import load_layout
+from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import BusError, LogError
 from emb_runtime.log import recorder_process
 from emb_runtime.log.recorder import Recorder
@@ -110,9 +112,16 @@ def test_the_loss_of_the_drive_s_bus_costs_its_frames_and_not_the_log(
                 raise BusError("can0 is down")
             return waiting.pop()
 
-    monkeypatch.setattr(recorder_process, "_open_drive_bus", lambda _header: Bus())
+    opened: list[Any] = []
+
+    def open_transport(iface: str, _bench: object, *, bitrate: int) -> tuple[Bus, None]:
+        opened.append((iface, bitrate))
+        return Bus(), None
+
+    monkeypatch.setattr(interfaces, "open_transport", open_transport)
     path, ring = tmp_path / "run.mcap", Ring.create(16)
-    header = to_builtins(replace(HEADER, drive_bus="can0"))
+    bench = Attachment("bench.toml", "application/toml", load_bench().text.encode())
+    header = to_builtins(replace(HEADER, drive_bus="can0", drive_bitrate=250_000, attachments=(bench,)))
     recording = recorder_process.begin(ring, {"path": str(path), "parent": 0, "header": header})
     commands = iter((None, None, {"exit_reason": "BUS_LOST"}))
 
@@ -122,6 +131,7 @@ def test_the_loss_of_the_drive_s_bus_costs_its_frames_and_not_the_log(
 
     monkeypatch.setattr(recording, "_listen", listen)
     answer = recording.run()
+    assert opened == [("can0", 250_000)]
     assert (answer["error"], answer["lost"]) == ("", 0)
     topics = decode(path)
     assert (len(topics["/drive/rx"]), len(topics["/safety"])) == (1, 3)
@@ -344,7 +354,9 @@ def test_a_recorder_that_is_killed_does_not_disturb_the_run_and_is_told_at_its_e
 
 RUNTIME = """
 import os, sys, time
+from emb_runtime.can import interfaces
 from emb_runtime.can.messages import load_layout
+from emb_runtime.config.bench import load_bench
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import LogHeader
 recorder = Recorder.start(sys.argv[1], LogHeader(0, 0, True, load_layout().text, {"emb.run": {"iface": "x"}}))
