@@ -30,16 +30,6 @@ BENCH = load_bench()
 T_S = 1e-3
 
 
-@st.composite
-def brakes(draw: st.DrawFn) -> BrakeParameters:
-    box = BENCH.range_set("pm50")
-    return BrakeParameters(*(draw(st.floats(low, high)) for low, high in zip(box.low, box.high, strict=True)))
-
-
-angles = st.one_of(st.sampled_from([0.0, -0.0, -10.0, 100.0]), st.floats(-10.0, 100.0))
-velocities = st.one_of(st.sampled_from([0.0, -0.0, -500.0, 500.0]), st.floats(-500.0, 500.0))
-currents = st.floats(-6.0, 6.0)
-sensitivities = st.floats(-1e3, 1e3)
 sizes = st.floats(1e-6, 3.0)  # of matrix elements: squares and inverses are ordinary numbers
 
 
@@ -55,77 +45,41 @@ def test_compiled_criteria_are_the_plain_ones_bit_for_bit(n: int, entries: list[
 
 def batch(p: BrakeParameters, x1: Floats, x2: Floats, u: Floats, s: Floats, m: Floats, t_s: float) -> None:
     """A batch as training writes one: arrays outside, scalar functions inside."""
-    for k in range(u.shape[0]):
-        for e in range(x1.shape[0]):
+    for e in prange(x1.shape[0]):
+        for k in range(u.shape[0]):
             for i in range(s.shape[1]):
                 s[e, i, 0], s[e, i, 1] = sensitivity_step(p, x1[e], x2[e], u[k, e], t_s, s[e, i, 0], s[e, i, 1], i)
             x1[e], x2[e] = step(p, x1[e], x2[e], u[k, e], t_s)
             add_increment(m[e], s[e], 1e6, 1.0)
 
 
-def test_a_compiled_batch_is_the_plain_one_bit_for_bit_through_reversals_and_loss_of_contact() -> None:
+def test_a_compiled_batch_is_the_plain_one_bit_for_bit_on_one_core_and_on_all() -> None:
+    """Through reversals and loss of contact."""
     u = np.random.default_rng(7).uniform(-3.0, 3.0, (60, 5)).repeat(4, axis=0)
     results = []
-    for run in (batch, compiled(batch)):
+    for run in (batch, compiled(batch), compiled(batch, parallel=True)):
         x1, x2, s, m = np.zeros(5), np.zeros(5), np.zeros((5, 4, 2)), np.zeros((5, 10))
         run(BENCH.brake, x1, x2, u, s, m, T_S)
         results.append((x1, x2, s, m))
-    for plain, fast in zip(*results, strict=True):
+    for plain, fast, parallel in zip(*results, strict=True):
         np.testing.assert_array_equal(fast, plain)
+        np.testing.assert_array_equal(parallel, plain)
     assert len(set(results[0][0].tolist())) == 5
-
-
-def on_all_cores(p: BrakeParameters, x1: Floats, x2: Floats, u: Floats, t_s: float) -> None:
-    for e in prange(x1.shape[0]):
-        for k in range(u.shape[0]):
-            x1[e], x2[e] = step(p, x1[e], x2[e], u[k, e], t_s)
-
-
-def test_brakes_on_all_cores_are_the_plain_ones_bit_for_bit() -> None:
-    u = np.random.default_rng(8).uniform(-3.0, 3.0, (100, 6))
-    ends = []
-    for run in (on_all_cores, compiled(on_all_cores), compiled(on_all_cores, parallel=True)):
-        x1, x2 = np.zeros(6), np.zeros(6)
-        run(BENCH.brake, x1, x2, u, T_S)
-        ends.append((x1, x2))
-    np.testing.assert_array_equal(ends[1], ends[0])
-    np.testing.assert_array_equal(ends[2], ends[0])
-
-
-def test_a_function_is_compiled_once_and_once_more_for_all_cores() -> None:
-    assert compiled(step) is compiled(step)
-    assert compiled(step) is not compiled(step, parallel=True)
-
-
-def doubled(value: float) -> float:
-    return 2.0 * value
-
-
-def uses_its_own_module(value: float) -> float:
-    return doubled(math.sqrt(value))
-
-
-def test_callees_in_the_same_module_and_math_are_reached() -> None:
-    assert compiled(uses_its_own_module)(9.0) == 6.0
 
 
 def uses_a_module(value: float) -> float:
     return euler.sign(value)
 
 
-def test_a_call_through_one_of_our_modules_is_refused_because_it_would_stay_python() -> None:
-    with pytest.raises(TypeError, match=r"uses the module emb_bench\.brake\.euler: import the functions"):
-        compiled(uses_a_module)
-
-
-def test_a_closure_is_refused_because_it_would_be_compiled_again_for_each_object() -> None:
+def test_what_would_stay_python_or_be_compiled_again_for_each_object_is_refused() -> None:
     factor = 3.0
 
     def closure(value: float) -> float:
         return factor * sign(value)
 
-    with pytest.raises(TypeError, match="closure"):
-        compiled(closure)
+    for function, why in ((uses_a_module, r"uses the module emb_bench\.brake\.euler: import"), (closure, "closure")):
+        with pytest.raises(TypeError, match=why):
+            compiled(function)
 
 
 def test_without_numba_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

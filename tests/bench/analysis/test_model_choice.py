@@ -149,7 +149,10 @@ def test_models_that_were_tried_while_growing_and_fit_as_well_are_named_too(
 ) -> None:
     log = square_log(tmp_path, simulate, "play", 150)
     found = make_study(bench, [log], StudyOptions(EstimationProblem(), starts=2, grow=True))
-    first, *others = document(found)["not_told_apart"]
+    said = document(found)
+    assert (said["model"], said["growth"][0]["model"]) == ("exact + play", "exact")
+    json.dumps(said)
+    first, *others = said["not_told_apart"]
     assert first == "exact + play"
     assert "exact + place of contact" in others
     for c in found.conclusions[: len(PARAMETER_NAMES)]:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EVERY
 from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.logs.log import read_log
-from emb_bench.report.estimate import document
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 
@@ -44,23 +42,15 @@ def test_the_model_grows_to_the_brake_that_was_there_and_no_further(bench: Bench
     best = found.choice.best
     assert best.name == " + ".join(("exact", *found.added)) == best.estimate.plant.name
     assert best.fits
+    ratios = [one.ratio for one in found.rounds]
+    assert ratios == sorted(ratios, reverse=True)
+    assert not any(trial.accepted for trial in found.rounds[-1].trials)
+    for trial in (trial for one in found.rounds for trial in one.trials):
+        assert abs(trial.sigmas) >= 3.0
+        assert not trial.accepted or (trial.bic < 0.0 and trial.held_out >= 0.0)
     for unknown in best.estimate.unknowns[: len(PARAMETER_NAMES)]:
         low, high = found.choice.interval(unknown, 0.9999)
         assert low < getattr(bench.brake, unknown.name) < high
-
-
-def test_the_path_begins_with_the_plant_and_ends_when_nothing_is_accepted(bench: Bench) -> None:
-    found = grown(bench, "load")
-    assert found.rounds[0].model == "exact"
-    accepted = [trial.name for one in found.rounds for trial in one.trials if trial.accepted]
-    assert set(accepted) == PATHS["load"]
-    assert not any(trial.accepted for trial in found.rounds[-1].trials)
-    ratios = [one.ratio for one in found.rounds]
-    assert ratios == sorted(ratios, reverse=True)
-    for one in found.rounds:
-        for trial in one.trials:
-            assert abs(trial.sigmas) >= 3.0
-            assert not trial.accepted or (trial.bic < 0.0 and trial.held_out >= 0.0)
 
 
 def test_under_the_right_model_the_scores_are_small(bench: Bench) -> None:
@@ -102,17 +92,6 @@ def test_where_no_model_fits_it_grows_with_systematic_errors(bench: Bench) -> No
     e = grow_with_errors(bench, plant, [data], asked, starts=1, seed=0).choice.best.estimate
     assert e.validation.fits
     assert e.values[e.labels.index("velocity_gain")] == pytest.approx(0.003, rel=0.2)
-
-
-def test_a_study_has_the_path(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
-    log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave, options="plant=hysteresis")))
-    found = make_study(bench, [log], StudyOptions(EstimationProblem(), starts=2, grow=True))
-    assert found.growth is not None
-    assert found.growth.added == ("hysteresis",)
-    said = document(found)
-    assert said["growth"][0]["model"] == "exact"
-    assert said["model"] == "exact + hysteresis"
-    json.dumps(said)
 
 
 def test_what_cannot_grow_is_refused(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:

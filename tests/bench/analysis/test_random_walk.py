@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from emb_bench.analysis.several_runs import FEWEST, constancy, random_walk, smoothed
+from emb_bench.analysis.several_runs import FEWEST, random_walk, smoothed
 
 WALKS = (0.0, 0.3, 1.0, 3.0)  # Of the simulated number, in the deviation of a measurement, per root of an hour
 
@@ -28,14 +28,6 @@ def test_it_is_the_gaussian_posterior_of_all_measurements_at_once(walk: float) -
         + 0.5 * np.log(vague)
     )
     assert likelihood - expected == pytest.approx(other, abs=1e-4)
-
-
-def test_without_a_walk_it_is_the_weighted_mean() -> None:
-    values, deviations = [1.0, 1.3, 0.8, 1.1], [0.2, 0.3, 0.1, 0.2]
-    (mean,), (variance,), _ = smoothed(np.arange(4.0), np.array(values), np.array(deviations) ** 2, np.zeros(1))
-    expected = constancy(values, deviations)
-    assert mean == pytest.approx(np.full(4, expected.mean))
-    assert np.sqrt(variance) == pytest.approx(np.full(4, expected.deviation))
 
 
 @pytest.mark.parametrize("walk", WALKS)

@@ -17,7 +17,8 @@ from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import RunLog, read_log
-from emb_bench.report.estimate import document
+from emb_bench.report.estimate import document, text
+from emb_bench.report.sentences import apart
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import UsageError
 
@@ -157,3 +158,13 @@ def test_an_interval_that_holds_zero_identifies_nothing(bench: Bench) -> None:
     wide = replace(e, information=e.information / e.information * 1.7**2)
     (found,) = conclude(wide, (), ())
     assert found.why_not == "its interval contains zero"
+
+
+def test_two_brakes_in_one_call_are_said_to_fit_each_alone(bench: Bench, log: Log) -> None:
+    options = StudyOptions(EstimationProblem(), starts=2, model="exact")
+    first, other = log("plant=exact,seed=1"), log("plant=exact,seed=2,k_m=0.0225")
+    study = make_study(bench, [first, other], options)
+    assert study.apart[0].name == "k_m"
+    assert " ".join(apart(study).split()) in " ".join(text(study).split())
+    for second in ("plant=exact,seed=2", "plant=stribeck,seed=2"):  # one brake, and one that the model does not know
+        assert make_study(bench, [first, log(second)], options).apart == ()

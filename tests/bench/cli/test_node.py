@@ -66,13 +66,6 @@ def play(bench: Bench, layout: Layout, late_ns: dict[int, int], periods: int = 2
     return bus, node, skipped
 
 
-def test_a_punctual_node_samples_on_its_grid(bench: Bench, layout: Layout) -> None:
-    bus, _, skipped = play(bench, layout, {})
-    assert skipped == 0
-    assert [t // MS for t, f in bus.sent if f.identifier == 0x100] == list(range(1, 21))
-    assert node_times_ms(bus, layout) == list(range(1, 21))
-
-
 def test_a_late_node_skips_and_its_stamps_tell_the_true_time(bench: Bench, layout: Layout) -> None:
     bus, node, skipped = play(bench, layout, {5: round(3.4 * MS)})
     assert skipped == 3

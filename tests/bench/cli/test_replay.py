@@ -69,20 +69,10 @@ def test_information_over_time_grows_to_that_of_the_whole(path: Path, replay: Re
         assert series["lambda_min"][-1] == pytest.approx(got[kind]["lambda_min"], rel=1e-12)
 
 
-def test_a_subset_of_parameters_is_a_block_of_the_whole(path: Path, replay: Replay) -> None:
-    whole = np.array(replay.document("fim", path)["physical"]["matrix"])
-    part = replay.document("fim", path, "--params", "f_v, k_m")
-    assert part["params"] == ["f_v", "k_m"]
-    np.testing.assert_allclose(part["physical"]["matrix"], whole[np.ix_([3, 0], [3, 0])], rtol=1e-12)
-
-
 def test_the_model_is_the_plant_that_was_simulated_unless_another_is_asked_for(log: Log, replay: Replay) -> None:
     path = log("exact.mcap", "plant=exact")
-    own, asked = (
-        replay.document("fim", path, "--theta", "nominal"),
-        replay.document("fim", path, "--theta", "nominal", "--model", "exact"),
-    )
-    assert own == asked
+    own = replay.document("fim", path, "--theta", "nominal")
+    assert own == replay.document("fim", path, "--theta", "nominal", "--model", "exact")
     assert own["warnings"] == []
     other = replay.document("fim", path, "--theta", "nominal", "--model", "euler")
     assert (other["model"], other["fit_sigmas"]["fits"], len(other["warnings"])) == ("euler", False, 1)
@@ -96,15 +86,6 @@ def test_a_log_that_does_not_say_what_moved_is_evaluated_with_the_brake_that_sti
     truth = {name: str(value) for name, value in run.transport.truth.items() if name != "plant"}
     old = write_log(tmp_path / "old.mcap", run, metadata={"emb.run": {}, "emb.truth": truth})
     assert replay.document("fim", old)["model"] == "euler"
-
-
-def test_one_record_is_seen_with_every_brake_side_by_side(bench: Bench, log: Log, replay: Replay) -> None:
-    asked = ("fim", log("exact.mcap", "plant=exact"), "--theta", "nominal", "--params", "k_m,f_v", "--model")
-    models = replay.document(*asked, "all")["models"]
-    assert [m["model"] for m in models] == list(bench.plants)
-    for m in models[:3]:
-        assert m == replay.document(*asked, m["model"])
-    assert {m["model"]: m["fit_sigmas"]["fits"] for m in models}.items() >= {"exact": True, "euler": False}.items()
 
 
 def test_nuisances_cost_information_and_a_prior_gives_some(log: Log, replay: Replay) -> None:
@@ -208,12 +189,8 @@ def test_another_bench_file_replaces_the_noise_of_the_one_in_the_log(
     tmp_path: Path, path: Path, replay: Replay
 ) -> None:
     file = tmp_path / "bench.toml"
-    noisy = (
-        shipped_bench_text()
-        .replace("angle    = 1.0e-3", "angle    = 1.0e-2")
-        .replace("velocity = 1.0 ", "velocity = 10.0 ")
-    )
-    file.write_text(noisy)
+    text = shipped_bench_text().replace("angle    = 1.0e-3", "angle    = 1.0e-2")
+    file.write_text(text.replace("velocity = 1.0 ", "velocity = 10.0 "))
     once, ten = replay.document("fim", path), replay.document("fim", path, "--bench", file)
     np.testing.assert_allclose(np.array(ten["physical"]["matrix"]) * 100.0, once["physical"]["matrix"], rtol=1e-9)
 
@@ -225,13 +202,9 @@ def test_a_cut_log_says_first_what_is_missing_and_gives_the_rest(path: Path, rep
     assert text.startswith("WARNING")
     assert text.count("WARNING") == 2  # the file is cut, and the experiment with it
     got = replay.document("fim", path, "--theta", "true")
-    assert got["complete"] is False
-    assert got["fit_sigmas"]["fits"] is True
+    assert (got["complete"], got["fit_sigmas"]["fits"]) == (False, True)
     assert math.isfinite(got["physical"]["log_det"])
-    assert got["exit_reason"].startswith("unknown")
-    info = replay.text("info", path)
-    assert info.startswith("WARNING")
-    assert "NOT complete" in info
+    assert replay.text("info", path).startswith("WARNING")
 
 
 def test_an_experiment_that_tells_nothing_is_reported_as_that(
@@ -242,7 +215,10 @@ def test_an_experiment_that_tells_nothing_is_reported_as_that(
     assert got["physical"]["singular"] is True
     assert (got["physical"]["log_det"], got["physical"]["condition"]) == (None, None)
     assert got["physical"]["cramer_rao"] == dict.fromkeys(("k_m", "k_1", "T_c", "f_v"))
-    assert "no information" in replay.text("fim", path, "-q")
+    for prior in ((), ("--prior", "pm50")):
+        said = replay.text("fim", path, *prior)
+        assert "no information" in said
+        assert "inf" not in said.replace("information", "")
 
 
 def test_info_counts_what_the_run_counted(path: Path, run: SimRun, replay: Replay) -> None:
@@ -287,13 +263,6 @@ def test_info_tells_the_delay_from_sensor_to_command(tmp_path: Path, run: SimRun
     delays = [1e-6 * k for k in range(500)]
     expected = {f"p{q:g}": float(np.percentile(delays, q)) for q in (50, 90, 99, 99.9, 100)}
     assert got["sensor_to_command"] == pytest.approx(expected)
-
-
-def test_given_parameters_are_checked(path: Path, replay: Replay) -> None:
-    for value in ("x", "-1.0", "nan", "inf", "1.0", "true"):
-        assert "f_v" in replay.refused("fim", path, "--theta", f"f_v={value}")
-    for text in ("k_1=0", "J=1.0", "f_v="):
-        replay.refused("fim", path, "--theta", text)
 
 
 @pytest.mark.parametrize("name", ["rubber", "all", "", "\x1b[31m"])

@@ -18,7 +18,7 @@ from emb_runtime.records import CycleRecord
 from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.hostile import write_trace
 from tests.bench.logs.test_timing import MS, START, cycle, unanswered
-from tests.bench.simulated_logs import square, write_log
+from tests.bench.simulated_logs import square
 
 from tests.conftest import Simulate  # isort: skip
 
@@ -115,12 +115,6 @@ def test_without_budgets_there_is_nothing_to_judge_by(write: Write, replay: Repl
         path = write(punctual(), budgets, name=f"{name}.mcap")
         assert verdicts(replay, path, code=2) == {}
         assert "not judged" in replay.text("timing", path, "-q", code=2)
-
-
-def test_simulated_time_is_shown_and_not_judged(tmp_path: Path, simulate: Simulate, replay: Replay) -> None:
-    path = write_log(tmp_path / "run.mcap", simulate(square))
-    (log,) = replay.document("timing", path, code=2)["logs"]
-    assert (log["simulated"], log["met"], log["budgets"]) == (True, None, [])
 
 
 def test_of_several_logs_one_that_is_not_met_decides(write: Write, replay: Replay) -> None:

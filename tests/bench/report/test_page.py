@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Callable
 
@@ -15,7 +16,7 @@ from emb_bench.figures import svg
 from emb_bench.numbers import around, between, chance, percent, plain, seconds, share, share_between
 from emb_bench.report.figures import ellipse
 from emb_bench.report.page import environment
-from emb_bench.report.text import Cell, Table
+from emb_bench.report.text import Cell, Table, show
 
 from tests.bench.report_pages import Reader, read  # isort: skip
 
@@ -49,11 +50,6 @@ def test_a_table_names_its_rows_and_columns_for_who_cannot_see_it() -> None:
     reader = read(html_of(table))
     assert reader.values("scope") == ["col", "col", "row", "row"]
     assert set(reader.values("aria-label")) == {"two rows"}
-
-
-def test_a_table_is_aligned_text_too() -> None:
-    table = Table("title", ["name", "n", "what"], [["a", "1", "x"], ["bcdef", "22", "yz"]], words=(0, 2))
-    assert table.text() == ["title", "name    n  what", "a       1  x", "bcdef  22  yz", ""]
 
 
 def _number(text: str) -> float:
@@ -112,3 +108,27 @@ def test_a_figure_is_the_same_bytes_each_time_and_its_text_is_text() -> None:
     assert first == second
     assert b">time [ms]</text>" in first
     assert not re.search(rb"<script|href=\"(?!#)", first)
+
+
+TEXT = "WARNING: THE MODEL 'x' DOES NOT FIT.\n  k_m  1 ± 2 N·m/A  yes\n  f_v  3; NOT identified: [b]flat[/b]"
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_shows_verdicts_in_colour_unless_it_is_asked_not_to(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    show(TEXT)
+    assert capsys.readouterr().out == f"{TEXT}\n"
+    monkeypatch.setenv("TERM", "xterm-256color")
+    for no_color in ("", "1"):
+        out = Terminal()
+        monkeypatch.setattr("sys.stdout", out)
+        monkeypatch.setenv("NO_COLOR", no_color)
+        show(TEXT)
+        shown = out.getvalue()
+        assert ("\x1b[1;31mWARNING: THE MODEL" in shown, "\x1b[32myes" in shown) == (not no_color, not no_color)
+        assert "[b]flat[/b]" in shown

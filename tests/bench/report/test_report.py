@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 import re
 import shutil
-import subprocess
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from emb_bench.analysis.drift import Earlier, read_last
+from emb_bench.analysis.drift import Earlier
 from emb_bench.analysis.study import StudyOptions, make_study
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
@@ -25,16 +23,13 @@ from emb_bench.batch.summary import text as text_of_campaign
 from emb_bench.cli.replay import main
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.records import EstimationProblem
-from emb_bench.experiment.evaluation import Question, evaluate
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.figures import COLOURS
 from emb_bench.logs.log import read_log
-from emb_bench.numbers import amount
 from emb_bench.report import figures
 from emb_bench.report.content import ActiveCycles, Content, gather
 from emb_bench.report.figures import applied_as_sent
 from emb_bench.report.page import document, report_page, view
-from emb_bench.report.sentences import drift
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import EXIT_OUTSIDE
 from emb_runtime.log.ring_buffer import Attachment, EventRecord, Level, LineRecord
@@ -48,12 +43,6 @@ from tests.bench.experiment.test_experiment import Lose  # isort: skip
 from tests.conftest import Simulate  # isort: skip
 
 HOSTILE = "</style></title><script>alert(1)</script><img src=x onerror=alert(2)>\"'&amp;\x00\u202e"
-FIRST = ["Verdict", "Parameters", "Measured against predicted", "What was tested"]
-FOLDED = [
-    *("Does the model fit", "Uncertainty", "Excitation", "Residuals", "Timing", "Safety"),
-    *("Completeness of the log", "Identity", "What the words mean"),
-]
-ONE_RUN = [*FIRST, "Evidence", *FOLDED]
 
 
 @pytest.fixture(scope="module")
@@ -83,20 +72,7 @@ def joint(folder: Path, good: Path, simulate: Simulate) -> Report:
     return make(folder / "joint.html", good, broken, other, never, *arguments, code=1)
 
 
-@pytest.fixture(scope="module")
-def validation(folder: Path, simulate: Simulate) -> Report:
-    path = write_log(folder / "wrong.mcap", simulate(square, options="plant=stribeck,seed=4"))
-    return make(folder / "wrong.html", path, "--model", "exact", "--starts", "1")
-
-
-def test_one_run_has_all_its_sections_verdict_first(report: Report) -> None:
-    assert report.reader.headings[0] == "Report of good.mcap"
-    assert [h for h in report.reader.headings[1:] if h in ONE_RUN] == ONE_RUN
-    assert report.reader.texts[0].startswith("The model 'exact' fits")
-
-
-def test_the_report_says_what_a_loss_of_all_commands_would_do(folder: Path, report: Report, simulate: Simulate) -> None:
-    assert "the node brakes, and no brake of the set 'envelope' reaches an end stop" in " ".join(report.reader.texts)
+def test_the_report_says_what_a_loss_of_all_commands_would_do(folder: Path, simulate: Simulate) -> None:
     lets_go = shipped_bench_text().replace('stop             = "damped"', 'stop             = "freewheel"')
     bench = Attachment("bench.toml", "application/toml", lets_go.encode())
     path = write_log(folder / "loose.mcap", simulate(square, options="plant=exact"), attachments=[bench])
@@ -147,26 +123,8 @@ def test_every_figure_says_what_it_shows(report: Report) -> None:
     assert all(len(text) > 30 for text in says)
 
 
-def test_each_parameter_is_concluded_with_value_interval_and_truth(report: Report) -> None:
-    numbers = report.numbers["estimate"]["parameters"]
-    assert numbers["f_v"]["true"] == 3e-5
-    for concluded in report.numbers["estimate"]["conclusions"]:
-        assert concluded["standing"] == "identified"
-        assert f"{concluded['label']} {numbers_text(concluded)}" in report.reader.text
-        low, high = concluded["interval"]
-        assert low < numbers[concluded["label"]]["value"] < high
-
-
 def test_the_numbers_are_those_of_the_command_estimate(report: Report, good: Path, replay: Replay) -> None:
     assert report.numbers["estimate"] == replay.document("estimate", good, "--starts", "2", "--profile")
-
-
-def test_the_information_is_that_of_the_fisher_information_at_the_estimate(good: Path) -> None:
-    log, question = read_log(good), Question(("k_m", "k_1", "T_c", "f_v"))
-    study = make_study(log.bench, [log], StudyOptions(EstimationProblem(), starts=2, systematic=False))
-    plant, theta = log.bench.plant("exact"), study.estimate.theta
-    (found,) = evaluate(log, read_experiment(log), log.bench, [plant], question, "x", theta)
-    np.testing.assert_allclose(study.estimate.information, found.histories["physical"][-1], rtol=1e-6)
 
 
 def test_the_pale_line_of_a_profile_is_the_parabola_of_the_fisher_information(
@@ -200,32 +158,6 @@ def test_residuals_and_motion_are_in_the_numbers(report: Report, good: Path) -> 
     assert run["experiment"]["angle"] == read_experiment(read_log(good)).all_samples[:, 0].tolist()
 
 
-def test_a_model_that_does_not_fit_is_said_before_any_number(validation: Report) -> None:
-    first = validation.reader.texts[0]
-    assert "DOES NOT FIT" in first
-    assert validation.reader.values("role")[0] == "alert"
-    assert validation.numbers["model_fits"] is False
-    # A profile trusts the model: where that is wrong the interval has to be the larger one of the residuals.
-    for concluded in validation.numbers["estimate"]["conclusions"]:
-        found = validation.numbers["estimate"]["parameters"][concluded["label"]]
-        assert concluded["interval"] == found["interval_95"]
-
-
-def test_several_runs_are_estimated_once_and_told_one_by_one(joint: Report) -> None:
-    headings = joint.reader.headings
-    assert [h for h in headings if h.startswith("Run ")] == [
-        "Run 1: good.mcap",
-        "Run 2: other.mcap",
-        "Run 3: never.mcap",
-    ]
-    assert headings.count("Parameters") == 1
-    assert headings.count("Runs") == headings.count("What was tested") == 1
-    assert re.search(r"k_m \[(ppm|%)\]", joint.reader.text)
-    assert "Each run evaluated alone; ± 95 % without errors that the runs share" in joint.reader.text
-    assert [record["name"][-10:] for record in joint.numbers["estimate"]["records"]] == ["/good.mcap", "other.mcap"]
-    assert [run["why_not_estimated"] == "" for run in joint.numbers["runs"]] == [True, True, False]
-
-
 def test_what_was_left_out_or_is_missing_comes_before_the_verdict(joint: Report) -> None:
     text = joint.reader.text
     verdict = text.index("Verdict")
@@ -242,18 +174,10 @@ def test_a_run_without_an_experiment_is_reported_without_an_estimate(folder: Pat
     made = make(folder / "alone.html", folder / "never.mcap", code=1)
     assert made.reader.texts[0].startswith("STOPPED: never.mcap: INTERRUPTED")
     assert "no experiment in this log: it never became active (INTERRUPTED)" in made.reader.text
-    assert [h for h in made.reader.headings if h in ONE_RUN] == [
-        *("Verdict", "What was tested", "Evidence", "Safety", "Completeness of the log", "Identity"),
-        "What the words mean",
-    ]
+    assert not {"Parameters", "Uncertainty", "Residuals"} & set(made.reader.headings)
     assert "stopped by the operator" in made.reader.text
     assert made.numbers["estimate"] is None
     assert made.numbers["model_fits"] is None
-
-
-def numbers_text(concluded: Mapping[str, Any]) -> str:
-    """Value and interval of a parameter, as they are shown."""
-    return amount(concluded["value"], tuple(concluded["interval"]), concluded["unit"])
 
 
 def gathered(bench: Bench, *paths: Path, last: Earlier | None = None) -> Content:
@@ -341,29 +265,6 @@ def test_a_report_replaces_a_report_but_never_what_it_reads(folder: Path, good: 
     assert sorted(path.name for path in here.iterdir()) == ["log.html", "page.html", "page.json"]
 
 
-def test_the_last_report_says_what_has_changed(folder: Path, bench: Bench, report: Report, simulate: Simulate) -> None:
-    now = write_log(folder / "now.mcap", simulate(square, options="plant=exact,f_v=3.3e-5,seed=8"))
-    study = gathered(bench, now, last=read_last(report.path.with_suffix(".json"))).study
-    assert study is not None
-    changed = {entry.name: entry for entry in study.drifts}["f_v"]
-    assert changed.drifted
-    assert changed.relative_change == pytest.approx(0.1, abs=0.01)
-    assert drift(changed).startswith("rose by ")
-
-
-def test_without_matplotlib_it_says_what_to_install(good: Path, folder: Path) -> None:
-    code = (
-        "import sys\n"
-        "sys.modules['matplotlib'] = None\n"
-        "from emb_bench.cli.replay import main\n"
-        f"sys.exit(main(['report', {str(good)!r}, '-o', {str(folder / 'bare.html')!r}]))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "emb-excite[bench]" in done.stderr
-
-
 def test_the_reader_of_these_tests_sees_what_must_not_be_there() -> None:
     assert "script" in read("<html><body><p><script>x</script></p></body></html>").tags
 
@@ -374,16 +275,9 @@ def test_an_experiment_that_was_cut_short_has_a_cause_and_no_values(
     run = simulate(lambda a, v, k: math.nan if k >= 120 else square(a, v, k), options="plant=exact,seed=5")
     path = write_log(folder / "cut.mcap", run)
     made = make(folder / "cut.html", path, "--starts", "1")
-    info = FAULTS[Fault.POLICY_NOT_FINITE]
-    assert made.reader.texts[0].startswith("STOPPED: cut.mcap")
-    assert info.cause in made.reader.text
-    assert info.advice in made.reader.text.replace(info.advice.capitalize(), info.advice)
+    assert FAULTS[Fault.POLICY_NOT_FINITE].cause in made.reader.text
     assert not {"Parameters", "What to do next", "Uncertainty"} & set(made.reader.headings)
     assert len(made.reader.values("alt")) >= 3
-    text = replay.text("estimate", path, "--starts", "1")
-    assert text.startswith("STOPPED: cut.mcap")
-    assert info.cause in " ".join(text.split())
-    assert "k_m" not in text
     assert "k_m" in replay.text("estimate", path, "--starts", "1", "-v")
 
 
