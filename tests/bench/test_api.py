@@ -84,6 +84,8 @@ def test_a_log_s_bench_is_replaced_by_one_of_the_same_sample_time_only(log: Path
     assert api.fisher_information(run, bench=same).fisher("physical").matrix.tolist() == (
         api.fisher_information(run).fisher("physical").matrix.tolist()
     )
+    with pytest.raises(UsageError, match="at least one run"):
+        api.estimate([])
     with pytest.raises(UsageError, match="sample time"):
         api.fisher_information(run, bench=slower)
 
@@ -129,11 +131,6 @@ def test_what_a_user_tries_first_works(log: Path, tmp_path: Path) -> None:
     }
     assert len(natural) == 31
     assert not [call for call, works in natural.items() if not works]
-
-
-def test_no_runs_are_refused() -> None:
-    with pytest.raises(UsageError, match="at least one run"):
-        api.estimate([])
 
 
 def test_a_topic_is_the_table_that_emb_replay_export_writes(log: Path, tmp_path: Path) -> None:

@@ -24,7 +24,6 @@ from emb_bench.brake.euler import sensitivity_step, sign, step
 from emb_bench.compiled import LOCK_WAIT, _fingerprint, compiled, on_compiling
 from emb_bench.information.symmetric import Floats, add_increment, lambda_min, log_det, pack, trace_inverse
 from emb_runtime.config.bench import BrakeParameters, load_bench
-from emb_runtime.errors import UsageError
 
 BENCH = load_bench()
 T_S = 1e-3
@@ -80,15 +79,6 @@ def test_what_would_stay_python_or_be_compiled_again_for_each_object_is_refused(
     for function, why in ((uses_a_module, r"uses the module emb_bench\.brake\.euler: import"), (closure, "closure")):
         with pytest.raises(TypeError, match=why):
             compiled(function)
-
-
-def test_without_numba_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    def unseen(value: float) -> float:
-        return value
-
-    monkeypatch.setitem(sys.modules, "numba", None)
-    with pytest.raises(UsageError, match=r"emb-excite\[bench\]"):
-        compiled(unseen)
 
 
 SCRIPT = """

@@ -90,18 +90,6 @@ def assert_reproduced(result: Rerun, run: Driven) -> None:
 # --- what happened is reproduced ------------------------------------------------------------------------------------
 
 
-def test_a_logged_run_is_reproduced_from_the_file_alone(tmp_path: Path, replay: Replay) -> None:
-    path = tmp_path / "run.mcap"
-    assert emb_run(["--iface", "sim:seed=2,plant=exact", "--log", str(path)]) == 0
-    result = replay.document("rerun", path)
-    assert result["reproduced"]
-    assert result["differences"] == []
-    assert result["ended"]
-    assert result["other_versions"] == []
-    assert result["decisions"] == len(read_log(path).cycles["step"]) == 501
-    assert result["frames"] == sum(frame.own for frame in read_log(path).frames) == 503
-
-
 @pytest.mark.parametrize("options", ["seed=1", "seed=9", "plant=exact", "plant=stribeck", "plant=lag"])
 def test_every_decision_of_the_shipped_actor_is_reproduced_on_every_brake(
     recorded: Callable[..., Driven], bench: Bench, layout: Layout, tmp_path: Path, options: str

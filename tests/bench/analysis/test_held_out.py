@@ -9,13 +9,12 @@ from scipy import stats
 
 from emb_bench.analysis.held_out import held_out, leave_one_out
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.open_loop import simulate
 
 from tests.bench.flows import square  # isort: skip
-from tests.bench.measurements import fit, record  # isort: skip
+from tests.bench.measurements import disturbed, fit, record  # isort: skip
 
 CURRENTS, OTHERS = square(15, 3.0)[:60], square(10, -2.0)[:40]
 PARAMS = ("k_m", "f_v")
@@ -96,20 +95,9 @@ def test_each_record_is_predicted_from_the_others(bench: Bench) -> None:
 
 
 def test_prediction_errors_of_a_disturbed_brake_are_those_of_its_filter(bench: Bench) -> None:
-    """A brake that is pushed at random is no longer where a simulation has it, and the innovations know."""
-
-    def disturbed(seed: int) -> Experiment:
-        rng, t_s, x = np.random.default_rng(seed), bench.timing.sample_time, (0.0, 0.0)
-        states = []
-        for u in CURRENTS:
-            after = simulate(bench.plant("exact").mechanics, bench.brake, [u], t_s, (), x).states[1]
-            x = (float(after[0]), float(after[1]) + 1.5 * float(rng.standard_normal()))
-            states.append(x)
-        noise = rng.standard_normal((len(states), 2)) * [bench.noise.angle, bench.noise.velocity]
-        return Experiment(f"{seed}", np.asarray(CURRENTS), np.array(states) + noise, 0.0, 0.0, 1e-4, True)
-
-    method = method_of("pem")(bench, bench.plant("exact"), EstimationProblem(PARAMS), starts=1)
-    e = method.fit([disturbed(n) for n in range(3)])
+    """A brake that is pushed at random is no longer where a simulation has it."""
+    *records, new = (disturbed(bench, CURRENTS, bench.brake, seed, walk=50.0) for seed in range(4))
+    e = fit(bench, "exact", records, EstimationProblem(PARAMS), method="pem")
     assert e.process_noise > 0.0
-    assert held_out(e, disturbed(7)).fits
-    assert not held_out(replace(e, method="oem"), disturbed(7)).fits
+    assert held_out(e, new).fits
+    assert not held_out(replace(e, method="oem"), new).fits

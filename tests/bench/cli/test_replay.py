@@ -62,8 +62,6 @@ def test_information_over_time_grows_to_that_of_the_whole(path: Path, replay: Re
     for kind in ("physical", "weighted"):
         series = got[kind]["over_time"]
         assert series["time"] == pytest.approx([0.001 * k for k in range(1, 501)])
-        known = [value for value in series["log_det"] if value is not None]
-        assert np.all(np.diff(known) > -1e-6)
         assert series["log_det"][0] is None  # one sample cannot tell four parameters
         assert series["log_det"][-1] == pytest.approx(got[kind]["log_det"], rel=1e-12)
         assert series["lambda_min"][-1] == pytest.approx(got[kind]["lambda_min"], rel=1e-12)

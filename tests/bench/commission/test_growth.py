@@ -35,19 +35,14 @@ def holds_the_truth(bench: Bench, one: Identification) -> bool:
 
 
 def test_two_experiments_tell_which_feature_the_brake_has(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
-    plant = "play"
-    logs = logs_of(tmp_path, simulate, plant)
+    logs = logs_of(tmp_path, simulate, "play")
     found = identified(bench, logs)
-    assert found.fits
-    assert set(found.features) == {plant}
-    assert found.features[plant] == pytest.approx(getattr(bench.plant(plant).mechanics, plant), rel=0.2)
-    assert found.model == f"exact + {plant}"
-    assert holds_the_truth(bench, found)
     # The next experiments are fitted with the features found, and look for no others where that explains them.
-    again = identified(bench, logs[1:], found)
-    assert again.fits
-    assert set(again.features) == {plant}
-    assert again.model == found.model
+    for one in (found, identified(bench, logs[1:], found)):
+        assert one.fits
+        assert (one.model, set(one.features)) == ("exact + play", {"play"})
+    assert found.features["play"] == pytest.approx(bench.plant("play").mechanics.play, rel=0.2)
+    assert holds_the_truth(bench, found)
 
 
 def test_a_single_experiment_grows_no_model(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
@@ -57,19 +52,15 @@ def test_a_single_experiment_grows_no_model(bench: Bench, tmp_path: Path, simula
     assert found.objections
 
 
-def test_a_plain_brake_stays_plain(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
-    found = identified(bench, logs_of(tmp_path, simulate, "exact"))
-    assert found.fits
-    assert (found.model, found.features, found.jitter) == ("exact", {}, 0.0)
-    low, high = found.intervals["k_m"]
-    assert high - low < bench.systematic.inertia * found.values["k_m"]  # the shield shares the error of J
-    assert holds_the_truth(bench, found)
-
-
-def test_features_that_do_not_explain_larger_experiments_are_added_to(
+def test_a_plain_brake_stays_plain_and_features_that_do_not_explain_larger_experiments_are_added_to(
     bench: Bench, tmp_path: Path, simulate: Simulate
 ) -> None:
     plain = identified(bench, logs_of(tmp_path, simulate, "exact"))
+    assert plain.fits
+    assert (plain.model, plain.features, plain.jitter) == ("exact", {}, 0.0)
+    low, high = plain.intervals["k_m"]
+    assert high - low < bench.systematic.inertia * plain.values["k_m"]  # the shield shares the error of J
+    assert holds_the_truth(bench, plain)
     before = replace(plain, model="exact + hysteresis", features={"hysteresis": 0.01})
     found = identified(bench, logs_of(tmp_path, simulate, "cubic"), before)
     assert found.fits

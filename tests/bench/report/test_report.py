@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from emb_bench.analysis.drift import Earlier
 from emb_bench.analysis.study import StudyOptions, make_study
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
@@ -180,10 +179,10 @@ def test_a_run_without_an_experiment_is_reported_without_an_estimate(folder: Pat
     assert made.numbers["model_fits"] is None
 
 
-def gathered(bench: Bench, *paths: Path, last: Earlier | None = None) -> Content:
+def gathered(bench: Bench, *paths: Path) -> Content:
     """What a report would say, without the figures."""
     options = StudyOptions(EstimationProblem(), starts=1)
-    return gather(bench, [read_log(path) for path in paths], [], options, "x", last=last)
+    return gather(bench, [read_log(path) for path in paths], [], options, "x")
 
 
 def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate) -> None:
@@ -227,9 +226,7 @@ def test_a_difference_between_sent_and_applied_current_is_drawn(
     assert joint.reader.text.count("The node applied what was sent.") == 1
 
 
-def test_simulated_time_is_said_to_mean_nothing_and_real_time_is_in_the_table(
-    folder: Path, bench: Bench, simulate: Simulate
-) -> None:
+def test_real_time_is_in_the_table(folder: Path, bench: Bench, simulate: Simulate) -> None:
     run = simulate(square, options="plant=exact", steps=60)
     number, records = count(), run.journal.records
     records[:] = [
@@ -239,15 +236,12 @@ def test_simulated_time_is_said_to_mean_nothing_and_real_time_is_in_the_table(
         for r in records
     ]
     metadata = {"emb.run": {"steps": "60", "iface": "can0"}}
-    paths = [write_log(folder / "sim.mcap", run, steps=60)]
-    paths.append(write_log(folder / "real.mcap", run, steps=60, metadata=metadata))
-    simulated, real = gathered(bench, paths[0]), gathered(bench, paths[1])
+    real = gathered(bench, write_log(folder / "real.mcap", run, steps=60, metadata=metadata))
     table = view(real.runs[0]).timing
     assert table is not None
     assert "343 µs" in [cell for row in table.rows for cell in row]
     page = report_page(real)
     assert "bench on can0" in page
-    assert "Time was simulated" in report_page(simulated)
     assert "Time was simulated" not in page
     assert document(real)["runs"][0]["timing"]["intervals"]["response"]["p100"] == pytest.approx(343.001e-6)
 
