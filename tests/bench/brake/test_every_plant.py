@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from emb_bench.config.bench import Bench
-from emb_bench.logs.log import read_log
-from emb_runtime.cli.main import main as emb_run
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.safety.state_machine import Fault
 
@@ -53,15 +50,6 @@ def test_full_current_on_any_plant_ends_by_itself_and_as_documented(
     assert run.outcome.fault is ENDS[plant]
     if run.outcome.fault is None:
         assert run.outcome.counters.answered == bench.timing.horizon
-
-
-def test_the_log_of_emb_run_says_which_plant_was_simulated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "run.mcap"
-    assert emb_run(["--iface", "sim:plant=exact,f_v=3e-5", "--duration", "0.02", "--log", str(path), "--json"]) == 0
-    log = read_log(path)
-    assert (log.true_plant, log.truth and log.truth.f_v) == ("exact", 3e-5)
-    assert emb_run(["--iface", "sim:plant=rubber", "--log", str(tmp_path / "no.mcap")]) == 2
-    assert "no plant is called 'rubber'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("plant", PROVED)

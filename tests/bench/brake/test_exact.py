@@ -12,10 +12,8 @@ from scipy.integrate import solve_ivp
 
 from emb_bench.brake import exact
 from emb_bench.brake.motion import Floats, no_sensitivity, rest
-from emb_bench.config.plants import EULER, Mechanics
-from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import BrakeParameters, load_bench
-from tests.bench.flows import ALL, EXACT, STEP, T_S, changed, difference, events, marched, moved
+from tests.bench.flows import ALL, EXACT, T_S, changed, difference, events, marched, moved
 
 BENCH = load_bench()
 BRAKE = BENCH.brake
@@ -169,42 +167,6 @@ def test_in_contact_it_is_the_damped_oscillator_of_the_textbook() -> None:
     assert delta / math.sqrt(spring / BRAKE.J) == pytest.approx(0.2407, abs=5e-5)  # the thesis's ζ
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
-@given(cases())
-def test_friction_never_creates_energy(case: Case) -> None:
-    # Over each period the kinetic and the elastic energy change by the motor's work at most.
-    p, currents, x0 = case
-    states = moved(EXACT, p, currents, x0)
-    energy = 0.5 * p.J * states[:, 1] ** 2 + 0.5 * p.gamma * p.k_1 * np.maximum(states[:, 0], 0.0) ** 2
-    lost = p.k_m * currents * np.diff(states[:, 0]) - np.diff(energy)
-    travelled = np.abs(np.diff(states[:, 0]))
-    assert (lost >= p.T_c * travelled - 1e-12 * (1.0 + energy[:-1])).all()
-
-
-@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
-@given(cases())
-def test_a_brake_at_rest_has_no_velocity_at_all_and_one_that_depends_on_nothing(case: Case) -> None:
-    p, currents, x0 = case
-    states, s = marched(EXACT, p, currents, x0)
-    for k, u in enumerate(currents):
-        pull = p.k_m * u - p.gamma * p.k_1 * max(states[k, 0], 0.0)
-        if states[k, 1] == 0.0 and abs(pull) <= p.T_c:
-            assert states[k + 1].tolist() == [states[k, 0], 0.0]
-            assert not s[k, :, 1].any()
-        elif states[k, 1] == 0.0:
-            assert states[k + 1, 1] * pull > 0.0
-
-
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
-@given(cases())
-def test_the_compiled_brake_is_the_plain_one_bit_for_bit(case: Case) -> None:
-    p, currents, x0 = case
-    plain = simulate(EXACT, p, currents, T_S, ALL, x0)
-    states, s = marched(EXACT, p, currents, x0)
-    np.testing.assert_array_equal(plain.states, states)
-    np.testing.assert_array_equal(plain.sensitivities, s)
-
-
 @settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
 @given(cases())
 def test_the_instants_of_all_events_of_a_period_are_found_by_few_evaluations_of_the_series(case: Case) -> None:
@@ -217,24 +179,3 @@ def test_the_instants_of_all_events_of_a_period_are_found_by_few_evaluations_of_
             evaluated.reset_mock()
             exact.advance_exact(p, x, u, T_S, chosen, s)
             assert evaluated.call_count <= 24
-
-
-def test_euler_comes_to_the_exact_brake_at_first_order_of_its_step() -> None:
-    currents = np.repeat([3.0, -2.0, 1.0], [40, 60, 30])
-    exact = moved(EXACT, BRAKE, currents, (0.0, 10.0))
-    finer, errors = (8, 32, 128, 512), []
-    for n in finer:
-        fine = simulate(Mechanics(EULER), BRAKE, np.repeat(currents, n), T_S / n, (), (0.0, 10.0)).states[::n]
-        errors.append(np.abs(fine - exact).max(axis=0))
-    for output in np.array(errors).T:  # where a stop falls between two steps scatters around the law
-        assert np.polyfit(np.log(finer), np.log(output), 1)[0] == pytest.approx(-1.0, abs=0.15)
-
-
-def test_a_command_that_comes_late_leaves_the_brake_longer_under_the_one_before() -> None:
-    # From zero to 3 A one sample later, in the clear: what is missing is one sample of that acceleration.
-    s = marched(EXACT, BRAKE, np.array([0.0, 3.0]), (-5.0, 50.0), ("delay",))[1]
-    late = changed(EXACT, BRAKE, np.array([0.0, 3.0]), (-5.0, 50.0), "delay", STEP)
-    prompt = moved(EXACT, BRAKE, np.array([0.0, 3.0]), (-5.0, 50.0))
-    missing = -T_S * BRAKE.k_m * 3.0 / BRAKE.J * math.exp(-BRAKE.f_v / BRAKE.J * T_S)
-    assert s[1, 0, 1] == pytest.approx(missing, rel=1e-9)
-    assert (late - prompt)[2, 1] / STEP == pytest.approx(missing, rel=1e-4)

@@ -14,7 +14,6 @@ from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
 from emb_bench.brake.motion import Floats, no_sensitivity, rest
 from emb_bench.brake.parameters import FEATURES, PARAMETERS
-from emb_bench.brake.runge_kutta import current
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import Mechanics
@@ -285,26 +284,6 @@ def test_the_motion_is_that_of_a_general_solver_with_events(name: str) -> None:
         np.testing.assert_allclose(found[:, 2], expected[:, 2], rtol=0, atol=5e-6)
         seen += events(found, m)
     assert (seen[:4] > 0).all(), f"the inputs did not do everything: {Events(*seen)}"
-
-
-def test_the_current_approaches_its_command_as_a_first_order_lag() -> None:
-    m = Mechanics(current_lag=0.002)
-    states, _ = run(m, P, np.repeat([6.0, -1.0], 10), (-5.0, 0.0))
-    t = T_S * np.arange(1, 11)
-    first = 6.0 * (1.0 - np.exp(-t / 0.002))
-    np.testing.assert_allclose(states[:10, 3], first, rtol=1e-13)
-    np.testing.assert_allclose(states[10:, 3], -1.0 + (first[-1] + 1.0) * np.exp(-t / 0.002), rtol=1e-12)
-    assert current(PLAIN, 3.0, 1.0, 0.0) == 1.0
-
-
-def test_with_a_lag_a_brake_breaks_away_within_a_period_when_the_torque_suffices() -> None:
-    # In free air: break-away when 6 A (1 − exp(−t/τ)) k_m = T_c, then J v' = k_m i − T_c, without viscous friction.
-    m, p, tau = Mechanics(current_lag=0.002), P._replace(f_v=0.0), 0.002
-    states, shown = run(m, p, np.full(1, 6.0), (-5.0, 0.0), ("T_c",))
-    start = -tau * math.log(1.0 - p.T_c / p.k_m / 6.0)
-    ramp = (T_S - start) - tau * (math.exp(-start / tau) - math.exp(-T_S / tau))
-    assert states[0, 1] == pytest.approx((p.k_m * 6.0 * ramp - p.T_c * (T_S - start)) / p.J, rel=1e-9)
-    assert shown[0, 0, 1] == pytest.approx(-p.T_c * (T_S - start) / p.J, rel=1e-9)
 
 
 def test_a_stop_between_two_samples_of_forward_motion_is_not_overlooked() -> None:

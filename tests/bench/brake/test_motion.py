@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from emb_bench.brake.euler import advance_euler, step
+from emb_bench.brake.euler import advance_euler
 from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
-from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, is_plain, no_sensitivity, rest
+from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, no_sensitivity, rest
+from emb_bench.brake.parameters import FEATURES as NAMED
+from emb_bench.brake.parameters import PARAMETERS, scale
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import ASYMMETRIES, EULER, EXACT, Mechanics
 
@@ -66,30 +68,6 @@ def test_each_brake_is_moved_by_its_own_solver(m: Mechanics, solver: Callable[..
     assert_array_equal(moved(m)[1], s)
 
 
-def test_the_euler_brake_is_stepped_as_the_thesis_does() -> None:
-    x, _ = moved(Mechanics(EULER))
-    assert (x[0], x[1]) == step(P, 5.0, 20.0, 2.0, T_S)
-    assert x[3] == 2.0
-
-
-@pytest.mark.parametrize("feature", FEATURES)
-def test_a_brake_with_any_one_feature_is_not_plain(feature: str) -> None:
-    assert not is_plain(with_feature(feature))
-
-
-def test_every_field_of_the_mechanics_is_looked_at() -> None:
-    # A solver and what shapes another feature do not make a brake rich by themselves.
-    shaping = {"solver", "stribeck_exponent", "hysteresis_travel"}
-    assert set(Mechanics._fields) == shaping | set(FEATURES)
-
-
-@pytest.mark.parametrize("name", ["euler", "exact", "rough"])
-def test_without_unknowns_the_brake_moves_the_same(name: str) -> None:
-    m, x, (chosen, s) = BENCH.plant(name).mechanics, start(), no_sensitivity(())
-    advance(m, P, x, 2.0, T_S, chosen, s)
-    assert_array_equal(x, moved(m)[0])
-
-
 def test_at_the_start_only_the_initial_state_is_sensitive_to_itself() -> None:
     _, s = no_sensitivity(("x2_0", "k_m", "x1_0"))
     assert rest().shape == (STATES,)
@@ -97,3 +75,20 @@ def test_at_the_start_only_the_initial_state_is_sensitive_to_itself() -> None:
     assert_array_equal(s, [[0, 1, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0]])
     with pytest.raises(ValueError, match="no_such_thing"):
         no_sensitivity(("no_such_thing",))
+
+
+def test_each_feature_of_the_mechanics_has_a_row_with_what_its_readers_take() -> None:
+    shaping = {"solver", "stribeck_exponent", "hysteresis_travel"}  # say how, not how much
+    assert set(Mechanics._fields) - shaping - set(PARAMETERS) == set()
+    assert set(NAMED) < set(Mechanics._fields)
+    for name, row in PARAMETERS.items():
+        assert row.unit, name
+        assert row.low <= row.start <= row.high or row.start == 0.0, name
+        assert row.low < row.high or name not in NAMED, name
+        assert bool(row.effect) == bool(row.remedy), name
+        assert row.step == 0.0 or name in NAMED, name
+        assert row.gross > 0.0, name
+
+
+def test_the_scale_is_the_value_of_a_relative_parameter_and_one_of_an_absolute_one() -> None:
+    assert_array_equal(scale(["k_m", "delay", "play"], [0.02, 0.3, 0.5]), [0.02, 1.0, 0.5])

@@ -150,12 +150,6 @@ def test_a_coarse_search_leaves_what_another_one_has_found() -> None:
     assert other > NEAR / 2.0
 
 
-@pytest.mark.parametrize("of", [(), ("k_m", "T_c"), ("J",), ("k_m", "k_m")])
-def test_ds_needs_a_proper_subset(of: tuple[str, ...]) -> None:
-    with pytest.raises(UsageError, match="some, but not all"):
-        criterion("Ds", TWO, of)
-
-
 @pytest.mark.parametrize("model", ["euler", "exact"])
 @pytest.mark.parametrize("params", [TWO, PARAMETER_NAMES, (*PARAMETER_NAMES, "J")], ids=len)
 def test_the_population_and_a_single_design_are_simulated_alike(model: str, params: tuple[str, ...]) -> None:
@@ -330,9 +324,3 @@ def test_no_design_is_above_the_proved_bound(name: Name) -> None:
     _, _, phi, price = p.explore(np.hstack([journeys, np.ones((200, 5))]))
     assert (price == 0.0).sum() > 50
     assert phi[price == 0.0].max() < ceiling(p, goal)
-
-
-@pytest.mark.parametrize("model", ["jitter", "observer"])
-def test_a_plant_whose_instruments_change_what_is_told_is_refused(model: str) -> None:
-    with pytest.raises(UsageError, match="exact sample times"):
-        problem(model=model)

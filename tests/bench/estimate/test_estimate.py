@@ -102,15 +102,6 @@ def test_derivatives_are_those_of_the_residuals(bench: Bench, names: tuple[str, 
     check_derivatives(lambda z: problem.jacobian(z, weights)[0], z, jacobian)
 
 
-def test_without_a_delay_the_prediction_is_that_of_every_plant(bench: Bench) -> None:
-    currents = currents_of(bench, "chirp")
-    problem = problem_of(bench, (*PARAMETER_NAMES, "delay"), exactly(bench))
-    run = simulate(bench.plant("exact").mechanics, bench.brake, currents, 0.001, (*PARAMETER_NAMES, "delay"))
-    said = problem.predict(problem.nominal(), 0)
-    assert said.states.tolist() == run.states.tolist()
-    assert said.sensitivities.tolist() == run.sensitivities.tolist()
-
-
 def test_a_command_that_acts_a_fraction_of_a_period_late_is_one_that_acts_late_on_a_finer_grid(bench: Bench) -> None:
     currents = currents_of(bench, "chirp")
     fine = np.repeat(currents, 10)
@@ -217,17 +208,6 @@ def test_bounds_that_hold_nothing_are_refused() -> None:
             EstimationProblem(("k_m", "x1_0", "delay"), bounds={name: (low, high)})
 
 
-def test_where_records_started_does_not_mix_with_their_samples(bench: Bench) -> None:
-    plant, currents = bench.plant("exact"), currents_of(bench, "chirp")
-    records = [record(bench, plant, currents, x0=(0.4, 0.0), seed=seed) for seed in (1, 2)]
-    found = fit(bench, plant, records, EstimationProblem(nuisances=("x1_0",)))
-    theta = found.theta
-    for i, data in enumerate(records):
-        states = simulate(plant.mechanics, theta, currents, 1e-3, (), (found.values[4 + i], 0.0)).states[1:]
-        expected = (data.samples - states) / [bench.noise.angle, bench.noise.velocity]
-        assert found.residuals[i] == pytest.approx(expected, abs=1e-6)
-
-
 def test_every_method_answers_by_its_name_and_no_other(bench: Bench) -> None:
     plant, data, b = bench.plant("exact"), exactly(bench), bench.brake
     for name in METHODS:
@@ -249,15 +229,6 @@ def test_the_same_seed_begins_at_the_same_points_all_within_the_ranges(bench: Be
     ranges = bench.range_set(bench.shield.ranges)
     low, high = (np.array([getattr(side, n) for n in PARAMETER_NAMES]) for side in (ranges.low, ranges.high))
     assert ((one * problem.units >= low) & (one * problem.units <= high)).all()
-
-
-def test_a_search_says_where_it_ended_and_what_it_cost(bench: Bench) -> None:
-    problem = problem_of(bench, ("f_v",), exactly(bench))
-    z, end = search(problem, np.array([1.4]), weights := problem.weights(problem.nominal()))
-    assert end.converged
-    assert end.start == (1.4 * bench.brake.f_v,)
-    assert end.values == (float(z[0]) * bench.brake.f_v,)
-    assert end.cost == pytest.approx(float(np.sum(problem.jacobian(z, weights)[0] ** 2)))
 
 
 def test_records_share_the_brake_and_have_their_own_start(bench: Bench) -> None:
@@ -287,27 +258,15 @@ def test_where_each_record_started_can_be_all_that_is_asked(bench: Bench) -> Non
     assert found.verdict().findings == ()
 
 
-def test_an_encoder_that_was_not_homed_is_found_if_it_is_asked_for(bench: Bench) -> None:
-    data = record(bench, bench.plant("offset"), currents_of(bench, "chirp"))
-    blind = fit(bench, "exact", [data])
-    assert not blind.validation.fits
-    found = fit(bench, "exact", [data], EstimationProblem(nuisances=("offset",)))
-    assert found.validation.fits
-    assert abs(found.values[4] - 0.2) < 4.0 * found.deviations()[4]
-    moved = fit(bench, "exact", [data], EstimationProblem(nuisances=("contact", "x1_0")))
-    assert moved.validation.fits
-    assert abs(moved.values[4] - 0.2) < 4.0 * moved.deviations()[4]
-    known = fit(bench, "offset", [data])
-    assert known.validation.fits
-
-
-def test_a_velocity_that_an_observer_derived_from_the_angle_does_not_count(bench: Bench) -> None:
+@pytest.mark.parametrize("method", ["oem", "pem"])
+def test_a_velocity_that_an_observer_derived_from_the_angle_does_not_count(bench: Bench, method: str) -> None:
     plant = bench.plant("observer")
     data = record(bench, plant, currents_of(bench, "chirp"))
     spoilt = np.stack([data.samples[:, 0], np.full(500, 7.0)], axis=1)
-    found = [fit(bench, plant, [d]) for d in (data, replace(data, samples=spoilt))]
+    found = [fit(bench, plant, [d], method=method) for d in (data, replace(data, samples=spoilt))]
     assert found[0].values.tolist() == found[1].values.tolist()
     assert found[0].validation.fits
+    assert (np.abs(errors_in_sigmas(found[0], bench.brake)) < 4.5).all()
     assert list(found[0].validation.whiteness) == ["angle"]
     assert found[0].validation.freedom == 496
 

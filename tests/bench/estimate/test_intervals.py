@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from emb_bench.estimate.intervals import deviations, interval, union, unnoticed
+from emb_bench.estimate.intervals import deviations, interval, unnoticed
 
 
 def test_biases_by_several_effects_add_in_quadrature_and_none_is_zero() -> None:
@@ -33,7 +33,3 @@ def test_a_profile_counts_where_it_is_open_or_its_assumptions_hold() -> None:
     ):
         found = interval(gaussian, profile, closed=closed, holds=holds, biased=biased)
         assert found == expected, (closed, holds, biased)
-
-
-def test_a_union_holds_both() -> None:
-    assert union((1.0, 2.0), (1.5, 3.0)) == union((1.5, 3.0), (1.0, 2.0)) == (1.0, 3.0)

@@ -45,13 +45,6 @@ def test_many_samples_apart_are_no_outliers_but_a_record_that_does_not_fit(bench
     assert not found.validation.fits
 
 
-def test_a_wrong_model_has_no_outliers(bench: Bench) -> None:
-    data = record(bench, bench.plant("stribeck"), currents_of(bench, "chirp"), seed=2)
-    found = fit(bench, "exact", [data])
-    assert found.records[0].outliers == 0
-    assert not found.validation.fits
-
-
 def test_noise_that_is_larger_than_the_bench_says_is_not_outlying() -> None:
     errors = 3.0 * np.random.default_rng(0).standard_normal((500, 2))
     assert not outliers(errors, np.ones((500, 2), np.bool_)).any()

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.innovations import GAIN, START, Filter, FilterInput, Innovations, march_filtered
+from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import EstimationProblem, with_systematic
-from emb_bench.estimate.search import converge, minimise, released, strong
+from emb_bench.estimate.search import converge, minimise
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.errors import UsageError
 
 from tests.bench.measurements import (  # isort: skip
     WALK,
@@ -27,7 +26,6 @@ from tests.bench.measurements import (  # isort: skip
     disturbed,
     errors_in_sigmas,
     fit,
-    hard,
     problem_of,
     record,
 )
@@ -145,35 +143,6 @@ def test_where_the_brake_is_linear_it_is_the_kalman_filter_of_the_books(bench: B
     assert found.deviance(z, weights) == pytest.approx(float(np.sum(expected**2)) + growth, rel=1e-3)
 
 
-def test_the_filter_is_the_same_compiled_and_as_it_is(bench: Bench) -> None:
-    currents = currents_of(bench, "chirp")[:120]
-    problem = problem_of(bench, ("k_m", "x1_0"), record(bench, bench.plant("exact"), currents))
-    z = problem.nominal()
-    weights, found = problem.weights(z), Filter(problem, WALK)
-    gains = found.gains(z, weights)
-    start = problem.opening(z, 0, (*START, "k_m", "x1_0"))
-    plain, innovations, shares = np.zeros((120, 2, GAIN)), np.zeros((120, 2)), np.zeros((120, 2, 2))
-    given = FilterInput(
-        currents,
-        bench.timing.sample_time,
-        0.0,
-        0,
-        problem.records[0].samples,
-        np.zeros(120),
-        np.zeros(120),
-        weights[0],
-        0.0,
-        1.0,
-        WALK,
-        0.0,
-    )
-    results, covariance = Innovations(innovations, shares), np.zeros((3, 3))
-    moves = problem.plant.mechanics
-    march_filtered(moves, start.p, given, start.chosen, start.x, start.s, covariance, False, plain, results)
-    assert plain.tolist() == gains[0].tolist()
-    assert innovations.ravel().tolist() == found.jacobian(z, weights, gains)[0][:240].tolist()
-
-
 @pytest.mark.slow
 def test_on_a_disturbed_brake_the_estimate_is_as_good_as_it_says_and_output_error_is_not(bench: Bench) -> None:
     brake = bench.brake._replace(f_v=3e-5)
@@ -251,23 +220,6 @@ def test_on_a_brake_that_nothing_disturbs_it_is_output_error(bench: Bench) -> No
     assert found.method == "pem"
 
 
-def test_it_follows_the_measured_brake_out_of_a_local_minimum(bench: Bench) -> None:
-    brake, plant = hard(bench), bench.plant("exact")
-    data = record(bench, plant, currents_of(bench, "constant-speed:turn=0.15", brake), brake=brake)
-    problem = problem_of(bench, PARAMETER_NAMES, data)
-    weights, start = problem.weights(problem.nominal()), problem.nominal()
-    _, lost = search(problem, start, weights)
-    z, end = released(problem, start)
-    assert lost.cost > 1000.0 * end.cost
-    assert end.start == lost.start
-    assert float(np.sum(problem.jacobian(z, weights)[0] ** 2)) == pytest.approx(end.cost, rel=1e-9)
-    _, strongly = converge(Filter(problem, strong(problem)), start)
-    assert strongly.evaluations < end.evaluations
-    found = estimate(bench, plant, [data])
-    assert found.validation.fits
-    assert (np.abs(errors_in_sigmas(found, brake)) < 4.5).all()
-
-
 @pytest.mark.parametrize("plant", ["stribeck", "hysteresis", "late"])
 def test_what_the_model_lacks_is_not_taken_for_a_good_fit(bench: Bench, plant: str) -> None:
     data = record(bench, bench.plant(plant), currents_of(bench, "chirp"))
@@ -309,16 +261,6 @@ def test_a_start_that_was_seen_but_is_not_certain_is_one_that_the_samples_may_co
     assert z == pytest.approx(free[:4], rel=1e-5)
 
 
-def test_a_velocity_that_an_observer_derived_is_no_measurement(bench: Bench) -> None:
-    plant = bench.plant("observer")
-    data = record(bench, plant, currents_of(bench, "chirp"))
-    spoilt = np.stack([data.samples[:, 0], np.full(500, 7.0)], axis=1)
-    found = [estimate(bench, plant, [d]) for d in (data, replace(data, samples=spoilt))]
-    assert found[0].values.tolist() == found[1].values.tolist()
-    assert list(found[0].validation.whiteness) == ["angle"]
-    assert (np.abs(errors_in_sigmas(found[0], bench.brake)) < 4.5).all()
-
-
 def test_a_trial_step_at_which_the_filter_diverges_is_one_that_is_not_taken(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), currents_of(bench, "chirp"))
     problem = problem_of(bench, PARAMETER_NAMES, data)
@@ -330,14 +272,3 @@ def test_a_trial_step_at_which_the_filter_diverges_is_one_that_is_not_taken(benc
     z, end = minimise(problem, np.ones(4), diverging)
     assert z[0] <= 1.2
     assert math.isfinite(end.cost)
-
-
-def test_what_cannot_be_estimated_is_refused(bench: Bench) -> None:
-    data = record(bench, bench.plant("exact"), currents_of(bench, "chirp")[:50])
-    for names, plant, records, starts, message in (
-        (("k_m", "delay"), "lag", [data], 1, "a delay is estimated with"),
-        (PARAMETER_NAMES, "exact", [], 1, "one record"),
-        (PARAMETER_NAMES, "exact", [data], 0, "1 start"),
-    ):
-        with pytest.raises(UsageError, match=message):
-            estimate(bench, plant, records, EstimationProblem(names), starts=starts)

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +11,6 @@ from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import Estimate, EstimationProblem
 from emb_bench.estimate.windows import begun_at, by_windows, linearised, predict_windows, weights_of, windowed
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.experiment.from_log import read_experiment
-from emb_bench.logs.log import read_log
 from emb_bench.recordings.map_file import parse_map
 from emb_bench.recordings.readers import Column, recorded
 from emb_bench.recordings.run_file import bench_of
@@ -185,23 +181,3 @@ def test_too_few_windows_and_starts_that_are_asked_for_are_refused() -> None:
     plant = bench.plant("recorded")
     with pytest.raises(UsageError, match="no other feature"):
         method_of("windows")(bench, plant, EstimationProblem(("viscous_asymmetry",), ("break_away",))).fit([own])
-
-
-def test_an_imported_recording_is_estimated_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from emb_bench.cli.replay import main
-
-    data = record(Machine(), 7.0)
-    rows = "\n".join(",".join(map(repr, row)) for row in zip(*(c.tolist() for c in data), strict=True))
-    (tmp_path / "r.csv").write_text(f"t,x,F\n{rows}\n")
-    (tmp_path / "map.toml").write_text(MAP)
-    run = str(tmp_path / "run.mcap")
-    assert main(["import", str(tmp_path / "r.csv"), "--map", str(tmp_path / "map.toml"), "-o", run]) == 0
-    capsys.readouterr()
-    assert main(["estimate", run, "--starts", "1", "-v"]) == 0
-    said = capsys.readouterr().out
-    assert "output error over windows" in said
-    assert "no velocity" in said
-    assert main(["fim", run]) == 0
-    log = read_log(run)
-    experiment = read_experiment(log)
-    assert math.isfinite(float(experiment.samples.sum()))

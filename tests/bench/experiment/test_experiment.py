@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 import math
+import random
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,28 +14,30 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
 from emb_bench.experiment.evaluation import Fit, ModelEvaluator
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.experiment.from_log import LOST, Samples, currents_by_charge, read_experiment
+from emb_bench.experiment.from_log import (
+    LOST,
+    UNKNOWN,
+    Samples,
+    control_cycles,
+    currents_by_charge,
+    read_experiment,
+    samples_before,
+)
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.sim.transport import SimTransport
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import Layout
+from emb_runtime.can.receiver import Reception
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError
 from emb_runtime.log.ring_buffer import FrameRecord
-from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.records import CycleRecord, Frame, RunState, SensorSample
 from emb_runtime.system.clock import SteppedClock
 
+from tests.bench.hostile import HostileBus, drive, write_trace  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
 from tests.independent import DATABASE  # isort: skip
-import random
-from typing import Any
-
-from emb_bench.experiment.from_log import UNKNOWN, control_cycles, samples_before
-from emb_runtime.can.receiver import Reception
-from emb_runtime.records import RunState, SensorSample
-
-from tests.bench.hostile import HostileBus, drive, write_trace  # isort: skip
 
 
 VELOCITY = 0x101
@@ -182,17 +186,6 @@ def test_a_brake_that_rests_off_the_origin_starts_where_it_rests(tmp_path: Path,
     assert experiment.x0()[1] == 0.0
 
 
-def test_an_encoder_offset_that_the_model_knows_is_taken_from_where_the_brake_rests(
-    tmp_path: Path, simulate: Simulate, bench: Bench
-) -> None:
-    log, experiment = recorded(tmp_path, simulate(square, options="plant=offset"))
-    assert experiment.x0()[0] == pytest.approx(0.2, abs=0.001)
-    assert experiment.x0(0.2) == (0.0, 0.0)
-    assert log.truth is not None
-    assert fit(experiment, bench, log.truth, bench.plant("offset")).fits
-    assert not fit(experiment, bench, log.truth, bench.plant("exact")).fits
-
-
 @pytest.mark.parametrize("plant", ["euler", "exact", "offset", "jitter", "observer"])
 def test_a_record_fits_the_plant_that_was_simulated_and_its_instruments(
     tmp_path: Path, simulate: Simulate, bench: Bench, plant: str
@@ -241,24 +234,6 @@ def test_what_cannot_be_compared_does_not_fit() -> None:
     assert not Fit(0.0, 0.0, 0).fits
     assert not Fit(1.0, math.nan, 500).fits
     assert not Fit(math.nan, 1.0, 500).fits
-
-
-def test_a_cut_log_has_the_experiment_up_to_the_cut(tmp_path: Path, simulate: Simulate) -> None:
-    whole_log, whole = recorded(tmp_path, simulate(square))
-    data = whole_log.path.read_bytes()
-    whole_log.path.write_bytes(data[: len(data) // 2])
-    log = read_log(whole_log.path)
-    part = read_experiment(log)
-    count = len(part.currents)
-    assert 100 < count < 400
-    assert part.missing == (f"the experiment ends after {count} of 500 samples",)
-    np.testing.assert_array_equal(part.currents, whole.currents[:count])
-    np.testing.assert_array_equal(part.all_samples, whole.all_samples[: count + 1])
-
-
-def test_a_shorter_run_by_order_misses_nothing(tmp_path: Path, simulate: Simulate) -> None:
-    _, experiment = recorded(tmp_path, simulate(square, steps=40), steps=40)
-    assert (len(experiment.currents), experiment.planned, experiment.missing) == (40, 40, ())
 
 
 def test_a_report_that_contradicts_the_command_is_counted(tmp_path: Path, simulate: Simulate) -> None:

@@ -11,19 +11,10 @@ from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.information.criteria import criteria, criteria_series
 from emb_bench.information.identifiability import Spectrum, combination, judge, schur_complement
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 
-BENCH = load_bench()
 FIVE = (*PARAMETER_NAMES, "J")
-
-
-def test_criteria_worked_by_hand() -> None:
-    found = criteria(np.diag([4.0, 1.0]), ("k_m", "f_v"))
-    assert found.log_det == pytest.approx(math.log(4.0), rel=1e-15)
-    assert (found.trace_inverse, found.lambda_min, found.condition) == pytest.approx((1.25, 1.0, 4.0), rel=1e-15)
-    assert not found.singular
-    assert found.weakest == {"k_m": 0.0, "f_v": 1.0}
 
 
 @pytest.mark.parametrize("matrix", [np.full((2, 2), np.nan), np.zeros((2, 3)), np.diag([1.0, -1.0])])

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import Instruments
-from emb_bench.information.criteria import criteria
 from emb_bench.information.fisher import (
     Fisher,
     Kind,
@@ -58,15 +57,6 @@ def test_the_weights_are_those_of_the_thesis_and_of_the_sensors() -> None:
     assert physical_weights(BENCH.noise) == pytest.approx((1e6, 1.0), rel=1e-12)
 
 
-@pytest.mark.parametrize(("half_period", "current", "expected"), [(10, 6.0, 80.8), (50, 1.5, 83.1), (500, 0.9, 91.4)])
-def test_log_det_of_known_designs_is_what_an_independent_implementation_found(
-    half_period: int, current: float, expected: float
-) -> None:
-    assert criteria(physical(square(half_period, current)), PARAMETER_NAMES).log_det == pytest.approx(
-        expected, abs=0.06
-    )
-
-
 @pytest.mark.parametrize(("kind", "scale"), [("physical", (1.0, 1.0)), ("weighted", (100.0, 500.0))])
 def test_the_fisher_information_is_the_sum_of_the_outer_products(kind: Kind, scale: tuple[float, float]) -> None:
     s = of_euler(square(20, 4.0)) / np.array(scale)
@@ -93,21 +83,6 @@ def test_a_lost_sample_tells_nothing_but_the_brake_moves_on() -> None:
     assert nothing.criteria().log_det == -math.inf
 
 
-def test_a_motion_in_one_direction_under_constant_current_names_the_direction_that_it_does_not_tell() -> None:
-    # While it moves forward, 1 % more motor torque and the friction that eats it up look the same.
-    current = 2.7
-    found = of(np.full(150, current), plant="euler", x0=(0.0, 10.0))
-    assert (euler_states(BRAKE, np.full(150, current), (0.0, 10.0))[:, 1] > 0.0).all()
-    verdict = found.criteria()
-    assert (verdict.log_det, verdict.trace_inverse, verdict.lambda_min) == (-math.inf, math.inf, 0.0)
-    assert verdict.condition == math.inf
-    assert verdict.singular
-    (flat,) = verdict.flat
-    assert flat == verdict.weakest
-    assert flat["k_m"] / flat["T_c"] == pytest.approx(BRAKE.T_c / (BRAKE.k_m * current), rel=1e-6)
-    assert (abs(flat["k_1"]), abs(flat["f_v"])) == pytest.approx((0.0, 0.0), abs=1e-6)
-
-
 def test_what_is_not_told_has_an_infinite_bound_and_the_others_keep_theirs() -> None:
     currents, start = np.full(150, 2.7), (0.0, 10.0)
     bounds = of(currents, plant="euler", x0=start).cramer_rao()
@@ -124,21 +99,12 @@ def test_a_brake_at_rest_tells_nothing() -> None:
     assert len(found.criteria().flat) == 4
 
 
-def test_no_samples_leave_what_was_known_before() -> None:
-    assert not of([], plant="euler").matrix.any()
-
-
 def test_knowing_a_range_of_fifty_percent_is_worth_twelve_and_bounds_what_a_resting_brake_does_not() -> None:
     prior = uniform_prior(BENCH.range_set("pm50"), PARAMETER_NAMES, BRAKE)
     np.testing.assert_allclose(prior, 12.0 * np.eye(4), rtol=1e-12, atol=0.0)
     found = of(np.zeros(500), plant="euler", prior=prior)
     assert list(found.cramer_rao().values()) == pytest.approx([1.0 / math.sqrt(12.0)] * 4, rel=1e-12)
     np.testing.assert_array_equal(found.prior, prior)
-
-
-def test_a_parameter_that_does_not_vary_has_no_prior() -> None:
-    with pytest.raises(UsageError):
-        uniform_prior(BENCH.range_set("viscous"), ("k_m",), BRAKE)
 
 
 def test_the_weighted_information_gives_no_bound() -> None:
@@ -262,28 +228,6 @@ def test_a_bound_above_the_value_itself_is_not_taken_for_an_answer() -> None:
     assert direction.shares["k_m"] == pytest.approx(0.469, abs=1e-3)
 
 
-def test_nuisances_cost_information_and_never_give_any() -> None:
-    known = of(chirp())
-    assert known.interest == PARAMETER_NAMES
-    loose = of(chirp(), nuisances=("delay", "contact", "x2_0"), x0=(0.0, 20.0))
-    tight = of(chirp(), x0=(0.0, 20.0))
-    assert loose.interest == PARAMETER_NAMES
-    assert loose.criteria().log_det < tight.criteria().log_det
-    for name in PARAMETER_NAMES:
-        assert loose.cramer_rao()[name] >= tight.cramer_rao()[name]
-    rows = list(range(4))
-    np.testing.assert_allclose(loose.matrix[np.ix_(rows, rows)], tight.matrix, rtol=1e-12)
-
-
-def test_what_was_measured_before_the_start_counts_as_a_prior_on_it() -> None:
-    prior = np.diag([0.0, 0.0, 0.0, 0.0, 1e8, 25.0, 0.0])
-    found = of(chirp(), nuisances=("x1_0", "offset", "contact"), prior=prior)
-    assert not found.criteria().singular
-    told = {finding.name: finding.why_not for finding in found.verdict().findings}
-    assert told["x1_0"] == "the data add nothing to what was known before"
-    assert not any(told[name] for name in (*PARAMETER_NAMES, "offset", "contact"))
-
-
 def test_an_error_of_the_sampling_instant_is_worth_what_the_output_changes_in_it() -> None:
     states = np.array([[0.0, 0.0], [0.1, 200.0], [0.4, 300.0]])
     found = weights_along(BENCH, "physical", Instruments(clock_jitter=1e-5), states)
@@ -319,8 +263,3 @@ def test_a_value_that_cannot_be_told_from_the_end_of_its_range_is_at_a_border() 
     ):
         verdict = of(chirp(), p=BRAKE._replace(k_1=k_1)).verdict(BENCH.range_set("viscous-stiffness"))
         assert {f.name: f.border for f in verdict.findings} == {"k_m": "", "k_1": expected, "T_c": "", "f_v": ""}
-
-
-def test_no_parameter_is_no_experiment() -> None:
-    with pytest.raises(UsageError):
-        of(chirp(), ())

@@ -100,12 +100,6 @@ def test_a_growing_log_gives_every_message_once_wherever_it_pauses(
     assert found == messages_of(shipped)
 
 
-def test_a_log_that_is_cut_ends_where_nothing_more_is_to_be_waited_for(shipped: Path, tmp_path: Path) -> None:
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(shipped.read_bytes()[: in_last_chunk(shipped)])
-    assert 0 < sum(len(chunk.at) for chunk in chunks(cut, never)) < messages_of(shipped).total()
-
-
 def test_what_is_no_log_is_refused(shipped: Path, tmp_path: Path) -> None:
     pipe, text, damaged, huge = (tmp_path / f"{name}.mcap" for name in ("pipe", "text", "damaged", "huge"))
     os.mkfifo(pipe)

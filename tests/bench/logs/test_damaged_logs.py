@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import zstandard
 from hypothesis import given, settings
@@ -83,31 +82,6 @@ def chunk(data: bytes, *, size: int | None = None, packed: bytes | None = None, 
     return record(
         CHUNK, head + struct.pack("<I", len(compression)) + compression + struct.pack("<Q", len(packed)) + packed
     )
-
-
-@pytest.mark.slow
-def test_a_log_cut_at_every_byte_of_its_last_chunk_is_salvaged_or_refused(path: Path, whole: Read) -> None:
-    data = path.read_bytes()
-    *_, (_, begin, end) = (r for r in records(data) if r[0] == CHUNK)
-    kept, messages = list[int](), list[int]()
-    for size in [*range(0, begin, 151), *range(begin, end + 40), *range(end + 40, len(data), 37), len(data) - 1]:
-        path.write_bytes(data[:size])
-        found = judge(path, whole)
-        kept.append(found.experiment.periods if found else 0)
-        if found is not None:
-            count = found.experiment.periods
-            assert found.said
-            assert "the file is cut at byte" in found.log.missing
-            history = whole.evaluation.histories["physical"][count - 1]
-            np.testing.assert_array_equal(found.evaluation.histories["physical"][-1], history)
-            messages.append(sum(found.log.counts.values()))
-            for topic, table in found.log.tables.items() if size % 50 == 0 else ():
-                for name, column in table.items():
-                    np.testing.assert_array_equal(column, whole.log.tables[topic][name][: len(column)])
-    assert kept == sorted(kept)
-    assert messages == sorted(messages)
-    assert messages[-1] == sum(whole.log.counts.values())
-    assert 0 < kept[-60] <= kept[-1] == STEPS
 
 
 @FIXTURE

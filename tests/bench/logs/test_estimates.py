@@ -22,7 +22,6 @@ from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log import mcap_schema
 from emb_runtime.log.mcap_schema import Field, Topic
 from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, Record
-from emb_runtime.records import CycleRecord
 
 from tests.bench.conftest import Replay  # isort: skip
 from tests.actors import constant_actor
@@ -119,16 +118,6 @@ def test_an_estimate_that_is_other_in_its_last_bit_or_missing_is_reported(write:
 
     for alter in (change, remove):
         assert [(d.step, d.what) for d in again(write(alter), bench).differences] == [(50, "estimate")]
-
-
-def test_a_log_that_is_cut_before_an_estimate_is_followed_up_to_there(write: Write, bench: Bench) -> None:
-    def cut(records: list[Record]) -> None:
-        last = [n for n, record in enumerate(records) if isinstance(record, CycleRecord)][80]
-        del records[last + 1 :]
-
-    result = again(write(cut, cut=True), bench)
-    assert (result.differences, result.followed, result.outcome) == ((), True, None)
-    assert result.decisions == 81
 
 
 def test_a_goal_that_nothing_estimates_is_refused_in_one_line(write: Write, replay: Replay) -> None:

@@ -71,20 +71,6 @@ def test_decoded_signals_are_those_of_the_frames(path: Path, run: SimRun) -> Non
         read_log(path).signals("EMB_Nothing")
 
 
-def test_a_damaged_chunk_is_left_out_and_the_others_are_kept(path: Path) -> None:
-    whole, data = read_log(path), bytearray(path.read_bytes())
-    chunks = [at for at in range(len(data)) if data[at : at + 4] == b"zstd"]
-    at = chunks[2] + 40
-    data[at : at + 4] = b"\xff\x00\xff\x00"
-    path.write_bytes(data)
-    log = read_log(path)
-    assert "the chunk at byte" in log.missing
-    assert "left out" in log.missing
-    assert 0 < len(log.cycles["step"]) < len(whole.cycles["step"])
-    assert set(log.cycles["step"]) < set(whole.cycles["step"])
-    assert log.cycles["step"][-1] == whole.cycles["step"][-1]
-
-
 def test_a_finished_log_without_its_first_chunk_is_read_with_the_descriptions_at_its_end(path: Path) -> None:
     data = path.read_bytes()
     at = data.index(b"zstd") + 40  # inside the first chunk, which describes the topics
