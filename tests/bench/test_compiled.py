@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import math
 import operator
 import os
 import subprocess
@@ -10,7 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -209,32 +208,6 @@ def test_no_other_process_can_come_between_the_steps_in_which_machine_code_is_ke
     assert done == ["load", "save"]
 
 
-class Holder:
-    """Another process that has the lock of the one directory; for how long, by a clock of its own [s]."""
-
-    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch, leaves: float = math.inf) -> None:
-        self.root, self.leaves, self.now = root, leaves, 0.0
-        self.file: IO[str] | None = None
-        monkeypatch.setattr("emb_bench.compiled._cache_root", lambda: root)
-        clock = SimpleNamespace(monotonic=lambda: self.now, sleep=self.sleep)
-        monkeypatch.setattr("emb_bench.compiled.time", clock)
-
-    def __enter__(self) -> Holder:
-        (directory,) = self.root.iterdir()
-        self.file = (directory / "lock").open("w")
-        fcntl.flock(self.file, fcntl.LOCK_EX)
-        return self
-
-    def sleep(self, duration: float) -> None:
-        self.now += duration
-        if self.now >= self.leaves:
-            self.__exit__()
-
-    def __exit__(self, *_: object) -> None:
-        if self.file is not None:
-            self.file.close()
-
-
 def halved(x: float) -> float:
     return 0.5 * x
 
@@ -242,11 +215,16 @@ def halved(x: float) -> float:
 def test_a_process_that_never_gives_the_lock_back_delays_and_stops_nobody(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    holder = Holder(tmp_path, monkeypatch)
+    waited: list[float] = []
+    clock = SimpleNamespace(monotonic=lambda: sum(waited), sleep=waited.append)
+    monkeypatch.setattr("emb_bench.compiled.time", clock)
+    monkeypatch.setattr("emb_bench.compiled._cache_root", lambda: tmp_path)
     fast = compiled(halved)
-    with holder:
+    (directory,) = tmp_path.iterdir()
+    with (directory / "lock").open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
         assert fast(3.0) == 1.5
-    assert holder.now == pytest.approx(2 * LOCK_WAIT, abs=1.0)  # to read, and to write
+    assert sum(waited) == pytest.approx(2 * LOCK_WAIT, abs=1.0)  # to read, and to write
     assert not kept(tmp_path)
 
 

@@ -19,7 +19,7 @@ from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document, text
 from emb_bench.report.sentences import apart
-from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
+from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import UsageError
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
@@ -44,23 +44,6 @@ def log(tmp_path: Path, simulate: Simulate) -> Log:
 
 def estimated(bench: Bench, *records: Experiment, **asked: object) -> Estimate:
     return fit(bench, "exact", records, EstimationProblem(**asked))  # type: ignore[arg-type]
-
-
-def test_a_study_of_one_log_has_an_estimate_and_a_conclusion_for_each_parameter(bench: Bench, log: Log) -> None:
-    found = make_study(bench, [log("plant=exact")], StudyOptions(EstimationProblem(), starts=1))
-    assert [c.label for c in found.conclusions] == list(PARAMETER_NAMES)
-    assert found.holds
-    assert found.identified
-    assert (found.profiles, found.held_out, found.left_out) == ((), (), ())
-    assert (found.advice, found.drifts, found.warnings) == ((), (), ())
-    assert found.model_reason == "it was simulated"
-    assert found.truth is not None
-    intervals = found.estimate.intervals()[found.estimate.wanted()].tolist()
-    for conclusion, interval in zip(found.conclusions, intervals, strict=True):
-        assert conclusion.identified
-        assert list(conclusion.interval) == interval
-        true = getattr(found.truth, conclusion.label)
-        assert abs(conclusion.value - true) < 2.0 * (interval[1] - interval[0])
 
 
 def test_a_record_that_is_not_predicted_decides_like_residuals_that_do_not_fit(bench: Bench, log: Log) -> None:

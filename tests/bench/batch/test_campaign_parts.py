@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import os
 import socket
 import sys
@@ -16,28 +15,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyarrow import parquet
 
-from emb_bench.analysis.several_runs import DIFFERENT, constancy
-from emb_bench.batch.campaign import find
+from emb_bench.analysis.several_runs import constancy
+from emb_bench.batch.campaign import draw, find
 from emb_bench.batch.row import Options, Parameter, Row, Source, failed, write_rows
-from emb_bench.batch.summary import mark_copies, summarise, text
+from emb_bench.batch.summary import Campaign, document, mark_copies, summarise, text
 from emb_bench.output import Progress, StatusLine, replacing
 from emb_runtime.errors import UsageError
 
 from tests.bench.conftest import Replay  # isort: skip
+from tests.bench.report.test_page import Terminal  # isort: skip
 
 NUMBERS = st.floats(-1e3, 1e3).map(lambda value: value if abs(value) > 1e-300 else 0.0)
 """Without those so small that they have lost digits."""
 DEVIATIONS = st.floats(1e-3, 1e3)
-
-
-@settings(deadline=None)  # the first one imports scipy
-@given(NUMBERS, NUMBERS, DEVIATIONS, DEVIATIONS)
-def test_two_runs_compare_as_their_difference_in_its_own_deviation(a: float, b: float, s: float, t: float) -> None:
-    found = constancy([a, b], [s, t])
-    apart = abs(a - b) / math.hypot(s, t)
-    assert found.chi2 == pytest.approx(apart**2, rel=1e-6, abs=1e-9)
-    assert found.p_value == pytest.approx(math.erfc(apart / math.sqrt(2.0)), rel=1e-6, abs=1e-4)
-    assert found.constant == (found.p_value >= DIFFERENT)
 
 
 @settings(deadline=None)
@@ -107,11 +97,6 @@ def test_a_folder_that_cannot_be_listed_is_in_the_list(tmp_path: Path, monkeypat
     first, second = find([tmp_path])
     assert (first.log, first.trouble) == ("a", "the folder cannot be listed: Permission denied")
     assert (second.log, second.trouble) == ("b/1.mcap", "")
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
 
 
 def test_a_terminal_has_one_line_that_is_written_over_and_failures_stay() -> None:
@@ -199,22 +184,6 @@ def test_a_run_counts_once_and_the_whole_log_or_the_one_that_holds_most_of_it_is
     assert [r.copy_of for r in mark_copies(rows)] == ["b", None, "b", None, None, None, None, "b"]
 
 
-def test_a_misfit_is_named_and_has_no_part_in_the_mean() -> None:
-    rows = [
-        Row(".", ".", f"{n}.mcap", None, start_time=n, fits=n < 3, model="exact", complete=True, exit_reason="DONE",
-            parameters=(Parameter("f_v", True, 2.3e-3, value, 0.9 * value, 1.1 * value, 1e-6, 1e-6),))
-        for n, value in enumerate([2.98e-5, 2.99e-5, 3.1e-5, 5e-5])
-    ]  # fmt: skip
-    found = summarise(rows, Options(params=("f_v",)), "r.parquet")
-    assert [row.log for row in found.misfit] == ["3.mcap"]
-    estimate = found.parameters["f_v"].estimate
-    assert estimate is not None
-    assert (estimate.runs, estimate.constancy.constant) == (3, False)
-    assert estimate.constancy.mean == pytest.approx(3.02e-5, rel=0.01)
-    assert estimate.total == pytest.approx(0.1 * 2.99e-5)
-    assert "3.mcap" in text(found)
-
-
 def test_the_rows_are_a_csv_file_where_the_name_says_so(tmp_path: Path) -> None:
     cut = failed(Source("logs/a.mcap", "logs", "a.mcap", "."), "cut")
     rows = [cut, Row("logs", ".", "b.mcap", warnings=("one", "two"))]
@@ -229,3 +198,87 @@ def test_the_rows_are_a_csv_file_where_the_name_says_so(tmp_path: Path) -> None:
     table = parquet.read_table(path)
     assert table.column_names == list(found[0])
     assert table["warnings"].to_pylist() == [None, ["one", "two"]]
+
+
+HOUR = 3600 * 10**9
+FIRST = 1_700_000_000 * 10**9
+TRUE, DEVIATION = 0.0217, 1e-5  # k_m at the begin, and the standard deviation of an estimate, relative
+OPTIONS = Options(params=("k_m",))
+
+
+def row(number: int, value: float, *, fits: bool = True, half: float = 0.0) -> Row:
+    low, high = value * (1.0 - half), value * (1.0 + half)
+    estimate = Parameter("k_m", True, DEVIATION, value, low, high, DEVIATION, DEVIATION)
+    return Row(
+        "root",
+        "day",
+        f"{number}.mcap",
+        start_time=FIRST + number * HOUR,
+        exit_reason="DONE",
+        complete=True,
+        fits=fits,
+        model="exact",
+        log_det=70.0,
+        weighted_log_det=40.0,
+        parameters=(estimate,),
+    )
+
+
+def campaign(values: list[float], wrong: int | None = None) -> Campaign:
+    rows = [row(n, value, fits=n != wrong) for n, value in enumerate(values)]
+    return summarise([*rows[1:], rows[0]], OPTIONS, "result.parquet")
+
+
+def drifting(walk: float, runs: int = 40) -> tuple[list[float], list[float]]:
+    """True and estimated k_m of runs an hour apart; the walk is relative, per root of an hour."""
+    rng = np.random.default_rng(4)
+    true = TRUE * (1.0 + np.cumsum(walk * rng.standard_normal(runs)))
+    return true.tolist(), (true * (1.0 + DEVIATION * rng.standard_normal(runs))).tolist()
+
+
+def test_the_trend_follows_a_parameter_that_drifts_from_run_to_run() -> None:
+    true, seen = drifting(2e-5)
+    trend = campaign(seen).parameters["k_m"].trend
+    assert trend is not None
+    assert trend.start_times == tuple(FIRST + n * HOUR for n in range(40))
+    assert trend.walk.walk == pytest.approx(2e-5 * TRUE, rel=0.4)
+    low, high = trend.walk.ends.T
+    assert np.mean((low <= true) & (true <= high)) > 0.85
+    assert (trend.walk.deviations < DEVIATION * TRUE).all()
+
+
+def test_runs_that_do_not_fit_and_few_runs_have_no_part_in_it() -> None:
+    _, seen = drifting(2e-5)
+    seen[7] = 2.0 * TRUE
+    found = campaign(seen, wrong=7).parameters["k_m"].trend
+    assert found is not None
+    assert len(found.values) == 39
+    assert campaign(seen[:3]).parameters["k_m"].trend is None
+
+
+def test_it_is_in_the_text_the_document_and_the_figure(tmp_path: Path) -> None:
+    _, seen = drifting(2e-5)
+    found = campaign(seen)
+    assert "walk of" in text(found, verbose=True)
+    trend = document(found)["parameters"]["k_m"]["trend"]
+    assert trend["start_times"] == [FIRST + n * HOUR for n in range(40)]
+    assert len(trend["walk"]["values"]) == 40
+    assert document(campaign(seen[:3]))["parameters"]["k_m"]["trend"] is None
+    draw(found, tmp_path / "trend.svg")
+    assert "random walk through all runs" in (tmp_path / "trend.svg").read_text()
+    draw(campaign(seen[:3]), tmp_path / "none.svg")
+    assert "enough runs" in (tmp_path / "none.svg").read_text()
+    with pytest.raises(UsageError, match="cannot write the figure"):
+        draw(found, tmp_path / "gone" / "trend.svg")
+
+
+def test_a_misfit_is_named_and_has_no_part_in_the_mean() -> None:
+    values = [2.98e-2, 2.99e-2, 3.1e-2, 5e-2]
+    found = summarise([row(n, value, fits=n < 3, half=0.1) for n, value in enumerate(values)], OPTIONS, "r.parquet")
+    assert [row.log for row in found.misfit] == ["3.mcap"]
+    estimate = found.parameters["k_m"].estimate
+    assert estimate is not None
+    assert (estimate.runs, estimate.constancy.constant) == (3, False)
+    assert estimate.constancy.mean == pytest.approx(3.02e-2, rel=0.01)
+    assert estimate.total == pytest.approx(0.1 * 2.99e-2)
+    assert "3.mcap" in text(found)

@@ -73,16 +73,6 @@ def test_two_logs_of_one_brake_tell_more_than_one(path: Path, log: Log, replay: 
         assert gain == pytest.approx(2**0.5, rel=0.05)
 
 
-def test_what_is_not_identified_has_no_interval_and_is_named_with_its_combination(path: Path, replay: Replay) -> None:
-    """Torques and inertia scale together."""
-    got = replay.document(path, "--nuisance", "J", "--starts", "2")
-    assert not got["identified"]
-    assert all(found["interval_95"] == [None, None] for found in got["parameters"].values())
-    (flat,) = got["directions"]
-    assert flat["deviation"] is None
-    assert [flat["shares"][name] for name in (*PARAMETER_NAMES, "J")] == pytest.approx([5**-0.5] * 5, rel=1e-3)
-
-
 def test_repeatability_is_the_scatter_of_further_runs_and_less_than_the_total(path: Path, replay: Replay) -> None:
     """By noise alone, so with systematic errors excluded it is all of the Cramér-Rao bound."""
     got = replay.document(path, "--starts", "1")["parameters"]
@@ -128,13 +118,6 @@ def test_a_prior_is_named_and_counts(path: Path, replay: Replay) -> None:
         assert 0.0 < shift < 0.1 * found["deviation"]
 
 
-@pytest.fixture
-def three(tmp_path: Path, path: Path, simulate: Simulate) -> list[Path]:
-    options = "plant=exact,f_v=3e-5,T_c=1.2e-2,seed="
-    others = [write_log(tmp_path / f"{n}.mcap", simulate(square, options=f"{options}{n}")) for n in (6, 7)]
-    return [path, *others]
-
-
 def test_bounds_are_kept_and_a_value_at_one_is_named(path: Path, replay: Replay) -> None:
     got = replay.document(path, "--bounds", "f_v=1e-5:2e-5", "--starts", "1")
     assert got["bounds"] == {"f_v": [1e-5, 2e-5]}
@@ -152,13 +135,13 @@ def test_strict_fails_where_the_model_does_not_fit_or_predict_or_something_is_no
         replay.text(path, "--strict", "--starts", "1", *arguments, code=1)
 
 
-def test_profiles_come_when_asked_for(three: list[Path], replay: Replay) -> None:
-    got = replay.document(*three, "--profile", "--starts", "1")
+def test_profiles_come_when_asked_for(path: Path, replay: Replay) -> None:
+    got = replay.document(path, "--profile", "--starts", "1")
     assert [(p["label"], p["shape"]) for p in got["profiles"]] == [(name, "closed") for name in PARAMETER_NAMES]
     for conclusion, profile in zip(got["conclusions"], got["profiles"], strict=True):
         (low, high), (first, last) = conclusion["interval"], profile["interval_95"]
         assert low <= first < last <= high  # it allows for suspects that were not noticed, too
-    ideal = replay.document(*three, "--profile", "--starts", "1", "--systematic", "none")
+    ideal = replay.document(path, "--profile", "--starts", "1", "--systematic", "none")
     for conclusion, profile in zip(ideal["conclusions"], ideal["profiles"], strict=True):
         assert conclusion["interval"] == profile["interval_95"]
 

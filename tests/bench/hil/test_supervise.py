@@ -1,8 +1,10 @@
-"""The time limit of emb-hil: what it does to a command, and that it says so."""
+"""emb-hil: its time limit ends a command and says so, and each kernel has a processor of its own where that goes."""
 
 from __future__ import annotations
 
+import os
 import signal
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -34,17 +36,14 @@ class Patient:
 
 
 def test_a_command_that_is_ended_by_its_time_limit_is_told_of_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert supervise(lambda: Patient(looks=2), timeout_s=600.0) == 0
+    assert capsys.readouterr() == ("", "")
     child = Patient(looks=10**9)
     assert supervise(lambda: child, timeout_s=1e-3) == EXIT_TIMEOUT == 124
     assert child.signals == [signal.SIGTERM]
     out, err = capsys.readouterr()
     assert out == ""
     assert err == "emb-hil: the time limit of 0.001 s is over, the command ends; exit code 124\n"
-
-
-def test_of_a_command_that_ends_in_time_nothing_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    assert supervise(lambda: Patient(looks=2), timeout_s=600.0) == 0
-    assert capsys.readouterr() == ("", "")
 
 
 def test_ctrl_c_while_a_kernel_is_made_ready_ends_it_and_leaves_nothing(
@@ -60,3 +59,28 @@ def test_ctrl_c_while_a_kernel_is_made_ready_ends_it_and_leaves_nothing(
     assert main(["--uml", "--", "true"]) == 130
     assert capfd.readouterr() == ("", "")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_two_kernels_share_no_processor_and_a_further_one_is_not_pinned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    allowed = os.sched_getaffinity(0)
+    for _ in range(2):  # afterwards every processor is free again
+        with ExitStack() as stack:
+            taken = []
+            for _ in allowed:
+                taken.append(stack.enter_context(uml.own_processor()))
+                assert os.sched_getaffinity(0) == {taken[-1]}
+                os.sched_setaffinity(0, allowed)  # the next one is another process
+            assert set(taken) == allowed
+            assert stack.enter_context(uml.own_processor()) is None
+            assert os.sched_getaffinity(0) == allowed
+    with uml.own_processor():
+        pass
+    assert os.sched_getaffinity(0) == allowed
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with uml.own_processor() as processor:  # where nothing can be locked
+        assert processor is None
+        assert os.sched_getaffinity(0) == allowed

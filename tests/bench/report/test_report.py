@@ -169,16 +169,6 @@ def test_what_was_left_out_or_is_missing_comes_before_the_verdict(joint: Report)
     assert lost["experiment"]["measured"] == 497
 
 
-def test_a_run_without_an_experiment_is_reported_without_an_estimate(folder: Path, joint: Report) -> None:
-    made = make(folder / "alone.html", folder / "never.mcap", code=1)
-    assert made.reader.texts[0].startswith("STOPPED: never.mcap: INTERRUPTED")
-    assert "no experiment in this log: it never became active (INTERRUPTED)" in made.reader.text
-    assert not {"Parameters", "Uncertainty", "Residuals"} & set(made.reader.headings)
-    assert "stopped by the operator" in made.reader.text
-    assert made.numbers["estimate"] is None
-    assert made.numbers["model_fits"] is None
-
-
 def gathered(bench: Bench, *paths: Path) -> Content:
     """What a report would say, without the figures."""
     options = StudyOptions(EstimationProblem(), starts=1)
