@@ -16,7 +16,6 @@ from emb_bench.information.symmetric import pack, unpack
 from emb_runtime.errors import UsageError
 from emb_train.closed_loop import Batch
 from emb_train.env import Scoring
-from emb_train.presets import preset_summaries
 from emb_train.rewards import (
     ONE_PARAMETER,
     Reward,
@@ -35,7 +34,6 @@ from emb_train.rewards import (
     squared_determinant_gain,
     trajectory_return,
 )
-from emb_train.training import load_preset
 from studies.thesis.determinant import normalised
 
 AT_HOME = Turn(np.zeros((1, 2)), np.zeros(1), np.zeros((1, 1)))
@@ -214,14 +212,3 @@ def test_the_packed_matrix_of_the_environment_is_the_one_that_the_rewards_unpack
     batch.begin(0, np.random.default_rng(0))
     total = sum(float(scoring.advance(np.full(1, 2.0))[0]) for _ in range(100))
     assert total == pytest.approx(np.linalg.eigvalsh(unpack(batch.m[0], 2))[0], rel=1e-9)
-
-
-def test_the_presets_of_the_thesis_have_its_printed_hyper_parameters() -> None:
-    names = [name for name in preset_summaries() if name.startswith("thesis-")]
-    assert len(names) == 9
-    for name in names:
-        preset = load_preset(name)
-        ppo, conditions = preset.ppo, preset.conditions
-        assert (ppo.envs, ppo.rollout, ppo.epochs, ppo.batch // ppo.minibatch) == (4, 2048, 10, 32), name
-        assert (ppo.learning_rate, ppo.gamma, ppo.gae_lambda, ppo.clip) == (1e-3, 0.99, 0.95, 0.2), name
-        assert (conditions.shielded, conditions.horizon in (0, 300)) == (False, True), name

@@ -164,6 +164,22 @@ class MappedBus:
         bus.receive, bus.send = received, sent  # type: ignore[method-assign]
 
 
+def rests_below(bus: MappedBus, speed: float) -> None:
+    """The true brake, which goes on without a commander, is let go, inside its travel and never faster than that."""
+    for _ in range(600):
+        bus.drive.tick()
+    low, high = bus.bench.limits.angle
+    assert low <= bus.drive.angle_range[0]
+    assert bus.drive.angle_range[1] <= high
+    assert bus.drive.top_speed <= speed
+    assert not bus.drive.armed
+
+
+def within_limits(bus: MappedBus) -> None:
+    """That, at the bench's limits."""
+    rests_below(bus, bus.bench.limits.velocity)
+
+
 def runner(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, current: float = 6.0
 ) -> tuple[MappedBus, EmbRun]:

@@ -6,7 +6,6 @@ Simulated drives in lock-step. A fault that comes later comes 60 samples into a 
 from __future__ import annotations
 
 import itertools
-import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -19,10 +18,9 @@ from emb_runtime.records import Frame
 from emb_runtime.safety.end_stop import released_speed
 from simulated_drives import SimulatedDrive
 from tests.drives import SHIPPED
-from tests.runtime.drives.mapped import PROTECTED, Change, MappedBus, protected, runner
+from tests.runtime.drives.mapped import PROTECTED, Change, MappedBus, protected, rests_below, runner, within_limits
 
 pytestmark = pytest.mark.usefixtures("handlers")
-COMES_TO_REST = 600  # periods
 Break = Callable[[MappedBus], object]
 
 
@@ -197,30 +195,7 @@ def test_a_fault_ends_the_run_with_its_name_and_the_brake_where_it_may_be(
     if expected.lets_go:
         rests_below(bus, released_speed(bus.bench, bus.mapping.watchdog))
     else:
-        rests_below(bus, bus.bench.limits.velocity)
-
-
-def rests_below(bus: MappedBus, speed: float) -> None:
-    """The true brake, which goes on without a commander, is let go, inside its travel and never faster than that."""
-    for _ in range(COMES_TO_REST):
-        bus.drive.tick()
-    low, high = bus.bench.limits.angle
-    assert low <= bus.drive.angle_range[0]
-    assert bus.drive.angle_range[1] <= high
-    assert bus.drive.top_speed <= speed
-    assert not bus.drive.armed
-
-
-def test_values_that_are_no_numbers_are_no_samples(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bus, emb_run = runner("odrive", tmp_path, capsys, monkeypatch)
-    replaced(0x009, lambda _data: struct.pack("<ff", math.nan, 0.0))(bus)
-    assert emb_run.document(code=3)["result"] == "SENSOR_LOST"
-    assert not bus.drive.armed
-    commands = [frame.data for frame in bus.sent if frame.identifier == 0x00E]
-    assert commands[-1] == bytes(4)
-    rests_below(bus, released_speed(bus.bench, bus.mapping.watchdog))
+        within_limits(bus)
 
 
 @pytest.mark.parametrize("name", OTHER_COMMAND)

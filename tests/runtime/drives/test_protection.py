@@ -49,9 +49,3 @@ def test_xor_and_sum_are_those_of_all_other_bytes_and_the_start_value() -> None:
     last = field("c", 63, 8, big_endian=True)
     assert Protection("xor", last, start=7).checksum_of(data) == 7 ^ 0 ^ 1 ^ 2 ^ 3 ^ 250 ^ 5 ^ 6
     assert Protection("sum", last, start=7).checksum_of(data) == (7 + 0 + 1 + 2 + 3 + 250 + 5 + 6) % 256
-
-
-def test_a_counter_that_cannot_be_is_a_fault() -> None:
-    assert Protection("none", None, field("n", 0, 4), 15).fault(bytes((14,))) == ""
-    assert Protection("none", None, field("n", 0, 4), 15).fault(bytes((15,))) == "invalid counter"
-    assert Protection("none").fault(bytes(8)) == ""
