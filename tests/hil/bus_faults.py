@@ -52,12 +52,7 @@ class Impairment:
 
 
 def impair(interface: str, impairment: Impairment) -> None:
-    """Give an interface this impairment, in place of any that it had. A vcan must have been loaded with ``echo=1``.
-
-    Raises:
-        OSError: no such interface, no right to, or a kernel without ``sch_netem`` (ENOENT).
-        ValueError: reordering without a delay.
-    """
+    """Give an interface this impairment, in place of any that it had. A vcan must have been loaded with ``echo=1``."""
     if impairment.reorder and not impairment.delay:
         raise ValueError("a frame overtakes others only where these are delayed: give a delay too")
     head = _NETEM.pack(
@@ -73,11 +68,7 @@ def impair(interface: str, impairment: Impairment) -> None:
 
 
 def clear_netem(interface: str) -> None:
-    """Take the impairment away; frames that wait in it are lost.
-
-    Raises:
-        OSError: there is none, or no such interface, or no right to.
-    """
+    """Take the impairment away; frames that wait in it are lost."""
     _qdisc(_RTM_DELQDISC, 0, interface, b"")
 
 
@@ -103,32 +94,17 @@ class Route:
 
 
 def add_route(route: Route) -> None:
-    """Hand frames on from now on. A frame is handed on once: two buses may be joined in both directions.
-
-    Raises:
-        OSError: no such interface, no right to, or a kernel without ``can_gw`` (EOPNOTSUPP).
-    """
+    """Hand frames on from now on. A frame is handed on once: two buses may be joined in both directions."""
     _route(_RTM_NEWROUTE, route)
 
 
 def remove_route(route: Route) -> None:
-    """Stop handing these frames on.
-
-    Raises:
-        OSError: there is no such route (EINVAL), or no right to.
-    """
+    """Stop handing these frames on."""
     _route(_RTM_DELROUTE, route)
 
 
 def bridge(one: str, other: str, identifier: int, xor: bytes) -> list[Route]:
-    """Make one bus of two, on which frames with ``identifier`` arrive corrupted on the other side.
-
-    Returns:
-        The routes, for :func:`remove_route`.
-
-    Raises:
-        OSError: as :func:`add_route`.
-    """
+    """Make one bus of two, on which frames with ``identifier`` arrive corrupted on the other side."""
     routes = [
         Route(source, destination, identifier, others, b"" if others else xor)
         for source, destination in ((one, other), (other, one))
@@ -153,11 +129,7 @@ def _route(kind: int, route: Route) -> None:
 def report_bus_off(interface: str, off: bool) -> None:
     """Send the error frame with which a controller reports that it went bus-off, or that it recovered.
 
-    It reaches every socket that subscribed to error frames; the interface itself goes on as before.
-
-    Raises:
-        OSError: no such interface, or it is down.
-    """
+    It reaches every socket that subscribed to error frames; the interface itself goes on as before."""
     what = _ERROR_FRAME | (_ERROR_BUS_OFF if off else _ERROR_RESTARTED)
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as sock:
         sock.bind((interface,))
@@ -165,21 +137,13 @@ def report_bus_off(interface: str, off: bool) -> None:
 
 
 def step_clock(seconds: float) -> None:
-    """Set the time of day that much later (earlier where negative); the monotonic clock goes on.
-
-    Raises:
-        OSError: no right to.
-    """
+    """Set the time of day that much later (earlier where negative); the monotonic clock goes on."""
     now = time.clock_gettime_ns(time.CLOCK_REALTIME)
     time.clock_settime_ns(time.CLOCK_REALTIME, now + round(seconds * 1e9))
 
 
 def small_disk(directory: Path, size: int) -> None:
-    """Make ``directory`` a file system in memory with room for ``size`` bytes, rounded up to whole pages.
-
-    Raises:
-        OSError: no right to.
-    """
+    """Make ``directory`` a file system in memory with room for ``size`` bytes, rounded up to whole pages."""
     directory.mkdir(parents=True, exist_ok=True)
     if _libc.mount(b"tmpfs", os.fsencode(directory), b"tmpfs", 0, f"size={size}".encode()) != 0:
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(directory))

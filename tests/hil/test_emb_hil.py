@@ -225,18 +225,6 @@ def test_a_signal_before_the_kernel_is_up_ends_everything(state: Path, tmp_path:
     assert_nothing_left(state)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [[], ["--"], ["true"], ["--timeout", "0", "--", "true"], ["--timeout", "nan", "--", "true"],
-     ["--memory", "1", "--", "true"], ["--slow", "0", "--", "true"], ["--slow", "1001", "--", "true"],
-     ["--slow", "2", "--host", "--", "true"], ["--slow", "x", "--", "true"], ["--host", "--uml", "--", "true"]],
-)  # fmt: skip
-def test_wrong_usage_is_told_apart_from_everything_else(arguments: list[str]) -> None:
-    result = with_environment({**os.environ}, *arguments)
-    assert result.returncode == 2
-    assert "Traceback" not in result.stderr
-
-
 STOOD_STILL = """
 import pathlib, sys, time
 directory = pathlib.Path(sys.argv[1])

@@ -3,7 +3,7 @@
 Policies, lost commands and the way brakes are drawn are those of :mod:`tests.properties.shield_search`. The noise is
 of the learner's kind: at its bound, aligned with the motion or with the second difference of angles, or such that the
 brake looks like another one of the set for as long as it can (*impersonation*). The brakes are the two that can be
-declared: forward Euler and the exact flow; or one that the bench's plants describe, which breaks what is declared.
+declared: forward Euler and the exact flow.
 """
 
 from __future__ import annotations
@@ -55,10 +55,8 @@ class Setting(NamedTuple):
 
     learning: Learning
     law: ShieldLaw  # For the whole set
-    plant: Mechanics  # The true brake's
+    plant: Mechanics
     excess: float  # Sensor noise over its bound
-    jitter: float  # Of the instant of a measurement, both ways [s]
-    shaken: bool  # The declared errors of model and current act
 
 
 class Script(NamedTuple):
@@ -136,7 +134,7 @@ def episode(s: Setting, script: Script, i: int, state: Any, row: Any) -> None:
         last = v
         side = _side(kind, v, since, script.period[i])
         y, w = _noise(s, script, i, k, side, true, shadow)
-        y += x + s.jitter * v * script.errors[i, k, 0]
+        y += x
         w += v
         lost = True
         if k > 0 and script.drops[i, k] == LOST and script.silent[i]:
@@ -156,10 +154,8 @@ def episode(s: Setting, script: Script, i: int, state: Any, row: Any) -> None:
             lost = _is_lost(script.drops[i, k], bits, x, v)
         if lost:
             current = damped_current(v, s.law.current, s.law.damping_velocity)
-        acting = current
-        if s.shaken:
-            acting += side * script.errors[i, k, 2] * a.current_error
-            acting += side * script.errors[i, k, 3] * a.model_error * p.J / p.k_m
+        acting = current + side * script.errors[i, k, 2] * a.current_error
+        acting += side * script.errors[i, k, 3] * a.model_error * p.J / p.k_m
         advance(s.plant, p, true, acting, t, chosen, slopes)
         if kind >= IMPERSONATE:
             advance(s.plant, q, shadow, current, t, chosen, slopes)
@@ -223,29 +219,12 @@ NOISES: dict[str, tuple[Plan, int]] = {
 }
 
 
-def setting_for(
-    bench: Bench,
-    flow: bool,
-    plant: str | None = None,
-    excess: float = 1.0,
-    jitter: float = 0.0,
-    shaken: bool = True,
-) -> Setting:
-    """What is declared, and what is true.
-
-    Args:
-        bench: with what its shield declares.
-        flow: which brake is declared: the exact flow or forward Euler.
-        plant: the true one, without it the one declared.
-        excess: sensor noise over its bound.
-        jitter: of the instant of a measurement, both ways [s].
-        shaken: the declared errors of model and current act; else only what the plant has beyond the model.
-    """
+def setting_for(bench: Bench, flow: bool, excess: float = 1.0) -> Setting:
+    """The exact flow or forward Euler is declared, and true; ``excess`` is sensor noise over its bound."""
     declared = replace(bench, shield=bench.shield._replace(learn=True, model="flow" if flow else "euler"))
     law = make_law(declared)
     learning = Learning(True, design_inputs(declared), bench.brake, assumptions_of(declared))
-    true = bench.plant(plant or ("exact" if flow else "euler"))
-    return Setting(learning, law, true.mechanics, excess, jitter, shaken)
+    return Setting(learning, law, bench.plant("exact" if flow else "euler").mechanics, excess)
 
 
 class Found(NamedTuple):
@@ -254,7 +233,6 @@ class Found(NamedTuple):
     bench: Bench
     seed: int
     brakes: Floats
-    noises: tuple[str, ...]
     labels: Codes  # Indices of policy, noise and drops
     rows: Floats
 
@@ -301,7 +279,7 @@ class Found(NamedTuple):
         r = self.rows[i]
         return (
             f"episode {i} of seed {self.seed}: {', '.join(f'{b:.6g}' for b in self.brakes[i])}; "
-            f"{list(POLICIES)[policy]}; noise {self.noises[noise]}; lost {list(DROPS)[drops]}; "
+            f"{list(POLICIES)[policy]}; noise {list(NOISES)[noise]}; lost {list(DROPS)[drops]}; "
             f"outside {r[OUTSIDE]:.0f} times, falsified {r[REFUTED]:.0f}; "
             f"angle {r[LOWEST]:.3f}..{r[HIGHEST]:.3f} rad, velocity "
             f"{r[SLOWEST]:.1f}..{r[FASTEST]:.1f} rad/s, end {r[END_ANGLE]:.3f} rad {r[END_VELOCITY]:.2f} rad/s"
@@ -320,20 +298,9 @@ def search(
     bench: Bench,
     n: int,
     seed: int,
-    noises: dict[str, tuple[Plan, int]] | None = None,
     run: Callable[[Setting, Script, Floats, Floats], None] = episodes,
 ) -> Found:
-    """Run ``n`` random adversarial episodes against a learning shield.
-
-    Args:
-        setting: from :func:`setting_for`.
-        bench: the same; the brakes are those of its shield's set.
-        n: episodes.
-        seed: of everything.
-        noises: kinds of noise; without them all.
-        run: how a chunk is run.
-    """
-    noises = noises or NOISES
+    """Run ``n`` random adversarial episodes against a learning shield, by ``run``, which may be a broken one."""
     box = bench.range_set(bench.shield.ranges)
     brakes, rows = np.zeros((n, len(BrakeParameters._fields))), np.zeros((n, COUNT))
     labels = np.zeros((n, 3), dtype=np.int64)
@@ -350,7 +317,7 @@ def search(
         for j, draw in enumerate(DROPS.values()):
             codes[drops == j] = draw(rng, int(np.sum(drops == j)), steps)
         policy, feedback = _kinds(rng, m, POLICIES, steps, wanted)
-        noise, kinds = _kinds(rng, m, noises, steps, errors)
+        noise, kinds = _kinds(rng, m, NOISES, steps, errors)
         script = Script(
             brakes=brakes[part],
             shadows=_shadows(rng, box, brakes[part]),
@@ -365,4 +332,4 @@ def search(
         )
         labels[part] = np.stack([policy, noise, drops], axis=1)
         play(setting, script, begun, rows[part])
-    return Found(bench, seed, brakes, tuple(noises), labels, rows)
+    return Found(bench, seed, brakes, labels, rows)

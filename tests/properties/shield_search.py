@@ -3,8 +3,8 @@
 Everything random is drawn beforehand (what the policy wants, noise, lost commands, frame ages); the compiled loop only
 adds what depends on the state. Three brakes are driven: the thesis's (forward Euler, 1 ms), the bench's plants, and one
 written here, in 25 µs pieces of constant acceleration with an exact standstill, that shares no line with the shield or
-with the project's own brakes. ``test_shield_envelope.py`` and ``test_shield_extensions.py`` run some thousands of them,
-``tests/searches/shield.py`` as many as it is told. One file, as only functions of one module are compiled together.
+with the project's own brakes. ``test_shield_envelope.py`` runs some thousands of them, ``tests/searches/shield.py``
+as many as it is told. One file, as only functions of one module are compiled together.
 """
 
 from __future__ import annotations
@@ -49,6 +49,28 @@ LOWEST, HIGHEST, FASTEST, SLOWEST, END_ANGLE, END_VELOCITY, CRUISE_OUT, CRUISE_H
 
 ROUGH: dict[str, Any] = {"current_lag": 0.002, "break_away": 1.2, "f_l": 1e-6}
 COASTING: dict[str, Any] = {"envelope": "coasting", "angle_margin": 1.1}
+EXTENSIONS: dict[str, dict[str, Any]] = {
+    "break_away 1.2, f_l 2e-6 m": {"break_away": 1.2, "f_l": 2e-6},
+    "current_lag 0.5 ms": {"current_lag": 0.0005},
+    "current_lag 2 ms": {"current_lag": 0.002},
+    "current_lag 2 ms, break_away, f_l": ROUGH,
+    "frame ages 0..1": {"frame_age": (0, 1)},
+    "frame ages 0..3": {"frame_age": (0, 3)},
+    "frame ages 3..3": {"frame_age": (3, 3)},
+    "frame ages 0..5": {"frame_age": (0, 5)},
+    "frame ages 5..5": {"frame_age": (5, 5)},
+    "coasting": COASTING,
+}
+"""What a bench may declare for its shield beyond the thesis's brake."""
+PLANTS: dict[str, dict[str, Any]] = {
+    "stribeck": {"break_away": 1.2},
+    "load": {"break_away": 1.2, "f_l": 2e-6},
+    "lag": {"current_lag": 0.002},
+    "rough": ROUGH,
+    "cubic": {},
+    "hysteresis": {},
+}
+"""Plants of the bench, and what its shield must declare to cover them."""
 
 
 def bench_with(**declared: Any) -> Bench:

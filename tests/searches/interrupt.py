@@ -1,6 +1,6 @@
 """Time in which ``emb-run`` ends after Ctrl-C or SIGTERM, at random moments from its start to its end.
 
-    python -m tests.searches.interrupt [--count N] [--seed S] [--json FILE]
+    python -m tests.searches.interrupt [--count N] [--seed S]
 
 Each time the command is started anew, on the simulated bus with a policy and a bench file that it has to load, and
 gets one of the two signals at a moment drawn from the call of its first function to its usual end. Counted are those
@@ -12,7 +12,6 @@ longer.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import random
 import signal
@@ -110,7 +109,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--count", type=int, default=200, metavar="N", help="moments (default: 200)")
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the moments (default: 0)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the numbers go")
     args = parser.parse_args()
     dice = random.Random(args.seed)
     with tempfile.TemporaryDirectory() as name:
@@ -128,9 +126,6 @@ def main() -> int:
         f"{args.count} moments of {usual:.2f} s: {len(faults)} faults; ended after {statistics.median(took):.3f} s in "
         f"the median, {took[-1]:.3f} s at most; exit codes {codes}"
     )
-    if args.json is not None:
-        found = {"moments": args.count, "faults": len(faults), "median_s": statistics.median(took), "most_s": took[-1]}
-        args.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return 1 if faults else 0
 
 

@@ -1,10 +1,7 @@
 """Search for a brake, a policy and noise that break the learning shield: docs/explanation/learning-shield.md.
 
-    python -m tests.searches.learning_shield [--episodes 100000] [--seed 0] [--found FILE]  # both brakes
-    python -m tests.searches.learning_shield --broken                     # assumptions that do not hold
-    python -m tests.searches.learning_shield --break NAME | all           # pads left out: must be found
-
-The search goes on where it was interrupted: what is done is a line of JSON in FILE, by case and seed.
+python -m tests.searches.learning_shield [--episodes 100000] [--seed 0]  # both brakes
+python -m tests.searches.learning_shield --break NAME | all              # pads left out: must be found
 """
 
 from __future__ import annotations
@@ -19,8 +16,7 @@ import numpy as np
 from emb_bench.config.bench import Bench, load_bench
 from emb_runtime.config.bench import Noise
 from tests.properties.learning_mutants import MUTANTS, broken
-from tests.properties.learning_search import NOISES, Found, episodes, search, setting_for
-from tests.properties.shield_search import of_plant, within_stiffness
+from tests.properties.learning_search import Found, episodes, search, setting_for
 
 BLOCK = 2000  # Episodes between two lines of what is done
 
@@ -123,39 +119,6 @@ def tell(found: Found) -> None:
         print(found.describe(int(i)), file=sys.stderr)
 
 
-def show_broken(n: int, seed: int) -> None:
-    """The consequences of an assumption that does not hold, and whether the learner notices: it falsifies the set."""
-    print(HEAD)
-    more = (800.0, 1e-3)
-    for name, plant, errors, excess, jitter, noises in (
-        ("noise 5 % over its bound", None, UNDECLARED, 1.05, 0.0, NOISES),
-        ("noise 20 % over its bound", None, UNDECLARED, 1.2, 0.0, NOISES),
-        ("clock jitter of 12 µs", None, UNDECLARED, 1.0, 12e-6, NOISES),
-        ("lag of the current, 2 ms", "lag", UNDECLARED, 1.0, 0.0, None),
-        ("hysteresis", "hysteresis", UNDECLARED, 1.0, 0.0, None),
-        ("hysteresis, 800 rad/s² declared", "hysteresis", more, 1.0, 0.0, None),
-        ("cubic stiffness", "cubic", UNDECLARED, 1.0, 0.0, None),
-        ("cubic stiffness, 800 rad/s² declared", "cubic", more, 1.0, 0.0, None),
-        ("Stribeck", "stribeck", UNDECLARED, 1.0, 0.0, None),
-        ("Stribeck, 800 rad/s² declared", "stribeck", more, 1.0, 0.0, None),
-        ("Euler declared, flow true", "exact", UNDECLARED, 1.0, 0.0, None),
-        ("flow declared, Euler true", "euler", UNDECLARED, 1.0, 0.0, None),
-    ):
-        bench = bench_of(Case(name, plant != "exact", errors=errors))
-        flow = not name.startswith("Euler")
-        setting = setting_for(bench, flow, plant=plant, excess=excess, jitter=jitter, shaken=plant is None)
-        line(name, count(search(setting, inside(bench, plant), n, seed, noises)))
-
-
-def inside(bench: Bench, plant: str | None) -> Bench:
-    """The bench with only those brakes in its set whose stiffness stays in the set's with a plant's features."""
-    if plant is None:
-        return bench
-    box = bench.range_set(bench.shield.ranges)
-    narrowed = within_stiffness(box, of_plant(bench.plant(plant).mechanics), bench.limits.angle[1])
-    return replace(bench, ranges={**bench.ranges, bench.shield.ranges: narrowed})
-
-
 def show_mutants(names: list[str], n: int, seed: int) -> bool:
     """Pads left out; whether one is not found."""
     missed = False
@@ -182,16 +145,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=70_000, help="of each case")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--broken", action="store_true", help="break each assumption in turn instead")
     parser.add_argument("--break", dest="left_out", choices=(*MUTANTS, "all"), help="leave a pad out instead")
     arguments = parser.parse_args()
     n, seed = arguments.episodes, arguments.seed
     if arguments.left_out:
         names = list(MUTANTS) if arguments.left_out == "all" else [arguments.left_out]
         return int(show_mutants(names, n, seed))
-    if arguments.broken:
-        show_broken(n, seed)
-        return 0
     return int(show_search(n, seed))
 
 

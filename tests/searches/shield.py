@@ -1,43 +1,38 @@
-"""Guarantee and cost of the envelope shield: the figures of docs/explanation/shield.md.
+"""Guarantee of the envelope shield: the figures of docs/explanation/shield.md.
 
     python -m tests.searches.shield [--episodes 20000] [--seed 0]
 
 Searches for violations with adversarial episodes on three brakes (forward Euler, a finer one with an exact standstill,
 the bench's plants) and by hill climbing, breaks each assumption in turn to show that the search can fail, samples the
-induction steps, measures what a freewheeling node would do, and what each envelope and extension costs in information.
+induction steps, and measures what a freewheeling node would do.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-import timeit
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench, load_bench
-from emb_bench.information.fisher import physical_weights
-from emb_runtime.config.bench import BrakeParameters, Ranges
-from emb_runtime.safety.end_stop import end_stop_speed
-from emb_runtime.safety.shield import NO_PAST, shield
-from emb_runtime.safety.shield_design import ShieldLaw, chatter_excess, damped_excess, make_law
+from emb_runtime.config.bench import Ranges
+from emb_runtime.safety.shield_design import chatter_excess, damped_excess, make_law
 from tests.properties.shield_climb import climb
 from tests.properties.shield_search import (
-    CRUISE_HOME,
-    CRUISE_OUT,
+    COASTING,
     DROPS,
     END_ANGLE,
     END_VELOCITY,
+    EXTENSIONS,
     FASTEST,
     HIGHEST,
     LAST_SPEED,
     LOWEST,
+    PLANTS,
     SLOWEST,
-    Floats,
     Found,
     coasting_induction,
     draw_brakes,
@@ -45,30 +40,6 @@ from tests.properties.shield_search import (
     lagging_induction,
     search,
 )
-
-KNOWN_COASTING: dict[str, Any] = {"envelope": "coasting", "angle_margin": 1.5}
-COASTING: dict[str, Any] = {"envelope": "coasting", "angle_margin": 1.1}
-ROUGH: dict[str, Any] = {"current_lag": 0.002, "break_away": 1.2, "f_l": 1e-6}
-EXTENSIONS: dict[str, dict[str, Any]] = {
-    "break_away 1.2, f_l 2e-6 m": {"break_away": 1.2, "f_l": 2e-6},
-    "current_lag 0.5 ms": {"current_lag": 0.0005},
-    "current_lag 2 ms": {"current_lag": 0.002},
-    "current_lag 2 ms, break_away, f_l": ROUGH,
-    "frame ages 0..1": {"frame_age": (0, 1)},
-    "frame ages 0..3": {"frame_age": (0, 3)},
-    "frame ages 3..3": {"frame_age": (3, 3)},
-    "frame ages 0..5": {"frame_age": (0, 5)},
-    "frame ages 5..5": {"frame_age": (5, 5)},
-    "coasting": COASTING,
-}
-PLANTS: dict[str, dict[str, Any]] = {
-    "stribeck": {"break_away": 1.2},
-    "load": {"break_away": 1.2, "f_l": 2e-6},
-    "lag": {"current_lag": 0.002},
-    "rough": ROUGH,
-    "cubic": {},
-    "hysteresis": {},
-}
 
 
 def bench_for(ranges: str = "envelope", **declared: Any) -> Bench:
@@ -192,96 +163,6 @@ def show_induction(n: int, seed: int) -> bool:
     return outside > 0
 
 
-def flown(
-    law: ShieldLaw, p: BrakeParameters, plans: Floats, noise: Floats, weights: tuple[float, float], out: Floats
-) -> None:
-    """Plans in shares of the limit, played into the shield on Euler's brake: the information on all four parameters.
-
-    Args:
-        law: the shield's.
-        p: the brake.
-        plans: shape [M, steps].
-        noise: of the measurements, shape [D, steps, 2].
-        weights: of the squared sensitivities.
-        out: becomes the information, shape [M, D, 4, 4].
-    """
-    for m in range(plans.shape[0]):
-        for i in range(noise.shape[0]):
-            x = v = 0.0
-            past = NO_PAST
-            s = np.zeros((4, 2))
-            for k in range(law.steps):
-                wanted = law.current * plans[m, k]
-                u, _ = shield(law, x + noise[i, k, 0], v + noise[i, k, 1], wanted, past, k)
-                past = (u, past[0], past[1], past[2], past[3])
-                for j in range(4):
-                    s[j, 0], s[j, 1] = sensitivity_step(p, x, v, u, law.sample_time, s[j, 0], s[j, 1], j)
-                x, v = step(p, x, v, u, law.sample_time)
-                for a in range(4):
-                    for b in range(4):
-                        out[m, i, a, b] += weights[0] * s[a, 0] * s[b, 0] + weights[1] * s[a, 1] * s[b, 1]
-
-
-def blind_plans(steps: int) -> Floats:
-    """+6 A throughout, one switch at 170 ms, and square waves with and without early reversals, shape [M, steps]."""
-    k = np.arange(steps)
-    plans = [np.ones(steps), np.where(k < 170, 1.0, -1.0)]
-    early = np.where((k >= 17) & (k < 29), -1.0, 1.0)
-    for half in (20, 30, 40, 55, 70, 90, 110, 140, 170, 200, 215, 250, 500):
-        square = np.where(k // half % 2 == 0, 1.0, -1.0)
-        plans += [square, np.where(k < 29, early, np.where((k - 29) // half % 2 == 0, 1.0, -1.0))]
-    return np.array(plans)
-
-
-def show_information(seed: int) -> None:
-    """Prints the cost of the uncertainty of the set, of each extension and of each envelope."""
-    bench = bench_for()
-    rng = np.random.default_rng(seed)
-    noise = rng.normal(size=(8, bench.timing.horizon, 2)) * [bench.noise.angle, bench.noise.velocity]
-    weights = physical_weights(bench.noise)
-    plans = blind_plans(bench.timing.horizon)
-    prior = 12.0 * np.eye(4)  # of a uniform ±50 %
-    print(
-        "\nPhysical information, nominal brake (Euler), relative parameters: +6 A throughout, and the best of "
-        f"{len(plans)} blind plans"
-    )
-    print(f"  {'':36s} {'+6 A: log det':>14s} {'F(f_v)':>10s} {'best log det':>13s} {'best F(f_v)':>12s}")
-    cases = [("the brake is known", bench_for("known")), ("known, coasting", bench_for("known", **KNOWN_COASTING))]
-    cases += [("viscous", bench_for("viscous")), ("envelope", bench)]
-    cases += [(f"envelope, {name}", bench_for(**declared)) for name, declared in EXTENSIONS.items()]
-    for name, case in cases:
-        out = np.zeros((len(plans), len(noise), 4, 4))
-        compiled(flown)(make_law(case), bench.brake, plans, noise, (weights.angle, weights.velocity), out)
-        log_det = np.linalg.slogdet(out + prior)[1].mean(axis=1)
-        viscous = out[:, :, 3, 3].mean(axis=1)
-        print(f"  {name:36s} {log_det[0]:14.2f} {viscous[0]:10.3e} {log_det.max():13.2f} {viscous.max():12.3e}")
-
-
-def show_speed(n: int, seed: int) -> None:
-    """Cruise speeds, and what a call costs."""
-    freewheel = replace(bench_for(), node=replace(bench_for().node, stop="freewheel"))
-    print(f"\nWorst end-stop speed of a node that lets go (end_stop_speed): {end_stop_speed(freewheel):.0f} rad/s")
-    print("\nMean speed while crossing 20..60 rad under the envelope law, median and 90 % of the episodes [rad/s]")
-    for truth in ("known", "envelope"):
-        rows = search(bench_for(), n, seed, truth=truth, drops=("none",)).rows
-        out, home = rows[rows[:, CRUISE_OUT] > 0, CRUISE_OUT], rows[rows[:, CRUISE_HOME] > 0, CRUISE_HOME]
-        print(f"  true brake {truth:9s} out {cruise(out)}; home {cruise(home)}")
-    law = make_law(bench_for())
-    cases = {"outward": (50.0, 300.0, 100), "homeward": (40.0, -450.0, 400), "landing": (0.3, -70.0, 480)}
-    print("Plain Python, one call [µs]: " + ", ".join(f"{name} {cost(law, *case):.1f}" for name, case in cases.items()))
-
-
-def cruise(speeds: Floats) -> str:
-    """Median and 90 % of speeds, in words where no episode crossed."""
-    return "{:.0f}, {:.0f}".format(*np.quantile(speeds, [0.5, 0.9])) if len(speeds) else "no crossing"
-
-
-def cost(law: ShieldLaw, angle: float, velocity: float, k: int) -> float:
-    """Fastest of several timings of one call [µs]."""
-    timer = timeit.Timer(lambda: shield(law, angle, velocity, 6.0, NO_PAST, k))
-    return min(timer.repeat(repeat=9, number=2000)) / 2000 * 1e6
-
-
 def main() -> int:
     """Print all figures; 1 if the shield fails, or a search that must find what is broken does not."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -293,8 +174,6 @@ def main() -> int:
     fails |= show_climbs(n // 5, seed)
     fails |= show_broken(max(n // 5, 1), seed)
     fails |= show_induction(20 * n, seed)
-    show_information(seed)
-    show_speed(max(n // 20, 1), seed)
     return 1 if fails else 0
 
 
