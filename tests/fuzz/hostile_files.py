@@ -407,13 +407,7 @@ def draw(seed: int, honest_log: bytes) -> Hostile:
 
 
 def judge(hostile: Hostile, folder: Path, longest: float = 60.0) -> Judged:
-    """Run the command on the file, in a process that is forked from this one: what is imported here is there already.
-
-    Args:
-        hostile: the file and its command.
-        folder: for the file and what is made of it.
-        longest: time after which the process is ended [s].
-    """
+    """Run the command on the file, in a process forked from this one with its imports, for ``longest`` seconds."""
     from emb_bench.cli.replay import main as replay
     from emb_runtime.cli.main import main as run
 

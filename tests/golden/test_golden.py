@@ -105,6 +105,8 @@ def alike(expected: str, text: str) -> bool:
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
+        ("info", ["info", "aborted.mcap"]),
+        ("design", ["design", "--bench", "short.toml", "--starts", "1", "--params", "k_m,T_c", "--model", "euler"]),
         ("fim", ["fim", "good.mcap", "--theta", "true"]),
         ("fim-nominal", ["fim", "good.mcap", "--theta", "nominal", "--nuisance", "x1_0"]),
         ("fim-verbose", ["fim", "good.mcap", "--theta", "true", "-v"]),
@@ -131,21 +133,10 @@ def test_several_runs_are_compared_with_an_earlier_estimate_and_with_each_other(
     golden("estimate-three", say("estimate", *three, "--profile", "--starts", "1", "-v"))
 
 
-def test_info_says(say: Say, golden: Callable[[str, str], None]) -> None:
-    golden("info", say("info", "aborted.mcap"))
-
-
-def test_timing_says(say: Say, golden: Callable[[str, str], None]) -> None:
+def test_a_timing_and_a_campaign_say(say: Say, golden: Callable[[str, str], None]) -> None:
     golden("timing", say("timing", "good.mcap", code=2))
-
-
-def test_a_campaign_says(say: Say, golden: Callable[[str, str], None]) -> None:
     logs = ["good.mcap", "again.mcap", "worn.mcap", "other.mcap", "aborted.mcap", "broken.mcap"]
     golden("campaign", say("campaign", *logs, "-o", "result.parquet", "--starts", "1", "--jobs", "1", code=1))
-
-
-def test_a_design_says(say: Say, golden: Callable[[str, str], None]) -> None:
-    golden("design", say("design", "--bench", "short.toml", "--starts", "1", "--params", "k_m,T_c", "--model", "euler"))
 
 
 @pytest.mark.parametrize(

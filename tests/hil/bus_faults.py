@@ -129,7 +129,8 @@ def _route(kind: int, route: Route) -> None:
 def report_bus_off(interface: str, off: bool) -> None:
     """Send the error frame with which a controller reports that it went bus-off, or that it recovered.
 
-    It reaches every socket that subscribed to error frames; the interface itself goes on as before."""
+    It reaches every socket that subscribed to error frames; the interface itself goes on as before.
+    """
     what = _ERROR_FRAME | (_ERROR_BUS_OFF if off else _ERROR_RESTARTED)
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as sock:
         sock.bind((interface,))

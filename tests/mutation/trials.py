@@ -107,15 +107,9 @@ def mutants_of(module: str) -> list[Mutant]:
 
 
 def judge_all(module: str, tests: Sequence[str], tell: Tell) -> None:
-    """Judge every mutant of a module.
+    """Judge every mutant of a module, and tell which test noticed it or how its process ended; empty if it survived.
 
-    Args:
-        module: of the runtime.
-        tests: files.
-        tell: told of each mutant, and of the test that noticed it or how else its process ended; empty if it survived.
-
-    Raises:
-        UntrustworthyError: the tests fail without a change, or pass with one that nothing could survive.
+    Raises :class:`UntrustworthyError`: the tests fail without a change, or pass with one that nothing could survive.
     """
     so_far = Experience()
     unchanged = _trial(so_far, "", lambda plugin: _collected_anew(module, UNCHANGED, tests, plugin))

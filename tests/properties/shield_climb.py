@@ -37,17 +37,6 @@ def climb(bench: Bench, chains: int, generations: int, seed: int, *, law: Shield
 
     A chain's genes, all in 0..1, are the brake and its features, the times at which full current switches sign, noise
     at its bound, stretches of lost commands, and which of the brakes and stops it is.
-
-    Args:
-        bench: its shield is made, its limits are checked.
-        chains: climbed at once.
-        generations: changes tried in each.
-        seed: of everything.
-        law: to be tested in place of the bench's own.
-
-    Returns:
-        The least margin of each chain: to the angle limits [rad] and a tenth of that to the speed limit [10 rad/s],
-        shape [chains]; negative where a limit was passed.
     """
     law = law or make_law(bench)
     rng = np.random.default_rng(seed)

@@ -671,18 +671,9 @@ def border_state(law: ShieldLaw, excess: float, r: Floats) -> tuple[float, float
 def induction(
     law: ShieldLaw, excess: float, chatter: float, brakes: Floats, draws: Floats, failed: NDArray[np.bool_]
 ) -> int:
-    """One step from sampled states of the safe set; marks those that leave it.
+    """One step from sampled states of the safe set, from ten numbers in [0, 1) each; marks those that leave it.
 
-    Args:
-        law: under test.
-        excess: see :func:`in_safe_set` [rad].
-        chatter: what Euler's sign() may add where a damped brake comes to rest [rad].
-        brakes: one per sample.
-        draws: ten numbers in [0, 1) per sample.
-        failed: one mark per sample, written here.
-
-    Returns:
-        How many samples began in the set.
+    ``chatter``: what Euler's sign() may add where a damped brake comes to rest [rad]. Returns how many began in it.
     """
     tried = 0
     for i in range(brakes.shape[0]):
@@ -720,17 +711,7 @@ def is_safe_lagging(law: ShieldLaw, p: BrakeParameters, lag: float, state: Float
 
 
 def lagging_induction(law: ShieldLaw, brakes: Floats, draws: Floats, failed: NDArray[np.bool_]) -> int:
-    """One period of brakes whose current lags, from sampled safe states; marks those that leave them.
-
-    Args:
-        law: under test.
-        brakes: one per sample.
-        draws: sixteen numbers in [0, 1) per sample: state, noise, lag, history, command.
-        failed: one mark per sample, written here.
-
-    Returns:
-        How many samples began safe.
-    """
+    """One period of brakes whose current lags, from sixteen numbers in [0, 1) each; marks those that fail."""
     tried = 0
     state = np.zeros(STATES)
     for k in range(brakes.shape[0]):

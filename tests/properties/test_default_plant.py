@@ -20,16 +20,10 @@ from emb_runtime.cli import options
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train import cli as train
 from emb_train.closed_loop import Batch
-from emb_train.presets import preset_summaries
-from emb_train.training import load_preset
 from emb_train.trial import TASKS
 
 from tests.bench.simulated_logs import write_log  # isort: skip
 from tests.conftest import Simulate  # isort: skip
-
-
-def test_the_default_brake_sticks(bench: Bench) -> None:
-    assert bench.plant(DEFAULT_PLANT).mechanics.solver == EXACT
 
 
 def test_whatever_is_told_no_plant_takes_the_same(bench: Bench) -> None:
@@ -42,11 +36,8 @@ def test_whatever_is_told_no_plant_takes_the_same(bench: Bench) -> None:
         *(task.plant for task in TASKS.values()),
     ]
     assert set(defaults) == {DEFAULT_PLANT}
+    assert bench.plant(DEFAULT_PLANT).mechanics.solver == EXACT
     assert f"(default {DEFAULT_PLANT})" in options.EPILOG
-
-
-def test_trainings_by_ppo_stay_with_the_thesis_s_brake() -> None:
-    assert {load_preset(name).plant for name in preset_summaries()} == {"euler"}
 
 
 @pytest.mark.parametrize("told", [True, False], ids=["simulated", "over a bus"])

@@ -15,6 +15,7 @@ import itertools
 import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from tests.fuzz.runs import HangError
 from tests.fuzz.targets import TARGETS, Played, ViolationError, valid_frame
 
 LONGEST = 60.0  # Time for one sequence [s]; the slowest takes a tenth of a second
+FINDINGS = ("exceptions", "hangs", "wrong")
 
 
 def bit_errors(draw: Random) -> Played:
@@ -64,32 +66,6 @@ ENTRIES = {
 }
 
 
-@dataclass
-class Tally:
-    """Findings of a target."""
-
-    sequences: int = 0
-    items: int = 0  # Frames or events
-    commands: int = 0  # Commands that reached the bus
-    exceptions: int = 0
-    hangs: int = 0
-    wrong: int = 0
-    seconds: float = 0.0
-    first: str = ""  # The first finding, in words
-
-    @property
-    def findings(self) -> int:
-        """All that was found."""
-        return self.exceptions + self.hangs + self.wrong
-
-    def found(self, name: str, number: int, error: BaseException) -> None:
-        """Count a finding."""
-        self.hangs += isinstance(error, HangError)
-        self.wrong += isinstance(error, ViolationError)
-        self.exceptions += not isinstance(error, HangError | ViolationError)
-        self.first = self.first or f"--target {name} --sequence {number}: {type(error).__name__}: {error}"[:400]
-
-
 @contextmanager
 def bounded() -> Iterator[None]:
     """End what takes longer than a sequence may."""
@@ -105,20 +81,22 @@ def bounded() -> Iterator[None]:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
-def fuzz(name: str, entry: Entry, seed: int, count: int) -> Tally:
-    """Play the first sequences of a target."""
-    tally, begin = Tally(), time.monotonic()
+def fuzz(name: str, entry: Entry, seed: int, count: int) -> Counter[str]:
+    """Play the first sequences of a target: frames or events, commands on the bus, and findings by their kind."""
+    found = Counter[str]()
     for number in range(count):
-        tally.sequences += 1
         try:
             with bounded():
                 items, commands = entry.target(Random(f"{name}:{seed}:{number}"))
-            tally.items += items
-            tally.commands += commands
+            found.update(items=items, commands=commands)
         except (Exception, HangError) as error:
-            tally.found(name, number, error)
-    tally.seconds = time.monotonic() - begin
-    return tally
+            kind = {HangError: "hangs", ViolationError: "wrong"}.get(type(error), "exceptions")
+            if not any(found[each] for each in FINDINGS):
+                print(
+                    f"  first: --target {name} --sequence {number}: {type(error).__name__}: {error}"[:400], flush=True
+                )
+            found[kind] += 1
+    return found
 
 
 def main() -> int:
@@ -134,27 +112,17 @@ def main() -> int:
             parser.error("--sequence needs --target")
         print(ENTRIES[args.target].target(Random(f"{args.target}:{args.seed}:{args.sequence}")))
         return 0
-    names = [args.target] if args.target else list(ENTRIES)
-    total = Tally()
+    findings = 0
     print("| target | sequences | frames, events | commands on the bus | exceptions | hangs | wrong | s | judged by |")
     print("|---|---|---|---|---|---|---|---|---|")
-    for name in names:
-        entry = ENTRIES[name]
-        tally = fuzz(name, entry, args.seed, max(1, round(entry.sequences * args.scale)))
-        print(row(name, tally, entry.judge), flush=True)
-        if tally.first:
-            print(f"  first: {tally.first}", flush=True)
-        for key in ("sequences", "items", "commands", "exceptions", "hangs", "wrong", "seconds"):
-            setattr(total, key, getattr(total, key) + getattr(tally, key))
-    print(row("all", total, ""))
-    return 1 if total.findings else 0
-
-
-def row(name: str, tally: Tally, judge: str) -> str:
-    """A line of the first table."""
-    played = f"{tally.sequences:,} | {tally.items:,} | {tally.commands:,}"
-    found = f"{tally.exceptions} | {tally.hangs} | {tally.wrong}"
-    return f"| {name} | {played} | {found} | {tally.seconds:.0f} | {judge} |"
+    for name in [args.target] if args.target else ENTRIES:
+        entry, begin = ENTRIES[name], time.monotonic()
+        count = max(1, round(entry.sequences * args.scale))
+        found = fuzz(name, entry, args.seed, count)
+        counts = [f"{n:,}" for n in (count, *(found[each] for each in ("items", "commands", *FINDINGS)))]
+        print(f"| {name} | {' | '.join(counts)} | {time.monotonic() - begin:.0f} | {entry.judge} |", flush=True)
+        findings += sum(found[each] for each in FINDINGS)
+    return 1 if findings else 0
 
 
 if __name__ == "__main__":

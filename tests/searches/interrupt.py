@@ -55,13 +55,7 @@ class Ended(NamedTuple):
 
 
 def interrupted(folder: Path, moment: float, number: int) -> Ended:
-    """Start the command, send a signal, and wait for its end.
-
-    Args:
-        folder: for its files.
-        moment: from the call of its first function to the signal [s].
-        number: of the signal.
-    """
+    """Start the command, send a signal ``moment`` seconds after its first function is called, and wait for its end."""
     policy, bench, log = folder / "policy.onnx", folder / "bench.toml", folder / "run.mcap"
     if not policy.exists():
         policy.write_bytes(shipped_actor_path().read_bytes())

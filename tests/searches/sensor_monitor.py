@@ -112,17 +112,7 @@ class Script(NamedTuple):
 
 
 def lie(kind: int, size: float, ts: float, told: Floats, angle: float, velocity: float, before: float) -> None:
-    """Readings of faulty sensors, in place: ``told`` is angle, velocity and the error so far.
-
-    Args:
-        kind: what is at fault.
-        size: of the fault.
-        ts: sample time [s].
-        told: [angle, velocity, sum], changed.
-        angle: honest [rad].
-        velocity: honest [rad/s].
-        before: honest angle one sample before [rad].
-    """
+    """Readings of faulty sensors, in place: ``told`` is angle [rad], velocity [rad/s] and the angle's error so far."""
     if kind in (ANGLE_DRIFT, BOTH_OFFSET):
         told[2] += size * ts
     if kind == BOTH_SCALE:
@@ -152,17 +142,7 @@ def fly(
     first: bool,
     out: Floats,
 ) -> None:
-    """Fly each experiment of a script, until its end or the monitor's verdict, and let the node bring it to rest.
-
-    Args:
-        law: the shield's.
-        limits: of the monitor.
-        mechanics: how the brakes move.
-        instruments: what lies between them and the bus.
-        script: what was drawn.
-        first: the first move is limited.
-        out: becomes a row of results per experiment.
-    """
+    """Fly each experiment, until its end or the monitor's verdict, and to rest; ``first`` limits the first move."""
     ts = law.sample_time
     memory, instrument = np.zeros(MEMORY), np.zeros(INSTRUMENTS_MEMORY)
     x, halted, told = np.zeros(STATES), np.zeros(STATES), np.zeros(3)
@@ -290,16 +270,7 @@ def draw(
 ) -> Script:
     """A chunk of experiments: brakes of the set (half of them its corners), policies, noise and losses.
 
-    Args:
-        rng: draws.
-        bench: the bench.
-        m: experiments.
-        plant: which brake of the bench.
-        kind: what is at fault.
-        size: of the fault.
-        duty: share of the time in which it acts.
-        onset: first samples between which it begins.
-        policies: what they want.
+    A fault of some kind and size begins up to the sample ``onset`` and acts for a share ``duty`` of the time.
     """
     n, limit = bench.timing.horizon, bench.limits.current
     chosen = rng.integers(0, len(policies), m)
