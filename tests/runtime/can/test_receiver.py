@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_runtime.can.codec import Fault
-from emb_runtime.can.messages import Layout, StopReason, load_layout
+from emb_runtime.can.messages import Layout, StopReason
 from emb_runtime.can.receiver import BUS_OFF, UNKNOWN, WITHOUT_DETAILS, Reception, Rejection, classify
-from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.config.bench import Bench
 from emb_runtime.records import CurrentCommand, Frame, NodeState, SensorSample
-from tests.independent import DATABASE, protected, read
+from tests.independent import protected
 
 MS = 1_000_000
 IDLE = NodeState.IDLE
@@ -73,13 +71,6 @@ def test_two_frames_of_one_counter_make_a_sample(node: Node, harness: Harness) -
     assert sample.device_time_ns == 1 * MS
     assert sample.receive_time_ns == 5_001 * MS
     assert harness.why == []
-
-
-def test_device_time_does_not_wrap_for_the_reader(node: Node, harness: Harness) -> None:
-    node.velocity = 0.0
-    samples = [s for _ in range(9_000) for s in harness.take(*node.pair())]  # the stamp wraps every 4.194 s
-    assert len(samples) == 9_000
-    assert {b.device_time_ns - a.device_time_ns for a, b in pairwise(samples)} == {1 * MS}
 
 
 def test_a_node_that_sends_the_velocity_first_is_told_what_its_frames_lack(node: Node, harness: Harness) -> None:
@@ -143,15 +134,6 @@ def test_rejections_add_up_and_four_good_frames_forgive_one(node: Node, harness:
     assert harness.reception.too_many_rejected
 
 
-def test_every_other_sample_that_jumps_is_too_many(node: Node, harness: Harness) -> None:
-    harness.take(*node.pair())
-    for n in range(7):
-        assert not harness.reception.too_many_rejected, n
-        harness.take(*node.pair(angle_error=5.0))
-        harness.take(*node.pair())
-    assert harness.reception.too_many_rejected
-
-
 @pytest.mark.parametrize("identifier", [ANGLE, VELOCITY, STATUS])
 def test_too_many_damaged_frames_of_any_message_are_too_many_and_good_ones_come_too_late(
     node: Node, harness: Harness, bench: Bench, identifier: int
@@ -185,20 +167,6 @@ def test_whoever_else_uses_our_identifier_is_noticed_and_our_own_echo_is_not(ben
         assert harness.reception.rejected == 0
 
 
-def test_frames_of_others_are_nobody_s_sensor_frames(node: Node, harness: Harness) -> None:
-    angle, velocity = node.pair()
-    others = [
-        Frame(0x123, b"12345678"),
-        angle._replace(extended=True),
-        velocity._replace(error=True),
-        angle._replace(own=True),
-        velocity._replace(own=True),
-    ]
-    assert harness.take(*others) == []
-    assert harness.reception.rejected == 0
-    assert len(harness.take(angle, velocity)) == 1
-
-
 def test_error_frames_are_counted_by_what_they_report(harness: Harness) -> None:
     harness.take(Frame(0x044, b"\0\x20\0\0\0\0\0\0", error=True), Frame(0x101, bytes(8), error=True))
     reported = harness.reception.bus_errors
@@ -211,14 +179,6 @@ def test_the_kernel_s_count_of_dropped_frames_never_falls(harness: Harness) -> N
     for dropped in (0, 3, 2, 7):
         harness.take(Frame(0x123, b"", dropped=dropped))
     assert harness.reception.dropped == 7
-
-
-def test_each_message_of_the_node_is_fresh_for_two_of_its_periods(harness: Harness) -> None:
-    states = {state.name: state for state in harness.reception.states if state.name != "pair"}
-    assert {*states} == {m.name for m in DATABASE.messages if m.senders == ["EMB_Node"]} - {"EMB_Charge", "EMB_Gateway"}
-    for name, state in states.items():
-        message = DATABASE.get_message_by_name(name)
-        assert (state.identifier, state.fresh_ns) == (message.frame_id, 2 * (message.cycle_time or 0) * MS)
 
 
 def test_the_charge_valid_or_damaged_repeated_or_silent_changes_nothing(bench: Bench, layout: Layout) -> None:
@@ -245,17 +205,6 @@ def test_every_code_of_node_state_and_stop_reason_is_known_or_rejected(bench: Be
             else:
                 assert status is None
                 assert harness.reception.rejections() == {"EMB_Status": {Fault.RANGE: 1}}
-
-
-@pytest.mark.parametrize("state", range(8))
-def test_every_node_state_comes_with_its_sample_and_an_unknown_one_makes_none(
-    node: Node, harness: Harness, layout: Layout, state: int
-) -> None:
-    angle, velocity = node.pair()
-    body = bytes([velocity.data[1] & 0x0F | state << 4]) + velocity.data[2:]
-    samples = harness.take(angle, velocity._replace(data=protected(VELOCITY, body)))
-    assert [s.node_state for s in samples] == [n for n in NodeState if n == state]
-    assert harness.reception.rejected == (state > max(NodeState))
 
 
 def test_the_latest_status_is_kept_and_a_repeated_counter_is_none(harness: Harness, layout: Layout) -> None:
@@ -397,29 +346,6 @@ def test_a_second_commander_or_too_many_rejections_remove_permission(bench: Benc
 
 
 # --- whatever comes -------------------------------------------------------------------------------------------------
-
-
-@given(st.lists(st.tuples(st.sampled_from([0x80, 0x100, 0x101, 0x102, 0x55]), st.binary(max_size=8)), max_size=30))
-def test_random_frames_never_make_a_sample_or_raise(content: list[tuple[int, bytes]]) -> None:
-    layout = load_layout()
-    harness = Harness(load_bench(), layout)
-    valid = {read(Frame(i, d)) is not None for i, d in content}
-    samples = harness.take(*(Frame(i, d) for i, d in content))
-    assert not samples or True in valid
-
-
-@given(st.data())
-def test_whatever_is_lost_doubled_or_swapped_every_sample_is_a_true_pair_in_order(data: st.DataObject) -> None:
-    node = Node(load_layout(), velocity=0.0)
-    frames = [frame for _ in range(40) for frame in node.pair()]
-    kept = [f for f in frames for _ in range(data.draw(st.sampled_from([0, 1, 1, 1, 2])))]
-    for _ in range(data.draw(st.integers(0, 6))):
-        i = data.draw(st.integers(0, max(0, len(kept) - 2)))
-        kept[i : i + 2] = reversed(kept[i : i + 2])
-    samples = Harness(load_bench(), node.layout).take(*kept)
-    times = [s.device_time_ns for s in samples]
-    assert times == sorted(set(times))
-    assert all(s.counter == s.device_time_ns // MS % 15 for s in samples)
 
 
 # --- error frames, as <linux/can/error.h> says ----------------------------------------------------------------------

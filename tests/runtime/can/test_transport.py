@@ -457,12 +457,6 @@ def test_a_frame_crosses_a_python_can_bus_unchanged(pair: tuple[Transport, Trans
     assert before - 1_000_000 <= arrived.time_ns <= clock.now_ns()
 
 
-def test_a_silent_python_can_bus_gives_nothing_by_the_deadline(pair: tuple[Transport, Transport, Clock]) -> None:
-    one, _, clock = pair
-    assert one.receive(clock.now_ns() + 2_000_000) is None
-    assert one.receive(0) is None
-
-
 class Stamper:
     """A python-can bus whose other end stamps its frames as it likes, read in simulated time."""
 
@@ -576,11 +570,6 @@ def test_a_python_can_bus_that_is_lost_raises_when_receiving(bench: Bench) -> No
         bus.receive(0)
 
 
-def test_an_unknown_backend_is_a_usage_error_that_lists_the_known_ones(bench: Bench) -> None:
-    with pytest.raises(UsageError, match=r"^carrier:pigeon: python-can has no backend 'carrier'; it has: .*virtual"):
-        open_transport("carrier:pigeon", bench)
-
-
 def test_a_backend_that_cannot_open_is_a_bus_error_in_one_line(bench: Bench) -> None:
     with pytest.raises(BusError, match=r"^slcan:/no/such/device: python-can cannot open it: ") as caught:
         open_transport("slcan:/no/such/device", bench)
@@ -590,13 +579,6 @@ def test_a_backend_that_cannot_open_is_a_bus_error_in_one_line(bench: Bench) -> 
 @pytest.mark.parametrize("iface", ["", ":", "virtual:", ":test"])
 def test_a_malformed_interface_is_a_usage_error(bench: Bench, iface: str) -> None:
     with pytest.raises(UsageError, match="expected INTERFACE"):
-        open_transport(iface, bench)
-
-
-@pytest.mark.parametrize("iface", ["nosuchcan0", "socketcan:nosuchcan0"])
-def test_a_plain_name_is_a_socketcan_interface(bench: Bench, iface: str) -> None:
-    # Either this kernel has no CAN, or no such interface.
-    with pytest.raises(BusError, match=r"^nosuchcan0: no (CAN sockets here|such CAN interface)"):
         open_transport(iface, bench)
 
 

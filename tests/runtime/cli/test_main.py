@@ -47,16 +47,6 @@ def test_a_run_whose_log_is_removed_meanwhile_is_not_done(emb_run: EmbRun, tmp_p
     assert "again" in advice
 
 
-def test_the_shipped_actor_is_the_default_and_the_summary_is_for_people(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = EmbRun((), capsys, tmp_path).text("--iface", "sim:seed=2,f_v=4e-5")
-    assert out.startswith("done: 500 of 500 samples answered")
-    assert "home" in out
-    assert "NOT HOME" not in out
-    assert len(list(tmp_path.glob("run-*.mcap"))) == 1
-
-
 def test_a_folder_for_logs_that_was_made_for_nothing_is_not_left(emb_run: EmbRun, tmp_path: Path, actor: Path) -> None:
     emb_run.text("--log", str(tmp_path / "a" / "b"), "--iface", "nocan99", code=4)
     assert list(tmp_path.iterdir()) == [actor]
@@ -65,13 +55,6 @@ def test_a_folder_for_logs_that_was_made_for_nothing_is_not_left(emb_run: EmbRun
     assert list((tmp_path / "mine").iterdir()) == []
     emb_run.text("--log", str(tmp_path / "a" / "b"), "--duration", "0.1")
     assert len(list((tmp_path / "a" / "b").iterdir())) == 1
-
-
-def test_a_bench_whose_bus_cannot_carry_it_is_refused(emb_run: EmbRun, edited: Edited, tmp_path: Path) -> None:
-    out, err = emb_run.streams("--bench", edited("bitrate = 1000000", "bitrate = 250000"), code=2)
-    assert out == ""
-    assert err.splitlines()[-1].startswith("emb-run: pre-flight, bus load: ")
-    assert not list(tmp_path.glob("*.mcap"))
 
 
 def test_a_simulation_longer_than_the_ring_is_logged_whole(emb_run: EmbRun, actor: Path, edited: Edited) -> None:

@@ -11,7 +11,6 @@ import pytest
 from emb_bench.logs.log import read_log
 from emb_bench.sim.node import STATUS_PERIODS, BrakeNode
 from emb_runtime.can.messages import StopReason
-from emb_runtime.cli.main import main
 from emb_runtime.cli.repeat import with_next_seed
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
@@ -144,14 +143,6 @@ def test_a_campaign_is_one_log_and_one_line_per_run_with_other_noise_in_each(
     assert sim.opened == ["f_v=3e-5,seed=7", "f_v=3e-5,seed=8", "f_v=3e-5,seed=9"]
     assert sorted(d["log"] for d in found) == sorted(map(str, (tmp_path / "logs").iterdir()))
     assert {read_log(Path(d["log"])).metadata["emb.truth"]["seed"] for d in found} == {"7", "8", "9"}
-
-
-def test_a_log_without_a_name_is_a_slip_and_no_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main(["--iface", "sim", "--log", ""])
-    assert ended.value.code == 2
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_campaign_in_words_is_a_line_per_run_and_a_summary(

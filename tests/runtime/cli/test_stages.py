@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,11 +13,8 @@ import pytest
 
 from emb_bench.logs.log import read_log
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.simulated_brake import gaussian_noise
-from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.transport import Transport
-from emb_runtime.cli.main import main
 from emb_runtime.cli.session import Bus
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
@@ -111,37 +107,6 @@ def test_read_only_that_is_ended_keeps_what_it_has_heard(
     assert log.complete
     assert log.end["exit_reason"].lower() == result.lower()
     assert json.loads(log.end["heard"]) == summary["heard"]
-
-
-def test_read_only_of_a_simulation_longer_than_the_ring_is_logged_whole(emb_run: EmbRun, sim: Sim) -> None:
-    assert emb_run.document("--read-only", "--duration", "9")["log_complete"]
-
-
-def test_read_only_hears_a_real_bus_beside_others(
-    tmp_path: Path, actor: Path, bench: Bench, layout: Layout, capsys: pytest.CaptureFixture[str]
-) -> None:
-    over = threading.Event()
-    node = BrakeNode(bench, layout, bench.brake, gaussian_noise(bench.noise, 1, 0.0))
-
-    def talk() -> None:
-        transport, _ = open_transport("virtual:shared", bench)
-        while not over.wait(0.001):
-            for frame in (*node.tick(), Frame(0x123, b"hello")):
-                transport.send(frame)
-        transport.close()
-
-    thread = threading.Thread(target=talk)
-    thread.start()
-    try:
-        arguments = ["--iface", "virtual:shared", "--policy", str(actor), "--log", str(tmp_path / "run.mcap")]
-        assert main([*arguments, "--read-only", "--duration", "2", "--json"]) in (0, 1)  # 1: a thread robbed for long
-    finally:
-        over.set()
-        thread.join()
-    heard = json.loads(capsys.readouterr().out)["heard"]
-    assert heard["others"] == pytest.approx(heard["frames"]["EMB_Angle"], abs=2)
-    assert heard["period"] == pytest.approx(1e-3)
-    assert node.rejected == node.obeyed == 0
 
 
 @pytest.mark.parametrize(("stage", "limit"), [(["--zero"], 0.0), (["--limit", "1.5"], 1.5), ([], 6.0)])

@@ -262,28 +262,6 @@ def test_a_node_that_sends_the_velocity_first_is_there_and_not_ready(simulate: S
     assert run.sent == []
 
 
-def test_a_counter_that_skips_every_other_sample_ends_the_run(simulate: Simulate, layout: Layout) -> None:
-    seen: list[SimTransport] = []
-
-    def skip(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        node = transport.node
-        if transport not in seen:
-            seen.append(transport)
-            tick = node.tick
-
-            def skipping(skipped: int = 0) -> list[Frame]:
-                node._counter = (node._counter + 1) % 15  # of a sample that it does not send
-                return tick(skipped)
-
-            node.tick = skipping  # type: ignore[method-assign]
-        return frame
-
-    run = simulate(on_receive=skip)
-    assert run.outcome.fault is Fault.SENSOR_LOST
-    assert "by the node's counter" in run.outcome.detail
-    assert [(c.enable, c.current) for c in commands(run, layout)[-STOP_FRAMES:]] == [(False, 0.0)] * STOP_FRAMES
-
-
 def test_every_fault_has_an_injection() -> None:
     assert set(INJECTIONS) == set(Fault)
 
@@ -365,15 +343,6 @@ def test_a_watchdog_that_trips_while_the_stop_frames_go_out_is_the_run_s_fault(s
     assert run.journal.codes[-3:] == ["STOPPING", "WATCHDOG_TRIPPED", "OVER"]
 
 
-def test_the_status_of_the_node_is_missed_after_two_of_its_periods(simulate: Simulate) -> None:
-    run = INJECTIONS[Fault.PERMISSION_LOST](simulate)
-    lost = next(time_ns for time_ns, code, _ in run.journal.events if code == Fault.PERMISSION_LOST.name)
-    last = max(f.time_ns for f in run.journal.frames if f.identifier == STATUS and f.time_ns < lost)
-    assert 200 * MS <= lost - last <= 202 * MS
-    enabled = [f.time_ns for f in run.journal.frames if f.own and f.data[4] & 1]
-    assert max(enabled) < lost
-
-
 def assert_within_limits(run: SimRun) -> None:
     low, high = run.transport.node.angle_range
     assert -10.0 <= low <= high <= 100.0
@@ -382,22 +351,3 @@ def assert_within_limits(run: SimRun) -> None:
 
 def commands(run: SimRun, layout: Layout) -> list[CurrentCommand]:
     return [layout.decode_command(frame) for frame in run.sent]
-
-
-def test_a_brake_whose_motor_has_the_wrong_sign_is_left_to_friction_before_its_node_may_brake_it(
-    simulate: Simulate, layout: Layout
-) -> None:
-    def swapped(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
-        theta = transport.node._theta
-        transport.node._theta = theta._replace(k_m=-abs(theta.k_m))
-        return frame
-
-    run = simulate(on_receive=swapped)
-    assert run.outcome.fault is Fault.WRONG_POLARITY
-    assert "the opposite sign would fit" in run.outcome.detail
-    assert run.transport.node.angle_range[0] > -1.0
-    assert run.transport.node.angle_range[1] < 1.0
-    assert run.transport.node.top_speed < 40.0
-    enabled = [c.current for c in commands(run, layout) if c.enable]
-    assert 1 <= sum(current != 0.0 for current in enabled) <= 2  # the first move: then the sign is known
-    assert enabled[-1] == 0.0

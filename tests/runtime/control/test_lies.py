@@ -267,12 +267,6 @@ def test_a_node_that_is_not_what_it_was_ends_the_run(lie: Lie, within: int, word
     assert words in seen.outcome.detail
 
 
-def test_20_ampere_of_own_braking_in_every_second_period_end_the_run() -> None:
-    seen = run(Lie(current=20.0, duty=0.5))
-    assert_ends(seen, Fault.CURRENT_MISMATCH, within=14)
-    assert "it reports 20.00 A of its own braking, at most 6 A" in seen.outcome.detail
-
-
 # --- sensors that contradict the motion -----------------------------------------------------------------------------
 
 SENSORS = (Fault.SENSORS_CONTRADICT, Fault.MOTION_OUTSIDE_SET, Fault.WRONG_POLARITY, Fault.FRAMES_REJECTED)

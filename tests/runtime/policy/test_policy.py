@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
-from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.speed_loop import follow_reference, scale_of
 from emb_runtime.policy.contract import (
@@ -105,35 +105,6 @@ def test_a_contract_survives_json_with_full_precision(
         provenance=provenance,
     )
     assert read_contract(contract.to_json()) == contract
-
-
-def every_place(value: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
-    entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return [path, *(p for key, child in list(entries)[:9] for p in every_place(child, (*path, key)))]
-
-
-PLACES = [p for p in every_place(json.loads(GOOD.to_json())) if p and p[0] != "provenance"]
-JUNK: st.SearchStrategy[object] = st.sampled_from(
-    [None, True, "", "x\ny", "\u202e", -1, 0, 0.5, 10**400, [], [[]], {}, {"a": {}}, "a" * 10_000]
-)
-
-
-@given(place=st.sampled_from(PLACES), junk=JUNK)
-@settings(max_examples=150)
-def test_junk_anywhere_is_refused_or_harmless_but_never_another_error(place: tuple[Any, ...], junk: Any) -> None:
-    def spoil(record: Any) -> None:
-        for step in place[:-1]:
-            record = record[step]
-        record[place[-1]] = junk
-
-    text = edited(spoil)
-    try:
-        contract = read_contract(text)
-    except PolicyRefusedError:
-        refusal(lambda: read_contract(text))
-        return
-    assert contract.limits.current > 0.0
-    assert all(math.isfinite(v) for vector in contract.vectors for v in (*vector.inputs, *vector.outputs))
 
 
 def test_what_is_no_contract_is_refused() -> None:
@@ -337,19 +308,6 @@ def test_a_file_cut_anywhere_or_of_random_bytes_is_refused() -> None:
     dice = np.random.default_rng(0)
     for _ in range(100):
         refused(dice.bytes(int(dice.integers(1, 200))))
-
-
-@given(position=st.floats(0.0, 1.0, exclude_max=True), value=st.integers(0, 255))
-@settings(max_examples=100, deadline=None)
-def test_a_damaged_byte_is_refused_or_harmless(position: float, value: int) -> None:
-    data = bytearray(constant_actor(BENCH, 2.0))
-    data[int(position * len(data))] = value
-    try:
-        policy = load_policy(bytes(data), BENCH)
-    except PolicyRefusedError:
-        refused(bytes(data))
-    else:
-        assert abs(asked(policy, 1.0, -3.0, 1) - 2.0) < 1e-4
 
 
 def test_a_file_beyond_the_bound_is_refused_without_being_read_whole_and_a_missing_one_is_a_usage_error(
