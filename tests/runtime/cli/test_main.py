@@ -64,15 +64,6 @@ def test_a_simulation_longer_than_the_ring_is_logged_whole(emb_run: EmbRun, acto
     assert len(emb_run.log().cycles["step"]) == 8001
 
 
-def test_a_full_disk_behind_standard_output_is_one_line(tmp_path: Path, actor: Path) -> None:
-    command = [*EMB_RUN, "--policy", str(actor), "--log", str(tmp_path / "run.mcap"), "--json"]
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "standard output" in done.stderr
-
-
 def test_the_shipped_bench_is_written_for_editing(emb_run: EmbRun, tmp_path: Path) -> None:
     path = tmp_path / "my.toml"
     emb_run.text("--write-bench", str(path))
@@ -107,27 +98,6 @@ def test_a_run_ends_with_its_page_where_that_is_asked_for_and_possible(
     monkeypatch.setattr("emb_runtime.cli.main.metadata.entry_points", lambda **_: [])
     emb_run.refused("nothing is installed that writes a page", "--report", str(page))
     assert not (tmp_path / "run.mcap").exists()
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_while_nobody_is_on_the_bus_ends_cleanly_and_nothing_is_logged(
-    edited: Edited, tmp_path: Path, actor: Path, number: signal.Signals
-) -> None:
-    """On python-can's virtual bus there is no node: it listens until the signal comes."""
-    patient = edited("start_timeout = 5.0", "start_timeout = 60.0")
-    command = [*EMB_RUN, "--iface", "virtual:t", "--policy", str(actor), "--bench", patient, "--json"]
-    logs = tmp_path / "logs"
-    process = subprocess.Popen(
-        [*command, "--log", str(logs)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    wait_for(logs.exists)  # made just before the bus is opened, long after the signals were taken
-    os.kill(process.pid, number)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 3, err
-    assert json.loads(out)["result"] == "INTERRUPTED"
-    assert err.count("\n") == 1
-    assert "before anything was sent" in err
-    assert not logs.exists()
 
 
 def test_no_node_is_a_bus_error_with_the_table_and_a_document(emb_run: EmbRun, edited: Edited, tmp_path: Path) -> None:

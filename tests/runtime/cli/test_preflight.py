@@ -14,7 +14,7 @@ from emb_bench.sim.transport import open_sim
 from emb_runtime.can.messages import Layout, StatusFrame, StopReason, load_layout
 from emb_runtime.cli.bus_monitor import ENOUGH_PAIRS, BusMonitor, BusStatistics, listen
 from emb_runtime.cli.options import MappedDrive, Stage, parser, prepare
-from emb_runtime.cli.preflight import CHECKS, CheckResult, Findings, RefusedError, Verdict, check, refuse, table
+from emb_runtime.cli.preflight import CHECKS, CheckResult, Findings, RefusedError, Verdict, check, refuse
 from emb_runtime.config.bench import Bench, parse_bench
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.drives.mapping_file import load_mapping
@@ -239,17 +239,6 @@ def test_on_the_way_home_the_brake_may_be_anywhere_inside_its_limits(findings: F
         assert lines_of(turned)["node state"].verdict is verdict
 
 
-def test_the_table_has_every_line_with_what_was_found_and_expected_whatever_the_numbers(findings: Findings) -> None:
-    odd = hears(findings, missing=2, period=math.nan, angle_scatter=math.inf, velocity_scatter=math.nan, duration=0.0)
-    for found, verdict in ((hears(findings, missing=2), "warning"), (odd, "refused")):
-        lines = check(found)
-        rows = table(lines).splitlines()
-        assert rows[0].split() == ["PRE-FLIGHT", "FOUND", "EXPECTED", "VERDICT"]
-        assert all(any(row.startswith(line.what) for row in rows) for line in lines)
-        assert [row.split()[-1] for row in rows if row.startswith("samples")] == [verdict]
-        assert max(map(len, rows)) <= 120
-
-
 # --- listening ------------------------------------------------------------------------------------------------------
 
 
@@ -345,15 +334,6 @@ def test_lost_frames_are_missing_pairs_and_damaged_ones_are_rejections(listened:
     assert sum(sum(reasons.values()) for reasons in heard.rejections.values()) == 1
 
 
-def test_a_source_whose_frames_are_mostly_damaged_is_not_trusted(listened: Callable[..., BusMonitor]) -> None:
-    def damage(frame: Frame) -> Frame:
-        return frame._replace(data=b"\x00" + frame.data[1:])
-
-    heard = listened(change=damage).statistics()
-    assert heard.distrusted
-    assert heard.pairs < 20  # a CRC of zero is right once in a while
-
-
 def test_frames_from_before_the_listening_and_error_frames_are_no_traffic(bench: Bench, monitor: BusMonitor) -> None:
     transport, clock = open_sim("", bench)
     old = [Frame(0x700, b"", clock.now_ns() - 1) for _ in range(5)]
@@ -374,17 +354,3 @@ def test_the_listening_ends_when_the_operator_says_so(bench: Bench, monitor: Bus
     begin_ns = clock.now_ns()
     listen(monitor, transport.receive, clock, MS, begin_ns + 10**12, lambda *_: False, lambda: monitor.pairs >= 7)
     assert monitor.pairs == 7
-
-
-def test_a_silent_bus_is_nothing_heard(bench: Bench, monitor: BusMonitor) -> None:
-    transport, clock = open_sim("", bench)
-
-    def nothing(deadline_ns: int) -> None:
-        while transport.receive(deadline_ns) is not None:
-            pass
-
-    listen(monitor, nothing, clock, MS, clock.now_ns() + 300 * MS, lambda *_: True, lambda: False)
-    heard = monitor.statistics()
-    assert (heard.frames, heard.pairs, heard.status, heard.load, heard.duration) == ({}, 0, None, 0.0, 0.0)
-    assert math.isnan(heard.period)
-    assert math.isnan(heard.angle_scatter)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_bench.config.bench import Bench, load_bench, parse_bench
+from emb_bench.config.bench import Bench, parse_bench
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import EXIT_USAGE, BenchFileError
 
@@ -123,22 +122,6 @@ def test_what_a_file_may_leave_out_is_not_missed() -> None:
     ]
     short = "\n".join(lines).partition("[budgets]")[0]
     assert (parse_bench(short, "t").budgets, parse_bench(short, "t").shield.break_away) == (None, 1.0)
-
-
-def test_a_missing_file_and_a_binary_one_are_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(BenchFileError, match="cannot read"):
-        load_bench(tmp_path / "none.toml")
-    binary = tmp_path / "binary.toml"
-    binary.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(BenchFileError, match="UTF-8"):
-        load_bench(binary)
-    with pytest.raises(BenchFileError, match="cannot read"):
-        load_bench(tmp_path)
-
-
-def test_an_unknown_set_of_ranges_is_named_with_those_that_exist(bench: Bench) -> None:
-    with pytest.raises(BenchFileError, match=r"'all'.*envelope, pm50, viscous"):
-        bench.range_set("all")
 
 
 def test_the_shipped_time_outs_are_the_longest_with_which_a_brake_is_driven(bench: Bench) -> None:

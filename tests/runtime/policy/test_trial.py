@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -130,15 +128,3 @@ def test_a_process_that_cannot_be_started_is_no_fault_of_the_file(monkeypatch: p
     monkeypatch.setattr(trial, "Child", full)
     with pytest.raises(UsageError, match="cannot start the process that tries the policy: Resource temporarily"):
         admit_policy(b"", BENCH)
-
-
-def test_emb_run_refuses_a_pipe_and_a_device_at_once(tmp_path: Path) -> None:
-    pipe, device = tmp_path / "pipe", tmp_path / "device"
-    os.mkfifo(pipe)
-    device.symlink_to("/dev/zero")
-    for option, path in (("--policy", pipe), ("--bench", device)):
-        command = [sys.executable, "-m", "emb_runtime.cli.main", option, str(path), "--log", str(tmp_path / "run.mcap")]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-        assert done.returncode == 2
-        assert done.stderr.count("\n") == 1
-        assert "expected a regular file, and it is a" in done.stderr
