@@ -1,4 +1,4 @@
-"""The law of a part of the set holds every brake of that part, and what the model lacks."""
+"""What is known of a brake, and the law of the part of the set that it leaves."""
 
 from __future__ import annotations
 
@@ -8,14 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emb_bench.brake.euler import acceleration
 from emb_bench.compiled import compiled
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, load_bench
-from emb_runtime.errors import BenchFileError
 from emb_runtime.learning.assumptions import make_assumptions
-from emb_runtime.learning.known import Known
+from emb_runtime.learning.known import FALSIFIED, HEAD, HEARD, Known, falsify, known, numbers, start_head
 from emb_runtime.learning.law import covered_viscous, farthest, fits, law_between, law_for, middle, with_room
-from emb_runtime.safety.shield import NO_PAST, shield, successor
 from emb_runtime.safety.shield_design import (
     VELOCITY_PAD,
     DesignInputs,
@@ -52,38 +49,6 @@ def test_a_part_counts_on_viscous_friction_as_far_as_the_pad_covers_its_change()
     assert law.viscous_low == pytest.approx(covered_viscous(setting, SET.high, SET.high) / SET.high.J)
     assert law.viscous_high == SET.high.f_v / SET.high.J
     assert covered_viscous(setting, SET.low, SET.high) == SET.low.f_v
-
-
-def test_what_the_model_lacks_is_within_the_law_of_the_whole_set_and_of_every_part() -> None:
-    error, rng = 700.0, np.random.default_rng(0)
-    low, high = np.array(SET.low), np.array(SET.high)
-    assert make_law(learning(model_error=error)) == pytest.approx(of(SET.low, SET.high, error), rel=1e-12)
-    outside = 0
-    for _ in range(2000):
-        ends = low + np.sort(rng.random((2, len(low))), axis=0) * (high - low)
-        p = BrakeParameters(*(ends[0] + rng.random(len(low)) * (ends[1] - ends[0])))
-        part = BrakeParameters(*ends[0]), BrakeParameters(*ends[1])
-        x, v, u = float(rng.uniform(-9.0, 99.0)), float(rng.uniform(-490.0, 490.0)), float(rng.uniform(-6.0, 6.0))
-        after = v + 1e-3 * (acceleration(p, x, v, u) + error * float(rng.choice([-1.0, 1.0])))
-        _, _, least, greatest = successor(of(*part, error), x, x, v, v, u)
-        assert least <= after <= greatest
-        _, _, least, greatest = successor(of(*part), x, x, v, v, u)
-        outside += not least <= after <= greatest
-    assert outside > 0
-
-
-def test_viscous_friction_that_the_pad_does_not_cover_for_some_part_of_the_set_is_refused() -> None:
-    def thicker(f_v: float) -> Bench:
-        return replace(BENCH, ranges={"envelope": replace(SET, high=SET.high._replace(f_v=f_v))})
-
-    assert make_law(thicker(5.2e-5))
-    with pytest.raises(
-        BenchFileError, match=r"viscous friction of a part of the set changes by 0\.311 rad/s and 0\.2988 are"
-    ):
-        make_assumptions(thicker(5.2e-5))
-    with pytest.raises(BenchFileError, match=r"changes by 0\.300"):
-        make_assumptions(thicker(5.02e-5))
-    assert make_assumptions(learning(thicker(5.02e-5), 500.0))  # what may add to friction slows the way home
 
 
 def test_a_law_is_asked_with_the_middle_of_the_box_and_its_noise_holds_the_whole_box_rounding_or_not() -> None:
@@ -134,16 +99,6 @@ def test_a_box_as_wide_as_the_measurement_stays_as_wide_and_a_wider_one_is_not_c
     assert with_room(setting, narrow)[10:12] == pytest.approx((-1.1, 1.1), rel=1e-12)
 
 
-def test_a_brake_that_rests_at_the_edge_of_the_rest_zone_is_not_pushed_home_just_before_the_end() -> None:
-    """The push would make its velocity as badly known as before, and it would not be at rest again in time."""
-    setting, low, high = design_inputs(BENCH), SET.low, SET.high
-    law = law_between(setting, low, high, 0.003, 1.2)
-    assert law.settling == pytest.approx((2.0 * 6.0 + 5.0) * low.J / low.T_c)
-    for left, pushed in ((15, False), (7, False), (16, True)):
-        current, _ = shield(law, -0.152, -0.7, 0.0, NO_PAST, law.steps - 1 - left)
-        assert (current > 1.0) == pushed
-
-
 def held_up_to(setting: DesignInputs, low: BrakeParameters, high: BrakeParameters) -> float:
     """L5 (d) by the definition: where the damped stop at V_down, or full braking, is 95 % of the stiffest spring."""
     m, d = setting.current * low.k_m / high.J, low.T_c / high.J - setting.model_error
@@ -185,3 +140,64 @@ def test_the_plan_of_the_way_home_leaves_a_fifth_of_what_the_weakest_motor_reach
     assert part.planned_speed < 0.5 * setting.speed
     thin = high._replace(f_v=1e-2 * high.f_v)  # of which no speed within the limit takes a fifth
     assert law_between(setting, low, thin, 0.006, 6.0).cruise < setting.speed
+
+
+# --- what is known ----------------------------------------------------------------------------------------------------
+
+
+def test_what_is_known_are_the_numbers_of_the_head_by_name_and_for_the_log_in_order() -> None:
+    """Least four at 2, greatest four at 6, the box of states at 10; contradicted or not at 1."""
+    head = [5.0, 0.0, 0.1, 0.2, 0.3, 0.4, 1.1, 1.2, 1.3, 1.4, -2.0, 2.0, -30.0, 30.0]
+    now = known(head)
+    assert now == (0.1, 1.1, 0.2, 1.2, 0.3, 1.3, 0.4, 1.4, -2.0, 2.0, -30.0, 30.0, False)
+    assert Known._fields[:4] == ("k_m_low", "k_m_high", "k_1_low", "k_1_high")
+    assert Known._fields[4:8] == ("t_c_low", "t_c_high", "f_v_low", "f_v_high")
+    assert numbers(now, 7) == (0.1, 1.1, 0.2, 1.2, 0.3, 1.3, 0.4, 1.4, -2.0, 2.0, -30.0, 30.0, 7.0)
+    assert known([*head[:1], 1.0, *head[2:]]) == now._replace(falsified=True)
+    assert len(head) == HEAD  # where the numbers of the learner begin
+
+
+def test_a_contradiction_is_the_set_known_beforehand_around_the_newest_sample() -> None:
+    assumptions = make_assumptions(BENCH)
+    state = [9.0] * HEAD
+    falsify(assumptions, state, 3.0, 40.0)
+    assert (state[HEARD], state[FALSIFIED]) == (0.0, 1.0)
+    now = known(state)
+    assert now[0:8:2] == assumptions.low
+    assert now[1:8:2] == assumptions.high
+    assert now[8:] == pytest.approx((2.994, 3.006, 34.0, 46.0, True), rel=1e-12)
+    start_head(assumptions, state)
+    assert state[:10] == [0.0, 0.0, *assumptions.low, *assumptions.high]
+
+
+def test_before_anything_is_heard_of_the_brake_the_law_is_the_benchs_compiled_or_not() -> None:
+    assumptions = make_assumptions(BENCH)
+    state = [0.0] * HEAD
+    start_head(assumptions, state)
+    assert not known(state).falsified
+    falsify(assumptions, state, 3.0, 40.0)
+    found = known(state)
+    assert found.falsified
+    assert middle(found) == pytest.approx((3.0, 40.0))
+    for function in (law_for, compiled(law_for)):
+        law = function(design_inputs(BENCH), BENCH.brake, found)
+        assert law == pytest.approx(make_law(BENCH), rel=1e-12)
+
+
+def test_a_law_is_kept_while_the_possible_states_fit_into_its_noise_and_it_serves_a_part_of_its_set() -> None:
+    setting = design_inputs(BENCH)
+    assumptions = make_assumptions(BENCH)
+    state = [0.0] * HEAD
+    falsify(assumptions, state, 3.0, 40.0)
+    whole = known(state)
+    part = whole._replace(angle_low=2.999, angle_high=3.0, velocity_low=39.0, velocity_high=41.0)
+    law = law_for(setting, BENCH.brake, with_room(setting, part))
+    assert law.velocity_noise == pytest.approx(1.1)
+    assert law.angle_noise == pytest.approx(setting.angle_noise)
+    assert fits(law, part)
+    assert fits(law, part._replace(velocity_low=50.0, velocity_high=52.19, angle_high=3.01))
+    assert not fits(law, part._replace(velocity_high=41.3))
+    assert not fits(law, part._replace(angle_high=3.0131))
+    wide = law_for(setting, BENCH.brake, with_room(setting, whole))  # never beyond the measurement's noise
+    assert (wide.angle_noise, wide.velocity_noise) == pytest.approx((setting.angle_noise, setting.velocity_noise))
+    assert fits(wide, whole)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from itertools import count
 
 import pytest
@@ -74,18 +73,6 @@ def test_what_is_sent_is_in_reach_and_in_the_shield_s_window_or_it_is_not_sent(
     assert lowest <= decision.current <= highest
 
 
-def test_a_narrow_slew_holds_a_step_back_and_says_so() -> None:
-    decision = decide(LAW, CommandLimits(6.0, 2.0), 10.0, 0.0, 6.0, NO_PAST, 1.0, 10)
-    assert decision == (6.0, 3.0, Reason.LIMITED)
-    assert decide(LAW, CommandLimits(6.0, 2.0), 10.0, 0.0, -6.0, NO_PAST, 1.0, 10).current == -1.0
-
-
-def test_where_the_shield_needs_more_than_is_in_reach_the_node_is_left_to_brake() -> None:
-    fast = decide(LAW, CommandLimits(6.0, 2.0), 95.0, 400.0, 6.0, NO_PAST, 6.0, 10)
-    assert math.isnan(fast.current)
-    assert fast.reasons & Reason.LEFT
-
-
 @pytest.mark.parametrize(("angle", "velocity"), [(99.0, 200.0), (-9.3, -200.0)])
 @pytest.mark.parametrize("limit", [1.0, 6.0])
 def test_what_the_shield_needs_beyond_the_operator_s_limit_is_left_to_the_node(
@@ -94,6 +81,7 @@ def test_what_the_shield_needs_beyond_the_operator_s_limit_is_left_to_the_node(
     decision = decide(LAW, CommandLimits(limit, 12.0), angle, velocity, 0.0, NO_PAST, 0.0, 100)
     if limit < 6.0:
         assert math.isnan(decision.current)
+        assert decision.reasons & Reason.LEFT
     else:
         assert decision.current == -math.copysign(6.0, velocity)
 
@@ -112,23 +100,17 @@ def test_a_command_held_back_by_the_slew_may_lie_on_the_end_of_the_window(up: bo
     assert decision.current == end
 
 
-def test_a_limit_of_nothing_sends_nothing_but_zero() -> None:
-    for angle, velocity in [(0.0, 0.0), (0.3, 3.0), (60.0, 100.0)]:
-        decision = decide(LAW, CommandLimits(0.0, 12.0), angle, velocity, 5.0, NO_PAST, 0.0, 0)
-        assert decision.current == 0.0 or math.isnan(decision.current)
-        assert decision.reasons & Reason.CLIPPED
+DECIDED = [
+    # limit, slew, angle, wanted, last → decision
+    (6.0, 12.0, 20.0, 6.0, 0.0, (6.0, 6.0, Reason.NONE)),
+    (6.0, 12.0, 20.0, -6.0, 0.0, (-6.0, -6.0, Reason.NONE)),
+    (6.0, 2.0, 10.0, 6.0, 1.0, (6.0, 3.0, Reason.LIMITED)),
+    (6.0, 2.0, 10.0, -6.0, 1.0, (-6.0, -1.0, Reason.LIMITED)),
+    (1.5, 12.0, 0.0, 4.0, 0.0, (1.5, 1.5, Reason.CLIPPED)),
+    (1.5, 12.0, 0.0, -4.0, 0.0, (-1.5, -1.5, Reason.CLIPPED)),
+]
 
 
-def test_a_request_at_the_limit_is_sent_as_it_is() -> None:
-    for current in (6.0, -6.0):
-        assert decide(LAW, FULL, 20.0, 0.0, current, NO_PAST, 0.0, 10) == (current, current, Reason.NONE)
-
-
-def test_a_narrower_limit_clips_the_wish() -> None:
-    decision = decide(LAW, CommandLimits(1.5, 12.0), 0.0, 0.0, -4.0, NO_PAST, 0.0, 0)
-    assert (decision.clipped, decision.current, decision.reasons) == (-1.5, -1.5, Reason.CLIPPED)
-
-
-def test_the_bench_s_own_limit_is_the_shield_s() -> None:
-    narrow = replace(BENCH, limits=replace(BENCH.limits, current=5.0), shield=BENCH.shield._replace(ranges="viscous"))
-    assert decide(make_law(narrow), CommandLimits(5.0, 12.0), 0.0, 0.0, 6.0, NO_PAST, 0.0, 0).current == 5.0
+def test_limit_and_slew_hold_a_wish_back_and_say_so() -> None:
+    for limit, slew, angle, wanted, last, expected in DECIDED:
+        assert decide(LAW, CommandLimits(limit, slew), angle, 0.0, wanted, NO_PAST, last, 10) == expected

@@ -4,10 +4,7 @@ import math
 import random
 from dataclasses import replace
 
-import pytest
-
 from emb_runtime.config.bench import Bench, Ranges, load_bench
-from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.end_stop import end_stop_speed, released_speed
 from emb_runtime.safety.shield_design import make_law
 
@@ -45,22 +42,6 @@ def test_viscous_friction_and_a_narrower_set_make_it_slower_and_a_lag_faster() -
     assert 930.0 < speed < end_stop_speed(without_viscous_friction(FREEWHEEL))  # a search saw 930 rad/s
     assert end_stop_speed(replace(FREEWHEEL, shield=SHIPPED.shield._replace(ranges="viscous"))) < 0.7 * speed
     assert end_stop_speed(replace(FREEWHEEL, shield=SHIPPED.shield._replace(current_lag=0.002))) > speed
-
-
-def test_without_a_spring_it_is_the_speed_from_which_full_braking_would_just_have_stopped() -> None:
-    box = SHIPPED.range_set("envelope")
-    soft = Ranges("envelope", box.low._replace(k_1=1e-6, f_v=1e-12), box.high._replace(k_1=1e-5, f_v=2e-12))
-    bench = replace(FREEWHEEL, ranges={"envelope": soft})
-    law = make_law(bench)
-    # At the speed limit as near to a stop as the grid has it; then friction is all.
-    nearest = max(100.0 - i for i in range(100) if 2.0 * law.braking * i >= law.outward_speed**2)
-    by_hand = math.sqrt(law.outward_speed**2 - 2.0 * law.friction_low * (100.0 - nearest))
-    assert math.isclose(end_stop_speed(bench), by_hand, rel_tol=1e-3)
-
-
-def test_a_bench_that_cannot_be_shielded_is_refused() -> None:
-    with pytest.raises(BenchFileError, match="angle_margin"):
-        end_stop_speed(replace(SHIPPED, shield=SHIPPED.shield._replace(angle_margin=0.05)))
 
 
 def coasted(bench: Bench, hold: float, dice: random.Random) -> float:

@@ -153,11 +153,6 @@ def test_honest_sensors_never_alarm_where_frames_or_currents_may_be_late(declare
     assert frozen.verdict == OUTSIDE_SET
 
 
-def test_a_brake_that_rests_is_honest_and_confirms_nothing() -> None:
-    run = Run(policy=lambda *_: 0.0, noise=random.Random(0))
-    assert (run.verdict, run.confirmed) == (HONEST, -1)
-
-
 def test_a_gentle_first_move_confirms_the_polarity_within_15_ms_on_any_brake() -> None:
     for seed in range(20):
         run = Run(brakes(seed), policy=lambda *_: LIMITS.first_current, noise=random.Random(seed), samples=40)
@@ -247,35 +242,10 @@ def test_missing_pairs_hide_a_drift_of_65_rad_s_times_their_share_and_little_mor
         assert seen.seen <= 100
 
 
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-@pytest.mark.parametrize(("drift", "within"), [(10.0, 70), (20.0, 15), (100.0, 3)])
-def test_with_every_tenth_pair_missing_a_drift_is_seen_within_milliseconds(
-    drift: float, within: int, sign: float
-) -> None:
-    for policy in (lambda *_: 0.0, gentle_then_full):
-        run = drifting_with_every_nth_missing(10, sign * drift, policy)
-        assert run.verdict == CONTRADICTING
-        assert run.seen <= within
-
-
 def test_a_jump_of_the_angle_behind_a_jump_of_the_device_time_is_seen_at_rest() -> None:
     memory = [0.0] * MEMORY
     begin(memory, 0.0, 0.0)
     assert judge(LAW, LIMITS, memory, 13e-3, 5.0, 0.0, False, 0.0, 0.0) == CONTRADICTING
-
-
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_reported_current_widens_what_may_have_acted_by_the_tolerance_and_no_more(sign: float) -> None:
-    def alarms_after(reported: float) -> int:
-        memory = [0.0] * MEMORY
-        begin(memory, 0.0, 0.0)
-        for k in range(1, 100):
-            if judge(LAW, LIMITS, memory, TS, 0.0, 0.0, True, sign * 3.0, sign * reported) != HONEST:
-                return k
-        return 100
-
-    assert alarms_after(3.5) == alarms_after(3.0)  # more current than commanded: a frozen sensor is frozen
-    assert alarms_after(3.0) < alarms_after(2.5) == alarms_after(-6.0)
 
 
 # --- hostile numbers --------------------------------------------------------------------------------------------------
@@ -330,20 +300,6 @@ def test_the_monitor_of_a_run_raises_the_fault_with_sum_and_threshold() -> None:
         monitor.check(TS, sample(0.14, 0.0), False, 0.0)
     assert caught.value.fault is Fault.SENSORS_CONTRADICT
     assert f"threshold {LIMITS.travel:.2f} rad" in caught.value.detail
-
-
-def test_the_first_move_is_limited_until_the_motion_shows_its_sign() -> None:
-    monitor = SensorMonitor(LAW, LIMITS)
-    first, seen = LIMITS.first_current, []
-    x = v = 0.0
-    monitor.begin(sample(x, v))
-    for _ in range(15):
-        seen.append(monitor.largest_current(6.0))
-        assert monitor.largest_current(1.0) == 1.0
-        x, v = moved(BENCH.brake, x, v, first)
-        monitor.check(TS, SensorSample(0, x, v, 0, 0, first, 15, NodeState.ACTIVE), True, first)
-    assert min(seen) > first
-    assert max(seen) == seen[-1] == 6.0
 
 
 def test_at_rest_at_the_origin_the_first_move_is_the_full_current_and_far_from_it_the_gentle_one() -> None:
@@ -447,18 +403,6 @@ def test_a_monitor_that_has_heard_nothing_limits_the_first_move_already() -> Non
 # --- a brake that is left to friction ---------------------------------------------------------------------------------
 
 
-def test_in_the_coasting_time_friction_stops_any_brake() -> None:
-    """Also one that is faster than measured, as an observer lags."""
-    for seed, velocity, unseen in itertools.product(range(20), [-40.0, -5.0, 20.0, 40.0], [0.0, 25.0]):
-        wait = coasting_time(LAW, 0.2, velocity, unseen)
-        assert 0.0 < wait < 0.1 + unseen / 500.0
-        x, v = 0.2, velocity + math.copysign(unseen, velocity)
-        for _ in range(math.ceil(wait / TS)):
-            x, v = moved(brakes(seed), x, v, 0.0)
-        assert v == 0.0
-        assert abs(x) < 5.0
-
-
 def test_the_wait_is_longer_by_what_the_last_current_may_have_added_unseen() -> None:
     waits = []
     for current in (0.0, 5.0, -5.0):
@@ -484,8 +428,3 @@ def test_at_the_border_friction_stops_any_brake_within_the_free_stroke() -> None
             x, v = moved(brakes(seed), x, v, 0.0)
         assert v == 0.0
         assert abs(x) < 8.0
-
-
-def test_where_the_spring_may_beat_friction_nobody_waits() -> None:
-    for angle, velocity in [(4.1, 0.0), (-4.1, 0.0), (0.0, 128.0), (0.0, -128.0), (2.0, 110.0)]:
-        assert coasting_time(LAW, angle, velocity) == 0.0

@@ -275,6 +275,8 @@ def drawn_samples(rng: Random, law: ShieldLaw, count: int) -> Iterator[Sample]:
 
 
 def test_verdicts_and_sums_are_those_of_the_page() -> None:
+    seen = dict.fromkeys([HONEST, CONTRADICTING, OUTSIDE_SET, REVERSED], 0)
+    confirmed = 0
     for seed in range(60):
         rng = Random(seed)
         for _ in range(6):
@@ -284,20 +286,11 @@ def test_verdicts_and_sums_are_those_of_the_page() -> None:
             begin(memory, *start)
             for s in drawn_samples(rng, law, 60):
                 expected = reference.judge(s)
+                seen[expected] += 1
                 assert judge(law, limits, memory, *s) == expected
                 assert [memory[i] for i in SUMS] == pytest.approx(reference.sums, rel=1e-9, abs=1e-9)
-
-
-def test_the_drawn_samples_give_every_verdict_and_confirm() -> None:
-    seen: dict[int | str, int] = dict.fromkeys([HONEST, CONTRADICTING, OUTSIDE_SET, REVERSED, "confirmed"], 0)
-    for seed in range(60):
-        rng = Random(seed)
-        law = drawn_law(rng)
-        reference = Reference(law, drawn_limits(rng), 0.0, 0.0)
-        for s in drawn_samples(rng, law, 60):
-            seen[reference.judge(s)] += 1
-        seen["confirmed"] += reference.confirmed
-    assert min(seen.values()) >= 10
+            confirmed += reference.confirmed
+    assert min(confirmed, *seen.values()) >= 10
 
 
 # --- exactly at a threshold -------------------------------------------------------------------------------------------

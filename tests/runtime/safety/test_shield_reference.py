@@ -13,6 +13,8 @@ from random import Random
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from emb_runtime.config.bench import load_bench
 from emb_runtime.records import Reason
@@ -24,6 +26,7 @@ SHIPPED = make_law(load_bench())
 SEEDS = range(10)
 STATES = 80
 CLOSE = 1e-6
+AGES = [(0, 0), (0, 1), (1, 1), (2, 3), (4, 5)]
 
 
 def drawn_law(rng: Random) -> ShieldLaw:
@@ -256,7 +259,7 @@ def drawn_past(rng: Random, law: ShieldLaw) -> Past:
     return one, two, three, four, five
 
 
-@pytest.mark.parametrize("ages", [(0, 1), (1, 1), (2, 3), (4, 5)])
+@pytest.mark.parametrize("ages", AGES[1:])
 def test_the_window_after_late_measurements_holds_whatever_their_age_and_whatever_was_lost(
     ages: tuple[int, int],
 ) -> None:
@@ -408,7 +411,7 @@ def test_the_way_home_takes_over_when_the_worst_brake_would_come_too_late() -> N
             assert_returns_at(law, state, NO_PAST, measured(law, *state))
 
 
-@pytest.mark.parametrize("ages", [(0, 1), (1, 1), (2, 3), (4, 5)])
+@pytest.mark.parametrize("ages", AGES[1:])
 def test_late_measurements_are_rolled_on_to_where_the_way_home_begins(ages: tuple[int, int]) -> None:
     rng = Random(10 * ages[0] + ages[1])
     for _ in range(30):
@@ -655,3 +658,19 @@ def test_the_greatest_believable_velocity_is_still_reasoned_about(sign: float) -
     full = -sign * law.current
     assert shield(law, 5.0, sign * 1e6, full, NO_PAST, 0) == (full, RETURNING)
     assert shield(law, 5.0, sign * BEYOND, full, NO_PAST, 0) == (0.0, LIMITED)
+
+
+anything = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@settings(max_examples=400)
+@given(
+    st.sampled_from([(0, 0), *AGES]), anything, anything, anything, st.tuples(*[anything] * 5), st.integers(-10, 2000)
+)
+def test_whatever_comes_in_a_finite_current_within_the_limit_comes_out(
+    ages: tuple[int, int], angle: float, velocity: float, wanted: float, past: Past, step: int
+) -> None:
+    law = SHIPPED._replace(age_low=ages[0], age_high=ages[1])
+    current, bits = shield(law, angle, velocity, wanted, past, step)
+    assert abs(current) <= law.current
+    assert bits in {0, LIMITED, RETURNING, LIMITED | RETURNING}

@@ -203,14 +203,6 @@ def test_letting_go_of_the_watchdog_after_disarming_sends_nothing(bus: Bus, benc
     assert bus.rest() == []
 
 
-def test_a_loop_that_has_not_armed_may_be_silent(bus: Bus, bench: Bench) -> None:
-    watchdog = watchdog_of(bus, bench, heartbeat=0.01)
-    time.sleep(0.1)
-    result = watchdog.finish()
-    assert (result.tripped, result.time_ns, result.silence_ns, result.frames, result.error) == ("", 0, 0, 0, "")
-    assert bus.rest() == []
-
-
 def test_letting_go_of_the_watchdog_while_armed_sends_the_stop_frames(bus: Bus, bench: Bench) -> None:
     watchdog = watchdog_of(bus, bench, heartbeat=60.0)
     watchdog.pulse.arm(time.monotonic_ns())
