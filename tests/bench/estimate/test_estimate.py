@@ -307,12 +307,6 @@ def test_the_rest_before_the_experiment_is_a_measurement_of_where_it_started(ben
     assert gained == pytest.approx(np.diag([0.0] * 4 + [data.slack**-2]), abs=1e-4 * gained.max())
 
 
-def test_a_question_that_cannot_be_answered_is_refused() -> None:
-    for names in ((), ("k_m", "mass"), ("k_m", "stribeck_exponent"), ("k_m", "k_m")):
-        with pytest.raises(UsageError):
-            EstimationProblem(names)
-
-
 def test_what_cannot_be_estimated_from_so_little_is_refused(bench: Bench) -> None:
     data = exactly(bench)
     none = replace(data, samples=np.full((500, 2), np.nan))

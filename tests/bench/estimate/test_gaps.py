@@ -13,9 +13,8 @@ from emb_bench.config.bench import Bench
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.least_squares import regression
 from emb_bench.estimate.methods import refit
-from emb_bench.estimate.output_error import settled
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import End, EstimationProblem
+from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES
 
@@ -156,20 +155,6 @@ def test_a_gap_at_the_end_and_one_from_the_first_period_on_are_bridged(bench: Be
     found = fit(bench, plant, [lossy(whole, [0, 1, 2, 499], 0.0), lossy(whole, [0, 498, 499], 0.0)])
     assert found.validation.fits
     assert np.abs(errors_in_sigmas(found, bench.brake)).max() < 3.5
-
-
-def test_a_search_with_gaps_ends_where_no_step_in_parameters_or_gaps_lowers_the_sum_of_squares(bench: Bench) -> None:
-    data = lossy(record(bench, bench.plant("exact"), currents_of(bench, "chirp"), seed=6), EVERY, -6.0)
-    problem = problem_of(bench, PARAMETER_NAMES, data)
-    begin = np.full(4, 1.02)
-    weights = problem.weights(begin)
-    before = float(np.sum(problem.joint(begin, weights)[0] ** 2))
-    found, z, end = settled(problem, begin, End(before, (), (), True, 0), weights)
-    errors, rows = found.joint(z, weights)
-    assert end.cost == pytest.approx(float(errors @ errors))
-    assert end.cost < before
-    slopes = rows.T @ errors / np.linalg.norm(rows, axis=0)  # standard deviations
-    assert np.abs(slopes).max() < 1e-3
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -255,11 +255,6 @@ def test_too_much_speed_alone_breaks_a_limit(periods: int, kept: bool) -> None:
     assert response.kept == kept
 
 
-def test_noise_of_another_shape_is_refused() -> None:
-    with pytest.raises(UsageError):
-        played("step", shielded=True, noise=np.zeros((500, 2)))
-
-
 @pytest.mark.parametrize("name", ["constant-speed", "prbs", "square"])
 def test_the_runtime_takes_an_excitation_as_its_actor(simulate: Simulate, name: str) -> None:
     excited = excitation(name, BENCH)

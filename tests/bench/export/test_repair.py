@@ -136,17 +136,6 @@ def test_a_flipped_bit_costs_at_most_a_neighbourhood_and_is_told(
     assert not read_log(fixed).complete
 
 
-def test_descriptions_that_are_lost_with_the_first_chunk_are_taken_from_the_summary(path: Path, tmp_path: Path) -> None:
-    whole = seen(path)
-    content = bytearray(path.read_bytes())
-    content[whole.chunks[0] + 100] ^= 1
-    damaged, fixed = tmp_path / "damaged.mcap", tmp_path / "fixed.mcap"
-    damaged.write_bytes(content)
-    repair(damaged, fixed)
-    assert seen(fixed).channels == whole.channels
-    assert len(seen(fixed).messages) == len(whole.messages) - 1  # the clock reading that the chunk is written with
-
-
 def test_repairing_takes_memory_for_a_chunk_not_for_the_file(tmp_path: Path) -> None:
     cut, fixed = tmp_path / "cut.mcap", tmp_path / "fixed.mcap"
     random = np.random.default_rng(1)

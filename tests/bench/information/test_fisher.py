@@ -66,14 +66,6 @@ def test_the_fisher_information_is_the_sum_of_the_outer_products(kind: Kind, sca
     assert (found.kind, found.params, found.theta, found.prior) == (kind, PARAMETER_NAMES, BRAKE, None)
 
 
-def test_information_over_time_ends_at_the_whole_and_never_shrinks() -> None:
-    s = of_euler(square(20, 4.0))
-    history = information_over_time(s, physical_weights(BENCH.noise))
-    assert history.shape == (500, 4, 4)
-    np.testing.assert_array_equal(history[-1], physical(square(20, 4.0)))
-    assert (np.diff(history.diagonal(axis1=1, axis2=2), axis=0) >= 0.0).all()
-
-
 def test_a_lost_sample_tells_nothing_but_the_brake_moves_on() -> None:
     s = of_euler(square(20, 4.0))
     measured = np.random.default_rng(2).random(500) > 0.2

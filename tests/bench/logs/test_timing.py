@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +17,6 @@ from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.log.ring_buffer import EventRecord, Record
 from emb_runtime.records import CycleRecord, NodeState, Reason, RunState
-from emb_runtime.system.terminal import as_json
 from tests.bench.hostile import HostileBus, drive, write_trace
 from tests.bench.simulated_logs import square, write_log
 
@@ -121,16 +119,6 @@ def test_a_log_without_an_experiment_has_no_intervals_and_no_clock(measure: Meas
     assert all(len(t.interval(name)) == 0 for name in INTERVALS)
     assert t.clock is None
     assert document(t)["intervals"] == {name: {} for name in INTERVALS}
-
-
-def test_the_document_is_json_in_seconds(measure: Measure) -> None:
-    late = cycle(3, START + 3 * MS, send_time_ns=START + 3 * MS + 900_000)
-    t = measure(*(cycle(n, START + n * MS) for n in range(3)), late)
-    read = json.loads(as_json(document(t)))
-    assert read["intervals"]["response"]["p100"] == pytest.approx(900e-6)
-    assert read["least_slack"] == pytest.approx(100e-6)
-    assert read["not_obeyed"] is None  # the run's last words are missing in this log
-    assert read["clock_drift"] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_the_counts_are_the_loop_s_and_a_simulation_is_called_so(

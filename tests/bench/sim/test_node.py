@@ -235,44 +235,6 @@ def test_a_late_drive_stops_without_delay(bench: Bench, layout: Layout) -> None:
     assert layout.decode_velocity(bus.frames[1]).applied_current < 0.0
 
 
-def test_a_delayed_measurement_shows_an_earlier_brake_under_a_stamp_that_does_not_know(
-    bench: Bench, layout: Layout
-) -> None:
-    bus = Bus(bench, layout, delayed(bench, measurement_delay=2))
-    truth, shown, stamps = [], [], []
-    for _ in range(10):
-        bus.drive(3.0)
-        truth.append(bus.node.angle)
-        angle = layout.decode_angle(bus.frames[0])
-        shown.append(angle.angle)
-        stamps.append(angle.device_time_ns)
-    assert shown[2:] == pytest.approx(truth[:-2], abs=1e-5)
-    assert stamps == [1_000_000 * k for k in range(2, 12)]
-
-
-def test_a_jittering_clock_samples_late_and_does_not_say_so(bench: Bench, layout: Layout) -> None:
-    node = BrakeNode(bench, layout, bench.brake, lambda: (0.0, 0.0, 1e-4), bench.plant("jitter"))
-    frames = node.tick()
-    for k in range(40):
-        node.receive(layout.encode_command(CurrentCommand(k % 15, k % 15, 3.0, True)))
-        frames = node.tick()
-    assert node.velocity > 200.0
-    assert layout.decode_angle(frames[0]).angle == pytest.approx(node.angle + 1e-4 * node.velocity, abs=2e-4)
-    assert layout.decode_angle(frames[0]).device_time_ns == 41_000_000
-
-
-def test_an_exact_brake_that_rests_stands_still_and_an_euler_brake_chatters(bench: Bench, layout: Layout) -> None:
-    speeds = {}
-    for name in ("exact", "euler"):
-        bus = Bus(bench, layout, bench.plant(name))
-        bus.drive(2.0, 60)
-        bus.tick(1500)
-        assert bus.node.state is NodeState.IDLE
-        speeds[name] = bus.node.velocity
-    assert speeds["exact"] == 0.0
-    assert 0.1 < abs(speeds["euler"]) < 2.5
-
-
 def test_sensor_noise_has_the_bench_s_standard_deviations_and_follows_its_seed(bench: Bench) -> None:
     for jitter in (0.0, 2e-5):
         draws = [gaussian_noise(bench.noise, 5, jitter) for _ in range(2)]
@@ -293,12 +255,6 @@ def test_random_frames_are_never_obeyed_unless_they_are_valid_answers(content: l
         bus.node.receive(Frame(identifier, data))
         bus.tick()
     assert bus.node.obeyed <= legal
-
-
-def test_parameters_are_read_from_name_value_pairs(bench: Bench) -> None:
-    theta = true_parameters(bench, parse_assignments("f_v=3e-5, k_1 = 30"))
-    assert (theta.f_v, theta.k_1, theta.k_m) == (3e-5, 30.0, bench.brake.k_m)
-    assert true_parameters(bench, parse_assignments("")) == bench.brake
 
 
 def test_parameters_that_make_no_sense_are_refused(bench: Bench) -> None:

@@ -59,14 +59,6 @@ def test_the_base_install_is_enough() -> None:
     assert done.stdout.strip() == ""
 
 
-def test_an_unknown_offset_of_the_encoder_moves_every_angle_and_nothing_else() -> None:
-    for plant in (EULER, EXACT):
-        s = simulate(plant.mechanics, BRAKE, square(20, 4.0), T_S, ("offset", "k_m")).sensitivities
-        np.testing.assert_array_equal(s[:, 0], np.tile([1.0, 0.0], (500, 1)))
-        alone = simulate(plant.mechanics, BRAKE, square(20, 4.0), T_S, ("k_m",)).sensitivities
-        np.testing.assert_array_equal(s[:, 1:], alone)
-
-
 def test_states_do_not_depend_on_what_is_asked_about_them() -> None:
     for plant in (EULER, EXACT, BENCH.plant("rough")):
         alone = simulate(plant.mechanics, BRAKE, square(20, 4.0), T_S, x0=(1.0, -20.0))
