@@ -1,4 +1,4 @@
-# make demo   one simulated experiment with the shipped actor, and its Fisher information
+# make demo   one simulated experiment with the shipped actor, its report as a page, and its Fisher information
 # make test   style, types, and the tests: no root, no kernel, nothing outside .venv (4 minutes on two processors)
 # make hil    the programs as shipped on a real vcan0, with faults; needs user-mode-linux, gcc, libc6-dev, iproute2
 # make night  what takes longer: slow tests, every fault, searches, fuzzing, all mutants
@@ -31,9 +31,9 @@ $(BIN)/python:
 		|| { echo "$(PYTHON) cannot make environments: sudo apt-get install python3-venv"; exit 1; }
 	$(PYTHON) -m venv --clear $(VENV)
 
-# What the bench computer gets: no torch.
+# What drives and analyses: no torch.
 $(VENV)/.base: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) -e .
+	$(PIP) -e '.[bench]'
 	@touch $@
 
 # torch first and pinned: left open, it is looked up anew, and may come with gigabytes of CUDA.
@@ -43,8 +43,8 @@ $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
 	@touch $@ $(VENV)/.base
 
 demo: $(VENV)/.base
-	@mkdir -p demo && rm -f demo/experiment.mcap
-	$(BIN)/emb-run --iface sim --log demo/experiment.mcap
+	@mkdir -p demo && rm -f demo/experiment.mcap demo/report.html
+	$(BIN)/emb-run --iface sim --log demo/experiment.mcap --report demo/report.html
 	$(BIN)/emb-replay fim demo/experiment.mcap
 
 lint: $(VENV)/.dev

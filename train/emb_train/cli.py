@@ -13,14 +13,14 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY
 from emb_bench.output import make_empty_folder, replacing
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
-from emb_runtime.system.terminal import as_json, complain, mention, show
+from emb_runtime.system.terminal import Parser, as_json, complain, mention, show
 from emb_train.presets import TASKS, listed, preset_summaries, reference_names, wrapped
 
 if TYPE_CHECKING:
@@ -72,16 +72,9 @@ of a minute for each other, and is kept in the user's cache. Ctrl-C ends the eva
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    """Refuses in one line, like the rest of a command."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UsageError(message)
-
-
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    p = _Parser(
+    p = Parser(
         prog="emb-train",
         description="Learn an excitation for brakes whose parameters are unknown.",
         epilog=EPILOG,

@@ -211,7 +211,8 @@ def emb_run(arguments: Sequence[str]) -> Mapping[str, Any]:
         for number, handler in before.items():
             signal.signal(number, handler)
     if not printed.strip():
-        raise StepFailedError("emb-run ended without a result", max(process.returncode, EXIT_SAFETY_STOP))
+        exit_code = process.returncode if process.returncode > 0 else EXIT_SAFETY_STOP
+        raise StepFailedError("emb-run ended without a result; its message is above", exit_code)
     document: dict[str, Any] = json.loads(printed)
     if ended and document["result"] == "done":
         raise SafetyStopError("stopped by the operator after a run; the same command goes on from there")

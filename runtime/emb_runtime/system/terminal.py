@@ -120,6 +120,10 @@ def confirmed(question: str, stop_requested: Callable[[], bool], wait: Callable[
 class Parser(argparse.ArgumentParser):
     """A command line whose wrong use is one line, with the option or the command that may have been meant."""
 
+    def __init__(self, **options: Any) -> None:
+        """A parser that takes no option by the beginning of its name."""
+        super().__init__(allow_abbrev=False, **options)
+
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         """The arguments; ends the program with 2 where they are wrong, with 0 after a ``--help``."""
         found, unknown = self.parse_known_args(args, namespace)
