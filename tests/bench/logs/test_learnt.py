@@ -60,7 +60,7 @@ def test_every_cycle_s_set_is_in_the_log_and_holds_the_true_brake(learnt_log: Pa
 
 def test_a_report_shows_the_set_that_is_left(learnt_log: Path, tmp_path: Path, replay: Replay) -> None:
     page = tmp_path / "page.html"
-    replay.text("report", learnt_log, "--out", page)
+    replay.text("report", learnt_log, "--output", page)
     text = page.read_text(encoding="utf-8")
     assert "What the shield learnt" in text
     low, high = last_learnt(read_log(learnt_log))["k_m"]
