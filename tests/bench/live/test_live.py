@@ -309,6 +309,7 @@ def test_the_page_in_a_browser_shows_every_sample_and_estimate(shipped: Path, tm
     with browser_at(server, tmp_path / "early") as page:
         page.wait("document.getElementById('state').textContent === 'waiting for a run'")
         for _ in range(2):  # the second log takes the place of the first
+            page.value("document.title = ''")
             follow(NewLogs(shipped.parent, shipped.name, old=True), server, never, wrong.append, once=True)
             page.wait(whole)
         assert page.value("cycles.map(c => c.angle)") == log.cycles["angle"][cycles].tolist()
