@@ -25,7 +25,7 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY
 from emb_bench.design.problem import COARSE_SEARCHES
 from emb_bench.estimate.records import STARTS
-from emb_bench.figures import require_place
+from emb_bench.figures import for_notebook, require_place
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_bench.output import replacing, say_if_compiling
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -80,11 +80,7 @@ class Run(RunLog):
             UsageError: matplotlib is missing.
             LogError: the run has no control cycles.
         """
-        try:
-            from matplotlib import pyplot as plt
-        except ImportError as err:
-            raise UsageError("a plot needs matplotlib: pip install 'emb-excite[bench]'") from err
-        figure, axes = plt.subplots(5, sharex=True, figsize=(8.0, 9.5), layout="constrained")
+        figure, axes = for_notebook(5, (8.0, 9.5), sharex=True)
         draw(self, axes)
         return figure
 

@@ -110,6 +110,24 @@ def svg(draw: Callable[[Any], None], rows: int, columns: int, size: tuple[float,
     return file.getvalue()
 
 
+def for_notebook(rows: int, size: tuple[float, float], **shared: Any) -> tuple[Any, Any]:
+    """A figure of matplotlib that a notebook shows, and its axes below each other; in matplotlib's own style.
+
+    Args:
+        rows: of axes.
+        size: width and height [inch].
+        shared: ``sharex`` of matplotlib's ``Figure.subplots``.
+
+    Raises:
+        UsageError: matplotlib is missing.
+    """
+    try:
+        from matplotlib import pyplot as plt
+    except ImportError as err:
+        raise UsageError("a plot needs matplotlib: pip install 'emb-excite[bench]'") from err
+    return plt.subplots(rows, figsize=size, layout="constrained", **shared)
+
+
 @contextmanager
 def _figure(rows: int, columns: int, size: tuple[float, float], style: Any, shared: Any) -> Iterator[tuple[Any, Any]]:
     try:

@@ -40,6 +40,7 @@ from emb_bench.estimate.records import (
 from emb_bench.experiment.evaluation import default_model, other_sample_time
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
+from emb_bench.figures import for_notebook
 from emb_bench.logs.log import RunLog
 from emb_bench.numbers import amount
 from emb_runtime.config.bench import BrakeParameters
@@ -167,11 +168,7 @@ class Study:
         Raises:
             UsageError: matplotlib is missing.
         """
-        try:
-            from matplotlib import pyplot as plt
-        except ImportError as err:
-            raise UsageError("a plot needs matplotlib: pip install 'emb-excite[bench]'") from err
-        figure, axes = plt.subplots(figsize=(7.0, 1.0 + 0.5 * len(self)), layout="constrained")
+        figure, axes = for_notebook(1, (7.0, 1.0 + 0.5 * len(self)))
         for row, c in enumerate(self):
             low, high = (100.0 * (end / c.value - 1.0) for end in c.interval)
             half = 100.0 * c.repeatability / abs(c.value)
@@ -427,13 +424,11 @@ def stop_of(log: RunLog, experiment: Experiment | None, name: str) -> Stop | Non
     """End of a run that was stopped; None if the log has no other reason for its end than completion."""
     if log.end.get("exit_reason", DONE) == DONE:
         return None
-    reason, (periods, planned) = (
-        log.exit_reason,
-        (0, 0) if experiment is None else (experiment.periods, experiment.planned),
-    )
+    reason = log.exit_reason
+    periods, planned = (0, 0) if experiment is None else (experiment.periods, experiment.planned)
     fault = FAULTS[Fault[reason]] if reason in Fault.__members__ else None
-    about = ("", "") if fault is None else (fault.cause, fault.advice)
-    return Stop(name, reason, log.end.get("detail", ""), periods, planned, *about)
+    cause, advice = ("", "") if fault is None else (fault.cause, fault.advice)
+    return Stop(name, reason, log.end.get("detail", ""), periods, planned, cause, advice)
 
 
 def _read(log: RunLog, bench: Bench, name: str) -> tuple[Experiment, list[str]]:
