@@ -7,17 +7,17 @@ import glob
 import time
 from pathlib import Path
 
-from emb_bench.live.follow import Lines, NewLogs, Viewer, follow
+from emb_bench.live.follow import NewLogs, follow
 from emb_bench.live.process import POLL
 from emb_bench.live.serve import HOST, PORT, Server
 from emb_runtime.errors import EXIT_DONE, LogError, UsageError
-from emb_runtime.system.terminal import mention, show
+from emb_runtime.system.terminal import mention
 
-HELP = "shows runs while they go on: on a page in the browser, in Foxglove, or in lines"
+HELP = "shows runs while they go on: on a page in the browser, or in Foxglove"
 DESCRIPTION = """\
-Follow the logs that appear in a folder, as they are written: on a page of the browser, for Foxglove and Lichtblick over
-the Foxglove WebSocket protocol (open the address as a connection, with the layout of the documentation), or in lines of
-text. It only reads files, and a run is the same with it and without. Ctrl-C ends it. emb-run --live shows one run.
+Follow the logs that appear in a folder, as they are written: on a page of the browser, and for Foxglove and Lichtblick
+over the Foxglove WebSocket protocol (open the address as a connection, with the layout of the documentation). It only
+reads files, and a run is the same with it and without. Ctrl-C ends it. emb-run --live shows one run.
 """
 
 
@@ -27,7 +27,6 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
         "place", type=Path, nargs="?", default=Path("runs"), metavar="DIR|LOG",
         help="folder whose new logs are shown, or one log; it need not exist yet, where it lies must (default: runs/)",
     )  # fmt: skip
-    p.add_argument("--lines", action="store_true", help="in lines of text, on standard output")
     p.add_argument("--host", default=HOST, help="address to listen at (default: %(default)s, this computer only)")
     p.add_argument("--port", type=int, default=PORT, help="port to listen at; 0 for a free one (default: %(default)s)")
 
@@ -43,11 +42,9 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--port: expected 0 to 65535, got {args.port}")
     if not args.place.parent.is_dir():
         raise UsageError(f"{args.place}: there is no folder {args.place.parent}: make it, or name a place in another")
-    server = None if args.lines else Server(args.host, args.port)
-    viewer: Viewer = server or Lines(show)
+    server = Server(args.host, args.port)
     one = bool(args.place.suffix) and not args.place.is_dir()
     logs = NewLogs(args.place.parent, glob.escape(args.place.name), old=True) if one else NewLogs(args.place)
-    where = f": {server.addresses}" if server is not None else ""
 
     def wait() -> bool:
         time.sleep(POLL)
@@ -59,11 +56,10 @@ def run(args: argparse.Namespace) -> int:
         mention(str(err))
 
     try:
-        mention(f"shows {'the log' if one else 'new logs in'} {args.place}{where}; Ctrl-C ends it")
-        follow(logs, viewer, wait, complain, once=one)
+        mention(f"shows {'the log' if one else 'new logs in'} {args.place}: {server.addresses}; Ctrl-C ends it")
+        follow(logs, server, wait, complain, once=one)
     except KeyboardInterrupt:
         pass
     finally:
-        if server is not None:
-            server.close()
+        server.close()
     return EXIT_DONE

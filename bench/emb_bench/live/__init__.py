@@ -1,1 +1,1 @@
-"""A run shown while it goes on: its log is read as it grows, and served to browsers and viewers or printed in lines."""
+"""A run shown while it goes on: its log is read as it grows, and served to browsers and viewers."""

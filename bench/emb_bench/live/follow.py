@@ -7,9 +7,8 @@ recorder do not know of a reader.
 from __future__ import annotations
 
 import json
-import math
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
@@ -28,7 +27,7 @@ from emb_bench.logs.mcap_file import (
     unpack_chunk,
 )
 from emb_runtime.errors import LogError
-from emb_runtime.estimator.estimate import LOST, NORMAL_95
+from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.log.mcap_schema import CYCLE, ESTIMATE, SAFETY, deviation_of
 from emb_runtime.records import Reason, RunState
 from emb_runtime.system.input_file import open_regular
@@ -159,14 +158,13 @@ def follow(
         goes_on &= not once
 
 
-EVERY = 25  # Samples from one line to the next
 TOLD = (CYCLE.name, ESTIMATE, SAFETY.name)
 RUNNING = (RunState.ACTIVE, RunState.HOMING)
 SHIELD = Reason.LIMITED | Reason.RETURNING | Reason.LEFT
 
 
 class Decoder:
-    """The messages of one log that a reader without a viewer is shown: cycles, estimates and transitions."""
+    """The messages of one log that the page shows: cycles, estimates and transitions."""
 
     def __init__(self) -> None:
         self._schemas: dict[int, mcap.Schema] = {}
@@ -193,71 +191,9 @@ class Decoder:
                 yield topic, factory.FromString(message.data)
 
 
-class Lines:
-    """The lines of one log after the other.
-
-    Args:
-        tell: takes a line.
-        every: samples from one line to the next.
-    """
-
-    def __init__(self, tell: Callable[[str], None], every: int = EVERY) -> None:
-        self._tell = tell
-        self._every = every
-        self.begin()
-
-    def begin(self) -> None:
-        """Another log begins."""
-        self._decoder = Decoder()
-        self._estimate: Any = None
-        self._shielded = self._samples = 0
-        self._start_ns = -1
-
-    def end(self, reason: str) -> None:
-        """Its last transition is a line already."""
-
-    def add(self, chunk: Chunk) -> None:
-        """Print what is in a chunk."""
-        for topic, message in self._decoder.messages(chunk):
-            self._take(topic, message)
-
-    def _take(self, topic: str, message: Any) -> None:
-        if topic == ESTIMATE:
-            self._estimate = message
-        elif topic == SAFETY.name:
-            if message.code == LOST:
-                self._estimate = None
-            self._tell(f"{'':8}{message.code}: {message.text}")
-        elif message.state in RUNNING:
-            if self._start_ns < 0:
-                self._start_ns = message.receive_time_ns
-            self._samples += 1
-            self._shielded += bool(message.reasons & SHIELD)
-            if message.step % self._every == 0:
-                self._tell(" ".join(self._parts(message)))
-                self._shielded = self._samples = 0
-
-    def _parts(self, cycle: Any) -> Iterator[str]:
-        yield f"{1e-9 * (cycle.receive_time_ns - self._start_ns):6.3f} s"
-        yield f"{cycle.angle:8.2f} rad {cycle.velocity:7.1f} rad/s"
-        sent = "  braking" if math.isnan(cycle.sent_current) else f"{cycle.sent_current:+7.3f} A"
-        yield sent
-        yield f"shield {100 * self._shielded // self._samples:3d} %"
-        if self._estimate is not None:
-            yield from _known(self._estimate, self._decoder.units)
-
-
 def intervals(estimate: Any) -> Iterator[tuple[str, float, float]]:
     """Name, value and half of the 95 % interval of each parameter in an estimate."""
     names = [field.name for field in estimate.DESCRIPTOR.fields]
     for name in names:
         if deviation_of(name) in names:
             yield name, getattr(estimate, name), NORMAL_95 * getattr(estimate, deviation_of(name))
-
-
-def _known(estimate: Any, units: Mapping[str, str]) -> Iterator[str]:
-    """Each parameter's value with its unit, and its 95 % interval, as a part of it."""
-    for name, value, half in intervals(estimate):
-        part = half / abs(value) if value else math.inf
-        known = f"{value:.4g} {units.get(name, '')}".rstrip()
-        yield f"{name} {known} ± {100 * part:.2g} % (95 %)" if part < 10.0 else f"{name} ?"

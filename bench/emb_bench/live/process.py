@@ -10,7 +10,7 @@ import select
 import sys
 from pathlib import Path
 
-from emb_bench.live.follow import Lines, NewLogs, Viewer, follow
+from emb_bench.live.follow import NewLogs, follow
 from emb_bench.live.serve import Server
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.system import child_process
@@ -25,17 +25,15 @@ def main(arguments: list[str]) -> int:
     step_back()
     (fd,) = map(int, arguments)
     document = child_process.read_document(fd)
-    viewer: Viewer
     try:
-        viewer = Lines(mention) if document["port"] is None else Server(port=document["port"])
+        server = Server(port=document["port"])
     except UsageError as err:
         child_process.answer({"error": str(err)})
         return 1
     logs = NewLogs(Path(document["folder"]), document["pattern"])
-    child_process.answer({"ready": viewer.addresses if isinstance(viewer, Server) else ""})
-    follow(logs, viewer, _wait, _complain)
-    if isinstance(viewer, Server):
-        viewer.close()
+    child_process.answer({"ready": server.addresses})
+    follow(logs, server, _wait, _complain)
+    server.close()
     return 0
 
 

@@ -112,7 +112,7 @@ def shown(plan: Plan) -> Iterator[None]:
     document = {
         "folder": str(plan.log.parent if one else plan.log),
         "pattern": f"{glob.escape(plan.log.stem)}*{glob.escape(plan.log.suffix)}" if one else "*.mcap",
-        "port": None if plan.live == "lines" else int(plan.live),
+        "port": plan.live,
     }
     try:
         child = Child("live", entries[0].value, document, [])
@@ -122,8 +122,7 @@ def shown(plan: Plan) -> Iterator[None]:
         answer = child.answer(VIEWER_TIMEOUT)
         if "ready" not in answer:
             raise UsageError(f"--live: {answer.get('error', 'its process gave no answer')}")
-        if answer["ready"]:
-            mention(f"live at {answer['ready']}")
+        mention(f"live at {answer['ready']}")
         yield
     finally:
         child.end()

@@ -140,7 +140,7 @@ class Plan:
     real_time: bool
     watchdog: bool
     ask: Ask
-    live: str | None  # Port at which the run is shown, or ``lines``
+    live: int | None  # Port at which the run is shown
     json: bool
     verbose: bool
     strict: bool = False  # An estimate outside the ranges is no success
@@ -194,9 +194,9 @@ def parser() -> argparse.ArgumentParser:
         "are below these parts of its values: k_1=1%%,f_v=5%%",
     )  # fmt: skip
     what.add_argument(
-        "--live", nargs="?", const=str(LIVE_PORT), metavar="PORT|lines",
-        help="show the run while it goes on, from a process of its own: to Foxglove or Lichtblick at this port "
-        f"(default: {LIVE_PORT}; needs the extra [live]), or in lines on standard error",
+        "--live", nargs="?", type=int, const=LIVE_PORT, metavar="PORT",
+        help="show the run while it goes on, from a process of its own: to browsers, Foxglove and Lichtblick at "
+        f"this port (default: {LIVE_PORT}; needs the extra [live])",
     )  # fmt: skip
     what.add_argument(
         "--report", type=Path, metavar="FILE.html",
@@ -394,10 +394,10 @@ def log_path(wanted: Path, ending: str = "") -> Path:
     return path
 
 
-def _live(wanted: str | None) -> str | None:
-    if wanted is None or wanted == "lines" or (wanted.isdecimal() and int(wanted) <= 65535):
-        return wanted
-    raise UsageError(f"--live: expected a port, 0 to 65535, or 'lines', got '{wanted}'")
+def _live(port: int | None) -> int | None:
+    if port is None or 0 <= port <= 65535:
+        return port
+    raise UsageError(f"--live: expected a port, 0 to 65535, got {port}")
 
 
 def _stop_condition(args: argparse.Namespace, bench: Bench) -> StopCondition | None:

@@ -22,7 +22,6 @@ WORKS: dict[str, tuple[str, ...]] = {
     "export --to parquet": ("export", "RUN", "--to", "parquet", "-o", "OUT.parquet"),
     "export --to plot": ("export", "RUN", "--to", "plot", "-o", "OUT.png"),
     "repair": ("repair", "RUN", "-o", "OUT.mcap"),
-    "live --lines": ("live", "RUN", "--lines"),
 }  # fmt: skip
 LACKS: dict[str, tuple[tuple[str, ...], str]] = {
     "timing": (("timing", "RUN"), "no loop whose timing"),
