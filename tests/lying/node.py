@@ -22,7 +22,7 @@ STATUS_PERIODS = 100
 
 J, GAMMA, K_M, K_1, T_C, F_V = 4.624e-6, 1.889e-5, 2.170e-2, 2.304e1, 1.037e-2, 2.160e-5
 WAVE = 5.0  # Hz
-STEPS = 20  # Of the brake's motion in a period
+STEPS = 4  # Of the brake's motion in a period: the midpoint rule is as exact with 4 as with 400
 
 Said = tuple[int, bytes]  # Identifier and payload of a frame
 
@@ -231,19 +231,12 @@ class LyingNode:
         self.stopped = self.stopped or self.periods
 
     def _move(self, current: float) -> None:
-        step = 1e-3 / STEPS
         stiffness = K_1 if self.began is None else self._lie.stiffness * K_1
         coulomb = T_C * (1.0 + self._lie.friction_rate * self._since())
         for _ in range(STEPS):
-            drive = K_M * current - GAMMA * stiffness * max(self.angle, 0.0) - F_V * self.velocity
-            if self.velocity == 0.0 and abs(drive) <= coulomb:
-                continue
-            friction = math.copysign(coulomb, self.velocity if self.velocity else drive)
-            after = self.velocity + step * (drive - friction) / J
-            if self.velocity * after < 0.0:
-                after = 0.0
-            self.angle += step * 0.5 * (self.velocity + after)
-            self.velocity = after
+            left = 1e-3 / STEPS
+            while left > 0.0:  # Twice where the brake comes to rest within the step
+                left -= self._step(left, current, stiffness, coulomb)
         self.lowest, self.highest = min(self.lowest, self.angle), max(self.highest, self.angle)
         self.fastest = max(self.fastest, abs(self.velocity))
         if (
@@ -256,6 +249,26 @@ class LyingNode:
             self._resting = self._resting + 1 if abs(self.velocity) < 0.5 else 0
             if self._resting >= 50:
                 self.state = IDLE
+
+    def _step(self, step: float, current: float, stiffness: float, coulomb: float) -> float:
+        """Move by the midpoint rule, up to the instant of rest if there is one; the time taken [s]."""
+
+        def drive(angle: float, velocity: float) -> float:
+            return K_M * current - GAMMA * stiffness * max(angle, 0.0) - F_V * velocity
+
+        pull = drive(self.angle, self.velocity)
+        if self.velocity == 0.0 and abs(pull) <= coulomb:
+            return step
+        friction = math.copysign(coulomb, self.velocity if self.velocity else pull)
+        first = (pull - friction) / J
+        half = 0.5 * step
+        a = (drive(self.angle + half * self.velocity, self.velocity + half * first) - friction) / J
+        after = self.velocity + step * a
+        if self.velocity * after < 0.0:
+            step, after = -self.velocity / a, 0.0
+        self.angle += step * 0.5 * (self.velocity + after)
+        self.velocity = after
+        return step
 
     def _sample(self, applied: float, obeyed: int) -> list[Said]:
         lie, time_s = self._lie, self.periods * 1e-3 + self._late

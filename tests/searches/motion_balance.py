@@ -7,7 +7,8 @@ commands, jitter and delays, as tests/searches/sensor_monitor.py draws them; pol
 ``--quick``, and those drawn there; an experiment has 500, 250 or 100 samples. For each plant: alarms, and the largest
 unexplained velocity and distance of the spring's origin as shares of what is allowed. Then the node stops the brake, as
 late as its watchdog lets it: the longest time until it is idle (NOT_AT_REST beyond 1.5 s), and how often the velocity
-that it then measures is taken for a motion.
+that it then measures is taken for a motion. Last: how often the estimator's model does not fit, as it must for brakes
+of another kind: it ends no run.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from emb_bench.sim.simulated_brake import pass_period
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.control.loop import STOP_LISTEN_NS
-from emb_runtime.estimator.kalman import Model, follow, make_model, start
+from emb_runtime.estimator.kalman import Model, fits, follow, make_model, start
 from emb_runtime.estimator.speed_loop import Scale
 from emb_runtime.safety.motion_balance import MEMORY as BALANCE_MEMORY
 from emb_runtime.safety.motion_balance import (
@@ -59,7 +60,7 @@ CHUNK = 1000
 ACTORS = ("four-d-exact-quadratic", "four-time-exact-quadratic")
 LENGTHS = (500, 500, 250, 100)
 PLANTS = {**COVERED, "play": {}}
-LARGEST, JUDGED, ORIGIN, REST, FIRST_VELOCITY = range(5)  # Columns of a row of results; REST in periods
+LARGEST, JUDGED, ORIGIN, REST, DOUBTED, FIRST_VELOCITY = range(6)  # Columns of a row of results; REST in periods
 COLUMNS = FIRST_VELOCITY + REST_SAMPLES
 STATUS_PERIODS = 100  # Most samples that a node at rest sends until its status says why it stopped
 
@@ -104,10 +105,11 @@ def fly(
         begin(sums, angle, velocity)
         past, periods, obeyed, sent, felt, wanted = NO_PAST, 0, False, 0.0, 0.0, 0.0
         for k in range(law.steps):
+            if periods == 0:
+                state = follow(model, state, angle, velocity, float(k), felt)
             if scripted:
                 wanted = script.wanted[m, k]
             elif periods == 0:
-                state = follow(model, state, angle, velocity, float(k), felt)
                 wanted = wanted_current(model, state, scale, box, table, reference)
             limit = largest_current(law, limits, memory, law.current)
             u, _ = shield(law, angle, velocity, wanted, past, k)
@@ -148,6 +150,7 @@ def fly(
         out[m, JUDGED] = last > 0.0
         place, most = origin(balance, sums)
         out[m, ORIGIN] = abs(place) / most if last > 0.0 else 0.0
+        out[m, DOUBTED] = not fits(state)
         halt(law, mechanics, instruments, p, stop, m, script, x, instrument, out[m])
 
 
@@ -246,13 +249,16 @@ def main() -> None:
     p.add_argument("--seed", type=int, default=1, help="0 is the one that the thresholds were chosen with")
     arguments = p.parse_args()
     bench, rng = load_bench(), np.random.default_rng(arguments.seed)
-    each, totals = max(arguments.experiments // len(PLANTS), 1), {"unexplained": 0, "not at rest": 0, "in motion": 0}
+    each, totals = (
+        max(arguments.experiments // len(PLANTS), 1),
+        {"unexplained": 0, "not at rest": 0, "in motion": 0, "model does not fit": 0},
+    )
     judged = total = 0
     print(
         "| plant | experiments | judged | alarms | share allowed | level of 1e-6 | of the origin | level | "
-        "longest until idle [s] | not idle | in motion |"
+        "longest until idle [s] | not idle | in motion | model does not fit |"
     )
-    print("|---" * 11 + "|", flush=True)
+    print("|---" * 12 + "|", flush=True)
     for plant in PLANTS:
         r = results(bench, plant, each, rng)
         share, origins = r[:, LARGEST], r[:, ORIGIN]
@@ -260,13 +266,14 @@ def main() -> None:
         longest = int(STOP_LISTEN_NS / 1e9 / bench.timing.sample_time)
         restless = int(np.count_nonzero(r[:, REST] > longest))
         moving = sum(steady_motion([*map(float, v)], bench.noise.velocity) != 0.0 for v in r[:, FIRST_VELOCITY:])
-        for name, count in zip(totals, (found, restless, moving), strict=True):
+        doubted = int(np.count_nonzero(r[:, DOUBTED]))
+        for name, count in zip(totals, (found, restless, moving, doubted), strict=True):
             totals[name] += count
         judged, total = judged + used, total + len(r)
         print(
             f"| {plant} | {len(r)} | {used} | {found} | {share.max():.2f} | {tail(share):.2f} | "
             f"{origins.max():.2f} | {tail(origins):.2f} | {r[:, REST].max() * bench.timing.sample_time:.3f} | "
-            f"{restless} | {moving} |",
+            f"{restless} | {moving} | {doubted} |",
             flush=True,
         )
     print(f"\n{judged} of {total} experiments are judged by the balance")

@@ -180,6 +180,7 @@ def facts(outcome: Outcome) -> dict[str, Any]:
         "rejections": dict(outcome.rejections),
         "bus_error_classes": dict(outcome.bus_errors),
         "learnt": None if outcome.learnt is None else ranges_of(outcome.learnt),
+        "model_fits": outcome.model_fits,
         "unexplained": outcome.unexplained if judged else None,  # by any one brake [rad/s]
         "unexplained_allowed": outcome.allowed if judged else None,
         "goal_reached": outcome.goal_reached,
@@ -265,6 +266,7 @@ def refusal(err: EmbError, iface: str) -> dict[str, Any]:
 def text(s: Mapping[str, Any], details: bool = False) -> str:
     """A :func:`document` for a person: the answer and what was unusual; every count with ``details``."""
     early = f", ended early: enough is known after {s['goal_s']:.3f} s" if s["goal_reached"] else ""
+    completed = s["result"] == "done" and s["purpose"] == RunType.EXPERIMENT
     done = f"done, OUTSIDE THE RANGES ({', '.join(s['outside'])})" if s["outside"] else "done"
     lines = [f"{done}: {s['answered']} of {s['steps']} samples answered, {'home' if s['home'] else 'NOT HOME'}{early}"]
     if s["result"] != "done":
@@ -284,7 +286,6 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
         lines += _brake(s)
     if s["pairs"] and (details or s["result"] != "done" or s["unanswered"] or s["missed"] or s["rejected"]):
         lines += _counts(s)
-    completed = s["result"] == "done" and s["purpose"] == RunType.EXPERIMENT
     if completed and (details or s["unexplained"] is None):
         lines.append(f"  motion     {_motion(s)}")
     lines += _unusual(s)
@@ -295,6 +296,8 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
         ]
     if s["estimate"]:
         lines.append("estimate while running ± half of the 95 % interval (k=2), if the model is right")
+        if not s["model_fits"]:
+            lines.append("  IT IS NOT  friction, a delay or a sensor is another: use emb-replay estimate")
         lines += [f"  {line}" for line in estimate.words(s["estimate"])]
     missing = "" if s["log_complete"] else f", INCOMPLETE: {s['log_error']}"
     lines.append(f"log: {s['log']} ({s['log_messages']} messages, {s['log_bytes'] / 1024:.0f} KiB{missing})")

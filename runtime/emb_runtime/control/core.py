@@ -333,6 +333,7 @@ class Core:
             rejections=reception.rejections(),
             bus_errors=dict(reception.bus_errors),
             estimate=self._estimate,
+            model_fits=self._estimator.fits,
             goal_reached=self._condition_met,
             goal_ns=self._met_ns,
             learnt=self._learner.known if self._start_ns else None,  # not of the warming up

@@ -79,6 +79,7 @@ class Outcome:
     bus_errors: Mapping[str, int]  # Number of the CAN controller's reports by error; only what happened
     estimate: tuple[float, ...] = ()
     """The actor's last estimate: values, then their standard deviations; empty if it estimates nothing."""
+    model_fits: bool = True  # The estimator's model explains the measurements
     unexplained: float = math.nan
     """Velocity that no one brake explains, see :mod:`emb_runtime.safety.motion_balance`; NaN of a run that was not
     completed [rad/s]."""

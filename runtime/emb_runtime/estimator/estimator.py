@@ -6,7 +6,7 @@ import math
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.estimator.estimate import Quantity
-from emb_runtime.estimator.kalman import Four, State, believed, deviations, follow, make_model, start
+from emb_runtime.estimator.kalman import Four, State, believed, deviations, fits, follow, make_model, start
 
 UNITS = {"k_m": "N·m/A", "k_1": "N/rad", "T_c": "N·m", "f_v": "N·m·s/rad"}  # Of the parameters
 
@@ -46,6 +46,11 @@ class Estimator:
     def parameters(self) -> tuple[float, ...]:
         """k_m, k_1, T_c and f_v in SI units, then their standard deviations."""
         return self.values + _in_si(deviations(self.model, self.state), self.model.nominal)
+
+    @property
+    def fits(self) -> bool:
+        """True if the model explains the measurements, up to now."""
+        return fits(self.state)
 
     @property
     def estimate(self) -> tuple[float, ...]:

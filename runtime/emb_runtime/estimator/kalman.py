@@ -196,12 +196,17 @@ def believed(model: Model, state: State) -> Four:
     )
 
 
+def fits(state: State) -> bool:
+    """Returns True if the innovations were as the model has them, up to now."""
+    return state.worst <= MISFIT
+
+
 def deviations(model: Model, state: State) -> Four:
     """Standard deviations of the relative parameters; at least the distance of the filter's value from the range.
 
     Once the model did not fit, at least those of the prior. Infinite where rounding has made a variance negative.
     """
-    mean, p, used, doubted = state.mean, state.covariance, believed(model, state), state.worst > MISFIT
+    mean, p, used, doubted = state.mean, state.covariance, believed(model, state), not fits(state)
     low, high = model.low, model.high
     return (
         _deviation(p[11], mean[2] - used[0], high[0] - low[0], doubted),

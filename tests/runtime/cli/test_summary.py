@@ -87,6 +87,7 @@ def test_every_count_and_every_trouble_has_its_words_and_an_undisturbed_run_few(
         ({"node_stop_reason": StopReason.LIMIT}, "LIMIT"),
         ({"node_stop_reason": None}, "has not reported its stop reason"),
         ({"unexplained": 3.6, "allowed": math.inf}, "not judged"),
+        ({"estimate": (0.02, 23.0, 0.01, 2e-5, 0.006, 6.6, 0.003, 6e-6), "model_fits": False}, "IT IS NOT"),
         ({"unexplained": 3.6, "allowed": 28.4}, "all but 4 rad/s of it, at most 28"),
     )
     for changes, part in rows:

@@ -376,6 +376,9 @@ def test_an_honest_node_under_the_shipped_actor_is_explained_with_and_without_lo
         outcome = run(lie, seed, actor=policy).outcome
         assert outcome.fault is None, outcome.detail
         assert 0.0 < outcome.unexplained < 0.5 * outcome.allowed < 20.0
+        assert outcome.model_fits
+        for value, deviation in zip(outcome.estimate[:4], outcome.estimate[4:], strict=True):
+            assert deviation < 0.002 * value
 
 
 @pytest.mark.parametrize("lie", [Lie(zero=2.0), Lie(zero=-2.0), Lie(slide=0.2, begin=0.0), Lie(gain_rate=0.2)], ids=str)
@@ -384,3 +387,4 @@ def test_what_stays_unseen_keeps_within_what_the_page_says(lie: Lie) -> None:
     assert seen.node.lowest >= -3.5
     assert seen.node.highest <= 80.0
     assert seen.node.fastest <= 522.0
+    assert not seen.outcome.model_fits
