@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from emb_bench.config.bench import Bench, load_bench
-from emb_bench.config.plants import DEFAULT_PLANT, EVERY
+from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.design.problem import COARSE_SEARCHES
 from emb_bench.estimate.records import STARTS
 from emb_bench.figures import for_notebook, require_place
@@ -44,8 +44,7 @@ if TYPE_CHECKING:  # scipy, numba, matplotlib and pyarrow come with the extra [b
     from emb_bench.report.content import Content
 
 __all__ = [
-    *("Run", "campaign", "compare_models", "design", "draw", "estimate", "fisher_information", "open_run", "report"),
-    *("simulate", "topic"),
+    *("Run", "campaign", "design", "draw", "estimate", "fisher_information", "open_run", "report", "simulate", "topic"),
 ]
 
 Source = RunLog | str | Path
@@ -196,8 +195,8 @@ def fisher_information(
 
     Args:
         run: MCAP file of emb-run.
-        model: plant of the bench to evaluate with, or 'all' for all of them side by side (default: the one that was
-            simulated; exact where the log does not say).
+        model: plant of the bench to evaluate with (default: the one that was simulated; exact where the log does not
+            say).
         params: parameters to evaluate; all others are taken as known (default: the four of the brake).
         nuisance: unknowns besides (default: none).
         prior: name of ranges in the bench file in which the parameters are known to lie (default: none).
@@ -213,31 +212,6 @@ def fisher_information(
         UsageError: a name is unknown, or the run only listened.
         LogError: the log says too little.
     """
-    if model == EVERY:
-        raise UsageError(f"--model {EVERY}: expected the name of a plant")
-    return _evaluations(run, model, params, nuisance, prior, theta, bench)[0]
-
-
-def compare_models(run: Source, **options: Any) -> list[Evaluation]:
-    """Fisher information of a run by each plant of the bench; options of :func:`fisher_information` but ``model``.
-
-    Raises:
-        UsageError: a name is unknown, or the run only listened.
-        LogError: the log says too little.
-    """
-    names = ("params", "nuisance", "prior", "theta", "bench")
-    return _evaluations(run, EVERY, *(options.get(name) for name in names))
-
-
-def _evaluations(
-    run: Source,
-    model: str | None,
-    params: Names | None,
-    nuisance: Names | None,
-    prior: str | None,
-    theta: str | Path | Mapping[str, float] | None,
-    bench: str | Path | None,
-) -> list[Evaluation]:
     from emb_bench.experiment.evaluation import Question, bench_for, default_model, evaluate
     from emb_bench.experiment.from_log import read_experiment
     from emb_bench.experiment.theta import read_theta
@@ -246,9 +220,9 @@ def _evaluations(
     log = _driven(run)
     its = bench_for(log, bench)
     question = Question(*_unknowns(params, nuisance, its), None if prior is None else its.range_set(prior))
-    plants = list(its.plants.values()) if model == EVERY else [its.plant(model or default_model(log)[0])]
+    plant = its.plant(model or default_model(log)[0])
     name, brake, errors = read_theta(_text_of(theta), log, its)
-    return evaluate(log, read_experiment(log, its), its, plants, question, name, brake, errors)
+    return evaluate(log, read_experiment(log, its), its, [plant], question, name, brake, errors)[0]
 
 
 def estimate(

@@ -110,7 +110,6 @@ def alike(expected: str, text: str) -> bool:
         ("fim", ["fim", "good.mcap", "--theta", "true"]),
         ("fim-nominal", ["fim", "good.mcap", "--theta", "nominal", "--nuisance", "x1_0"]),
         ("fim-verbose", ["fim", "good.mcap", "--theta", "true", "-v"]),
-        ("fim-models", ["fim", "good.mcap", "--model", "all"]),
         ("estimate-good", ["estimate", "good.mcap", "--starts", "2"]),
         ("estimate-verbose", ["estimate", "other.mcap", "--model", "exact", "--starts", "2", "-v"]),
         ("estimate-misfit", ["estimate", "other.mcap", "--model", "exact", "--starts", "2"]),

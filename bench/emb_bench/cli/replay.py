@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from emb_bench import api
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.cli.options import add, add_output_options, answer, given, summary
-from emb_bench.config.plants import EVERY
 from emb_bench.figures import ENDINGS, require_place
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import read_log
@@ -52,14 +51,8 @@ UNKNOWNS = METHODS + "\nThe names of unknowns are in the help of emb-replay esti
 
 
 def _fim(args: argparse.Namespace) -> int:
-    options = given(args, api.fisher_information)
-    if options.get("model") == EVERY:
-        del options["model"]
-        every = api.compare_models(**options)
-        answer(args, lambda: {"models": [fim.document(e) for e in every]}, lambda _: fim.models_text(every))
-    else:
-        found = api.fisher_information(**options)
-        answer(args, lambda: fim.document(found), lambda verbose: fim.text(found, verbose=verbose))
+    found = api.fisher_information(**given(args, api.fisher_information))
+    answer(args, lambda: fim.document(found), lambda verbose: fim.text(found, verbose=verbose))
     return EXIT_DONE
 
 

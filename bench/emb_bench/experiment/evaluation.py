@@ -61,11 +61,6 @@ class Fit:
         """True if there are samples, and they differ no more than the sensors' noise explains."""
         return self.samples > 0 and self.angle <= self.expected and self.velocity <= self.expected  # not with NaN
 
-    @property
-    def loose(self) -> bool:
-        """True if they differ so little that the model expects more noise than there is."""
-        return self.fits and min(self.angle, self.velocity) < 2.0 - self.expected
-
 
 class _DelayLine:
     """Rows that are seen some samples later; until then the first ones are what was seen ``before``."""

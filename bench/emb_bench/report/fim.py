@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from emb_bench.brake.parameters import UNITS, quantity
+from emb_bench.brake.parameters import quantity
 from emb_bench.config.machine import CURRENT
 from emb_bench.documents import to_json
-from emb_bench.experiment.evaluation import KINDS, Evaluation, Fit, Question, default_model, evenly
+from emb_bench.experiment.evaluation import KINDS, Evaluation, Question, default_model, evenly
 from emb_bench.information.criteria import criteria_series
 from emb_bench.information.identifiability import Finding, combination
 from emb_bench.numbers import NOTHING, in_samples, plain
@@ -129,47 +128,6 @@ def _over_time(e: Evaluation) -> Table:
         for k, det, least, trace, w in zip(steps, *physical, weighted.log_det, strict=True)
     ]
     return Table("", ("time [ms]", "log det", "lambda_min", "tr M^-1", "log det weighted"), rows, words=())
-
-
-def models_text(evaluations: Sequence[Evaluation]) -> str:
-    """Fisher information of one record for every model of the brake, side by side, as text."""
-    first = evaluations[0]
-    lines = listed("WARNING: ", (first.log.missing, *first.experiment.missing))
-    if not any(e.fit.fits for e in evaluations):
-        lines += wrapped(f"WARNING: no model fits at {first.theta_name} parameters: they are not this brake's")
-    names = first.question.names
-    shown = {name: quantity(first.bench.machine, name) for name in names}
-    lines += listed(
-        "NOTE: ",
-        (
-            f"{name} is zero in {', '.join(lacking)}: the data say nothing about it there"
-            for name in names
-            if (lacking := [e.plant.name for e in evaluations if name in e.absent])
-        ),
-    )
-    rows = []
-    for e in evaluations:
-        fisher = e.fisher("physical")
-        bounds = fisher.cramer_rao()
-        halves = (NORMAL_95 * bounds[name] * (shown[name].factor if name in UNITS else 100.0) for name in names)
-        sizes = (f"{e.fit.angle:.3g}", f"{e.fit.velocity:.3g}", f"{fisher.criteria().log_det:.3f}")
-        rows.append([e.plant.name, _fits(e.fit), *sizes, *(f"{half:.4g}" for half in halves)])
-    header = ["model", "fits", "angle", "velocity", "log det"]
-    header += [f"{shown[name].name} [{shown[name].unit if name in UNITS else '%'}]" for name in names]
-    title = "residuals in sigma; best possible ± 95 % (k=2), if the sensors have noise and no systematic error"
-    lines += [*_heading(first), *_unknowns(first.question), "", *wrapped(title, 0)]
-    lines += Table("", header, rows, words=(0, 1)).lines()
-    if any(e.fit.loose for e in evaluations):
-        lines.append("loose: the model expects more noise than there is, and its bounds are too large")
-    if first.log.truth:
-        lines.append(f"what was simulated: {default_model(first.log)[0]}")
-    return "\n".join(lines)
-
-
-def _fits(fit: Fit) -> str:
-    if fit.loose:
-        return "loose"
-    return "yes" if fit.fits else "no"
 
 
 def _heading(e: Evaluation) -> list[str]:

@@ -12,7 +12,6 @@ from tests.bench.linear_machine import MAP, Machine, record
 WORKS: dict[str, tuple[str, ...]] = {
     "info": ("info", "RUN"),
     "fim": ("fim", "RUN"),
-    "fim --model all": ("fim", "RUN", "--model", "all"),
     "estimate": ("estimate", "RUN", "--starts", "1"),
     "estimate --method pem": ("estimate", "RUN", "--method", "pem", "--starts", "1"),
     "report": ("report", "RUN", "--starts", "1", "-o", "OUT.html"),
@@ -22,6 +21,7 @@ WORKS: dict[str, tuple[str, ...]] = {
     "export --to parquet": ("export", "RUN", "--to", "parquet", "-o", "OUT.parquet"),
     "export --to plot": ("export", "RUN", "--to", "plot", "-o", "OUT.png"),
     "repair": ("repair", "RUN", "-o", "OUT.mcap"),
+    "live": ("live", "RUN", "--port", "0"),
 }  # fmt: skip
 LACKS: dict[str, tuple[tuple[str, ...], str]] = {
     "timing": (("timing", "RUN"), "no loop whose timing"),
