@@ -136,7 +136,7 @@ def reference_file(source: str, bench: Bench) -> tuple[bytes, float]:
     for relative, reference in zip(seen.tolist(), wanted, strict=True):
         set_reference(table, features(box, tuple(relative)), reference)
     nominal = np.array([getattr(bench.brake, name) for name in PARAMETER_NAMES])
-    kept_of = {name: getattr(kept, name) for name in ("task", "form", "plant", "shield", "seed", "command")}
+    kept_of = {name: getattr(kept, name) for name in ("task", "form", "plant", "seed", "command")}
     provenance = {"reference": Path(source).stem, **kept_of}
     nodes = [
         helper.make_node("Log", [INPUT_NAME], ["logarithm"]),

@@ -8,7 +8,6 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, NamedTuple
 
-import emb_train.trial as learning_module
 import tests.properties.learning_search as search_module
 from emb_bench.compiled import source_module
 
@@ -84,9 +83,7 @@ def broken(mutant: Mutant, episodes: Callable[..., None]) -> Any:
     changed = ModuleType(f"{original.__name__}_changed")
     sys.modules[changed.__name__] = changed
     exec(compile(source.replace(mutant.old, mutant.new), str(original.__file__), "exec"), changed.__dict__)
-    listen = _rewired(learning_module.listen, {"hear": changed.hear})
-    miss = _rewired(learning_module.miss, {"lose": changed.lose})
-    episode = _rewired(search_module.episode, {"listen": listen, "miss": miss})
+    episode = _rewired(search_module.episode, {"hear": changed.hear, "lose": changed.lose})
     return _rewired(episodes, {"episode": episode})
 
 

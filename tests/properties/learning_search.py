@@ -21,12 +21,12 @@ from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
-from emb_runtime.learning.assumptions import assumptions_of
+from emb_runtime.learning.assumptions import Assumptions, assumptions_of
+from emb_runtime.learning.bounded import hear, lose, start
 from emb_runtime.learning.known import HIGH, LOW, Known, known
 from emb_runtime.learning.law import law_for, middle
 from emb_runtime.safety.shield import NO_PAST, damped_current, shield
-from emb_runtime.safety.shield_design import ShieldLaw, design_inputs, make_law
-from emb_train.trial import Learning, begin, holds, listen, miss
+from emb_runtime.safety.shield_design import DesignInputs, ShieldLaw, design_inputs, make_law
 from tests.properties.shield_search import (
     DROPS,
     LOST,
@@ -53,7 +53,9 @@ OUTSIDE, REFUTED, LOWEST, HIGHEST, SLOWEST, FASTEST, END_ANGLE, END_VELOCITY, WI
 class Setting(NamedTuple):
     """What all episodes of a search have in common."""
 
-    learning: Learning
+    inputs: DesignInputs  # Of the bench
+    nominal: BrakeParameters  # Brake that the parameters are relative to
+    assumptions: Assumptions  # Of the learner
     law: ShieldLaw  # For the whole set
     plant: Mechanics
     excess: float  # Sensor noise over its bound
@@ -95,7 +97,7 @@ def _brake(b: Any) -> BrakeParameters:
 
 def _noise(s: Setting, script: Script, i: int, k: int, side: float, true: Any, shadow: Any) -> tuple[float, float]:
     """Errors of a measured angle [rad] and velocity [rad/s]; an anchored shadow goes on from what is seen of it."""
-    a = s.learning.assumptions
+    a = s.assumptions
     most_y, most_w = a.angle_noise * s.excess, a.velocity_noise * s.excess
     if script.noise[i] < IMPERSONATE:
         return script.errors[i, k, 0] * side * most_y, script.errors[i, k, 1] * side * most_w
@@ -116,12 +118,25 @@ def _answer(s: Setting, script: Script, i: int, k: int, now: Known, seen: tuple[
     if now.falsified:
         return shield(s.law, seen[0], seen[1], wish, NO_PAST, k)
     y, w = middle(now)
-    return shield(law_for(s.learning.inputs, s.learning.nominal, now), y, w, wish, NO_PAST, k)
+    return shield(law_for(s.inputs, s.nominal, now), y, w, wish, NO_PAST, k)
+
+
+def _holds(nominal: BrakeParameters, possible: Known, brake: Any, angle: float, velocity: float) -> bool:
+    """True if the true parameters, angle [rad] and velocity [rad/s] are among what is known to be possible."""
+    k_m, k_1, t_c, f_v = brake[2] / nominal.k_m, brake[3] / nominal.k_1, brake[4] / nominal.T_c, brake[5] / nominal.f_v
+    return bool(
+        possible.k_m_low <= k_m <= possible.k_m_high
+        and possible.k_1_low <= k_1 <= possible.k_1_high
+        and possible.t_c_low <= t_c <= possible.t_c_high
+        and possible.f_v_low <= f_v <= possible.f_v_high
+        and possible.angle_low <= angle <= possible.angle_high
+        and possible.velocity_low <= velocity <= possible.velocity_high
+    )
 
 
 def episode(s: Setting, script: Script, i: int, state: Any, row: Any) -> None:
     """Run one episode and write its results into ``row``."""
-    learning, a, t = s.learning, s.learning.assumptions, s.learning.assumptions.sample_time
+    a, t = s.assumptions, s.assumptions.sample_time
     b, kind = script.brakes[i], script.noise[i]
     p, q = _brake(b), _brake(script.shadows[i])
     true, shadow = np.zeros(STATES), np.zeros(STATES)
@@ -138,13 +153,13 @@ def episode(s: Setting, script: Script, i: int, state: Any, row: Any) -> None:
         w += v
         lost = True
         if k > 0 and script.drops[i, k] == LOST and script.silent[i]:
-            miss(learning, state)
+            lose(a, state)
         else:
-            listen(learning, state, y, w, current)
+            hear(a, state, y, w, current)
             now = known(state)
             if now.falsified:
                 row[REFUTED] += 1.0
-            elif not holds(learning.nominal, now, b, x, v):
+            elif not _holds(s.nominal, now, b, x, v):
                 row[OUTSIDE] += 1.0
             if script.feedback[i] == REVERSE_WHEN_LIMITED and bits & 2:
                 touched += 1
@@ -223,8 +238,8 @@ def setting_for(bench: Bench, flow: bool, excess: float = 1.0) -> Setting:
     """The exact flow or forward Euler is declared, and true; ``excess`` is sensor noise over its bound."""
     declared = replace(bench, shield=bench.shield._replace(learn=True, model="flow" if flow else "euler"))
     law = make_law(declared)
-    learning = Learning(True, design_inputs(declared), bench.brake, assumptions_of(declared))
-    return Setting(learning, law, bench.plant("exact" if flow else "euler").mechanics, excess)
+    mechanics = bench.plant("exact" if flow else "euler").mechanics
+    return Setting(design_inputs(declared), bench.brake, assumptions_of(declared), law, mechanics, excess)
 
 
 class Found(NamedTuple):
@@ -304,7 +319,7 @@ def search(
     box = bench.range_set(bench.shield.ranges)
     brakes, rows = np.zeros((n, len(BrakeParameters._fields))), np.zeros((n, COUNT))
     labels = np.zeros((n, 3), dtype=np.int64)
-    begun = begin(setting.learning)
+    begun = np.array(start(setting.assumptions))
     play, names, steps = compiled(run), list(DROPS), setting.law.steps
     for first in range(0, n, CHUNK):
         part = slice(first, min(first + CHUNK, n))

@@ -52,7 +52,7 @@ MANY = dataclasses.replace(SHORT, plants={**SHORT.plants, **PLANTS})
 
 
 OPEN = Conditions(shielded=False, horizon=30, observes="everything", information="physical")
-VARYING = Conditions(command_delay=(0, 2), frame_loss=(0.0, 0.2))
+VARYING = Conditions(command_delay=(0, 2))
 
 
 def test_gymnasium_finds_nothing_wrong_with_the_registered_environment() -> None:

@@ -1,12 +1,10 @@
-"""References: what they are, what they are worth, the errors of their estimates, and the shield that learns."""
+"""References: what they are, what they are worth, and the errors of their estimates."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import shlex
-from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,7 @@ from emb_bench.config.bench import load_bench
 from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
-from emb_runtime.estimator.kalman import MISFIT, follow, make_model, start
+from emb_runtime.estimator.kalman import MISFIT, State, follow, make_model, start
 from emb_runtime.estimator.speed_loop import scale_of
 from emb_train.cli import parser
 from emb_train.closed_loop import Batch, Conditions
@@ -38,7 +36,7 @@ from emb_train.reference import (
     stored,
     wanted_current,
 )
-from emb_train.trial import TASKS, Task, Trials
+from emb_train.trial import Task, Trials
 
 BENCH = load_bench()
 PM50 = BENCH.range_set("pm50")
@@ -90,17 +88,15 @@ def test_a_trial_is_the_environments_experiment_with_the_runtimes_functions(plan
     assert outcome.estimates[:, 8].tolist() == [s.worst for s in states]
 
 
-def test_a_reference_as_an_excitation_is_the_trial_also_where_samples_are_lost() -> None:
+def test_a_reference_as_an_excitation_is_the_trial() -> None:
     kept, draws = stored("four-d-exact-quadratic"), fresh_draws(PM50, 9, 4)
-    for loss in (0.0, 0.1):
-        conditions = Conditions(information="physical", frame_loss=(loss, loss))
-        (tuned,) = Trials(BENCH, PM50, PARAMETER_NAMES, draws, "exact", conditions).play(
-            kept.scale(BENCH), kept.array()[None]
-        )
-        played = play(BENCH, PM50, PARAMETER_NAMES, Following(kept, BENCH, PM50), draws, "exact", conditions)
-        # What is seen is rounded to single precision.
-        assert np.linalg.slogdet(played.matrices)[1] == pytest.approx(np.linalg.slogdet(tuned.matrices)[1], abs=0.05)
-        assert played.home.all()
+    conditions = Conditions(information="physical")
+    trials = Trials(BENCH, PM50, PARAMETER_NAMES, draws, "exact", conditions)
+    (tuned,) = trials.play(kept.scale(BENCH), kept.array()[None])
+    played = play(BENCH, PM50, PARAMETER_NAMES, Following(kept, BENCH, PM50), draws, "exact", conditions)
+    # What is seen is rounded to single precision.
+    assert np.linalg.slogdet(played.matrices)[1] == pytest.approx(np.linalg.slogdet(tuned.matrices)[1], abs=0.05)
+    assert played.home.all()
 
 
 def test_an_experiment_that_leaves_the_limits_keeps_its_information_until_then() -> None:
@@ -127,8 +123,8 @@ def test_ranges_in_which_the_inertia_varies_are_refused() -> None:
 # The errors of the estimate -------------------------------------------------------------------------------------------
 
 
-def followed(kind: str, delay: int, count: int, plant: str = "exact") -> tuple[list[Floats], Floats]:
-    """States of the estimator at some steps [N, STATE] under an excitation, and the true relative parameters [N, 4]."""
+def followed(kind: str, delay: int, count: int, plant: str = "exact") -> tuple[list[list[State]], Floats]:
+    """States of N estimators at some steps under an excitation, and the true relative parameters [N, 4]."""
     conditions = Conditions(information="physical", command_delay=(delay, delay))
     batch = Batch(BENCH, PM50, PARAMETER_NAMES, count, plant, conditions)
     for i, draw in enumerate(fresh_draws(PM50, 11, count)):
@@ -148,20 +144,21 @@ def followed(kind: str, delay: int, count: int, plant: str = "exact") -> tuple[l
 def test_errors_are_as_large_as_the_filter_says_whatever_the_delay(kind: str, delay: int) -> None:
     found, truth = followed(kind, delay, 200)
     for states in found:
-        errors, covariance = states[:, 3:7] - truth, unpack(states[:, 7:28], 6)[:, 2:, 2:]
+        errors = np.array([s.mean[2:] for s in states]) - truth
+        covariance = unpack(np.array([s.covariance for s in states]), 6)[:, 2:, 2:]
         shares = errors / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         spread = np.sqrt((shares**2).mean(axis=0))
         assert 0.75 < spread.min() < spread.max() < 1.3
         squares = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
         assert (squares < chi2.ppf(0.95, 4)).mean() > 0.85  # 0.95 of a linear model
         assert squares.max() < 60.0
-        assert (states[:, 29] < MISFIT).all()
+        assert max(s.worst for s in states) < MISFIT
 
 
 def test_a_brake_that_is_not_the_filters_is_noticed() -> None:
     for plant in ("euler", "stribeck", "lag", "rough"):
         states, _ = followed("tuned", 0, 12, plant)
-        assert (states[-1][:, 29] > MISFIT).all(), plant
+        assert min(s.worst for s in states[-1]) > MISFIT, plant
 
 
 # Those that are kept --------------------------------------------------------------------------------------------------
@@ -185,7 +182,7 @@ def test_every_packaged_reference_is_made_by_a_command_that_exists_and_keeps_wha
         assert (program, command) == ("emb-train", "reference")
         asked = parser().parse_args([command, *options])
         assert (asked.task, asked.form, asked.plant, asked.gain) == (kept.task, kept.form, kept.plant, kept.gain), name
-        assert (asked.shield, tuple(asked.command_delay), asked.seed) == (kept.shield, kept.command_delay, kept.seed)
+        assert (tuple(asked.command_delay), asked.seed) == (kept.command_delay, kept.seed)
         assert kept.draws == asked.steps * BATCH
         assert asked.out.name == name
 
@@ -195,47 +192,3 @@ def test_a_kept_delay_that_is_none_is_refused() -> None:
     for delay in ([0], [2, 1], [0, 99], [0, 1.5], [-1, 0]):
         with pytest.raises(UsageError, match="mine: command_delay"):
             read_text(json.dumps({**record, "command_delay": delay}), "mine")
-
-
-FOUR = TASKS["four-d"]
-
-
-@pytest.mark.parametrize("plant", ["exact", "euler"])
-def test_behind_the_shield_that_learns_the_limits_hold_the_truth_stays_possible_and_more_is_told(plant: str) -> None:
-    kept, scores = stored("four-d-exact-quadratic"), []
-    for shield in ("worst case", "bounded"):
-        task = replace(FOUR, plant=plant, shield=shield)
-        (found,) = task.trials(BENCH, task.draws(BENCH, 6, 24)).play(kept.scale(BENCH), kept.array()[None])
-        assert not found.left.any()
-        assert found.home.all()
-        assert not found.mistaken.any()
-        scores.append(task.score(found))
-    assert (scores[1] - scores[0]).mean() > 0.1
-
-
-def test_a_truth_outside_of_what_was_learnt_is_counted() -> None:
-    draws = FOUR.draws(BENCH, 6, 4)
-    strong = [d._replace(brake=d.brake._replace(k_m=2.0 * BENCH.brake.k_m)) for d in draws]  # the set ends at 1.5
-    trials = replace(FOUR, shield="bounded").trials(BENCH, strong)
-    kept = stored("four-d-exact-quadratic")
-    (found,) = trials.play(kept.scale(BENCH), kept.array()[None])
-    assert found.mistaken.all()
-
-
-def test_a_shield_that_learns_is_refused_where_its_model_is_not_the_brake_s() -> None:
-    shields: list[dict[str, Any]] = [
-        {"frame_age": (0, 1)},
-        {"current_lag": 5e-4},
-        {"envelope": "coasting", "angle_margin": 1.1},
-    ]
-    cases = [(BENCH, plant, (0, 0)) for plant in ("late", "lag", "offset", "observer", "rough")]
-    cases += [(replace(BENCH, shield=BENCH.shield._replace(**s)), "exact", (0, 0)) for s in shields]
-    for bench, plant, delay in [*cases, (BENCH, "exact", (0, 1))]:
-        for shielded in (True, False):
-            conditions = Conditions(shielded=shielded, command_delay=delay)
-            begin = partial(Trials, bench, bench.range_set("pm50"), PARAMETER_NAMES, [], plant, conditions)
-            with pytest.raises(UsageError):
-                begin(shield="bounded")
-            begin()
-    for plant in ("euler", "exact", "stribeck", "jitter"):
-        replace(FOUR, plant=plant, shield="bounded").trials(BENCH, [])

@@ -133,12 +133,6 @@ def _add_reference(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument("--steps", type=_at_least(1), default=400, metavar="N", help="of evolution (default: %(default)s)")
     p.add_argument("--plant", default=DEFAULT_PLANT, metavar="NAME", help="of the bench (default: %(default)s)")
-    p.add_argument(
-        "--shield",
-        choices=("worst case", "bounded"),
-        default="worst case",
-        help="for the whole set (worst case), or for what has been learnt (bounded) (default: %(default)s)",
-    )
     _add_late(p)
     p.add_argument(
         "--gain",
@@ -161,7 +155,6 @@ def _add_ppo(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument("--plant", metavar="NAME", help="plant of the bench that the brakes are (default: the preset's)")
     _add_late(p)
-    _add_loss(p)
     _add_common(p, "of everything random")
 
 
@@ -190,7 +183,6 @@ def _add_evaluate(p: argparse.ArgumentParser) -> None:
     p.add_argument("--json", action="store_true", help="print JSON, with the values of every draw")
     p.add_argument("--out", type=Path, metavar="DIR", help="also write evaluation.txt and evaluation.json there")
     _add_late(p)
-    _add_loss(p)
     _add_common(p, "of brakes and noise; never those of a training")
 
 
@@ -202,17 +194,6 @@ def _add_late(p: argparse.ArgumentParser) -> None:
         metavar=("LEAST", "MOST"),
         default=(0, 0),
         help="of each experiment, beside the plant's own; the shield covers it [samples] (default: 0 0)",
-    )
-
-
-def _add_loss(p: argparse.ArgumentParser) -> None:
-    p.add_argument(
-        "--frame-loss",
-        type=float,
-        nargs=2,
-        metavar=("LEAST", "MOST"),
-        default=(0.0, 0.0),
-        help="of each experiment: probability that a sample does not arrive (default: 0 0)",
     )
 
 
@@ -275,7 +256,7 @@ def reference(arguments: argparse.Namespace) -> int:
     from emb_train.trial import TASKS
 
     bench, (least, most) = load_bench(arguments.bench), arguments.command_delay
-    task = replace(TASKS[arguments.task], plant=arguments.plant, shield=arguments.shield, command_delay=(least, most))
+    task = replace(TASKS[arguments.task], plant=arguments.plant, command_delay=(least, most))
     begin, blind = _beginning(arguments, task), arguments.form == "blind"
     task.trials(bench, task.draws(bench, 0, 1))  # what cannot be is refused before there is a folder
     folder = arguments.out
@@ -300,7 +281,6 @@ def reference(arguments: argparse.Namespace) -> int:
         score=found.score,
         draws=found.steps * BATCH,
         command=f"emb-train {' '.join(arguments.given)}",
-        shield=task.shield,
         command_delay=task.command_delay,
     )
     with replacing(folder / REFERENCE) as beside:
@@ -341,7 +321,7 @@ def ppo(arguments: argparse.Namespace) -> int:
     bench, folder = load_bench(arguments.bench), arguments.out
     changes = {"total_steps": arguments.steps, "plant": arguments.plant, "seed": arguments.seed}
     training = load_preset(arguments.preset, **{k: v for k, v in changes.items() if v is not None})
-    conditions = msgspec.structs.replace(training.conditions, **_varied(arguments))
+    conditions = msgspec.structs.replace(training.conditions, command_delay=tuple(arguments.command_delay))
     training = msgspec.structs.replace(training, conditions=conditions)
     begin_training(folder, training, bench)
     with progress(training.preset, training.ppo.iterations) as advance:
@@ -361,10 +341,6 @@ def ppo(arguments: argparse.Namespace) -> int:
         show(grid_text(grid_outcomes(load_training(folder))))
     show(f"{folder}: export it with emb-export {folder}; emb-train evaluate {folder} compares it")
     return EXIT_DONE
-
-
-def _varied(arguments: argparse.Namespace) -> dict[str, Any]:
-    return {name: tuple(getattr(arguments, name)) for name in ("command_delay", "frame_loss")}
 
 
 def evaluate(arguments: argparse.Namespace) -> int:
@@ -431,7 +407,7 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subjec
         conditions=Conditions(
             information=measure.kind,
             shield_ranges=arguments.shield or subjects[0].shield,
-            **_varied(arguments),
+            command_delay=tuple(arguments.command_delay),
         ),
     )
     ranges = bench.range_set(settings.ranges)

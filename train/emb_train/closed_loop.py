@@ -5,9 +5,6 @@
 Time: an experiment begins with the measurement y_0. The current that answers y_k is shielded with y_k and acts during
 [k, k + 1], or later by the plant's command delay. The Fisher information is that of angle and velocity with the bench's
 noise, whatever the plant's instruments make of it.
-
-A sample may be lost (:class:`Conditions`), as on the bench: nothing is sent in its period, the node brakes by itself,
-the last sample received stays, and a requested current has no effect.
 """
 
 from __future__ import annotations
@@ -31,7 +28,6 @@ from emb_bench.sim.instruments import MEMORY, command, measure, settle
 from emb_bench.sim.simulated_brake import pass_period, sent_current
 from emb_runtime.config.bench import OLDEST_FRAME, PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import UsageError
-from emb_runtime.records import Reason
 from emb_runtime.safety.sensor_monitor import CONFIRMED, judge, largest_current
 from emb_runtime.safety.sensor_monitor import MEMORY as MONITOR
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
@@ -41,7 +37,6 @@ from emb_runtime.safety.shield_design import ShieldLaw, make_law
 
 MEASURED: Literal["measured"] = "measured"
 EVERYTHING: Literal["everything"] = "everything"
-MOST_LOST = 0.5  # Largest probability that a sample is lost
 
 Bools = NDArray[np.bool_]
 
@@ -57,20 +52,16 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     information: Kind = "weighted"  # Fisher information that is collected: the thesis's, or the physical one
     command_delay: tuple[int, int] = (0, 0)
     """Least and most samples that a command waits beside the plant's own delay, drawn for each experiment."""
-    frame_loss: tuple[float, float] = (0.0, 0.0)
-    """Least and greatest probability with which a sample does not arrive, drawn for each experiment: then nothing is
-    sent, and the node brakes. The first sample always arrives, and never as many in a row are lost as end a run."""
 
     def __post_init__(self) -> None:
         """Refuse what does not exist.
 
         Raises:
-            UsageError: a range or the horizon is out of its bounds.
+            UsageError: the delay or the horizon is out of its bounds.
         """
-        for name, most in (("command_delay", OLDEST_FRAME), ("frame_loss", MOST_LOST)):
-            low, high = getattr(self, name)
-            if not 0 <= low <= high <= most:  # written so that NaN fails
-                raise UsageError(f"{name}: expected least and most, from 0 to {most:g}, got {low:g}, {high:g}")
+        low, high = self.command_delay
+        if not 0 <= low <= high <= OLDEST_FRAME:
+            raise UsageError(f"command_delay: expected least and most, from 0 to {OLDEST_FRAME}, got {low}, {high}")
         if self.horizon < 0:
             raise UsageError(f"horizon: expected steps, or 0 for the bench's, got {self.horizon}")
         if self.horizon and self.shielded:
@@ -78,8 +69,8 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def varies(self) -> bool:
-        """True if experiments have a delay or losses of their own."""
-        return self.command_delay[1] > 0 or self.frame_loss[1] > 0.0
+        """True if experiments have a delay of their own."""
+        return self.command_delay[1] > 0
 
     def observation_size(self, count: int) -> int:
         """Length of the actor's observation if the information of this many parameters is collected."""
@@ -89,7 +80,7 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The bench with this horizon, and a shield for this set of brakes that covers the drawn delays as well.
 
         It covers what the bench's shield covers or what is drawn, not the sum of both: right for a plant without a
-        delay of its own. It plans for lost frames anyway.
+        delay of its own.
         """
         timing = replace(bench.timing, horizon=self.horizon or bench.timing.horizon)
         shield = bench.shield._replace(ranges=self.shield_ranges or bench.shield.ranges)
@@ -98,37 +89,11 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             shield = shield._replace(frame_age=(min(least, low), max(most, high)))
         return replace(bench, timing=timing, shield=shield)
 
-    def drawn(self, rng: np.random.Generator, samples: int, longest: int) -> tuple[int, Bools]:
-        """Draws what one experiment has of its own.
-
-        Args:
-            rng: draws the same number of times, whatever varies.
-            samples: of the experiment, the first and the last included.
-            longest: as many samples in a row may be lost, see :func:`longest_loss`.
-
-        Returns:
-            Samples that its commands wait, and which samples do not arrive, shape [samples].
-        """
-        delay = int(rng.integers(self.command_delay[0], self.command_delay[1] + 1))
-        lost = rng.random(samples) < rng.uniform(*self.frame_loss)
-        lost[[0, -1]] = False  # the first begins the experiment, the last only ends it
-        sample = np.arange(samples)
-        in_a_row = sample - np.maximum.accumulate(np.where(lost, 0, sample))
-        return delay, lost & (in_a_row % (longest + 1) != 0)
-
 
 BENCH_CONDITIONS = Conditions()
 
 
-def longest_loss(bench: Bench) -> int:
-    """Samples in a row that may be lost without an end of the run: neither the node nor the loop gives up [samples]."""
-    node = math.ceil(bench.node.watchdog / bench.timing.sample_time - 1e-9)
-    return max(min(node, bench.watch.stop_missed) - 1, 0)
-
-
 Integers = NDArray[np.int64]
-
-LOST = int(Reason.MISSED)  # Reason that stands for a lost sample
 
 
 class Rules(NamedTuple):
@@ -149,8 +114,6 @@ class Setup(NamedTuple):
     """Constants that experiments side by side share; it compiles."""
 
     law: ShieldLaw  # Law of the shield; its limit of the current holds also without a shield
-    whole: ShieldLaw
-    """Law for the whole set, by which the sensors are judged; another than ``law`` where the shield learns."""
     thresholds: SensorThresholds
     """Of the sensor monitor: until the motion has shown its sign, it limits the current to a first move."""
     rules: Rules
@@ -175,16 +138,11 @@ def make_setup(
         damping,
     )
     thresholds = sensor_thresholds(bench, law)
-    return Setup(law, law, thresholds, rules, plant.mechanics, plant.instruments, no_sensitivity(parameters)[0])
-
-
-def with_law(setup: Setup, law: ShieldLaw) -> Setup:
-    """The setup with another law of the shield; compiled code has no ``_replace``."""
-    return Setup(law, setup.whole, setup.thresholds, setup.rules, setup.mechanics, setup.instruments, setup.chosen)
+    return Setup(law, thresholds, rules, plant.mechanics, plant.instruments, no_sensitivity(parameters)[0])
 
 
 class Experiments(NamedTuple):
-    """N experiments with n parameters: their brakes, their states, and the errors and losses of all their samples.
+    """N experiments with n parameters: their brakes, their states, and the errors of all their samples.
 
     Arrays only, so that it compiles; functions change them in place.
     """
@@ -196,13 +154,12 @@ class Experiments(NamedTuple):
     s: Floats  # Sensitivities of all four to the relative parameters, shape [N, n, 4]
     m: Floats  # Packed FIM, shape [N, n (n + 1) / 2]
     memory: Floats  # Of the instruments, shape [N, MEMORY]
-    y: Floats  # Last received measured angle and velocity, shape [N, 2]
+    y: Floats  # Newest measured angle and velocity, shape [N, 2]
     applied: Floats  # The current that acted in the period before, as the node last reported it [A], shape [N]
     past: Floats  # The last sent currents, newest first [A], shape [N, PAST]; 0 where nothing was sent
     k: Integers  # Step, shape [N]
     noise: Floats  # Of the sensors for all samples of the experiment, shape [N, horizon + 1, 2]
     late: Floats  # Lateness with which each sample is taken [s], shape [N, horizon + 1]
-    lost: Bools  # Mask of the samples that do not arrive, shape [N, horizon + 1]
     reasons: Integers
     """Reasons why the last current is not the requested one: :class:`emb_runtime.records.Reason` bits, shape [N]."""
     violated: Bools  # Mask of the brakes outside their limits, shape [N]
@@ -225,7 +182,6 @@ def no_experiments(count: int, n: int, steps: int) -> Experiments:
         k=np.full(count, steps),
         noise=np.zeros((count, steps + 1, 2)),
         late=np.zeros((count, steps + 1)),
-        lost=np.zeros((count, steps + 1), np.bool_),
         reasons=np.zeros(count, np.int64),
         violated=np.zeros(count, np.bool_),
         monitor=np.zeros((count, MONITOR)),
@@ -251,7 +207,7 @@ def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
 
 def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -> None:
     """One sample period of experiment ``i``, in place; arguments as for :func:`advance`."""
-    brakes, delay, x, s, m, memory, y, applied, past, k, noise, late, lost, reasons, violated, monitor = experiments
+    brakes, delay, x, s, m, memory, y, applied, past, k, noise, late, reasons, violated, monitor = experiments
     rules = setup.rules
     p = BrakeParameters(
         float(brakes[i, 0]),
@@ -264,15 +220,9 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     instruments = delayed(setup.instruments, int(delay[i]))
     y1, y2 = float(y[i, 0]), float(y[i, 1])
     u1, u2, u3, u4, u5 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2]), float(past[i, 3]), float(past[i, 4])
-    sent, asked = 0.0, math.nan
-    if lost[i, k[i]]:
-        reasons[i] = LOST
-    else:
-        most = largest_current(setup.whole, setup.thresholds, monitor[i], setup.law.current)
-        asked, reasons[i] = sent_current(
-            setup.law, rules.shielded, y1, y2, wanted, (u1, u2, u3, u4, u5), int(k[i]), most
-        )
-        sent = 0.0 if math.isnan(asked) else asked
+    most = largest_current(setup.law, setup.thresholds, monitor[i], setup.law.current)
+    asked, reasons[i] = sent_current(setup.law, rules.shielded, y1, y2, wanted, (u1, u2, u3, u4, u5), int(k[i]), most)
+    sent = 0.0 if math.isnan(asked) else asked
     current = command(instruments, memory[i], asked)
     if math.isnan(current):
         current = damped_current(float(x[i, 1]), setup.law.current, rules.damping_velocity)
@@ -283,16 +233,10 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     )
     add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
     past[i, 0], past[i, 1], past[i, 2], past[i, 3], past[i, 4] = sent, u1, u2, u3, u4
-    if not lost[i, k[i]]:
-        y[i, 0], y[i, 1], applied[i] = y1, y2, current
-        if monitor[i, CONFIRMED] == 0.0:
-            periods = 1
-            while lost[i, k[i] - periods]:
-                periods += 1
-            judge(
-                setup.whole, setup.thresholds, monitor[i], periods * rules.sample_time, y1, y2,
-                not math.isnan(asked), float(past[i, min(periods, PAST) - 1]), current,
-            )  # fmt: skip
+    y[i, 0], y[i, 1], applied[i] = y1, y2, current
+    if monitor[i, CONFIRMED] == 0.0:
+        obeyed = not math.isnan(asked)
+        judge(setup.law, setup.thresholds, monitor[i], rules.sample_time, y1, y2, obeyed, sent, current)
     inside = rules.angle_low <= x[i, 0] <= rules.angle_high and abs(x[i, 1]) <= rules.velocity
     violated[i] = not inside
 
@@ -305,7 +249,7 @@ class Batch:
         experiments: all of them; the following are some of its arrays.
         brakes: shape [N, 6].
         x: true states, shape [N, 4].
-        y: last received measurements, shape [N, 2].
+        y: newest measurements, shape [N, 2].
         m: packed FIMs, of the conditions' kind, shape [N, n (n + 1) / 2].
         k: steps, shape [N].
         past: last sent currents, newest first, shape [N, PAST].
@@ -369,7 +313,7 @@ class Batch:
         Args:
             i: row.
             rng: draws the uncertain parameters first (also if ``brake`` is given), then the noise of all samples, then
-                the jitter of their instants if there is any, then delay and losses if they vary.
+                the jitter of their instants if there is any, then the delay if it varies.
             brake: the brake to use instead of a drawn one.
         """
         e = self.experiments
@@ -380,7 +324,8 @@ class Batch:
         if jitter > 0.0:
             e.late[i] = rng.normal(0.0, jitter, e.late.shape[1])
         if self.conditions.varies:
-            e.delay[i], e.lost[i] = self.conditions.drawn(rng, e.lost.shape[1], longest_loss(self.bench))
+            low, high = self.conditions.command_delay
+            e.delay[i] = rng.integers(low, high + 1)
         e.x[i] = 0.0
         instruments = delayed(self._plant.instruments, int(e.delay[i]))
         settle(instruments, e.memory[i], 0.0)
@@ -417,12 +362,6 @@ class Batch:
         at_home = (np.abs(self.x[:, 0]) <= shield_.home_angle) & (np.abs(self.x[:, 1]) <= shield_.home_velocity)
         return at_home & ~self.violated
 
-    @property
-    def heard(self) -> Bools:
-        """Mask of the experiments whose newest sample has arrived, shape [N]; in others a current has no effect now."""
-        heard: Bools = ~self.experiments.lost[np.arange(len(self.k)), self.k]
-        return heard
-
     def observation(self) -> NDArray[np.float32]:
         """Observation of the actor, by the conditions: :meth:`actor_observation`, or Table 4.2 without measurements.
 
@@ -441,14 +380,8 @@ class Batch:
         return out
 
     def seen(self) -> NDArray[np.float32]:
-        """Observation of an excitation: the actor's three and the current that acted in the last period [A], [N, 4].
-
-        NaN but for the step where the sample was lost: on the bench no policy is called then.
-        """
-        seen = np.column_stack((self.y, self.k, self.experiments.applied)).astype(np.float32)
-        for column in (0, 1, 3):
-            seen[~self.heard, column] = np.nan
-        return seen
+        """Observation of an excitation: the actor's three and the current that acted in the last period [A], [N, 4]."""
+        return np.column_stack((self.y, self.k, self.experiments.applied)).astype(np.float32)
 
     def info(self) -> dict[str, NDArray[Any]]:
         """Outputs of an environment beside the observation, each with N as its first dimension; all of them copies."""
@@ -459,16 +392,14 @@ class Batch:
             "fim": self.m.copy(),
             "violated": self.violated.copy(),
             "home": self.home,
-            "heard": self.heard,
         }
 
     def critic_observation(self) -> NDArray[np.float32]:
         """Observation of the critic: the true state in fixed scales of order one, shape [N, critic_size].
 
         Thesis Table 4.2 (x_1, x_2, k, θ, FIM) and the sensitivities: without them the next increment of the FIM is not
-        a function of the state, which would not be Markov. Where experiments vary beside the brake, also the delay of
-        the commands, whether the sample was received, the current in the motor, and the last sent currents, which may
-        still be on their way.
+        a function of the state, which would not be Markov. Where the delay of the commands is drawn, also that, the
+        current in the motor, and the last sent currents, which may still be on their way.
         """
         e, limits = self.experiments, self.bench.limits
         outputs = np.array([limits.angle[1], limits.velocity])
@@ -480,10 +411,8 @@ class Batch:
             (4.0 * e.s[:, :, :2] / outputs).reshape(len(self.k), 2 * len(self._columns)),
         ]
         if self.conditions.varies:
-            delay = max(self.conditions.command_delay[1], 1)
             parts += [
-                e.delay[:, None] / delay,
-                self.heard[:, None],
+                e.delay[:, None] / self.conditions.command_delay[1],
                 e.x[:, 3:] / limits.current,
                 e.past / limits.current,
             ]

@@ -4,9 +4,6 @@
 * **Observation**, shape [3]: measured angle [rad], measured velocity [rad/s], step (thesis Table 4.2, actor), raw;
   under conditions in which the actor sees everything (5.2), the critic's observation without the sensitivities.
 * ``info["critic"]``: the critic's observation, see :meth:`emb_train.closed_loop.Batch.critic_observation`.
-* ``info["heard"]``: True if this observation is a new one. Where samples get lost
-  (see :class:`emb_train.closed_loop.Conditions`) it is the last one with the step going on, and the action that answers
-  it has no effect.
 * **Reward**: see :mod:`emb_train.rewards`.
 * **End**: leaving the limits and reaching the horizon are both terminal. The experiment is the horizon long by design
   and the step is observed, so nothing is truncated and nothing is bootstrapped there.

@@ -259,7 +259,7 @@ def _scene(a: Settings) -> str:
     shield = f"shield, which covers '{c.shield_ranges}'" if c.shield_ranges else "shield"
     own = (
         f" Each experiment has its own delay of commands, {c.command_delay[0]} to {c.command_delay[1]} samples, which "
-        f"the shield covers, and its own probability of a lost sample, {c.frame_loss[0]:g} to {c.frame_loss[1]:g}."
+        "the shield covers."
     )
     return (
         f"{a.measure.label} of {', '.join(a.parameters)}, relative to the true values; {a.draws} brakes drawn from the "
@@ -328,7 +328,7 @@ def grid_outcomes(trained: Trained) -> dict[str, Outcome]:
     draws = grid_draws(ranges, training.parameters[0], training.seed)
 
     def on_grid(excitation: Excitation, times: int = 1) -> Outcome:
-        conditions = msgspec.structs.replace(training.conditions, command_delay=(0, 0), frame_loss=(0.0, 0.0))
+        conditions = msgspec.structs.replace(training.conditions, command_delay=(0, 0))
         return play(trained.bench, ranges, training.parameters, excitation, draws * times, training.plant, conditions)
 
     found = {"trained actor": on_grid(Network(DeployedActor(trained.actor, limit)))}

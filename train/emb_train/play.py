@@ -42,11 +42,7 @@ class Excitation(ABC):
 
     @abstractmethod
     def __call__(self, seen: Seen) -> Currents:
-        """Requested currents [A], shape [N], for observations of shape [N, 4].
-
-        Where a sample was lost, all but the step is NaN. Then the state does not change, and the answer does not
-        count.
-        """
+        """Requested currents [A], shape [N], for observations of shape [N, 4]."""
 
 
 class Played(Excitation):
@@ -164,7 +160,7 @@ def followed(batch: Batch, excitation: Excitation) -> Iterator[Seen]:
     for k in range(batch.setup.rules.horizon):
         seen = batch.seen()
         wanted = excitation(seen)
-        if not np.isfinite(wanted[~left & batch.heard]).all():
+        if not np.isfinite(wanted[~left]).all():
             raise PolicyRefusedError(
                 f"expected finite currents, got another at step {k}, not finite: this actor cannot be played"
             )

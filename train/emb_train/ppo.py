@@ -192,9 +192,7 @@ class Rollout:
 
     seen: Tensor  # Observations of the actor, shape [T, N, I]
     states: Tensor  # Observations of the critic, shape [T + 1, N, C]; the last follow the last step
-    actions: Tensor
-    """Actions as sampled, before they are clipped, shape [T, N, 1]. One that answered a lost sample had no effect and
-    is kept: what follows does not depend on it, so that it adds noise to the gradient and no bias."""
+    actions: Tensor  # As sampled, before they are clipped, shape [T, N, 1]
     log_densities: Tensor  # Log π(a | o) of these actions, shape [T, N]
     rewards: Tensor  # Shape [T, N]
     terminals: Tensor  # 1 where the step ended its experiment, shape [T, N]

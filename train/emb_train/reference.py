@@ -5,7 +5,7 @@ logarithms of the estimates, scaled to −1..1 over their ranges and cut off the
 reference is blind: it depends on no measurement. A first level of small speed is a probe: its few milliseconds tell
 the estimator enough to decide on the rest. How it is followed: :mod:`emb_runtime.estimator.speed_loop`.
 
-The scalar functions are also run compiled, see :func:`emb_bench.compiled.compiled`.
+The scalar functions also run compiled, in :mod:`emb_train.trial`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import OLDEST_FRAME, Ranges
@@ -29,7 +28,7 @@ from emb_runtime.estimator.kalman import Four, Model, State, believed, follow, m
 from emb_runtime.estimator.speed_loop import Scale, follow_reference, scale_of
 from emb_runtime.policy.policy import Policy
 from emb_runtime.system.input_file import read_bytes
-from emb_train.play import ANGLE, Currents, Excitation, Seen
+from emb_train.play import Currents, Excitation, Seen
 from emb_train.presets import FILES, TASKS, reference_names
 
 FEATURES = 4  # Scaled estimates that a reference may depend on
@@ -107,7 +106,6 @@ def wanted_current(model: Model, state: State, scale: Scale, box: Box, table: An
 
 MAX_STORED_BYTES = 1 << 20  # Of a file; the tuned ones have some kilobytes
 
-Shield = Literal["worst case", "bounded"]  # For the whole set, or for what has been learnt of the brake
 Form = Literal["blind", "quadratic"]
 FORMS: tuple[Form, ...] = get_args(Form)  # Constants, or polynomials of the second degree in the estimate's logarithms
 Row = Annotated[tuple[float, ...], Meta(min_length=TERMS, max_length=TERMS)]
@@ -127,7 +125,6 @@ class Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     score: float  # Mean over the brakes that it was tuned on
     draws: int  # Number of those brakes
     command: str  # Command that made it
-    shield: Shield  # Shield behind which it was tuned
     command_delay: tuple[Samples, Samples]  # Least and most samples that its commands waited
 
     def __post_init__(self) -> None:
@@ -180,34 +177,29 @@ def read_text(text: str | bytes, source: str) -> Stored:
     return read(Stored, document, source, UsageError, remedy="make it anew with emb-train", longest_text=10_000)
 
 
-STATE = 30  # Numbers of a row: step, mean, covariance, innovation, worst
-
-
 class Following(Excitation):
-    """A stored reference in N experiments.
+    """A stored reference, one experiment after the other, each with an estimator of its own.
 
     Attributes:
-        states: of the estimators, shape [N, STATE].
+        states: of the estimators.
     """
 
     def __init__(self, kept: Stored, bench: Bench, ranges: Ranges, *, sticks: bool = True) -> None:
         """Follow a reference with an estimator for these ranges."""
         self._model, self._scale = make_model(bench, ranges, sticks=sticks), kept.scale(bench)
-        self._box, self._table = box_of(bench, ranges), kept.array()
-        self.states: Floats = np.zeros((0, STATE))
+        self._box, self._table = box_of(bench, ranges), kept.table
+        self.states: list[State] = []
 
     def begin(self, count: int) -> None:
         """Begin N experiments anew."""
-        self.states = np.zeros((count, STATE))
-        for row in self.states:
-            to_row(start(self._model), row)
+        self.states = [start(self._model)] * count
 
     def __call__(self, seen: Seen) -> Currents:
         """See :class:`emb_train.play.Excitation`."""
-        wanted: Currents = np.zeros(len(seen))
-        compiled(answer)(
-            self._model, self._scale, self._box, self._table, self.states, np.asarray(seen, np.float64), wanted
-        )
+        wanted, reference = np.zeros(len(seen)), [0.0] * len(self._table)
+        for i, sample in enumerate(seen.tolist()):
+            self.states[i] = state = follow(self._model, self.states[i], *sample)
+            wanted[i] = wanted_current(self._model, state, self._scale, self._box, self._table, reference)
         return wanted
 
 
@@ -226,51 +218,7 @@ class PolicyFile(Excitation):
     def __call__(self, seen: Seen) -> Currents:
         """See :class:`emb_train.play.Excitation`."""
         wanted: Currents = np.zeros(len(seen))
-        for i in np.flatnonzero(~np.isnan(seen[:, ANGLE])):
-            angle, velocity, step, applied = seen[i].tolist()
+        for i, (angle, velocity, step, applied) in enumerate(seen.tolist()):
             self._estimators[i].take(angle, velocity, step, applied)
             wanted[i] = self._policy.act(angle, velocity, step, self._estimators[i])
         return wanted
-
-
-def answer(model: Model, scale: Scale, box: Box, table: Floats, states: Floats, seen: Floats, wanted: Floats) -> None:
-    """Take in one sample of each experiment and answer it, in place; a sample that was lost is left out.
-
-    Args:
-        model: of the estimators.
-        scale: of the reference.
-        box: of its features.
-        table: of the reference, see :func:`emb_train.reference.set_reference`.
-        states: of the estimators, shape [N, STATE].
-        seen: angle [rad], velocity [rad/s], step and applied current [A], shape [N, 4].
-        wanted: becomes the currents [A], shape [N].
-    """
-    reference = np.zeros(table.shape[0])
-    for i in range(len(states)):
-        if not np.isnan(seen[i, ANGLE]):
-            state = follow(model, of_row(states[i]), seen[i, 0], seen[i, 1], seen[i, 2], seen[i, 3])
-            wanted[i] = wanted_current(model, state, scale, box, table, reference)
-            to_row(state, states[i])
-
-
-def to_row(state: State, row: Any) -> None:
-    """Write a state into a row, shape [STATE]."""
-    row[0], row[28], row[29] = state.step, state.innovation, state.worst
-    for i in range(6):
-        row[1 + i] = state.mean[i]
-    for i in range(21):
-        row[7 + i] = state.covariance[i]
-
-
-def of_row(r: Any) -> State:
-    """The state in a row."""
-    mean = (r[1], r[2], r[3], r[4], r[5], r[6])
-    covariance = (
-        r[7], r[8], r[9], r[10], r[11], r[12],
-        r[13], r[14], r[15], r[16], r[17],
-        r[18], r[19], r[20], r[21],
-        r[22], r[23], r[24],
-        r[25], r[26],
-        r[27],
-    )  # fmt: skip
-    return State(r[0], mean, covariance, r[28], r[29])

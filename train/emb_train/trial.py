@@ -1,7 +1,6 @@
 """Tasks of a reference, and whole compiled experiments in which it is tried: estimator, speed loop, shield, brake.
 
-The step is :func:`emb_train.closed_loop.advance_one`, so that what is learned here is what the environment plays. The
-shield covers the whole set of brakes, or is the runtime's learning shield.
+The step is :func:`emb_train.closed_loop.advance_one`, so that what is learned here is what the environment plays.
 """
 
 from __future__ import annotations
@@ -11,105 +10,21 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
-from emb_bench.config.plants import DEFAULT_PLANT, EULER, Plant
+from emb_bench.config.plants import DEFAULT_PLANT, EULER
 from emb_bench.information.symmetric import Floats, unpack
-from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, LearntModel, Ranges
+from emb_runtime.config.bench import PARAMETER_NAMES, Ranges
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.kalman import MISFIT, Four, Model, State, believed, deviations, follow, make_model, start
 from emb_runtime.estimator.speed_loop import Scale, share_after
-from emb_runtime.learning.assumptions import Assumptions, assumptions_of, make_assumptions
-from emb_runtime.learning.bounded import hear, lose
-from emb_runtime.learning.bounded import start as start_learning
-from emb_runtime.learning.known import Known, known
-from emb_runtime.learning.law import law_for, middle
-from emb_runtime.safety.shield_design import DesignInputs, design_inputs
-from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Bools, Conditions, Experiments, Setup, advance_one, with_law
+from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Bools, Conditions, Experiments, Setup, advance_one
 from emb_train.play import MEASURES, Draw, Measure, Outcome, begin_all, fresh_draws, joined
-from emb_train.reference import FEATURES, PRODUCTS, Box, Shield, Stored, box_of, features, wanted_current
-
-
-class Learning(NamedTuple):
-    """Prior knowledge of a learning shield; numbers only."""
-
-    learns: bool
-    inputs: DesignInputs  # Of the bench
-    nominal: BrakeParameters  # Brake that the parameters are relative to
-    assumptions: Assumptions
-
-
-def make_learning(bench: Bench, shield: Shield, plant: Plant, delay: int) -> Learning:
-    """Prior knowledge of the shield, which takes the brakes for what they are: Euler's, or ones that stick.
-
-    Raises:
-        BenchFileError: an assumption does not hold on this bench.
-        UsageError: one does not hold for the brakes.
-    """
-    learns = shield == "bounded"
-    if learns and not can_learn(bench, plant, delay):
-        raise UsageError(
-            "a shield that learns needs fresh frames, no lag, an encoder without an offset, a velocity that is "
-            "measured and the braking envelope"
-        )
-    model: LearntModel = "euler" if plant.mechanics.solver == EULER else "flow"
-    declared = bench.shield._replace(learn=learns, model=model)
-    bench = replace(bench, shield=declared)
-    assumptions = make_assumptions(bench) if learns else assumptions_of(bench)
-    return Learning(learns, design_inputs(bench), bench.brake, assumptions)
-
-
-def can_learn(bench: Bench, plant: Plant, delay: int) -> bool:
-    """Returns True if a shield can learn: its model has no delay, lag, offset or observer, and the drive has to brake.
-
-    It matters whether the shield covers one, the plant has it or it is drawn.
-    """
-    shield, between = bench.shield, plant.instruments
-    late = max(shield.frame_age[1], between.command_delay, between.measurement_delay, delay) > 0
-    lagging = max(shield.current_lag, plant.mechanics.current_lag) > 0.0
-    off = between.encoder_offset != 0.0
-    return not (late or lagging or off or between.observer_bandwidth > 0.0 or shield.envelope == "coasting")
-
-
-def begin(learning: Learning) -> Floats:
-    """The state before the first sample."""
-    return np.array(start_learning(learning.assumptions))
-
-
-def listen(learning: Learning, state: Any, angle: float, velocity: float, applied: float) -> None:
-    """Take in a sample, in place; arguments as of :func:`emb_runtime.learning.bounded.hear`."""
-    hear(learning.assumptions, state, angle, velocity, applied)
-
-
-def miss(learning: Learning, state: Any) -> None:
-    """Go on by a period of which nothing is known, in place."""
-    lose(learning.assumptions, state)
-
-
-def holds(nominal: BrakeParameters, possible: Known, brake: Any, angle: float, velocity: float) -> bool:
-    """Returns True if the true parameters, angle and velocity are among what is known to be possible.
-
-    Args:
-        nominal: brake that the parameters are relative to.
-        possible: what is known.
-        brake: true parameters, a row of :class:`emb_runtime.config.bench.BrakeParameters`, shape [6].
-        angle: true [rad].
-        velocity: true [rad/s].
-    """
-    k_m, k_1, t_c, f_v = brake[2] / nominal.k_m, brake[3] / nominal.k_1, brake[4] / nominal.T_c, brake[5] / nominal.f_v
-    return bool(
-        possible.k_m_low <= k_m <= possible.k_m_high
-        and possible.k_1_low <= k_1 <= possible.k_1_high
-        and possible.t_c_low <= t_c <= possible.t_c_high
-        and possible.f_v_low <= f_v <= possible.f_v_high
-        and possible.angle_low <= angle <= possible.angle_high
-        and possible.velocity_low <= velocity <= possible.velocity_high
-    )
-
+from emb_train.reference import FEATURES, PRODUCTS, Box, Stored, box_of, features, wanted_current
 
 CHUNK = 64  # Experiments that a thread plays at a time
 ANY_PRECISION: Four = (math.inf, math.inf, math.inf, math.inf)
@@ -122,8 +37,6 @@ class ReportedOutcome(Outcome):
 
     estimates: Floats
     """Relative parameters at the end, their standard deviations, and the worst innovation, shape [N, 9]."""
-    mistaken: Bools
-    """Mask of the experiments in which the truth was at some time outside what the shield had learnt, shape [N]."""
     known: Floats
     """Time until the estimates had the precision asked for [s], shape [N]. Where they had not at the end: more than the
     experiment's duration, by as much as the logarithm of what was missing says."""
@@ -143,7 +56,6 @@ class Trials(Batch):
         draws: Sequence[Draw],
         plant: str = DEFAULT_PLANT,
         conditions: Conditions = BENCH_CONDITIONS,
-        shield: Shield = "worst case",
         precision: Four = ANY_PRECISION,
     ) -> None:
         """Begin the experiments.
@@ -155,16 +67,13 @@ class Trials(Batch):
             draws: brakes and noise.
             plant: which of the bench's plants.
             conditions: which information is collected, and for which brakes the shield holds the limits.
-            shield: for all of them at any time, or for what has been learnt of each.
             precision: relative deviations of k_m, k_1, T_c and f_v; once the estimates have them, 0 A is asked for.
 
         Raises:
             BenchFileError: the bench has no such plant, or the shield cannot hold the limits.
-            UsageError: J or γ vary in these ranges; see :class:`emb_train.closed_loop.Batch` and
-                :func:`emb_train.trial.make_learning`.
+            UsageError: J or γ vary in these ranges; see :class:`emb_train.closed_loop.Batch`.
         """
         super().__init__(bench, ranges, parameters, len(draws), plant, conditions)
-        self.learning = make_learning(self.bench, shield, self._plant, conditions.command_delay[1])
         for name in ("J", "gamma"):
             if getattr(ranges.low, name) < getattr(ranges.high, name):
                 raise UsageError(f"the estimator takes {name} as known, the set of ranges '{ranges.name}' varies it")
@@ -203,47 +112,40 @@ class Trials(Batch):
     def _play(self, scale: Scale, tables: Floats, part: slice, noted: int) -> ReportedOutcome:
         experiments = Experiments._make(array[part].copy() for array in self.experiments)
         x, count, shield = experiments.x, len(experiments.k), self.bench.shield
-        m, left, mistaken = np.zeros_like(experiments.m), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+        m, left = np.zeros_like(experiments.m), np.zeros(count, np.bool_)
         estimates, reached = np.zeros((count, 9)), np.zeros(count)
-        learnt = np.tile(begin(self.learning), (count, 1))
         used = np.zeros((count, noted, tables.shape[2]))
         play = compiled(play_trials)
         play(
             self.setup,
             experiments,
             self.model,
-            self.learning,
             scale,
             self.box,
             np.ascontiguousarray(tables),
             self.precision,
             estimates,
-            learnt,
             m,
             left,
-            mistaken,
             reached,
             used,
         )
         home = (np.abs(x[:, 0]) <= shield.home_angle) & (np.abs(x[:, 1]) <= shield.home_velocity) & ~left
         matrices = unpack(m, len(self.parameters))
-        return ReportedOutcome(matrices, left, home, x[:, 0], x[:, 1], estimates, mistaken, reached, used)
+        return ReportedOutcome(matrices, left, home, x[:, 0], x[:, 1], estimates, reached, used)
 
 
 def play_trials(
     setup: Setup,
     experiments: Experiments,
     model: Model,
-    learning: Learning,
     scale: Scale,
     box: Box,
     tables: Floats,  # Of the references, shape [N, 2 n − 1, TERMS]
     precision: Four,  # At which 0 A is asked for from then on, and the estimate rests
     estimates: Floats,  # Become the estimates at the end, shape [N, 9]
-    learnt: Floats,  # What the shields have learnt, one row each
     informed: Floats,  # Becomes the packed FIM, up to where the limits were left, shape [N, n (n + 1) / 2]
     left: Bools,  # Becomes whether they were, shape [N]
-    mistaken: Bools,  # Becomes whether the truth was ever not among what was learnt, shape [N]
     reached: Floats,  # Becomes the time until the precision was reached [s], shape [N]
     used: Floats,  # Becomes the mean features of each row of the table; nothing is noted if it has no rows
 ) -> None:
@@ -253,26 +155,22 @@ def play_trials(
     for i in range(k.shape[0]):
         weights[:] = 0.0
         state = start(model)
-        now, wanted, missing, over = setup, 0.0, math.inf, False
+        wanted, missing, over = 0.0, math.inf, False
         for _ in range(setup.rules.horizon):
-            if not experiments.lost[i, k[i]]:  # else the law is not called
-                if not over:
-                    y, u = experiments.y, experiments.applied[i]
-                    state = follow(model, state, y[i, 0], y[i, 1], float(k[i]), u)
-                    wanted = wanted_current(model, state, scale, box, tables[i], reference)
-                    if used.shape[1] > 0:
-                        note_use(scale, features(box, believed(model, state)), reference, state.step, used[i], weights)
-                    before, missing = missing, lacking(model, state, precision)
-                    over = missing <= 1.0
-                    reached[i] = reached_at(setup.rules.sample_time, k[i], before, missing)
-                if over:
-                    wanted = 0.0
-                    if used.shape[1] > 0:  # it is trained, and only the time counts
-                        break
-                now = with_learnt(setup, experiments, i, learning, learnt[i], mistaken)
-            elif learning.learns:
-                miss(learning, learnt[i])
-            advance_one(now, experiments, i, wanted)
+            if not over:
+                y, u = experiments.y, experiments.applied[i]
+                state = follow(model, state, y[i, 0], y[i, 1], float(k[i]), u)
+                wanted = wanted_current(model, state, scale, box, tables[i], reference)
+                if used.shape[1] > 0:
+                    note_use(scale, features(box, believed(model, state)), reference, state.step, used[i], weights)
+                before, missing = missing, lacking(model, state, precision)
+                over = missing <= 1.0
+                reached[i] = reached_at(setup.rules.sample_time, k[i], before, missing)
+            if over:
+                wanted = 0.0
+                if used.shape[1] > 0:  # it is trained, and only the time counts
+                    break
+            advance_one(setup, experiments, i, wanted)
             if experiments.violated[i]:
                 left[i] = True
                 break
@@ -283,21 +181,6 @@ def play_trials(
         average(used[i], weights)
         estimates[i, :4], estimates[i, 4:8] = believed(model, state), deviations(model, state)
         estimates[i, 8] = state.worst
-
-
-def with_learnt(
-    setup: Setup, experiments: Experiments, i: int, learning: Learning, learnt: Any, mistaken: Bools
-) -> Setup:
-    """The setup with the shield for what has been learnt, after the newest sample of an experiment."""
-    brakes, x, y = experiments.brakes, experiments.x, experiments.y
-    if learning.learns:
-        listen(learning, learnt, y[i, 0], y[i, 1], experiments.applied[i])
-        possible = known(learnt)
-        mistaken[i] = mistaken[i] or not holds(learning.nominal, possible, brakes[i], x[i, 0], x[i, 1])
-        if not possible.falsified:
-            y[i, 0], y[i, 1] = middle(possible)
-            return with_law(setup, law_for(learning.inputs, learning.nominal, possible))
-    return setup
 
 
 def reached_at(sample_time: float, step: int, before: float, missing: float) -> float:
@@ -358,7 +241,6 @@ class Task:
     shield_ranges: str  # Set of the bench that the shield covers; it contains ``ranges``
     criterion: str  # Name of a measure, see :data:`emb_train.play.MEASURES`
     plant: str = DEFAULT_PLANT  # Name of the bench's plant that the brakes are
-    shield: Shield = "worst case"  # For all of that set at any time, or for what has been learnt of the brake
     command_delay: tuple[int, int] = (0, 0)  # Least and most samples that a command waits, drawn for each experiment
     precision: Four = ANY_PRECISION
     """Relative deviations of k_m, k_1, T_c and f_v: where these are asked for, the time until they are reached counts,
@@ -369,7 +251,7 @@ class Task:
     @classmethod
     def of(cls, kept: Stored) -> Task:
         """The task that a reference was tuned for."""
-        return replace(TASKS[kept.task], plant=kept.plant, shield=kept.shield, command_delay=kept.command_delay)
+        return replace(TASKS[kept.task], plant=kept.plant, command_delay=kept.command_delay)
 
     @property
     def measure(self) -> Measure:
@@ -388,14 +270,14 @@ class Task:
         return fresh_draws(bench.range_set(self.ranges), seed, count)
 
     def trials(self, bench: Bench, draws: list[Draw]) -> Trials:
-        """Experiments with these brakes behind this task's shield.
+        """Experiments with these brakes behind the shield.
 
         Raises:
             BenchFileError: the shield cannot guarantee the limits for its set, or the bench lacks a set or the plant.
             UsageError: the shield does not cover the brakes.
         """
         ranges = bench.range_set(self.ranges)
-        return Trials(bench, ranges, self.parameters, draws, self.plant, self.conditions, self.shield, self.precision)
+        return Trials(bench, ranges, self.parameters, draws, self.plant, self.conditions, self.precision)
 
     def score(self, outcome: Outcome) -> Floats:
         """The criterion of each experiment, or minus its time until the precision, shape [N]; higher is better."""
