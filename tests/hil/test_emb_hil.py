@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -18,26 +17,11 @@ from pathlib import Path
 import pytest
 
 from emb_bench.hil import uml
-from emb_bench.hil.supervise import interface
 from emb_runtime.errors import BusError
 
 from .conftest import EMB_HIL, Hil
 
 PYTHON = sys.executable
-
-
-def places() -> list[tuple[str, ...]]:
-    """Wherever this machine can have a vcan0. Where it has none, the kernel: so that the tests fail with its line."""
-    found: list[tuple[str, ...]] = []
-    with contextlib.suppress(BusError), interface():
-        found.append(("--host",))
-    if shutil.which(uml.PROGRAM) is not None or not found:
-        found.append(("--uml",))
-    return found
-
-
-PLACES = places()
-everywhere = pytest.mark.parametrize("place", PLACES, ids=" ".join)
 
 
 @pytest.fixture
@@ -47,10 +31,10 @@ def state() -> Iterator[Path]:
         yield Path(directory)
 
 
-def start(state: Path, place: tuple[str, ...], *command: str) -> subprocess.Popen[str]:
-    """The command runs at ``place``, with the state directory as its last argument, so that it can be found."""
+def start(state: Path, options: tuple[str, ...], *command: str) -> subprocess.Popen[str]:
+    """The command runs in a kernel, with the state directory as its last argument, so that it can be found."""
     return subprocess.Popen(
-        [*EMB_HIL, *place, "--", *command, str(state)],
+        [*EMB_HIL, "--uml", *options, "--", *command, str(state)],
         env={**os.environ, "TMPDIR": str(state)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -87,9 +71,9 @@ def assert_nothing_left(state: Path) -> None:
         time.sleep(0.05)
 
 
-@pytest.mark.parametrize("place", [*PLACES, *((("--uml", "--slow", "20"),) if ("--uml",) in PLACES else ())])
+@pytest.mark.parametrize("options", [("--uml",), ("--uml", "--slow", "20")])
 def test_the_command_runs_in_the_callers_world(
-    hil: Hil, place: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    hil: Hil, options: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = "a 'b' \"c\" $HOME `d`\n\\e é"
     monkeypatch.chdir(tmp_path)
@@ -100,7 +84,7 @@ seen = dict(env=os.environ["EMB_TEST"], cwd=os.getcwd(), uid=os.getuid(), stdin=
 open("seen.json", "w").write(json.dumps(seen))
 print("x" * 3_000_000); print("complained", file=sys.stderr); sys.exit(7)
 """
-    result = hil([PYTHON, "-c", program, text], options=place)
+    result = hil([PYTHON, "-c", program, text], options=options)
     assert (result.returncode, len(result.stdout), result.stderr) == (7, 3_000_001, "complained\n")
     assert json.loads((tmp_path / "seen.json").read_text()) == {
         "env": text,
@@ -111,10 +95,7 @@ print("x" * 3_000_000); print("complained", file=sys.stderr); sys.exit(7)
     }
 
 
-@everywhere
-def test_two_processes_exchange_frames_on_vcan0_and_the_exit_status_is_a_shell_s(
-    hil: Hil, place: tuple[str, ...]
-) -> None:
+def test_two_processes_exchange_frames_on_vcan0_and_the_exit_status_is_a_shell_s(hil: Hil) -> None:
     program = """
 import os, signal, socket, struct, time
 def bus():
@@ -137,15 +118,12 @@ for k in range(100):
 assert os.wait()[1] == 0
 os.kill(os.getpid(), signal.SIGKILL)
 """
-    result = hil([PYTHON, "-c", program], options=place)
+    result = hil([PYTHON, "-c", program], options=["--uml"])
     assert (result.returncode, result.stderr) == (137, "")
-    assert hil(["no-such-command"], options=place).returncode == 127
+    assert hil(["no-such-command"], options=["--uml"]).returncode == 127
 
 
-@everywhere
-def test_signals_reach_the_command_a_deaf_one_is_ended_and_a_killed_emb_hil_leaves_nothing(
-    place: tuple[str, ...],
-) -> None:
+def test_signals_reach_the_command_a_deaf_one_is_ended_and_a_killed_emb_hil_leaves_nothing() -> None:
     polite = """
 import signal, sys, time
 def end(number, frame):
@@ -160,15 +138,15 @@ time.sleep(1000)
     with contextlib.ExitStack() as stack:
         states = [Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hil"))) for _ in range(4)]
         # The deaf one takes its grace of 10 s, in which the others run.
-        late = stack.enter_context(start(states[0], (*place, "--timeout", "6"), *deaf))
+        late = stack.enter_context(start(states[0], ("--timeout", "6"), *deaf))
         for state, number in zip(states[1:3], (signal.SIGINT, signal.SIGTERM), strict=True):
-            with start(state, place, PYTHON, "-c", polite) as process:
+            with start(state, (), PYTHON, "-c", polite) as process:
                 assert process.stdout is not None
                 assert process.stdout.readline() == "ready\n"  # output comes while it runs
                 process.send_signal(number)
                 assert process.communicate(timeout=60)[0] == f"got {int(number)}\n"
                 assert process.returncode == 9
-        with start(states[3], place, *deaf) as process:
+        with start(states[3], (), *deaf) as process:
             assert process.stdout is not None
             assert process.stdout.readline() == "ready\n"
             process.kill()
@@ -178,14 +156,16 @@ time.sleep(1000)
             assert_nothing_left(state)
 
 
-def test_the_host_keeps_an_interface_that_was_there_and_loses_one_that_was_made(hil: Hil) -> None:
-    show = "import socket; print([name for _, name in socket.if_nameindex() if name == 'vcan0'])"
-    on_host = [*EMB_HIL, "--host", "--", PYTHON, "-c", show]
-    script = f"{shlex.join(on_host)}; {shlex.join([PYTHON, '-c', show])}"
-    assert hil(["sh", "-c", script]).stdout.splitlines() == ["['vcan0']", "['vcan0']"]
-    # A network namespace of one's own has none yet, and an ordinary user may make one there.
-    made = hil(["unshare", "--user", "--map-root-user", "--net", "sh", "-c", script], options=PLACES[-1])
-    assert made.stdout.splitlines() == ["['vcan0']", "[]"], made.stderr
+def test_where_vcan0_is_the_command_takes_the_place_of_emb_hil(hil: Hil) -> None:
+    """Such a host is a kernel of emb-hil's own, here."""
+    ours = shlex.join(EMB_HIL)
+    show = f"{ours} -- sh -c 'cat; ip -br link show vcan0; exit 7'; echo $?"
+    late = f"{ours} --timeout 0.5 -- sleep 60; echo $?"
+    absent = f"{ours} -- no-such-command; echo $?"
+    without = f"unshare --user --map-root-user --net {ours} --host -- true; echo $?"
+    out = hil(["sh", "-c", "; ".join((show, late, absent, without))], options=["--uml"]).stdout.splitlines()
+    assert out[0].startswith("vcan0")
+    assert out[1:] == ["7", "124", "127", "4"]
 
 
 RUNNING = """
@@ -246,7 +226,7 @@ def test_a_computer_that_stands_still_counts_that_many_times_less_in_a_slow_kern
     (state / "there").mkdir()
     here = state / "here"  # time runs slowly wherever temporary files are
     here.symlink_to("there")
-    process = start(here, ("--uml", "--slow", str(slow)), PYTHON, "-c", STOOD_STILL)
+    process = start(here, ("--slow", str(slow)), PYTHON, "-c", STOOD_STILL)
     while not (here / "begun").exists():
         assert process.poll() is None, process.communicate()
         time.sleep(0.01)

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
 import signal
 import sys
 from collections.abc import Sequence
 
-from emb_bench.hil import uml
-from emb_bench.hil.supervise import EXIT_TIMEOUT, HostCommand, interface, supervise
+from emb_bench.hil import link, uml
+from emb_bench.hil.guest import INTERFACE, not_started
+from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
 from emb_bench.hil.uml import KernelCommand, state_directory
 from emb_runtime.errors import EXIT_BUS, EXIT_USAGE, BusError, EmbError, UsageError
-from emb_runtime.system.terminal import Parser, complain
+from emb_runtime.system.terminal import Parser, complain, mention
 
 _USAGE = "emb-hil [--host | --uml] [--root] [--slow N] [--timeout S] [--memory MB] -- COMMAND..."
 _EPILOG = f"""\
-The command sees your files, working directory, environment and user; /proc, /sys, /dev, /run and /dev/shm are the
-kernel's own, standard input is empty. Ctrl-C and SIGTERM reach the command, a second one kills.
+Where vcan0 exists and is up, the command runs here, in place of emb-hil. Else it runs in a kernel and sees your files,
+working directory, environment and user; /proc, /sys, /dev, /run and /dev/shm are the kernel's own. Standard input is
+empty. Ctrl-C and SIGTERM reach the command, a second one kills.
 
 exit status: the command's own (128 + n where signal n ended it, 126 or 127 where it could not be started);
 {EXIT_TIMEOUT} time limit reached, {EXIT_BUS} vcan0 cannot be had or the kernel died, {EXIT_USAGE} wrong usage."""
+
+_LIMITED = ("timeout", "--kill-after=10")
+_MAKE = f"`sudo ip link add dev {INTERFACE} type vcan && sudo ip link set {INTERFACE} up`"
 
 SLOWEST = 1000
 """Largest ``--slow``. Far beyond it, a program that waits for a time without sleeping would seem to hang."""
@@ -48,22 +52,27 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace, command: list[str]) -> int:
-    with contextlib.ExitStack() as stack:
-        if not options.uml:
-            try:
-                stack.enter_context(interface())
-            except BusError:
-                if options.host:
-                    raise
-            else:
-                return supervise(lambda: HostCommand(command), options.timeout)
-        stack.enter_context(uml.own_processor())
-        state = stack.enter_context(state_directory())
+    if not options.uml and link.is_up(INTERFACE):
+        return _become(command if options.timeout is None else [*_LIMITED, f"{options.timeout:g}", *command])
+    if options.host:
+        raise BusError(f"{INTERFACE} does not exist here, or is down: {_MAKE}")
+    with uml.own_processor(), state_directory() as state:
 
         def start() -> KernelCommand:
-            return KernelCommand(command, uml.kernel(options.memory, options.slow, state), state, options.root)
+            return KernelCommand(command, state, options.memory, options.slow, options.root)
 
         return supervise(start, options.timeout)
+
+
+def _become(command: list[str]) -> int:
+    """Run a command on this kernel in place of this process; its exit status where it cannot be started."""
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    try:
+        os.execvp(command[0], command)
+    except OSError as error:
+        message, status = not_started(command[0], error)
+        mention(message.removesuffix("\n"))
+        return status
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Virtual CAN interfaces over rtnetlink: make, set up or down, remove.
+"""Virtual CAN interfaces over rtnetlink: make, set up or down.
 
 Sockets and nothing else: a minimal Debian has neither iproute2 nor kmod, and starting a program would disturb the one
 processor whose bus is being watched. Source of the message layouts: netlink(7), rtnetlink(7), netdevice(7).
@@ -16,7 +16,7 @@ _REQUEST = 0x1
 _HEADER = struct.Struct("=IHHII")
 _ATTRIBUTE = struct.Struct("=HH")
 
-_RTM_NEWLINK, _RTM_DELLINK = 16, 17
+_RTM_NEWLINK = 16
 _IFLA_IFNAME, _IFLA_LINKINFO, _IFLA_INFO_KIND = 3, 18, 1
 _IFINFO = struct.Struct("=BxHiII")
 _IFF_UP = 1
@@ -62,26 +62,10 @@ def set_up(name: str, up: bool = True) -> None:
     request(_RTM_NEWLINK, 0, _IFINFO.pack(socket.AF_UNSPEC, 0, index, _IFF_UP if up else 0, _IFF_UP))
 
 
-def exists(name: str) -> bool:
-    """Returns True if the network namespace of this process has the interface; /sys may show another namespace's."""
-    return any(name == known for _, known in socket.if_nameindex())
-
-
 def is_up(name: str) -> bool:
-    """Returns True if an existing interface is up.
-
-    Raises:
-        OSError: no such interface.
-    """
+    """Returns True if an interface of this process's network namespace exists and is up."""
+    if all(name != known for _, known in socket.if_nameindex()):
+        return False
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         answer = fcntl.ioctl(sock, _SIOCGIFFLAGS, struct.pack("=16sH22x", name.encode(), 0))
     return bool(struct.unpack_from("=H", answer, 16)[0] & _IFF_UP)
-
-
-def remove(name: str) -> None:
-    """Remove a virtual interface.
-
-    Raises:
-        OSError: no such interface, or no right to.
-    """
-    request(_RTM_DELLINK, 0, _IFINFO.pack(socket.AF_UNSPEC, 0, socket.if_nametoindex(name), 0, 0))

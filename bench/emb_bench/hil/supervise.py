@@ -1,20 +1,14 @@
-"""Waiting for a command: hands on the signals that come, ends it at its time limit, leaves nothing running."""
+"""Waiting for a command in a kernel: hands on the signals that come, ends it at its time limit."""
 
 from __future__ import annotations
 
-import contextlib
-import os
 import signal
-import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from types import FrameType
 from typing import Protocol
 
-from emb_bench.hil import link
-from emb_bench.hil.guest import INTERFACE, not_started
-from emb_runtime.errors import BusError
 from emb_runtime.system.terminal import mention
 
 EXIT_TIMEOUT = 124  # as timeout(1) has it
@@ -25,7 +19,7 @@ _SCRIPT = 'read -r _ || { kill -s KILL -- "-$1"; rm -rf -- "$2"; }'
 
 
 class Child(Protocol):
-    """A running command, wherever it runs."""
+    """A running command."""
 
     @property
     def grace(self) -> float:
@@ -98,67 +92,3 @@ class ParentDeathWatch:
     def release(self) -> None:
         """All was ended in order; nothing is left to watch."""
         self._shell.communicate(b"done\n")
-
-
-@contextlib.contextmanager
-def interface(name: str = INTERFACE) -> Iterator[None]:
-    """``name`` exists and is up within the context; afterwards it is gone again only if it was made here.
-
-    Raises:
-        BusError: the host cannot have it; the message says why.
-    """
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except OSError as error:
-        raise BusError(f"this kernel has no CAN sockets ({error.strerror})") from error
-    made = not link.exists(name)
-    try:
-        if made:
-            link.add(name)
-        elif not link.is_up(name):
-            link.set_up(name)
-    except OSError as error:
-        raise BusError(f"{name} cannot be {'made' if made else 'set up'} here ({error.strerror})") from error
-    try:
-        yield
-    finally:
-        if made:
-            with contextlib.suppress(OSError):  # the command may have removed it itself
-                link.remove(name)
-
-
-class HostCommand:
-    """The command as an ordinary child, in a session of its own; a :class:`~emb_bench.hil.supervise.Child`."""
-
-    grace = 10.0
-
-    def __init__(self, command: list[str]) -> None:
-        self._started: tuple[subprocess.Popen[bytes], ParentDeathWatch] | None = None
-        self._status = 0
-        try:
-            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
-        except OSError as error:
-            message, self._status = not_started(command[0], error)
-            mention(message.removesuffix("\n"))
-        else:
-            self._started = process, ParentDeathWatch(process.pid, "")
-
-    def poll(self) -> int | None:
-        """Its exit status as a shell has it, None while it runs."""
-        if self._started is None:
-            return self._status
-        status = self._started[0].poll()
-        return status if status is None or status >= 0 else 128 - status
-
-    def signal(self, number: int) -> None:
-        """Hand its process group a signal."""
-        if self._started is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._started[0].pid, number)
-
-    def kill(self) -> None:
-        """End its process group."""
-        self.signal(signal.SIGKILL)
-        if self._started is not None:
-            self._started[0].wait()
-            self._started[1].release()

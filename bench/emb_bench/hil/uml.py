@@ -20,9 +20,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -152,40 +151,6 @@ def memory_directory(bytes_needed: int) -> Path:
     raise BusError(f"no place for the kernel's memory ({'; '.join(refused)}): free some, or lower --memory")
 
 
-def kernel(memory_mb: int, slow: int, state: Path) -> Kernel:
-    """The kernel with what it needs on this host.
-
-    Args:
-        memory_mb: its memory [MiB].
-        slow: seconds of this computer's for each of its own.
-        state: its private directory.
-    """
-    program = _program()
-    environment = {"PATH": os.defpath, "HOME": str(state), "TMPDIR": str(memory_directory(memory_mb << 20))}
-    libraries = [compiled(XSTATE)] if host_has_amx(Path("/proc/cpuinfo").read_text()) else []
-    if slow > 1:
-        libraries.append(compiled(SLOW))
-        environment |= {SLOW_MARK: str(slow), "EMB_SLOW_FROM": str((state / JOB_FILE).resolve())}
-    environment["LD_PRELOAD"] = ":".join(map(str, libraries))
-
-    def press_ctrl_alt_del() -> None:
-        """Through the kernel's management socket."""
-        text = b"cad"
-        message = struct.pack("=III", _MCONSOLE_MAGIC, _MCONSOLE_VERSION, len(text)) + text.ljust(512, b"\0")
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
-            sock.bind("")  # the kernel answers, so the socket needs an address
-            sock.sendto(message, str(state / "uml" / "mconsole"))
-
-    return Kernel(
-        arguments=[program, "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw", f"init={init_program(state)}",
-                   f"mem={memory_mb}M", "con=null", "con0=null,fd:1", "ssl=null", f"uml_dir={state}", "umid=uml"],
-        environment=environment,
-        extra_env={SLOW_MARK: str(slow)} if slow > 1 else {},
-        console_marker=SLOW_TOLD if slow > 1 else "",
-        send_signal=press_ctrl_alt_del,
-    )  # fmt: skip
-
-
 _CONSOLE_LINES = 40
 _BOOT_LIMIT = 60.0  # Time until the command must run [s]
 _GRACE = 10.0  # Time from a signal until the command is killed [s]
@@ -195,15 +160,14 @@ exec {python} -S -s -m emb_bench.hil.guest {state}
 """
 
 
-@dataclass(frozen=True)
-class Kernel:
-    """Description of a kernel: its program and the way to reach it."""
-
-    arguments: Sequence[str]  # of the program that it runs in
-    environment: Mapping[str, str]  # of that program
-    extra_env: Mapping[str, str]  # added to the environment of the command
-    console_marker: str  # text that its console must have before the command may run; empty for none
-    send_signal: Callable[[], None]  # sends its first process a SIGINT, which makes it look for signals
+def _environment(state: Path, memory: int, slow: int) -> dict[str, str]:
+    """Environment of the kernel's program, with the libraries that it needs on this computer."""
+    environment = {"PATH": os.defpath, "HOME": str(state), "TMPDIR": str(memory_directory(memory << 20))}
+    libraries = [compiled(XSTATE)] if host_has_amx(Path("/proc/cpuinfo").read_text()) else []
+    if slow > 1:
+        libraries.append(compiled(SLOW))
+        environment |= {SLOW_MARK: str(slow), "EMB_SLOW_FROM": str((state / JOB_FILE).resolve())}
+    return environment | {"LD_PRELOAD": ":".join(map(str, libraries))}
 
 
 @contextlib.contextmanager
@@ -217,36 +181,46 @@ def state_directory() -> Iterator[Path]:
 
 
 class KernelCommand:
-    """The command inside the kernel; a :class:`~emb_bench.hil.supervise.Child`."""
+    """The command inside the kernel; a :class:`~emb_bench.hil.supervise.Child`.
 
-    def __init__(self, command: list[str], kernel: Kernel, state: Path, as_root: bool) -> None:
-        self._kernel = kernel
+    Args:
+        command: with its arguments.
+        state: private directory of the kernel.
+        memory: of the kernel [MiB].
+        slow: seconds of this computer's for each of its own.
+        as_root: the command is root in the kernel.
+    """
+
+    def __init__(self, command: list[str], state: Path, memory: int, slow: int, as_root: bool) -> None:
         self._state = state
+        self._is_slow = slow > 1
+        program, environment = _program(), _environment(state, memory, slow)
         self._merged = os.path.sameopenfile(1, 2)
-        self._write_job(command, as_root)
+        self._write_job(command, as_root, {SLOW_MARK: str(slow)} if slow > 1 else {})
         self._streams = [(1, (state / "stdout").open("rb"))]
         if not self._merged:
             self._streams.append((2, (state / "stderr").open("rb")))
         with (state / "console").open("ab") as console:
             self._process = subprocess.Popen(
-                kernel.arguments,
+                [program, "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw", f"init={init_program(state)}",
+                 f"mem={memory}M", "con=null", "con0=null,fd:1", "ssl=null", f"uml_dir={state}", "umid=uml"],
                 stdin=subprocess.DEVNULL,
                 stdout=console,
                 stderr=console,
-                env=kernel.environment,
+                env=environment,
                 start_new_session=True,
-            )
+            )  # fmt: skip
         _put_first(self._process.pid)
         self._watch = ParentDeathWatch(self._process.pid, str(state))
         self._boot_until = time.monotonic() + _BOOT_LIMIT
 
-    def _write_job(self, command: list[str], as_root: bool) -> None:
+    def _write_job(self, command: list[str], as_root: bool, extra_env: Mapping[str, str]) -> None:
         umask = os.umask(0o077)
         os.umask(umask)
         job: dict[str, Any] = {
             "command": command,
             "cwd": str(Path.cwd()),
-            "env": dict(os.environ) | dict(self._kernel.extra_env),
+            "env": dict(os.environ) | dict(extra_env),
             "umask": umask,
             "host": socket.gethostname(),
             "uid": 0 if as_root else os.getuid(),
@@ -287,12 +261,8 @@ class KernelCommand:
         if not ended:
             if not status and time.monotonic() > self._boot_until:
                 raise BusError(self._obituary(f"the kernel did not come up within {_BOOT_LIMIT:.0f} s"))
-            if (
-                self._kernel.console_marker
-                and status
-                and self._kernel.console_marker not in (self._state / "console").read_text(errors="replace")
-            ):
-                raise BusError(self._obituary(f"it did not say '{self._kernel.console_marker}'"))
+            if self._is_slow and status and SLOW_TOLD not in (self._state / "console").read_text(errors="replace"):
+                raise BusError(self._obituary(f"it did not say '{SLOW_TOLD}'"))
             return None
         last = status.splitlines()[-1:]
         if not last or last[0] == RUNNING.strip():
@@ -315,7 +285,15 @@ class KernelCommand:
         (self._state / SIGNAL_FILE.format(number)).touch()
         if self._status().startswith(RUNNING):  # before that the guest looks by itself when it starts the command
             with contextlib.suppress(OSError):  # it ends at this moment
-                self._kernel.send_signal()
+                self._press_ctrl_alt_del()
+
+    def _press_ctrl_alt_del(self) -> None:
+        """Have the kernel's first process look for signals, through the kernel's management socket."""
+        text = b"cad"
+        message = struct.pack("=III", _MCONSOLE_MAGIC, _MCONSOLE_VERSION, len(text)) + text.ljust(512, b"\0")
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
+            sock.bind("")  # the kernel answers, so the socket needs an address
+            sock.sendto(message, str(self._state / "uml" / "mconsole"))
 
     def kill(self) -> None:
         """End the kernel with all its processes, and with them the command."""

@@ -12,7 +12,6 @@ import pytest
 from emb_bench.hil import uml
 from emb_bench.hil.cli import main
 from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
-from emb_bench.hil.uml import Kernel
 
 
 class Patient:
@@ -49,16 +48,20 @@ def test_a_command_that_is_ended_by_its_time_limit_is_told_of_in_one_line(capsys
 def test_ctrl_c_while_a_kernel_is_made_ready_ends_it_and_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def made(_memory: int, _slow: int, _state: Path) -> Kernel:
-        signal.raise_signal(signal.SIGINT)  # to compile its library, or to pack its first files, takes seconds
-        return Kernel(["sleep", "1000"], {}, {}, "", lambda: None)
+    def made(_state: Path, _memory: int, _slow: int) -> dict[str, str]:
+        signal.raise_signal(signal.SIGINT)  # to compile its library takes seconds
+        return dict(os.environ)
 
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    (tmp_path / "sleep").write_text("#!/bin/sh\nexec sleep 1000\n")
+    (tmp_path / "sleep").chmod(0o755)
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "state"))
     monkeypatch.setattr("tempfile.tempdir", None)
-    monkeypatch.setattr(uml, "kernel", made)
+    (tmp_path / "state").mkdir()
+    monkeypatch.setattr(uml, "_program", lambda: str(tmp_path / "sleep"))
+    monkeypatch.setattr(uml, "_environment", made)
     assert main(["--uml", "--", "true"]) == 130
     assert capfd.readouterr() == ("", "")
-    assert list(tmp_path.iterdir()) == []
+    assert list((tmp_path / "state").iterdir()) == []
 
 
 def test_two_kernels_share_no_processor_and_a_further_one_is_not_pinned(
