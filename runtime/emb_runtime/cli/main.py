@@ -115,14 +115,11 @@ def shown(plan: Plan) -> Iterator[None]:
         "port": plan.live,
     }
     try:
-        child = Child("live", entries[0].value, document, [])
+        child = Child("live", entries[0].value, document, VIEWER_TIMEOUT)
     except OSError as err:
-        raise UsageError(f"--live: cannot start its process: {err.strerror}") from err
+        raise UsageError(f"--live: {err}") from err
     try:
-        answer = child.answer(VIEWER_TIMEOUT)
-        if "ready" not in answer:
-            raise UsageError(f"--live: {answer.get('error', 'its process gave no answer')}")
-        mention(f"live at {answer['ready']}")
+        mention(f"live at {child.ready}")
         yield
     finally:
         child.end()

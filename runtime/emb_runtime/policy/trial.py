@@ -65,14 +65,10 @@ def _try(data: bytes, bench: Bench) -> None:
         "multiple": MULTIPLE,
     }
     try:
-        child = Child("trial", PROGRAM, document, [])
+        child = Child("trial", PROGRAM, document, TIMEOUT)
     except OSError as err:
-        raise UsageError(f"cannot start the process that tries the policy: {err.strerror}") from err
+        raise UsageError(f"cannot try the policy: {err}") from err
     try:
-        answer = child.answer(TIMEOUT)
-        if "ready" not in answer:
-            raise UsageError(f"cannot try the policy: {answer.get('error', 'no answer')}")
-        seconds = answer["ready"]
         answer = child.answer(TIMEOUT)
         exit_code = child.exit_code
     finally:
@@ -80,7 +76,7 @@ def _try(data: bytes, bench: Bench) -> None:
     if "accepted" in answer:
         return
     if exit_code == -signal.SIGKILL:
-        reason = f"loading and asking it takes more than {seconds:.1f} s of processor time: not a policy of ours"
+        reason = f"loading and asking it takes more than {child.ready:.1f} s of processor time: not a policy of ours"
     else:
         reason = str(answer.get("refused") or f"it could not be tried: {answer.get('error')}")
     raise PolicyRefusedError(reason)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import time
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 
 from emb_runtime.can.transport import SocketCan, Transport, is_private
@@ -82,16 +83,15 @@ class WatchdogHandle:
         sockets = [transport.descriptor] if isinstance(transport, SocketCan) else []
         document = {"iface": name, "bench": bench.text, "parent": os.getpid(), "real_time": real_time}
         try:
-            pulse = Heartbeat.create(heartbeat, time.monotonic_ns())
-            child = Child("watchdog", "emb_runtime.safety.watchdog_process", document, [pulse.fd, *sockets])
+            with ExitStack() as opened:
+                pulse = Heartbeat.create(heartbeat, time.monotonic_ns())
+                opened.callback(pulse.close)
+                program = "emb_runtime.safety.watchdog_process"
+                child = Child("watchdog", program, document, timeout, [pulse.fd, *sockets])
+                opened.pop_all()
         except OSError as err:
-            raise BusError(f"{name}: cannot start the watchdog process: {err.strerror}") from err
-        answer = child.answer(timeout)
-        if "ready" not in answer:
-            child.end()
-            pulse.close()
-            raise BusError(f"{name}: cannot watch over the loop: {answer['error']}")
-        return cls(pulse, child, answer["realtime"])
+            raise BusError(f"{name}: cannot watch over the loop: {err}") from err
+        return cls(pulse, child, child.ready)
 
     @property
     def pid(self) -> int:

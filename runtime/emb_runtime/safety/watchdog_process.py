@@ -226,7 +226,7 @@ def main(arguments: list[str]) -> int:
         wait=wait,
     )
     obtained = realtime.obtain(priority=PRIORITY) if document["real_time"] else {}
-    child_process.answer({"ready": True, "realtime": obtained})
+    child_process.answer({"ready": obtained})
     child_process.answer(watchdog.run())
     transport.close()
     return 0

@@ -29,10 +29,21 @@ _PR_SET_PDEATHSIG = 1
 
 
 class Child:
-    """A running process ``python -m MODULE FD... DOCUMENT_FD``, which inherits further file descriptors."""
+    """A running process ``python -m MODULE FD... DOCUMENT_FD`` that has said that it is ready.
+
+    Args:
+        name: of the process, in messages.
+        module: its program.
+        document: handed to it.
+        fds: file descriptors that it inherits.
+        timeout: longest wait for its first answer, ``ready`` or ``error`` [s].
+
+    Raises:
+        OSError: it cannot be started, or did not become ready; the message says why.
+    """
 
     def __init__(
-        self, name: str, module: str, document: Mapping[str, Any], fds: Sequence[int], inherited: Sequence[int] = ()
+        self, name: str, module: str, document: Mapping[str, Any], timeout: float, fds: Sequence[int] = ()
     ) -> None:
         import subprocess  # not in the process itself, whose start the runtime waits for
 
@@ -48,9 +59,15 @@ class Child:
                 [sys.executable, "-P", "-m", module, *map(str, fds), str(fd)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                pass_fds=(*fds, *inherited, fd),
+                pass_fds=(*fds, fd),
                 process_group=0,
             )
+        answer = self.answer(timeout)
+        if "ready" not in answer:
+            self.kill()
+            raise ChildProcessError(answer.get("error", f"the {name} process is not ready"))
+        self.ready: Any = answer["ready"]
+        """Content of its first answer."""
 
     @property
     def pid(self) -> int:

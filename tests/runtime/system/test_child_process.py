@@ -23,11 +23,8 @@ def test_what_is_no_answer_is_an_error_and_no_exception(monkeypatch: pytest.Monk
             return started([sys.executable, "-c", told], **keywords)
 
         monkeypatch.setattr(subprocess, "Popen", babbling)
-        child = Child("trial", "none", {}, [])
-        try:
-            assert child.answer(60.0) == {"error": "the trial process said what is no answer"}
-        finally:
-            child.kill()
+        with pytest.raises(ChildProcessError, match="the trial process said what is no answer"):
+            Child("trial", "none", {}, 60.0)
 
 
 PROGRAM = """
