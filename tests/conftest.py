@@ -23,7 +23,7 @@ from emb_runtime.control.core import Core
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord, LineRecord, Record
+from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord, Record
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import Heartbeat, Unwatched
@@ -119,10 +119,6 @@ class Journal:
     @property
     def events(self) -> list[EventRecord]:
         return [record for record in self.records if isinstance(record, EventRecord)]
-
-    @property
-    def lines(self) -> list[LineRecord]:
-        return [record for record in self.records if isinstance(record, LineRecord)]
 
     @property
     def codes(self) -> list[str]:

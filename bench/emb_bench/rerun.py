@@ -34,7 +34,7 @@ from emb_runtime.drives.mapping import mapping_hash
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, BusError, FrameError, LogError, UsageError
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder_process import DIED
-from emb_runtime.log.ring_buffer import Direction, EstimateRecord, EventRecord, FrameRecord, LearntRecord
+from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord
 from emb_runtime.records import CycleRecord, Frame, RunState
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import STOP_FRAMES
@@ -77,7 +77,7 @@ def read_items(log: RunLog) -> tuple[Item, ...]:
             log.require(topic, ["read_time_ns"])
             reads += zip(tables[topic]["order"].tolist(), tables[topic]["read_time_ns"].tolist(), strict=True)
     for (order, read_ns), frame in zip(sorted(reads), log.frames, strict=True):
-        ordered.append((order, FrameRecord(Direction.TX if frame.own else Direction.RX, frame, read_ns)))
+        ordered.append((order, FrameRecord(frame, read_ns)))
     cycles = log.cycles
     rows = zip(*(cycles[name].tolist() for name in CycleRecord._fields), strict=True)
     ordered += zip(cycles["order"].tolist(), map(CycleRecord._make, rows), strict=True)

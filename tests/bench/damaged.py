@@ -169,7 +169,7 @@ def rewritten(
 def without(topic: str, *names: str) -> Callable[[Topic], Topic]:
     def change(t: Topic) -> Topic:
         kept = tuple(f for f in t.fields if f.name not in names)
-        return Topic(t.name, t.message, kept, t.notes, t.bare_enums) if t.name == topic else t
+        return Topic(t.name, t.message, kept, t.notes) if t.name == topic else t
 
     return change
 
@@ -182,6 +182,6 @@ def with_field(topic: str, name: str, kind: str) -> Callable[[Topic], Topic]:
             return t
         fields = tuple(Field(name, kind) if f.name == name else f for f in t.fields)
         more = () if any(f.name == name for f in t.fields) else (Field(name, kind),)
-        return Topic(t.name, t.message, (*fields, *more), t.notes, t.bare_enums)
+        return Topic(t.name, t.message, (*fields, *more), t.notes)
 
     return change

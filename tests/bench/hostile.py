@@ -54,7 +54,7 @@ def write_trace(
         wall_offset_ns=WALL,
         simulated=True,
         dbc=layout.text,
-        messages=layout.descriptions,
+        messages=layout.known,
         metadata={"emb.run": {"steps": str(steps), "purpose": "experiment", "limit": "6.0", **identity}},
         estimates=estimated(bench),
         attachments=files,

@@ -13,11 +13,8 @@ from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.log.ring_buffer import (
     Attachment,
-    Direction,
     EventRecord,
     FrameRecord,
-    Level,
-    LineRecord,
     LogHeader,
     Record,
 )
@@ -47,7 +44,7 @@ def write_log(
         wall_offset_ns=wall,
         simulated=True,
         dbc=load_layout().text,
-        messages=load_layout().descriptions,
+        messages=load_layout().known,
         metadata={
             "emb.run": {"steps": str(steps), "iface": "sim", "purpose": "experiment", "limit": "6.0"},
             "emb.truth": {name: str(value) for name, value in run.transport.truth.items()},
@@ -68,13 +65,11 @@ def write_log(
 def _records(run: SimRun) -> Iterator[tuple[int, Record]]:
     journal = run.journal
     for frame in journal.frames:
-        yield frame.time_ns, FrameRecord(Direction.TX if frame.own else Direction.RX, frame)
+        yield frame.time_ns, FrameRecord(frame)
     for cycle in journal.cycles:
         yield cycle.receive_time_ns, cycle
     for event in journal.events:
         yield event[0], EventRecord(*event)
-    for time_ns, level, text in journal.lines:
-        yield time_ns, LineRecord(time_ns, Level(level), text)
 
 
 def square(_angle: float, _velocity: float, step: float) -> float:

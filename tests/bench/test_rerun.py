@@ -18,7 +18,7 @@ from emb_bench.rerun import Rerun, carried_policy, rerun
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import Bench, load_bench, parse_bench
-from emb_runtime.log.ring_buffer import Direction, EventRecord, FrameRecord, LearntRecord, Record
+from emb_runtime.log.ring_buffer import EventRecord, FrameRecord, LearntRecord, Record
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import CycleRecord, Reason, RunState
 from emb_runtime.safety.state_machine import Fault
@@ -287,7 +287,7 @@ def test_a_sent_frame_that_is_missing_or_other_is_reported(recorded: Callable[..
         record = records[at]
         assert isinstance(record, FrameRecord)
         data = record.frame.data[:2] + bytes([record.frame.data[2] ^ 1]) + record.frame.data[3:]
-        records[at] = FrameRecord(Direction.TX, record.frame._replace(data=data), record.read_ns)
+        records[at] = FrameRecord(record.frame._replace(data=data), record.read_ns)
 
     def add(number: int, records: list[Record]) -> None:
         records.insert(own(records, number), records[own(records, number)])

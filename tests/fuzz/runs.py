@@ -219,14 +219,14 @@ def run(draw: Random) -> Played:
     driven: Any = {"send": bus.send, "receive": bus.receive, "now_ns": clock.now_ns, "push": journal.push}
     asked: Any = {"stop_requested": lambda: stop and chance(draw, 1), "homing": homing}
     loop = make_loop(BENCH, Actor(draw, bus), steps, layout=LAYOUT, **driven, **asked)
-    judge_end(loop.run(), bus, loop.core.guard, journal)
+    judge_end(loop.run(), bus, loop.core.guard)
     return Played(bus.receives, bus.judge.enabled + bus.judge.stops)
 
 
-def judge_end(outcome: Outcome, bus: HostileBus, guard: Guard, journal: Journal) -> None:
+def judge_end(outcome: Outcome, bus: HostileBus, guard: Guard) -> None:
     """A run ends for a reason that it can name, with stop frames if anything could have left before."""
     internal = outcome.fault is Fault.INTERNAL and not outcome.detail.startswith(PolicyError.__name__)
-    demand(not internal, outcome.detail, *(text for _, _, text in journal.lines))
+    demand(not internal, outcome.detail)
     demand(guard.rejected == 0 and outcome.fault is not Fault.GUARD_REJECTED, "refused:", outcome.detail)
     judge = bus.judge
     demand(judge.enabled == 0 or judge.stops > 0 or bus.broken, "no stop frame:", outcome)

@@ -140,7 +140,7 @@ def write_run(found: Recorded, name: str, texts: dict[str, str], source: dict[st
         wall_offset_ns=0,
         simulated=False,
         dbc=load_layout().text,
-        messages=load_layout().descriptions,
+        messages=load_layout().known,
         metadata={
             "emb.run": {
                 "tool": f"emb-excite {metadata.version('emb-excite')}",

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from importlib.metadata import distribution
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from emb_runtime.can import e2e
 from emb_runtime.errors import FrameError
@@ -150,15 +150,6 @@ def worst_bits(length: int, *, extended: bool = False) -> int:
     and 2).
     """
     return (80 if extended else 55) + 10 * length
-
-
-def from_description(found: Mapping[str, Any]) -> Message:
-    """The message that :attr:`emb_runtime.can.messages.Layout.descriptions` describes, in another process."""
-    signals = [
-        Signal(**{**signal, "choices": {int(value): name for value, name in signal["choices"].items()}})
-        for signal in found["signals"]
-    ]
-    return Message(**{**found, "signals": tuple(signals)})
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cache
 from importlib import resources
@@ -180,11 +180,6 @@ class Layout:
         """All messages, those included that need not be sent."""
         required = (*self.messages.values(), self.charge)
         return required if self.gateway is None else (*required, self.gateway)
-
-    @property
-    def descriptions(self) -> list[dict[str, Any]]:
-        """All messages as plain data, for a process that is not to read the DBC."""
-        return [asdict(message) for message in self.known]
 
     def current_within(self, limit: float) -> float:
         """The largest current that a command can carry and that is not beyond a limit [A]."""

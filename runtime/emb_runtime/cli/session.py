@@ -26,7 +26,6 @@ from emb_runtime.control.loop import Loop
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
-from emb_runtime.log.ring_buffer import Level
 from emb_runtime.records import Frame, RunType, SensorSample
 from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.safety.guard import Guard
@@ -101,8 +100,6 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
             recorder = start_recorder(plan, bus, run_type, path, lines, steps)
         outcome = result = None
         try:
-            for name, value in (obtained or {}).items():
-                recorder.push_log(bus.clock.now_ns(), Level.INFO, f"real time, {name}: {value}")
             push_clock(recorder, bus.clock)
             pulse = watchdog.pulse if watchdog is not None else Unwatched()
             core = Core(

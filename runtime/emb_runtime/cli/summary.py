@@ -132,7 +132,7 @@ def header(
         wall_offset_ns=clock.wall_offset_ns(),
         simulated=truth is not None,
         dbc=plan.layout.text,
-        messages=plan.layout.descriptions,
+        messages=plan.layout.known,
         metadata=records,
         attachments=tuple(attachments),
         estimates=estimates,

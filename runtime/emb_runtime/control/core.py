@@ -32,7 +32,7 @@ from emb_runtime.estimator.estimate import LOST
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.learning.known import numbers
 from emb_runtime.learning.learner import Learner, words
-from emb_runtime.log.ring_buffer import Direction, EstimateRecord, EventRecord, FrameRecord, LearntRecord, Record
+from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord, Record
 from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, Reason, RunState, SensorSample
 from emb_runtime.safety.command_limits import CommandLimits, Decision, checked, decide
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS, Guard
@@ -57,8 +57,6 @@ ENDING: Final = (STOPPING, OVER)
 IDLE: Final = NodeState.IDLE
 OBEYING: Final = NodeState.ACTIVE
 UNFIT: Final = (NodeState.STOPPING, NodeState.FAULT)
-RX: Final = Direction.RX
-TX: Final = Direction.TX
 PAIR: Final = Event.PAIR
 COVERAGE: Final = 0.8
 """Share of an experiment's periods that must have had a sample and a command that acted: the rest may be what the leaky
@@ -212,8 +210,7 @@ class Core:
         self._now_ns = now_ns
         newest: SensorSample | None = None
         for left, frame in enumerate(frames, 1 - len(frames)):
-            said = TX if frame.own else RX, frame, now_ns if left == 0 else 0
-            self.records.append(tuple.__new__(FrameRecord, said))
+            self.records.append(tuple.__new__(FrameRecord, (frame, now_ns if left == 0 else 0)))
             try:
                 newest = self._take(frame, newest) if self.state is not OVER else None
             except StopError as stop:

@@ -6,7 +6,6 @@ per event: frames or a timeout are in hand, the command is decided, the command 
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, cast
@@ -15,7 +14,7 @@ from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.control.core import SILENT, Core, Proposal
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError, PolicyRefusedError
-from emb_runtime.log.ring_buffer import Level, LineRecord, Record
+from emb_runtime.log.ring_buffer import Record
 from emb_runtime.records import Frame, RunState
 from emb_runtime.safety.guard import GuardRejectedError
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat, Unwatched
@@ -151,7 +150,7 @@ class Loop:
         if frames:  # else there is nothing to stop, or the watchdog does
             self._send_stop_frame()
         if self._cause is not None:
-            self._explain(self._cause)
+            core.explain(self._fault, detail_of(self._cause))
         self._record()
         for sent in range(1, frames + 1):
             # Each in a period of its own: what stood in the way of one may be gone for the next.
@@ -161,15 +160,6 @@ class Loop:
         if core.state is RunState.STOPPING:
             self._end_stop()
         self._record()
-
-    def _explain(self, cause: BaseException) -> None:
-        if self._fault is Fault.INTERNAL:
-            self._attempt("TRACEBACK_FAILED", lambda: self._note_traceback(cause))
-        self.core.explain(self._fault, detail_of(cause))
-
-    def _note_traceback(self, cause: BaseException) -> None:
-        text = "".join(traceback.format_exception(cause, limit=-3))
-        self.core.records.append(LineRecord(self._now_ns, Level.FATAL, text))
 
     def _end_stop(self) -> None:
         """Let the watchdog go, and watch the node come to rest."""
@@ -248,10 +238,22 @@ def fault_of(err: BaseException) -> Fault:
 
 
 def detail_of(err: BaseException) -> str:
-    """Message of a refusal; class and message of an error in the program. One line."""
+    """Message of a refusal; class, message and place of an error in the program. One line."""
     if issubclass(type(err), StopError):
         return cast("StopError", err).detail
-    return one_line(err, named=not issubclass(type(err), GuardRejectedError | PolicyRefusedError | BusError))
+    if issubclass(type(err), GuardRejectedError | PolicyRefusedError | BusError):
+        return one_line(err, named=False)
+    return one_line(err) + _place(err)
+
+
+def _place(err: BaseException) -> str:
+    """Place at which an error was raised: the log has no traceback."""
+    last = err.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    if last is None:
+        return ""
+    return f" ({last.tb_frame.f_code.co_filename.rpartition('/')[2]}, line {last.tb_lineno})"
 
 
 def one_line(err: BaseException, *, named: bool = True) -> str:

@@ -14,7 +14,7 @@ from enum import IntEnum
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from emb_runtime.records import CYCLE_UNITS, CycleRecord, NodeState, Reason, RunState
 
@@ -24,11 +24,9 @@ _TYPES = {
     "int64": _Proto.TYPE_INT64,
     "uint64": _Proto.TYPE_UINT64,
     "uint32": _Proto.TYPE_UINT32,
-    "fixed32": _Proto.TYPE_FIXED32,
     "bool": _Proto.TYPE_BOOL,
     "string": _Proto.TYPE_STRING,
     "bytes": _Proto.TYPE_BYTES,
-    "timestamp": _Proto.TYPE_MESSAGE,
 }
 
 
@@ -36,7 +34,7 @@ class Field(NamedTuple):
     """One field of a message."""
 
     name: str
-    type: str  # A key of the protobuf scalar types above, ``timestamp``, or ``enum``
+    type: str  # A key of the protobuf scalar types above, or ``enum``
     unit: str = ""  # SI unit, empty if it has none
     choices: Mapping[str, int] | None = None  # Names and values, for an ``enum``
 
@@ -49,7 +47,6 @@ class Topic:
     message: str  # Fully qualified protobuf name
     fields: tuple[Field, ...]
     notes: Mapping[str, str]  # Further channel metadata
-    bare_enums: bool = False  # Enums lie in the message itself, not in a holder of their own, as in ``foxglove.Log``
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -59,13 +56,12 @@ class Topic:
 
     @cached_property
     def descriptor(self) -> descriptor_pb2.FileDescriptorSet:
-        """The message and every file that it imports, as a reader without our code needs them."""
+        """The message, as a reader without our code needs it."""
         package, _, short = self.message.rpartition(".")
         file = descriptor_pb2.FileDescriptorProto(
             name=f"{self.message.replace('.', '/')}.proto", package=package, syntax="proto3"
         )
         message = file.message_type.add(name=short)
-        everything = descriptor_pb2.FileDescriptorSet()
         for number, field in enumerate(self.fields, 1):
             proto = message.field.add(name=field.name, number=number, label=_Proto.LABEL_OPTIONAL)
             if field.type == "enum":
@@ -73,16 +69,10 @@ class Topic:
                 proto.type_name = f".{self.message}.{self._add_enum(message, field)}"
             else:
                 proto.type = _TYPES[field.type]
-            if field.type == "timestamp":
-                proto.type_name = ".google.protobuf.Timestamp"
-                timestamp_pb2.DESCRIPTOR.CopyToProto(everything.file.add())
-                file.dependency.append(timestamp_pb2.DESCRIPTOR.name)
-            else:
-                proto.proto3_optional = True
-                proto.oneof_index = len(message.oneof_decl)
-                message.oneof_decl.add(name=f"_{field.name}")
-        everything.file.append(file)
-        return everything
+            proto.proto3_optional = True
+            proto.oneof_index = len(message.oneof_decl)
+            message.oneof_decl.add(name=f"_{field.name}")
+        return descriptor_pb2.FileDescriptorSet(file=[file])
 
     def _add_enum(self, message: descriptor_pb2.DescriptorProto, field: Field) -> str:
         """Declare a field's enum and return its name inside the message.
@@ -91,16 +81,13 @@ class Topic:
         of its own: RunState and NodeState both have an ACTIVE.
         """
         title = "".join(part.capitalize() for part in field.name.split("_"))
-        holder, name, path = message, title, title
-        if not self.bare_enums:
-            holder, name, path = message.nested_type.add(name=title), "Value", f"{title}.Value"
-        enum = holder.enum_type.add(name=name)
+        enum = message.nested_type.add(name=title).enum_type.add(name="Value")
         choices = dict(field.choices or {})
         if 0 not in choices.values():
             choices = {"UNNAMED_0": 0} | choices  # proto3 demands a zero, first
         for label, value in sorted(choices.items(), key=lambda item: item[1]):
             enum.value.add(name=label, number=value)
-        return path
+        return f"{title}.Value"
 
     @cached_property
     def factory(self) -> Any:
@@ -169,25 +156,6 @@ CLOCK = Topic(
     (Field("monotonic_ns", "int64", "ns"), Field("wall_ns", "int64", "ns"), Field("drift_ns", "int64", "ns")),
     {"description": "drift_ns: how far Unix time has moved against the epoch of this log since its start"},
 )
-LOG = Topic(
-    "/log",
-    "foxglove.Log",  # viewers know this schema by its name and its field names
-    (
-        Field("timestamp", "timestamp"),
-        Field(
-            "level",
-            "enum",
-            "",
-            {"UNKNOWN": 0, "DEBUG": 1, "INFO": 2, "WARNING": 3, "ERROR": 4, "FATAL": 5},
-        ),
-        Field("message", "string"),
-        Field("name", "string"),
-        Field("file", "string"),
-        Field("line", "fixed32"),
-    ),
-    {},
-    bare_enums=True,
-)
 ESTIMATE = "/estimate"  # Topic of an experiment, see :func:`estimate_topic`
 LEARNT = Topic(
     "/learnt",
@@ -205,7 +173,7 @@ LEARNT = Topic(
     },
 )
 """Topic of logs whose shield learns, see :class:`emb_runtime.learning.known.Known`."""
-FIXED_TOPICS = (CAN_RX, CAN_TX, CYCLE, SAFETY, CLOCK, LOG)
+FIXED_TOPICS = (CAN_RX, CAN_TX, CYCLE, SAFETY, CLOCK)
 """Topics that every log has; one per DBC message comes on top, see :func:`message_topic`."""
 
 

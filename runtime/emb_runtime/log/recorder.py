@@ -20,11 +20,8 @@ from msgspec import to_builtins
 from emb_runtime.errors import LogError
 from emb_runtime.log.ring_buffer import (
     ClockRecord,
-    Direction,
     EventRecord,
     FrameRecord,
-    Level,
-    LineRecord,
     LogHeader,
     Record,
     Ring,
@@ -55,11 +52,8 @@ class _WriterHere:
         # By name, because the compiler would follow into it, and with it into libraries that it does not need.
         begin = importlib.import_module("emb_runtime.log.recorder_process").begin
         self.pid, self.alive = os.getpid(), True
-        self._answer: dict[str, Any] = {"ready": True}
-        try:
-            self._recording = begin(ring, document)
-        except LogError as err:
-            self._answer = {"error": str(err)}
+        self._answer: dict[str, Any] = {}
+        self._recording = begin(ring, document)
 
     def make_room(self) -> None:
         self._recording.drain()
@@ -92,21 +86,19 @@ class Recorder:
             LogError: the file exists or cannot be made, or the process did not start in time.
         """
         path = Path(path)
+        document = {"path": str(path), "parent": os.getpid(), "header": to_builtins(header, str_keys=True)}
         try:
-            ring = Ring.create(slots)
-            document = {"path": str(path), "parent": os.getpid(), "header": to_builtins(header)}
-            child: Child | _WriterHere = (
-                Child("recorder", "emb_runtime.log.recorder_process", document, [ring.fd])
-                if HAS_CHILD_PROCESSES
-                else _WriterHere(ring, document)
-            )
-        except OSError as err:
-            raise LogError(f"{path}: cannot start the recorder process: {err.strerror}") from err
-        answer = child.answer(timeout)
-        if "ready" not in answer:
-            child.end()
-            ring.close()
-            raise LogError(f"{path}: cannot record: {answer['error']}")
+            with contextlib.ExitStack() as opened:
+                ring = Ring.create(slots)
+                opened.callback(ring.close)
+                child: Child | _WriterHere = (
+                    Child("recorder", "emb_runtime.log.recorder_process", document, timeout, [ring.fd])
+                    if HAS_CHILD_PROCESSES
+                    else _WriterHere(ring, document)
+                )
+                opened.pop_all()
+        except (OSError, LogError) as err:
+            raise LogError(f"{path}: cannot record: {err}") from err
         return cls(path, ring, child)
 
     @property
@@ -129,16 +121,12 @@ class Recorder:
         self._ring.push(*pack(record))
 
     def push_frame(self, frame: Frame) -> None:
-        """Record a frame that was on the bus; one whose echo came back (``own``) is one that was sent."""
-        self.push(FrameRecord(Direction.TX if frame.own else Direction.RX, frame))
+        """Record a frame that was on the bus."""
+        self.push(FrameRecord(frame))
 
     def push_event(self, time_ns: int, code: str, text: str) -> None:
-        """Record what the safety chain did at a monotonic time [ns]: a stable name, and the same for a person."""
+        """Record what the safety chain did at a monotonic time [ns]: a stable name, and words, cut to 192 bytes."""
         self.push(EventRecord(time_ns, code, text))
-
-    def push_log(self, time_ns: int, level: Level, text: str) -> None:
-        """Record a line of text for a person; cut beyond about 230 bytes."""
-        self.push(LineRecord(time_ns, level, text))
 
     def push_clock(self, monotonic_ns: int, wall_ns: int) -> None:
         """Record one reading of the monotonic and of the Unix clock; once a second is plenty."""

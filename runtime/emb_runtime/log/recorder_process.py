@@ -25,19 +25,17 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from msgspec import convert
 
-from emb_runtime.can.codec import FrameRejectedError, Signal, from_description
+from emb_runtime.can.codec import FrameRejectedError, Signal
 from emb_runtime.can.messages import CHARGE
 from emb_runtime.can.transport import Transport
 from emb_runtime.errors import BusError, EmbError, LogError
 from emb_runtime.log import mcap_schema
 from emb_runtime.log.ring_buffer import (
     ClockRecord,
-    Direction,
     EstimateRecord,
     EventRecord,
     FrameRecord,
     LearntRecord,
-    LineRecord,
     LogHeader,
     Record,
     Ring,
@@ -58,14 +56,11 @@ END = "emb.end"  # Names of the metadata records with the run's identity and wit
 DIED = "the runtime process died"  # Exit reason in a log whose runtime ended without saying why
 
 
-_FRAME_TOPICS = {Direction.RX: mcap_schema.CAN_RX, Direction.TX: mcap_schema.CAN_TX}
-
-
 class LogWriter:
     """Turns records into MCAP messages. Writes to what it is given, reads no clock."""
 
     def __init__(self, output: BinaryIO, header: LogHeader) -> None:
-        self._messages = {message.identifier: message for message in map(from_description, header.messages)}
+        self._messages = {message.identifier: message for message in header.messages}
         self._offset = header.wall_offset_ns
         self._mcap = Writer(output, chunk_size=CHUNK, compression=CompressionType.ZSTD, enable_data_crcs=True)
         tool = header.metadata.get(RUN, {}).get("tool", "emb-excite").replace(" ", "/")
@@ -121,11 +116,6 @@ class LogWriter:
                 drift = wall_ns - monotonic_ns - self._offset
                 values = {"monotonic_ns": monotonic_ns, "wall_ns": wall_ns, "drift_ns": drift}
                 self._add(mcap_schema.CLOCK, log_time, monotonic_ns, values)
-            case LineRecord(time_ns, level, text):
-                seconds, nanos = divmod(time_ns + self._offset, 1_000_000_000)
-                stamp = {"seconds": seconds, "nanos": nanos}
-                line = {"timestamp": stamp, "level": int(level), "message": text, "name": "emb-run"}
-                self._add(mcap_schema.LOG, log_time, time_ns, line)
 
     def write_drive(self, frame: Frame, read_ns: int, log_time: int) -> None:
         """Write a frame of a mapped drive's bus, whose identifiers have another meaning."""
@@ -142,8 +132,9 @@ class LogWriter:
         self._mcap.finish()  # type: ignore[no-untyped-call]
 
     def _write_frame(self, record: FrameRecord, log_time: int) -> None:
-        direction, frame, read_ns = record
-        self._add(_FRAME_TOPICS[direction], log_time, frame.time_ns, _frame_values(frame, read_ns))
+        frame, read_ns = record
+        topic = mcap_schema.CAN_TX if frame.own else mcap_schema.CAN_RX
+        self._add(topic, log_time, frame.time_ns, _frame_values(frame, read_ns))
         try:
             message = self._messages[frame.identifier]
             signals = message.decode(frame)
@@ -205,7 +196,7 @@ class Recording:
     """One recording: the ring at one end, the file at the other."""
 
     def __init__(self, ring: Ring, document: Mapping[str, Any], output: BinaryIO) -> None:
-        header = convert(document["header"], LogHeader)
+        header = convert(document["header"], LogHeader, str_keys=True)
         self._ring = ring
         self._parent = int(document["parent"])
         self._simulated, self._offset = header.simulated, header.wall_offset_ns
@@ -336,7 +327,7 @@ def _open_drive_bus(header: LogHeader) -> Transport | None:
 
 def _time(record: Record) -> int:
     match record:
-        case FrameRecord(_, frame, _):
+        case FrameRecord(frame, _):
             return frame.time_ns
         case CycleRecord():
             return record.receive_time_ns

@@ -17,11 +17,11 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
-from typing import Any, Final, NamedTuple, cast
+from typing import Final, NamedTuple, cast
 
 from msgspec import msgpack
 
+from emb_runtime.can.codec import Message
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES
 
@@ -150,7 +150,7 @@ class LogHeader:
     simulated: bool  # The clock does not follow the computer's: records are written when they happened
     dbc: str  # Text of the DBC: it decodes the frames, and travels as the attachment ``emb.dbc``
     metadata: Mapping[str, Mapping[str, str]]  # Metadata records by name; ``emb.run`` has the run's identity
-    messages: Sequence[Mapping[str, Any]] = ()  # ``Layout.descriptions`` of that DBC: these are decoded
+    messages: tuple[Message, ...] = ()  # Of that DBC: these are decoded
     attachments: Sequence[Attachment] = ()  # Further files: ``policy.onnx``, ``bench.toml``
     estimates: Sequence[tuple[str, str]] = ()  # Names and units of what is estimated
     learns: bool = False  # The shield learns which brakes are possible
@@ -158,27 +158,9 @@ class LogHeader:
     drive_bitrate: int = 0  # Of that bus [bit/s]
 
 
-class Direction(IntEnum):
-    """Direction of a frame."""
-
-    RX = 0
-    TX = 1
-
-
-class Level(IntEnum):
-    """Severity of a log line; the numbers are those of ``foxglove.Log``."""
-
-    DEBUG = 1
-    INFO = 2
-    WARNING = 3
-    ERROR = 4
-    FATAL = 5
-
-
 class FrameRecord(NamedTuple):
-    """A frame that was received or sent."""
+    """A frame that was received, or one that was sent, whose echo (``own``) came back."""
 
-    direction: Direction
     frame: Frame
     read_ns: int = 0  # Time at which the loop had it, monotonic [ns]; 0 if more frames of the same read follow
 
@@ -202,18 +184,6 @@ class ClockRecord(NamedTuple):
     wall_ns: int  # Unix time [ns]
 
 
-class LineRecord(NamedTuple):
-    """A line of text for a person."""
-
-    time_ns: int  # Monotonic [ns]
-    level: Level
-    text: str
-
-    def clipped(self) -> LineRecord:
-        """The record with a text that fits into a slot."""
-        return self._replace(text=_clipped(self.text, _MAX_LINE))
-
-
 class EstimateRecord(NamedTuple):
     """Estimate of the actor at a sample."""
 
@@ -230,16 +200,14 @@ class LearntRecord(NamedTuple):
     numbers: tuple[float, ...]  # See :func:`emb_runtime.learning.known.numbers`
 
 
-Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | LineRecord | EstimateRecord | LearntRecord
+Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | EstimateRecord | LearntRecord
 
-RECORDS: Final = (FrameRecord, CycleRecord, EventRecord, ClockRecord, LineRecord, EstimateRecord, LearntRecord)
+RECORDS: Final = (FrameRecord, CycleRecord, EventRecord, ClockRecord, EstimateRecord, LearntRecord)
 """Types of the records; a type's place is its type byte in the ring."""
-TEXTS: Final = (EventRecord, LineRecord)
 KINDS: Final = {record: kind for kind, record in enumerate(RECORDS)}
 
 _MAX_CODE: Final = 40  # Bytes of an event's code
 _MAX_EVENT_TEXT: Final = MAX_PAYLOAD - _MAX_CODE - 16
-_MAX_LINE: Final = MAX_PAYLOAD - 16
 
 _ENCODER: Final = msgpack.Encoder(enc_hook=lambda number: number.item())  # of numpy
 _DECODERS: Final = tuple(msgpack.Decoder(record) for record in RECORDS)
@@ -248,7 +216,7 @@ _DECODERS: Final = tuple(msgpack.Decoder(record) for record in RECORDS)
 def pack(record: Record) -> tuple[int, bytes]:
     """Type byte and payload of a record: MessagePack of its fields. Texts beyond the slot are cut."""
     kind = KINDS[type(record)]
-    if isinstance(record, TEXTS):
+    if isinstance(record, EventRecord):
         record = record.clipped()
     return kind, _ENCODER.encode(record)
 

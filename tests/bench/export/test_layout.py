@@ -68,7 +68,6 @@ def test_every_topic_and_field_of_the_layout_is_in_a_fresh_log(
         path["value"] for kind in ("Plot", "StateTransitions") for p in panels(layout, kind) for path in p["paths"]
     ]
     named += [panel["topicPath"] for panel in panels(layout, "RawMessages")]
-    named += [panel["topicToRender"] for panel in panels(layout, "RosOut")]
     assert len(named) > 10
     for path in named:
         match = PATH.fullmatch(path)
@@ -101,6 +100,4 @@ def test_the_panels_can_show_what_they_are_given(
     for path in ("/cycle.state", "/cycle.node_state"):  # shown by name
         assert path in states
         assert schemas["/cycle"][1][path.rpartition(".")[2]] == of_field.TYPE_ENUM
-    for panel in panels(layout, "RosOut"):
-        assert schemas[panel["topicToRender"]][0] == "foxglove.Log"  # the panel knows it by this name
     assert {panel["topicPath"] for panel in panels(layout, "RawMessages")} == {"/safety", "/cycle"}

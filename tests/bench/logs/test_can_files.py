@@ -14,7 +14,7 @@ import pytest
 from emb_bench.export.repair import repair
 from emb_bench.logs.can_files import McapReader
 from emb_bench.logs.log import read_log
-from emb_runtime.log.ring_buffer import Direction, FrameRecord
+from emb_runtime.log.ring_buffer import FrameRecord
 from emb_runtime.records import Frame
 
 from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
@@ -48,7 +48,7 @@ def run(simulate: Simulate) -> SimRun:
         Frame(0x88, bytes(8), last + 3_000_000, error=True),
         Frame(0x7FF, b"", last + 4_000_000),
     ):
-        run.journal.push(FrameRecord(Direction.RX, frame))
+        run.journal.push(FrameRecord(frame))
     return run
 
 

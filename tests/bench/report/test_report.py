@@ -31,7 +31,7 @@ from emb_bench.report.figures import applied_as_sent
 from emb_bench.report.page import document, report_page, view
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import EXIT_OUTSIDE
-from emb_runtime.log.ring_buffer import Attachment, EventRecord, Level, LineRecord
+from emb_runtime.log.ring_buffer import Attachment, EventRecord
 from emb_runtime.records import CycleRecord
 from emb_runtime.safety.state_machine import FAULTS, Fault
 
@@ -178,7 +178,7 @@ def gathered(bench: Bench, *paths: Path) -> Content:
 def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate) -> None:
     run = simulate(square, options="plant=exact", stop_requested=lambda: True)
     when = run.journal.events[-1].time_ns
-    run.journal.records += [EventRecord(when, HOSTILE, HOSTILE), LineRecord(when, Level.INFO, HOSTILE)]
+    run.journal.records += [EventRecord(when, HOSTILE, HOSTILE)]
     path = folder / "<script>alert(3)<"  # as the name of a folder
     path.mkdir()
     log = write_log(

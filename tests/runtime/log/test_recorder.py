@@ -26,7 +26,7 @@ from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import BusError, LogError
 from emb_runtime.log import recorder_process
 from emb_runtime.log.recorder import Recorder
-from emb_runtime.log.ring_buffer import Attachment, EventRecord, Level, LogHeader, Ring, pack
+from emb_runtime.log.ring_buffer import Attachment, EventRecord, LogHeader, Ring, pack
 from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, Reason, RunState
 
 from tests.bench.processes import wait_until_gone  # isort: skip
@@ -39,7 +39,7 @@ HEADER = LogHeader(
     wall_offset_ns=WALL,
     simulated=True,
     dbc=LAYOUT.text,
-    messages=LAYOUT.descriptions,
+    messages=LAYOUT.known,
     metadata={"emb.run": {"iface": "sim", "argv": "emb-run --iface sim"}, "emb.truth": {"f_v": "2e-5"}},
     attachments=(Attachment("policy.onnx", "application/octet-stream", bytes(range(256)) * 400),),
 )
@@ -93,7 +93,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recorder.push_frame(Frame(0x20, b"", START + 31_000_000, error=True))
     recorder.push(cycle(20, START + 32_000_000, policy_current=math.nan, state=RunState.STOPPING))
     recorder.push_event(START + 33_000_000, "SENSOR_LATE", "5 periods ohne Δ")
-    recorder.push_log(START + 34_000_000, Level.WARNING, "hello")
     recorder.push_clock(START + 35_000_000, WALL + START + 35_000_000 + 7)
     result = recorder.finish({"exit_reason": "done"})
     assert (result.complete, result.error, result.dropped, result.bytes) == (True, "", 0, path.stat().st_size)
@@ -160,7 +159,7 @@ def test_a_plain_reader_finds_every_record_with_the_descriptors_in_the_file(log:
     topics = decode(log)
     counts = {name: len(messages) for name, messages in topics.items()}
     assert counts == {
-        "/clock": 2, "/can/rx": 42, "/can/tx": 20, "/cycle": 21, "/safety": 1, "/log": 1,
+        "/clock": 2, "/can/rx": 42, "/can/tx": 20, "/cycle": 21, "/safety": 1,
         "/emb/EMB_Angle": 20, "/emb/EMB_Velocity": 20, "/emb/EMB_Command": 20,
     }  # fmt: skip
     frame = topics["/can/rx"][0][1]
@@ -171,10 +170,8 @@ def test_a_plain_reader_finds_every_record_with_the_descriptors_in_the_file(log:
     assert (angle.Counter, angle.Angle, angle.DeviceTime) == (7, pytest.approx(0.5), pytest.approx(0.007))
     assert (velocity.Velocity, velocity.CommandCounter) == (pytest.approx(-3.5), 15)
     assert (command.Answers, command.Current, command.Enable) == (7, pytest.approx(1.5), 1)
-    event, line, clock = topics["/safety"][0][1], topics["/log"][0][1], topics["/clock"][1][1]
+    event, clock = topics["/safety"][0][1], topics["/clock"][1][1]
     assert (event.code, event.text) == ("SENSOR_LATE", "5 periods ohne Δ")
-    assert (line.message, line.level) == ("hello", 3)
-    assert line.timestamp.ToNanoseconds() == WALL + START + 34_000_000
     assert clock.drift_ns == 7
 
 
@@ -197,17 +194,6 @@ def test_zeros_are_on_the_wire_and_states_are_enums(log: Path) -> None:
     states = velocity.fields_by_name["NodeState"].enum_type
     assert {v.name: v.number for v in states.values} == {state.name: state.value for state in NodeState}
     assert velocity.fields_by_name["CommandCounter"].enum_type is None
-
-
-def test_log_lines_have_the_schema_that_viewers_know(log: Path) -> None:
-    schemas = {s.name: s for s in summary(log)[0].schemas.values()}
-    files = descriptor_pb2.FileDescriptorSet.FromString(schemas["foxglove.Log"].data).file
-    assert [file.name for file in files] == ["google/protobuf/timestamp.proto", "foxglove/Log.proto"]
-    message = files[1].message_type[0]
-    assert [(f.name, f.number, f.type_name) for f in message.field] == [
-        ("timestamp", 1, ".google.protobuf.Timestamp"), ("level", 2, ".foxglove.Log.Level"), ("message", 3, ""),
-        ("name", 4, ""), ("file", 5, ""), ("line", 6, ""),
-    ]  # fmt: skip
 
 
 def test_units_travel_in_the_channel_metadata(log: Path) -> None:
@@ -334,7 +320,7 @@ def test_a_full_disk_does_not_disturb_the_run_and_is_told_at_its_end(tmp_path: P
     size = recorder.path.stat().st_size
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (size + 1000, size + 1000))
     for k in range(3000):
-        recorder.push_log(START + k, Level.INFO, f"{k}: {os.urandom(40).hex()}")
+        recorder.push_event(START + k, "X", f"{k}: {os.urandom(40).hex()}")
     result = recorder.finish({"exit_reason": "done"})
     assert not result.complete
     assert result.error.startswith("writing failed: ")

@@ -18,13 +18,10 @@ from emb_runtime.log.ring_buffer import (
     MAX_PAYLOAD,
     SLOT,
     ClockRecord,
-    Direction,
     EstimateRecord,
     EventRecord,
     FrameRecord,
     LearntRecord,
-    Level,
-    LineRecord,
     Record,
     Ring,
     pack,
@@ -155,11 +152,10 @@ FLOATS = st.floats(allow_nan=False)
 
 @given(
     st.one_of(
-        st.builds(FrameRecord, st.sampled_from(Direction), FRAMES, INT64),
+        st.builds(FrameRecord, FRAMES, INT64),
         st.tuples(*[INT64] * 7, *[FLOATS] * 6, *[INT64] * 5).map(CycleRecord._make),
         st.builds(EventRecord, INT64, st.text(max_size=10), st.text(max_size=40)),
         st.builds(ClockRecord, INT64, INT64),
-        st.builds(LineRecord, INT64, st.sampled_from(Level), st.text(max_size=50)),
         st.builds(EstimateRecord, INT64, INT64, st.tuples(*[FLOATS] * 24)),
         st.builds(LearntRecord, INT64, INT64, st.tuples(*[FLOATS] * 13)),
     )
@@ -181,19 +177,17 @@ def test_a_value_that_a_cycle_does_not_have_stays_nan_and_numbers_of_numpy_trave
     assert unpack(*pack(EstimateRecord(1, 2, numbers))) == EstimateRecord(1, 2, (1.5, 0.5))
 
 
-@given(INT64, st.text(max_size=300), st.text(max_size=300), st.sampled_from(Level))
-def test_texts_travel_or_are_cut_between_characters(when: int, code: str, text: str, level: Level) -> None:
-    events, lines = pack(EventRecord(when, code, text)), pack(LineRecord(when, level, text))
-    assert max(len(events[1]), len(lines[1])) <= MAX_PAYLOAD
-    event, line = unpack(*events), unpack(*lines)
+@given(INT64, st.text(max_size=300), st.text(max_size=300))
+def test_texts_travel_or_are_cut_between_characters(when: int, code: str, text: str) -> None:
+    packed = pack(EventRecord(when, code, text))
+    assert len(packed[1]) <= MAX_PAYLOAD
+    event = unpack(*packed)
     assert isinstance(event, EventRecord)
-    assert isinstance(line, LineRecord)
-    assert (event.time_ns, line.time_ns, line.level) == (when, when, level)
-    for got, sent in ((event.code, code), (event.text, text), (line.text, text)):
+    assert event.time_ns == when
+    for got, sent in ((event.code, code), (event.text, text)):
         assert got == sent or (got[-1] == "…" and sent.startswith(got[:-1]))
-    assert line.text == text or len(text.encode()) > 230
     assert event.text == text or len(text.encode()) > 190
-    assert unpack(*pack(LineRecord(1, Level.INFO, "a\udcff"))) == LineRecord(1, Level.INFO, "a?")  # no valid Unicode
+    assert unpack(*pack(EventRecord(1, "X", "a\udcff"))) == EventRecord(1, "X", "a?")  # no valid Unicode
 
 
 def test_an_unknown_kind_or_a_payload_that_is_no_such_record_is_refused() -> None:
