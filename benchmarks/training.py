@@ -3,7 +3,8 @@
     python benchmarks/training.py [--seeds N] [--seconds S]
 
 Our PPO and Stable-Baselines3's train for S seconds of processor time each, in turns, with the same network widths,
-minibatches and epochs. Then the preset is trained with N seeds, and each actor is valued on the 40-value grid of f_v.
+minibatches and epochs. Then the preset is trained with N seeds, and each actor is valued on the 40-value grid of f_v,
+beside the best single switch between the largest currents that is found there.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_train.env import EmbExcitationVectorEnv
-from emb_train.evaluate import grid_outcomes
-from emb_train.ppo import train
-from emb_train.training import Training, begin_training, load_preset, load_training, run_training
+from emb_train.evaluate import Network
+from emb_train.play import Excitation, Outcome, Played, grid_draws, play
+from emb_train.ppo import DeployedActor, train
+from emb_train.training import Trained, Training, begin_training, load_preset, load_training, run_training
 
 WORTH = 2.737e7  # Mean information on the grid, at least
 RATIO = 1.5  # Steps per second over those of Stable-Baselines3, at least
@@ -114,6 +116,23 @@ def ours(training: Training, bench: Bench, seconds: float) -> float:
     return steps / (time.process_time() - start)
 
 
+def on_grid(trained: Trained) -> dict[str, Outcome]:
+    """The trained actor and the best blind switch on the grid, with the same noise."""
+    training, bench = trained.training, trained.bench
+    ranges, limit, horizon = bench.range_set(training.ranges), bench.limits.current, bench.timing.horizon
+    draws = grid_draws(ranges, training.parameters[0], training.seed)
+
+    def played(excitation: Excitation) -> Outcome:
+        return play(bench, ranges, training.parameters, excitation, draws, training.plant, training.conditions)
+
+    blind = {}
+    for u in (limit, -limit):
+        for t in range(horizon // 100, horizon + 1, horizon // 100):  # the last is no switch at all
+            blind[f"{u:+g} A, from step {t} {-u:+g} A"] = played(Played(np.where(np.arange(horizon) < t, u, -u)))
+    best = max(blind, key=lambda name: float(blind[name].matrices.mean()))
+    return {"trained actor": played(Network(DeployedActor(trained.actor, limit))), best: blind[best]}
+
+
 def main() -> None:
     """Run the benchmark."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -136,7 +155,7 @@ def main() -> None:
             folder, training = Path(directory) / "run", load_preset("single-viscous", seed=seed)
             begin_training(folder, training, bench)
             run_training(folder, training, bench)
-            outcomes = grid_outcomes(load_training(folder))
+            outcomes = on_grid(load_training(folder))
         for name, o in outcomes.items():
             worth = f"{o.matrices[:, 0, 0].mean():.4e}"
             print(f"seed {seed}, {name}: {worth} (at least {WORTH:.3e}), {o.left.sum()} left, home {o.home.sum()}/40")

@@ -43,7 +43,7 @@ def quiet(line: str) -> None:
 
 
 def run(*arguments: object) -> int:
-    return main(["evaluate", *map(str, arguments), "--optimum", "0", "--draws", "4", "--plant", "euler"])
+    return main(["evaluate", *map(str, arguments), "--draws", "4", "--plant", "euler"])
 
 
 def test_what_was_played_has_the_information_that_plain_python_computes_from_the_same_currents() -> None:
@@ -61,7 +61,6 @@ def test_what_was_played_has_the_information_that_plain_python_computes_from_the
             np.testing.assert_allclose(outcome.matrices[i], found.matrix, rtol=1e-6)
             assert outcome.home[i] == played.home
             assert outcome.left[i] == (not played.kept)
-            assert (outcome.angle[i], outcome.velocity[i]) == pytest.approx(tuple(played.states[-1]), abs=1e-6)
 
 
 def test_a_draw_depends_on_the_seed_and_its_number_alone() -> None:
@@ -82,7 +81,6 @@ def test_an_experiment_that_leaves_the_limits_keeps_what_it_had_and_is_not_home(
         before = float(batch.m[0, 0])
         batch.advance(np.array([6.0]))
     assert (outcome.left[0], outcome.home[0], outcome.matrices[0, 0, 0]) == (True, False, before)
-    assert (outcome.angle[0], outcome.velocity[0]) == tuple(batch.x[0, :2])
 
 
 def test_policies_that_cannot_be_played_are_refused(tmp_path: Path) -> None:
@@ -128,7 +126,7 @@ def problem(plant: str = "euler", **changes: float) -> Problem:
 
 
 @pytest.fixture
-def searched(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[float]:
+def searched(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """f_v of the brakes that were searched for, without a search: a current that depends on the brake is found."""
     brakes: list[float] = []
 
@@ -142,33 +140,17 @@ def searched(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[float]:
         return Found(np.full(asked.horizon, 1e5 * asked.brake.f_v))
 
     monkeypatch.setattr(optimum, "search", search)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return brakes
 
 
-def test_the_known_optimum_is_the_information_of_the_kept_currents_and_is_looked_for_once(
-    searched: list[float], tmp_path: Path
-) -> None:
+def test_the_known_optimum_is_the_information_of_the_currents_that_were_found(searched: list[float]) -> None:
     brakes = [BENCH.brake._replace(f_v=v) for v in (3e-5, 1e-5, 4e-5)]
-
-    def found() -> NDArray[np.float64]:
-        return optima(BENCH, MEASURES["weighted"], ("f_v",), "euler", brakes, quiet)
-
-    first = found()
-    for brake, value in zip(brakes, first, strict=True):
+    found = optima(BENCH, MEASURES["weighted"], ("f_v",), "euler", brakes, quiet)
+    for brake, value in zip(brakes, found, strict=True):
         currents, plant = np.full(500, 1e5 * brake.f_v), BENCH.plant("euler")
         own = fisher(BENCH, brake, currents, kind="weighted", plant=plant, params=("f_v",))
         assert value == pytest.approx(own.matrix[0, 0], rel=1e-9)
     assert searched == [3e-5, 1e-5, 4e-5]
-    np.testing.assert_array_equal(found(), first)
-    assert len(searched) == 3
-    optima(BENCH, MEASURES["weighted"], ("f_v",), "exact", brakes[:1], quiet)  # of another model: another search
-    assert len(searched) == 4
-    for path in (tmp_path / "cache").rglob("*"):
-        if path.is_file():
-            path.write_bytes(path.read_bytes()[:-1])  # as a full disk leaves it
-    np.testing.assert_array_equal(found(), first)
-    assert len(searched) == 7
 
 
 def test_speeds_that_are_followed_are_reached_on_another_brake() -> None:
@@ -200,7 +182,6 @@ def test_table_and_document_say_the_same(finished: Path, tmp_path: Path, capsys:
     table = (tmp_path / "out" / "evaluation.txt").read_text()
     line = next(x for x in table.splitlines() if x.startswith(str(finished)))
     assert f"{row['measure']['value']:.3e}" in line
-    assert f"{max(map(abs, row['end_velocity'])):.2f}" in line
 
 
 def test_the_verdict_and_the_interval_over_policies_are_those_of_the_numbers() -> None:

@@ -63,18 +63,12 @@ def test_a_training_writes_all_that_its_result_depends_on_and_keeps_the_best_act
     assert len({(finished / name).stat().st_mode for name in (CONFIGURATION, ACTOR)}) == 1
 
 
-def test_the_same_seed_gives_the_same_files(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_same_seed_gives_the_same_files(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_tiny(monkeypatch)
     bench, other = finished.parent / "short.toml", tmp_path / "run"
     assert main(["ppo", "single-viscous", "--bench", str(bench), "--out", str(other)]) == 0
     for name in FILES:
         assert (other / name).read_bytes() == (finished / name).read_bytes(), name
-    said = capsys.readouterr().out
-    for row in ("trained actor", "constant +6 A", "constant -6 A", "best blind switch"):
-        line = next(line for line in said.splitlines() if line.startswith(row))
-        assert line.split()[-2:] == ["0", "40/40"], row
 
 
 def test_ctrl_c_and_divergence_leave_the_best_actor_so_far(

@@ -38,7 +38,7 @@ EPILOG = """\
 examples:
   emb-train reference four-d --out mine && emb-export mine/reference.json --out mine/actor.onnx
   emb-train ppo single-viscous --out run && emb-export run
-  emb-train evaluate mine/actor.onnx four-d-exact-blind --plant exact --optimum 0
+  emb-train evaluate mine/actor.onnx four-d-exact-blind --plant exact
 
 Ctrl-C ends a command and keeps the best so far.
 
@@ -68,7 +68,7 @@ thesis's weighted information, for one parameter that information itself. All re
 
 The optimum is what the search of emb-design finds if the brake is known, on the thesis's brakes (euler, exact; a plant
 that differs from exact in its instruments alone is held against exact). It takes minutes for the first brake, a quarter
-of a minute for each other, and is kept in the user's cache. Ctrl-C ends the evaluation: plants that are done are shown.
+of a minute for each other. Ctrl-C ends the evaluation: plants that are done are shown.
 """
 
 
@@ -176,9 +176,9 @@ def _add_evaluate(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--optimum",
         type=_at_least(0),
-        default=20,
+        default=0,
         metavar="N",
-        help="search the optimum for the first N brakes; 0 for none (default: %(default)s)",
+        help="search the optimum for the first N brakes, which takes minutes (default: %(default)s)",
     )
     p.add_argument("--json", action="store_true", help="print JSON, with the values of every draw")
     p.add_argument("--out", type=Path, metavar="DIR", help="also write evaluation.txt and evaluation.json there")
@@ -314,9 +314,8 @@ def ppo(arguments: argparse.Namespace) -> int:
     """
     import msgspec
 
-    from emb_train.evaluate import grid_outcomes, grid_text
     from emb_train.ppo import Metrics
-    from emb_train.training import ACTOR, begin_training, load_preset, load_training, run_training
+    from emb_train.training import ACTOR, begin_training, load_preset, run_training
 
     bench, folder = load_bench(arguments.bench), arguments.out
     changes = {"total_steps": arguments.steps, "plant": arguments.plant, "seed": arguments.seed}
@@ -337,8 +336,6 @@ def ppo(arguments: argparse.Namespace) -> int:
     if not conditions.shielded:
         show(f"{folder}: trained without a shield, which no bench runs; the study of the thesis shows what it does")
         return EXIT_DONE
-    if len(training.parameters) == 1:  # the grid is for one
-        show(grid_text(grid_outcomes(load_training(folder))))
     show(f"{folder}: export it with emb-export {folder}; emb-train evaluate {folder} compares it")
     return EXIT_DONE
 

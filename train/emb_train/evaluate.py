@@ -32,10 +32,8 @@ from emb_train.play import (
     Excitation,
     Measure,
     Outcome,
-    Played,
     Seen,
     fresh_draws,
-    grid_draws,
     mean_score,
     middle_of,
     play,
@@ -44,7 +42,7 @@ from emb_train.play import (
 from emb_train.ppo import DeployedActor
 from emb_train.presets import reference_names
 from emb_train.reference import Following, PolicyFile, stored
-from emb_train.training import Trained, load_training
+from emb_train.training import load_training
 from emb_train.trial import Task
 
 MEASURED_COLUMNS = 3  # Angle, velocity and step: what a network observes
@@ -171,8 +169,6 @@ class Row:
     left: int  # Experiments that left the limits, and were stopped there
     home: int  # Experiments that ended at home
     values: Floats  # The measure of each draw, shape [draws]
-    end_angle: Floats  # Of each draw [rad], shape [draws]
-    end_velocity: Floats  # Of each draw [rad/s], shape [draws]
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,13 +224,13 @@ def result(measure: Measure, outcomes: Mapping[str, Outcome], policies: int, bes
         share = mean_score(measure.shares(values[: len(best)], best)) if len(best) else None
         ahead = mean_score((rows[0].values if rows else values) - values)
         learned, left, home = len(rows) < policies, int(o.left.sum()), int(o.home.sum())
-        rows.append(Row(name, learned, mean_score(values), share, ahead, left, home, values, o.angle, o.velocity))
+        rows.append(Row(name, learned, mean_score(values), share, ahead, left, home, values))
     means = np.array([row.measure.value for row in rows])
     over = mean_score(means[:policies]) if policies > 1 else None
     return PlantResult(best, rows[policies + int(np.argmax(means[policies:]))].name, over, tuple(rows))
 
 
-HEADER = ("excitation", "measure", "against optimum", "first ahead by", "left", "home", "end rad", "end rad/s")
+HEADER = ("excitation", "measure", "against optimum", "first ahead by", "left", "home")
 UNIT: Mapping[str, str] = {"difference": "nat", "log-ratio": "nat", "ratio": ""}
 
 
@@ -265,8 +261,8 @@ def _scene(a: Settings) -> str:
         f"{a.measure.label} of {', '.join(a.parameters)}, relative to the true values; {a.draws} brakes drawn from the "
         f"ranges '{a.ranges}' for evaluation alone, seed {a.seed}; the same brakes and noise for all, all behind the "
         f"same {shield}. Brackets are 95 % intervals over the draws. 'left': experiments that left the limits and were "
-        "stopped there; 'home': share that ended at the origin; 'end': the worst angle and speed at the end. 'ahead': "
-        f"the first policy's measure less that of the line, paired by draw.{own if c.varies else ''}"
+        "stopped there; 'home': share that ended at the origin; 'ahead': the first policy's measure less that of the "
+        f"line, paired by draw.{own if c.varies else ''}"
     )
 
 
@@ -283,8 +279,6 @@ def _cells(measure: Measure, row: Row, first: bool) -> tuple[str, ...]:
         "" if first else _interval(row.first_ahead_by, measure),
         f"{row.left}/{len(row.values)}",
         f"{100.0 * row.home / len(row.values):.4g} %",
-        f"{np.abs(row.end_angle).max():.3f}",
-        f"{np.abs(row.end_velocity).max():.2f}",
     )
 
 
@@ -316,38 +310,3 @@ def document(settings: Settings, results: Mapping[str, PlantResult]) -> dict[str
     of_measure = {"measure": measure.name, "measure_is": measure.label, "unit": UNIT[measure.against]}
     conditions = msgspec.structs.asdict(settings.conditions)
     return {**of_measure, **to_json({**kept, "conditions": conditions, "plants": results})}
-
-
-def grid_outcomes(trained: Trained) -> dict[str, Outcome]:
-    """A training for one parameter on the grid of 40 brakes, beside what needs no learning; all with the same noise.
-
-    Beside it: the largest current of either sign, and the best single switch between them that is found on this grid.
-    """
-    training, limit, horizon = trained.training, trained.bench.limits.current, trained.bench.timing.horizon
-    ranges = trained.bench.range_set(training.ranges)
-    draws = grid_draws(ranges, training.parameters[0], training.seed)
-
-    def on_grid(excitation: Excitation, times: int = 1) -> Outcome:
-        conditions = msgspec.structs.replace(training.conditions, command_delay=(0, 0))
-        return play(trained.bench, ranges, training.parameters, excitation, draws * times, training.plant, conditions)
-
-    found = {"trained actor": on_grid(Network(DeployedActor(trained.actor, limit)))}
-    for u in (limit, -limit):
-        found[f"constant {u:+g} A"] = on_grid(Played(np.full(horizon, u)))
-    every = max(1, horizon // 100)
-    switches = [(u, t) for u in (limit, -limit) for t in range(every, horizon, every)]
-    blind = np.array([np.where(np.arange(horizon) < t, u, -u) for u, t in switches])
-    played = on_grid(Played(np.repeat(blind, len(draws), axis=0)), len(switches))
-    best = int(np.argmax(played.matrices[:, 0, 0].reshape(len(switches), -1).mean(axis=1)))
-    u, t = switches[best]
-    found[f"best blind switch: {u:+g} A, from step {t} {-u:+g} A"] = on_grid(Played(blind[best]))
-    return found
-
-
-def grid_text(outcomes: Mapping[str, Outcome]) -> str:
-    """Outcomes on the grid as a table."""
-    rows = [
-        (name, f"{o.matrices[:, 0, 0].mean():.4e}", f"{o.left.sum()}", f"{o.home.sum()}/{len(o.home)}")
-        for name, o in outcomes.items()
-    ]
-    return "\n".join(Table("on the grid, same shield", ("excitation", "information", "left", "home"), rows).lines())

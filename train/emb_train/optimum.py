@@ -2,17 +2,13 @@
 
 A search takes a quarter of a minute for a brake, and minutes for the first one, in the middle of the ranges. The others
 start from the optimum of that one: its speeds are followed on the other brake, and the search goes on from there. The
-result is the best that was found, not proved to be the best there is. Each is kept in the user's cache.
+result is the best that was found, not proved to be the best there is.
 """
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import os
 from collections.abc import Callable, Sequence
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 
@@ -23,16 +19,13 @@ from emb_bench.config.plants import EULER, EXACT, Plant
 from emb_bench.design.problem import Problem, make_problem
 from emb_bench.design.search import search
 from emb_bench.information.symmetric import Floats
-from emb_bench.output import replacing
 from emb_bench.sim.open_loop import feedback
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.errors import UsageError
 from emb_train.play import Measure
 
 FIRST_STARTS = 24  # Coarse searches for the brake in the middle
 STARTS = 3  # Coarse searches for each other brake, besides the warm start
 SEED = 0  # Seed of the searches
-GENERATION = 5  # Number of the search itself: what an earlier one found is not taken for the best that is known
 
 
 def searchable(plant: Plant) -> str:
@@ -76,33 +69,12 @@ def optima(
         tell(f"optimum on {plant}, brake {number} of {len(brakes)}")
         goal = measure.goal(len(parameters))
         problem = make_problem(bench, goal, parameters, model=plant, kind=measure.kind, brake=brake, returns=True)
-        design = problem.design(best_currents(problem, speeds))
+        warm = [followed(problem, speeds)] if speeds else []
+        found = search(problem, starts=STARTS if speeds else FIRST_STARTS, seed=SEED, warm=warm)
+        design = problem.design(found.best.currents)
         speeds = speeds or design.states[1:, 1].tolist()
         matrices.append(design.matrix)
     return measure.values(np.array(matrices))
-
-
-def best_currents(problem: Problem, speeds: Sequence[float]) -> Floats:
-    """The best currents that are found for a brake, or were found before [A], shape [horizon].
-
-    Args:
-        problem: brake, criterion, limits.
-        speeds: of the middle brake's optimum at the end of each sample [rad/s]; none for that brake itself.
-    """
-    path = _place(problem, speeds)
-    if path is not None:
-        with contextlib.suppress(OSError, ValueError):
-            found: Floats = np.load(path, allow_pickle=False)
-            if found.shape == (problem.horizon,) and np.isfinite(found).all():
-                return found
-    warm = [followed(problem, speeds)] if speeds else []
-    currents = search(problem, starts=STARTS if speeds else FIRST_STARTS, seed=SEED, warm=warm).best.currents
-    if path is not None:
-        with contextlib.suppress(OSError, UsageError):  # what cannot be kept is searched for again
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(path) as beside, beside.open("wb") as file:
-                np.save(file, currents)
-    return currents
 
 
 def followed(problem: Problem, speeds: Sequence[float]) -> Floats:
@@ -115,16 +87,3 @@ def followed(problem: Problem, speeds: Sequence[float]) -> Floats:
 
     motion = feedback(problem.plant.mechanics, p, law, t_s)
     return np.array([current for current, _, _ in islice(motion, len(speeds))])
-
-
-def _place(problem: Problem, speeds: Sequence[float]) -> Path | None:
-    """File for an optimum, named after all that it depends on; None for a user without a home."""
-    parts = (problem.plant.mechanics, problem.brake, problem.params, problem.goal, problem.weights, problem.box)
-    digest = hashlib.sha256(
-        repr((parts, problem.sample_time, problem.horizon, SEED, GENERATION, tuple(speeds))).encode()
-    )
-    try:
-        chosen = os.environ.get("XDG_CACHE_HOME")
-        return (Path(chosen) if chosen else Path.home() / ".cache") / "emb-excite" / "optima" / digest.hexdigest()
-    except RuntimeError:
-        return None

@@ -105,8 +105,6 @@ class Outcome:
     the limits: that before it left them."""
     left: Bools  # Mask of the experiments that left the limits, shape [N]
     home: Bools  # Mask of the experiments that ended at home without having left the limits, shape [N]
-    angle: Floats  # At the end [rad], shape [N]
-    velocity: Floats  # At the end [rad/s], shape [N]
 
 
 def play(
@@ -126,12 +124,11 @@ def play(
     """
     batch = Batch(bench, ranges, parameters, len(draws), plant, conditions)
     begin_all(batch, draws)
-    m, end, left = batch.m.copy(), batch.x[:, :2].copy(), np.zeros(len(draws), np.bool_)
+    m, left = batch.m.copy(), np.zeros(len(draws), np.bool_)
     for _ in followed(batch, excitation):
-        end = np.where(left[:, None], end, batch.x[:, :2])
         left |= batch.violated
         m = np.where(left[:, None], m, batch.m)
-    return Outcome(unpack(m, len(parameters)), left, batch.home & ~left, end[:, 0], end[:, 1])
+    return Outcome(unpack(m, len(parameters)), left, batch.home & ~left)
 
 
 def joined(parts: Sequence[Results]) -> Results:

@@ -132,7 +132,7 @@ class Trials(Batch):
         )
         home = (np.abs(x[:, 0]) <= shield.home_angle) & (np.abs(x[:, 1]) <= shield.home_velocity) & ~left
         matrices = unpack(m, len(self.parameters))
-        return ReportedOutcome(matrices, left, home, x[:, 0], x[:, 1], estimates, reached, used)
+        return ReportedOutcome(matrices, left, home, estimates, reached, used)
 
 
 def play_trials(
