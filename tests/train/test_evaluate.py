@@ -215,7 +215,7 @@ def test_the_share_of_the_optimum_is_over_the_draws_that_have_one(searched: list
         assert row.against_optimum.value == pytest.approx(np.mean(row.values[:2] / plant.optima))
 
 
-def test_a_policy_is_evaluated_behind_the_shield_that_it_was_made_behind_unless_another_one_is_named(
+def test_a_policy_is_evaluated_behind_the_shield_that_it_was_made_behind(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     arguments = ("viscous-exact-quadratic", "--criterion", "weighted", "--json")
@@ -224,8 +224,7 @@ def test_a_policy_is_evaluated_behind_the_shield_that_it_was_made_behind_unless_
     assert (said["ranges"], said["conditions"]["shield_ranges"]) == ("viscous", "viscous")
     assert {row["left"] for row in said["plants"]["euler"]["rows"]} == {0}
     assert run("actor", "four-d-exact-blind") == 0  # both behind the bench's own
-    assert run(*arguments, "--shield", "pm50") == 2  # which does not cover the brakes
-    assert run("actor", "viscous-exact-quadratic", "--ranges", "viscous", "--parameters", "f_v") == 2
+    assert run("actor", "viscous-exact-quadratic", "--ranges", "viscous") == 2
 
 
 def test_delays_change_each_experiment_and_are_told(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:

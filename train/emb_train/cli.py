@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from emb_bench.information.symmetric import Floats
     from emb_train.evaluate import Settings, Subject
     from emb_train.trial import Task
-
-T = TypeVar("T")
 
 CRITERIA = ("D", "A", "E", "weighted")
 FORMS = ("blind", "quadratic")
@@ -161,14 +159,7 @@ def _add_ppo(p: argparse.ArgumentParser) -> None:
 def _add_evaluate(p: argparse.ArgumentParser) -> None:
     p.add_argument("policies", nargs="+", metavar="POLICY", help="what is evaluated; several give an interval as well")
     p.add_argument("--criterion", choices=CRITERIA, default="D", help="by what (default: %(default)s)")
-    p.add_argument("--parameters", metavar="NAMES", help="unknown ones, such as f_v,k_1 (default: the policy's)")
     p.add_argument("--ranges", metavar="NAME", help="where brakes are drawn from, by name (default: the policy's)")
-    p.add_argument(
-        "--shield",
-        metavar="NAME",
-        help="ranges that the shield covers (default: those that it covered when the policy was made; of an ONNX file "
-        "those that the bench names)",
-    )
     p.add_argument("--draws", type=_at_least(2), default=200, metavar="N", help="brakes (default: %(default)s)")
     p.add_argument(
         "--plant", default="euler,exact", metavar="NAMES", help="of the bench, or 'all' (default: %(default)s)"
@@ -383,43 +374,33 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subjec
     bench = subjects[0].bench
     if any(s.bench.identity_hash != bench.identity_hash for s in subjects):
         raise UsageError("the policies are for different benches: evaluate them apart")
-    names = None if arguments.parameters is None else tuple(arguments.parameters.split(","))
-    parameters = _one("--parameters", names, [s.parameters for s in subjects])
-    if unknown := set(parameters) - set(PARAMETER_NAMES):
-        raise UsageError(f"--parameters: expected some of {', '.join(PARAMETER_NAMES)}, got '{min(unknown)}'")
     plants = tuple(bench.plants) if arguments.plant == EVERY else tuple(arguments.plant.split(","))
     if len(set(plants)) < len(plants):
         raise UsageError(f"--plant: expected names of plants, each once, got '{arguments.plant}'")
-    if arguments.shield is None and any(s.shield != subjects[0].shield for s in subjects):
-        raise UsageError("--shield: the policies were made behind different ones: name the ranges that it covers")
+    if any(s.shield != subjects[0].shield for s in subjects):
+        raise UsageError("the policies were made behind different shields: evaluate them apart")
+    named = {arguments.ranges} if arguments.ranges else {s.ranges for s in subjects}
+    if len(named) > 1 or "" in named:
+        raise UsageError("--ranges: the policies do not say which, or not the same: name it")
+    ranges = bench.range_set(named.pop())
     measure = MEASURES[arguments.criterion]
     settings = Settings(
         measure=measure,
-        parameters=tuple(name for name in PARAMETER_NAMES if name in parameters),
-        ranges=_one("--ranges", arguments.ranges, [s.ranges for s in subjects]),
+        parameters=tuple(n for n in PARAMETER_NAMES if getattr(ranges.low, n) < getattr(ranges.high, n)),
+        ranges=ranges.name,
         plants=plants,
         draws=arguments.draws,
         seed=arguments.seed,
         optimum=min(arguments.optimum, arguments.draws),
         conditions=Conditions(
             information=measure.kind,
-            shield_ranges=arguments.shield or subjects[0].shield,
+            shield_ranges=subjects[0].shield,
             command_delay=tuple(arguments.command_delay),
         ),
     )
-    ranges = bench.range_set(settings.ranges)
     for name in plants:  # what no experiment can be made of is refused before anything is looked for
         Batch(bench, ranges, settings.parameters, 1, name, settings.conditions)
     return bench, settings, subjects
-
-
-def _one(option: str, given: T | None, of_policies: list[T]) -> T:
-    """The given value, or else the one that all policies share."""
-    if given:
-        return given
-    if not of_policies[0] or any(other != of_policies[0] for other in of_policies):
-        raise UsageError(f"{option}: the policies do not say which, or not the same: name it")
-    return of_policies[0]
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {"reference": reference, "ppo": ppo, "evaluate": evaluate}

@@ -72,7 +72,6 @@ class Subject:
     bench: Bench
     excitation: Excitation
     ranges: str = ""  # Set of the bench that it was made for; empty if none of the bench's sets is that
-    parameters: tuple[str, ...] = ()  # Parameters that it was made for
     shield: str | None = None  # Set of the bench that the shield covered then; None for the one that the bench names
 
 
@@ -98,7 +97,7 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
         task = Task.of(kept)
         sticks = bench.plant(kept.plant).mechanics.solver != EULER
         following = Following(kept, bench, bench.range_set(task.ranges), sticks=sticks)
-        return Subject(given, bench, following, task.ranges, task.parameters, _other_shield(task.shield_ranges, bench))
+        return Subject(given, bench, following, task.ranges, _other_shield(task.shield_ranges, bench))
     if not path.is_dir():
         raise UsageError(
             f"{given}: no such folder, and no reference of that name; there are: {ACTOR}, "
@@ -112,7 +111,7 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
         raise UsageError(f"{given}: sees the parameters and the information, which no bench measures: it cannot be run")
     excitation = Network(DeployedActor(trained.actor, trained.bench.limits.current))
     shield = _other_shield(conditions.shield_ranges, trained.bench)
-    return Subject(given, trained.bench, excitation, training.ranges, training.parameters, shield)
+    return Subject(given, trained.bench, excitation, training.ranges, shield)
 
 
 def _other_shield(name: str | None, bench: Bench) -> str | None:
@@ -131,8 +130,7 @@ def _file(name: str, path: Path, bench: Bench) -> Subject:
         for s in bench.ranges.values()
         if made_for == {n: (getattr(s.low, n), getattr(s.high, n)) for n in PARAMETER_NAMES}
     ]
-    varied = tuple(n for n in PARAMETER_NAMES if n in made_for and made_for[n][0] < made_for[n][1])
-    return Subject(name, bench, PolicyFile(policy, bench), sets[0] if sets else "", varied)
+    return Subject(name, bench, PolicyFile(policy, bench), sets[0] if sets else "")
 
 
 def references(bench: Bench) -> dict[str, Excitation]:
@@ -147,7 +145,7 @@ class Settings:
     """Measure, brakes and conditions of an evaluation."""
 
     measure: Measure
-    parameters: tuple[str, ...]  # Unknown; others that vary in the ranges count as known
+    parameters: tuple[str, ...]  # Those that vary in the ranges
     ranges: str  # Set of the bench that brakes are drawn from
     plants: tuple[str, ...]  # Plants: mechanics and instruments
     draws: int

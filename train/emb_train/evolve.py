@@ -101,7 +101,7 @@ def evolve(
             change = rng.standard_normal((batch, len(table)))
             moved = np.zeros((batch, *table.shape))
             moved[:, :, 0] = change * reach
-            up, down = trials.perturbed(scale, [table + moved, table - moved])
+            up, down = trials.play(scale, [table + moved, table - moved])
             scores = task.score(up), task.score(down)
             gain = 0.5 * (scores[0] - scores[1])
             gain = np.clip(gain / max(float(gain.std()), 1e-12), -OUTLIER, OUTLIER)
@@ -120,7 +120,7 @@ def evolve(
             show(Progress(made, float(both.mean()), int(up.home.sum() + down.home.sum()), int(up.left.sum())))
     fresh = task.trials(bench, task.draws(bench, first - 1, JUDGED))
     found = summed / parts if parts else table
-    values = [task.score(outcome) for outcome in fresh.play(scale, np.array([found, begin]))]
+    values = [task.score(outcome) for outcome in fresh.play(scale, [found, begin])]
     better = float(mean_score(values[0]).value) > float(mean_score(values[1]).value)
     best, scored = (found, values[0]) if better else (begin, values[1])
     return Tuned(best, float(scored.mean()), made)

@@ -35,14 +35,12 @@ ANY_PRECISION: Four = (math.inf, math.inf, math.inf, math.inf)
 class ReportedOutcome(Outcome):
     """Final results of N experiments and of their estimators."""
 
-    estimates: Floats
-    """Relative parameters at the end, their standard deviations, and the worst innovation, shape [N, 9]."""
     known: Floats
     """Time until the estimates had the precision asked for [s], shape [N]. Where they had not at the end: more than the
     experiment's duration, by as much as the logarithm of what was missing says."""
     used: Floats
-    """Features with which each level and each switch of the reference was used, on average, 0 where it was not; only of
-    trials that are :meth:`Trials.perturbed`, shape [N, 2 n − 1, C]."""
+    """Features with which each level and each switch of the reference was used, on average, 0 where it was not, shape
+    [N, 2 n − 1, TERMS]."""
 
 
 class Trials(Batch):
@@ -67,7 +65,7 @@ class Trials(Batch):
             draws: brakes and noise.
             plant: which of the bench's plants.
             conditions: which information is collected, and for which brakes the shield holds the limits.
-            precision: relative deviations of k_m, k_1, T_c and f_v; once the estimates have them, 0 A is asked for.
+            precision: relative deviations of k_m, k_1, T_c and f_v; an experiment ends once its estimates have them.
 
         Raises:
             BenchFileError: the bench has no such plant, or the shield cannot hold the limits.
@@ -82,105 +80,70 @@ class Trials(Batch):
         self.precision = precision
         begin_all(self, draws)
 
-    def play(self, scale: Scale, tables: Floats) -> list[ReportedOutcome]:
+    def play(self, scale: Scale, tables: Sequence[Floats]) -> list[ReportedOutcome]:
         """Play every reference on all the brakes.
 
         Args:
             scale: of the references.
-            tables: of the references, see :func:`emb_train.reference.set_reference`, shape [C, 2 n − 1, TERMS].
+            tables: of the references, see :func:`emb_train.reference.set_reference`, each of shape [2 n − 1, TERMS] or,
+                with one for each brake, [N, 2 n − 1, TERMS].
         """
-        count = len(self.k)
-        each = [np.tile(table, (count, 1, 1)) for table in np.asarray(tables, np.float64)]
-        return self._all(scale, each, 0)
-
-    def perturbed(self, scale: Scale, tables: Sequence[Floats]) -> list[ReportedOutcome]:
-        """Play several times, with a reference for each brake; says with which features it was used.
-
-        Args:
-            scale: of the references.
-            tables: of the references, each of shape [N, 2 n − 1, TERMS].
-        """
-        return self._all(scale, tables, tables[0].shape[1])
-
-    def _all(self, scale: Scale, tables: Sequence[Floats], noted: int) -> list[ReportedOutcome]:
         parts = [slice(i, i + CHUNK) for i in range(0, len(self.k), CHUNK)]
-        pieces = [(table[part], part, noted) for table in tables for part in parts]
+        each = [np.broadcast_to(table, (len(self.k), *table.shape[-2:])) for table in tables]
+        pieces = [(table[part], part) for table in each for part in parts]
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             found = list(pool.map(lambda piece: self._play(scale, *piece), pieces))
         return [joined(found[i : i + len(parts)]) for i in range(0, len(found), len(parts))]
 
-    def _play(self, scale: Scale, tables: Floats, part: slice, noted: int) -> ReportedOutcome:
+    def _play(self, scale: Scale, tables: Floats, part: slice) -> ReportedOutcome:
         experiments = Experiments._make(array[part].copy() for array in self.experiments)
         x, count, shield = experiments.x, len(experiments.k), self.bench.shield
-        m, left = np.zeros_like(experiments.m), np.zeros(count, np.bool_)
-        estimates, reached = np.zeros((count, 9)), np.zeros(count)
-        used = np.zeros((count, noted, tables.shape[2]))
-        play = compiled(play_trials)
-        play(
-            self.setup,
-            experiments,
-            self.model,
-            scale,
-            self.box,
-            np.ascontiguousarray(tables),
-            self.precision,
-            estimates,
-            m,
-            left,
-            reached,
-            used,
-        )
+        m, left, reached = np.zeros_like(experiments.m), np.zeros(count, np.bool_), np.zeros(count)
+        tables = np.ascontiguousarray(tables)
+        used, fixed = np.zeros_like(tables), (self.setup, self.model, scale, self.box, self.precision)
+        compiled(play_trials)(*fixed, experiments, tables, m, left, reached, used)
         home = (np.abs(x[:, 0]) <= shield.home_angle) & (np.abs(x[:, 1]) <= shield.home_velocity) & ~left
         matrices = unpack(m, len(self.parameters))
-        return ReportedOutcome(matrices, left, home, estimates, reached, used)
+        return ReportedOutcome(matrices, left, home, reached, used)
 
 
 def play_trials(
     setup: Setup,
-    experiments: Experiments,
     model: Model,
     scale: Scale,
     box: Box,
+    precision: Four,  # At which an experiment ends
+    experiments: Experiments,
     tables: Floats,  # Of the references, shape [N, 2 n − 1, TERMS]
-    precision: Four,  # At which 0 A is asked for from then on, and the estimate rests
-    estimates: Floats,  # Become the estimates at the end, shape [N, 9]
     informed: Floats,  # Becomes the packed FIM, up to where the limits were left, shape [N, n (n + 1) / 2]
     left: Bools,  # Becomes whether they were, shape [N]
     reached: Floats,  # Becomes the time until the precision was reached [s], shape [N]
-    used: Floats,  # Becomes the mean features of each row of the table; nothing is noted if it has no rows
+    used: Floats,  # Becomes the mean features of each row of the table
 ) -> None:
-    """N experiments from their first sample to their end, or to where they leave the limits, in place."""
+    """N experiments from their first sample to their end, to the precision or out of the limits, in place."""
     k, duration = experiments.k, setup.rules.sample_time * setup.rules.horizon
     weights, reference = np.zeros(used.shape[1]), np.zeros(tables.shape[1])
     for i in range(k.shape[0]):
         weights[:] = 0.0
         state = start(model)
-        wanted, missing, over = 0.0, math.inf, False
+        missing = math.inf
         for _ in range(setup.rules.horizon):
-            if not over:
-                y, u = experiments.y, experiments.applied[i]
-                state = follow(model, state, y[i, 0], y[i, 1], float(k[i]), u)
-                wanted = wanted_current(model, state, scale, box, tables[i], reference)
-                if used.shape[1] > 0:
-                    note_use(scale, features(box, believed(model, state)), reference, state.step, used[i], weights)
-                before, missing = missing, lacking(model, state, precision)
-                over = missing <= 1.0
+            y, u = experiments.y, experiments.applied[i]
+            state = follow(model, state, y[i, 0], y[i, 1], float(k[i]), u)
+            wanted = wanted_current(model, state, scale, box, tables[i], reference)
+            note_use(scale, features(box, believed(model, state)), reference, state.step, used[i], weights)
+            before, missing = missing, lacking(model, state, precision)
+            if missing <= 1.0:
                 reached[i] = reached_at(setup.rules.sample_time, k[i], before, missing)
-            if over:
-                wanted = 0.0
-                if used.shape[1] > 0:  # it is trained, and only the time counts
-                    break
+                break
             advance_one(setup, experiments, i, wanted)
             if experiments.violated[i]:
                 left[i] = True
                 break
-            if not over:
-                informed[i] = experiments.m[i]
-        if not over:
-            reached[i] = duration * (1.0 + math.log(max(missing, 1.0)))
+            informed[i] = experiments.m[i]
+        if not missing <= 1.0:
+            reached[i] = duration * (1.0 + math.log(missing))
         average(used[i], weights)
-        estimates[i, :4], estimates[i, 4:8] = believed(model, state), deviations(model, state)
-        estimates[i, 8] = state.worst
 
 
 def reached_at(sample_time: float, step: int, before: float, missing: float) -> float:
