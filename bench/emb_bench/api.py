@@ -365,7 +365,6 @@ def campaign(
     jobs: int | None = None,
     time_limit: float = 600.0,
     ray: str | None = None,
-    plot: str | Path | None = None,
 ) -> Campaign:
     """Many logs in parallel: one row each in a Parquet or CSV file, and what they say together.
 
@@ -383,7 +382,6 @@ def campaign(
         jobs: logs at a time (default: one for each processor).
         time_limit: longest time for one log [s]; one that takes longer has failed (default: 600).
         ray: address of a Ray cluster, or 'local' for a Ray of this machine (default: processes of this machine).
-        plot: figure to write, of the parameters over time.
 
     Returns:
         The summary; the rows are in the file.
@@ -409,8 +407,7 @@ def campaign(
         Question(*names, None if prior is None else its.range_set(prior))
     options = Options(method, *names, model, prior, None if its is None else its.text, starts, seed)
     places = [Path(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
-    figure = None if plot is None else Path(plot)
-    return run_campaign(places, Path(output), options, jobs=jobs, time_limit=time_limit, ray=ray, plot=figure)
+    return run_campaign(places, Path(output), options, jobs=jobs, time_limit=time_limit, ray=ray)
 
 
 def design(

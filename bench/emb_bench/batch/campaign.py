@@ -1,4 +1,4 @@
-"""A campaign: many logs, each evaluated on its own, a file of rows, a summary, and a figure.
+"""A campaign: many logs, each evaluated on its own, a file of rows, and a summary.
 
 Logs are shared out to processes or to Ray: one that dies, or takes too long, costs its own log and no other.
 """
@@ -8,11 +8,8 @@ from __future__ import annotations
 import faulthandler
 import os
 import signal
-import sys
-import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path, PurePath
 
@@ -20,9 +17,8 @@ from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import ENDINGS as ROWS
 from emb_bench.batch.row import Options, Row, Source, failed, write_rows
 from emb_bench.batch.summary import Campaign, mark_copies, summarise
-from emb_bench.estimate.records import NORMAL_95
-from emb_bench.figures import COLOURS, ENDINGS, drawn, require_place
-from emb_bench.output import Progress, replacing, say_if_compiling
+from emb_bench.figures import require_place
+from emb_bench.output import replacing
 from emb_bench.parallel import Lost, shared_out, shared_out_on_ray
 from emb_runtime.errors import UsageError
 from emb_runtime.records import HOMING_LOG, LISTEN_ONLY_LOG
@@ -32,7 +28,6 @@ SUFFIX = ".mcap"
 PASSED_OVER = (HOMING_LOG + SUFFIX, LISTEN_ONLY_LOG + SUFFIX)  # Logs of emb-run that hold no experiment
 OUT_OF_TIME = -signal.SIGALRM if hasattr(signal, "SIGALRM") else 1
 """Exit code of a process whose time for a log is up: that signal ends it, or what Windows has instead."""
-WIDTH, HEIGHT = 8.0, 2.2  # Of one parameter [inch]
 Evaluate = Callable[[Source], Row]  # A function that another process can import; a ``functools.partial`` of one as well
 
 
@@ -44,15 +39,13 @@ def run_campaign(
     jobs: int | None,
     time_limit: float,
     ray: str | None,
-    plot: Path | None,
 ) -> Campaign:
-    """Evaluate logs, and write their rows and the figure; the arguments are those of :func:`emb_bench.api.campaign`.
+    """Evaluate logs, and write their rows; the arguments are those of :func:`emb_bench.api.campaign`.
 
     Raises:
         UsageError: there is no log, a library is missing, or a file cannot be written.
     """
     require_place("--output", output, ROWS)
-    require_place("--plot", plot, ENDINGS)
     try:
         import numba  # noqa: F401
         import pyarrow  # noqa: F401
@@ -60,7 +53,6 @@ def run_campaign(
     except ImportError as err:
         raise UsageError(f"a campaign needs {err.name}: pip install 'emb-excite[bench]'") from err
     sources, evaluate = find(paths), partial(evaluate_one, options=options)
-    say_if_compiling()
     with replacing(output) as beside:
         if ray is None:
             numbered = in_processes(evaluate, sources, jobs or len(processors()), time_limit)
@@ -68,22 +60,23 @@ def run_campaign(
             numbered = on_ray(evaluate, sources, jobs, time_limit, ray)
         rows = mark_copies(_in_order(len(sources), numbered))
         write_rows(beside, output.suffix, rows, options)
-    found = summarise(rows, options, str(output))
-    if plot is not None:
-        draw(found, plot)
-    return found
+    return summarise(rows, options, str(output))
 
 
 def _in_order(count: int, numbered: Generator[tuple[int, Row], None, None]) -> list[Row]:
-    """All rows in the order of the logs; reports each as it comes."""
-    progress, rows = Progress(sys.stderr, count, time.monotonic), dict[int, Row]()
-    try:
-        with closing(numbered):  # processes end here, whatever happens
-            for number, row in numbered:
-                rows[number] = row
-                progress.took(row.error)
-    finally:
-        progress.end()
+    """All rows in the order of the logs; shows how many there are, and says at once what failed."""
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (MofNCompleteColumn(), TextColumn("logs"), TimeRemainingColumn(), TextColumn("left"))
+    console, rows = Console(stderr=True, markup=False, highlight=False, emoji=False), dict[int, Row]()
+    with closing(numbered), Progress(*columns, console=console, disable=not console.is_terminal) as shown:
+        task = shown.add_task("", total=count)  # processes end with the generator, whatever happens
+        for number, row in numbered:
+            rows[number] = row
+            shown.advance(task)
+            if row.error is not None:
+                console.print(f"FAILED {row.error}", soft_wrap=True)
     return [rows[number] for number in range(count)]
 
 
@@ -203,29 +196,3 @@ def limited_to(seconds: float) -> Iterator[None]:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-
-
-def draw(c: Campaign, path: Path) -> None:
-    """Draws the parameters that have a trend, each with the 95 % intervals of the runs and of the trend.
-
-    Raises:
-        UsageError: matplotlib is missing, or the file cannot be written.
-    """
-    shown = {name: p for name, p in c.parameters.items() if p.trend is not None}
-    title = "Parameters over the campaign, ± 95 %" if shown else "No parameter has enough runs for a trend"
-    rows = max(len(shown), 1)
-    with drawn(path, rows, 1, title, (WIDTH, HEIGHT * rows), sharex=True) as axes:
-        for (name, p), axis in zip(shown.items(), axes[:, 0], strict=False):
-            if p.trend is not None:
-                times = [datetime.fromtimestamp(start * 1e-9, UTC) for start in p.trend.start_times]
-                half = [NORMAL_95 * deviation for deviation in p.trend.deviations]
-                low, high = p.trend.walk.ends.T
-                axis.fill_between(times, low, high, color=COLOURS[1], alpha=0.25, linewidth=0.0)
-                axis.plot(times, p.trend.walk.values, color=COLOURS[1], label="random walk through all runs")
-                alone = {"fmt": "o", "color": COLOURS[0], "capsize": 2.5, "markersize": 3.5, "linewidth": 1.0}
-                axis.errorbar(times, p.trend.values, half, label="each run alone", **alone)
-                axis.set_ylabel(f"{name} [{p.unit}]")
-        axes[-1, 0].set_xlabel("time [UTC]")
-        if shown:
-            axes[0, 0].legend(ncols=2)
-        axes[-1, 0].tick_params(axis="x", labelrotation=20.0)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.analysis.several_runs import Constancy, RandomWalk, constancy, random_walk
+from emb_bench.analysis.several_runs import Constancy, constancy
 from emb_bench.batch.row import NONE, Options, Parameter, Row, is_relative, unit_of
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE, NORMAL_95
@@ -17,7 +17,7 @@ from emb_bench.numbers import NOTHING, plain
 from emb_bench.report.sentences import INTERVALS, p_value
 from emb_bench.report.text import Table, listed, wrapped
 
-SHOWN = 20  # Most failed logs in the text; the file has them all
+SHOWN = 3  # Most logs of a kind that are named without ``-v``
 
 
 @dataclass(frozen=True)
@@ -34,21 +34,6 @@ class ParameterEstimates:
     covered: float | None  # Share of the simulated runs whose 95 % interval holds the true value
 
 
-@dataclass(frozen=True, eq=False)
-class Trend:
-    """One parameter over the runs that the model fits and that identify it, in their order; SI units."""
-
-    start_times: tuple[int, ...]  # Of the runs [ns]
-    values: tuple[float, ...]  # Of each run alone
-    deviations: tuple[float, ...]
-    walk: RandomWalk  # The parameter as all the runs together have it, if it walks at random between them
-
-    @property
-    def last(self) -> tuple[float, float]:
-        """Value in the last run and half its 95 % interval."""
-        return float(self.walk.values[-1]), NORMAL_95 * float(self.walk.deviations[-1])
-
-
 @dataclass(frozen=True)
 class ParameterSummary:
     """One parameter over all runs."""
@@ -58,7 +43,6 @@ class ParameterSummary:
     cramer_rao: float | None  # Median of the bounds by the information at the nominal brake
     relative: bool  # True if the bound is relative to the value
     estimate: ParameterEstimates | None  # None if no run that the model fits identifies it
-    trend: Trend | None  # None for few runs
 
 
 @dataclass(frozen=True)
@@ -145,19 +129,7 @@ def _parameter(rows: Sequence[Row], name: str) -> ParameterSummary:
         cramer_rao=float(np.median(bounds)) if bounds else None,
         relative=is_relative(name),
         estimate=_estimates(_usable(rows, name)),
-        trend=_trend(rows, name),
     )
-
-
-def _trend(rows: Sequence[Row], name: str) -> Trend | None:
-    timed = sorted((row for row in rows if row.start_time is not None), key=lambda row: row.start_time or 0)
-    found = [(row.start_time or 0, p) for row in timed for p in _usable([row], name)]
-    if not found:
-        return None
-    starts, used = tuple(start for start, _ in found), [p for _, p in found]
-    values, deviations = tuple(p.estimate or 0.0 for p in used), _deviations(used)
-    walk = random_walk([(start - starts[0]) * 1e-9 / 3600.0 for start in starts], values, deviations)
-    return None if walk is None else Trend(starts, values, tuple(deviations), walk)
 
 
 def _estimates(used: Sequence[Parameter]) -> ParameterEstimates | None:
@@ -200,30 +172,27 @@ def _deviations(used: Sequence[Parameter]) -> list[float]:
 
 
 def text(c: Campaign, *, verbose: bool = False) -> str:
-    """Failures, the parameters over all runs, and agreement of the runs; with ``verbose`` trends."""
+    """Failures, the parameters over all runs, and agreement of the runs; with ``verbose`` each log with something."""
+    most = None if verbose else SHOWN
     lines = []
     if c.failed:
-        lines += [f"{len(c.failed)} of {c.logs} logs FAILED", *listed("  ", (str(r.error) for r in c.failed[:SHOWN]))]
-        lines += _more(c.failed, "error")
+        lines += [f"{len(c.failed)} of {c.logs} logs FAILED", *listed("  ", (str(r.error) for r in c.failed[:most]))]
     if not c.evaluated:
         return "\n".join(lines)
     lines += wrapped(
-        f"{c.result}: {c.evaluated} of {c.logs} logs evaluated, {c.incomplete} incomplete, {c.violating} beyond a "
-        f"limit of the bench, {len(c.misfit)} not explained by the model ({', '.join(c.models)})"
+        f"{c.result}: {c.evaluated} of {c.logs} logs evaluated, {len(c.stopped)} stopped, {c.incomplete} incomplete, "
+        f"{len(c.copies)} copies, {c.violating} beyond a limit of the bench, {len(c.misfit)} not explained by the "
+        f"model ({', '.join(c.models)})"
     )
-    outside = ((row.log, ", ".join(row.outside or ())) for row in c.outside[:SHOWN])
+    outside = ((row.log, ", ".join(row.outside or ())) for row in c.outside[:most])
     lines += listed("OUTSIDE: ", (f"{log}: {names}: the limits were not guaranteed" for log, names in outside))
+    lines += listed("NOTE: ", _notes(c) if verbose else ())
+    if len(c.models) > 1:
+        lines += wrapped("NOTE: the runs are of different models: use --model, or name the logs of one")
     lines += ["", *parameter_table(c).lines()]
     if c.method != NONE:
         lines += wrapped("Medians of all runs. " + INTERVALS, 0)
-    lines += ["", *listed("", _agreement(c))]
-    lines += [*listed("NOTE: ", _notes(c)), *_more(c.misfit, "fits")]
-    return "\n".join([*lines, *(_trends(c) if verbose else ())]).rstrip()
-
-
-def _more(rows: Sequence[Row], column: str) -> list[str]:
-    left = len(rows) - SHOWN
-    return [f"  and {left} more: column '{column}' of the result"] if left > 0 else []
+    return "\n".join([*lines, *listed("", _agreement(c))])
 
 
 def _agreement(c: Campaign) -> Iterator[str]:
@@ -240,22 +209,8 @@ def _agreement(c: Campaign) -> Iterator[str]:
 def _notes(c: Campaign) -> Iterator[str]:
     yield from (f"{row.log} is a copy of {row.copy_of}: the run counts once" for row in c.copies)
     unused = "" if c.method == NONE else ", and it is not in the means"
-    yield from (f"{row.log}: the model '{row.model}' does not fit{unused}" for row in c.misfit[:SHOWN])
+    yield from (f"{row.log}: the model '{row.model}' does not fit{unused}" for row in c.misfit)
     yield from (f"{row.log} was stopped ({row.exit_reason}) and counts where it identifies" for row in c.stopped)
-    if len(c.models) > 1:
-        yield "the runs are of different models: use --model, or name the logs of one"
-
-
-def _trends(c: Campaign) -> Iterator[str]:
-    """Parameters over time."""
-    found = {name: p for name, p in c.parameters.items() if p.trend is not None}
-    if found:
-        yield from ("", "in the last run, if a parameter walks at random between the runs")
-    for name, p in found.items():
-        if p.trend is not None:
-            (value, half), q = p.trend.last, p.trend.walk.walk
-            walk = f"walk of {q:.2g} {p.unit} per root of an hour" if q > 0.0 else "no drift found"
-            yield f"  {name}  {value:.6g} ± {half:.2g} {p.unit}; {walk}"
 
 
 def parameter_table(c: Campaign) -> Table:

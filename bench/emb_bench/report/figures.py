@@ -17,7 +17,6 @@ from emb_bench.experiment.experiment import Experiment
 from emb_bench.figures import COLOURS, DASHED, GREY, svg
 from emb_bench.numbers import SMALL
 from emb_bench.report.content import ActiveCycles, Run, StopSamples
-from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.records import Reason
 
 WIDE = 8.6  # Width of a figure that fills the page [inch]
@@ -212,9 +211,6 @@ def _measured(errors: Floats) -> list[tuple[int, str]]:
 
 # ---- uncertainty of an estimate ----
 
-ELLIPSES = 6  # Most unknowns whose ellipses are drawn; more would be too small to read
-JOINT_95 = math.sqrt(-2.0 * math.log(0.05))
-"""Standard deviations of the ellipse that holds 95 % of a Gaussian in the plane: χ² with two degrees of freedom."""
 ACROSS = 4  # Most panels side by side
 _POWERS = (-2, 5)  # of ten, beyond which the axis has a common one: its numbers would touch
 
@@ -225,65 +221,6 @@ def axis_unit(e: Estimate, i: int) -> tuple[float, str]:
         return e.shown[i].factor, e.shown[i].unit
     factor, unit = (1e6, "ppm") if 3.0 * float(e.deviations()[i]) < SMALL else (100.0, "%")
     return factor / float(e.scale[i]), unit
-
-
-def ellipse(covariance: Floats) -> Floats:
-    """Border of the region that holds 95 % of a Gaussian at the origin, as 181 points.
-
-    Args:
-        covariance: shape (2, 2), positive semidefinite.
-
-    Returns:
-        Shape (181, 2).
-    """
-    values, vectors = np.linalg.eigh(covariance)
-    angle = np.linspace(0.0, 2.0 * math.pi, 181)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    result: Floats = JOINT_95 * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return result
-
-
-def drawable(e: Estimate) -> list[int]:
-    """The unknowns of which ellipses can be drawn: shared, asked for, with a finite deviation, up to ``ELLIPSES``."""
-    deviations = e.deviations()
-    return [i for i in e.shared() if i in e.wanted() and math.isfinite(deviations[i]) and deviations[i] > 0.0][
-        :ELLIPSES
-    ]
-
-
-def ellipses(e: Estimate, truth: BrakeParameters | None) -> bytes:
-    """Confidence ellipses of each pair, around the estimate; a cross where the truth is, if that is known."""
-    chosen = drawable(e)
-    units = [axis_unit(e, i) for i in range(len(e.labels))]
-    scale = np.array([factor for factor, _ in units])
-    spread = e.deviations() * scale * e.scale
-    correlation = e.correlation()
-    size = len(chosen) - 1
-
-    def draw(axes: Any) -> None:
-        for row in range(size):
-            for column in range(size):
-                axis = axes[row, column]
-                if column > row:
-                    axis.set_visible(False)
-                    continue
-                x, y = chosen[column], chosen[row + 1]
-                pair = np.array([x, y])
-                border = ellipse(correlation[np.ix_(pair, pair)] * np.outer(spread[pair], spread[pair]))
-                axis.fill(border[:, 0], border[:, 1], facecolor="#0072B222", edgecolor=COLOURS[0], linewidth=1.1)
-                axis.plot(0.0, 0.0, "o", color=COLOURS[0], markersize=3.5)
-                if truth is not None and all(hasattr(truth, e.unknowns[i].name) for i in pair):
-                    true = np.array([getattr(truth, e.unknowns[i].name) for i in pair])
-                    axis.plot(*((true - e.values[pair]) * scale[pair]), "x", color=COLOURS[1], markersize=7, mew=1.8)
-                axis.locator_params(axis="y", nbins=4)
-                axis.locator_params(axis="x", nbins=3)
-                axis.ticklabel_format(style="sci", scilimits=_POWERS)
-                if row == size - 1:
-                    axis.set_xlabel(f"{e.labels[x]} [{units[x][1]}]")
-                if column == 0:
-                    axis.set_ylabel(f"{e.labels[y]} [{units[y][1]}]")
-
-    return svg(draw, size, size, (WIDE, {1: 3.2, 2: 5.0}.get(size, 0.75 * WIDE)))
 
 
 def profiles(found: Sequence[Profile], e: Estimate) -> bytes:

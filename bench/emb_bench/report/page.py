@@ -113,7 +113,6 @@ def _of_study(study: Study) -> dict[str, Any]:
         "checks": (*checks, tables.models(study), tables.growth_path(study)),
         "drifts": tables.drifts(study) if study.drifts else None,
         "budget": tables.budget(study),
-        "ellipses": figures.ellipses(e, study.truth) if len(figures.drawable(e)) > 1 else None,
         "correlation": correlation,
         "pairs": pairs,
         "profiles": figures.profiles(study.profiles, e) if study.profiles else None,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import os
 import socket
 import sys
@@ -16,14 +15,13 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 from emb_bench.analysis.several_runs import constancy
-from emb_bench.batch.campaign import draw, find
+from emb_bench.batch.campaign import find
 from emb_bench.batch.row import Options, Parameter, Row, Source, failed, write_rows
-from emb_bench.batch.summary import Campaign, document, mark_copies, summarise, text
-from emb_bench.output import Progress, StatusLine, replacing
+from emb_bench.batch.summary import Campaign, mark_copies, summarise, text
+from emb_bench.output import replacing
 from emb_runtime.errors import UsageError
 
 from tests.bench.conftest import Replay  # isort: skip
-from tests.bench.report.test_page import Terminal  # isort: skip
 
 NUMBERS = st.floats(-1e3, 1e3).map(lambda value: value if abs(value) > 1e-300 else 0.0)
 """Without those so small that they have lost digits."""
@@ -97,41 +95,6 @@ def test_a_folder_that_cannot_be_listed_is_in_the_list(tmp_path: Path, monkeypat
     first, second = find([tmp_path])
     assert (first.log, first.trouble) == ("a", "the folder cannot be listed: Permission denied")
     assert (second.log, second.trouble) == ("b/1.mcap", "")
-
-
-def test_a_terminal_has_one_line_that_is_written_over_and_failures_stay() -> None:
-    out, now = Terminal(), iter([0.0, 1.0, 1.1, 2.0])
-    progress = Progress(out, 4, lambda: next(now))
-    progress.took(None)
-    progress.took(None)
-    progress.took("b.mcap: not an MCAP file")
-    progress.end()
-    shown = out.getvalue().split("\r\x1b[K")
-    assert shown == [
-        "",
-        "1/4 logs, 0 failed, 1 logs/s, 3 s left",
-        "FAILED b.mcap: not an MCAP file\n",
-        "3/4 logs, 1 failed, 1.5 logs/s, 1 s left",
-        "",
-    ]
-
-
-def test_elsewhere_a_line_comes_every_ten_seconds_and_each_failure_at_once() -> None:
-    out, now = io.StringIO(), iter([0.0, 4.0, 9.0, 12.0, 13.0])
-    progress = Progress(out, 2000, lambda: next(now))
-    for error in (None, "b.mcap: empty", None, None):
-        progress.took(error)
-    progress.end()
-    assert out.getvalue() == "FAILED b.mcap: empty\n3/2000 logs, 1 failed, 0.25 logs/s, 2.2 h left\n"
-
-
-def test_a_status_line_comes_at_once_and_then_now_and_then_where_nobody_watches() -> None:
-    out = io.StringIO()
-    line = StatusLine(out, prefix="emb-train evaluate: ")
-    for said, now in (("one", 0.0), ("two", 9.0), ("three", 11.0)):
-        line.say(said, now)
-    line.end()
-    assert out.getvalue() == "emb-train evaluate: one\nemb-train evaluate: three\n"
 
 
 def test_a_result_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -229,49 +192,6 @@ def campaign(values: list[float], wrong: int | None = None) -> Campaign:
     return summarise([*rows[1:], rows[0]], OPTIONS, "result.parquet")
 
 
-def drifting(walk: float, runs: int = 40) -> tuple[list[float], list[float]]:
-    """True and estimated k_m of runs an hour apart; the walk is relative, per root of an hour."""
-    rng = np.random.default_rng(4)
-    true = TRUE * (1.0 + np.cumsum(walk * rng.standard_normal(runs)))
-    return true.tolist(), (true * (1.0 + DEVIATION * rng.standard_normal(runs))).tolist()
-
-
-def test_the_trend_follows_a_parameter_that_drifts_from_run_to_run() -> None:
-    true, seen = drifting(2e-5)
-    trend = campaign(seen).parameters["k_m"].trend
-    assert trend is not None
-    assert trend.start_times == tuple(FIRST + n * HOUR for n in range(40))
-    assert trend.walk.walk == pytest.approx(2e-5 * TRUE, rel=0.4)
-    low, high = trend.walk.ends.T
-    assert np.mean((low <= true) & (true <= high)) > 0.85
-    assert (trend.walk.deviations < DEVIATION * TRUE).all()
-
-
-def test_runs_that_do_not_fit_and_few_runs_have_no_part_in_it() -> None:
-    _, seen = drifting(2e-5)
-    seen[7] = 2.0 * TRUE
-    found = campaign(seen, wrong=7).parameters["k_m"].trend
-    assert found is not None
-    assert len(found.values) == 39
-    assert campaign(seen[:3]).parameters["k_m"].trend is None
-
-
-def test_it_is_in_the_text_the_document_and_the_figure(tmp_path: Path) -> None:
-    _, seen = drifting(2e-5)
-    found = campaign(seen)
-    assert "walk of" in text(found, verbose=True)
-    trend = document(found)["parameters"]["k_m"]["trend"]
-    assert trend["start_times"] == [FIRST + n * HOUR for n in range(40)]
-    assert len(trend["walk"]["values"]) == 40
-    assert document(campaign(seen[:3]))["parameters"]["k_m"]["trend"] is None
-    draw(found, tmp_path / "trend.svg")
-    assert "random walk through all runs" in (tmp_path / "trend.svg").read_text()
-    draw(campaign(seen[:3]), tmp_path / "none.svg")
-    assert "enough runs" in (tmp_path / "none.svg").read_text()
-    with pytest.raises(UsageError, match="cannot write the figure"):
-        draw(found, tmp_path / "gone" / "trend.svg")
-
-
 def test_a_misfit_is_named_and_has_no_part_in_the_mean() -> None:
     values = [2.98e-2, 2.99e-2, 3.1e-2, 5e-2]
     found = summarise([row(n, value, fits=n < 3, half=0.1) for n, value in enumerate(values)], OPTIONS, "r.parquet")
@@ -281,4 +201,4 @@ def test_a_misfit_is_named_and_has_no_part_in_the_mean() -> None:
     assert (estimate.runs, estimate.constancy.constant) == (3, False)
     assert estimate.constancy.mean == pytest.approx(3.02e-2, rel=0.01)
     assert estimate.total == pytest.approx(0.1 * 2.99e-2)
-    assert "3.mcap" in text(found)
+    assert "3.mcap" in text(found, verbose=True)

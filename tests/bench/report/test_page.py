@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 
 from emb_bench.figures import svg
 from emb_bench.numbers import around, between, chance, percent, plain, seconds, share, share_between
-from emb_bench.report.figures import ellipse
 from emb_bench.report.page import environment
 from emb_bench.report.text import Cell, Table, show
 
@@ -90,13 +88,6 @@ def test_numbers_are_written_for_people() -> None:
     for both, pairs in of_two.items():
         for first, second, text in pairs:
             assert both(first, second) == text
-
-
-def test_an_ellipse_holds_95_percent_of_a_gaussian() -> None:
-    covariance = np.array([[4.0, -1.9], [-1.9, 1.0]])
-    border = ellipse(covariance)
-    squares = np.einsum("ni,ij,nj->n", border, np.linalg.inv(covariance), border)
-    assert squares == pytest.approx(stats.chi2.ppf(0.95, 2))
 
 
 def test_a_figure_is_the_same_bytes_each_time_and_its_text_is_text() -> None:
