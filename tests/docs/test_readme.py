@@ -44,3 +44,12 @@ def test_the_citation_is_of_this_version() -> None:
     assert {citation[key] for key in ("title", "version", "license")} == {
         project[k] for k in ("name", "version", "license")
     }
+
+
+def test_the_readme_names_this_version_its_python_and_its_license() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    first = project["requires-python"].removeprefix(">=").partition(",")[0]
+    (version, python, licence) = re.findall(
+        r"^Version (\S+) · Python (\S+) to \S+ · Linux · (\S+)$", README.read_text(encoding="utf-8"), re.MULTILINE
+    )[0]
+    assert (version, python, licence) == (project["version"], first, project["license"])
