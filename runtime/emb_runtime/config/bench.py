@@ -233,10 +233,9 @@ class Bench:
     tables: Mapping[str, Any]  # Tables of ANALYSIS as they stand, which :mod:`emb_bench.config` reads
 
     def range_set(self, name: str) -> Ranges:
-        """The named set of uncertain parameters; "nominal", where nothing is uncertain, is always there.
+        """The named set of uncertain parameters; BenchFileError if there is none.
 
-        Raises:
-            BenchFileError: no set has that name.
+        "nominal", where nothing is uncertain, is always there.
         """
         try:
             return self.ranges[name]
@@ -249,11 +248,7 @@ class Bench:
             ) from None
 
     def refuse_long_timeouts(self) -> None:
-        """Refuse time-outs and counts beyond those with which a brake is driven.
-
-        Raises:
-            BenchFileError: one is longer; the message names it.
-        """
+        """Raise BenchFileError for a time-out or count beyond those with which a brake is driven."""
         for name, value, longest in (
             ("watch.stop_missed", self.watch.stop_missed, LONGEST_MISSED),
             ("watch.rejected", self.watch.rejected, LONGEST_REJECTED),
@@ -301,11 +296,7 @@ def load_bench(path: str | Path | None = None) -> Bench:
 
 
 def read_bench_text(path: str | Path | None = None) -> tuple[str, str]:
-    """Text of a bench file, of the shipped one without a path, and its name for messages.
-
-    Raises:
-        BenchFileError: it cannot be read.
-    """
+    """Text of a bench file, of the shipped one without a path, and its name; BenchFileError if it cannot be read."""
     if path is None:
         return shipped_bench_text(), "shipped bench.toml"
     try:
@@ -316,15 +307,7 @@ def read_bench_text(path: str | Path | None = None) -> tuple[str, str]:
 
 
 def parse_bench(text: str, source: str) -> Bench:
-    """Turn the text of a bench file into checked records.
-
-    Args:
-        text: TOML.
-        source: what to call it in error messages.
-
-    Raises:
-        BenchFileError: see :func:`load_bench`.
-    """
+    """Checked records of the text of a bench file; BenchFileError calls it ``source``."""
     document = parse_document(text, source)
     if "machine" in document:
         reason = "a machine for the analysis of recordings: nothing is driven or designed with it"
@@ -333,11 +316,7 @@ def parse_bench(text: str, source: str) -> Bench:
 
 
 def parse_document(text: str, source: str) -> dict[str, Any]:
-    """The tables of a bench file, unchecked.
-
-    Raises:
-        BenchFileError: the text is not TOML, or too large.
-    """
+    """The tables of a bench file, unchecked; BenchFileError if the text is not TOML, or too large."""
     try:
         return parse_toml(text)
     except ValueError as err:
@@ -345,16 +324,9 @@ def parse_document(text: str, source: str) -> dict[str, Any]:
 
 
 def checked_bench(document: Mapping[str, Any], text: str, source: str, *, driven: bool = True) -> Bench:
-    """The records of a bench file's tables.
+    """The records of a bench file's tables, with the text in which they stand; BenchFileError calls it ``source``.
 
-    Args:
-        document: the tables.
-        text: where they stand.
-        source: what to call it in error messages.
-        driven: False for a machine that is only analysed: the ceilings do not hold, and there may be no spring.
-
-    Raises:
-        BenchFileError: see :func:`load_bench`.
+    A machine that is not ``driven`` is only analysed: the ceilings do not hold, and there may be no spring.
     """
     found = read(_Document, document, source, BenchFileError, remedy=REMEDY, smallest=SMALLEST)
     try:
@@ -364,11 +336,6 @@ def checked_bench(document: Mapping[str, Any], text: str, source: str, *, driven
 
 
 def _checked(found: _Document, document: Mapping[str, Any], text: str, driven: bool) -> Bench:
-    """The records of a document whose values do not contradict each other.
-
-    Raises:
-        FieldError: they do.
-    """
     brake = BrakeParameters(**msgspec.structs.asdict(found.brake))
     shield = Shield(**msgspec.structs.asdict(found.shield))
     bench = Bench(

@@ -32,12 +32,7 @@ Keys = tuple[str | int, ...]  # Keys and indices that lead to a value
 
 
 class FieldError(ValueError):
-    """Raised by a record's ``__post_init__``: one of its values contradicts another.
-
-    Args:
-        key: of the record.
-        reason: what was expected and what came.
-    """
+    """Raised by a record's ``__post_init__``: the value of a key contradicts another."""
 
     def __init__(self, key: str, reason: str) -> None:
         super().__init__(reason)
@@ -106,11 +101,7 @@ def struct_of(*kinds: type[Any], **others: tuple[Any, Any]) -> Any:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The document of a text that nobody vouches for, read within bounds of time and memory.
-
-    Raises:
-        ValueError: the text is not TOML, or too large; the message says what is wrong with it.
-    """
+    """The document of a text of unknown origin, read within bounds of time and memory; else ValueError."""
     if text.startswith("\ufeff"):
         raise ValueError("it begins with a byte-order mark: save it as UTF-8 without one")
     if len(text) > MAX_TOML_BYTES:
@@ -160,11 +151,7 @@ class _Reader:
         self.missing: list[tuple[Keys, Any]] = []  # Required keys that are not there; then no record is made
 
     def convert(self, value: Any, kind: Any, keys: Keys) -> Any:
-        """A value as a type has it.
-
-        Raises:
-            _RefusedError: it does not fit.
-        """
+        """A value as a type has it; raises _RefusedError if it does not fit."""
         plain = get_args(kind)[0] if get_origin(kind) is Annotated else kind
         if get_origin(plain) in (Union, UnionType):
             kind = plain = next((one for one in get_args(plain) if _takes(one, value)), kind)

@@ -18,12 +18,7 @@ class Quantity(NamedTuple):
 
 
 def by_name(quantities: Sequence[Quantity], numbers: Sequence[float]) -> dict[str, dict[str, Any]]:
-    """Value, standard deviation, 95 % interval and unit of each quantity.
-
-    Args:
-        quantities: what is estimated, in order.
-        numbers: values, then standard deviations; none where nothing was estimated.
-    """
+    """Value, standard deviation, 95 % interval and unit of each quantity, by values that their deviations follow."""
     if not numbers:
         return {}
     count = len(quantities)

@@ -91,12 +91,9 @@ class Prediction(NamedTuple):
 
 
 def make_model(bench: Bench, ranges: Ranges, *, sticks: bool) -> Model:
-    """Prior knowledge of the filter on a bench. J and γ have their nominal values.
+    """Prior knowledge of the filter on a bench. J and γ have their nominal values; for ``sticks`` see :class:`Model`.
 
-    Args:
-        bench: nominal brake, noise, timing, limits, home.
-        ranges: of the parameters; each is taken to be uniform there: ±50 % have the variance 1/12.
-        sticks: see :attr:`Model.sticks`.
+    The other parameters are taken to be uniform in their ranges: ±50 % have the variance 1/12.
     """
     brake, t_s = bench.brake, bench.timing.sample_time
     return Model(
@@ -144,15 +141,10 @@ def start(model: Model) -> State:
 
 
 def follow(model: Model, state: State, angle: float, velocity: float, step: float, applied: float) -> State:
-    """Estimate with one more sample.
+    """Estimate with one more sample, measured [rad, rad/s].
 
-    Args:
-        model: from :func:`make_model`.
-        state: from :func:`start`, or after the samples before.
-        angle: measured [rad].
-        velocity: measured [rad/s].
-        step: of the sample; where it does not follow the last one, samples were lost.
-        applied: current that acted in the period that ends at the sample [A].
+    Samples were lost where its ``step`` does not follow the last one. The current ``applied`` acted in the period that
+    ends at the sample [A].
     """
     mean, p = predict(model, state, step - state.step, applied)
     row = p[0], p[1], p[2], p[3], p[4], p[5]
@@ -164,13 +156,9 @@ def follow(model: Model, state: State, angle: float, velocity: float, step: floa
 
 
 def predict(model: Model, state: State, periods: float, applied: float) -> tuple[Six, Packed]:
-    """Mean and covariance after a number of periods; unchanged if there are none.
+    """Mean and covariance after a number of periods, the last of them with the current ``applied`` [A].
 
-    Args:
-        model: from :func:`make_model`.
-        state: after the last sample.
-        periods: since then.
-        applied: current in the last of them [A].
+    They are unchanged if there are none.
     """
     mean, p = state.mean, state.covariance
     if periods <= 0.0:
@@ -224,15 +212,9 @@ def _deviation(variance: float, beyond: float, width: float, doubted: bool) -> f
 
 
 def slid(model: Model, mean: Six, p: Packed, applied: float, t: float, lost: float) -> Prediction:
-    """A step of forward Euler, as the brake with sign() moves.
+    """A step of forward Euler over ``t`` [s] with a current [A], as the brake with sign() moves.
 
-    Args:
-        model: from :func:`make_model`.
-        mean: of the unknowns.
-        p: their covariance.
-        applied: current [A].
-        t: duration [s].
-        lost: uncertainty of the velocity after lost samples [rad/s].
+    After lost samples the velocity is uncertain by ``lost`` [rad/s].
     """
     x, v, km, k1, tc, fv = mean
     toward = direction(v, p[6])
@@ -354,12 +336,7 @@ def _spread(p: Packed, to: Prediction) -> Packed:
 def _correct(mean: Six, p: Packed, row: Six, innovation: float, variance: float) -> tuple[Six, Packed, float]:
     """Mean and covariance after one measurement, and the square of its innovation over its variance.
 
-    Args:
-        mean: of the unknowns.
-        p: their covariance.
-        row: of it, of the unknown that is measured.
-        innovation: measured minus mean.
-        variance: of the innovation.
+    ``row``: that of the covariance for the unknown that is measured.
     """
     m0, m1, m2, m3, m4, m5 = mean
     p00, p01, p02, p03, p04, p05, p11, p12, p13, p14, p15, p22, p23, p24, p25, p33, p34, p35, p44, p45, p55 = p

@@ -37,12 +37,7 @@ def scale_of(bench: Bench, gain: float = 1.0) -> Scale:
 def current_for(model: Model, state: State, parameters: Four, speed: float, gain: float) -> float:
     """Current that takes the velocity to ``speed`` [rad/s], or ``gain`` of the way, within one period [A].
 
-    Args:
-        model: of the estimator.
-        state: estimate of the newest sample.
-        parameters: relative, within their ranges.
-        speed: to be reached [rad/s].
-        gain: share of the error that is removed.
+    The parameters are relative, within their ranges.
     """
     x, v, variance = state.mean[0], state.mean[1], state.covariance[6]
     km, k1, tc, fv = parameters
@@ -60,7 +55,7 @@ def share_after(switch: float, step: float, horizon: float) -> float:
 
 
 def follow_reference(model: Model, state: State, scale: Scale, levels: Any, switches: Any, step: float) -> float:
-    """Current for the period that begins now [A].
+    """Current for the period that begins now, at the sample ``step`` [A].
 
     Args:
         model: of the estimator.

@@ -41,11 +41,7 @@ class Assumptions(NamedTuple):
 
 
 def make_assumptions(bench: Bench) -> Assumptions:
-    """Prior knowledge for a bench, as its ``[shield]`` declares it.
-
-    Raises:
-        BenchFileError: an assumption does not hold there; the message names it.
-    """
+    """Prior knowledge for a bench; BenchFileError names an assumption that does not hold."""
     if reason := unmet_assumption(bench):
         raise BenchFileError(f"shield.learn: {reason}")
     return assumptions_of(bench)
@@ -76,11 +72,7 @@ def assumptions_of(bench: Bench) -> Assumptions:
 
 
 def unmet_assumption(bench: Bench) -> str:
-    """The first assumption of learning that does not hold on a bench; "" if all do.
-
-    Raises:
-        BenchFileError: it has no shield at all.
-    """
+    """The first assumption of learning that does not hold on a bench; "" if all do."""
     shield = bench.shield
     if shield.envelope != "braking":
         return "expected shield.envelope = 'braking': the argument does not cover a drive that coasts"

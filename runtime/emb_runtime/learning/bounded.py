@@ -74,14 +74,9 @@ def start(assumptions: Assumptions) -> State:
 
 
 def hear(assumptions: Assumptions, state: State, angle: float, velocity: float, applied: float) -> None:
-    """Take in a sample, one period after the one before, in place; one that is no number is lost.
+    """Take in a sample [rad, rad/s], one period after the one before, in place; one that is no number is lost.
 
-    Args:
-        assumptions: what is taken as true.
-        state: from :func:`start`, or after the samples before.
-        angle: measured [rad].
-        velocity: measured [rad/s].
-        applied: current that acted in the period that ends at the sample [A].
+    The current ``applied`` acted in the period that ends at the sample [A].
     """
     if not math.isfinite(angle + velocity + applied):
         lose(assumptions, state)
@@ -174,15 +169,8 @@ def _fastest(
 ) -> float:
     """Greatest velocity one period after [vl, vh]; a brake that would come to rest may stick.
 
-    Args:
-        t: period [s].
-        vl: least velocity [rad/s].
-        vh: greatest velocity [rad/s].
-        drive: of motor and spring, at most [rad/s²].
-        slowest: Coulomb friction, at least [rad/s²].
-        friction: at most [rad/s²].
-        lightest: viscous friction, at least [1/s].
-        thickest: at most [1/s].
+    Motor and spring have ``drive`` at most; friction lies within ``slowest`` and ``friction`` [rad/s²], viscous
+    friction within ``lightest`` and ``thickest`` [1/s].
     """
     if vh <= 0.0:
         return vh + t * (drive + friction - thickest * vh)

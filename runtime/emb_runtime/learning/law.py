@@ -22,10 +22,7 @@ PLANNED = 0.8
 def law_for(inputs: DesignInputs, nominal: BrakeParameters, known: Known) -> ShieldLaw:
     """The law for what is known, to be asked with the middle of the box of states as the measurement.
 
-    Args:
-        inputs: of the bench.
-        nominal: brake that the parameters are relative to.
-        known: brakes and states that are possible.
+    The parameters in ``known`` are relative to the ``nominal`` brake.
     """
     angle, velocity = middle(known)
     return law_between(
@@ -100,12 +97,7 @@ def law_between(
 ) -> ShieldLaw:
     """The law for every brake between these two, up to the angle at which they can all be held.
 
-    Args:
-        inputs: of the bench.
-        low: least parameters.
-        high: greatest parameters.
-        angle_noise: the angle is known to within this [rad].
-        velocity_noise: the velocity is known to within this [rad/s].
+    Angle and velocity are known to within ``angle_noise`` [rad] and ``velocity_noise`` [rad/s].
     """
     driving = inputs.current * low.k_m / high.J - inputs.shield.break_away * high.T_c / low.J - inputs.model_error
     part = Part(

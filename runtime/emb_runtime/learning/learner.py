@@ -23,15 +23,9 @@ LONGEST_KEPT: Final = 10
 
 
 class Learner:
-    """Learns while a run lasts, from its first sample on.
+    """Learns while a run lasts, from its first sample on; not ``active``, it learns nothing.
 
-    Args:
-        bench: with the assumptions.
-        whole: law for the whole set.
-        active: False for a run that learns nothing.
-
-    Raises:
-        BenchFileError: an assumption does not hold.
+    The law ``whole`` is that of the whole set. BenchFileError names an assumption that does not hold.
     """
 
     _heard: tuple[Assumptions, State]  # Prior knowledge and what was heard, from :meth:`begin` on

@@ -126,12 +126,7 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def read_contract(text: str) -> Contract:
-    """Read a contract of unknown origin.
-
-    Raises:
-        PolicyRefusedError: it is not JSON, has another schema, lacks a key, has one too many, or a value of the wrong
-            type or out of bounds.
-    """
+    """Read a contract of unknown origin; PolicyRefusedError says what is wrong with it."""
     if len(text) > MAX_JSON_CHARACTERS:
         raise PolicyRefusedError(f"contract: expected at most {MAX_JSON_CHARACTERS} characters, got {len(text)}")
     try:

@@ -21,11 +21,7 @@ TYPES = {"current": ("f", "tensor(float)"), "reference": ("d", "tensor(double)")
 
 
 class Inference:
-    """A graph.
-
-    Args:
-        data: the ONNX file.
-        contract: what its input and its output must be.
+    """A graph of an ONNX file, with the input and the output that its contract has.
 
     Raises:
         PolicyRefusedError: ONNX Runtime refuses it, or it has other inputs or outputs.
@@ -51,11 +47,7 @@ class Inference:
             bind(name, "cpu", 0, np.dtype(code), [1, len(ports[name])], ports[name].buffer_info()[0])
 
     def run(self) -> None:
-        """Compute the outputs of the inputs.
-
-        Raises:
-            PolicyRefusedError: ONNX Runtime could not.
-        """
+        """Compute the outputs of the inputs; PolicyRefusedError if ONNX Runtime could not."""
         try:
             self._session.run_with_iobinding(self._binding)
         except Exception as err:  # ONNX Runtime's errors have no public base class
@@ -63,11 +55,7 @@ class Inference:
 
 
 def open_session(data: bytes) -> ort.InferenceSession:
-    """A graph in ONNX Runtime, from a file's bytes.
-
-    Raises:
-        PolicyRefusedError: ONNX Runtime refuses it.
-    """
+    """A graph in ONNX Runtime, from a file's bytes; PolicyRefusedError if it refuses it."""
     import onnxruntime as ort  # takes its time, and most commands need none
 
     options = ort.SessionOptions()

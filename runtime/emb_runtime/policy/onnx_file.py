@@ -172,8 +172,7 @@ FIXED: Mapping[str, slice] = MappingProxyType(
 def require_bounded(graph: Graph) -> None:
     """Check that the graph's work does not depend on what it is given.
 
-    Raises:
-        PolicyRefusedError: it has another operator, or one that takes a size from a computation; the message names it.
+    PolicyRefusedError names another operator, or one that takes a size from a computation.
     """
     fixed = graph.tensors - {name for node in graph.nodes if node.operator != "Constant" for name in node.outputs}
     for node in graph.nodes:

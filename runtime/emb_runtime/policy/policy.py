@@ -56,16 +56,13 @@ class Policy:
         """Current for the period that begins at a sample [A]; finite and within limits only if the caller checks it.
 
         The speed loop cuts off every current at the limit. So a reference that is not finite gives NaN, and one beyond
-        ±1 a current beyond the contract's limit.
+        ±1 a current beyond the contract's limit. PolicyRefusedError if ONNX Runtime could not evaluate the graph.
 
         Args:
             angle: measured [rad].
             velocity: measured [rad/s].
             step: samples since the experiment began.
             estimator: with the sample taken in.
-
-        Raises:
-            PolicyRefusedError: ONNX Runtime could not evaluate the graph.
         """
         inputs, outputs = self._inference.inputs, self._inference.outputs
         if self._is_reference:
@@ -86,13 +83,9 @@ class Policy:
 
 
 def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
-    """Read and check a policy in this process: a shipped one, or one that was tried.
+    """Read and check a policy, by its path or its bytes, in this process: a shipped one, or one that was tried.
 
     A file of unknown origin goes through :func:`emb_runtime.policy.trial.admit_policy`.
-
-    Args:
-        source: path of the ONNX file, or its bytes.
-        bench: what it is to drive.
 
     Raises:
         UsageError: the file cannot be read.
@@ -132,11 +125,7 @@ def _difference(inference: Inference, contract: Contract) -> str:
 
 
 def read_policy(path: Path) -> bytes:
-    """Bytes of a policy file, one more than are allowed at most.
-
-    Raises:
-        UsageError: it cannot be read.
-    """
+    """Bytes of a policy file, one more than are allowed at most; UsageError if it cannot be read."""
     try:
         with open_regular(path) as file:
             return file.read(MAX_FILE_BYTES + 1)
@@ -145,11 +134,6 @@ def read_policy(path: Path) -> bytes:
 
 
 def _contract_text(graph: Graph) -> str:
-    """The contract in a file's metadata.
-
-    Raises:
-        PolicyRefusedError: there is none, or more than one.
-    """
     texts = [value for key, value in graph.texts if key == CONTRACT_KEY]
     if len(texts) != 1:
         raise PolicyRefusedError(

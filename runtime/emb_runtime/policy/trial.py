@@ -32,13 +32,9 @@ TIMEOUT = 300.0
 
 
 def admit_policy(source: str | Path | bytes, bench: Bench) -> Policy:
-    """A policy of unknown origin, tried and then loaded.
+    """A policy of unknown origin, by its path or its bytes, tried and then loaded.
 
     Where there are no processes of our own there is no brake either, only a simulated one: it is loaded untried.
-
-    Args:
-        source: path of the ONNX file, or its bytes.
-        bench: what it is to drive.
 
     Raises:
         UsageError: the file cannot be read, or no process can be started to try it.
@@ -52,11 +48,6 @@ def admit_policy(source: str | Path | bytes, bench: Bench) -> Policy:
 
 
 def _try(data: bytes, bench: Bench) -> None:
-    """Load a policy in a confined process.
-
-    Raises:
-        UsageError, PolicyRefusedError: see :func:`admit_policy`.
-    """
     document = {
         "policy": base64.b64encode(data).decode(),
         "bench": base64.b64encode(pickle.dumps(bench)).decode(),

@@ -32,12 +32,9 @@ class Decision(NamedTuple):
 
 
 def checked(requested: float, contract_limit: float) -> float:
-    """The policy's request [A], if it is finite and within its contract.
+    """The policy's request [A]; raises StopError if it is not finite, or beyond its contract.
 
     Finite is asked first: NaN passes ``min``, ``max`` and every comparison written the wrong way round.
-
-    Raises:
-        StopError: it is not finite, or beyond the contract.
     """
     if not math.isfinite(requested):
         raise StopError(Fault.POLICY_NOT_FINITE, f"it answered {requested}")

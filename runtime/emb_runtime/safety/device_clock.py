@@ -31,11 +31,7 @@ OFF_GRID: Final = 5  # Samples off the sampling grid, by a leaky count, that are
 
 
 class DeviceClock:
-    """Judges the device time of each sample.
-
-    Args:
-        period_ns: the sampling period [ns].
-    """
+    """Judges the device time of each sample, of a node with this sampling period."""
 
     _reference_ns: int
     _device_ns: int  # Of the last sample
@@ -55,11 +51,7 @@ class DeviceClock:
         self._first_ns = None
 
     def learn(self, device_ns: int, receive_ns: int) -> bool:
-        """Take a pair before arming.
-
-        Args:
-            device_ns: its device time [ns].
-            receive_ns: its arrival, monotonic [ns].
+        """Take a pair before arming: its device time and its arrival, monotonic [ns].
 
         Returns:
             False if it arrived earlier than the first one by more than the allowance: the first ones had piled up, or
@@ -74,15 +66,12 @@ class DeviceClock:
         return steady
 
     def time_problem(self, device_ns: int, receive_ns: int, seen_ns: int) -> str:
-        """Judge a sample after arming.
+        """Judge a sample after arming; gives :attr:`problem`.
 
         Args:
             device_ns: its device time [ns].
             receive_ns: its arrival by its stamp, which a step of the wall clock may make too early [ns].
             seen_ns: when it was in hand, monotonic, read after it had arrived [ns].
-
-        Returns:
-            :attr:`problem`.
         """
         if not self.problem:
             self._judge_grid(device_ns)

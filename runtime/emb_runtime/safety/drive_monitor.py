@@ -35,23 +35,15 @@ class DriveCheck(LeakyCount):
         self._oldest = 0  # place of the oldest of them
 
     def sent(self, counter: int, current: float) -> None:
-        """Remember a command.
-
-        Args:
-            counter: its alive counter, 0..14.
-            current: [A].
-        """
+        """Remember a command: its alive counter, 0..14, and its current [A]."""
         self._sent[counter] = current
 
     def current_problem(self, command_counter: int, applied: float) -> str:
-        """Judge what a sample reports of the period before it.
+        """Fault of the drive, once too many samples reported what is out of place; "" otherwise.
 
         Args:
-            command_counter: counter of the command that the node obeyed, 15 if none.
+            command_counter: counter of the command that the node obeyed in the period before, 15 if none.
             applied: the current that it measured [A].
-
-        Returns:
-            Fault of the drive, once there were too many reports out of place; "" otherwise.
         """
         if command_counter == NO_COUNTER:
             return self._judge_braking(applied)

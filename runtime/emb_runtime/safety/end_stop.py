@@ -20,9 +20,6 @@ def end_stop_speed(bench: Bench) -> float:
     stop, with the least friction, and with the spring that makes it worst: the stiffest on the way home, the softest on
     the way up.
     A computed worst case on that grid, in steps that leave friction out rather than in on the way home.
-
-    Raises:
-        BenchFileError: no shield can be made for this bench.
     """
     law = make_law(bench)
     if bench.node.stop == "damped" or law.coasting:
@@ -44,19 +41,12 @@ def end_stop_speed(bench: Bench) -> float:
 
 
 def released_speed(bench: Bench, hold: float) -> float:
-    """Bound on the speed of a brake whose drive holds its last current for a time, and then lets go [rad/s].
+    """Bound on the speed of a brake whose drive holds its last current for ``hold`` [s], and then lets go [rad/s].
 
     Let w² = v² + (γ k_1 / J) max(x, 0)²: twice the energy over the inertia. Motion and spring only exchange it and
     friction takes of it, so a current i raises w by |k_m i| / J a second at most, and without a current w never rises.
     So |v| <= w stays below the largest w inside the envelope plus what hold and lag of the current add: at every angle,
     the end stops among them, and for every brake of the shield's set.
-
-    Args:
-        bench: whose envelope the brake is in when it is held.
-        hold: [s].
-
-    Raises:
-        BenchFileError: no shield can be made for this bench.
     """
     law = make_law(bench)
     low, high = bench.limits.angle

@@ -115,34 +115,21 @@ class Guard:
         self.passed += 1
 
     def judge(self, sample: SensorSample) -> None:
-        """Hold what the drive reports against what was let out.
-
-        Raises:
-            StopError: it does not apply what it is commanded.
-        """
+        """Hold what the drive reports against what was let out; raises StopError if it does not apply that."""
         if problem := self._drive.current_problem(sample.command_counter, sample.applied_current):
             raise StopError(Fault.CURRENT_MISMATCH, problem)
 
     def learn_time(self, sample: SensorSample, *, first: bool) -> bool:
-        """Take a sample before arming as a reference of the two clocks.
+        """Take a sample before arming as a reference of the two clocks; with ``first`` those before it do not count.
 
-        Args:
-            sample: the newest.
-            first: the ones before it do not count.
-
-        Returns:
-            False if it cannot continue the reference, and begins a new one.
+        Gives False if it cannot continue the reference, and begins a new one.
         """
         if first:
             self._device_clock.restart()
         return self._device_clock.learn(sample.device_time_ns, sample.receive_time_ns)
 
     def judge_time(self, sample: SensorSample, seen_ns: int) -> None:
-        """Hold a sample's device time against this computer's.
-
-        Args:
-            sample: the newest.
-            seen_ns: when it was in hand, monotonic [ns].
+        """Hold a sample's device time against this computer's, monotonic, when it was in hand [ns].
 
         Raises:
             StopError: the node's clock is wrong; from then on no enabled command passes.

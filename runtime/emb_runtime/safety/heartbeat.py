@@ -29,13 +29,10 @@ _TRIPPED_AT, _SIGN_AT = 16, 17  # the watchdog's
 
 
 class Heartbeat:
-    """One end of the shared memory: the loop's or the watchdog's.
-
-    Args:
-        fd: file descriptor of the shared memory, from :meth:`create` or inherited from the creator.
+    """One end of the shared memory, by its file descriptor: the loop's or the watchdog's.
 
     Raises:
-        ValueError: the memory behind ``fd`` is not a heartbeat of this version.
+        ValueError: the memory is not a heartbeat of this version.
     """
 
     def __init__(self, fd: int) -> None:
@@ -52,14 +49,11 @@ class Heartbeat:
 
     @classmethod
     def create(cls, heartbeat: float, now_ns: int) -> Heartbeat:
-        """New shared memory: not armed, no command sent.
+        """New shared memory: not armed, no command sent; OSError if the system has none.
 
         Args:
             heartbeat: silence of the loop that trips the watchdog [s].
             now_ns: monotonic; counts as the watchdog's first sign of life [ns].
-
-        Raises:
-            OSError: the system has no memory for it.
         """
         fd = os.memfd_create("emb-heartbeat", os.MFD_CLOEXEC)
         os.ftruncate(fd, _SIZE)

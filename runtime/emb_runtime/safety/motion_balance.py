@@ -116,13 +116,7 @@ def balance_model(bench: Bench) -> BalanceModel:
 
 
 def begin(memory: Any, angle: float, velocity: float) -> None:
-    """Begin a run.
-
-    Args:
-        memory: shape [MEMORY], overwritten.
-        angle: first measurement [rad].
-        velocity: first measurement [rad/s].
-    """
+    """Begin a run with its first measurement, in a row of length MEMORY that is overwritten [rad, rad/s]."""
     for i in range(MEMORY):
         memory[i] = 0.0
     memory[ANGLE], memory[VELOCITY], memory[SPACING] = angle, velocity, STRIDE
@@ -132,7 +126,7 @@ def take(model: BalanceModel, memory: Any, follows: bool, angle: float, velocity
     """Take in one more sample.
 
     Args:
-        model: from :func:`balance_model`.
+        model: of the bench.
         memory: row of the run, changed.
         follows: it is the next sample, and the command acted between the two; else nothing is summed up.
         angle: measured [rad].
@@ -295,14 +289,10 @@ def _end_stretch(memory: Any) -> None:
 
 
 def _eliminate(memory: Any, work: int, solution: int, count: int, width: int) -> None:
-    """Solve symmetric equations by Gauss's elimination, in the row.
+    """Solve ``count`` symmetric equations by Gauss's elimination, in the row.
 
-    Args:
-        memory: row, changed.
-        work: place of the equations: upper triangle of ``count`` rows of ``width``, with the right side at the end.
-        solution: place of what solves them.
-        count: of the equations.
-        width: of a row.
+    At the place ``work`` lies their upper triangle, in rows of ``width`` with the right side at the end; what solves
+    them comes to the place ``solution``.
     """
     for i in range(count):
         top = work + i * width
@@ -319,13 +309,10 @@ def _eliminate(memory: Any, work: int, solution: int, count: int, width: int) ->
 
 
 def steady_motion(velocities: Sequence[float], deviation: float) -> float:
-    """Velocity that a node at rest goes on to measure [rad/s]; 0 if it measures none.
+    """Velocity that a node at rest goes on to measure [rad/s]; 0 if it measures none, or fewer than REST_SAMPLES times.
 
-    A brake without a current that moves is slowed down by friction, so that a velocity that stays is an error.
-
-    Args:
-        velocities: the last REST_SAMPLES measurements [rad/s]; of fewer nothing is said.
-        deviation: standard deviation of one [rad/s].
+    A brake without a current that moves is slowed down by friction, so that a velocity that stays is an error. The
+    ``deviation`` is that of one measurement.
     """
     if len(velocities) < REST_SAMPLES:
         return 0.0
@@ -337,11 +324,7 @@ def steady_motion(velocities: Sequence[float], deviation: float) -> float:
 
 
 class MotionBalance:
-    """The balance of one run.
-
-    Args:
-        bench: brake, noise, and what its shield declares.
-    """
+    """The balance of one run on a bench."""
 
     __slots__ = ("_memory", "_model")
 
@@ -354,19 +337,14 @@ class MotionBalance:
         begin(self._memory, sample.angle, sample.velocity)
 
     def take(self, sample: SensorSample, follows: bool) -> None:
-        """Take in one more sample; arguments are as for :func:`take`.
-
-        Raises:
-            StopError: the motion so far has no explanation.
-        """
+        """Take in one more sample, as :func:`take`; raises StopError if the motion so far has no explanation."""
         if take(self._model, self._memory, follows, sample.angle, sample.velocity, sample.applied_current):
             self.judge()
 
     def judge(self) -> tuple[float, float]:
-        """Unexplained velocity and what is allowed [rad/s]; the latter is infinite where nothing is judged.
+        """Unexplained velocity and what is allowed, infinite where nothing is judged [rad/s].
 
-        Raises:
-            StopError: it is more.
+        Raises StopError if it is more than that.
         """
         found = unexplained(self._model, self._memory)
         most = allowance(self._model, self._memory)
@@ -378,11 +356,7 @@ class MotionBalance:
         return found, most
 
     def judge_zero(self) -> None:
-        """Judge at the end of a run whether the spring begins at the zero of the angle.
-
-        Raises:
-            StopError: it does not.
-        """
+        """Raise StopError if the spring, at the end of a run, does not begin at the zero of the angle."""
         place, most = origin(self._model, self._memory)
         if abs(place) > most and allowance(self._model, self._memory) < math.inf:
             raise StopError(

@@ -59,13 +59,7 @@ MEMORY: Final = HIGHS + PERIODS  # Length of the row
 
 
 def begin(memory: Any, angle: float, velocity: float) -> None:
-    """Begin a run, without a current so far.
-
-    Args:
-        memory: shape [MEMORY], overwritten.
-        angle: first measurement [rad].
-        velocity: first measurement [rad/s].
-    """
+    """Begin a run with its first measurement and without a current, in a row of length MEMORY [rad, rad/s]."""
     for i in range(MEMORY):
         memory[i] = 0.0
     memory[ANGLE] = angle
@@ -140,13 +134,9 @@ def judge(
 
 
 def largest_current(law: ShieldLaw, limits: SensorThresholds, memory: Any, limit: float) -> float:
-    """Largest current that may be sent [A]: until the motion has shown its sign, what friction can stop if it is wrong.
+    """Largest current that may be sent, at most ``limit`` [A].
 
-    Args:
-        law: of the shield.
-        limits: the thresholds.
-        memory: row of the run.
-        limit: of the run [A].
+    Until the motion has shown its sign, it is what friction can stop if that is wrong.
     """
     if memory[OBEYS] != 0.0:
         return limit
@@ -160,14 +150,8 @@ def coasting_time(law: ShieldLaw, angle: float, velocity: float, unseen: float =
     """Time in which friction alone stops any brake of the set near the origin [s]; 0 where it may not.
 
     The signs of the sensors do not matter. Twice what the least friction takes of the measured speed, as the spring may
-    help the motion by half of it; and what it takes of all of the speed, with the help of the spring from here.
-
-    Args:
-        law: of the shield.
-        angle: measured [rad].
-        velocity: measured [rad/s].
-        unseen: from :func:`unseen_speed`. It only makes the wait longer: the limit of the first move has kept the
-            distance for it.
+    help the motion by half of it; and what it takes of all of the speed, with the help of the spring from here. What is
+    ``unseen``, by :func:`unseen_speed`, only makes the wait longer: the limit of the first move has kept the distance.
     """
     speed, friction = abs(velocity) + law.velocity_noise, law.friction_low
     now = abs(angle) + law.angle_noise
@@ -182,11 +166,6 @@ def unseen_speed(law: ShieldLaw, limits: SensorThresholds, memory: Any) -> float
     """Upper bound on the speed change not yet visible in the measurement [rad/s].
 
     Causes are frames that act late, a current that lags, and a velocity that an observer derives from the angle.
-
-    Args:
-        law: of the shield.
-        limits: the thresholds.
-        memory: row of the run.
     """
     speed = 0.0
     for i in range(law.age_high + 1):
@@ -338,12 +317,7 @@ def _judge_polarity(limits: SensorThresholds, memory: Any, velocity: float, cont
 
 
 class SensorMonitor:
-    """The monitor of one run.
-
-    Args:
-        law: of the shield.
-        limits: from :func:`~emb_runtime.safety.sensor_thresholds.sensor_thresholds`.
-    """
+    """The monitor of one run."""
 
     __slots__ = ("_law", "_limits", "_memory")
 
@@ -368,11 +342,7 @@ class SensorMonitor:
         return coasting_time(law, sample.angle, sample.velocity, unseen_speed(law, limits, memory))
 
     def check(self, elapsed: float, sample: SensorSample, obeyed: bool, command: float) -> None:
-        """Take one more sample; arguments are as for :func:`judge`.
-
-        Raises:
-            StopError: the sensors cannot be right.
-        """
+        """Take one more sample, as :func:`judge`; raises StopError if the sensors cannot be right."""
         verdict = judge(
             self._law, self._limits, self._memory, elapsed, sample.angle, sample.velocity, obeyed, command,
             sample.applied_current,

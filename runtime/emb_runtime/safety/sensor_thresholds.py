@@ -34,12 +34,7 @@ class SensorThresholds(NamedTuple):
 
 
 def sensor_thresholds(bench: Bench, law: ShieldLaw) -> SensorThresholds:
-    """Thresholds of a bench.
-
-    Args:
-        bench: noise and tolerances.
-        law: of its shield: set of brakes, sample time, largest errors of the sensors.
-    """
+    """Thresholds of a bench and the law of its shield."""
     ts, deviation = law.sample_time, bench.noise.velocity
     offset = TOLERATED_OFFSET * deviation
     # Of a random walk with the standard deviation s per step and the mean -m, P(it ever reaches h) < exp(-2 m h / s^2);

@@ -50,10 +50,10 @@ def shield(law: ShieldLaw, angle: float, velocity: float, wanted: float, past: P
     refuses such samples before they come here, and the node then brakes by itself.
 
     Args:
-        law: from :func:`emb_runtime.safety.shield_design.make_law`.
+        law: of the bench.
         angle: newest measurement [rad].
         velocity: newest measurement [rad/s].
-        wanted: what the policy asks for [A].
+        wanted: by the policy [A].
         past: the last own commands, newest first [A].
         step: index of this command in the experiment, 0 first.
 
@@ -76,17 +76,10 @@ def shield(law: ShieldLaw, angle: float, velocity: float, wanted: float, past: P
 
 
 def window(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[float, float]:
-    """The currents from which every brake of the set can still be held, whatever comes after them.
+    """Least and greatest current from which every brake of the set can still be held, whatever comes after them [A].
 
-    Args:
-        law: from :func:`emb_runtime.safety.shield_design.make_law`.
-        angle: newest measurement [rad].
-        velocity: newest measurement [rad/s].
-        past: the last own commands, newest first [A].
-
-    Returns:
-        Least and greatest current [A], both within the limit. They are the same where only full braking is left, and
-        where the measurement or an own command is NaN, infinite or absurd: then the damped stop, or 0 A.
+    Both are within the limit [A]. They are the same where only full braking is left, and where the measurement or an
+    own command is NaN, infinite or absurd: then the damped stop, or 0 A.
     """
     if not _believable(law, angle, velocity, past):
         blind = _blind_current(law, velocity)
@@ -165,13 +158,8 @@ def _lagging_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, 
 def _flowing(law: ShieldLaw, past: Past, slowest: float, sign: float) -> float:
     """Greatest current, times ``sign``, that may flow at the begin of this period [A].
 
-    Each of the last periods had the own command or, where that was lost, the node's damped stop; before, anything.
-
-    Args:
-        law: from :func:`emb_runtime.safety.shield_design.make_law`.
-        past: own commands.
-        slowest: least velocity now, times ``sign`` [rad/s].
-        sign: 1.0, or −1.0 for the least current.
+    Each of the last periods had the own command or, where that was lost, the node's damped stop; before, anything. The
+    least velocity now is ``slowest``, times ``sign``, which is −1 for the least current.
     """
     flowing = law.current
     for i in range(PAST - 1, -1, -1):
@@ -199,12 +187,12 @@ def _lagging_current(
     Against ``room``, full braking acts as if the brake were faster by motor · lag · (flowing + limit).
 
     Args:
-        law: from :func:`emb_runtime.safety.shield_design.make_law`.
+        law: of the bench.
         vl: least velocity now [rad/s].
         vh: greatest velocity now [rad/s].
         room: distance to the limit, at least [rad].
         speed: greatest velocity that any brake may reach [rad/s].
-        spring: what the clamping force takes from the motion, at least [rad/s²]; negative where it drives it.
+        spring: as of :func:`_highest_current` [rad/s²].
         flowing: greatest current now, positive where it drives [A].
         motor: k_m / J [rad/(s²·A)].
         braking: deceleration of the weakest brake with this motor [rad/s²].
@@ -253,10 +241,7 @@ def _rolled(
 def damped_current(velocity: float, limit: float, damping_velocity: float) -> float:
     """Damped stop: the current with which a node that gets no command brakes, against the speed up to the limit [A].
 
-    Args:
-        velocity: of the brake [rad/s].
-        limit: of the current [A].
-        damping_velocity: from which on it is the limit; infinite for a node that only lets go [rad/s].
+    It is the limit from ``damping_velocity`` on, which is infinite for a node that only lets go [rad/s].
     """
     return min(max(-limit * velocity / damping_velocity, -limit), limit)
 
@@ -282,18 +267,9 @@ def _now(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[flo
 def successor(
     law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, u: float
 ) -> tuple[float, float, float, float]:
-    """The box of states that any brake of the parameter box can reach in one sample.
+    """The box of states that any brake of the parameter box can reach in one sample with the current ``u`` [A].
 
-    Args:
-        law: from :func:`make_law`.
-        xl: least angle [rad].
-        xh: greatest angle [rad].
-        vl: least velocity [rad/s].
-        vh: greatest velocity [rad/s].
-        u: current during the sample [A].
-
-    Returns:
-        The same four bounds one sample later, for forward Euler and for the exact flow.
+    Four bounds [rad, rad/s] give the same four one sample later, for forward Euler and for the exact flow.
     """
     return _moved(law, xl, xh, vl, vh, u, u)
 
@@ -311,12 +287,7 @@ def _moved(
 def drives(law: ShieldLaw, xl: float, xh: float, u_low: float, u_high: float) -> tuple[float, float]:
     """Least and greatest acceleration by motor and spring that any brake of the set has within a sample [rad/s²].
 
-    Args:
-        law: from :func:`emb_runtime.safety.shield_design.make_law`.
-        xl: least angle at its begin [rad].
-        xh: greatest angle at its begin [rad].
-        u_low: least current during it [A].
-        u_high: greatest current during it [A].
+    Its angle begins within ``xl`` and ``xh`` [rad], and its current stays within ``u_low`` and ``u_high`` [A].
     """
     drive_high = max(law.motor_high * u_high, law.motor_low * u_high) - law.spring_low * max(xl - law.reach, 0.0)
     drive_low = min(law.motor_high * u_low, law.motor_low * u_low) - law.spring_high * max(xh + law.reach, 0.0)
@@ -339,16 +310,11 @@ def fastest_next(law: ShieldLaw, vl: float, vh: float, drive: float) -> float:
 
 
 def _highest_current(law: ShieldLaw, vl: float, vh: float, v: float, spring: float) -> float:
-    """Greatest current after which no brake is faster than ``v`` [A]. The inverse of :func:`fastest_next`.
+    """Greatest current after which no brake is faster than ``v``; full braking where that is negative [A].
 
-    For the lower limits it is called in mirrored velocities.
-
-    Args:
-        law: from :func:`emb_runtime.safety.shield_design.make_law`.
-        vl: least velocity now [rad/s].
-        vh: greatest velocity now [rad/s].
-        v: greatest velocity that the successor may have [rad/s]; full braking where it is negative.
-        spring: what the clamping force takes from the motion, at least [rad/s²]; negative where it drives it.
+    The inverse of :func:`fastest_next` for velocities within ``vl`` and ``vh``; for the lower limits it is called in
+    mirrored velocities. ``spring`` is what the clamping force takes from the motion, at least [rad/s²]; negative where
+    it drives it.
     """
     ts = law.sample_time
     if v < 0.0:

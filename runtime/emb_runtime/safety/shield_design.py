@@ -133,12 +133,7 @@ def damped_excess(motor: float, friction: float, current: float, damping_velocit
     within V/c − d/c² ln(1 + c V/d), sampled within V t_s more. Full braking takes V²/2(c V + d) + V t_s/2.
     The difference grows with the speed up to V and stays from there on; it falls with d.
 
-    Args:
-        motor: smallest k_m / J [rad/(s²·A)].
-        friction: smallest T_c / J [rad/s²].
-        current: limit [A].
-        damping_velocity: V [rad/s].
-        sample_time: t_s [s].
+    ``motor`` is the smallest k_m / J [rad/(s²·A)], ``friction`` the smallest T_c / J [rad/s²], ``current`` I the limit.
     """
     v = damping_velocity
     slope = motor * current / v
@@ -147,36 +142,25 @@ def damped_excess(motor: float, friction: float, current: float, damping_velocit
 
 
 def chatter_excess(friction_low: float, friction_high: float, sample_time: float) -> float:
-    """Largest way that forward Euler's sign() adds to a damped stop [rad].
+    """Largest way that forward Euler's sign() adds to a damped stop, with T_c/J within these bounds [rad].
 
     A brake that comes to rest under Euler is thrown to the other side, with up to w = t_s T_c/J, again and again with
     alternating signs. Stopping from w takes w²/2d + w t_s, and the alternating steps sum to less than 2 w t_s.
-
-    Args:
-        friction_low: smallest T_c / J [rad/s²].
-        friction_high: greatest T_c / J [rad/s²].
-        sample_time: t_s [s].
     """
     thrown = sample_time * friction_high
     return 0.5 * thrown * thrown / friction_low + 3.0 * thrown * sample_time
 
 
 def coasting_excess(spring: float, friction: float, viscous: float, stroke: float, sample_time: float) -> float:
-    """Largest way that forward Euler adds to that of a coasting brake [rad].
+    """Largest way that forward Euler adds to that of a coasting brake, in a free ``stroke`` [rad].
 
     An Euler step of t_s at the acceleration a adds t_s²/2 (a² + w v²) to the energy; viscous friction takes t_s d v².
     So energy is gained below a speed v* only, there t_s/2 ∫ a² dt = t_s/2 ∫ |a| d|v| ≤ t_s/2 · a · v* on each of the
-    way up, the way home and the end in the free stroke; friction turns energy into way.
+    way up, the way home and the end in the free stroke; friction turns energy into way. Infinite where viscous friction
+    takes less than Euler adds.
 
-    Args:
-        spring: stiffest w = γ k_1 / J [1/s²].
-        friction: smallest T_c / J [rad/s²].
-        viscous: smallest d = f_v / J [1/s].
-        stroke: free stroke [rad].
-        sample_time: t_s [s].
-
-    Returns:
-        The way; infinite where viscous friction takes less than Euler adds.
+    ``spring`` is the stiffest w = γ k_1 / J [1/s²], ``friction`` the smallest T_c / J [rad/s²], ``viscous`` the
+    smallest d = f_v / J [1/s].
     """
     taken = viscous - 0.5 * sample_time * spring
     if taken <= 0.0:
@@ -234,12 +218,6 @@ def law_of(inputs: DesignInputs, low: BrakeParameters, high: BrakeParameters, pa
     """The law for every brake between two, as far as there is one: nothing is checked here.
 
     A plain scalar function, so that training can compile it and narrow the set while an experiment runs.
-
-    Args:
-        inputs: from :func:`design_inputs`.
-        low: least parameters.
-        high: greatest parameters.
-        part: from :func:`whole`, or narrower.
     """
     shield, ts, current = inputs.shield, inputs.sample_time, inputs.current
     lag, age_high = shield.current_lag, shield.frame_age[1]

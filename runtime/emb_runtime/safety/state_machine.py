@@ -107,13 +107,7 @@ _WATCHED: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)  # States i
 
 
 def step(times: Timeouts, run: Run, event: Event | Fault, now_ns: int) -> Run:
-    """State of a run after an event.
-
-    Args:
-        times: from :func:`timeouts`.
-        run: state before.
-        event: the event.
-        now_ns: its time, monotonic [ns].
+    """State of a run after an event at a monotonic time [ns].
 
     Raises:
         ValueError: the event cannot happen in that state, which is an error in the program.
@@ -303,12 +297,7 @@ FAULTS: dict[Fault, FaultInfo] = {
 
 
 class StateMachine:
-    """A run's state, moved on by events; each change and each fault is recorded.
-
-    Args:
-        times: from :func:`timeouts`.
-        push_event: records an event: its time [ns], its code and a text.
-    """
+    """A run's state, moved on by events; each change and each fault is recorded: time [ns], code and text."""
 
     def __init__(self, times: Timeouts, push_event: Callable[[int, str, str], object]) -> None:
         self._times = times
@@ -316,11 +305,7 @@ class StateMachine:
         self.run = Run()
 
     def handle_event(self, event: Event, now_ns: int) -> None:
-        """Take an event.
-
-        Raises:
-            StopError: the run has failed by this event; whoever catches the error calls :meth:`fail`.
-        """
+        """Take an event; raises StopError if the run has failed by it: whoever catches the error latches the fault."""
         before, after = self.run, step(self._times, self.run, event, now_ns)
         if after.fault is not None and before.fault is None:
             raise StopError(after.fault, self._detail(before, now_ns))

@@ -70,7 +70,7 @@ class WatchdogHandle:
             transport: the loop's own, open. The process opens the same bus once more, for itself.
             bench: the bench.
             heartbeat: silence of the loop that trips it [s].
-            real_time: whether the process asks for real-time behaviour, above the loop's.
+            real_time: the process asks for real-time behaviour, above the loop's.
             timeout: longest wait [s].
 
         Raises:
@@ -101,11 +101,7 @@ class WatchdogHandle:
     def finish(self, timeout: float = FINISH_TIMEOUT) -> WatchdogResult:
         """End the process; if the loop has not disarmed, it sends the stop frames first.
 
-        Args:
-            timeout: longest wait for its report [s].
-
-        Returns:
-            Its report; a failure is reported there, never raised.
+        A failure is in its report, which is waited for at most ``timeout`` seconds, and never raised.
         """
         self._child.release()
         answer = self._child.answer(timeout)

@@ -57,14 +57,10 @@ class LoopStatus(StrEnum):
 
 
 class SilenceMonitor:
-    """Judges the loop's silence. Pure: time is handed in.
+    """Judges the loop's silence. Pure: monotonic times are handed in [ns].
 
     A silence as long as the heartbeat trips. If this process itself was delayed by more than two polls, the excess is
     not counted as loop silence, up to two heartbeats in all: that is the longest silence, plus the time of one poll.
-
-    Args:
-        heartbeat_ns: silence that trips [ns].
-        now_ns: monotonic [ns].
     """
 
     def __init__(self, heartbeat_ns: int, now_ns: int) -> None:
@@ -76,13 +72,10 @@ class SilenceMonitor:
         self._stolen_ns = 0
 
     def step(self, now_ns: int, beat_ns: int, armed: bool, gone: bool) -> LoopStatus:
-        """One look.
+        """Look once at a monotonic time, which is read after the loop's last sign of life, ``beat_ns`` [ns].
 
-        Args:
-            now_ns: monotonic, read after the other two [ns].
-            beat_ns: the loop's last sign of life, monotonic [ns]. One from the future is none: the memory is damaged.
-            armed: whether the loop is to be watched.
-            gone: whether its process has ended.
+        One from the future is none: the memory is damaged. ``armed``: the loop is to be watched; ``gone``: it has
+        ended.
         """
         gap_ns, self._look_ns = now_ns - self._look_ns, now_ns
         if gone:
