@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import make_problem
-from emb_bench.estimate.records import Estimate, EstimationProblem
+from emb_bench.estimate.records import EstimationProblem
 from emb_bench.estimate.windows import predict_windows
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment

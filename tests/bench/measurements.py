@@ -13,9 +13,10 @@ from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate, EstimationProblem
+from emb_bench.estimate.records import EstimationProblem
 from emb_bench.excitation import parse_excitation, run_excitation
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.instruments import MEMORY, measure, settle

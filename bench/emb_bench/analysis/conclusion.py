@@ -20,8 +20,9 @@ from emb_bench.analysis.drift import Drift
 from emb_bench.analysis.profile import Profile
 from emb_bench.analysis.recommendation import PRECISE
 from emb_bench.brake.motion import Floats
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.intervals import interval as with_profile
-from emb_bench.estimate.records import NORMAL_95, Estimate, Unknown
+from emb_bench.estimate.records import NORMAL_95, Unknown
 from emb_bench.information.identifiability import GROSS, Finding, Spectrum
 from emb_runtime.config.bench import PARAMETER_NAMES
 

@@ -18,7 +18,7 @@ from typing import Annotated
 import msgspec
 from scipy import special
 
-from emb_bench.estimate.records import Estimate
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.experiment.theta import MAX_JSON_BYTES
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text

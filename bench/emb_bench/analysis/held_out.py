@@ -18,12 +18,12 @@ import numpy as np
 from scipy import special
 
 from emb_bench.brake.motion import Floats
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.methods import refit
 from emb_bench.estimate.model_validation import taken
 from emb_bench.estimate.output_error import search, settled
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate
 from emb_bench.estimate.search import minimise
 from emb_bench.estimate.windows import predict_windows
 from emb_bench.experiment.experiment import Experiment
@@ -83,7 +83,7 @@ def leave_one_out(e: Estimate) -> tuple[HeldOut, ...]:
 def _predicted(e: Estimate, record: Experiment, level: float) -> HeldOut:
     if e.method == "windows":
         return _windows_predicted(e, record, level)
-    problem = Problem(e.bench, e.plant, replace(e.asked, prior=None), (record,))
+    problem = replace(e.problem, asked=replace(e.asked, prior=None), records=(record,))
     index = [i for i, unknown in enumerate(problem.unknowns) if unknown.record is None]
     start = problem.nominal()
     start[index] = e.values[e.shared()] / problem.units[index]
@@ -120,7 +120,7 @@ def _windows_predicted(e: Estimate, record: Experiment, level: float) -> HeldOut
 
     What a window was disturbed by is not in the parameters, so that their uncertainty is not released.
     """
-    error, chi2, freedom = predict_windows(Problem(e.bench, e.plant, e.asked, (record,)), e.values)
+    error, chi2, freedom = predict_windows(replace(e.problem, records=(record,)), e.values)
     p_value = float(special.chdtrc(freedom, chi2))
     return HeldOut(record.name, chi2, freedom, p_value, p_value >= level, error)
 

@@ -36,18 +36,11 @@ from scipy import optimize, special
 from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import REWEIGHTED, finished, most, search, settled
 from emb_bench.estimate.prediction import Problem, make_problem
-from emb_bench.estimate.records import (
-    NORMAL_95,
-    End,
-    Estimate,
-    EstimationProblem,
-    Unknown,
-    has_time_for_a_delay,
-    with_systematic,
-)
+from emb_bench.estimate.records import NORMAL_95, End, EstimationProblem, Unknown, has_time_for_a_delay, with_systematic
 from emb_bench.estimate.search import released
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.instruments import observer_gains
@@ -210,11 +203,6 @@ class Fit(NamedTuple):
         return finished(self.problem, self.z, self.weights, (self.end,))
 
 
-def problem_of(e: Estimate) -> Problem:
-    """The problem that an estimate answers."""
-    return Problem(e.bench, e.plant, e.asked, e.records)
-
-
 def _from_the_best(fits: Sequence[Fit]) -> list[Fit]:
     """Fits what does not explain the records once more, from the best of the others."""
     near = min(fits, key=lambda fit: fit.ratio)
@@ -265,7 +253,7 @@ def _fit(problem: Problem, known: Mapping[Unknown, float], follow: bool = False)
 def candidate(name: str, e: Estimate) -> Candidate:
     """A fitted model with its criteria."""
     samples = sum(int(record.measured.sum()) for record in e.records) * 2
-    deviance, count = _deviance(e), len(e.wanted())
+    deviance, count = _deviance(e.problem, e.z), len(e.wanted())
     return Candidate(
         name, e, deviance, deviance + 2.0 * count, deviance + count * math.log(samples), held_out_score(e, deviance)
     )
@@ -282,12 +270,7 @@ def ranked(candidates: Sequence[Candidate]) -> ModelChoice:
     )
 
 
-def _deviance(e: Estimate) -> float:
-    problem = problem_of(e)
-    return _deviance_at(problem, e.values / problem.units)
-
-
-def _deviance_at(problem: Problem, z: Floats) -> float:
+def _deviance(problem: Problem, z: Floats) -> float:
     """−2 log L of the samples, but for what all models share."""
     weights = problem.weights(z)
     errors, _ = problem.jacobian(z, weights)
@@ -315,28 +298,17 @@ def _observed(record: Experiment, bandwidth: float, t_s: float) -> float:
 
 def held_out_score(e: Estimate, deviance: float) -> float:
     """Logarithm of the density that the model gives to what was held out when it was fitted to the rest."""
-    whole = problem_of(e)
-    z = e.values / whole.units
-    volume = _volume(whole, z)
-    score = 0.0
-    for kept, part in _parts(e.records):
-        problem = Problem(e.bench, e.plant, e.asked, part)
-        start = problem.nominal()
-        for i, unknown in enumerate(problem.unknowns):
-            own = unknown if unknown.record is None else Unknown(unknown.name, kept[unknown.record])
-            start[i] = z[whole.unknowns.index(own)]
-        weights = problem.weights(start)
-        there, _ = search(problem, start, weights, WRONG)
-        score -= 0.5 * (deviance - _deviance_at(problem, there) + volume - _volume(problem, there))
+    volume, score, count = _volume(e.problem, e.z), 0.0, len(e.records)
+    for out in range(count):
+        if count > 1:
+            problem, own = e.problem.part([i for i in range(count) if i != out])
+        else:
+            half = e.records[0].until(max(len(e.records[0].currents) // 2, 1))
+            problem, own = replace(e.problem, records=(half,)), list(range(len(e.z)))
+        start = e.z[own]
+        there, _ = search(problem, start, problem.weights(start), WRONG)
+        score -= 0.5 * (deviance - _deviance(problem, there) + volume - _volume(problem, there))
     return score
-
-
-def _parts(records: Sequence[Experiment]) -> list[tuple[list[int], tuple[Experiment, ...]]]:
-    """The parts that are fitted to when the rest is held out: numbers of the records, and the records."""
-    if len(records) > 1:
-        left = [[i for i in range(len(records)) if i != out] for out in range(len(records))]
-        return [(kept, tuple(records[i] for i in kept)) for kept in left]
-    return [([0], (records[0].until(max(len(records[0].currents) // 2, 1)),))]
 
 
 def _volume(problem: Problem, z: Floats) -> float:

@@ -23,9 +23,10 @@ from emb_bench.analysis.model_choice import Candidate, ModelChoice, candidate, f
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EXACT, Plant
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate, EstimationProblem, check_model, with_systematic
+from emb_bench.estimate.records import EstimationProblem, check_model, with_systematic
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.errors import UsageError
 
@@ -186,7 +187,7 @@ def _problem(plant: Plant, asked: EstimationProblem, near: Estimate, names: Sequ
 
 def _judged(plant: Plant, e: Estimate, added: Sequence[str]) -> Candidate:
     name = " + ".join((plant.name, *added))
-    found = candidate(name, replace(e, plant=replace(e.plant, name=name)))
+    found = candidate(name, replace(e, problem=replace(e.problem, plant=replace(e.plant, name=name))))
     return replace(found, bic=found.bic + 2.0 * math.log(math.comb(len(ADDITIONS), len(added))))
 
 
@@ -202,7 +203,7 @@ def _polished(plant: Plant, asked: EstimationProblem, found: Candidate, names: S
     """The model searched once more from around its minimum, in case that is a local one."""
     e, rng = found.estimate, np.random.default_rng(seed)
     problem = _problem(plant, asked, e, names)
-    near = [replace(e, values=e.values * (1.0 + AROUND * rng.standard_normal(len(e.values)))) for _ in range(POLISHED)]
+    near = [replace(e, z=e.z * (1.0 + AROUND * rng.standard_normal(len(e.z)))) for _ in range(POLISHED)]
     fits = [fit_from(problem, e, follow=True), *(fit_from(problem, start) for start in near)]
     best = min(fits, key=lambda fit: fit.end.cost)
     return _judged(plant, best.finished(), names) if best.end.cost < e.ends[0].cost - 1e-3 else found

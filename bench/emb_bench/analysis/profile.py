@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import NORMAL_95, Estimate, searched
+from emb_bench.estimate.records import NORMAL_95, searched
 from emb_bench.estimate.search import minimise
 from emb_bench.information.identifiability import GROSS
 from emb_runtime.errors import UsageError
@@ -139,8 +140,7 @@ def profile(e: Estimate, label: str) -> Profile:
     if label not in e.labels:
         raise UsageError(f"no profile of '{label}': expected one of {', '.join(e.labels)}")
     i = e.labels.index(label)
-    problem = Problem(e.bench, e.plant, e.asked, e.records)
-    start = np.clip(e.values / problem.units, *problem.bounds)
+    problem, start = e.problem, np.clip(e.z, *e.problem.bounds)
     weights = problem.weights(start)
     z, end = search(problem, start, weights)
     found = end.cost

@@ -17,9 +17,10 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate, Unknown
+from emb_bench.estimate.records import Unknown
 from emb_bench.excitation import parse_excitation, run_excitation
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.criteria import criteria
@@ -127,7 +128,7 @@ def _information(e: Estimate, text: str) -> Floats:
     samples = np.zeros((len(played.currents), 2))
     slack = max(record.slack for record in e.records)
     record = Experiment(text, played.currents, samples, instruments.encoder_offset, 0.0, slack, True)
-    problem = Problem(bench, e.plant, replace(e.asked, prior=None), (record,))
+    problem = replace(e.problem, asked=replace(e.asked, prior=None), records=(record,))
     own = [i for i, unknown in enumerate(problem.unknowns) if unknown.record is None]
     values = dict(zip(e.unknowns, e.values.tolist(), strict=True)) | {
         Unknown(name): value for name, value in brake._asdict().items()

@@ -23,20 +23,12 @@ from emb_bench.analysis.recommendation import Recommendation, advise
 from emb_bench.analysis.several_runs import Differing, apart
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY, Plant
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.intervals import union
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import SAME
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import (
-    DONE,
-    STARTS,
-    End,
-    Estimate,
-    EstimationProblem,
-    Suspect,
-    Unknown,
-    with_systematic,
-)
+from emb_bench.estimate.records import DONE, STARTS, End, EstimationProblem, Suspect, Unknown, with_systematic
 from emb_bench.experiment.evaluation import default_model, other_sample_time
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment

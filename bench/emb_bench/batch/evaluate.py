@@ -13,7 +13,8 @@ import numpy as np
 
 from emb_bench.batch.row import NONE, Options, Parameter, Row, Source, failed, is_relative, one_line, printable
 from emb_bench.config.bench import Bench, parse_bench
-from emb_bench.estimate.records import Estimate, EstimationProblem, with_systematic
+from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment

@@ -17,9 +17,10 @@ from emb_bench.brake.parameters import FEATURES, SI
 from emb_bench.commission.records import CurrentCheck, FirstMove, Identification, Rest
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Instruments, Mechanics, Plant
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import NORMAL_95, Estimate, EstimationProblem, with_systematic
+from emb_bench.estimate.records import NORMAL_95, EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Booleans, Experiment, Floats
 from emb_bench.experiment.from_log import read_experiment, step_of
 from emb_bench.logs.log import RunLog, read_log
@@ -221,7 +222,7 @@ def _grown(e: Estimate, prior: Ranges) -> Estimate:
         if e.validation.fits or not 0.0 < jitter <= MOST_JITTER:
             return e
         shaken = replace(e.plant, instruments=e.plant.instruments._replace(clock_jitter=jitter))
-        fitted = fit_from(Problem(e.bench, shaken, e.asked, e.records), e).finished()
+        fitted = fit_from(replace(e.problem, plant=shaken), e).finished()
         if not (fitted.validation.fits or fitted.validation.ratio < e.validation.ratio):
             return e
         e = fitted

@@ -20,10 +20,11 @@ from scipy.optimize import lsq_linear
 
 from emb_bench.brake.motion import Floats, is_plain
 from emb_bench.config.plants import EXACT
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.output_error import finished, sandwich
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import End, Estimate
+from emb_bench.estimate.records import End
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.instruments import observer_noise
 from emb_runtime.config.bench import PARAMETER_NAMES

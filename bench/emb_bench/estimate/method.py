@@ -11,8 +11,9 @@ from emb_bench.brake.parameters import command, quantity
 from emb_bench.config.bench import Bench
 from emb_bench.config.machine import CURRENT
 from emb_bench.config.plants import Plant
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.prediction import Problem, make_problem
-from emb_bench.estimate.records import STARTS, Estimate, EstimationProblem
+from emb_bench.estimate.records import STARTS, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.errors import UsageError
 

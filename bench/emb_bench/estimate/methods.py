@@ -9,8 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.method import Method
-from emb_bench.estimate.records import METHODS, Estimate, Unknown
+from emb_bench.estimate.records import METHODS
 from emb_runtime.errors import UsageError
 
 
@@ -51,16 +54,11 @@ def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
         chosen: numbers of records, any of them as often as it is to count.
     """
     from emb_bench.estimate.output_error import finished, search, settled
-    from emb_bench.estimate.prediction import Problem
 
-    records = tuple(e.records[i] for i in chosen)
+    problem, own = e.problem.part(chosen)
     if e.method != "oem":
-        return method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit(records)
-    problem = Problem(e.bench, e.plant, e.asked, records)
-    known = dict(zip(e.unknowns, e.values.tolist(), strict=True))
-    start = problem.started(
-        {u: known[Unknown(u.name, None if u.record is None else chosen[u.record])] for u in problem.unknowns}
-    )
+        return method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit(problem.records)
+    start = np.clip(e.z[own], *problem.bounds)
     weights = problem.weights(start)
     problem, z, end = settled(problem, *search(problem, start, weights), weights)
     return finished(problem, z, weights, (end,), validation=e.validation)

@@ -29,7 +29,7 @@ from scipy import special
 
 from emb_bench.brake.motion import Floats
 from emb_bench.config.machine import Machine
-from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.prediction import Marginal, Problem, by_record
 from emb_bench.estimate.records import Independence, ModelValidation, Suspect, Whiteness, chance
 from emb_bench.estimate.suspects import Scores, Shown, Simulated, explained, score, shown_as
 
@@ -69,12 +69,9 @@ def examine(
     problem: Problem,
     z: Floats,
     weights: Sequence[Floats],
-    residuals: Sequence[Floats],
-    jacobian: Floats,
+    found: Marginal,
     disturbance: Disturbance | None = None,
     shown: Shown | None = None,
-    errors: Floats | None = None,
-    gaps: Floats | None = None,
 ) -> ModelValidation:
     """Compare the residuals at an estimate with what the right model would leave.
 
@@ -82,22 +79,19 @@ def examine(
         problem: records and model.
         z: the estimate.
         weights: inverse standard deviations of the samples of each record, zero where one does not count.
-        residuals: of each record, in standard deviations, zero where a sample does not count, shape (n, 2).
-        jacobian: derivatives of all residuals, samples first, shape (m, len(z)).
+        found: all residuals and their derivatives.
         disturbance: of an estimator that whitens the residuals.
         shown: what is shown at the estimate; the simulation without.
-        errors: all residuals, samples first, where some are of no sample, shape (m,).
-        gaps: orthonormal basis of what the unknown currents of gaps have explained already, shape (m, gaps).
     """
     counts = np.concatenate([root.ravel() for root in weights]) > 0.0
-    e = np.concatenate([r.ravel() for r in residuals])
-    every = e if errors is None else errors
-    model, whole = _basis(jacobian[: len(every)]), float(every @ every)
+    every, residuals = found.residuals, by_record(found.residuals, weights)
+    e = every[: len(counts)]
+    model, whole = _basis(found.jacobian), float(every @ every)
     freedom = int(counts.sum()) - model.shape[1]
-    if gaps is not None and gaps.shape[1]:
-        freedom -= taken(gaps, len(e))
-        model = np.concatenate([model, gaps], axis=1)
-        whole -= float(np.sum(every[len(every) - gaps.shape[1] :] ** 2))
+    if found.basis.shape[1]:
+        freedom -= taken(found.basis, len(e))
+        model = np.concatenate([model, found.basis], axis=1)
+        whole -= float(np.sum(every[len(every) - found.basis.shape[1] :] ** 2))
     freedom = max(freedom, 1)
     chi2 = float(e @ e)
     share = _share(disturbance)
@@ -109,7 +103,7 @@ def examine(
     independence = {OUTPUTS[n]: _independence(problem, n, every, whole, counts, model, freedom) for n in outputs}
     seen = shown or Simulated(problem, z, weights)
     disturbed = disturbance is not None and disturbance.p_value < share
-    scores = score(problem, z, every, jacobian[: len(every)], model, seen, chi2 / freedom, disturbed=disturbed)
+    scores = score(problem, z, every, found.jacobian, model, seen, chi2 / freedom, disturbed=disturbed)
     chi2_p = float(special.chdtrc(freedom, chi2))
     together = Independence(scores.statistic, scores.p_value, 0.0, 0) if scores.suspects else None
     alarms, notes, suspected = _words(

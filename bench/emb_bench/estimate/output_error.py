@@ -29,10 +29,11 @@ from numpy.typing import NDArray
 from scipy import special
 
 from emb_bench.brake.motion import Floats
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import LEVEL, examine
-from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import End, Estimate, ModelValidation
+from emb_bench.estimate.prediction import Marginal, Problem, by_record
+from emb_bench.estimate.records import End, ModelValidation
 from emb_bench.estimate.search import EVALUATIONS, minimise, released
 from emb_bench.information.identifiability import Spectrum
 from emb_runtime.errors import UsageError
@@ -43,7 +44,6 @@ MOST = 0.01  # Largest share of the samples that is left out
 SAME = 1.0  # Searches whose weighted sums of squares differ by less ended in the same minimum: a shift of one sigma
 REWEIGHTED = 3  # Rounds in which the weights follow the motion, where the clock jitters
 LEFT_OUT = 3  # Most times that outliers are looked for
-_NEAR_BOUND = 1e-6  # share of the width of what is searched
 
 
 class OutputError(Method):
@@ -271,7 +271,7 @@ def finished(
     z: Floats,
     weights: Sequence[Floats],
     ends: tuple[End, ...],
-    parts: tuple[Floats, Floats] | None = None,
+    found: Marginal | None = None,
     validation: ModelValidation | None = None,
     **more: Any,
 ) -> Estimate:
@@ -282,62 +282,24 @@ def finished(
         z: the estimate.
         weights: inverse standard deviations of the samples of each record.
         ends: of the local searches.
-        parts: residuals and their derivatives at ``z``, where they are not those of the simulation.
+        found: residuals at ``z``, where they are not those of the simulation.
         validation: from these.
         more: further fields of the estimate.
     """
-    found = problem.marginal(z, weights) if parts is None else None
-    errors, jacobian = (found.residuals, found.jacobian) if found is not None else parts or (np.zeros(0), np.zeros(0))
-    residuals = by_record(errors, weights)
-    scale = problem.scale(z)
-    relative = jacobian * scale
+    found = found or problem.marginal(z, weights)
+    residuals, scale = by_record(found.residuals, weights), problem.scale(z)
+    relative = found.jacobian * scale
     information = relative.T @ relative
     fields = {
         "information": information,
         "prior": np.diag((problem.belief[1] * scale) ** 2) if problem.belief[1].any() else None,
-        "sandwich": sandwich(information, relative, errors, [len(r) for r in residuals]),
-        "validation": validation
-        or examine(
-            problem, z, weights, residuals, jacobian, errors=errors, gaps=None if found is None else found.basis
-        ),
+        "sandwich": sandwich(information, relative, found.residuals, [len(r) for r in residuals]),
+        "validation": validation or examine(problem, z, weights, found),
         "ends": ends,
         "caveats": of_losses(problem),
         "residuals": tuple(np.where(root > 0.0, r, np.nan) for r, root in zip(residuals, weights, strict=True)),
     }
-    return estimate_at(problem, z, **fields | more)
-
-
-def estimate_at(problem: Problem, z: Floats, **fields: Any) -> Estimate:
-    """Estimate with the values ``z`` of a problem's unknowns, and which of them are at a bound.
-
-    Args:
-        problem: records, model and unknowns.
-        z: the estimate.
-        fields: what else is known of it.
-    """
-    low, high = problem.bounds
-    near = np.minimum(z - low, high - z) <= _NEAR_BOUND * (high - low)
-    made = Estimate(
-        bench=problem.bench,
-        plant=replace(problem.plant, mechanics=problem.mechanics(z)),
-        records=problem.records,
-        asked=problem.asked,
-        unknowns=problem.unknowns,
-        theta=problem.theta(z),
-        values=z * problem.units,
-        at_bound=(),
-        **fields,
-    )
-    return replace(made, at_bound=tuple(made.label(u) for u, n in zip(problem.unknowns, near, strict=True) if n))
-
-
-def by_record(errors: Floats, weights: Sequence[Floats]) -> list[Floats]:
-    """The residuals of each record's samples, shape (n, 2), from all of them in one row."""
-    residuals, used = [], 0
-    for root in weights:
-        residuals.append(errors[used : used + root.size].reshape(root.shape))
-        used += root.size
-    return residuals
+    return Estimate(problem.solved(z), z, **fields | more)
 
 
 def sandwich(information: Floats, jacobian: Floats, errors: Floats, lengths: Sequence[int]) -> Floats:

@@ -169,6 +169,16 @@ class Problem:
             found.setdefault("stribeck_velocity", PARAMETERS["stribeck_velocity"].start)
         return m._replace(**found)
 
+    def solved(self, z: Floats) -> Problem:
+        """The problem whose plant has the features of ``z``."""
+        return replace(self, plant=replace(self.plant, mechanics=self.mechanics(z)))
+
+    def part(self, kept: Sequence[int]) -> tuple[Problem, list[int]]:
+        """The problem of some of the records, any of them as often as it is to count, and the elements of z it has."""
+        problem = replace(self, records=tuple(self.records[i] for i in kept))
+        own = [Unknown(u.name, None if u.record is None else kept[u.record]) for u in problem.unknowns]
+        return problem, [self.unknowns.index(unknown) for unknown in own]
+
     def columns(self, record: int) -> list[int]:
         """Indices of the elements of z that a record depends on."""
         return [i for i, u in enumerate(self.unknowns) if u.record in (None, record)]
@@ -388,6 +398,12 @@ class Problem:
         residuals.append((mean - z)[believed] * inverse[believed])
         rows.append(-np.diag(inverse)[believed])
         return np.concatenate(residuals), np.concatenate(rows)
+
+
+def by_record(errors: Floats, weights: Sequence[Floats]) -> list[Floats]:
+    """The residuals of each record's samples, shape (n, 2), from all of them in one row."""
+    ends = np.cumsum([root.size for root in weights])
+    return [part.reshape(root.shape) for part, root in zip(np.split(errors, ends), weights, strict=False)]
 
 
 def make_problem(bench: Bench, plant: Plant, records: Sequence[Experiment], asked: EstimationProblem) -> Problem:

@@ -21,12 +21,12 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from emb_bench.brake.motion import Floats
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.innovations import Filter, Followed
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import Disturbance, examine
-from emb_bench.estimate.output_error import by_record, finished, of_losses, start_points
-from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import Estimate
+from emb_bench.estimate.output_error import finished, of_losses, start_points
+from emb_bench.estimate.prediction import Marginal, Problem
 from emb_bench.estimate.search import converge, strong, strong_load
 
 POWERS = {"walk": range(2, -7, -1), "load": range(0, -5, -1)}
@@ -59,16 +59,15 @@ class PredictionError(Method):
         weights = problem.weights(best)
         gains = found.gains(best, weights)
         errors, jacobian = found.jacobian(best, weights, gains)
-
-        shown = Followed(found, best, weights, gains)
-        disturbance, residuals = Disturbance(found.walk, found.load, ratio), by_record(errors, weights)
-        validation = examine(problem, best, weights, residuals, jacobian, disturbance, shown, errors)
+        innovations = Marginal(errors, jacobian, np.zeros((len(errors), 0)))
+        disturbance, shown = Disturbance(found.walk, found.load, ratio), Followed(found, best, weights, gains)
+        validation = examine(problem, best, weights, innovations, disturbance, shown)
         return finished(
             problem,
             best,
             weights,
             tuple(end for _, end in searches),
-            (errors, jacobian),
+            innovations,
             validation,
             method="pem",
             process_noise=found.walk,

@@ -33,11 +33,12 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import OF_A_RECORD
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import examine
-from emb_bench.estimate.output_error import by_record, estimate_at, start_points
+from emb_bench.estimate.output_error import start_points
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import NORMAL_95, WINDOW, End, Estimate, ModelValidation
+from emb_bench.estimate.records import NORMAL_95, WINDOW, End, ModelValidation
 from emb_bench.estimate.search import EVALUATIONS, minimise
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Spectrum
@@ -269,8 +270,8 @@ def _finished(
     information, scores, scale = _sums(problem, at.shared, linearised(cut, at, weights))
     changes = [change / scale for change in moved]
     covariance = by_windows(information, scores, follows_on(cut))
-    return estimate_at(
-        problem,
+    return Estimate(
+        problem.solved(at.shared),
         at.shared,
         information=information,
         prior=None,
@@ -290,8 +291,7 @@ def _validated(cut: Sequence[Problem], at: Point, weights: Sequence[Floats]) -> 
     chosen = sorted({round(k) for k in np.linspace(0, count - 1, min(count, few_enough)).tolist()})
     few = replace(cut[0], records=tuple(cut[i].records[0] for i in chosen))
     z, roots = np.concatenate([at.shared, at.starts[chosen].T.ravel()]), [weights[i] for i in chosen]
-    errors, jacobian = few.jacobian(z, roots)
-    return examine(few, z, roots, by_record(errors, roots), jacobian, errors=errors)
+    return examine(few, z, roots, few.marginal(z, roots))
 
 
 def _residuals(problem: Problem, cut: Sequence[Problem], at: Point, weights: Sequence[Floats]) -> tuple[Floats, ...]:

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from emb_bench.analysis.acceptance import Acceptance, Criteria, Result, RunFacts, judge
 from emb_bench.analysis.drift import Earlier
-from emb_bench.analysis.model_choice import problem_of
 from emb_bench.analysis.study import Stop, Study, StudyOptions, begun_with, make_study, stop_of
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.prediction import Problem, too_few
-from emb_bench.estimate.records import DONE, Estimate
+from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.prediction import too_few
+from emb_bench.estimate.records import DONE
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs import timing
@@ -258,8 +258,7 @@ def _run(
 
 
 def _predicted(e: Estimate, number: int) -> NDArray[np.float64]:
-    whole, problem = problem_of(e), Problem(e.bench, e.plant, e.asked, (e.records[number],))
-    return problem.predict((e.values / whole.units)[whole.columns(number)], 0).shown
+    return e.problem.predict(e.z, number).shown
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ import numpy as np
 
 from emb_bench.analysis.study import Study, file_names
 from emb_bench.documents import to_json
-from emb_bench.estimate.records import METHODS, Estimate
+from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.records import METHODS
 from emb_bench.estimate.suspects import explained
 from emb_bench.information.identifiability import schur_complement
 from emb_bench.numbers import signed

@@ -11,8 +11,8 @@ import numpy as np
 from emb_bench.analysis.profile import LEVEL, Profile
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import angle, command, velocity
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.model_validation import OUTPUTS
-from emb_bench.estimate.records import Estimate
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.figures import COLOURS, DASHED, GREY, svg
 from emb_bench.numbers import SMALL

@@ -18,7 +18,8 @@ if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.profile import OpenSide, Profile
     from emb_bench.analysis.recommendation import Recommendation
     from emb_bench.analysis.study import Stop, Study
-    from emb_bench.estimate.records import Contribution, Estimate
+    from emb_bench.estimate.estimate import Estimate
+    from emb_bench.estimate.records import Contribution
     from emb_bench.experiment.evaluation import Evaluation
     from emb_bench.information.identifiability import Direction, Finding, Identifiability
     from emb_bench.report.content import Content, Run
@@ -143,7 +144,7 @@ def models(study: Study) -> str:
 
 def limit(effect: Contribution, e: Estimate) -> str:
     """Effect that limits an interval most, with the prior of one that all runs share."""
-    from emb_bench.estimate.records import OF_THE_BENCH
+    from emb_bench.estimate.estimate import OF_THE_BENCH
     from emb_bench.estimate.suspects import shown_as
 
     name, shared = shown_as(effect, e.bench.machine).name, effect.name in OF_THE_BENCH

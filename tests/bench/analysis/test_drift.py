@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from emb_bench.analysis.drift import Doubt, Earlier, drifts, read_last
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.records import Estimate
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.experiment.theta import MAX_JSON_BYTES
 from emb_bench.report.sentences import drift as sentence
 from emb_runtime.config.bench import PARAMETER_NAMES

@@ -9,7 +9,8 @@ from scipy import stats
 
 from emb_bench.analysis.held_out import held_out, leave_one_out
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.records import Estimate, EstimationProblem
+from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.open_loop import simulate
 

@@ -9,8 +9,9 @@ from scipy.optimize import minimize_scalar
 
 from emb_bench.analysis.profile import LEVEL, profile
 from emb_bench.config.bench import Bench
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import NORMAL_95, Estimate, EstimationProblem
+from emb_bench.estimate.records import NORMAL_95, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES
 
@@ -114,7 +115,7 @@ def test_a_profile_that_comes_upon_a_lower_minimum_says_that_the_estimate_was_a_
     current = 1.5 * bench.brake.T_c / bench.brake.k_m
     data = record(bench, bench.plant("exact"), np.full(60, current))
     found = estimated(bench, [data], "T_c")
-    stuck = replace(found, values=2.0 * found.values)
+    stuck = replace(found, z=2.0 * found.z)
     good, bad = profile(found, "T_c"), profile(stuck, "T_c")
     assert good.fell == 0.0
     assert bad.fell > 0.0

@@ -9,7 +9,8 @@ import pytest
 from emb_bench.analysis.recommendation import HELPS, PRECISE, advise
 from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.records import Estimate, EstimationProblem
+from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.records import EstimationProblem
 from emb_bench.excitation import parse_excitation, run_excitation
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import fisher

@@ -14,7 +14,8 @@ from emb_bench.analysis.study import ModelStanding, StudyOptions, make_study
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
 from emb_bench.config.bench import Bench, parse_bench
-from emb_bench.estimate.records import Estimate, EstimationProblem
+from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document, text

@@ -8,8 +8,9 @@ import pytest
 from scipy import stats
 
 from emb_bench.config.bench import Bench, load_bench
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
-from emb_bench.estimate.records import DRIFTS, NORMAL_95, Estimate, EstimationProblem, with_systematic
+from emb_bench.estimate.records import DRIFTS, NORMAL_95, EstimationProblem, with_systematic
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES
 

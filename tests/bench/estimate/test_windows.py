@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from emb_bench.config.bench import Bench, parse_bench
+from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import make_problem
-from emb_bench.estimate.records import Estimate, EstimationProblem
+from emb_bench.estimate.records import EstimationProblem
 from emb_bench.estimate.windows import begun_at, by_windows, linearised, predict_windows, weights_of, windowed
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.recordings.map_file import parse_map

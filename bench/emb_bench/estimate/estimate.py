@@ -1,0 +1,179 @@
+"""An estimate: values of the unknowns of a problem, with their information, covariance and tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from emb_bench.brake.motion import Floats
+from emb_bench.brake.parameters import Quantity, quantity, scale
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import Plant
+from emb_bench.estimate.intervals import deviations, unnoticed
+from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.records import (
+    ANGLE_SCALE,
+    NORMAL_95,
+    Contribution,
+    End,
+    EstimationProblem,
+    ModelValidation,
+    Unknown,
+)
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
+from emb_runtime.config.bench import BrakeParameters
+
+NEAR_BOUND = 1e-6  # Share of what is searched within which an unknown is at its border
+OF_THE_BENCH = ("J", ANGLE_SCALE)  # Effects that all runs on one bench share
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Parameters from records."""
+
+    problem: Problem  # Its plant has the features that were estimated
+    z: Floats  # The unknowns, scaled as in ``problem``
+    information: Floats  # Physical FIM at the estimate, prior included, relative parameters
+    prior: Floats | None  # The prior's part of it
+    sandwich: Floats
+    """Covariance from the residuals, relative parameters: right too if the noise differs from the bench's."""
+    validation: ModelValidation
+    ends: tuple[End, ...]  # Of all local searches, best first
+    residuals: tuple[Floats, ...] = field(repr=False)
+    """Of each record in standard deviations, NaN where lost, shape (n, 2); innovations where the method has them."""
+    method: str = "oem"  # Key of ``METHODS``
+    process_noise: float = 0.0
+    """Standard deviation of the velocity's random walk, as the prediction error method estimates it [rad/s per √s]."""
+    load_noise: float = 0.0
+    """Standard deviation of the load's random walk, as a current, as it estimates that [A per √s]."""
+    caveats: tuple[str, ...] = ()  # Limitations of this method on these records
+
+    @property
+    def bench(self) -> Bench:
+        """Noise, sample time and nominal brake."""
+        return self.problem.bench
+
+    @property
+    def plant(self) -> Plant:
+        """The model, with the features that were estimated."""
+        return self.problem.plant
+
+    @property
+    def records(self) -> tuple[Experiment, ...]:
+        """The experiments, without outliers."""
+        return self.problem.records
+
+    @property
+    def asked(self) -> EstimationProblem:
+        """The unknowns that were asked for."""
+        return self.problem.asked
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """The unknowns, in the order of ``values``."""
+        return self.problem.unknowns
+
+    @property
+    def theta(self) -> BrakeParameters:
+        """The estimated brake; what is not among the unknowns is nominal."""
+        return self.problem.theta(self.z)
+
+    @property
+    def values(self) -> Floats:
+        """The unknowns in SI units."""
+        result: Floats = self.z * self.problem.units
+        return result
+
+    @property
+    def at_bound(self) -> tuple[str, ...]:
+        """Labels of the unknowns that ended at the border of what is searched."""
+        low, high = self.problem.bounds
+        near = np.minimum(self.z - low, high - self.z) <= NEAR_BOUND * (high - low)
+        return tuple(label for label, at in zip(self.labels, near, strict=True) if at)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the unknowns, in their order."""
+        return tuple(self.label(unknown) for unknown in self.unknowns)
+
+    @property
+    def scale(self) -> Floats:
+        """Factors from relative deviations, or those in an unknown's unit, to SI units."""
+        return np.abs(scale([unknown.name for unknown in self.unknowns], self.values.tolist()))
+
+    def cramer_rao(self) -> Floats:
+        """Least standard deviations by the physical FIM: relative or in the unknown's unit, inf if not identified."""
+        bounds: Floats = np.sqrt(np.diag(Spectrum(self.information).inverse()))
+        return bounds
+
+    def robust(self) -> Floats:
+        """Standard deviations from the residuals, in the same units."""
+        deviations: Floats = np.sqrt(np.diag(self.sandwich))
+        return deviations
+
+    def deviations(self) -> Floats:
+        """Total standard deviations, by the rules of :mod:`emb_bench.estimate.intervals`."""
+        return deviations(self.cramer_rao(), self.open(), self.robust(), fits=self.validation.fits)
+
+    def between_runs(self) -> Floats:
+        """Deviations of values that are compared: the total without errors that all runs on one bench share."""
+        return deviations(self.cramer_rao(), self.open(OF_THE_BENCH), self.robust(), fits=self.validation.fits)
+
+    def open(self, shared: Sequence[str] = ()) -> Floats:
+        """Root mean square bias of each unknown by effects that are not estimated, but those ``shared``."""
+        parts = [one.bias for one in self.validation.budget if one.name not in shared]
+        return unnoticed(np.array(parts).reshape(-1, len(self.unknowns)))
+
+    def left_open_by(self, i: int) -> Contribution | None:
+        """The largest entry of the uncertainty budget of unknown ``i``; None without any."""
+        found = [one for one in self.validation.budget if one.bias[i] > 0.0]
+        return max(found, key=lambda one: one.bias[i], default=None)
+
+    def intervals(self) -> Floats:
+        """Gaussian 95 % intervals in SI units, shape (unknowns, 2)."""
+        half = NORMAL_95 * self.deviations() * self.scale
+        return np.stack([self.values - half, self.values + half], axis=1)
+
+    def correlation(self) -> Floats:
+        """Correlations of the estimates, shape (unknowns, unknowns)."""
+        return Spectrum(self.information).correlation()
+
+    def shared(self) -> list[int]:
+        """Indices of the unknowns that all records share."""
+        return [i for i, unknown in enumerate(self.unknowns) if unknown.record is None]
+
+    def wanted(self) -> list[int]:
+        """Indices of the unknowns that were asked for: all but the systematic errors that are estimated along."""
+        return [i for i, unknown in enumerate(self.unknowns) if unknown.name not in self.asked.along]
+
+    def shared_information(self) -> Floats:
+        """FIM of the shared unknowns when those of single records are unknown too; relative, prior included."""
+        return schur_complement(self.information, self.shared())
+
+    def verdict(self) -> Identifiability:
+        """Identifiability of each unknown that was asked for; of several records, of those that they share."""
+        shared = [i for i, u in enumerate(self.unknowns) if u.record is None or len(self.records) == 1]
+        if not shared:
+            return Identifiability((), (), ())
+        matrix = schur_complement(self.information, shared)
+        prior = None if self.asked.prior is None or self.prior is None else self.prior[np.ix_(shared, shared)]
+        found = judge(matrix, [self.unknowns[i].name for i in shared], prior)
+        wanted = replace(found, findings=tuple(f for f in found.findings if f.name not in self.asked.along))
+        return wanted.shown(self.bench.machine)
+
+    @property
+    def shown(self) -> tuple[Quantity, ...]:
+        """Names and units in which the unknowns are shown, in their order."""
+        return tuple(quantity(self.bench.machine, unknown.name) for unknown in self.unknowns)
+
+    def factor(self, label: str) -> float:
+        """Factor from SI units to those in which the unknown of a label is shown."""
+        return self.shown[self.labels.index(label)].factor
+
+    def label(self, unknown: Unknown) -> str:
+        """Label of an unknown."""
+        name = quantity(self.bench.machine, unknown.name).name
+        return name if unknown.record is None or len(self.records) == 1 else f"{name}[{unknown.record}]"
