@@ -294,7 +294,7 @@ def report(
     junit: str | Path | None = None,
     **options: Any,
 ) -> Content:
-    """One page about runs of one brake, to hand over, and a JSON file beside it; both are replaced if they exist.
+    """One page about runs of one brake, to hand over, and a JSON file beside it.
 
     Args:
         runs: MCAP files of emb-run, of one brake. What cannot be used is named on the page and left out.
@@ -370,7 +370,7 @@ def campaign(
 
     Args:
         paths: logs, or folders to search for *.mcap.
-        output: file to write, Parquet or CSV by its ending; replaced if it exists.
+        output: file to write, Parquet or CSV by its ending.
         method: see above, or 'none' for information alone (default: oem).
         model: plant to estimate with (default: the one that was simulated; exact where a log does not say).
         params: parameters to estimate (default: the four of the brake).

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from emb_bench.output import replacing
 from emb_runtime.errors import UsageError
 
 # Blue, orange, green, pink, sky, yellow of Okabe and Ito: distinguishable by colour-blind eyes too.
@@ -79,10 +80,8 @@ def drawn(
         figure.suptitle(title, fontsize=11.0, x=0.01, horizontalalignment="left")
         yield axes
         figure.align_ylabels(axes[:, 0])
-        try:
-            figure.savefig(path, dpi=dpi)
-        except OSError as err:
-            raise UsageError(f"{path}: cannot write the figure: {err.strerror}") from err
+        with replacing(path) as beside:
+            figure.savefig(beside, dpi=dpi)
 
 
 def svg(draw: Callable[[Any], None], rows: int, columns: int, size: tuple[float, float], **shared: Any) -> bytes:

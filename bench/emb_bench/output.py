@@ -7,7 +7,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+
+from mcap.writer import MCAP0_MAGIC
 
 from emb_bench.compiled import on_compiling
 from emb_runtime.errors import UsageError
@@ -17,15 +18,19 @@ from emb_runtime.errors import UsageError
 def replacing(path: Path) -> Iterator[Path]:
     """A file beside ``path`` to write to, which takes its place when all went well, and else is gone.
 
+    Results are replaced, logs are not: what is computed can be computed again.
+
     Raises:
-        UsageError: it cannot be written, or something is there that is no file: a folder, a device, a pipe.
+        UsageError: it cannot be written, or what is there is a log, a folder, a device or a pipe.
     """
     if path.is_dir():
         raise UsageError(f"{path}: expected a file to write, and it is a folder")
     if path.exists() and not path.is_file():
         raise UsageError(f"{path}: expected a file to write, and it is a device or a pipe: choose another name")
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    beside = path.with_name(f".{os.getpid()}-{path.name}")
     try:
+        if path.exists() and _is_log(path):
+            raise UsageError(f"{path}: a log, and logs are never overwritten: choose another name")
         beside.touch()
         try:
             yield beside
@@ -37,28 +42,9 @@ def replacing(path: Path) -> Iterator[Path]:
         raise UsageError(f"{path}: the result cannot be written: {err.strerror or err}") from err
 
 
-@contextmanager
-def new_file(path: Path) -> Iterator[BinaryIO]:
-    """A file that did not exist, open for writing; it is removed again if writing it fails in any way.
-
-    Raises:
-        UsageError: something of that name exists, or it cannot be written.
-    """
-    try:
-        file = path.open("x+b")
-    except FileExistsError as err:
-        raise UsageError(f"{path}: exists, and nothing is overwritten: choose another name") from err
-    except OSError as err:
-        raise UsageError(f"{path}: cannot write: {err.strerror}") from err
-    try:
-        with file:
-            yield file
-    except OSError as err:
-        path.unlink(missing_ok=True)
-        raise UsageError(f"{path}: cannot write: {err.strerror or err}") from err
-    except BaseException:
-        path.unlink(missing_ok=True)
-        raise
+def _is_log(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
 
 
 def make_empty_folder(path: Path) -> None:

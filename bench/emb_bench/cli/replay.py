@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from emb_bench import api
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.cli.options import add, add_output_options, answer, given, summary
-from emb_bench.figures import ENDINGS, require_place
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import read_log
 from emb_bench.output import reported_if_interrupted
 from emb_bench.report import fim, runs
-from emb_bench.report.runs import RunTiming, draw_timing, run_timing
+from emb_bench.report.runs import RunTiming, run_timing
 from emb_bench.report.text import show
 from emb_runtime.errors import (
     EXIT_CANNOT_TELL,
@@ -118,18 +117,13 @@ def _info(args: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def timing(runs: Sequence[Path], *, plot: Path | None = None) -> list[RunTiming]:
+def timing(runs: Sequence[Path]) -> list[RunTiming]:
     """Timing of runs, judged by the budgets of their bench.
 
     Args:
         runs: MCAP files of emb-run.
-        plot: histograms of all runs together; .png, .svg or .pdf.
     """
-    require_place("--plot", plot, ENDINGS)
-    found = [run_timing(read_log(path)) for path in runs]
-    if plot is not None:
-        draw_timing(plot, [entry.timing for entry in found])
-    return found
+    return [run_timing(read_log(path)) for path in runs]
 
 
 def _timing(args: argparse.Namespace) -> int:

@@ -23,6 +23,7 @@ from emb_bench.information.criteria import Criterion, criteria
 from emb_bench.information.fisher import Kind, fisher, information_over_time, weights_of
 from emb_bench.information.identifiability import Spectrum
 from emb_bench.information.symmetric import Floats
+from emb_bench.output import replacing
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
@@ -202,10 +203,8 @@ def write(report: Report, path: Path) -> None:
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(COLUMNS)
     rows.writerows(zip(*(columns[name].tolist() for name in COLUMNS), strict=True))
-    try:
-        path.write_text(text.getvalue(), encoding="utf-8", newline="")
-    except OSError as err:
-        raise UsageError(f"--out {path}: cannot be written: {err.strerror}") from err
+    with replacing(path) as beside:
+        beside.write_text(text.getvalue(), encoding="utf-8", newline="")
 
 
 def read_design(path: Path, bench: Bench) -> tuple[Floats, str]:

@@ -14,7 +14,7 @@ from emb_bench.export.mjcf import write_mjcf
 from emb_bench.export.picture import ENDINGS, draw_run
 from emb_bench.logs.log import UNIX_TIME, RunLog, read_log
 from emb_bench.logs.mcap_file import Column
-from emb_bench.output import new_file
+from emb_bench.output import replacing
 from emb_runtime.errors import EXIT_DONE, UsageError
 from emb_runtime.system.terminal import as_json, show
 
@@ -73,7 +73,7 @@ def write_parquet(log: RunLog, topic: str, path: Path) -> str:
     schema, tables = arrow_batches(log, topic)
     from pyarrow import parquet
 
-    with new_file(path) as file, parquet.ParquetWriter(file, schema) as writer:
+    with replacing(path) as beside, parquet.ParquetWriter(beside, schema) as writer:
         for table in tables:
             writer.write_table(table)
     return f"{log.counts[topic]} rows of {topic}"
@@ -96,7 +96,7 @@ def write_csv(log: RunLog, topic: str, path: Path) -> str:
 
     titles = [column.title for column in log.describe(topic)]
     head = pa.table([plain(column) for column in schema.empty_table()], titles)
-    with new_file(path) as file, csv.CSVWriter(file, head.schema) as writer:
+    with replacing(path) as beside, csv.CSVWriter(beside, head.schema) as writer:
         for table in tables:
             writer.write_table(pa.table([plain(column) for column in table], titles))
     return f"{log.counts[topic]} rows of {topic}"
@@ -123,7 +123,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
     p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
     p.add_argument("--to", choices=FORMATS, required=True, help="what to write")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to make; never overwritten")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
     p.add_argument("--topic", metavar="TOPIC", help=f"for {' and '.join(TABLES)}: which one (default: {CYCLE})")
     p.add_argument(
         "--theta", metavar="THETA",

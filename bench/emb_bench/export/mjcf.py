@@ -11,7 +11,7 @@ from pathlib import Path
 
 from emb_bench.experiment.theta import read_theta
 from emb_bench.logs.log import RunLog
-from emb_bench.output import new_file
+from emb_bench.output import replacing
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.errors import UsageError
 
@@ -72,13 +72,13 @@ def write_mjcf(log: RunLog, theta: str, path: Path) -> str:
         A description of the file's content.
 
     Raises:
-        UsageError: the log is of a machine that is no brake, the parameters cannot be read, or the file exists or
-            cannot be written.
+        UsageError: the log is of a machine that is no brake, the parameters cannot be read, or the file cannot be
+            written.
     """
     if log.bench.machine is not None:
         raise UsageError(f"{log.path}: expected the log of a brake, got a recording of another machine")
     name, brake, _ = read_theta(theta, log, log.bench)
     text = mjcf(log.bench, brake)
-    with new_file(path) as file:
-        file.write(text.encode())
+    with replacing(path) as beside:
+        beside.write_text(text, encoding="utf-8")
     return f"a model of MuJoCo, parameters: {name}"

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from emb_bench.figures import COLOURS, GREY, drawn
 from emb_bench.logs.log import RunLog
-from emb_bench.output import new_file
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.records import NodeState, Reason, RunState
 
@@ -37,7 +36,7 @@ def draw_run(log: RunLog, path: Path) -> str:
     """
     _require_cycles(log)
     title = f"{log.path.name}: {log.exit_reason}" + ("" if log.complete else " (the log is NOT complete)")
-    with new_file(path), drawn(path, ROWS, 1, title, (8.0, 9.5), sharex=True) as grid:
+    with drawn(path, ROWS, 1, title, (8.0, 9.5), sharex=True) as grid:
         draw_on(log, grid[:, 0])
     count = len(log.cycles["publish_time"])
     return f"a picture of {count} {'cycle' if count == 1 else 'cycles'}"

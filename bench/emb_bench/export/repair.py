@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 
 from emb_bench.logs.log import REPAIR
 from emb_bench.logs.mcap_file import McapFile
-from emb_bench.output import new_file
+from emb_bench.output import replacing
 from emb_runtime.errors import EXIT_DONE, LogError, UsageError
 from emb_runtime.log.recorder_process import CHUNK
 from emb_runtime.system.input_file import open_regular
@@ -33,7 +33,7 @@ alone, and nothing is written.
 def add_arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
     p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to make; never overwritten")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="log to write")
     p.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -71,7 +71,7 @@ def repair(source: Path, target: Path) -> Found | None:
         What was found; None if the log is whole, and nothing was written.
 
     Raises:
-        UsageError: a file cannot be read or written, or ``target`` exists.
+        UsageError: a file cannot be read or written, or ``target`` is a log already.
         LogError: ``source`` is no log, or not one message in it can be saved.
     """
     try:
@@ -94,7 +94,7 @@ def repair(source: Path, target: Path) -> Found | None:
                 "source_sha256": _sha256(file, size),
                 "repaired_by": f"emb-excite/{version('emb-excite')}",
             }
-            with new_file(target) as output:
+            with replacing(target) as beside, beside.open("wb") as output:
                 _write(McapFile(source, file, size), whole, described, note, output)
     except OSError as err:
         raise UsageError(f"{source}: cannot read the log: {err.strerror}") from err

@@ -14,7 +14,7 @@ import tomlkit
 from emb_bench.config.bench import Systematic, parse_bench
 from emb_bench.config.plants import IMPORTED_PLANT
 from emb_bench.logs.log import IMPORT
-from emb_bench.output import new_file
+from emb_bench.output import replacing
 from emb_bench.recordings.map_file import RecordingMap, read_map
 from emb_bench.recordings.readers import Recorded, read_columns, recorded
 from emb_runtime.can.e2e import NO_COUNTER
@@ -45,7 +45,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
     p.add_argument("recording", type=Path, metavar="FILE", help="the recording")
     p.add_argument("--map", type=Path, required=True, metavar="FILE", help="map file")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="log to make; never overwritten")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="log to write")
     p.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -69,7 +69,7 @@ def import_recording(path: Path, map_path: Path, out: Path) -> Recorded:
     Args:
         path: the recording.
         map_path: its map.
-        out: log to make; never overwritten.
+        out: log to write.
 
     Returns:
         What was written.
@@ -153,7 +153,7 @@ def write_run(found: Recorded, name: str, texts: dict[str, str], source: dict[st
         },
         attachments=[Attachment(file, "application/toml", text.encode()) for file, text in texts.items()],
     )
-    with new_file(out) as file:
+    with replacing(out) as beside, beside.open("wb") as file:
         writer = LogWriter(file, header)
         for record in _cycles(found):
             writer.write(record, record.receive_time_ns)

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from emb_bench.config.bench import COUNTED, QUANTILE_NAMES
-from emb_bench.figures import COLOURS, GREY, drawn
 from emb_bench.logs.log import IMPORT, RunLog
 from emb_bench.logs.timing import INTERVALS, BudgetCheck, Timing, document, judge, quantiles, timing
 from emb_bench.numbers import NOTHING, around, percent, plain, seconds
@@ -18,8 +14,6 @@ from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE, LogErro
 from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.system.terminal import one_line
 
-SHOWN = ("period", "age", "decision", "response", "slack")
-"""Intervals that get a histogram; sending has a row of the table."""
 UNITS = ((1.0, "s"), (1e3, "ms"), (1e6, "µs"))  # Of times, with their factors
 
 
@@ -203,19 +197,3 @@ def _row(said: str, values: list[float]) -> list[str]:
         return [said, *[NOTHING] * len(QUANTILE_NAMES), ""]
     factor, unit = next(((f, u) for f, u in UNITS if max(map(abs, values)) * f >= 1.0), UNITS[-1])
     return [said, *(f"{factor * value:.4g}" for value in values), unit]
-
-
-def draw_timing(path: Path, timings: Sequence[Timing]) -> None:
-    """Draw histograms of the intervals of all runs together.
-
-    Raises:
-        UsageError: matplotlib is missing, or the file cannot be written.
-    """
-    with drawn(path, len(SHOWN), 1, "Timing of the control cycles", (7.0, 9.0)) as axes:
-        for axis, colour, name in zip(axes[:, 0], COLOURS, SHOWN, strict=False):
-            values = 1e6 * np.concatenate([t.interval(name) for t in timings])
-            if len(values):
-                axis.hist(values, bins=60, color=colour, log=True)
-                axis.axvline(float(np.median(values)), color=GREY, linewidth=0.9, linestyle=(0, (5, 3)))
-            axis.set_xlabel(f"{INTERVALS[name]} [µs]")
-            axis.set_ylabel("count")

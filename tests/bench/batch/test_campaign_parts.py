@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import MCAP0_MAGIC
 from pyarrow import parquet
 
 from emb_bench.analysis.several_runs import constancy
@@ -116,6 +117,14 @@ def test_a_result_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="the result cannot be written: No space left"), replacing(path):
         raise OSError(28, "No space left on device")
     assert [entry.name for entry in tmp_path.iterdir()] == ["r.parquet"]
+
+
+def test_a_log_is_never_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"  # whatever it is called
+    path.write_bytes(MCAP0_MAGIC + b"the rest")
+    with pytest.raises(UsageError, match="logs are never overwritten"), replacing(path):
+        pass
+    assert path.read_bytes() == MCAP0_MAGIC + b"the rest"
 
 
 def test_a_ray_that_is_not_there_is_refused_at_once(tmp_path: Path, replay: Replay) -> None:

@@ -129,10 +129,3 @@ def test_of_several_logs_one_that_is_not_met_decides(write: Write, replay: Repla
         ("bad.mcap", False),
         ("good.mcap", True),
     ]
-
-
-def test_the_figure_has_the_format_that_its_name_says(write: Write, tmp_path: Path, replay: Replay) -> None:
-    path = write(punctual(), "[budgets.response]\np50 = 1e-3\n")
-    figure = tmp_path / "timing.svg"
-    replay.text("timing", path, "--plot", figure)
-    assert "<svg" in figure.read_text()
