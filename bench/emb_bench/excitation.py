@@ -103,12 +103,9 @@ class Response:
 
 
 def excitation(name: str, bench: Bench, **parameters: float) -> Excitation:
-    """A reference excitation for the bench's sample time, horizon and limits.
+    """A reference excitation for the bench's sample time, horizon, limits and brake, by a name of the table above.
 
-    Args:
-        name: one of those in the table above.
-        bench: also the nominal brake, which constant-speed uses to feed forward.
-        parameters: those to change; ``Excitation.parameters`` has all with their defaults.
+    ``Excitation.parameters`` has all parameters with their defaults.
 
     Raises:
         UsageError: the name or a parameter is unknown, or a value is out of range or contradicts another.
@@ -189,18 +186,10 @@ def run_excitation(
 ) -> Response:
     """Play an excitation against a simulated brake: measure, answer, on request shield, move; as in the runtime.
 
-    With the shield comes the first move of :mod:`emb_runtime.safety.sensor_monitor`.
-
-    The bus and the instruments are left out: what acts is not rounded to the steps of its signal, and nothing is late
-    or lost. Without the shield only the current limit is kept.
-
-    Args:
-        bench: limits, timing, shield.
-        excited: the excitation, or any other actor.
-        mechanics: how the brake moves, ``bench.plant("exact").mechanics`` for one; it starts at rest at the origin.
-        p: the brake. The shield keeps the limits for those in ``bench.shield.ranges``.
-        shielded: pass the requested current through the envelope shield.
-        noise: errors of each sample's angle [rad] and velocity [rad/s], shape (horizon + 1, 2); none without.
+    With the shield comes the first move of :mod:`emb_runtime.safety.sensor_monitor`; it keeps the limits for the brakes
+    in ``bench.shield.ranges``. Without it only the current limit is kept. Bus and instruments are left out: what acts
+    is not rounded to the steps of its signal, and nothing is late or lost. The brake starts at rest at the origin.
+    The noise is the errors of each sample's angle [rad] and velocity [rad/s], shape (horizon + 1, 2).
 
     Raises:
         UsageError: ``noise`` has another shape.

@@ -48,10 +48,7 @@ def shared_out(
 ) -> Generator[tuple[int, Result | Lost], None, None]:
     """Do pieces of work, as many at a time as there are ``jobs``. Closed or interrupted, it ends its processes at once.
 
-    Args:
-        work: what is done with a piece: a function that another process can import, or a ``functools.partial`` of one.
-        pieces: they travel to the processes, and the results back.
-        jobs: processes.
+    The work is a function that another process can import, or a ``functools.partial`` of one.
 
     Yields:
         Each piece's number and result, as they come.

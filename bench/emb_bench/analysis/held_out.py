@@ -54,13 +54,7 @@ class HeldOut:
 
 
 def held_out(e: Estimate, record: Experiment, *, among: int = 1) -> HeldOut:
-    """Predict a record from an estimate of others.
-
-    Args:
-        e: the estimate.
-        record: of the same brake; where it started, and how its encoder was homed, is its own.
-        among: how many are predicted together, which share the chance of a false alarm.
-    """
+    """Predict a record of the same brake from an estimate of others; several share the false alarms."""
     return _predicted(e, record, LEVEL / among)
 
 

@@ -115,12 +115,7 @@ class ModelChoice:
 
 
 def mixture_interval(parts: Sequence[tuple[float, float, float]], level: float) -> tuple[float, float]:
-    """Central interval of a mixture of Gaussians.
-
-    Args:
-        parts: of each its weight, mean and standard deviation.
-        level: probability inside.
-    """
+    """Central interval of a mixture of Gaussians, each with a weight, a mean and a standard deviation."""
     if not parts or not all(math.isfinite(deviation) for _, _, deviation in parts):
         return -math.inf, math.inf
     weights, means, deviations = (np.array(column) for column in zip(*parts, strict=True))

@@ -77,14 +77,6 @@ def grow_model(
 ) -> ModelGrowth:
     """Adds features to a plant until the records ask for nothing more.
 
-    Args:
-        bench: noise, sample time, nominal brake.
-        plant: to begin with.
-        records: what was done and measured.
-        asked: the unknowns to begin with, and the systematic errors that are estimated along.
-        starts: local searches of the first model.
-        seed: of the random numbers.
-
     Raises:
         UsageError: the plant is not solved exactly, or there are too few samples.
     """

@@ -128,11 +128,7 @@ def _bent(e: Estimate, i: int) -> bool:
 
 
 def profile(e: Estimate, label: str) -> Profile:
-    """The likelihood profile of one unknown.
-
-    Args:
-        e: the estimate.
-        label: one of ``e.labels``.
+    """The likelihood profile of one unknown, by its label.
 
     Raises:
         UsageError: there is no such unknown.

@@ -66,10 +66,8 @@ class Recommendation:
 def advise(e: Estimate) -> tuple[Recommendation, ...]:
     """Recommends runs, best first; none if all unknowns of interest are identified well, or no candidate helps.
 
-    None is recommended after recursive least squares, which does not use all the information in the records.
-
-    Args:
-        e: the estimate. The candidates are played on its brake, inside the ranges that the shield is made for.
+    None is recommended after recursive least squares, which does not use all the information in the records. The
+    candidates are played on the estimated brake, inside the ranges that the shield is made for.
     """
     index = e.shared()
     names = [e.unknowns[i].name for i in index]

@@ -29,12 +29,10 @@ class Constancy:
 
 
 def constancy(values: Sequence[float], deviations: Sequence[float]) -> Constancy:
-    """Compare measurements of one number.
+    """Compare measurements of one number with positive standard deviations.
 
-    Args:
-        values: at least one.
-        deviations: their standard deviations, positive and finite. If they are shares of the number, take the same
-            number for all: with each one's own value, those that came out small would count too much.
+    If these are shares of the number, take the same number for all: with each one's own value, those that came out
+    small would count too much.
     """
     from scipy import special
 
@@ -57,12 +55,9 @@ class Differing:
 
 
 def apart(e: Estimate) -> tuple[Differing, ...]:
-    """Parameters in which records differ that each fit alone; the most different first.
+    """Parameters in which the records of an estimate differ that each fit alone; the most different first.
 
     Empty if they fit together, if one does not fit alone, or if no parameter differs.
-
-    Args:
-        e: estimate from all of the records together.
     """
     if len(e.records) < 2 or e.validation.fits:
         return ()

@@ -38,19 +38,11 @@ def stiffness(p: BrakeParameters, x1: float) -> float:
 
 
 def torque(p: BrakeParameters, x1: float, x2: float, u: float, i: int) -> float:
-    """The torque that parameter ``i`` scales, signed as it acts on the motor (eq. 3.12-3.14) [N·m].
+    """The torque that parameter ``i`` of ``PARAMETERS`` scales, signed as it acts on the motor (eq. 3.12-3.14) [N·m].
 
     It is also θ_i times its own derivative with respect to θ_i. The inertia scales no torque but what all together
-    do: its share is −J ẍ. The derivatives to the angle of contact [N·m/rad] and to an
-    offset of the current [N·m/A] are absolute.
-
-    Args:
-        p: the brake.
-        x1: angle [rad].
-        x2: velocity [rad/s].
-        u: current [A].
-        i: index in ``PARAMETERS``: 0 motor, 1 clamping, 2 Coulomb friction, 3 viscous friction, and the inertia, the
-            angle of contact and an offset of the current; 0 for any other.
+    do: its share is −J ẍ. The derivatives to the angle of contact [N·m/rad] and to an offset of the current [N·m/A] are
+    absolute; any other parameter has none, 0.
     """
     if i == K_M:
         return p.k_m * u
@@ -77,18 +69,7 @@ def acceleration(p: BrakeParameters, x1: float, x2: float, u: float) -> float:
 
 
 def step(p: BrakeParameters, x1: float, x2: float, u: float, t_s: float) -> tuple[float, float]:
-    """One Euler step of the brake (eq. 4.1).
-
-    Args:
-        p: the brake.
-        x1: angle [rad].
-        x2: velocity [rad/s].
-        u: current, held over the step [A].
-        t_s: time step [s].
-
-    Returns:
-        Angle [rad] and velocity [rad/s] one step later. Limits are the caller's.
-    """
+    """Angle and velocity after one Euler step (eq. 4.1) under a held current; limits are the caller's."""
     return x1 + t_s * x2, x2 + t_s * acceleration(p, x1, x2, u)
 
 
@@ -98,20 +79,8 @@ def sensitivity_step(
     """One step of the sensitivity to the *relative* parameter ``i`` (eq. 4.25; eq. 5.6 for f_v, 6.1 for k_1).
 
     Relative means θ_i ∂x/∂θ_i with the value that ``p`` has: to normalise by another value θ_nom,i instead (eq. 4.17),
-    multiply the sensitivity by θ_nom,i / θ_i.
-
-    Args:
-        p: the brake.
-        x1: angle before the step [rad].
-        x2: velocity before the step [rad/s].
-        u: current, held over the step [A].
-        t_s: time step [s].
-        s1: sensitivity of the angle before the step [rad]; 0 at the start (eq. 4.26).
-        s2: sensitivity of the velocity before the step [rad/s]; 0 at the start.
-        i: index in ``PARAMETERS``.
-
-    Returns:
-        Sensitivities of the angle [rad] and of the velocity [rad/s] that :func:`step` returns.
+    multiply the sensitivity by θ_nom,i / θ_i. Angle, velocity and their sensitivities s1 and s2, 0 at the start
+    (eq. 4.26), are those before the step; it returns the sensitivities after it.
     """
     restoring = stiffness(p, x1) * s1 + p.f_v * s2
     return s1 + t_s * s2, s2 + t_s * ((torque(p, x1, x2, u, i) - restoring) / p.J)

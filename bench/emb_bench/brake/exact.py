@@ -104,13 +104,8 @@ def advance_exact(
 def glide(damping: float, w: float, x1: float, x2: float, a: float, t: float) -> tuple[float, float, float]:
     """Angle, velocity and acceleration after the time ``t`` of a segment, from those at its start.
 
-    Args:
-        damping: f_v / J [1/s].
-        w: γ k_1 / J in contact, else 0 [1/s²].
-        x1: angle [rad].
-        x2: velocity [rad/s].
-        a: acceleration [rad/s²].
-        t: time [s], up to LONGEST over the rate of the derivatives.
+    The damping is f_v / J [1/s], w is γ k_1 / J in contact, else 0 [1/s²]; ``t`` is at most LONGEST over the rate of
+    the derivatives.
     """
     angle, velocity, acceleration = x1, x2, a
     first, second = x2, a  # D_n, D_{n+1}
@@ -210,10 +205,8 @@ def _delayed_switch(
 def late_start(before: float, caught: float, now: float) -> float:
     """Velocity that a brake at rest loses or gains per time by which a command comes later [rad/s²].
 
-    Args:
-        before: acceleration from rest under the command before, 0 if it sticks [rad/s²].
-        caught: acceleration under the new command of a brake that slides slowly as the one before has it [rad/s²].
-        now: acceleration from rest under the new command [rad/s²].
+    Accelerations: ``before`` from rest under the command before, 0 if it sticks; ``caught`` under the new command of a
+    brake that slides slowly as the one before has it; ``now`` from rest under the new command.
     """
     if before == 0.0 or caught == 0.0:
         return -now

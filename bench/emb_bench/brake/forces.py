@@ -71,15 +71,7 @@ def decay_slope(m: Mechanics, speed: float, left: float) -> float:
 
 
 def sliding_torque(m: Mechanics, p: BrakeParameters, speed: float, force: float, left: float) -> float:
-    """Friction against the motion (eq. 3.5) [N·m].
-
-    Args:
-        m: the brake's features.
-        p: its parameters.
-        speed: velocity in the direction of motion [rad/s].
-        force: clamping force [N].
-        left: :func:`decay` at this speed; 1 gives the static friction.
-    """
+    """Friction against the motion (eq. 3.5) [N·m]; ``left`` is :func:`decay` at this speed, 1 for the static one."""
     return p.T_c + (static_torque(m, p, force) - p.T_c) * left + p.f_v * speed
 
 
@@ -104,14 +96,7 @@ def sliding_share(m: Mechanics, p: BrakeParameters, speed: float, force: float, 
 
 
 def acceleration_from_rest(m: Mechanics, p: BrakeParameters, pull: float, force: float) -> float:
-    """Acceleration of a brake at rest under a torque: 0 while it sticks [rad/s²].
-
-    Args:
-        m: the brake's features.
-        p: its parameters.
-        pull: motor torque less the torque of the clamping force [N·m].
-        force: clamping force [N].
-    """
+    """Acceleration of a brake at rest under the motor's torque less the clamping force's: 0 if it sticks [rad/s²]."""
     if abs(pull) <= static_torque(m, p, force):
         return 0.0
     return (pull - math.copysign(sliding_torque(m, p, 0.0, force, decay(m, 0.0)), pull)) / p.J
@@ -178,14 +163,7 @@ def stop_rate(m: Mechanics, w: float, direction: float) -> float:
 
 
 def edge_ahead(m: Mechanics, x1: float, w: float, direction: float) -> float:
-    """The next angle in ``direction`` where the force changes its law: contact, or saturation of w; or infinity [rad].
-
-    Args:
-        m: the brake's features.
-        x1: angle [rad].
-        w: position of the stop.
-        direction: of motion, 1.0 or −1.0.
-    """
+    """The next angle ahead where the force changes its law: contact, or saturation of w; or infinity [rad]."""
     rate = stop_rate(m, w, direction)
     if m.play > 0.0:
         if rate > 0.0:

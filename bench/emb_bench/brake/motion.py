@@ -29,17 +29,10 @@ SENSITIVE = 4  # Sensitivities of the same, in this order. That of the current i
 def advance(
     mechanics: Mechanics, p: BrakeParameters, x: Floats, u: float, t_s: float, chosen: Integers, s: Floats
 ) -> None:
-    """One sample period, in place.
+    """One sample period under a held current, in place.
 
-    Args:
-        mechanics: how the brake moves.
-        p: the brake.
-        x: state, shape [4]; without a current lag x[3] is the current of the period before.
-        u: commanded current, held over the period [A].
-        t_s: the period [s].
-        chosen: indices in ``PARAMETERS`` of the n unknowns, shape [n].
-        s: sensitivities of angle [rad], velocity [rad/s], hysteresis position or lag of the clamp, and
-            current [A] to them, shape [n, 4].
+    Without a current lag x[3] is the current of the period before. ``chosen`` are indices in ``PARAMETERS`` of the n
+    unknowns; ``s``, shape (n, SENSITIVE), are the sensitivities of the states to them.
     """
     if mechanics.solver == EULER:
         advance_euler(p, x, u, t_s, chosen, s)

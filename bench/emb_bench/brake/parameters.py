@@ -266,12 +266,7 @@ class Quantity(NamedTuple):
 
 
 def quantity(machine: Machine | None, name: str) -> Quantity:
-    """An unknown of a brake, or of another machine, as it is shown.
-
-    Args:
-        machine: of the bench; None for a brake, whose unknowns are shown as they are.
-        name: one of :data:`emb_bench.brake.parameters.PARAMETERS`.
-    """
+    """An unknown of a brake, or of another machine, as it is shown."""
     if machine is None:
         return Quantity(name, SI[name], 1.0)
     if machine.travel and name in _OF_LINEAR:

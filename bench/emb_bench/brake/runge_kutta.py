@@ -129,16 +129,7 @@ def stage(m: Mechanics, p: BrakeParameters, a: Slide, t: float, x1: float, x2: f
 
 
 def forcing(m: Mechanics, p: BrakeParameters, direction: float, at: Stage, i: int, current_change: float) -> float:
-    """θ_i ∂/∂θ_i of the acceleration at constant state, and what the change of the current adds [rad/s²].
-
-    Args:
-        m: the brake's features.
-        p: its parameters.
-        direction: of motion.
-        at: the instant.
-        i: index in ``PARAMETERS``.
-        current_change: sensitivity of the current to it [A].
-    """
+    """θ_i ∂/∂θ_i of the acceleration at constant state, and what the change of the current [A] adds [rad/s²]."""
     if i == K_M:
         return p.k_m * at.i / p.J
     if i == J:
@@ -199,17 +190,9 @@ def vary(
     before: tuple[float, float, float, float],
     t_s: float,
 ) -> tuple[float, float]:
-    """Sensitivities of angle [rad] and velocity [rad/s] to unknown ``i`` at the end of a step.
+    """Sensitivities of angle [rad] and velocity [rad/s] to unknown ``i`` at the end of a step of length ``h`` [s].
 
-    Args:
-        m: the brake's features.
-        p: its parameters.
-        a: the step.
-        at: its stages.
-        h: its length [s].
-        i: index in ``PARAMETERS``.
-        before: sensitivities of angle, velocity, w and current at its start.
-        t_s: the sample period [s].
+    ``before`` are those of angle, velocity, w and current at its start.
     """
     x1, v1, w, c = before
     w -= a.rate * x1  # what that of w has beyond the angle's share

@@ -128,12 +128,7 @@ def load_bench(path: str | Path | None = None, *, analysis: bool = False) -> Ben
 
 
 def parse_bench(text: str, source: str, *, analysis: bool = False) -> Bench:
-    """Turn the text of a bench file into checked records.
-
-    Args:
-        text: TOML.
-        source: what to call it in error messages.
-        analysis: as for :func:`load_bench`.
+    """Turn the text of a bench file into checked records; ``source`` and ``analysis`` as for :func:`load_bench`.
 
     Raises:
         BenchFileError: see :func:`load_bench`.

@@ -51,12 +51,9 @@ class Tracks(NamedTuple):
 
 
 def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floats:
-    """Currents of the best design that an annealing passed in its colder half, shape (n,).
+    """Currents of the best design that an annealing passed in its colder half, shape (n,), n ≥ 3.
 
-    Args:
-        problem: what is designed.
-        speeds: to begin with, at the ends of the samples [rad/s], shape (n,), n ≥ 3.
-        rng: random numbers.
+    It begins with speeds at the ends of the samples [rad/s].
     """
     tracks = tracked(problem, np.tile(speeds, (2, 1)))  # the present one and its variation
     best: Floats = tracks.u[0].copy()
@@ -88,14 +85,9 @@ def track(task: Task, number: int, tracks: Tracks) -> None:
 
 
 def reach(task: Task, first: int, speeds: Floats, u: Floats, x: Floats) -> None:
-    """Find the currents for a design's speeds from a period on, and the speeds that they reach.
+    """Find the currents for a design's speeds from a period on, and the states and speeds that they reach, in place.
 
-    Args:
-        task: the brake; of the box, only the currents' limit is kept for sure.
-        first: the period.
-        speeds: wanted at the ends of the periods, and then reached, shape (n,) [rad/s].
-        u: currents, a result, shape (n,) [A].
-        x: states, a result but for those up to the start of the period, shape (n + 1, STATES).
+    Of the box, only the currents' limit is kept for sure.
     """
     p, most = task.brake, task.box.current
     nothing, none = task.chosen[:0], task.start[:0]
@@ -119,15 +111,10 @@ def reach(task: Task, first: int, speeds: Floats, u: Floats, x: Floats) -> None:
 
 
 def anneal(task: Task, goal: Goal, count: int, rng: np.random.Generator, tracks: Tracks, best: Floats) -> None:
-    """Vary a design again and again, and go on with the variation unless it is too much worse.
+    """Vary a design ``count`` times, and go on with the variation unless it is too much worse.
 
-    Args:
-        task: what is designed.
-        goal: φ.
-        count: variations.
-        rng: random numbers.
-        tracks: two designs, of which the first one is varied first; both change.
-        best: currents of the best design of the colder half, a result, shape (n,).
+    Of the two designs the first one is varied first; both change. ``best`` becomes the currents of the best design of
+    the colder half.
     """
     box, n, rows = task.box, tracks.u.shape[1], tracks.s.shape[2]
     packed, work = np.empty(tracks.m.shape[2]), np.empty((rows, rows))
@@ -161,16 +148,7 @@ def anneal(task: Task, goal: Goal, count: int, rng: np.random.Generator, tracks:
 
 
 def vary(v: Floats, largest: float, rng: np.random.Generator) -> int:
-    """Change a sequence of speeds once or twice, in place.
-
-    Args:
-        v: at the ends of the samples [rad/s], shape (n,), n ≥ 3.
-        largest: speed limit [rad/s].
-        rng: random numbers.
-
-    Returns:
-        Index before which nothing is changed.
-    """
+    """Change speeds up to ``largest`` [rad/s] once or twice, in place; index before which nothing is changed."""
     first = change(v, largest, rng)
     if rng.random() < TWICE:
         first = min(first, change(v, largest, rng))

@@ -74,16 +74,7 @@ def excess(x: Floats, box: Box) -> tuple[float, float]:
 
 
 def inform(task: Task, first: int, u: Floats, x: Floats, s: Floats, m: Floats) -> None:
-    """Sensitivities and information of a motion from a period on.
-
-    Args:
-        task: brake and unknowns.
-        first: the period.
-        u: currents, shape (n,).
-        x: states, shape (n + 1, STATES).
-        s: sensitivities, a result but for those up to the start of the period, shape (n + 1, m, SENSITIVE).
-        m: packed FIM of the samples up to each, likewise, shape (n + 1, m (m + 1) / 2).
-    """
+    """Sensitivities and information of a motion from a period on; what was before its start is left as it is."""
     size = task.chosen.shape[0]
     y, trial = np.zeros((size, 2)), np.zeros(STATES)
     for k in range(first, u.shape[0]):
@@ -101,17 +92,10 @@ def inform(task: Task, first: int, u: Floats, x: Floats, s: Floats, m: Floats) -
 
 
 def linearise(task: Task, u: Floats, x: Floats, s: Floats, jacobian: Floats) -> None:
-    """Derivatives of every period's map (z, u) → z by central differences.
+    """Derivatives of every period's map (z, u) → z by central differences, shape (n, Z, Z + 1), the current's last.
 
     The map is linear in the sensitivities, and each row of them moves as the brake's state does: their derivatives are
     differences over a unit step, of one row for all.
-
-    Args:
-        task: brake and unknowns.
-        u: currents, shape (n,).
-        x: states, shape (n + 1, STATES).
-        s: sensitivities, shape (n + 1, m, SENSITIVE).
-        jacobian: the result, shape (n, Z, Z + 1); its last column is the current's.
     """
     m = task.chosen.shape[0]
     size = STATES + SENSITIVE * m
@@ -154,13 +138,9 @@ def aside(value: float) -> float:
 
 
 def gradients(task: Task, jacobian: Floats, s: Floats, result: Floats) -> None:
-    """Derivatives of every element of the FIM with respect to every current, by one adjoint sweep.
+    """Derivatives of every packed element of the FIM with respect to every current, by one adjoint sweep.
 
-    Args:
-        task: unknowns and weights.
-        jacobian: of :func:`linearise`, shape (n, Z, Z + 1).
-        s: sensitivities, shape (n + 1, m, SENSITIVE).
-        result: shape (m (m + 1) / 2, n), packed elements by currents.
+    The result has the shape (m (m + 1) / 2, n); the Jacobian is that of :func:`linearise`.
     """
     w1, w2, bias = task.w1, task.w2, task.bias
     n, size = jacobian.shape[0], jacobian.shape[1]
@@ -191,16 +171,12 @@ def explore(task: Task, genes: Floats, u: Floats, m: Floats, price: Floats) -> N
 
     A journey is the fastest way to an angle, and a speed from there on. Where a brake waits, and on which side of
     contact and in which direction it creeps while it does, is worth more than how it gets there; a reference that
-    gives only speeds has it as the small difference of long ways.
+    gives only speeds has it as the small difference of long ways. The loop's simple laws may miss the box.
 
-    Args:
-        task: brake, unknowns, and the box, which is kept but for what the loop's simple laws miss.
-        genes: shape (count, 3 g): the angles −1..1 of g journeys, of which the cube is the share of the angle's limit
-            on that side; the speeds −1..1 thereafter, of which it is the share of the largest; their lengths in any
-            unit.
-        u: currents, a result, shape (count, n).
-        m: packed FIM, a result, shape (count, m (m + 1) / 2).
-        price: a result, that of :func:`excess`, shape (count,).
+    Genes, shape (count, 3 g): the angles −1..1 of g journeys, of which the cube is the share of the angle's limit on
+    that side; the speeds −1..1 thereafter, of which it is the share of the largest; their lengths in any unit.
+
+    Results: currents ``u``, shape (count, n), packed FIM ``m`` and the price of :func:`excess`, one for each design.
     """
     p, box, t_s, n = task.brake, task.box, task.t_s, u.shape[1]
     journeys, nothing, none = genes.shape[1] // 3, task.chosen[:0], task.start[:0]
@@ -244,14 +220,7 @@ def deceleration(p: BrakeParameters, box: Box) -> float:
 def follow(p: BrakeParameters, box: Box, t_s: float, x1: float, x2: float, wanted: float, left: int) -> float:
     """Current that brings the speed to ``wanted`` in one period, unless a limit or the way home forbids [A].
 
-    Args:
-        p: the brake.
-        box: what is kept.
-        t_s: period [s].
-        x1: angle [rad].
-        x2: velocity [rad/s].
-        wanted: velocity [rad/s].
-        left: periods to the end of the experiment.
+    There are ``left`` periods to the end of the experiment.
     """
     spring = p.gamma * p.k_1 * max(x1, 0.0)
     braking = deceleration(p, box)

@@ -80,12 +80,7 @@ class Table(NamedTuple):
 def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: Sequence[Floats] = ()) -> Found:
     """The best design of many searches; the same seed finds the same design, whatever the number of workers.
 
-    Args:
-        problem: what is designed.
-        starts: number of coarse searches.
-        seed: of their random numbers.
-        workers: threads; 0 for one per processor.
-        warm: currents to start from besides, each of shape (n,).
+    ``starts`` are coarse searches, ``workers`` threads, 0 for one per processor, ``warm`` currents to begin with too.
 
     Raises:
         UsageError: nothing that was found keeps the limits.
@@ -169,14 +164,7 @@ def _between_samples(problem: Problem, design: Design) -> Design | None:
 
 
 def coarse(problem: Problem, journeys: int, seed: np.random.SeedSequence, far: Sequence[Table] = ()) -> Table:
-    """A table that was searched for from random ones.
-
-    Args:
-        problem: what is designed.
-        journeys: their number.
-        seed: of the random numbers.
-        far: tables to which nearness costs.
-    """
+    """A table of some journeys that was searched for from random ones; nearness to tables ``far`` costs."""
     rng = np.random.default_rng(seed)
     low, high = _borders(journeys)
     drawn = low + rng.random((DRAWN, 3 * journeys)) * (high - low)
@@ -223,17 +211,7 @@ def evolved(
     population: int = POPULATION,
     far: Sequence[Table] = (),
 ) -> Table:
-    """The best table of a search by CMA-ES.
-
-    Args:
-        problem: what is designed.
-        begin: genes to begin with.
-        spread: first standard deviation.
-        count: coarse designs to simulate.
-        rng: of the random numbers.
-        population: of CMA-ES.
-        far: tables to which nearness costs.
-    """
+    """The best table of a search by CMA-ES from genes with a deviation ``spread``; it simulates ``count`` designs."""
     low, high = _borders(len(begin) // 3)
     options: dict[str, Any] = {
         "bounds": [low, high],

@@ -50,12 +50,7 @@ class Filter:
     load: float = 0.0  # r, standard deviation of the load's random walk, as a current [A per √s]
 
     def gains(self, z: Floats, weights: Sequence[Floats]) -> list[Floats]:
-        """Gains of each record along the motion for ``z``, shape (n, 2, 4), in the order of ``GAIN``.
-
-        Args:
-            z: the unknowns.
-            weights: inverse standard deviations of the samples of each record, zero where one does not count.
-        """
+        """Gains of each record along the motion for ``z``, shape (n, 2, 4), in the order of ``GAIN``."""
         gains = [np.zeros((*root.shape, GAIN)) for root in weights]
         self._parts(z, weights, gains, False, ())
         return gains
@@ -95,7 +90,7 @@ class Filter:
         added: Floats | float = 0.0,
         shifted: Floats | float = 0.0,
     ) -> tuple[Floats, Floats]:
-        """Innovations of one record over their standard deviations, and what unknowns add to what is shown.
+        """Innovations of record ``i`` over their standard deviations, and what unknowns add to what is shown.
 
         Args:
             z: the unknowns.
@@ -234,17 +229,8 @@ def march_filtered(
 ) -> None:
     """One record through the filter, which corrects the state between two periods; runs as it is or compiled.
 
-    Args:
-        mechanics: how the brake moves.
-        p: its parameters.
-        given: record and instruments.
-        chosen: indices of the unknowns, ``START`` first.
-        x: state, in place.
-        s: sensitivities of the state, in place.
-        covariance: of angle, velocity and load, shape (3, 3), in place.
-        held: True if the gains are given; else they are computed.
-        gains: shape (n, 2, 4), in the order of ``GAIN``.
-        results: filled.
+    The unknowns ``chosen`` begin with ``START``. State ``x``, its sensitivities ``s``, the ``covariance`` of angle,
+    velocity and load, shape (3, 3), and ``results`` change in place; so do the ``gains``, unless they are ``held``.
     """
     currents, t_s, late, delay, samples, stamps, unreported, root, bias, velocity_scale, walk, load = given
     innovations, shares = results
@@ -331,13 +317,9 @@ def _copy(source: Floats, target: Floats) -> None:
 
 
 def _push(covariance: Floats, variance: float, change: float, t_s: float) -> None:
-    """Add what an unknown current does to a free inertia; one that is taken to stick may have moved.
+    """Add what an unknown current of a ``variance`` [A²] does to a free inertia: one that is taken to stick may move.
 
-    Args:
-        covariance: in place.
-        variance: of the current [A²].
-        change: of the velocity in a period by a current of 1 A [rad/s].
-        t_s: period [s].
+    A current of 1 A changes its velocity by ``change`` in a period [rad/s].
     """
     if variance > 0.0:
         way = 0.5 * change * t_s

@@ -24,14 +24,7 @@ def unnoticed(biases: Floats) -> Floats:
 
 
 def deviations(bound: Floats, unnoticed: Floats, sandwich: Floats, *, fits: bool) -> Floats:
-    """Standard deviations by rules 1 to 3, shape (unknowns,).
-
-    Args:
-        bound: Cramér-Rao bounds.
-        unnoticed: largest biases that one unmodelled effect may have caused without being noticed.
-        sandwich: deviations from the residuals.
-        fits: True if the model fits.
-    """
+    """Standard deviations by rules 1 to 3, from Cramér-Rao bounds, biases and the sandwich, shape (unknowns,)."""
     total: Floats = np.hypot(bound, unnoticed)
     return total if fits else np.maximum(total, sandwich)
 
@@ -39,12 +32,8 @@ def deviations(bound: Floats, unnoticed: Floats, sandwich: Floats, *, fits: bool
 def interval(gaussian: Interval, profile: Interval, *, closed: bool, holds: bool, biased: bool) -> Interval:
     """Interval of one unknown by rule 4.
 
-    Args:
-        gaussian: by rules 1 to 3.
-        profile: of the likelihood.
-        closed: True if the profile rises beyond the level on both sides.
-        holds: True if its assumptions hold.
-        biased: True if rule 2 widened the Gaussian one.
+    The profile is ``closed`` if it rises beyond the level on both sides; ``holds`` if the assumptions of rule 4 do;
+    ``biased`` if rule 2 widened the Gaussian interval.
     """
     if closed and not holds:
         return gaussian

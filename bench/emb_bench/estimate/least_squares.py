@@ -139,13 +139,9 @@ def beginning(problem: Problem) -> tuple[Floats, Floats]:
 
 
 def recursion(rows: Floats, errors: Floats, z: Floats, covariance: Floats) -> Floats:
-    """Take one equation after the other, each with a noise of variance one.
+    """Mean after equations ``rows z = errors``, shape (m, p), one after the other, each with a noise of variance one.
 
-    Args:
-        rows: regressors, shape (m, p).
-        errors: what they make up, shape (m,).
-        z: mean at the beginning, shape (p,).
-        covariance: of that, shape (p, p).
+    Begins at the mean ``z`` and its ``covariance``.
     """
     for row, value in zip(rows, errors.tolist(), strict=True):
         along = covariance @ row

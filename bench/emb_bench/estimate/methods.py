@@ -45,13 +45,9 @@ def method_of(name: str) -> type[Method]:
 
 
 def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
-    """Estimates again from some of the records, by the same method.
+    """Estimates again from some of the records, any of them as often as it is to count, by the same method.
 
     Output error begins where the estimate is. The model validation is not repeated: it is that of the first estimate.
-
-    Args:
-        e: the estimate.
-        chosen: numbers of records, any of them as often as it is to count.
     """
     from emb_bench.estimate.output_error import finished, search, settled
 

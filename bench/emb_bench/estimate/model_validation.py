@@ -73,15 +73,10 @@ def examine(
     disturbance: Disturbance | None = None,
     shown: Shown | None = None,
 ) -> ModelValidation:
-    """Compare the residuals at an estimate with what the right model would leave.
+    """Compare the residuals ``found`` at an estimate with what the right model would leave.
 
-    Args:
-        problem: records and model.
-        z: the estimate.
-        weights: inverse standard deviations of the samples of each record, zero where one does not count.
-        found: all residuals and their derivatives.
-        disturbance: of an estimator that whitens the residuals.
-        shown: what is shown at the estimate; the simulation without.
+    The ``disturbance`` is that of an estimator that whitens them, ``shown`` what is shown at the estimate; without, the
+    simulation.
     """
     counts = np.concatenate([root.ravel() for root in weights]) > 0.0
     every, residuals = found.residuals, by_record(found.residuals, weights)
@@ -224,9 +219,7 @@ def _words(
 def taken(gaps: Floats, samples: int) -> int:
     """Degrees of freedom that the unknowns of gaps take: as much of each as the samples, and not an assumption, tell.
 
-    Args:
-        gaps: orthonormal basis of what they explain, the samples first, shape (m, gaps).
-        samples: numbers measured, two of each sample.
+    The orthonormal basis of what the gaps explain, shape (m, gaps), begins with the numbers measured.
     """
     return round(float(np.sum(gaps[:samples] ** 2)))
 

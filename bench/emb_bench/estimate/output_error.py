@@ -95,9 +95,7 @@ def _without_outliers(problem: Problem, z: Floats, weights: Sequence[Floats]) ->
 def outliers(residuals: Floats, counts: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mask of the samples of a record that lie apart from their neighbours, shape (n,).
 
-    Args:
-        residuals: in standard deviations, shape (n, 2).
-        counts: True where an output of a sample counts, shape (n, 2).
+    From residuals in standard deviations, and a mask of the outputs that count, shape (n, 2).
     """
     found = np.zeros(len(residuals), np.bool_)
     for errors, counted in zip(residuals.T, counts.T, strict=True):
@@ -146,12 +144,6 @@ def settled(problem: Problem, z: Floats, end: End, weights: Sequence[Floats]) ->
     A search sees the gaps linearly around what the records hold of them. Here the simulation follows each step in both,
     and none is taken that does not lower the sum of squares.
 
-    Args:
-        problem: records, model and unknowns.
-        z: where the search ended.
-        end: the same in words.
-        weights: inverse standard deviations of the samples of each record.
-
     Returns:
         The problem whose records hold what was found in their gaps, and the search's new end. Without gaps, the same.
     """
@@ -185,14 +177,7 @@ def _settled(
 def _with_systematic(
     problem: Problem, ideal: Problem, searches: Sequence[tuple[Floats, End]], weights: Sequence[Floats]
 ) -> list[tuple[Floats, End]]:
-    """Searches best first, the best minimum once more with the systematic errors that are estimated along.
-
-    Args:
-        problem: records, model and unknowns.
-        ideal: the same without systematic errors.
-        searches: where those of ``ideal`` ended.
-        weights: inverse standard deviations of the samples of each record.
-    """
+    """Searches best first, the best minimum once more with the systematic errors, which ``ideal`` lacks."""
     ends = sorted(searches, key=lambda pair: pair[1].cost)
     if not problem.asked.along:
         return ends
@@ -252,17 +237,7 @@ def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
 def search(
     problem: Problem, start: Floats, weights: Sequence[Floats], evaluations: int = EVALUATIONS
 ) -> tuple[Floats, End]:
-    """One local search.
-
-    Args:
-        problem: records, model and unknowns.
-        start: z to begin with.
-        weights: inverse standard deviations of the samples of each record.
-        evaluations: most simulations.
-
-    Returns:
-        The z where it ended, and the same in words.
-    """
+    """One local search of the simulation nearest to the samples: where it ended, and its record."""
     return minimise(problem, start, lambda z: problem.jacobian(z, weights), evaluations)
 
 
@@ -277,14 +252,7 @@ def finished(
 ) -> Estimate:
     """Estimate with all that follows from its values: information, covariance, validation.
 
-    Args:
-        problem: records, model and unknowns.
-        z: the estimate.
-        weights: inverse standard deviations of the samples of each record.
-        ends: of the local searches.
-        found: residuals at ``z``, where they are not those of the simulation.
-        validation: from these.
-        more: further fields of the estimate.
+    The residuals ``found`` at ``z`` are those of the simulation, if no others are given; ``more`` are further fields.
     """
     found = found or problem.marginal(z, weights)
     residuals, scale = by_record(found.residuals, weights), problem.scale(z)
@@ -303,19 +271,12 @@ def finished(
 
 
 def sandwich(information: Floats, jacobian: Floats, errors: Floats, lengths: Sequence[int]) -> Floats:
-    """Covariance of an estimate from its own residuals: H⁻¹ (Σ g g^T) H⁻¹ with the scores g of the samples.
+    """Covariance of an estimate from its own residuals: H⁻¹ (Σ g g^T) H⁻¹ with the scores g of samples, shape (p, p).
 
     Scores of neighbouring samples count together (Newey and West 1987, Bartlett weights up to 4 (n/100)^(2/9) lags), so
     that residuals that follow from each other widen it. What is no sample, a start or a prior, has its own information.
-
-    Args:
-        information: H, shape (p, p).
-        jacobian: derivatives of all residuals, shape (m, p).
-        errors: the residuals, shape (m,): two for each sample of each record, then what is no sample.
-        lengths: samples of each record.
-
-    Returns:
-        Shape (p, p); inf on the diagonal of unknowns that the data do not identify.
+    The residuals, shape (m,), are two for each sample of records of these lengths, then those of what is no sample. The
+    diagonal is inf for unknowns that the data do not identify.
     """
     scores, meat, used = jacobian * errors[:, None], np.zeros_like(information), 0
     for n in lengths:

@@ -213,12 +213,7 @@ class Problem:
     ) -> Prediction:
         """Predicts a record, with sensitivities to its unknowns and to those ``besides``, which come last.
 
-        Args:
-            z: the unknowns.
-            record: number of the record.
-            besides: names of further unknowns.
-            mechanics: how another brake moves; without, that of ``z``.
-            added: current that acts besides [A].
+        Another brake moves by ``mechanics``; ``added`` is a current that acts besides [A].
         """
         data, instruments, t_s = self.records[record], self.plant.instruments, self.bench.timing.sample_time
         at, delay = self.opening(z, record, (*self.names(record), *besides)), instruments.measurement_delay
@@ -353,15 +348,10 @@ class Problem:
         return replace(self, records=tuple(records))
 
     def stacked(self, z: Floats, parts: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
-        """All residuals in one row, and their derivatives to z.
+        """All residuals in one row, and their derivatives to z, as :meth:`jacobian`.
 
-        Args:
-            z: the unknowns.
-            parts: of each record the errors of its samples in standard deviations, shape (n, 2), and what each of its
-                unknowns adds to what is shown, in the same unit, relative for parameters, shape (n, own, 2).
-
-        Returns:
-            As :meth:`jacobian`.
+        The ``parts`` are of each record the errors of its samples in standard deviations, shape (n, 2), and what each
+        of its unknowns adds to what is shown, in the same unit, relative for parameters, shape (n, own, 2).
         """
         residuals, rows, factors = [], [], self.scale(z)
         for i, (errors, shares) in enumerate(parts):

@@ -84,16 +84,9 @@ class PredictionError(Method):
 
 
 def likely(problem: Problem, near: Floats) -> tuple[Filter, Floats, float]:
-    """The disturbance of the greatest restricted likelihood, the other unknowns at theirs.
+    """The disturbance of the greatest restricted likelihood, z under it, and the deviance that it takes away.
 
     A walk of the velocity, or one of the load; both where that takes away more of the deviance than chance would.
-
-    Args:
-        problem: records, model and unknowns.
-        near: z to begin with.
-
-    Returns:
-        The disturbance, z under it, and the deviance that it takes away.
     """
     none, kinds = Filter(problem, 0.0), tuple(POWERS)
     places = [_refined(none, kind, _roughly(none, kind, near)) for kind in kinds]

@@ -38,11 +38,8 @@ def minimise(
 ) -> tuple[Floats, End]:
     """One local search for the least sum of squares within the bounds.
 
-    Args:
-        problem: whose unknowns they are.
-        start: z to begin with, and whatever else is searched along without bounds.
-        residuals: of a z, with their derivatives, as :meth:`Problem.jacobian` gives them.
-        evaluations: most simulations.
+    What follows the unknowns of the problem in ``start`` is searched along without bounds. ``residuals`` gives those of
+    a z with their derivatives.
     """
     known: dict[bytes, tuple[Floats, Floats]] = {}
     low, high = problem.bounds
@@ -87,15 +84,7 @@ def strong_load(problem: Problem) -> float:
 
 
 def converge(found: Filter, start: Floats) -> tuple[Floats, End]:
-    """One local search under a disturbance.
-
-    Args:
-        found: records, model, unknowns, and the disturbance.
-        start: z to begin with.
-
-    Returns:
-        The z where it ended, and the same in words.
-    """
+    """One local search under a disturbance: where it ended, and its record."""
     problem, z, evaluations = found.problem, start, 0
     for _ in range(ROUNDS):
         weights = problem.weights(z)
@@ -111,15 +100,7 @@ def converge(found: Filter, start: Floats) -> tuple[Floats, End]:
 
 
 def released(problem: Problem, start: Floats) -> tuple[Floats, End]:
-    """Minimum that a filter leads to which follows the measured brake at first, and is the simulation in the end.
-
-    Args:
-        problem: records, model and unknowns.
-        start: z to begin with.
-
-    Returns:
-        The z where it ended, and the same in words.
-    """
+    """Minimum that a filter leads to which follows the measured brake at first, and is the simulation in the end."""
     z, evaluations = start, 0
     for share in RELEASE:
         z, end = converge(Filter(problem, share * strong(problem)), z)

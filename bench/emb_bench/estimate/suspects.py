@@ -166,12 +166,6 @@ def _drifts(problem: Problem, z: Floats, record: int, shown: Floats) -> tuple[Fl
 
     Each is a drift by the whole parameter from the first period to the last, zero in the middle. In a period in which
     the brake turns around, the friction acts one way and then the other, as if the velocity changed evenly.
-
-    Args:
-        problem: whose parameters are constant.
-        z: the unknowns.
-        record: number of the record.
-        shown: its angle and velocity at the end of each period, shape (n, 2).
     """
     at, data = problem.opening(z, record, ()), problem.records[record]
     n, delay = len(shown), problem.plant.instruments.measurement_delay
@@ -192,15 +186,7 @@ def _drifts(problem: Problem, z: Floats, record: int, shown: Floats) -> tuple[Fl
 
 
 def _clearance(problem: Problem, z: Floats, record: int, shown: Floats, play: float) -> Floats:
-    """Current that turns the motor as a clearance in the gear does: the nut lags the screw, and with it the force [A].
-
-    Args:
-        problem: whose model has none.
-        z: the unknowns.
-        record: number of the record.
-        shown: its angle and velocity at the end of each period, shape (n, 2).
-        play: width of the clearance [rad].
-    """
+    """Current that turns the motor as a clearance of the gear does: nut and force lag behind the screw [A]."""
     at = problem.opening(z, record, ())
     angles = np.concatenate([at.x[:1], shown[:, 0] - at.offset - at.contact])
     nut, behind = float(angles[0]), np.empty(len(angles))
@@ -332,11 +318,8 @@ def _priors(problem: Problem, drifting: float) -> dict[str, float]:
 def _size(name: str, prior: float, length: float, score: float) -> float:
     """Root mean square of an effect by its posterior.
 
-    Args:
-        name: of the effect.
-        prior: standard deviation before any record.
-        length: root of the information on it beside all that is estimated.
-        score: product of its column beside all that is estimated with the residuals.
+    From its prior deviation, the root ``length`` of the information on it beside all that is estimated, and the product
+    ``score`` of its column there with the residuals.
     """
     variance = 1.0 / (prior**-2 + length**2)
     probability = 1.0 if name in NEVER_EXACT else PRESENT

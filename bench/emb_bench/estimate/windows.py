@@ -225,11 +225,7 @@ def _seconds(problem: Problem) -> float:
 
 
 def predict_windows(problem: Problem, values: Floats) -> tuple[float, float, int]:
-    """Prediction of the windows of records with given parameters, each from the start that fits it best.
-
-    Args:
-        problem: records, model and unknowns.
-        values: of the unknowns, SI units.
+    """Prediction of the windows of records with parameters in SI units, each from the start that fits it best.
 
     Returns:
         Root mean square of the angle's error [rad], χ² of the samples, and its degrees of freedom.
@@ -479,12 +475,7 @@ def search(
 ) -> tuple[Point, End]:
     """One local search over what the windows share, again from better starts as long as there are any.
 
-    Args:
-        problem: the whole records.
-        cut: their windows.
-        begun: where it begins.
-        weights: inverse standard deviations of the samples of each window.
-        evaluations: most simulations of a descent; below ``EVALUATIONS`` the search is only begun.
+    With fewer ``evaluations`` than ``EVALUATIONS`` the search is only begun.
     """
     at, end = _descended(problem, cut, begun, weights, evaluations)
     total = end.evaluations
@@ -526,15 +517,10 @@ def restarted(cut: Sequence[Problem], at: Point, begun: Point, weights: Sequence
 
 
 def by_windows(information: Floats, scores: Floats, follows: Sequence[bool]) -> Floats:
-    """Covariance from the scatter of the windows: H⁻¹ (Σ g g^T) H⁻¹, neighbours counted together.
+    """Covariance from the scatter of the windows: H⁻¹ (Σ g g^T) H⁻¹, neighbours counted together, shape (p, p).
 
-    Args:
-        information: H, shape (p, p).
-        scores: g of each window, shape (m, p).
-        follows: True for a window that begins where the one before it ends, length m.
-
-    Returns:
-        Shape (p, p); inf on the diagonal of unknowns that the windows do not identify.
+    From the information H and the scores g of each window, shape (m, p); ``follows`` is True for a window that begins
+    where the one before it ends. The diagonal is inf for unknowns that the windows do not identify.
     """
     m, p = scores.shape
     meat = scatter(scores, follows)

@@ -78,13 +78,7 @@ class _DelayLine:
 
 
 def later(samples: Floats, delay: int, before: Floats | None = None) -> Floats:
-    """Samples as they are seen ``delay`` samples later.
-
-    Args:
-        samples: shape (n, ...).
-        delay: whole samples.
-        before: what is seen until then, shape (1, ...); the first sample without it.
-    """
+    """Samples, shape (n, ...), as they are seen ``delay`` samples later; until then ``before``, or the first one."""
     return _DelayLine(delay)(samples, samples[:1] if before is None else before)
 
 
@@ -303,15 +297,7 @@ def evaluate(
 ) -> list[Evaluation]:
     """Compute both Fisher informations over time, and how well each model fits; all go through the record together.
 
-    Args:
-        log: the record.
-        experiment: its content, from :func:`emb_bench.experiment.from_log.read_experiment`.
-        bench: noise, limits and sample time.
-        plants: the models.
-        question: unknown parameters and prior.
-        theta_name: what to call ``theta``.
-        theta: the brake at which the information is computed.
-        errors: systematic errors of the bench there.
+    They are those at ``theta``, with the systematic errors of the bench there.
     """
     instants = evenly(experiment.periods, INSTANTS)
     evaluators = [

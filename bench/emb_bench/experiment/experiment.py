@@ -88,11 +88,7 @@ class Experiment:
         return len(self.gaps[0]) + 2 * len(self.gaps[1])
 
     def x0(self, encoder_offset: float = 0.0) -> tuple[float, float]:
-        """True angle [rad] and velocity [rad/s] at sample 0; an angle that may be the origin is taken as the origin.
-
-        Args:
-            encoder_offset: the encoder's reading at the origin [rad].
-        """
+        """True angle [rad] and velocity [rad/s] at sample 0; an angle that may be the origin is taken as the origin."""
         angle = self.angle - encoder_offset
         return (0.0 if abs(angle) <= REST_SIGMAS * self.slack else angle), self.velocity
 

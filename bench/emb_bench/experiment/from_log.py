@@ -46,12 +46,7 @@ _DELAYS = range(LONGEST_DELAY + 1)  # Samples by which commands may act late
 
 
 def read_experiment(log: RunLog, bench: Bench | None = None, name: str = "") -> Experiment:
-    """The experiment in a log.
-
-    Args:
-        log: the log.
-        bench: used where the log carries no bench file.
-        name: what to call it; without, the log's file name.
+    """The experiment in a log; ``bench`` is used where the log carries no bench file.
 
     Raises:
         LogError: the log has no experiment, or none of which a whole period is left, or contradicts itself.
@@ -112,15 +107,8 @@ def _commanded(log: RunLog, samples: Samples, delay: int) -> Floats:
 def _disagreements(log: RunLog, bench: Bench, samples: Samples, delay: int, within: float) -> tuple[int, float]:
     """Periods whose report names another command than the one sent for them, or another current than the one to act.
 
-    The one to act is that of the command of ``delay`` samples before.
-    What the node does where no command came in time is its own affair.
-
-    Args:
-        log: the log.
-        bench: the limit of the current.
-        samples: on the grid.
-        delay: samples by which commands act late.
-        within: distance that is no disagreement, of a mapped drive [A].
+    The one to act is that of the command of ``delay`` samples before; of a mapped drive a difference ``within`` some
+    steps is none [A]. What the node does where no command came in time is its own affair.
 
     Returns:
         Their number, and the mean square of the differences of the currents [A²].
@@ -187,11 +175,6 @@ def currents_by_charge(samples: Samples, bench: Bench, layout: Layout) -> Floats
     The charge is reported in steps of the current over a period, so that such a current is known to the step that
     commands have: the rounding moves the brake by less than a thousandth of the sensors' noise.
 
-    Args:
-        samples: on the grid, shape (n,).
-        bench: sample time, and the limit of what can have acted.
-        layout: the bus layout, which says where the charge wraps.
-
     Returns:
         [A], NaN for every other period, shape (n,).
     """
@@ -257,13 +240,7 @@ LOST = Samples(math.nan, math.nan, 0.0, math.nan, math.nan, math.nan, UNKNOWN, U
 
 
 def samples_on_grid(log: RunLog, bench: Bench, planned: int) -> Samples:
-    """One sample for each step from 0 to the last one, received or not.
-
-    Args:
-        log: the log.
-        bench: the sample time.
-        planned: periods of the experiment; later samples are left out.
-    """
+    """One sample for each step from 0 to the last of the ``planned`` ones, received or not."""
     steps, buffers = bytearray(), [bytearray() for _ in LOST]  # thousands of small arrays would break up the memory
     for step, samples in control_cycles(log, bench, planned):
         steps += step.tobytes()
@@ -359,12 +336,7 @@ def _measured(cycles: Table, layout: Layout) -> Booleans:
 class _Reports:
     """The node's reports of what acted before each sample, in a message with the counter of the sample.
 
-    Args:
-        log: the log.
-        message: its name.
-        signal: that reports.
-        unknown: where no report came.
-        apart_ns: most time between two messages of a sample [ns].
+    Two messages of a sample are at most ``apart_ns`` apart; ``unknown`` stands where no report came.
     """
 
     def __init__(self, log: RunLog, message: str, signal: str, unknown: float, apart_ns: int) -> None:
@@ -403,13 +375,7 @@ class _Reports:
 
 
 def samples_before(log: RunLog, bench: Bench, count: int) -> list[SensorSample]:
-    """The last samples up to sample 0 that the runtime took from the frames before the first control cycle.
-
-    Args:
-        log: the log.
-        bench: limits of plausible samples.
-        count: how many, at most.
-    """
+    """The last samples up to sample 0, ``count`` at most, by the frames before the experiment."""
     layout = log.layout
     frames: deque[Frame] = deque(maxlen=4 * count)
     device_time_ns = 0

@@ -25,12 +25,8 @@ MAX_JSON_BYTES = 64 * 2**20  # Size limit of the JSON of an estimate or a report
 def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParameters, SystematicErrors]:
     """The name of the parameters to evaluate at, the parameters, and the systematic errors estimated with them.
 
-    Args:
-        choice: ``log`` for the last running estimate in the log, empty for that or nominal where there is none,
-            ``nominal``, ``true``, ``name=value,name=value``, or the JSON of an estimate or a report; the others are
-            nominal.
-        log: may contain the true ones.
-        bench: contains the nominal ones.
+    The choice is ``log`` for the last running estimate in the log, empty for that or nominal where there is none,
+    ``nominal``, ``true``, ``name=value,name=value``, or the JSON of an estimate or a report; the others are nominal.
     """
     if choice in ("", LOG):
         values = _running(log, bench)
@@ -121,13 +117,7 @@ def _names(records: Any) -> list[str]:
 
 
 def _named(entries: Mapping[str, Any], labels: Mapping[str, Quantity], expected: str) -> dict[str, float]:
-    """Values of a table of the document, by our names [SI].
-
-    Args:
-        entries: each a number, or a table with its ``value``, by label.
-        labels: labels and units by our names.
-        expected: what a value has to be.
-    """
+    """Values of a table of the document, by our names [SI]: numbers, or tables with a ``value``, by label."""
     found = {}
     for name, label in labels.items():
         if label.name in entries:

@@ -69,11 +69,7 @@ class Criteria:
 def criteria(matrix: Any, params: Sequence[str], interest: Sequence[str] | None = None) -> Criteria:
     """D, A, E, condition number and the worst identified combination of an FIM, or of a subset of its parameters.
 
-    Args:
-        matrix: FIM, shape (len(params), len(params)).
-        params: what to call its rows.
-        interest: those that count; the others are unknown nuisances, so that it is the Schur complement that is
-            judged (Ds-optimality). All of them by default.
+    The parameters that are of no ``interest`` are unknown nuisances: the Schur complement is judged (Ds-optimality).
 
     Raises:
         UsageError: the matrix is not square, not finite, or has a negative diagonal element; or the subset is not one.
@@ -121,16 +117,7 @@ def _of_covariance(covariance: Floats) -> Series:
 
 
 def criteria_series(matrices: Floats, params: Sequence[str], interest: Sequence[str]) -> Series:
-    """D, E and A of many matrices, such as those of an experiment as it goes on: to rounding, :func:`criteria` of each.
-
-    Args:
-        matrices: FIMs, shape (m, len(params), len(params)).
-        params: what to call their rows.
-        interest: those that count; the others are unknown nuisances.
-
-    Raises:
-        UsageError: a matrix is not finite, or has a negative diagonal element; or the subset is not one.
-    """
+    """D, E and A of many FIMs, such as those of an experiment as it goes on: to rounding, :func:`criteria` of each."""
     index = [list(params).index(name) for name in interest]
     diagonals = np.diagonal(matrices, axis1=1, axis2=2)
     found = Series(*(np.full(len(matrices), worst) for worst in (-math.inf, 0.0, math.inf)))
@@ -218,12 +205,7 @@ class Criterion:
 
 
 def criterion(name: Name, params: Sequence[str], of: Sequence[str] = ()) -> Criterion:
-    """A criterion by name.
-
-    Args:
-        name: D, A, E or Ds.
-        params: the unknowns.
-        of: for Ds, those that are of interest; the others are nuisances.
+    """A criterion by name; for Ds ``of`` some of the parameters, the others being nuisances.
 
     Raises:
         UsageError: ``of`` does not go with the criterion, or is no proper subset of the unknowns.

@@ -61,14 +61,7 @@ def weights_along(bench: Bench, kind: Kind, instruments: Instruments, states: Fl
     A velocity that an observer derives from the measured angles adds no information to them: it does not count.
     Instruments concern the physical information; the weighted one is the thesis's, whatever measured.
 
-    Args:
-        bench: its noise, limits and sample time.
-        kind: ``physical`` or ``weighted``.
-        instruments: what lies between brake and bus.
-        states: angle and velocity at all instants, shape (n + 1, 2).
-
-    Returns:
-        Shape (n, 2): of the angle and of the velocity, in the units of :class:`Weights`.
+    The states are those at all n + 1 instants; the weights, shape (n, 2), have the units of :class:`Weights`.
     """
     result = np.tile(weights_of(bench, kind), (len(states) - 1, 1))
     if kind == "physical" and instruments.clock_jitter > 0.0:
@@ -85,8 +78,7 @@ def information_over_time(s: Floats, weights: Weights | Floats, start: Any = Non
 
     Args:
         s: sensitivities, shape (n, p, 2).
-        weights: :func:`physical_weights` or :func:`thesis_weights`, or those of each sample, shape (n, 2), from
-            :func:`weights_along`.
+        weights: of all samples, or those of each one, shape (n, 2), from :func:`weights_along`.
         start: FIM before the first sample, shape (p, p): a prior or the thesis's ε I; zero without (eq. 4.27).
         measured: n booleans, False for a sample that was lost: the brake moved on unobserved.
 
@@ -172,10 +164,7 @@ class Fisher:
         return Spectrum(self.matrix).correlation()
 
     def verdict(self, ranges: Ranges | None = None) -> Identifiability:
-        """Identifiability of each parameter.
-
-        Args:
-            ranges: where each parameter is known to lie; without, none is at a border.
+        """Identifiability of each parameter, with ``ranges`` in which it is known to lie.
 
         Raises:
             UsageError: this is the weighted FIM, which bounds nothing.
@@ -216,19 +205,10 @@ def fisher(
     prior: Floats | None = None,
     measured: Any = None,
 ) -> Fisher:
-    """The Fisher information that a sequence of currents draws from a brake.
+    """The Fisher information that a sequence of currents [A] draws from a brake whose parameters are the true ones.
 
-    Args:
-        bench: its noise, limits and sample time.
-        p: the brake, whose parameters are the true ones.
-        currents: what acts in each period [A], length n; samples y_1..y_n count.
-        kind: ``physical`` or ``weighted``.
-        plant: how the brake moves, and what the instruments cost.
-        params: names of the unknown parameters that the experiment is for; what is not named is known.
-        nuisances: names of what is unknown besides; its rows come after those of ``params``.
-        x0: angle [rad] and velocity [rad/s] at the start.
-        prior: FIM before the first sample, of all unknowns.
-        measured: n booleans, False for a lost sample.
+    Rows of nuisances come after those of ``params``; what is not named is known. The prior is the FIM of all of them
+    before the first sample; ``measured`` is False for a lost sample.
 
     Raises:
         UsageError: ``currents`` is not one row of finite numbers, or a parameter is unknown, comes twice or is missing.

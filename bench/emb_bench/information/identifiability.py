@@ -136,9 +136,7 @@ def combination(direction: Mapping[str, float]) -> str:
 def schur_complement(matrix: Any, index: Sequence[int]) -> Floats:
     """Information on some parameters when the others are unknown too: M_aa − M_ab M_bb⁻¹ M_ba.
 
-    Args:
-        matrix: FIM, shape (n, n); nuisances that the data do not identify cost no more than those that they do.
-        index: rows of the parameters that count.
+    Nuisances that the data do not identify cost no more than those that they do.
     """
     m = np.asarray(matrix, dtype=np.float64)
     others = [i for i in range(len(m)) if i not in index]

@@ -45,13 +45,7 @@ def packed_index(n: int, i: int, j: int) -> int:
 def information(a1: float, a2: float, b1: float, b2: float, w1: float, w2: float) -> float:
     """One element of an increment of the FIM, a^T R⁻¹ b for the sensitivities a and b of two parameters (eq. 4.21).
 
-    Args:
-        a1: sensitivity of the angle to the first parameter.
-        a2: sensitivity of the velocity to the first parameter.
-        b1: sensitivity of the angle to the second parameter.
-        b2: sensitivity of the velocity to the second parameter.
-        w1: weight of the angle; the thesis's is 1/(100² · 1e-6) = 100.
-        w2: weight of the velocity; the thesis's is 1/500² = 1/250000.
+    1 is the angle, 2 the velocity; their weights in the thesis are 1/(100² · 1e-6) = 100 and 1/500² = 1/250000.
     """
     return w1 * a1 * b1 + w2 * a2 * b2
 
@@ -59,11 +53,7 @@ def information(a1: float, a2: float, b1: float, b2: float, w1: float, w2: float
 def add_increment(m: Floats, s: Floats, w1: float, w2: float) -> None:
     """Add one sample's information to a packed FIM in place: rank two at most, for there are two outputs (eq. 4.37).
 
-    Args:
-        m: packed FIM, shape (n (n + 1) / 2,).
-        s: sensitivities of angle and velocity, shape (n, 2).
-        w1: weight of the angle, see :func:`information`.
-        w2: weight of the velocity.
+    Sensitivities of angle and velocity have the shape (n, 2).
     """
     position = 0
     for i in range(s.shape[0]):
@@ -73,11 +63,7 @@ def add_increment(m: Floats, s: Floats, w1: float, w2: float) -> None:
 
 
 def cholesky(m: Floats, work: Floats) -> bool:
-    """Upper Cholesky factor U of a packed matrix, M = U^T U.
-
-    Args:
-        m: packed matrix, shape (n (n + 1) / 2,); left as it is.
-        work: shape (n, n); becomes U in its upper triangle, the rest is left as it is.
+    """Upper Cholesky factor U of a packed matrix, M = U^T U, in the upper triangle of ``work``.
 
     Returns:
         False if the matrix is singular to rounding, indefinite or holds a NaN; ``work`` is then of no use.
@@ -98,12 +84,7 @@ def cholesky(m: Floats, work: Floats) -> bool:
 
 
 def log_det(m: Floats, work: Floats) -> float:
-    """Logarithm of the determinant of a packed matrix, −inf if it is singular (D-optimality, eq. 4.12).
-
-    Args:
-        m: packed matrix, shape (n (n + 1) / 2,).
-        work: scratch, shape (n, n).
-    """
+    """Logarithm of the determinant of a packed matrix, −inf if it is singular (D-optimality, eq. 4.12)."""
     if not cholesky(m, work):
         return -math.inf
     total = 0.0
@@ -113,12 +94,7 @@ def log_det(m: Floats, work: Floats) -> float:
 
 
 def trace_inverse(m: Floats, work: Floats) -> float:
-    """Trace of M⁻¹ of a packed matrix, inf if it is singular (A-optimality, eq. 4.16): ‖U⁻¹‖² of its factor.
-
-    Args:
-        m: packed matrix, shape (n (n + 1) / 2,).
-        work: scratch, shape (n, n).
-    """
+    """Trace of M⁻¹ of a packed matrix, inf if it is singular (A-optimality, eq. 4.16): ‖U⁻¹‖² of its factor."""
     if not cholesky(m, work):
         return math.inf
     n = work.shape[0]
@@ -140,10 +116,6 @@ def lambda_min(m: Floats, work: Floats) -> float:
 
     Small eigenvalues keep their relative accuracy: 2×2 as |M| / λ_max, larger ones by one-sided Jacobi rotations of the
     Cholesky factor, so that nothing is subtracted from λ_max.
-
-    Args:
-        m: packed matrix, shape (n (n + 1) / 2,).
-        work: scratch, shape (n, n).
     """
     n = work.shape[0]
     if not cholesky(m, work):
@@ -171,16 +143,10 @@ class Goal(NamedTuple):
 
 
 def phi(goal: Goal, m: Floats, softness: float, packed: Floats, work: Floats) -> float:
-    """φ of a packed matrix; −inf if it is singular.
+    """φ of a packed matrix; −inf if it is singular. ``packed``, of its shape, is scratch.
 
-    Ds is the sum of the logarithms of the last pivots if the nuisances come first.
-
-    Args:
-        goal: which φ.
-        m: packed matrix, shape (n (n + 1) / 2,).
-        softness: rounds E's kinks, see :meth:`emb_bench.information.criteria.Criterion.phi`.
-        packed: scratch, shape (n (n + 1) / 2,).
-        work: scratch, shape (n, n).
+    Ds is the sum of the logarithms of the last pivots if the nuisances come first. A softness rounds E's kinks, see
+    :meth:`emb_bench.information.criteria.Criterion.phi`.
     """
     n = work.shape[0]
     for i in range(n):
@@ -249,16 +215,7 @@ def rotate(rows: Floats, a: int, b: int) -> bool:
 
 
 def each(criterion: int, m: Floats, added: float) -> Floats:
-    """A criterion of N packed matrices M + added · I; compiled.
-
-    Args:
-        criterion: ``LOG_DET``, ``LAMBDA_MIN``, ``LOG_LAMBDA_MIN`` or ``MINUS_LOG_TRACE``.
-        m: packed, shape (N, n (n + 1) / 2).
-        added: the thesis's ε (eq. 4.28), a prior, or 0.
-
-    Returns:
-        Shape (N,).
-    """
+    """A criterion of N packed matrices M + added · I, shape (N,); compiled. The thesis adds ε (eq. 4.28)."""
     out = np.empty(len(m))
     compiled(_each)(criterion, m, added, out)
     return out
