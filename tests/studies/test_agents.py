@@ -72,7 +72,7 @@ def test_every_target_has_statements_of_its_own_trainings_which_are_made_once(
 ) -> None:
     assert set(TRAININGS) == set(FIGURES)
     facts = [fact for figure in FIGURES for fact in agents.agent_facts(figure, made)]
-    assert len(facts) == 37 + 7  # those of docs/studies/reproduction/, and Table 6.2
+    assert len(facts) == 37 + 7  # those of docs/studies/reproduction.md, and Table 6.2
     assert all(fact.found and fact.agrees in (True, False) for fact in facts)
     both = ("e-optimal-hybrid", "e-optimal-trajectory", "trajectory-a", "trajectory-b")
     once = ("adaptive", "d-optimal-1", "d-optimal-2", "fixed", "random")
