@@ -26,7 +26,6 @@ from typing import Any
 from emb_bench.brake.parameters import (
     COMMAND,
     CONTACT,
-    COULOMB_ASYMMETRY,
     CURRENT_OFFSET,
     DELAY,
     F_V,
@@ -52,22 +51,21 @@ def advance_exact(
     t_s: float,
     chosen: Any,
     s: Any,
-    coulomb_asymmetry: float = 0.0,
     viscous_asymmetry: float = 0.0,
 ) -> None:
     """One sample period, in place; arguments are those of :func:`emb_bench.brake.motion.advance`.
 
-    Friction may depend on the direction d = ±1: T_c (1 + d coulomb_asymmetry) + f_v (1 + d viscous_asymmetry) |x2|.
+    Friction may depend on the direction d = ±1: T_c + f_v (1 + d viscous_asymmetry) |x2|.
     """
     drive, spring = p.k_m * u / p.J, p.gamma * p.k_1 / p.J
-    _delayed_switch(p, x, u, t_s, chosen, s, coulomb_asymmetry)
+    _delayed_switch(p, x, u, t_s, chosen, s)
     x1, x2 = float(x[0]), float(x[1])
     left = t_s
     while left > 0.0:
         pull = drive - spring * max(x1, 0.0)
         ahead = x2 if x2 != 0.0 else pull
         direction = 1.0 if ahead > 0.0 else -1.0
-        coulomb = p.T_c / p.J * (1.0 + direction * coulomb_asymmetry)
+        coulomb = p.T_c / p.J
         damping = p.f_v / p.J * (1.0 + direction * viscous_asymmetry)
         if x2 == 0.0 and abs(pull) <= coulomb:
             for j in range(chosen.shape[0]):
@@ -91,7 +89,7 @@ def advance_exact(
                 damping, w, p, u, x1, x2, a, direction, coulomb, s[j, 0], s[j, 1], int(chosen[j]), t
             )
         if stops:
-            after = _acceleration_from_rest(drive - spring * max(y1, 0.0), p.T_c / p.J, coulomb_asymmetry)
+            after = _acceleration_from_rest(drive - spring * max(y1, 0.0), coulomb)
             factor = after / b if b * direction < 0.0 else 0.0
             for j in range(chosen.shape[0]):
                 s[j, 1] *= factor
@@ -152,8 +150,6 @@ def _glide_sensitivity(
         constant = w
     elif i in (CURRENT_OFFSET, COMMAND):
         constant = p.k_m / p.J
-    elif i == COULOMB_ASYMMETRY:
-        constant = -p.T_c / p.J  # of either sign of the motion
     elif i == VISCOUS_ASYMMETRY:
         velocity_share = -direction * p.f_v / p.J
     first, second = x2, a
@@ -172,21 +168,12 @@ def _glide_sensitivity(
     return angle, velocity
 
 
-def _friction_from_rest(pull: float, coulomb: float, asymmetry: float) -> float:
-    """Largest friction per inertia against a torque ``pull`` on a brake at rest, with the sign of ``pull`` [rad/s²]."""
-    direction = math.copysign(1.0, pull)
-    return direction * coulomb * (1.0 + direction * asymmetry)
-
-
-def _acceleration_from_rest(pull: float, coulomb: float, asymmetry: float) -> float:
+def _acceleration_from_rest(pull: float, coulomb: float) -> float:
     """Acceleration of a brake at rest under a torque ``pull`` per inertia: 0 while it sticks [rad/s²]."""
-    friction = _friction_from_rest(pull, coulomb, asymmetry)
-    return 0.0 if abs(pull) <= abs(friction) else pull - friction
+    return 0.0 if abs(pull) <= coulomb else pull - math.copysign(coulomb, pull)
 
 
-def _delayed_switch(
-    p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any, coulomb_asymmetry: float
-) -> None:
+def _delayed_switch(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> None:
     """Adds what a later switch does to the sensitivity to a delay: the command before it acts for that time."""
     for j in range(chosen.shape[0]):
         if chosen[j] == DELAY:
@@ -196,9 +183,9 @@ def _delayed_switch(
                 s[j, 1] += t_s * (before - now)
             else:
                 s[j, 1] += t_s * late_start(
-                    _acceleration_from_rest(before, coulomb, coulomb_asymmetry),
-                    now - _friction_from_rest(before, coulomb, coulomb_asymmetry),
-                    _acceleration_from_rest(now, coulomb, coulomb_asymmetry),
+                    _acceleration_from_rest(before, coulomb),
+                    now - math.copysign(coulomb, before),
+                    _acceleration_from_rest(now, coulomb),
                 )
 
 

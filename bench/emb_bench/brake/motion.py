@@ -37,9 +37,9 @@ def advance(
     if mechanics.solver == EULER:
         advance_euler(p, x, u, t_s, chosen, s)
     elif is_plain(mechanics):
-        advance_exact(p, x, u, t_s, chosen, s, 0.0, 0.0)
-    elif depends_on_direction(mechanics):
-        advance_exact(p, x, u, t_s, chosen, s, mechanics.coulomb_asymmetry, mechanics.viscous_asymmetry)
+        advance_exact(p, x, u, t_s, chosen, s, 0.0)
+    elif mechanics.viscous_asymmetry != 0.0:  # which goes with no other feature
+        advance_exact(p, x, u, t_s, chosen, s, mechanics.viscous_asymmetry)
     else:
         advance_extended(mechanics, p, x, u, t_s, chosen, s)
 
@@ -48,12 +48,7 @@ def is_plain(m: Mechanics) -> bool:
     """Returns True if a brake solved exactly has none of the features beyond the thesis's equations."""
     friction = m.break_away == 1.0 and m.stribeck_velocity == 0.0 and m.f_l == 0.0
     stiffness = m.quadratic == 0.0 and m.cubic == 0.0 and m.hysteresis == 0.0 and m.play == 0.0
-    return friction and stiffness and m.current_lag == 0.0 and not depends_on_direction(m)
-
-
-def depends_on_direction(m: Mechanics) -> bool:
-    """Returns True if the friction depends on the direction of motion; such a brake has no other feature."""
-    return m.coulomb_asymmetry != 0.0 or m.viscous_asymmetry != 0.0
+    return friction and stiffness and m.current_lag == 0.0 and m.viscous_asymmetry == 0.0
 
 
 def rest() -> Floats:

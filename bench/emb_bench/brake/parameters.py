@@ -202,10 +202,9 @@ PARAMETERS: Mapping[str, Parameter] = {
         positive=True,
         addition="lag of the current",
     ),
-    "coulomb_asymmetry": Parameter(
-        "1", False, "share by which T_c is larger in the positive direction and smaller in the negative", -0.9, 0.9
+    "viscous_asymmetry": Parameter(
+        "1", False, "share by which f_v is larger in the positive direction and smaller in the negative", -0.9, 0.9
     ),
-    "viscous_asymmetry": Parameter("1", False, "the same of f_v", -0.9, 0.9),
 }
 
 _index = list(PARAMETERS).index
@@ -228,7 +227,6 @@ HYSTERESIS = _index("hysteresis")
 CURRENT_LAG = _index("current_lag")
 CURRENT_OFFSET = _index("current_offset")
 VELOCITY_GAIN = _index("velocity_gain")
-COULOMB_ASYMMETRY = _index("coulomb_asymmetry")
 VISCOUS_ASYMMETRY = _index("viscous_asymmetry")
 PLAY = _index("play")
 COMMAND = len(PARAMETERS)

@@ -54,9 +54,6 @@ class Mechanics(NamedTuple):
     current_lag: Annotated[float, Meta(ge=SHORTEST_LAG, le=0.1)] = (
         0.0  # Time constant of the current loop [s]; 0: the current is there at once
     )
-    coulomb_asymmetry: Annotated[float, Meta(ge=-0.9, le=0.9)] = (
-        0.0  # T_c (1 + it) in the positive direction, T_c (1 − it) in the negative
-    )
     viscous_asymmetry: Annotated[float, Meta(ge=-0.9, le=0.9)] = (
         0.0  # f_v (1 + it) in the positive direction, f_v (1 − it) in the negative
     )
@@ -98,8 +95,7 @@ BUILT_IN = {
     DEFAULT_PLANT: Plant(DEFAULT_PLANT, Mechanics(solver=EXACT), Instruments()),
 }
 
-ASYMMETRIES = ("coulomb_asymmetry", "viscous_asymmetry")
-"""Friction by direction, which goes with no other feature of the mechanics."""
+DIRECTED = "viscous_asymmetry"  # Friction by direction, which goes with no other feature of the mechanics
 EVERY = "all"  # Name for all plants together, which no plant may have
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")  # it stands in tables and in sim:plant=NAME,f_v=3e-5
 _TABLE = struct_of(Mechanics, Instruments, solver=(Solver, "exact"))
@@ -129,12 +125,11 @@ def read_plant(name: str, document: Mapping[str, Any], source: str) -> Plant:
 def _contradictions(given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Keys that do not go with others, and why."""
     features = sorted({*given} & {*Mechanics._fields} - {"solver"})
-    directions = {*given} & {*ASYMMETRIES}
     for key in features:
         if (solver := given.get("solver", "exact")) != "exact":
             yield key, f'goes with solver = "exact", not with "{solver}"'
-        if directions and key not in directions:
-            yield key, f"does not go with {' or '.join(ASYMMETRIES)}: expected one of the two"
+        if DIRECTED in given and key != DIRECTED:
+            yield key, f"does not go with {DIRECTED}: expected one of the two"
         if (needed := _NEEDED.get(key, key)) not in given:
             yield key, f"has no effect without {needed}"
     if {"play", "hysteresis"} <= {*given}:

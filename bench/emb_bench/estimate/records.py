@@ -10,7 +10,7 @@ from typing import NamedTuple
 from emb_bench.brake.motion import is_plain
 from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS
 from emb_bench.config.bench import Bench
-from emb_bench.config.plants import ASYMMETRIES, EXACT, Plant
+from emb_bench.config.plants import DIRECTED, EXACT, Plant
 from emb_bench.experiment.evaluation import Question, SystematicErrors
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
@@ -141,11 +141,6 @@ def with_systematic(asked: EstimationProblem, bench: Bench, plant: Plant) -> Est
     )
 
 
-def has_no_feature(plant: Plant) -> bool:
-    """True if the plant moves as the thesis's equations say, friction by direction apart."""
-    return is_plain(plant.mechanics._replace(coulomb_asymmetry=0.0, viscous_asymmetry=0.0))
-
-
 def check_model(plant: Plant, names: Sequence[str]) -> None:
     """Refuses unknowns that a model cannot estimate.
 
@@ -160,11 +155,10 @@ def check_model(plant: Plant, names: Sequence[str]) -> None:
             "have it"
         )
     m = plant.mechanics
-    directed = [name for name in names if name in ASYMMETRIES]
-    if directed and (plant.mechanics.solver != EXACT or features or not has_no_feature(plant)):
+    alone = is_plain(m._replace(viscous_asymmetry=0.0)) and not features
+    if DIRECTED in names and (m.solver != EXACT or not alone):
         raise UsageError(
-            f"plant '{plant.name}': {', '.join(directed)}: expected a plant that is solved exactly and has no other "
-            "feature"
+            f"plant '{plant.name}': {DIRECTED}: expected a plant that is solved exactly and has no other feature"
         )
     with_play, with_hysteresis = (getattr(m, name) > 0.0 or name in features for name in ("play", "hysteresis"))
     if with_play and with_hysteresis and {"play", "hysteresis"} & {*features}:

@@ -276,7 +276,7 @@ def _finished(
         ends=ends,
         residuals=_residuals(problem, cut, at, weights),
         method="windows",
-        caveats=(*said, *_caveats(problem, len(cut))),
+        caveats=(*said, f"each of the {len(cut)} windows of {window_of(problem):g} s has a start of its own"),
     )
 
 
@@ -298,17 +298,6 @@ def _residuals(problem: Problem, cut: Sequence[Problem], at: Point, weights: Seq
         errors = (window.records[0].samples - window.predict(z, 0).shown) * root
         found[name][begin:end] = np.where(root > 0.0, errors, np.nan)
     return tuple(found[record.name] for record in problem.records)
-
-
-def _caveats(problem: Problem, windows: int) -> tuple[str, ...]:
-    names = problem.asked.names
-    said = [f"each of the {windows} windows of {window_of(problem):g} s has a start of its own"]
-    if {"coulomb_asymmetry", "current_offset"} <= {*names}:
-        said.append(
-            "while the machine moves, a Coulomb friction by direction and an offset of the current are one and the "
-            "same number: only standstill tells them apart"
-        )
-    return tuple(said)
 
 
 @dataclass(frozen=True, eq=False)

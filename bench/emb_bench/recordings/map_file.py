@@ -141,7 +141,7 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True):
     travel: Positive = 0.0  # Metres per radian of a linear machine; 0 for one that turns
     window: Annotated[float, Meta(ge=1e-3, le=3600.0)] = 0.0  # [s]; 0: the recording chooses
     nuisances: tuple[str, ...] = ()
-    by_direction: tuple[Literal["coulomb_asymmetry", "viscous_asymmetry"], ...] = ()
+    by_direction: tuple[Literal["viscous_asymmetry"], ...] = ()
     units: Units = Units()
 
     def __post_init__(self) -> None:

@@ -14,7 +14,7 @@ from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, no_sensit
 from emb_bench.brake.parameters import FEATURES as NAMED
 from emb_bench.brake.parameters import PARAMETERS, scale
 from emb_bench.config.bench import load_bench
-from emb_bench.config.plants import ASYMMETRIES, EULER, EXACT, Mechanics
+from emb_bench.config.plants import DIRECTED, EULER, EXACT, Mechanics
 
 BENCH = load_bench()
 P = BENCH.brake
@@ -28,7 +28,6 @@ FEATURES = {
     "cubic": 1e-5,
     "hysteresis": 0.1,
     "current_lag": 0.002,
-    "coulomb_asymmetry": 0.1,
     "viscous_asymmetry": -0.2,
     "play": 0.3,
 }
@@ -39,7 +38,7 @@ def start() -> Floats:
 
 
 def advance_directed(m: Mechanics, p: Any, x: Floats, u: float, t_s: float, chosen: Any, s: Floats) -> None:
-    advance_exact(p, x, u, t_s, chosen, s, m.coulomb_asymmetry, m.viscous_asymmetry)
+    advance_exact(p, x, u, t_s, chosen, s, m.viscous_asymmetry)
 
 
 def moved(m: Mechanics) -> tuple[Floats, Floats]:
@@ -57,8 +56,8 @@ def with_feature(name: str) -> Mechanics:
     [
         (Mechanics(EULER), lambda _, *arguments: advance_euler(*arguments)),
         (Mechanics(EXACT), lambda _, *arguments: advance_exact(*arguments)),
-        *((with_feature(name), advance_extended) for name in FEATURES if name not in ASYMMETRIES),
-        *((with_feature(name), advance_directed) for name in ASYMMETRIES),
+        *((with_feature(name), advance_extended) for name in FEATURES if name != DIRECTED),
+        (with_feature(DIRECTED), advance_directed),
     ],
 )
 def test_each_brake_is_moved_by_its_own_solver(m: Mechanics, solver: Callable[..., None]) -> None:
