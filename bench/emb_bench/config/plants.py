@@ -13,9 +13,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
-from msgspec import Meta, structs
+from msgspec import Meta
 
-from emb_runtime.config.typed import SMALLEST, key_text, read, struct_of
+from emb_runtime.config.typed import SMALLEST, key_text, read, shown
 from emb_runtime.errors import BenchFileError
 
 Solver = Literal["euler", "exact"]
@@ -98,7 +98,6 @@ BUILT_IN = {
 DIRECTED = "viscous_asymmetry"  # Friction by direction, which goes with no other feature of the mechanics
 EVERY = "all"  # Name for all plants together, which no plant may have
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")  # it stands in tables and in sim:plant=NAME,f_v=3e-5
-_TABLE = struct_of(Mechanics, Instruments, solver=(Solver, "exact"))
 _NEEDED = {"stribeck_exponent": "stribeck_velocity", "hysteresis_travel": "hysteresis"}  # Keys without effect alone
 
 
@@ -114,12 +113,19 @@ def read_plant(name: str, document: Mapping[str, Any], source: str) -> Plant:
     if name == EVERY or not _NAME.fullmatch(name):
         wanted = f"expected a name of 1 to 40 letters, digits, '-' and '_', other than '{EVERY}'"
         raise BenchFileError(f"{at}: {wanted}")
-    given = read(_TABLE, document, source, BenchFileError, at=("plants", name), smallest=SMALLEST)
+    solver = document.get("solver", "exact")
+    if solver not in SOLVERS:
+        raise BenchFileError(f"{at}.solver: expected one of {', '.join(SOLVERS)}, got {shown(solver)}")
+    # Features of the mechanics; what is none of them is of the instruments, or unknown.
+    features = {key: value for key, value in document.items() if key in Mechanics._fields}
+    features["solver"] = SOLVERS.index(solver)
+    others = {key: value for key, value in document.items() if key not in Mechanics._fields}
+    place = ("plants", name)
+    mechanics = read(Mechanics, features, source, BenchFileError, at=place, smallest=SMALLEST)
+    instruments = read(Instruments, others, source, BenchFileError, at=place, smallest=SMALLEST)
     for key, reason in _contradictions(document):
         raise BenchFileError(f"{at}.{key}: {reason}")
-    values = structs.asdict(given) | {"solver": SOLVERS.index(given.solver)}
-    mechanics = Mechanics(**{key: values[key] for key in Mechanics._fields})
-    return Plant(name, mechanics, Instruments(**{key: values[key] for key in Instruments._fields}))
+    return Plant(name, mechanics, instruments)
 
 
 def _contradictions(given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

@@ -13,12 +13,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import msgspec
 from msgspec import Meta
 
-from emb_runtime.config.typed import MAX_TOML_BYTES, SMALLEST, FieldError, Positive, parse_toml, read, struct_of
+from emb_runtime.config.typed import MAX_TOML_BYTES, SMALLEST, FieldError, Positive, parse_toml, read
 from emb_runtime.errors import BenchFileError, near
 from emb_runtime.system.input_file import read_text
 
@@ -184,24 +184,17 @@ class Can:
     """SHA-256 of the mapping of a drive, and its DBC: no other one is taken then. Empty where the file names none."""
 
 
-if TYPE_CHECKING:
-    from msgspec import Struct as _Brake
-    from msgspec import Struct as _Shield
-else:
-    _Brake, _Shield = struct_of(BrakeParameters), struct_of(Shield)
-
-
 class _Document(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A bench file as it stands."""
 
     schema: Literal[1]
     name: str
-    brake: _Brake
+    brake: BrakeParameters
     ranges: dict[str, dict[ParameterName, tuple[Positive, Positive]]]
     limits: Limits
     noise: Noise
     timing: Timing
-    shield: _Shield
+    shield: Shield
     watch: Watch
     guard: GuardLimits
     node: Node
@@ -336,17 +329,15 @@ def checked_bench(document: Mapping[str, Any], text: str, source: str, *, driven
 
 
 def _checked(found: _Document, document: Mapping[str, Any], text: str, driven: bool) -> Bench:
-    brake = BrakeParameters(**msgspec.structs.asdict(found.brake))
-    shield = Shield(**msgspec.structs.asdict(found.shield))
     bench = Bench(
         name=found.name,
-        brake=brake,
-        ranges={name: _ranges(name, table, brake) for name, table in found.ranges.items()},
+        brake=found.brake,
+        ranges={name: _ranges(name, table, found.brake) for name, table in found.ranges.items()},
         limits=found.limits,
         noise=found.noise,
         timing=found.timing,
-        shield=shield,
-        prior=shield.ranges if found.estimator is None else found.estimator.ranges,
+        shield=found.shield,
+        prior=found.shield.ranges if found.estimator is None else found.estimator.ranges,
         watch=found.watch,
         guard=found.guard,
         node=found.node,

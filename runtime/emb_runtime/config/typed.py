@@ -1,6 +1,7 @@
 """Documents of unknown origin, read into records: TOML and JSON, types, bounds, no unknown key.
 
-A record is a frozen ``msgspec.Struct`` or dataclass whose fields carry their bounds, ``Annotated[float, Meta(gt=0)]``.
+A record is a frozen ``msgspec.Struct``, dataclass or named tuple whose fields carry their bounds,
+``Annotated[float, Meta(gt=0)]``.
 An error is one line: document, key, what was expected, what came.
 """
 
@@ -26,7 +27,7 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 LONGEST_VALUE = 120  # Characters of a foreign value that a message repeats
 MAX_TOML_BYTES = 64 * 1024  # A bench file has a few KiB
 MAX_DOTS = 500  # Most dots in a line: for a key of n parts tomllib takes time and memory that grow with n²
-_RECORDS = (inspect.StructType, inspect.DataclassType)
+_RECORDS = (inspect.StructType, inspect.DataclassType, inspect.NamedTupleType)
 
 Keys = tuple[str | int, ...]  # Keys and indices that lead to a value
 
@@ -82,22 +83,6 @@ def read(
         keys, reason = err.keys, str(err)
     place = key_text((*at, *keys))
     raise error(f"{source}: {place}: {reason}" if place else f"{source}: {reason}")
-
-
-def struct_of(*kinds: type[Any], **others: tuple[Any, Any]) -> Any:
-    """A struct with the fields, bounds and defaults of named tuples, which msgspec itself reads from a list.
-
-    Args:
-        kinds: the named tuples.
-        others: types and defaults of further fields, or of those that a document writes in another way.
-    """
-    fields = {}
-    for kind in kinds:
-        for name, hint in get_type_hints(kind, include_extras=True).items():
-            fields[name] = hint, kind._field_defaults.get(name, msgspec.NODEFAULT)
-    return msgspec.defstruct(
-        "Table", [(name, *field) for name, field in (fields | others).items()], frozen=True, kw_only=True
-    )
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -252,6 +237,7 @@ _NOUNS: Mapping[type, str] = {
     inspect.BoolType: "true or false",
     inspect.StructType: "a table",
     inspect.DataclassType: "a table",
+    inspect.NamedTupleType: "a table",
     inspect.DictType: "a table",
 }
 
