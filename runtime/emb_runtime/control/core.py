@@ -476,11 +476,12 @@ class Core:
             self._finish(sample, step)
             return None
         self._check_sample(sample)
-        self._remember(*NO_PAST[: self._missed])
+        if self._missed:
+            self._remember(*NO_PAST[: self._missed])
         self._estimator.take(sample.angle, sample.velocity, step, sample.applied_current)
         asked = self.actor.act(sample.angle, sample.velocity, step, self._estimator)
         wanted = checked(asked, self.current_limit)
-        return Proposal(sample, step, wanted, self._decide(sample, wanted, step))
+        return tuple.__new__(Proposal, (sample, step, wanted, self._decide(sample, wanted, step)))
 
     def _begin(self, sample: SensorSample) -> None:
         self._start_ns = sample.device_time_ns

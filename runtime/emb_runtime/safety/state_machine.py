@@ -104,6 +104,8 @@ _NEXT: Final[dict[tuple[RunState, Event], RunState]] = {
 }
 _LISTENING: Final = (RunState.SILENT, RunState.ARMED, RunState.ACTIVE, RunState.HOMING, RunState.STOPPING)
 _WATCHED: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)  # States in which the node must be heard
+_ENABLING: Final = (RunState.ACTIVE, RunState.HOMING)  # By names of their own: asked several times in each cycle
+_SENDING: Final = (*_ENABLING, RunState.STOPPING)
 
 
 def step(times: Timeouts, run: Run, event: Event | Fault, now_ns: int) -> Run:
@@ -154,12 +156,12 @@ def _waited(times: Timeouts, run: Run, now_ns: int) -> Run:
 
 def may_send(state: RunState) -> bool:
     """Returns True if any frame may leave in this state."""
-    return state in (RunState.ACTIVE, RunState.HOMING, RunState.STOPPING)
+    return state in _SENDING
 
 
 def may_enable(state: RunState) -> bool:
     """Returns True if an enabled command, one with a current, may leave in this state."""
-    return state in (RunState.ACTIVE, RunState.HOMING)
+    return state in _ENABLING
 
 
 class StopError(Exception):
