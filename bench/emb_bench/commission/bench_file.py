@@ -34,15 +34,12 @@ SHEETS = "the data sheet's"
 def working_text(sheet: Bench) -> str:
     """Bench file that the steps run with: the data sheet's, its angle as wide as a shield can be made for its ranges.
 
-    Args:
-        sheet: bench file with the data sheet's ranges in the set of its shield.
-
     Raises:
-        BenchFileError: there is no shield for these ranges.
+        BenchFileError: there is no shield for the ranges in the set of the data sheet's shield.
     """
-    document, origins = _of_sheet(sheet), dict[str, str]()
-    _limit_angle(document, origins)
-    return _toml(document, origins)
+    draft = _Draft(sheet)
+    draft.limit_angle()
+    return str(draft)
 
 
 def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
@@ -60,43 +57,41 @@ def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
     assert rest is not None
     assert current is not None
     assert one is not None
-    document = _of_sheet(sheet)
-    how = f"output error, model {one.model}, {logs['experiments']}"
-    origins = dict.fromkeys(("limits.current", "limits.angle", "limits.velocity"), SHEETS)
-    measured = document["ranges"][MEASURED] = {n: list(pair) for n, pair in measured_ranges(sheet, one).items()}
-    for name, (low, high) in measured.items():
-        document["brake"][name] = _rounded(min(max(one.values[name], low), high))
-        origins[f"brake.{name}"] = how
-        origins[f"ranges.{MEASURED}.{name}"] = _origin_of_range(sheet, one, name, (low, high))
+    draft, how = _Draft(sheet), f"output error, model {one.model}, {logs['experiments']}"
+    draft.origins |= dict.fromkeys(("limits.current", "limits.angle", "limits.velocity"), SHEETS)
+    for name, (low, high) in measured_ranges(sheet, one).items():
+        draft.put(f"brake.{name}", _rounded(min(max(one.values[name], low), high)), how)
+        draft.put(f"ranges.{MEASURED}.{name}", [low, high], _origin_of_range(sheet, one, name, (low, high)))
     for name in ("angle", "velocity"):
         at_rest, moving = getattr(rest.noise, name), getattr(one.noise, name)
-        document["noise"][name] = _rounded(NOISE_WIDENED * max(at_rest, moving), up=True)
-        origins[f"noise.{name}"] = (
+        draft.put(
+            f"noise.{name}",
+            _rounded(NOISE_WIDENED * max(at_rest, moving), up=True),
             f"at rest {at_rest:.3g} ({logs['rest']}), in motion {moving:.3g} (residuals); the larger times "
-            f"{NOISE_WIDENED:g}"
+            f"{NOISE_WIDENED:g}",
         )
     age = current.delay + current.uncertain + one.measurement_delay
-    lag = min(sheet.shield.current_lag, _rounded(LAG_WIDENED * one.current_lag[1], up=True))
-    document["shield"] |= {
-        "ranges": MEASURED,
-        "frame_age": [min(age, sheet.shield.frame_age[0]), age],
-        "current_lag": lag,
-    }
-    origins["shield.frame_age"] = (
+    unsure = f", and {current.uncertain} as the drive does not say which command it obeyed" if current.uncertain else ""
+    draft.put(
+        "shield.frame_age",
+        [min(age, sheet.shield.frame_age[0]), age],
         f"commands {current.delay} samples late by the node's reports ({logs['current']}), measurements "
-        f"{one.measurement_delay} by the best fit"
-        + (f", and {current.uncertain} as the drive does not say which command it obeyed" if current.uncertain else "")
+        f"{one.measurement_delay} by the best fit{unsure}",
     )
-    origins["shield.current_lag"] = (
-        f"95 % up to {one.current_lag[1]:.3g} s ({how}), times {LAG_WIDENED:g}, at most {SHEETS}"
-        if one.current_lag[1] > 0.0
-        else "the experiments ask for none"
+    slowest = one.current_lag[1]
+    draft.put(
+        "shield.current_lag",
+        min(sheet.shield.current_lag, _rounded(LAG_WIDENED * slowest, up=True)),
+        f"95 % up to {slowest:.3g} s ({how}), times {LAG_WIDENED:g}, at most {SHEETS}"
+        if slowest > 0.0
+        else "the experiments ask for none",
     )
-    origins["shield.break_away"] = origins["shield.f_l"] = f"{SHEETS} bound: not measured by itself"
-    origins["systematic.offset"] = f"contact found at {one.contact[0]:.4g} to {one.contact[1]:.4g} rad"
-    document.setdefault("plants", {})[MEASURED] = _plant(one, current)
-    _limit_angle(document, origins)
-    return _toml(document, origins)
+    draft.document["shield"]["ranges"] = MEASURED
+    draft.origins |= dict.fromkeys(("shield.break_away", "shield.f_l"), f"{SHEETS} bound: not measured by itself")
+    draft.origins["systematic.offset"] = f"contact found at {one.contact[0]:.4g} to {one.contact[1]:.4g} rad"
+    draft.document.setdefault("plants", {})[MEASURED] = _plant(one, current)
+    draft.limit_angle()
+    return str(draft)
 
 
 def _origin_of_range(sheet: Bench, one: Identification, name: str, measured: tuple[float, float]) -> str:
@@ -230,47 +225,53 @@ def _rounded(value: float, *, up: bool = False) -> float:
 # --- documents ------------------------------------------------------------------------------------------------------
 
 
-def _of_sheet(sheet: Bench) -> dict[str, Any]:
-    """The data sheet's document with its ranges as one whole set, without the learning shield."""
-    document = parse_toml(sheet.text)
-    document["ranges"] = {SHEET: {name: list(_range(sheet, name)) for name in PARAMETER_NAMES}}
-    document["shield"] = {key: value for key, value in document["shield"].items() if key not in LEARNING}
-    document["shield"]["ranges"] = SHEET
-    document.pop("estimator", None)  # it begins with the shield's ranges
-    return document
+class _Draft:
+    """The data sheet's document with its ranges as one whole set, without the learning shield, and what changes."""
 
+    def __init__(self, sheet: Bench) -> None:
+        self.document = parse_toml(sheet.text)
+        self.origins: dict[str, str] = {}  # By the path of an entry, ``table.key``
+        self.document["ranges"] = {SHEET: {name: list(_range(sheet, name)) for name in PARAMETER_NAMES}}
+        shield = self.document["shield"]
+        self.document["shield"] = {key: value for key, value in shield.items() if key not in LEARNING}
+        self.document["shield"]["ranges"] = SHEET
+        self.document.pop("estimator", None)  # it begins with the shield's ranges
 
-def _limit_angle(document: dict[str, Any], origins: dict[str, str]) -> None:
-    """Lower the upper angle limit of a document to the largest for which there is a shield."""
-    low, own = document["limits"]["angle"]
-    problem = _shield_problem(document)
-    if problem is None:
-        return
-    for steps in range(1, int((own - NARROWEST) / STEP_DOWN) + 1):
-        document["limits"]["angle"] = [low, own - steps * STEP_DOWN]
-        if _shield_problem(document) is None:
-            origins["limits.angle"] = f"{own:g} rad by the data sheet; the largest for which a shield covers the ranges"
-            return
-    raise problem
-
-
-def _shield_problem(document: Mapping[str, Any]) -> BenchFileError | None:
-    """Reason why there is no shield for a document; None if there is one."""
-    try:
-        make_law(parse_bench(tomlkit.dumps(document), "the bench of a commissioning"))
-    except BenchFileError as err:
-        return err
-    return None
-
-
-def _toml(document: Mapping[str, Any], origins: Mapping[str, str]) -> str:
-    """A document as TOML, with its origin behind each entry that has one and is there."""
-    written = tomlkit.parse(tomlkit.dumps(document))
-    for path, origin in origins.items():
+    def put(self, path: str, value: Any, origin: str) -> None:
         *tables, key = path.split(".")
-        table: Any = written
+        table = self.document
         for name in tables:
-            table = table.get(name, {})
-        if key in table:
-            table.value.item(key).comment(origin)
-    return f"# {WRITTEN}\n# A number without an origin behind it is that file's.\n\n{tomlkit.dumps(written)}"
+            table = table.setdefault(name, {})
+        table[key], self.origins[path] = value, origin
+
+    def limit_angle(self) -> None:
+        """Lower the upper angle limit to the largest for which there is a shield."""
+        low, own = self.document["limits"]["angle"]
+        problem = self._shield_problem()
+        if problem is None:
+            return
+        for steps in range(1, int((own - NARROWEST) / STEP_DOWN) + 1):
+            origin = f"{own:g} rad by the data sheet; the largest for which a shield covers the ranges"
+            self.put("limits.angle", [low, own - steps * STEP_DOWN], origin)
+            if self._shield_problem() is None:
+                return
+        raise problem
+
+    def _shield_problem(self) -> BenchFileError | None:
+        try:
+            make_law(parse_bench(tomlkit.dumps(self.document), "the bench of a commissioning"))
+        except BenchFileError as err:
+            return err
+        return None
+
+    def __str__(self) -> str:
+        """TOML, with its origin behind each entry that has one and is there."""
+        written = tomlkit.parse(tomlkit.dumps(self.document))
+        for path, origin in self.origins.items():
+            *tables, key = path.split(".")
+            table: Any = written
+            for name in tables:
+                table = table.get(name, {})
+            if key in table:
+                table.value.item(key).comment(origin)
+        return f"# {WRITTEN}\n# A number without an origin behind it is that file's.\n\n{tomlkit.dumps(written)}"

@@ -7,15 +7,16 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from emb_bench.commission import examination
 from emb_bench.commission.bench_file import WRITTEN, found_text, measured_ranges, working_text
-from emb_bench.commission.records import Findings, Identification, Kind, Step
-from emb_bench.commission.steps import EXPERIMENTS, FULL, STEPS, judged, policy_file, suspected
+from emb_bench.commission.records import Findings, Identification, Step
+from emb_bench.commission.steps import EXPERIMENTS, FULL, RECENT, STEPS, policy_file, suspected
 from emb_bench.config.bench import Bench, load_bench, parse_bench
+from emb_bench.documents import to_json
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.typed import parse_toml
@@ -24,7 +25,6 @@ from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system import terminal
 
 WORKING, FOUND = "working.toml", "bench.toml"  # Names of the bench files in the folder
-RECENT = 2  # Experiments that the parameters are estimated from: each is larger and tells more than those before it
 OUTSIDE = {Fault.OUT_OF_LIMITS.name, Fault.MOTION_OUTSIDE_SET.name}
 """Results by which the brake may lie outside of the data sheet's ranges."""
 SIMULATED = ("sim", "sim-drive")  # Buses whose brake is made anew for each run
@@ -48,20 +48,19 @@ class Commissioned:
     bench: Path  # The file that was found
     ranges: Mapping[str, tuple[float, float]]  # In it
     found: Findings
-    identified: Identification
     logs: tuple[Path, ...]  # Of the steps, in their order
     runs: int  # Runs made by this call
 
     def document(self) -> dict[str, Any]:
         """Result as plain data."""
-        return {
-            "result": "done",
-            "bench": str(self.bench),
-            "logs": [str(path) for path in self.logs],
-            "runs": self.runs,
-            "ranges": {name: list(pair) for name, pair in self.ranges.items()},
-            "found": asdict(self.found),
-        }
+        found: dict[str, Any] = to_json({"result": "done", **vars(self)})
+        return found
+
+    @property
+    def identified(self) -> Identification:
+        """The last estimate with the data sheet's ranges."""
+        assert self.found.identified is not None
+        return self.found.identified
 
     def __str__(self) -> str:
         one = self.identified
@@ -98,17 +97,16 @@ class Commissioning:
         """All steps that are not done yet."""
         work = self._bench(WORKING, working_text(self._sheet))
         found = Findings()
-        for name, make in STEPS.items():
+        for name, row in STEPS.items():
             bench = self._found_bench(found) if name == FULL else work
-            step = make(bench, found)
-            self._logs[name] = self._completed(name) or self._run(step, bench, found)
-            finding = self._examine(step, found)
-            found = judged(step, finding, self._sheet, found)
+            log = self._completed(name) or self._run(row.make(name, bench, found), bench, found)
+            finding = row.examine(log, self._experiments(), self._sheet, found)
+            found = row.judge(finding, self._sheet, found)
+            self._logs[name] = log
             self._say(f"  found: {finding or 'nothing to object to'}")
-        one = found.identified
-        assert one is not None
-        ranges = measured_ranges(self._sheet, one)
-        return Commissioned(self._folder / FOUND, ranges, found, one, tuple(self._logs.values()), self._runs)
+        assert found.identified is not None
+        ranges = measured_ranges(self._sheet, found.identified)
+        return Commissioned(self._folder / FOUND, ranges, found, tuple(self._logs.values()), self._runs)
 
     # --- files ------------------------------------------------------------------------------------------------------
 
@@ -132,13 +130,13 @@ class Commissioning:
         return load_bench(path)
 
     def _found_bench(self, found: Findings) -> Bench:
-        used = " and ".join(path.name for path in self._experiments())
+        used = " and ".join(path.name for path in self._experiments()[-RECENT:])
         logs = {"rest": self._logs["1-listen"].name, "current": self._logs["3-current"].name, "experiments": used}
         return self._bench(FOUND, found_text(self._sheet, found, logs))
 
     def _experiments(self) -> list[Path]:
-        """Logs of the latest experiments with the data sheet's ranges."""
-        return [self._logs[name] for name in EXPERIMENTS if name in self._logs][-RECENT:]
+        """Logs of the experiments with the data sheet's ranges so far."""
+        return [self._logs[name] for name in EXPERIMENTS if name in self._logs]
 
     def _attempts(self, name: str) -> list[Path]:
         """Logs of a step that are there, and last the one that its next run makes."""
@@ -154,7 +152,7 @@ class Commissioning:
 
     def _run(self, step: Step, bench: Bench, found: Findings) -> Path:
         self._say(f"{step.name}: {step.purpose}\n  relies on {step.rests_on}")
-        path = self._folder / (FOUND if step.kind is Kind.FULL else WORKING)
+        path = self._folder / (FOUND if step.name == FULL else WORKING)
         if bench.identity_hash != self._identity:
             self._identity = bench.identity_hash
             identity = bench_identity(bench.identity_hash)
@@ -164,7 +162,7 @@ class Commissioning:
         arguments = ["--iface", simulated(self._iface, self._sheet, self._runs), "--bench", str(path)]
         arguments += ["--policy", str(policy), "--log", str(log), "--duration", repr(step.duration)]
         self._runs += 1
-        document = self._make_run([*arguments, *self._options, *_stage(step), "--json"])
+        document = self._make_run([*arguments, *self._options, *step.stage, "--json"])
         if document["exit_code"] == EXIT_DONE and examination.ended(log) == "DONE":
             return log
         why, is_outside = _failure(document)
@@ -173,21 +171,6 @@ class Commissioning:
             f"step {step.name} was not completed: {why}; {suspected(self._sheet, found) if is_outside else advice}",
             document["exit_code"] or EXIT_SAFETY_STOP,
         )
-
-    def _examine(self, step: Step, found: Findings) -> object:
-        log = self._logs[step.name]
-        match step.kind:
-            case Kind.REST:
-                return examination.at_rest(log)
-            case Kind.CURRENT:
-                return examination.current(log)
-            case Kind.CHAIN:
-                return None
-        assert found.rest is not None
-        if step.kind is Kind.FIRST_MOVE:
-            return examination.first_move(log, found.rest.noise)
-        logs = [log] if step.kind is Kind.FULL else self._experiments()
-        return examination.identify(logs, self._sheet, found.rest.noise, found.identified)
 
 
 def emb_run(arguments: Sequence[str]) -> Mapping[str, Any]:
@@ -237,15 +220,6 @@ def simulated(iface: str, sheet: Bench, run: int) -> str:
     if run and seed.isdecimal():
         given = [option for option in given if not option.startswith("seed")] + [f"seed={int(seed) + run}"]
     return f"{head}{at}{name}:{','.join(given)}"
-
-
-def _stage(step: Step) -> list[str]:
-    if step.kind is Kind.REST:
-        return ["--read-only"]
-    if step.limit == 0.0:
-        return ["--zero"]
-    # No way home with a current whose sign and scale are not known yet.
-    return ["--limit", repr(step.limit), *(["--home"] if step.kind is not Kind.CURRENT else [])]
 
 
 def _failure(document: Mapping[str, Any]) -> tuple[str, bool]:

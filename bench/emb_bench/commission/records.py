@@ -4,20 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 
 from emb_runtime.config.bench import Noise
-
-
-class Kind(StrEnum):
-    """Kind of a step: what is looked for in its log."""
-
-    REST = "rest"  # Noise and clock of the sensors while nothing is sent
-    CHAIN = "chain"  # The whole chain with 0 A
-    CURRENT = "current"  # Sign, scale and latency of the reported current, with too little to move the brake
-    FIRST_MOVE = "first move"  # Signs and scales of the sensors, and the current that moves the brake
-    EXPERIMENT = "experiment"  # Parameters
-    FULL = "full"  # Parameters again, with the bench file that was found
 
 
 @dataclass(frozen=True)
@@ -34,13 +22,17 @@ class Step:
     """One guarded run: what is done, within which limits, and what these rest on."""
 
     name: str  # Name of its files
-    kind: Kind
     purpose: str  # Description of what is done, for the operator
     rests_on: str  # Origin of the numbers that its limits come from
-    limit: float  # Largest current that may leave [A]; 0 for none but 0 A
     duration: float  # [s]
     window: Window
+    stage: tuple[str, ...] = ()  # Options of ``emb-run`` for what may be sent; none: currents up to the limit
     currents: tuple[float, ...] = (0.0,)  # Wanted current by sample [A]; after the last one it stays
+
+    @property
+    def limit(self) -> float:
+        """Largest current that may leave [A]."""
+        return max(map(abs, self.currents))
 
 
 @dataclass(frozen=True)

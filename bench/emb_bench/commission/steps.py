@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import onnx
 
+from emb_bench.commission import examination
 from emb_bench.commission.bench_file import contradiction, measured_ranges, not_inside, outside
-from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Kind, Rest, Step, Window
+from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Rest, Step, Window
 from emb_bench.config.bench import Bench
 from emb_runtime.errors import BenchFileError, SafetyStopError
 from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, SAMPLE, Contract, PolicyLimits, Vector
@@ -30,6 +31,7 @@ NOISE_EXCESS = 1.1  # Noise at rest over the data sheet's, at most: a deviation 
 AT_REST = 8.0  # Standard deviations of the angle's noise within which the brake has not moved
 AT_BORDER = 0.1  # Share of a border of the data sheet within which a parameter may be what is wrong there
 NEARLY = 1.5  # Mean square of the residuals, in variances of the noise at rest, up to which a model almost fits
+RECENT = 2  # Experiments that the parameters are estimated from: each is larger and tells more than those before it
 AGAIN = "and begin again in another folder"
 SIGNS = (1, -1, 1, 1, -1, -1, 1, -1, -1, 1)  # of the check of the current, five samples each
 SHARES = ((1.0, 0.12), (-1.0, 0.12), (0.7, 0.1), (-0.7, 0.1), (1.0, 0.08), (0.5, 0.06), (-1.0, 0.14))
@@ -64,25 +66,22 @@ def break_away(bench: Bench) -> tuple[float, float]:
 
 
 def _listen(name: str, work: Bench, _: Findings) -> Step:
-    window = Window(*work.limits.angle, work.limits.velocity)
-    return Step(name, Kind.REST, "listen, send nothing", "nothing", 0.0, LISTENING, window)
+    return Step(name, "listen, send nothing", "nothing", LISTENING, _everywhere(work), ("--read-only",))
 
 
 def _chain(name: str, work: Bench, _: Findings) -> Step:
-    window = Window(*work.limits.angle, work.limits.velocity)
-    return Step(name, Kind.CHAIN, "the whole chain with 0 A", "noise and clock at rest", 0.0, SHORT, window)
+    return Step(name, "the whole chain with 0 A", "noise and clock at rest", SHORT, _everywhere(work), ("--zero",))
 
 
 def _current(name: str, work: Bench, _: Findings) -> Step:
     amplitude = BELOW * break_away(work)[0]
     return Step(
         name,
-        Kind.CURRENT,
         f"sign, scale and latency of the current with {1e3 * amplitude:.0f} mA, which moves no brake of the data sheet",
         "least friction and strongest motor of the data sheet",
-        amplitude,
         SHORT,
         Window(-work.shield.home_angle, work.shield.home_angle, work.shield.home_velocity),
+        ("--limit", repr(amplitude)),  # no way home with a current whose sign and scale are not known yet
         4 * tuple(amplitude * sign for sign in SIGNS for _ in range(5)),
     )
 
@@ -93,12 +92,11 @@ def _first_move(name: str, work: Bench, _: Findings) -> Step:
     ramp = [most * (k + 1) / fifth for k in range(fifth)]
     return Step(
         name,
-        Kind.FIRST_MOVE,
         f"a current that rises to {most:.2f} A at most until the brake moves, in either direction",
         "greatest friction and weakest motor of the data sheet; sign and scale of the current",
-        most,
         work.timing.duration,
         Window(-1.0, 1.0, 10.0),
+        ("--limit", repr(most), "--home"),
         (*ramp, *[0.0] * (fifth // 5), *[-value for value in ramp], 0.0),
     )
 
@@ -108,83 +106,42 @@ def _experiment(name: str, work: Bench, found: Findings) -> Step:
     assert move is not None
     limit = min(row.multiple * (MOVES * max(move.up, move.down)), work.limits.current)
     window = Window(row.stroke * work.limits.angle[0], min(row.highest, REACH * work.limits.angle[1]), row.speed)
-    return Step(
+    return _excited(
         name,
-        Kind.EXPERIMENT,
         f"{row.words}: {limit:.2f} A, {window.lowest:.1f} to {window.highest:.1f} rad, {window.speed:g} rad/s",
         "the currents of the first move" if one is None else f"the estimate so far (model {one.model})",
-        limit,
-        work.timing.duration,
+        work,
         window,
-        _alternating(limit, work.timing.horizon),
+        limit,
     )
 
 
 def _full(name: str, bench: Bench, _: Findings) -> Step:
     limits = bench.limits
     window = Window(0.7 * limits.angle[0], REACH * limits.angle[1], FULL_SPEED * limits.velocity)
-    return Step(
+    return _excited(
         name,
-        Kind.FULL,
         f"an experiment with the bench file that was found: {limits.current:g} A, up to {window.highest:.0f} rad and "
         f"{window.speed:.0f} rad/s",
         "all of it",
-        limits.current,
-        bench.timing.duration,
+        bench,
         window,
-        _alternating(limits.current, bench.timing.horizon),
+        limits.current,
     )
 
 
-def _alternating(current: float, horizon: int) -> tuple[float, ...]:
-    return (*(current * share for share, part in SHARES for _ in range(round(part * horizon))), 0.0)
+def _everywhere(bench: Bench) -> Window:
+    return Window(*bench.limits.angle, bench.limits.velocity)
 
 
-FULL = "9-full"
-STEPS: Mapping[str, Callable[[Bench, Findings], Step]] = {
-    "1-listen": partial(_listen, "1-listen"),
-    "2-zero": partial(_chain, "2-zero"),
-    "3-current": partial(_current, "3-current"),
-    "4-first-move": partial(_first_move, "4-first-move"),
-    **{name: partial(_experiment, name) for name in EXPERIMENTS},
-    FULL: partial(_full, FULL),
-}
-"""The steps in their order: each of the bench file that it runs with and of what was found before it."""
+def _excited(name: str, purpose: str, rests_on: str, bench: Bench, window: Window, limit: float) -> Step:
+    """Currents out and back, as :data:`SHARES` has them."""
+    timing = bench.timing
+    currents = (*(limit * share for share, part in SHARES for _ in range(round(part * timing.horizon))), 0.0)
+    return Step(name, purpose, rests_on, timing.duration, window, ("--limit", repr(limit), "--home"), currents)
 
 
 # --- comparison with the data sheet: comparisons are this way round for NaN ------------------------------------------
-
-
-def judged(step: Step, finding: object, sheet: Bench, found: Findings) -> Findings:
-    """Findings with those of one more step.
-
-    Args:
-        step: that was done.
-        finding: by its log.
-        sheet: bench file with the data sheet's ranges.
-        found: before it.
-
-    Raises:
-        SafetyStopError: it contradicts the data sheet, so that nothing more may be done; the message says how.
-        BenchFileError: a parameter lies outside of the data sheet's range.
-    """
-    match finding:
-        case Rest():
-            _judge_rest(finding, sheet)
-            return replace(found, rest=finding)
-        case CurrentCheck():
-            _judge_current(finding, sheet)
-            return replace(found, current=finding)
-        case FirstMove():
-            _judge_first_move(finding, sheet)
-            return replace(found, first_move=finding)
-        case Identification() if step.kind is Kind.FULL:
-            _judge_last(finding, found, sheet)
-        case Identification():
-            _judge_ranges(finding, sheet, is_first=found.identified is None)
-            _judge_delays(finding, sheet)
-            return replace(found, identified=finding)
-    return found
 
 
 def suspected(sheet: Bench, found: Findings) -> str:
@@ -206,7 +163,7 @@ def _require(condition: bool, message: str) -> None:
         raise SafetyStopError(message)
 
 
-def _judge_rest(rest: Rest, sheet: Bench) -> None:
+def _judge_rest(rest: Rest, sheet: Bench, found: Findings) -> Findings:
     for name, got, most, unit in (
         ("angle", rest.noise.angle, sheet.noise.angle, "rad"),
         ("velocity", rest.noise.velocity, sheet.noise.velocity, "rad/s"),
@@ -220,9 +177,10 @@ def _judge_rest(rest: Rest, sheet: Bench) -> None:
         abs(rest.period / sheet.timing.sample_time - 1.0) <= 0.01,
         f"a sample comes every {rest.period:.6g} s by the node's clock, expected {sheet.timing.sample_time:g} s",
     )
+    return replace(found, rest=rest)
 
 
-def _judge_current(check: CurrentCheck, sheet: Bench) -> None:
+def _judge_current(check: CurrentCheck, sheet: Bench, found: Findings) -> Findings:
     _require(
         abs(check.scale - 1.0) <= SCALE_ERROR,
         f"the drive reports {check.scale:.3g} A for 1 A commanded: sign or scale of its current is wrong",
@@ -237,9 +195,10 @@ def _judge_current(check: CurrentCheck, sheet: Bench) -> None:
         f"commands act {check.delay} samples late, and the data sheet's bench file allows for "
         f"{sheet.shield.frame_age[1]}: correct shield.frame_age {AGAIN}",
     )
+    return replace(found, current=check)
 
 
-def _judge_first_move(move: FirstMove, sheet: Bench) -> None:
+def _judge_first_move(move: FirstMove, sheet: Bench, found: Findings) -> Findings:
     _require(
         math.isfinite(move.up) and math.isfinite(move.down),
         "the brake did not move under a current that moves every brake of the data sheet: it is held or not connected, "
@@ -250,6 +209,13 @@ def _judge_first_move(move: FirstMove, sheet: Bench) -> None:
         abs(move.scale - 1.0) <= SCALE_ERROR,
         f"the angle travels {move.scale:.3g} times as far as by the velocity: a sign or scale of a sensor is wrong",
     )
+    return replace(found, first_move=move)
+
+
+def _judge_experiment(one: Identification, sheet: Bench, found: Findings) -> Findings:
+    _judge_ranges(one, sheet, is_first=found.identified is None)
+    _judge_delays(one, sheet)
+    return replace(found, identified=one)
 
 
 def _judge_ranges(one: Identification, sheet: Bench, *, is_first: bool) -> None:
@@ -280,7 +246,7 @@ def _judge_delays(one: Identification, sheet: Bench) -> None:
     )
 
 
-def _judge_last(last: Identification, found: Findings, sheet: Bench) -> None:
+def _judge_last(last: Identification, sheet: Bench, found: Findings) -> Findings:
     """Compare the run with the bench file that was found with the ranges in it."""
     assert found.identified is not None
     for name, (low, high) in measured_ranges(sheet, found.identified).items():
@@ -290,6 +256,47 @@ def _judge_last(last: Identification, found: Findings, sheet: Bench) -> None:
             f"by the run with the bench file that was found {name} is {got[0]:.4g} to {got[1]:.4g} {last.units[name]}, "
             f"in the file {low:.4g} to {high:.4g}: the brake is not the one of the steps before, or changes",
         )
+    return found
+
+
+# --- the table ------------------------------------------------------------------------------------------------------
+
+
+class Row(NamedTuple):
+    """One step: how it is made, how its log is examined, and how what was found compares with the data sheet.
+
+    ``examine`` takes the log and those of the experiments before it; ``judge`` gives the findings with this one, or
+    raises SafetyStopError or BenchFileError where it contradicts the data sheet, so that nothing more may be done.
+    """
+
+    make: Callable[[str, Bench, Findings], Step]
+    examine: Callable[[Path, Sequence[Path], Bench, Findings], Any]
+    judge: Callable[[Any, Bench, Findings], Findings]
+
+
+def _identified(log: Path, before: Sequence[Path], sheet: Bench, found: Findings) -> Identification:
+    assert found.rest is not None
+    return examination.identify([*before, log][-RECENT:], sheet, found.rest.noise, found.identified)
+
+
+def _moved(log: Path, _before: Sequence[Path], _sheet: Bench, found: Findings) -> FirstMove:
+    assert found.rest is not None
+    return examination.first_move(log, found.rest.noise)
+
+
+FULL = "9-full"
+STEPS: Mapping[str, Row] = {
+    "1-listen": Row(_listen, lambda log, *_: examination.at_rest(log), _judge_rest),
+    "2-zero": Row(_chain, lambda *_: None, lambda _finding, _sheet, found: found),
+    "3-current": Row(_current, lambda log, *_: examination.current(log), _judge_current),
+    "4-first-move": Row(_first_move, _moved, _judge_first_move),
+    **dict.fromkeys(EXPERIMENTS, Row(_experiment, _identified, _judge_experiment)),
+    FULL: Row(_full, lambda log, _, *rest: _identified(log, (), *rest), _judge_last),
+}
+"""The steps in their order."""
+
+
+# --- their policies -------------------------------------------------------------------------------------------------
 
 
 GRAPH = """

@@ -18,8 +18,8 @@ from emb_bench.commission.bench_file import (
     working_text,
 )
 from emb_bench.commission.examination import noise_in_motion, scatter
-from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Kind, Rest, Step, Window
-from emb_bench.commission.steps import EXPERIMENTS, STEPS, break_away, judged, policy_file, suspected
+from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Rest, Step, Window
+from emb_bench.commission.steps import EXPERIMENTS, FULL, STEPS, break_away, policy_file, suspected
 from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_runtime.config.bench import PARAMETER_NAMES, Noise, shipped_bench_text
 from emb_runtime.drives.mapping_file import load_mapping
@@ -83,14 +83,15 @@ def found(sheet: Bench, **changed: object) -> Findings:
 
 
 def all_steps(work: Bench, findings: Findings) -> list[Step]:
-    return [make(work, findings) for make in STEPS.values()]
+    return [row.make(name, work, findings) for name, row in STEPS.items()]
 
 
 def test_nothing_is_sent_before_the_sensors_are_known_and_each_experiment_may_do_more(
     sheet: Bench, work: Bench
 ) -> None:
     steps = all_steps(work, found(sheet))
-    assert [step.kind for step in steps[:4]] == [Kind.REST, Kind.CHAIN, Kind.CURRENT, Kind.FIRST_MOVE]
+    assert [step.stage[0] for step in steps] == ["--read-only", "--zero", *["--limit"] * 7]
+    assert ["--home" in step.stage for step in steps] == 3 * [False] + 6 * [True]
     assert steps[0].limit == steps[1].limit == 0.0
     experiments = steps[4:]
     assert len(experiments) == len(EXPERIMENTS) + 1
@@ -99,9 +100,9 @@ def test_nothing_is_sent_before_the_sensors_are_known_and_each_experiment_may_do
         assert after.window.speed >= before.window.speed
         assert after.window.highest >= before.window.highest
         assert after.window.lowest <= before.window.lowest
-    assert [step.kind for step in experiments] == [Kind.EXPERIMENT] * len(EXPERIMENTS) + [Kind.FULL]
+    assert [step.name for step in experiments] == [*EXPERIMENTS, FULL]
     for step in steps:
-        assert max(map(abs, step.currents)) <= step.limit + 1e-12
+        assert step.stage[0] != "--limit" or float(step.stage[1]) == step.limit
         assert len(step.currents) <= work.timing.horizon
         assert work.limits.angle[0] <= step.window.lowest
         assert step.window.highest <= sheet.limits.angle[1]
@@ -117,8 +118,16 @@ def test_the_current_check_moves_no_brake_of_the_data_sheet_and_the_first_move_e
     assert steps[2].limit == pytest.approx(0.06, abs=0.001)  # 5.2e-3 N·m / 0.0434 N·m/A / 2
 
 
-def test_what_contradicts_the_data_sheet_ends_it(sheet: Bench, work: Bench) -> None:
-    step = all_steps(work, found(sheet))[0]
+JUDGES = {
+    Rest: STEPS["1-listen"].judge,
+    CurrentCheck: STEPS["3-current"].judge,
+    FirstMove: STEPS["4-first-move"].judge,
+    Identification: STEPS["5-free-stroke"].judge,
+}
+judge_experiment = JUDGES[Identification]
+
+
+def test_what_contradicts_the_data_sheet_ends_it(sheet: Bench) -> None:
     for finding, words in (
         (replace(REST, noise=Noise(2e-3, 1.0)), "angle scatters"),
         (replace(REST, noise=Noise(1e-3, 1.3)), "velocity scatters"),
@@ -134,14 +143,13 @@ def test_what_contradicts_the_data_sheet_ends_it(sheet: Bench, work: Bench) -> N
         (identification(sheet, current_lag=(9e-4, 1.1e-3)), "the current lags by"),
     ):
         with pytest.raises(EmbError, match=words):
-            judged(step, finding, sheet, Findings())
+            JUDGES[type(finding)](finding, sheet, Findings())
 
 
-def test_what_agrees_with_the_data_sheet_is_kept_and_the_rest_stays(sheet: Bench, work: Bench) -> None:
-    steps = all_steps(work, found(sheet))
+def test_what_agrees_with_the_data_sheet_is_kept_and_the_rest_stays(sheet: Bench) -> None:
     findings = Findings()
-    for step, finding in zip(steps, (REST, None, CURRENT, MOVE, identification(sheet)), strict=False):
-        findings = judged(step, finding, sheet, findings)
+    for row, finding in zip(STEPS.values(), (REST, None, CURRENT, MOVE, identification(sheet)), strict=False):
+        findings = row.judge(finding, sheet, findings)
     assert findings == found(sheet)
 
 
@@ -163,29 +171,27 @@ def test_no_range_is_written_that_does_not_hold_the_interval(sheet: Bench) -> No
             found_text(sheet, found(sheet, identified=one), LOGS)
 
 
-def test_an_interval_outside_of_a_range_ends_it_and_one_across_a_border_does_not(sheet: Bench, work: Bench) -> None:
-    step = all_steps(work, found(sheet))[4]
+def test_an_interval_outside_of_a_range_ends_it_and_one_across_a_border_does_not(sheet: Bench) -> None:
     for name in PARAMETER_NAMES:
         for shares in AWAY:
             with pytest.raises(BenchFileError, match=rf"widen {name} in \[ranges\.wide\]"):
-                judged(step, with_interval(identification(sheet), name, shares), sheet, Findings())
+                judge_experiment(with_interval(identification(sheet), name, shares), sheet, Findings())
         for shares in ACROSS:  # larger experiments tell
             across = with_interval(identification(sheet), name, shares)
-            assert judged(step, across, sheet, Findings()).identified is across
+            assert judge_experiment(across, sheet, Findings()).identified is across
 
 
 def test_an_almost_fitting_model_far_outside_of_the_data_sheet_ends_it_from_the_second_experiment_on(
-    sheet: Bench, work: Bench
+    sheet: Bench,
 ) -> None:
-    step = all_steps(work, found(sheet))[5]
     one = identification(sheet, fits=False, ratio=0.95, objections=("correct J in the bench file",))
     for share in (5.0, 0.2):
         outside = with_interval(one, "f_v", (0.95 * share, 1.05 * share))
-        assert judged(step, outside, sheet, found(sheet, identified=None)).identified == outside
+        assert judge_experiment(outside, sheet, found(sheet, identified=None)).identified == outside
         with pytest.raises(EmbError, match=r"f_v is .*: widen f_v in \[ranges\.wide\] of .*; or correct J"):
-            judged(step, outside, sheet, found(sheet))
-        assert judged(step, replace(outside, ratio=4.0), sheet, found(sheet)).identified is not None
-    assert judged(step, one, sheet, found(sheet)).identified == one
+            judge_experiment(outside, sheet, found(sheet))
+        assert judge_experiment(replace(outside, ratio=4.0), sheet, found(sheet)).identified is not None
+    assert judge_experiment(one, sheet, found(sheet)).identified == one
 
 
 def test_where_the_brake_moves_as_none_of_the_set_the_parameter_to_widen_is_named(sheet: Bench) -> None:
@@ -207,14 +213,13 @@ def test_where_the_brake_moves_as_none_of_the_set_the_parameter_to_widen_is_name
         assert "widen" not in said
 
 
-def test_the_last_run_must_not_contradict_the_file(sheet: Bench, work: Bench) -> None:
-    findings = found(sheet)
-    last = all_steps(work, findings)[-1]
+def test_the_last_run_must_not_contradict_the_file(sheet: Bench) -> None:
+    findings, judge_last = found(sheet), STEPS[FULL].judge
     one = identification(sheet)
     moved = replace(one, intervals={**one.intervals, "T_c": (0.012, 0.013)})
     with pytest.raises(EmbError, match=r"T_c is 0\.012"):
-        judged(last, moved, sheet, findings)
-    assert judged(last, one, sheet, findings) == findings  # and changes nothing
+        judge_last(moved, sheet, findings)
+    assert judge_last(one, sheet, findings) == findings  # and changes nothing
 
 
 # --- bench files ----------------------------------------------------------------------------------------------------
@@ -336,7 +341,7 @@ def test_jitter_and_lag_that_were_found_are_in_the_plant_of_the_file() -> None:
     assert bench.shield.current_lag >= 1.9e-5
 
 
-STEP = Step("try", Kind.EXPERIMENT, "", "", 2.0, 0.5, Window(-1.0, 2.0, 30.0), (1.0, 1.0, -1.5, 0.25))
+STEP = Step("try", "", "", 0.5, Window(-1.0, 2.0, 30.0), currents=(1.0, 1.0, -1.5, 0.25))
 
 ESTIMATOR = Estimator(load_bench())
 
