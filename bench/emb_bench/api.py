@@ -235,7 +235,6 @@ def estimate(
     grow: bool = False,
     systematic: Literal["bench", "none"] = "bench",
     prior: str | None = None,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
     window: float = 0.0,
     starts: int = STARTS,
     seed: int = 0,
@@ -257,7 +256,6 @@ def estimate(
         systematic: 'bench' also estimates sensor offsets, gain and delay, with priors from [systematic] of the bench
             file; 'none' assumes ideal sensors (default: bench).
         prior: name of ranges in the bench file in which the parameters are known to lie (default: none).
-        bounds: where to search, as k_m=0.01:0.1 (default: nominal/10 to nominal*10).
         window: length of the windows [s], with method windows (default: what the map says, or 0.5).
         starts: local searches (default: 8).
         seed: of where they begin (default: 0).
@@ -525,8 +523,8 @@ def _study_options(given: Mapping[str, Any]) -> Callable[[Bench], StudyOptions]:
         raise UsageError(f"--window: expected a time from 0.001 to 3600 s, got {given['window']:g}")
     from emb_bench.estimate.records import EstimationProblem
 
-    unknowns, bounds = (given["params"], given["nuisance"]), dict(given["bounds"] or {})
-    EstimationProblem(*_unknowns(*unknowns, None), None, bounds, window=given["window"])
+    unknowns = given["params"], given["nuisance"]
+    EstimationProblem(*_unknowns(*unknowns, None), window=given["window"])
     try:
         import numba  # noqa: F401
 
@@ -537,7 +535,7 @@ def _study_options(given: Mapping[str, Any]) -> Callable[[Bench], StudyOptions]:
     def of(bench: Bench) -> StudyOptions:
         prior = None if given["prior"] is None else bench.range_set(given["prior"])
         return StudyOptions(
-            EstimationProblem(*_unknowns(*unknowns, bench), prior, bounds, window=given["window"]),
+            EstimationProblem(*_unknowns(*unknowns, bench), prior, window=given["window"]),
             given["method"] or ("oem" if bench.machine is None else "windows"),
             given["model"],
             given["starts"],

@@ -122,7 +122,7 @@ def profiles(e: Estimate, *, of_all: bool) -> tuple[Profile, ...]:
 
 def _bent(e: Estimate, i: int) -> bool:
     """Returns True if the Gaussian approximation is doubtful for one unknown."""
-    (low, high), (first, last) = searched(e.bench, e.asked, e.unknowns[i]), e.intervals()[i].tolist()
+    (low, high), (first, last) = searched(e.bench, e.unknowns[i]), e.intervals()[i].tolist()
     deviation = float(e.deviations()[i])
     return deviation > DOUBTFUL * GROSS.get(e.unknowns[i].name, 1.0) or first < low or last > high
 

@@ -16,8 +16,6 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from emb_bench.report.text import show
-from emb_bench.sim.simulated_brake import parse_assignments
-from emb_runtime.errors import UsageError
 from emb_runtime.system.terminal import as_json
 
 Function = Callable[..., Any]
@@ -82,28 +80,10 @@ def _form(name: str, parameter: inspect.Parameter, kind: Any) -> dict[str, Any]:
     for number, word in ((int, "N"), (float, "X")):
         if number in parts:
             return {**form, "type": number, "metavar": word}
-    if name == "bounds":
-        return {**form, "type": bounds_of, "metavar": "NAME=LOW:HIGH,..."}
     if Path in parts and Mapping[str, float] not in parts:
         return {**form, "type": Path, "metavar": METAVARS.get(name, "RUN")}
     names = "NAMES" if Sequence[str] in parts else METAVARS.get(name, name.upper())
     return {**form, "metavar": names}
-
-
-def bounds_of(text: str) -> dict[str, tuple[float, float]]:
-    """``k_m=0.01:0.1,f_v=1e-6:1e-4`` as a mapping to two numbers.
-
-    Raises:
-        UsageError: the text is not of that form.
-    """
-    found = {}
-    for name, pair in parse_assignments(text, "--bounds: ").items():
-        low, _, high = pair.partition(":")
-        try:
-            found[name] = (float(low), float(high))
-        except ValueError:
-            raise UsageError(f"--bounds: {name}: expected two numbers as in 0.01:0.1, got '{pair}'") from None
-    return found
 
 
 def _described(function: Function) -> dict[str, str]:

@@ -210,8 +210,6 @@ def most(weights: Sequence[Floats], unknowns: int) -> float:
 def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
     """Starts of the searches: the nominal brake, then uniform draws from the prior's or else the shield's ranges.
 
-    Bounds cut the ranges, and replace those that lie outside.
-
     Raises:
         UsageError: ``starts`` is below 1.
     """
@@ -224,10 +222,6 @@ def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
         drawn, point = rng.random(len(first)), first.copy()
         for i, unknown in enumerate(problem.unknowns):
             low, high = getattr(ranges.low, unknown.name, 0.0), getattr(ranges.high, unknown.name, 0.0)
-            if unknown.name in problem.asked.bounds:
-                own = problem.asked.bounds[unknown.name]
-                inside = max(low, own[0]), min(high, own[1])
-                low, high = inside if inside[0] < inside[1] else own
             if low < high:
                 point[i] = (low + drawn[i] * (high - low)) / problem.units[i]
         points.append(np.clip(point, *problem.bounds))

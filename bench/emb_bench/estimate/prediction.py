@@ -102,7 +102,7 @@ class Problem:
     @cached_property
     def bounds(self) -> tuple[Floats, Floats]:
         """Lowest and highest z."""
-        pairs = np.array([searched(self.bench, self.asked, u) for u in self.unknowns]) / self.units[:, None]
+        pairs = np.array([searched(self.bench, u) for u in self.unknowns]) / self.units[:, None]
         return pairs[:, 0], pairs[:, 1]
 
     @cached_property

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import NamedTuple
@@ -56,8 +55,6 @@ class Unknown(NamedTuple):
 class EstimationProblem(Question):
     """Parameters to be estimated; a prior is taken as a Gaussian of the same mean and variance."""
 
-    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Lowest and highest value that is searched, by name [SI units]; what is not named has bounds of its own."""
     systematic: Mapping[str, float] = field(default_factory=dict)
     """Systematic errors that are estimated along: standard deviation of the prior, by name; inf without a prior."""
     allowed: Mapping[str, float] = field(default_factory=dict)
@@ -67,27 +64,6 @@ class EstimationProblem(Question):
     between: str = ""
     """Course of a command between its stamps in that method, ``held`` or ``linear``; empty for what the bench says, or
     the records choose."""
-
-    def __post_init__(self) -> None:
-        """Check the names and the bounds.
-
-        Raises:
-            UsageError: a name is missing, unknown or comes twice; bounds are of something that is not estimated, or
-                hold nothing that it can be.
-        """
-        super().__post_init__()
-        for name, (low, high) in self.bounds.items():
-            if name not in self.names:
-                raise UsageError(f"bounds of {name}, which is not estimated; expected some of {', '.join(self.names)}")
-            if not (math.isfinite(low) and math.isfinite(high) and low < high):
-                raise UsageError(f"bounds of {name}: expected two finite numbers, the lower first, got {low}, {high}")
-            row = PARAMETERS[name]
-            if low <= 0.0 and row.relative:
-                raise UsageError(f"bounds of {name}: expected positive numbers, got {low:g}, {high:g}")
-            if name == "delay" and not row.low <= low < high <= row.high:
-                raise UsageError(
-                    f"bounds of delay: expected {row.low:g} to {row.high:g} samples, got {low:g}, {high:g}"
-                )
 
     @property
     def along(self) -> tuple[str, ...]:
@@ -103,10 +79,8 @@ class EstimationProblem(Question):
         return tuple(found)
 
 
-def searched(bench: Bench, asked: EstimationProblem, unknown: Unknown) -> tuple[float, float]:
+def searched(bench: Bench, unknown: Unknown) -> tuple[float, float]:
     """Search range of an unknown: lowest and highest value in SI units."""
-    if unknown.name in asked.bounds:
-        return asked.bounds[unknown.name]
     row, limits = PARAMETERS[unknown.name], bench.limits
     if row.low < row.high:
         return row.low, row.high

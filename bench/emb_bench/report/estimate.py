@@ -147,7 +147,6 @@ def document(study: Study) -> dict[str, Any]:
         "nuisances": e.asked.nuisances,
         "systematic": _systematic(e),
         "prior": e.asked.prior.name if e.asked.prior else None,
-        "bounds": e.asked.bounds,
         "misfit": {
             **_fields(validation, "chi2", "freedom", "expected", "whiteness", "independence", "alarms", "notes"),
             "chi2_per_freedom": validation.ratio,

@@ -118,14 +118,6 @@ def test_a_prior_is_named_and_counts(path: Path, replay: Replay) -> None:
         assert 0.0 < shift < 0.1 * found["deviation"]
 
 
-def test_bounds_are_kept_and_a_value_at_one_is_named(path: Path, replay: Replay) -> None:
-    got = replay.document(path, "--bounds", "f_v=1e-5:2e-5", "--starts", "1")
-    assert got["bounds"] == {"f_v": [1e-5, 2e-5]}
-    assert got["parameters"]["f_v"]["at_bound"]
-    assert got["parameters"]["f_v"]["value"] <= 2e-5
-    assert not got["parameters"]["f_v"]["identified"]
-
-
 def test_strict_fails_where_the_model_does_not_fit_or_predict_or_something_is_not_identified(
     path: Path, log: Log, replay: Replay
 ) -> None:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,6 @@ from scipy import stats
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import search, start_points
-from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import METHODS, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import fisher, uniform_prior
@@ -184,28 +182,19 @@ def test_if_no_start_leads_to_a_model_that_fits_one_that_follows_the_measured_br
     assert len(easy.ends) == 1
 
 
-def test_bounds_hold_the_search_and_where_it_begins(bench: Bench) -> None:
+def test_the_search_begins_in_the_shield_s_ranges_and_ends_at_the_border_of_ten_times_nominal(bench: Bench) -> None:
     plant, data, b = bench.plant("exact"), exactly(bench), bench.brake
-    held = fit(bench, plant, [data], EstimationProblem(bounds={"f_v": (1.2 * b.f_v, 3.0 * b.f_v)}), starts=2)
+    off = replace(bench, brake=b._replace(f_v=12.0 * b.f_v))
+    held = fit(off, plant, [data], starts=2)
     assert held.values[3] == pytest.approx(1.2 * b.f_v, rel=1e-4)
     assert held.values[3] >= 1.2 * b.f_v
     assert held.at_bound == ("f_v",)
-    wide = fit(bench, plant, [data], EstimationProblem(bounds={"f_v": (0.5 * b.f_v, 2.0 * b.f_v)}), starts=2)
-    assert wide.values == pytest.approx(fit(bench, plant, [data]).values, rel=1e-8)
-    for low, high, begins in ((0.5, 1.1, (0.5, 1.1)), (1.0, 90.0, (1.0, 1.5)), (3.0, 4.0, (3.0, 4.0))):
-        asked = EstimationProblem(("k_m", "x1_0"), bounds={"k_m": (low * b.k_m, high * b.k_m), "x1_0": (-0.1, 0.1)})
-        points = np.array(start_points(Problem(bench, plant, asked, (data,)), 40, 0))
-        assert (points[1:, 0] >= begins[0]).all()
-        assert (points[1:, 0] <= begins[1]).all()
-        assert np.ptp(points[1:, 0]) > 0.8 * (begins[1] - begins[0])
-
-
-def test_bounds_that_hold_nothing_are_refused() -> None:
-    for name, low, high in (
-        *(("J", 1e-6, 1e-5), ("k_m", 0.03, 0.02), ("x1_0", 0.0, math.inf), ("k_m", 0.0, 0.02), ("delay", 0.5, 1.0)),
-    ):
-        with pytest.raises(UsageError):
-            EstimationProblem(("k_m", "x1_0", "delay"), bounds={name: (low, high)})
+    assert not fit(bench, plant, [data], starts=2).at_bound
+    ranges = bench.range_set(bench.shield.ranges)
+    points = np.array(start_points(problem_of(bench, ("f_v",), data), 40, 0)) * b.f_v
+    assert (points >= ranges.low.f_v).all()
+    assert (points <= ranges.high.f_v).all()
+    assert np.ptp(points) > 0.8 * (ranges.high.f_v - ranges.low.f_v)
 
 
 def test_every_method_answers_by_its_name_and_no_other(bench: Bench) -> None:
