@@ -149,14 +149,14 @@ class _Tanh(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
-        y = torch.sigmoid(2.0 * x).mul_(2.0).sub_(1.0)
+        y = torch.rsub((2.0 * x).sigmoid_(), -1.0, alpha=-2.0)  # as few passes over memory as there can be
         ctx.save_for_backward(y)
         return y
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        (y,) = ctx.saved_tensors
-        return torch.addcmul(gradient, gradient, y * y, value=-1.0)
+        slope: Tensor = torch.ops.aten.tanh_backward(gradient, *ctx.saved_tensors)
+        return slope
 
 
 class Tanh(nn.Module):
@@ -230,15 +230,14 @@ def train(env: EmbExcitationVectorEnv, actor: Actor, ppo: Ppo, seed: int) -> Ite
     """
     torch.set_num_threads(1)  # networks this small lose more by sharing out a product than they win
     critic = Critic(env.batch.critic_size, ppo.hidden)
-    optimisers = [torch.optim.Adam(network.parameters(), eps=1e-5, fused=True) for network in (actor, critic)]
+    optimiser = torch.optim.Adam([*actor.parameters(), *critic.parameters()], eps=1e-5, fused=True)
     early = 0
     for iteration in range(ppo.iterations):
         draws = np.random.SeedSequence([seed, iteration]).generate_state(ppo.envs + 1, np.uint64).tolist()
         generator = torch.Generator().manual_seed(draws.pop() >> 1)
-        for optimiser in optimisers:
-            optimiser.param_groups[0]["lr"] = ppo.learning_rate * (1.0 - iteration / ppo.iterations)
+        optimiser.param_groups[0]["lr"] = ppo.learning_rate * (1.0 - iteration / ppo.iterations)
         rollout = collect(env, actor, ppo.rollout, ppo.noise_memory, draws, generator)
-        losses = improve(actor, critic, optimisers, rollout, ppo, generator)
+        losses = improve(actor, critic, optimiser, rollout, ppo, generator)
         if not all(torch.isfinite(w).all() for network in (actor, critic) for w in network.parameters()):
             raise TrainingDivergedError(
                 f"training diverged in iteration {iteration + 1}: a weight is not finite: lower the learning rate or "
@@ -328,7 +327,7 @@ def exploration_noise(steps: int, envs: int, noise_memory: float, generator: tor
 def improve(
     actor: Actor,
     critic: Critic,
-    optimisers: Sequence[torch.optim.Optimizer],
+    optimiser: torch.optim.Optimizer,
     rollout: Rollout,
     ppo: Ppo,
     generator: torch.Generator,
@@ -351,9 +350,12 @@ def improve(
             before, advantage, value = rest.unbind(1)
             log_ratio = actor.log_density(seen, actions) - before
             policy_loss = surrogate(log_ratio, advantage, ppo.clip)
-            descend(optimisers[0], actor, policy_loss - ppo.entropy * actor.entropy(), ppo.max_gradient)
             value_loss = 0.5 * (critic(states) - value).square().mean()  # eq. 4.46
-            descend(optimisers[1], critic, value_loss, ppo.max_gradient)
+            optimiser.zero_grad()
+            torch.autograd.backward(policy_loss - ppo.entropy * actor.entropy() + value_loss)
+            for network in (actor, critic):
+                nn.utils.clip_grad_norm_(network.parameters(), ppo.max_gradient)
+            optimiser.step()
             if epoch == ppo.epochs - 1:
                 with torch.no_grad():
                     kl = (log_ratio.exp() - 1.0 - log_ratio).mean()
@@ -394,11 +396,3 @@ def surrogate(log_ratio: Tensor, advantages: Tensor, clip: float) -> Tensor:
     """
     ratio = log_ratio.exp()
     return -torch.min(ratio * advantages, ratio.clamp(1.0 - clip, 1.0 + clip) * advantages).mean()
-
-
-def descend(optimiser: torch.optim.Optimizer, network: nn.Module, loss: Tensor, max_gradient: float) -> None:
-    """One step of the optimiser along the clipped gradient of a loss."""
-    optimiser.zero_grad()
-    torch.autograd.backward(loss)
-    nn.utils.clip_grad_norm_(network.parameters(), max_gradient)
-    optimiser.step()
