@@ -80,8 +80,7 @@ def _export(arguments: argparse.Namespace) -> str:
         from emb_export.network import network_file
 
         path = path or source / "actor.onnx"
-        data, difference, origin = network_file(source)
-        of = f"of the trained network, {origin}"
+        data, difference, what = network_file(source)
     else:
         from emb_export.file import read_sequence, reference_file, sequence_file
 
@@ -89,15 +88,14 @@ def _export(arguments: argparse.Namespace) -> str:
         make_law(bench)  # where no shield can be made, emb-run would refuse the bench
         if source.suffix == ".json" or arguments.source in reference_names():
             data, difference = reference_file(arguments.source, bench)
-            of = "of the reference"
+            what = "the reference"
         else:
             currents, what = read_sequence(arguments.source, bench)
             data, difference = sequence_file(currents, what, bench)
-            of = f"of {what}"
         load_policy(data, bench)  # with each check of emb-run
     with replacing(path) as beside:
         beside.write_bytes(data)
-    return f"{path}: {len(data)} bytes, within {difference:.1e} {of}"
+    return f"{path}: {len(data)} bytes, within {difference:.1e} of {what}"
 
 
 if __name__ == "__main__":

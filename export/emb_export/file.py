@@ -10,8 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 import onnx
+import onnx.parser
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper, numpy_helper
 
 from emb_bench.config.bench import Bench
 from emb_bench.excitation import parse_excitation
@@ -27,7 +28,7 @@ from emb_runtime.policy.contract import (
     PolicyLimits,
     Vector,
 )
-from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME, Inference
+from emb_runtime.policy.inference import Inference
 from emb_train.reference import FEATURES, PRODUCTS, Box, box_of, features, set_reference, stored
 from emb_train.trial import Task
 
@@ -39,16 +40,11 @@ Kind = Literal["current", "reference"]
 Provenance = Mapping[str, str | int | float]
 
 
-def graph_of(
-    nodes: list[onnx.NodeProto], constants: Mapping[str, NDArray[Any]], kind: Kind, shape: tuple[int, int]
-) -> onnx.ModelProto:
-    """A model of nodes from ``inputs`` to ``outputs``, whose numbers are as many as ``shape`` says."""
-    number = TensorProto.FLOAT if kind == "current" else TensorProto.DOUBLE
-    ports = zip((INPUT_NAME, OUTPUT_NAME), shape, strict=True)
-    taken, given = (helper.make_tensor_value_info(name, number, [1, width]) for name, width in ports)
-    tensors = [numpy_helper.from_array(value, name) for name, value in constants.items()]
-    graph = helper.make_graph(nodes, "policy", [taken], [given], tensors)
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+def model_of(graph: str, constants: Mapping[str, NDArray[Any]]) -> onnx.ModelProto:
+    """The model of a graph in ONNX's own text form, with its constants."""
+    model = onnx.parser.parse_model(f'<ir_version: {IR_VERSION}, opset_import: ["" : {OPSET}]>\n{graph}')
+    model.graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in constants.items())
+    return model
 
 
 def policy_file(
@@ -119,6 +115,18 @@ def versions(*names: str) -> dict[str, str]:
     return {name: version(name) for name in names}
 
 
+REFERENCE = """policy (double[1, %d] inputs) => (double[1, %d] outputs) {
+    logarithm = Log (inputs)
+    scaled = Gemm (logarithm, scale, middle)
+    feature = Clip (scaled, minus_one, one)
+    left = Gemm (feature, first, no_first)
+    right = Gemm (feature, second, no_second)
+    terms = Mul (left, right)
+    free = Gemm (terms, slopes, constants)
+    outputs = Clip (free, minus_one, one)
+}"""
+
+
 def reference_file(source: str, bench: Bench) -> tuple[bytes, float]:
     """The file of a reference (:func:`emb_train.reference.stored`), and the largest difference from its table.
 
@@ -138,17 +146,7 @@ def reference_file(source: str, bench: Bench) -> tuple[bytes, float]:
     nominal = np.array([getattr(bench.brake, name) for name in PARAMETER_NAMES])
     kept_of = {name: getattr(kept, name) for name in ("task", "form", "plant", "seed", "command")}
     provenance = {"reference": Path(source).stem, **kept_of}
-    nodes = [
-        helper.make_node("Log", [INPUT_NAME], ["logarithm"]),
-        helper.make_node("Gemm", ["logarithm", "scale", "middle"], ["scaled"]),
-        helper.make_node("Clip", ["scaled", "minus_one", "one"], ["feature"]),
-        helper.make_node("Gemm", ["feature", "first", "no_first"], ["left"]),
-        helper.make_node("Gemm", ["feature", "second", "no_second"], ["right"]),
-        helper.make_node("Mul", ["left", "right"], ["terms"]),
-        helper.make_node("Gemm", ["terms", "slopes", "constants"], ["free"]),
-        helper.make_node("Clip", ["free", "minus_one", "one"], [OUTPUT_NAME]),
-    ]
-    model = graph_of(nodes, _constants(table, box, nominal), "reference", (FEATURES, len(table)))
+    model = model_of(REFERENCE % (FEATURES, len(table)), _constants(table, box, nominal))
     return policy_file(
         model, bench, "reference", PARAMETER_NAMES, seen * nominal, wanted, provenance, ranges, kept.gain
     )
@@ -189,6 +187,16 @@ def read_sequence(text: str, bench: Bench) -> tuple[Floats, str]:
     return excited.currents, excited.text
 
 
+SEQUENCE = """policy (float[1, 3] inputs) => (float[1, 1] outputs) {
+    time = Gather <axis = 1> (inputs, time_index)
+    step = Mul (time, rate)
+    whole = Round (step)
+    number = Cast <to = 7> (whole)
+    place = Clip (number, begin, end)
+    outputs = Gather <axis = 0> (currents, place)
+}"""
+
+
 def sequence_file(currents: Floats, what: str, bench: Bench) -> tuple[bytes, float]:
     """The file of a sequence of currents [A], shape [horizon], and its largest difference as a part of their limit.
 
@@ -203,15 +211,7 @@ def sequence_file(currents: Floats, what: str, bench: Bench) -> tuple[bytes, flo
         "begin": np.array(0),
         "end": np.array(last),
     }
-    nodes = [
-        helper.make_node("Gather", [INPUT_NAME, "time_index"], ["time"], axis=1),
-        helper.make_node("Mul", ["time", "rate"], ["step"]),
-        helper.make_node("Round", ["step"], ["whole"]),
-        helper.make_node("Cast", ["whole"], ["number"], to=TensorProto.INT64),
-        helper.make_node("Clip", ["number", "begin", "end"], ["place"]),
-        helper.make_node("Gather", ["currents", "place"], [OUTPUT_NAME], axis=0),
-    ]
-    model = graph_of(nodes, constants, "current", (len(SAMPLE), 1))
+    model = model_of(SEQUENCE, constants)
     seen = np.zeros((len(currents), len(SAMPLE)))
     seen[:, 2] = t_s * np.arange(len(currents))
     return policy_file(model, bench, "current", SAMPLE, seen, currents[:, None], {"sequence": what})

@@ -13,7 +13,7 @@ import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
 from emb_bench.config.bench import Bench
 from emb_export.file import OPSET, policy_file, versions
@@ -25,20 +25,6 @@ from emb_train.ppo import DeployedActor
 from emb_train.training import load_training
 
 OBSERVATIONS = 2000
-
-
-class InSeconds(nn.Module):
-    """An actor of angle, velocity and step, asked with the time [s]."""
-
-    def __init__(self, actor: nn.Module, sample_time: float) -> None:
-        super().__init__()
-        self.actor, self.sample_time = actor, sample_time
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Currents [A], shape [N, 1], for inputs of shape [N, 3]."""
-        sample, time = inputs[:, :2], inputs[:, 2:]
-        currents: Tensor = self.actor(torch.cat([sample, time / self.sample_time], 1))
-        return currents
 
 
 def network_file(directory: Path) -> tuple[bytes, float, str]:
@@ -53,7 +39,7 @@ def network_file(directory: Path) -> tuple[bytes, float, str]:
     if training.conditions.observes == EVERYTHING:
         raise UsageError(f"{directory}: observes the parameters and the information, which no bench measures")
     torch.set_num_threads(1)
-    actor = InSeconds(DeployedActor(trained.actor, bench.limits.current), bench.timing.sample_time).eval()
+    actor = DeployedActor(trained.actor, bench.limits.current, bench.timing.sample_time).eval()
     seen = observations(bench)
     with torch.no_grad():
         wanted = actor(torch.from_numpy(seen)).numpy().astype(np.float64)
@@ -68,8 +54,8 @@ def network_file(directory: Path) -> tuple[bytes, float, str]:
     }
     ranges = bench.range_set(training.ranges)
     data, difference = policy_file(_graph(actor), bench, "current", SAMPLE, seen, wanted, provenance, ranges)
-    origin = f"iteration {trained.iteration} of {training.ppo.iterations}, which returned {trained.score:.6g}"
-    return data, difference, f"of {origin} on brakes that no training draws"
+    score = f"iteration {trained.iteration} of {training.ppo.iterations}, which returned {trained.score:.6g}"
+    return data, difference, f"the trained network, of {score} on brakes that no training draws"
 
 
 def observations(bench: Bench) -> NDArray[np.float32]:

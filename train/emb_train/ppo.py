@@ -133,14 +133,15 @@ class Critic(nn.Module):
 class DeployedActor(nn.Module):
     """The network that is exported: raw observation in, current [A] out; normaliser, scaling and clip inside."""
 
-    def __init__(self, actor: Actor, limit: float) -> None:
-        """Wrap a trained actor for a bench with this current limit [A]."""
+    def __init__(self, actor: Actor, limit: float, sample_time: float = 1.0) -> None:
+        """Wrap a trained actor for a bench with this current limit [A]; with a sample time [s] it is given the time."""
         super().__init__()
-        self.actor = actor
-        self.limit = limit
+        self.actor, self.limit, self.sample_time = actor, limit, sample_time
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Currents [A] within ±limit, shape [N, 1], for raw observations, shape [N, 3]."""
+        """Currents [A] within ±limit, shape [N, 1], for raw observations, shape [N, I]."""
+        if self.sample_time != 1.0:
+            observation = torch.cat([observation[:, :2], observation[:, 2:] / self.sample_time], 1)
         return self.limit * torch.clamp(self.actor(observation), -1.0, 1.0)
 
 
