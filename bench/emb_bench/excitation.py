@@ -106,9 +106,6 @@ def excitation(name: str, bench: Bench, **parameters: float) -> Excitation:
     """A reference excitation for the bench's sample time, horizon, limits and brake, by a name of the table above.
 
     ``Excitation.parameters`` has all parameters with their defaults.
-
-    Raises:
-        UsageError: the name or a parameter is unknown, or a value is out of range or contradicts another.
     """
     known = {parameter.name: parameter for parameter in parameters_of(name, bench)}
     for given in parameters:
@@ -123,11 +120,7 @@ def excitation(name: str, bench: Bench, **parameters: float) -> Excitation:
 
 
 def parameters_of(name: str, bench: Bench) -> tuple[Parameter, ...]:
-    """Parameters of an excitation, with the defaults and ranges that the bench gives.
-
-    Raises:
-        UsageError: the name is unknown.
-    """
+    """Parameters of an excitation, with the defaults and ranges that the bench gives."""
     t_s, current, speed = bench.timing.sample_time, bench.limits.current, bench.limits.velocity
     lasting, nyquist = bench.timing.horizon * t_s, 0.5 / t_s
 
@@ -160,11 +153,7 @@ def parameters_of(name: str, bench: Bench) -> tuple[Parameter, ...]:
 
 
 def parse_excitation(text: str, bench: Bench) -> Excitation:
-    """The excitation that a text such as ``square`` or ``chirp:f0=1,f1=50,amplitude=3`` names.
-
-    Raises:
-        UsageError: as :func:`excitation`, or the text is not of that form.
-    """
+    """The excitation that a text such as ``square`` or ``chirp:f0=1,f1=50,amplitude=3`` names."""
     name, _, options = text.partition(":")
     values = {}
     for key, number in parse_assignments(options).items():
@@ -190,10 +179,6 @@ def run_excitation(
     in ``bench.shield.ranges``. Without it only the current limit is kept. Bus and instruments are left out: what acts
     is not rounded to the steps of its signal, and nothing is late or lost. The brake starts at rest at the origin.
     The noise is the errors of each sample's angle [rad] and velocity [rad/s], shape (horizon + 1, 2).
-
-    Raises:
-        UsageError: ``noise`` has another shape.
-        BenchFileError: no shield can be made for this bench.
     """
     count = bench.timing.horizon
     errors = np.zeros((count + 1, 2)) if noise is None else np.asarray(noise, dtype=np.float64)

@@ -38,16 +38,7 @@ _SVG: Any = {
 
 
 def require_place(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
-    """Complain before the work, not after it.
-
-    Args:
-        option: that names the file.
-        path: the file; None where none is requested.
-        endings: of its name, one of these.
-
-    Raises:
-        UsageError: it ends in nothing of these, there is no such folder, or it is a folder itself.
-    """
+    """Refuse before the work a file that an option names, whose name has another ending, or that has no folder."""
     if path is None:
         return
     if path.suffix not in endings:
@@ -62,19 +53,9 @@ def require_place(option: str, path: Path | None, endings: tuple[str, ...]) -> N
 def drawn(
     path: Path, rows: int, columns: int, title: str, size: tuple[float, float], *, dpi: int = 140, **shared: Any
 ) -> Iterator[Any]:
-    """Axes to draw on, shape [rows, columns]; written to ``path`` at the end, whose ending is the format.
+    """Axes to draw on, shape [rows, columns], size in inch; written to ``path`` at the end, whose ending is the format.
 
-    Args:
-        path: the file.
-        rows: of axes.
-        columns: of axes.
-        title: above them all.
-        size: width and height [inch].
-        dpi: pixels to an inch, where the format has pixels.
-        shared: ``sharex`` and ``sharey`` of matplotlib's ``Figure.subplots``.
-
-    Raises:
-        UsageError: matplotlib is missing, or the file cannot be written.
+    ``shared`` are ``sharex`` and ``sharey`` of matplotlib's ``Figure.subplots``.
     """
     with _figure(rows, columns, size, {}, shared) as (figure, axes):
         figure.suptitle(title, fontsize=11.0, x=0.01, horizontalalignment="left")
@@ -85,17 +66,9 @@ def drawn(
 
 
 def svg(draw: Callable[[Any], None], rows: int, columns: int, size: tuple[float, float], **shared: Any) -> bytes:
-    """A figure for a page, without a title.
+    """A figure for a page, without a title, of a size in inch; ``draw`` gets the axes, shape [rows, columns].
 
-    Args:
-        draw: draws on the axes, shape [rows, columns].
-        rows: of axes.
-        columns: of axes.
-        size: width and height [inch].
-        shared: ``sharex``, ``sharey`` and ``height_ratios`` of matplotlib's ``Figure.subplots``.
-
-    Raises:
-        UsageError: matplotlib is missing.
+    ``shared`` are ``sharex``, ``sharey`` and ``height_ratios`` of matplotlib's ``Figure.subplots``.
     """
     with _figure(rows, columns, size, _SVG, shared) as (figure, axes):
         from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -110,16 +83,7 @@ def svg(draw: Callable[[Any], None], rows: int, columns: int, size: tuple[float,
 
 
 def for_notebook(rows: int, size: tuple[float, float], **shared: Any) -> tuple[Any, Any]:
-    """A figure of matplotlib that a notebook shows, and its axes below each other; in matplotlib's own style.
-
-    Args:
-        rows: of axes.
-        size: width and height [inch].
-        shared: ``sharex`` of matplotlib's ``Figure.subplots``.
-
-    Raises:
-        UsageError: matplotlib is missing.
-    """
+    """A figure of matplotlib that a notebook shows, and its axes below each other; in matplotlib's own style."""
     try:
         from matplotlib import pyplot as plt
     except ImportError as err:

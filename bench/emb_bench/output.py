@@ -48,11 +48,7 @@ def _is_log(path: Path) -> bool:
 
 
 def make_empty_folder(path: Path) -> None:
-    """Make a folder for results.
-
-    Raises:
-        UsageError: it holds something already, or cannot be made.
-    """
+    """Make a folder for results."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         if any(path.iterdir()):

@@ -46,15 +46,10 @@ class Lost(NamedTuple):
 def shared_out(
     work: Callable[[Piece], Result], pieces: Sequence[Piece], jobs: int
 ) -> Generator[tuple[int, Result | Lost], None, None]:
-    """Do pieces of work, as many at a time as there are ``jobs``. Closed or interrupted, it ends its processes at once.
+    """Each piece's number and result, as they come, with at most ``jobs`` processes at work.
 
-    The work is a function that another process can import, or a ``functools.partial`` of one.
-
-    Yields:
-        Each piece's number and result, as they come.
-
-    Raises:
-        EmbError: the work has raised it.
+    The work is a function that another process can import, or a ``functools.partial`` of one. Closed or interrupted, it
+    ends its processes at once.
     """
     waiting = iter(enumerate(pieces))
     busy: dict[Any, tuple[_Worker, int]] = {}
@@ -156,17 +151,9 @@ def _start_settings() -> Iterator[None]:
 def shared_out_on_ray(
     work: Callable[[Piece], Result], pieces: Sequence[Piece], jobs: int | None, address: str, command: str
 ) -> Generator[tuple[int, Result | Lost], None, None]:
-    """Do pieces of work as tasks of Ray, on this machine or on a cluster.
+    """Each piece's number and result, as they come, of tasks of Ray at an address, or of one started here (``LOCAL``).
 
-    Args:
-        work: what is done with a piece. It raises nothing.
-        pieces: they travel to the tasks, and the results back.
-        jobs: tasks at a time; None is one for each processor.
-        address: of a cluster's head, or ``LOCAL``.
-        command: that needs Ray, for the message if it is not installed.
-
-    Yields:
-        Each piece's number and result, as they come; of a piece whose task was lost, Ray's name for that.
+    The work raises nothing. ``command`` is the one that needs Ray, for the message if it is not installed.
     """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # else Ray reports to its makers that it is used
     try:

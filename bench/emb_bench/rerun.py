@@ -90,11 +90,7 @@ def read_items(log: RunLog) -> tuple[Item, ...]:
 
 
 class Playback:
-    """One run again.
-
-    Args:
-        log: what was recorded.
-    """
+    """The run of a log again."""
 
     def __init__(self, log: RunLog) -> None:
         self._items = read_items(log)
@@ -118,11 +114,7 @@ class Playback:
         return self._at == len(self._items)
 
     def send(self, frame: Frame) -> None:
-        """Take a frame that the guard has let out.
-
-        Raises:
-            BusError: the bus had not taken it.
-        """
+        """Take a frame that the guard has let out."""
         refusal, self._refusal = self._refusal, None
         if refusal is not None:
             raise refusal
@@ -431,14 +423,7 @@ def carried_policy(log: RunLog) -> Policy:
 
 
 def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopCondition | None = None) -> Rerun:
-    """Run the loop of a log again.
-
-    Args:
-        log: what was recorded.
-        actor: what decided.
-        current_limit: largest current that its contract allows [A].
-        stop_condition: of the run, if it had one.
-    """
+    """Run the loop of a log again with what decided, the largest current of its contract [A] and its stop condition."""
     bench, layout, run = log.bench, log.layout, recorded_run(log)
     playback = Playback(log)
     core = Core(

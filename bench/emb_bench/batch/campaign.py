@@ -40,11 +40,7 @@ def run_campaign(
     time_limit: float,
     ray: str | None,
 ) -> Campaign:
-    """Evaluate logs, and write their rows; the arguments are those of :func:`emb_bench.api.campaign`.
-
-    Raises:
-        UsageError: there is no log, a library is missing, or a file cannot be written.
-    """
+    """Evaluate logs, and write their rows; the arguments are those of :func:`emb_bench.api.campaign`."""
     require_place("--output", output, ROWS)
     try:
         import numba  # noqa: F401
@@ -83,14 +79,9 @@ def _in_order(count: int, numbered: Generator[tuple[int, Row], None, None]) -> l
 def find(paths: Sequence[Path]) -> list[Source]:
     """The logs in files and folders, sorted; one that is reached twice is taken once.
 
-    A folder that cannot be listed, and what is called ``*.mcap`` and is no file, are in the list with their trouble.
-
-    Args:
-        paths: a file is a log whatever its name; a folder is searched for ``*.mcap``, with the folders in it, and
-            ways home and mere listening are passed over.
-
-    Raises:
-        UsageError: a path does not exist, or there is no log in all of them.
+    A file is a log whatever its name; a folder is searched for ``*.mcap``, with the folders in it, and ways home and
+    mere listening are passed over. A folder that cannot be listed, and what is called ``*.mcap`` and is no file, are in
+    the list with their trouble.
     """
     found: list[Source] = []
     for path in sorted(set(paths), key=str):
@@ -140,11 +131,7 @@ def _source(root: Path, path: Path, trouble: str) -> Source:
 def in_processes(
     evaluate: Evaluate, sources: Sequence[Source], jobs: int, time_limit: float
 ) -> Generator[tuple[int, Row], None, None]:
-    """Evaluates logs in processes of this machine.
-
-    Yields:
-        Each log's number and row, as they come.
-    """
+    """Each log's number and row, as they come, evaluated in processes of this machine."""
     with closing(shared_out(partial(_in_time, evaluate, time_limit), sources, jobs)) as rows:
         for number, row in rows:
             yield number, _failed(sources[number], row, time_limit) if isinstance(row, Lost) else row
@@ -153,14 +140,7 @@ def in_processes(
 def on_ray(
     evaluate: Evaluate, sources: Sequence[Source], jobs: int | None, time_limit: float, address: str
 ) -> Generator[tuple[int, Row], None, None]:
-    """Evaluates logs on Ray, one task for each; each is opened where its task runs, under the same path.
-
-    Yields:
-        Each log's number and row, as they come.
-
-    Raises:
-        UsageError: Ray is not installed, does not start, or is not at this address.
-    """
+    """Each log's number and row, as they come, evaluated on Ray, whose machines have the logs at the same paths."""
     in_time = partial(_in_time, evaluate, time_limit)
     for number, row in shared_out_on_ray(in_time, sources, jobs, address, "emb-replay campaign"):
         if isinstance(row, Lost):

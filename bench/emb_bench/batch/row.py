@@ -48,13 +48,7 @@ class Options:
 
 
 def column(about: str, unit: str = "", default: Any = None) -> Any:
-    """A field that becomes a column.
-
-    Args:
-        about: what it is.
-        unit: of its numbers; empty for what is no measurable quantity.
-        default: value of a log that does not have it.
-    """
+    """A field that becomes a column, with the unit of its numbers and the value of a log that does not have it."""
     return field(default=default, metadata={"about": about, "unit": unit})
 
 
@@ -168,10 +162,6 @@ def write_rows(path: Path, ending: str, rows: Sequence[Row], options: Options) -
 
     Parquet has units in the columns' metadata and the options in the file's. CSV has neither, and the entries of a list
     with ``"; "`` between them. The same rows give the same bytes.
-
-    Raises:
-        ImportError: pyarrow is missing.
-        OSError: the file cannot be written.
     """
     import pyarrow as pa
     from pyarrow import compute, csv, parquet

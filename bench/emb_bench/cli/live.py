@@ -32,12 +32,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show runs until Ctrl-C; gives the exit code.
-
-    Raises:
-        UsageError: there is no folder for the place, or the server cannot listen or needs a library.
-        LogError: the one log to be shown is none, or is damaged.
-    """
+    """Show runs until Ctrl-C; gives the exit code."""
     if not 0 <= args.port <= 65535:
         raise UsageError(f"--port: expected 0 to 65535, got {args.port}")
     if not args.place.parent.is_dir():

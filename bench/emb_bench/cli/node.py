@@ -79,18 +79,9 @@ def run_node(
     periods: int | None,
     stop_requested: Callable[[], bool],
 ) -> int:
-    """Drive a node in real time on an absolute grid: late ticks are skipped and counted, never made up in a burst.
+    """Drive a node in real time on an absolute grid, for some periods or without end.
 
-    Args:
-        node: the node.
-        transport: its bus.
-        clock: real time.
-        period_ns: sampling period [ns].
-        periods: how many sampling periods to run; None for no end.
-        stop_requested: called once per period.
-
-    Returns:
-        Sampling periods that passed without a sample, because the computer was late.
+    Late ticks are skipped, never made up in a burst; returns their number.
     """
     skipped_total = 0
     deadline_ns = clock.now_ns() + period_ns

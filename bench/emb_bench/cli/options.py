@@ -102,13 +102,7 @@ def add_output_options(p: argparse.ArgumentParser) -> None:
 
 
 def answer(args: argparse.Namespace, document: Callable[[], Any], text: Callable[[bool], str]) -> None:
-    """Print a result as the options ask for it.
-
-    Args:
-        args: with the options of :func:`add_output_options`.
-        document: gives the JSON document.
-        text: gives the text; its argument is True if it is to be verbose.
-    """
+    """Print a result as the options of :func:`add_output_options` say; ``text`` takes True if it is to be verbose."""
     if args.json:
         show(as_json(document()))
         return

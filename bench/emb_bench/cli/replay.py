@@ -152,14 +152,7 @@ class Command(NamedTuple):
 def _command(
     function: Callable[..., Any], run: Callable[[argparse.Namespace], int], text: str = "", strict: str = ""
 ) -> Command:
-    """A command whose options are the arguments of a function.
-
-    Args:
-        function: its docstring is the help.
-        run: does what the options ask for.
-        text: further description.
-        strict: help of the option ``--strict``; empty if there is none.
-    """
+    """A command whose options and help are a function's; ``strict`` is the help of ``--strict``, if it has that."""
 
     def add_arguments(p: argparse.ArgumentParser) -> None:
         add(p, function)
@@ -309,11 +302,7 @@ def epilog(codes: Mapping[int, str]) -> str:
 
 
 def parser(only: str | None = None) -> argparse.ArgumentParser:
-    """The command line.
-
-    Args:
-        only: the command that is wanted, where it is known: the others' imports would take longer than many of them.
-    """
+    """The command line, of one command where it is known: the others' imports would take longer than many of them."""
     p = Parser(
         prog="emb-replay",
         description="Evaluate logs of emb-run.",

@@ -32,27 +32,14 @@ SHEETS = "the data sheet's"
 
 
 def working_text(sheet: Bench) -> str:
-    """Bench file that the steps run with: the data sheet's, its angle as wide as a shield can be made for its ranges.
-
-    Raises:
-        BenchFileError: there is no shield for the ranges in the set of the data sheet's shield.
-    """
+    """Bench file that the steps run with: the data sheet's, its angle as far as its ranges have a shield."""
     draft = _Draft(sheet)
     draft.limit_angle()
     return str(draft)
 
 
 def found_text(sheet: Bench, found: Findings, logs: Mapping[str, str]) -> str:
-    """Bench file that a commissioning finds.
-
-    Args:
-        sheet: bench file with the data sheet's ranges.
-        found: by all steps.
-        logs: name of the log by its kind: ``rest``, ``current``, ``experiments``.
-
-    Raises:
-        BenchFileError: no shield can be made for what was found.
-    """
+    """Bench file that is found; names of logs by their kind: ``rest``, ``current``, ``experiments``."""
     rest, current, one = found.rest, found.current, found.identified
     assert rest is not None
     assert current is not None
@@ -158,13 +145,7 @@ def outside(sheet: Bench, one: Identification) -> list[str]:
 
 
 def not_inside(sheet: Bench, one: Identification, margin: float = 0.0) -> list[str]:
-    """Parameters whose interval is not inside of the data sheet's range, or not known.
-
-    Args:
-        sheet: bench file with the data sheet's ranges.
-        one: the estimate.
-        margin: share of each border by which the interval is to stay away from it.
-    """
+    """Parameters whose interval is not known, or not inside of the data sheet's range less a share of each border."""
     found = []
     for name, (low, high) in one.intervals.items():
         lowest, highest = _range(sheet, name)

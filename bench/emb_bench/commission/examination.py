@@ -301,12 +301,7 @@ def noise_in_motion(at_rest: Noise, drive: DriveMapping | None) -> Noise:
 
 
 def scatter(values: Floats, step: float) -> float:
-    """Standard deviation of a normal noise before it was rounded to steps, about a constant: most likely one.
-
-    Args:
-        values: as they came.
-        step: of their signal.
-    """
+    """Most likely standard deviation of a normal noise about a constant, before it was rounded to steps."""
     found = float(np.std(values, ddof=1))
     if found >= step:
         return math.sqrt(found**2 - (UNIFORM * step) ** 2)

@@ -20,14 +20,9 @@ from emb_runtime.system.terminal import as_json, show
 
 
 def arrow_batches(log: RunLog, topic: str) -> tuple[Any, Iterator[Any]]:
-    """One topic as Arrow tables: units in the fields' metadata, the run's identity and completeness in the schema's.
+    """One topic as a schema and Arrow tables, whose rows follow each other.
 
-    Returns:
-        The schema, and the tables, whose rows follow each other.
-
-    Raises:
-        UsageError: the log has no such topic, or pyarrow is missing.
-        LogError: the topic cannot be decoded.
+    Units are in the fields' metadata, the run's identity and completeness in the schema's.
     """
     try:
         import pyarrow as pa
@@ -65,11 +60,7 @@ def arrow_batches(log: RunLog, topic: str) -> tuple[Any, Iterator[Any]]:
 
 
 def write_parquet(log: RunLog, topic: str, path: Path) -> str:
-    """One topic as Parquet, see :func:`arrow_batches`.
-
-    Returns:
-        A description of the file's content.
-    """
+    """Write one topic as Parquet, see :func:`arrow_batches`; describes the content."""
     schema, tables = arrow_batches(log, topic)
     from pyarrow import parquet
 
@@ -80,11 +71,7 @@ def write_parquet(log: RunLog, topic: str, path: Path) -> str:
 
 
 def write_csv(log: RunLog, topic: str, path: Path) -> str:
-    """One topic as comma-separated values with units in the head: bytes are hex, times nanoseconds since 1970.
-
-    Returns:
-        A description of the file's content.
-    """
+    """Write one topic as CSV: units in the head, bytes as hex, times in nanoseconds since 1970; describes the content."""
     schema, tables = arrow_batches(log, topic)
     import pyarrow as pa
     from pyarrow import csv

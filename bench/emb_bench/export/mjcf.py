@@ -48,12 +48,7 @@ _TEXT = """\
 
 
 def mjcf(bench: Bench, brake: BrakeParameters) -> str:
-    """The text of the model.
-
-    Args:
-        bench: knows the sample time and the largest current.
-        brake: its parameters.
-    """
+    """The text of the model, with the sample time and the largest current of the bench."""
     step = bench.timing.sample_time / STEPS
     return _TEXT.format(
         p=brake, step=step, time_constant=2.0 * step, stiffness=brake.k_1 / brake.gamma, current=bench.limits.current
@@ -61,20 +56,7 @@ def mjcf(bench: Bench, brake: BrakeParameters) -> str:
 
 
 def write_mjcf(log: RunLog, theta: str, path: Path) -> str:
-    """The brake of a log as a model.
-
-    Args:
-        log: the log.
-        theta: which parameters, as :func:`emb_bench.experiment.theta.read_theta` takes them.
-        path: file to make.
-
-    Returns:
-        A description of the file's content.
-
-    Raises:
-        UsageError: the log is of a machine that is no brake, the parameters cannot be read, or the file cannot be
-            written.
-    """
+    """Write the brake of a log; says which parameters it has, of :func:`emb_bench.experiment.theta.read_theta`."""
     if log.bench.machine is not None:
         raise UsageError(f"{log.path}: expected the log of a brake, got a recording of another machine")
     name, brake, _ = read_theta(theta, log, log.bench)

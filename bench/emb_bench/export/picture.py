@@ -25,15 +25,7 @@ CURRENTS = (  # field, label, colour, width, period after or before the sample; 
 
 
 def draw_run(log: RunLog, path: Path) -> str:
-    """Draw angle, velocity, currents, reasons and states over the time since the log began.
-
-    Args:
-        log: the log.
-        path: the file to make; its ending, one of ``ENDINGS``, is the format.
-
-    Returns:
-        A description of the file's content.
-    """
+    """Draw angle, velocity, currents, reasons and states over the time since the log began; describes the content."""
     _require_cycles(log)
     title = f"{log.path.name}: {log.exit_reason}" + ("" if log.complete else " (the log is NOT complete)")
     with drawn(path, ROWS, 1, title, (8.0, 9.5), sharex=True) as grid:

@@ -63,16 +63,7 @@ class Found(NamedTuple):
 def repair(source: Path, target: Path) -> Found | None:
     """Write what is left of a log as a finished one, in two passes, chunk by chunk.
 
-    Args:
-        source: the log.
-        target: the file to make.
-
-    Returns:
-        What was found; None if the log is whole, and nothing was written.
-
-    Raises:
-        UsageError: a file cannot be read or written, or ``target`` is a log already.
-        LogError: ``source`` is no log, or not one message in it can be saved.
+    Returns None if the log is whole, and nothing was written.
     """
     try:
         with open_regular(source) as file:

@@ -38,9 +38,7 @@ _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 def chunks(path: Path, wait: Callable[[], bool]) -> Iterator[Chunk]:
     """The chunks of a log, each as soon as it is whole; ends with the log's footer.
 
-    Args:
-        path: of the log.
-        wait: called where the file has no more yet; waits a little. False if nothing more is to be waited for.
+    ``wait`` is called where the file has no more yet, waits a little, and is False if nothing more is to be waited for.
 
     Raises:
         LogError: it cannot be read, or is no log.
@@ -77,13 +75,7 @@ def _read(file: BinaryIO, count: int, wait: Callable[[], bool]) -> bytes | None:
 
 
 class NewLogs:
-    """The logs that appear in a folder, the oldest first.
-
-    Args:
-        folder: where; it need not exist yet.
-        pattern: of their names.
-        old: those that are there already count, too.
-    """
+    """The logs that appear in a folder, the oldest first; with ``old`` those that are there already, too."""
 
     def __init__(self, folder: Path, pattern: str = "*.mcap", old: bool = False) -> None:
         self._folder = folder
@@ -131,14 +123,9 @@ def follow(
     complain: Callable[[LogError], object],
     once: bool = False,
 ) -> None:
-    """Give a viewer every log that appears, as it grows, until there is nothing to wait for.
+    """Give a viewer every log that appears, or the first only, as it grows, until ``wait`` says that no more comes.
 
-    Args:
-        logs: the logs.
-        viewer: who looks at them.
-        wait: waits a little; False if nothing more is to be waited for.
-        complain: takes what is wrong with a log; the next is followed all the same.
-        once: end after the first log.
+    ``complain`` takes what is wrong with a log; the next is followed all the same.
     """
     goes_on = True
     while goes_on or (logs.waiting and not once):

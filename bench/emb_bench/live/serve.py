@@ -129,9 +129,7 @@ class Viewer:
 class Server:
     """A server of one log after the other; a topic keeps its channel where its schema stays the same.
 
-    Args:
-        host: address to listen at.
-        port: to listen at; 0 for any that is free.
+    Port 0 is any free one.
 
     Raises:
         UsageError: websockets is not installed, or the port cannot be had.

@@ -33,14 +33,6 @@ class McapReader(MessageReader):
     """The frames of a log, received and sent, in the order in which they were recorded.
 
     A log that was cut or damaged is read as far as it goes, and what is missing is logged as a warning.
-
-    Args:
-        file: path of the log.
-        kwargs: options of other readers of python-can; not used.
-
-    Raises:
-        UsageError: the file cannot be read.
-        LogError: it is not a log of ours.
     """
 
     def __init__(self, file: StringPathLike, **kwargs: Any) -> None:

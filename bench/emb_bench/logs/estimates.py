@@ -32,11 +32,7 @@ def by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
 
 
 def last_estimate(log: RunLog) -> dict[str, dict[str, Any]]:
-    """The estimate at the end: value, standard deviation and unit by name; empty if there was none.
-
-    Raises:
-        LogError: see :func:`by_step`.
-    """
+    """The estimate at the end: value, standard deviation and unit by name; empty if there was none."""
     if any(event.code == LOST for event in log.events):
         return {}
     last = deque(_rows(log), maxlen=1)

@@ -163,12 +163,7 @@ class RunLog:
         return _Tables(self)
 
     def table(self, topic: str) -> Table:
-        """All messages of a topic, which of a long log take much memory.
-
-        Raises:
-            KeyError: the log has no such topic.
-            LogError: a message cannot be decoded, or the table would take many times the memory of its log.
-        """
+        """All messages of a topic, which of a long log take much memory."""
         names = [column.name for column in describe(self.topics[topic].factory)]
         size = 8 * len(names) * self.topics[topic].messages
         if size > SMALL_TABLE + TABLE * self.size:
@@ -180,8 +175,7 @@ class RunLog:
     def batches(self, wanted: Mapping[str, Sequence[str]]) -> Iterator[dict[str, Table]]:
         """Messages by topic, some at a time and in the order of the file: for a log of any length.
 
-        Args:
-            wanted: names of fields by topic; topics and fields that the log does not have are left out.
+        Topics and fields, ``wanted`` by topic, that the log does not have are left out.
         """
         held, size, order = list[Chunk](), 0, 0
         for chunk in self.chunks:
@@ -211,11 +205,7 @@ class RunLog:
         return found
 
     def rows(self, topic: str, *names: str) -> Iterator[tuple[Any, ...]]:
-        """Some columns of a topic, message by message; nothing if the log does not have it.
-
-        Raises:
-            LogError: a field is missing or means something else, or a message cannot be decoded.
-        """
+        """Some columns of a topic, message by message; nothing if the log does not have it."""
         if topic not in self.topics:
             return
         if topic in _OURS:
@@ -351,11 +341,7 @@ class RunLog:
 
     @cached_property
     def bench(self) -> Bench:
-        """The bench that the run was made on.
-
-        Raises:
-            LogError: the log carries no bench file, or a broken one.
-        """
+        """The bench that the run was made on."""
         try:
             return _bench(self._text("bench.toml"))
         except BenchFileError as err:

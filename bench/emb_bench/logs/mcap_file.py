@@ -90,16 +90,7 @@ class Chunk(NamedTuple):
 
 
 class McapFile:
-    """An MCAP file that is read once.
-
-    Args:
-        path: name of the file, for messages.
-        file: the file.
-        size: bytes of it that count; what is appended meanwhile does not.
-
-    Raises:
-        LogError: the file is empty, or not MCAP.
-    """
+    """An MCAP file that is read once, ``size`` bytes of it; what is appended meanwhile does not count."""
 
     def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
         self._path, self._file, self._size = path, file, size
@@ -392,11 +383,7 @@ def message_class(name: str, descriptors: bytes) -> Any:
 
 @lru_cache(maxsize=64)
 def describe(factory: Any, units: str = "{}") -> tuple[Column, ...]:
-    """The columns that the fields of a message become: all but messages in the message.
-
-    Args:
-        factory: the message class.
-        units: SI units by field, as JSON.
+    """The columns that the fields of a message become, all but messages in it; ``units`` are JSON by field.
 
     Raises:
         ValueError: the units are not JSON.
@@ -412,15 +399,9 @@ def describe(factory: Any, units: str = "{}") -> tuple[Column, ...]:
 
 
 def columns(factory: Any, payloads: Sequence[bytes], wanted: Collection[str]) -> dict[str, NDArray[Any]]:
-    """Some fields of many messages.
+    """Wanted fields of n serialised messages, each of shape (n,), but those that are missing, or messages themselves.
 
-    Args:
-        factory: the message class.
-        payloads: the n messages, serialised.
-        wanted: names of fields; one that the message lacks, or that is itself a message, is left out.
-
-    Returns:
-        Numbers as int64 or float64, bool as bool, text and bytes as objects, each of shape (n,).
+    Numbers are int64 or float64, bool is bool, text and bytes are objects.
 
     Raises:
         google.protobuf.message.DecodeError: a message is damaged.

@@ -273,12 +273,7 @@ def read_map(path: Path) -> tuple[RecordingMap, str]:
 
 
 def parse_map(text: str, source: str) -> RecordingMap:
-    """The map file's text as a checked record.
-
-    Args:
-        text: TOML.
-        source: what to call it in messages.
-    """
+    """The map file's text, TOML, as a checked record; messages call it ``source``."""
     try:
         document = parse_toml(text)
     except ValueError as err:

@@ -38,17 +38,7 @@ class Column(NamedTuple):
 
 
 def read_columns(path: Path, kind: str, source: Source, names: Sequence[str]) -> dict[str, Column]:
-    """Named columns of a file.
-
-    Args:
-        path: of the file.
-        kind: of the file, a key of ``KINDS``.
-        source: its form.
-        names: of columns; ``struct.field`` inside MATLAB structures.
-
-    Raises:
-        UsageError: the file cannot be read, is not of its kind, or lacks a column; or a library is missing.
-    """
+    """Named columns of a file of a kind, a key of ``KINDS``; ``struct.field`` inside MATLAB structures."""
     names = list(dict.fromkeys(names))
     readers: Mapping[str, tuple[str, str, Callable[[], Iterator[tuple[str, Any, Any]]]]] = {
         "csv": ("CSV", "pyarrow", lambda: _csv(path, source, names)),
@@ -198,14 +188,7 @@ class Recorded:
 
 
 def recorded(columns: Mapping[str, Column], wanted: RecordingMap, kind: str, source: str) -> Recorded:
-    """Puts columns on a grid.
-
-    Args:
-        columns: by their names.
-        wanted: the map.
-        kind: of the file.
-        source: what to call the file in messages.
-    """
+    """Columns, by their names, on a grid; messages call the file ``source``."""
     given, timing = wanted.signals.given, wanted.timing
     clock = columns[timing.column].values * wanted.time_unit if timing.column else None
     signals = {name: _signal(columns, signal, name, wanted, clock, source) for name, signal in given.items()}

@@ -64,16 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def import_recording(path: Path, map_path: Path, out: Path) -> Recorded:
-    """Writes a recording as a log.
-
-    Args:
-        path: the recording.
-        map_path: its map.
-        out: log to write.
-
-    Returns:
-        What was written.
-    """
+    """Write a recording as a log, by its map; gives what was written."""
     wanted, map_text = read_map(map_path)
     kind, timing = wanted.kind_of(path), wanted.timing
     names = [signal.column for signal in wanted.signals.given.values()] + ([timing.column] if timing.column else [])
@@ -125,15 +116,7 @@ def bench_of(found: Recorded, wanted: RecordingMap) -> str:
 
 
 def write_run(found: Recorded, name: str, texts: dict[str, str], source: dict[str, str], out: Path) -> None:
-    """Writes the log.
-
-    Args:
-        found: the samples.
-        name: of the recording.
-        texts: the bench file and the map, by file name.
-        source: name and digest of the recording.
-        out: log to make.
-    """
+    """Write the log, with the bench file and the map as attached texts, and name and digest of the recording."""
     steps = str(int(found.step[-1]))
     header = LogHeader(
         start_ns=0,

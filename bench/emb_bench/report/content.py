@@ -56,11 +56,7 @@ class Run:
 
     @cached_property
     def log_sha256(self) -> str:
-        """SHA-256 of the log's file.
-
-        Raises:
-            LogError: it cannot be read any more.
-        """
+        """SHA-256 of the log's file."""
         try:
             with self.log.path.open("rb") as file:
                 return hashlib.file_digest(file, "sha256").hexdigest()
@@ -193,12 +189,7 @@ def gather(
     last: Earlier | None = None,
     criteria: Criteria | None = None,
 ) -> Content:
-    """Estimates from the logs that have an experiment, and states for each other log why it is not used.
-
-    Raises:
-        UsageError: logs do not go together, or the options do not suit them.
-        LogError: a log that is held out lacks what a prediction needs.
-    """
+    """Estimates from the logs that have an experiment, and states for each other log why it is not used."""
     experiments = [_experiment(log, bench, wanted) for log in logs]
     used = [log for log, (_, why_not) in zip(logs, experiments, strict=True) if not why_not]
     study = make_study(bench, used, wanted, held_out=held_out, last=last) if used else None
@@ -304,11 +295,7 @@ class ActiveCycles:
     """The cycles of an experiment as columns, in order; n of them."""
 
     def __init__(self, run: Run) -> None:
-        """Take them from the log.
-
-        Raises:
-            LogError: the log has no control cycles.
-        """
+        """Take them from the log."""
         cycles = run.log.cycles
         active = timing.in_control(cycles)
         self.time: NDArray[np.float64] = cycles["step"][active] * run.bench.timing.sample_time

@@ -135,10 +135,7 @@ def _spans(time: Floats, where: Any, period: float) -> list[tuple[float, float]]
 def motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) -> list[Panel]:
     """Measured angle and velocity, and what the model predicts at the estimate, with the bench's limits.
 
-    Args:
-        run: with an experiment, or with cycles.
-        cycles: of the run; None if it has none.
-        after: samples after the last cycle of a stopped run.
+    The run has an experiment, or else cycles; ``after`` are the samples after the last cycle of a stopped run.
     """
     limits, period = run.bench.limits, run.bench.timing.sample_time
     if run.experiment is None:

@@ -73,12 +73,7 @@ class Safety(NamedTuple):
 
 
 def report_page(content: Content) -> str:
-    """The whole report as HTML: the verdict first, then what it rests on; evidence is folded.
-
-    Raises:
-        UsageError: matplotlib is missing.
-        LogError: a log cannot be read any more.
-    """
+    """The whole report as HTML: the verdict first, then what it rests on; evidence is folded."""
     several = len(content.runs) > 1
     # Of an experiment that was cut short no value is used, nor a prediction with it.
     shown = [replace(run, predicted=None, residuals=None) if content.shown is None else run for run in content.runs]

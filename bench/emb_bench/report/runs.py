@@ -126,11 +126,7 @@ class RunTiming(NamedTuple):
 
 
 def run_timing(log: RunLog) -> RunTiming:
-    """Timing of a run beside the budgets of its own bench.
-
-    Raises:
-        LogError: the log has no control cycles or no bench, or was imported.
-    """
+    """Timing of a run beside the budgets of its own bench."""
     if log.imported:
         raise LogError(f"{log.path}: a recording of others has no loop whose timing could be told")
     t = timing(log)

@@ -19,13 +19,7 @@ GOOD = r"(?P<good>^The model '[^']*' fits\b|limits held|\byes$)"  # Words that s
 
 
 class Cell(str):
-    """Text of a cell that is to stand out.
-
-    Args:
-        text: the text.
-        tone: ``good``, ``bad`` or ``care``; empty for none.
-        shade: -1 to 1, colour of the background; 0 for none.
-    """
+    """Text of a cell that is to stand out: ``good``, ``bad`` or ``care``, and a background from -1 to 1."""
 
     tone: str
     shade: float
@@ -79,11 +73,7 @@ class Table:
 
 
 def show(text: str) -> None:
-    """Prints a result.
-
-    Raises:
-        UsageError: standard output takes nothing: it is closed, or the disk behind it is full.
-    """
+    """Prints a result."""
     terminal.show(text, coloured if sys.stdout is not None and sys.stdout.isatty() else str)
 
 

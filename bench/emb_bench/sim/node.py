@@ -36,16 +36,7 @@ NOTHING_ASKED = math.nan  # On its way to the motor where no command is
 
 
 class BrakeNode(SimulatedBrake):
-    """A brake with its drive and sensors on the bus.
-
-    Args:
-        bench: limits, timing, what the node does by itself.
-        layout: the bus layout.
-        theta: the brake's true parameters.
-        noise: draws the sensors' errors.
-        plant: how the brake moves and what lies between it and the bus; the default one without.
-        charge: True to send the integral of the current before each sample.
-    """
+    """A brake with its drive and sensors on the bus; with ``charge`` it sends the integral of the current before each sample."""
 
     def __init__(
         self,
@@ -98,13 +89,10 @@ class BrakeNode(SimulatedBrake):
         self._command = taken
 
     def tick(self, skipped: int = 0) -> list[Frame]:
-        """Let one sampling period pass, and more if the node was late; measure at the end of the last one.
+        """Let one sampling period pass, measure at its end, and give the frames to send.
 
-        Args:
-            skipped: periods that passed before it without a sample: no command could answer, so they are braked.
-
-        Returns:
-            The frames to send: the charge if asked for, angle, velocity, now and then status.
+        As many more as were ``skipped`` before it, because the node was late, pass without a sample: no command could answer,
+        so they are braked.
         """
         for _ in range(skipped + 1):
             asked, answered_by = self._take_command()

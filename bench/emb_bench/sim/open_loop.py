@@ -58,9 +58,6 @@ def simulate(
         t_s: period [s].
         params: names of the unknown parameters, any of ``PARAMETERS`` in any order; none gives the states alone.
         x0: angle [rad] and velocity [rad/s] at the start. Unless ``x1_0`` and ``x2_0`` are among the parameters, known.
-
-    Raises:
-        UsageError: ``currents`` is not one row of finite numbers, or a name is unknown or comes twice.
     """
     check_unknowns(params)
     chosen, s = no_sensitivity(params)

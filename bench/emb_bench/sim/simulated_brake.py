@@ -36,17 +36,8 @@ def sent_current(
 ) -> tuple[float, int]:
     """Current for a measurement [A], NaN for none, and the :class:`~emb_runtime.records.Reason` bits.
 
-    As :func:`emb_runtime.safety.command_limits.decide` without a limit of the slope.
-
-    Args:
-        law: this and what follows as for :func:`emb_runtime.safety.shield.shield`.
-        shield: without it a current is clipped to the law's limit, no more.
-        angle: measured [rad].
-        velocity: measured [rad/s].
-        wanted: requested [A].
-        past: the last own commands, newest first [A].
-        step: of the sample.
-        limit: largest current that may be sent now, at most the law's [A].
+    As :func:`emb_runtime.safety.command_limits.decide` without a limit of the slope. ``limit`` [A] is at most the law's;
+    without the shield the current is clipped to the law's, no more.
     """
     if not shield:
         return clipped(wanted, law.current), 0
@@ -65,22 +56,10 @@ def pass_period(
     s: Floats,
     memory: Any,
 ) -> tuple[float, float]:
-    """Let one sample period pass, in place, and measure at its end.
+    """Let one sample period pass, in place; gives measured angle [rad] and velocity [rad/s] at its end.
 
-    Args:
-        mechanics: how the brake moves.
-        instruments: what lies between it and the bus.
-        p: the brake.
-        t_s: the period [s].
-        current: what acts [A].
-        errors: of the angle [rad], of the velocity [rad/s] and of the instant of the sample [s].
-        x: state, shape [4], see :mod:`emb_bench.brake.motion`.
-        chosen: indices of the n unknowns, shape [n].
-        s: sensitivities to them, shape [n, 4].
-        memory: of the instruments, shape [MEMORY].
-
-    Returns:
-        Measured angle [rad] and velocity [rad/s].
+    Errors are of the angle [rad], the velocity [rad/s] and the instant of the sample [s]. The state ``x`` has shape [4],
+    ``chosen`` the indices of the n unknowns, ``s`` their sensitivities, shape [n, 4], ``memory`` shape [MEMORY].
     """
     before = float(x[1])
     advance(mechanics, p, x, current, t_s, chosen, s)
@@ -93,14 +72,7 @@ Noise = Callable[[], tuple[float, float, float]]
 
 
 class SimulatedBrake:
-    """A brake at rest in its origin, driven with one current per sampling period.
-
-    Args:
-        theta: the brake's true parameters.
-        noise: draws the sensors' errors.
-        plant: how the brake moves and what lies between it and the bus.
-        sample_time: [s].
-    """
+    """A brake at rest in its origin, driven with one current per sampling period [s]."""
 
     def __init__(self, theta: BrakeParameters, noise: Noise, plant: Plant, sample_time: float) -> None:
         self._mechanics, self._instruments = plant.mechanics, plant.instruments
@@ -159,12 +131,7 @@ FARTHEST = 100.0  # A brake that is farther from nominal, by this factor, is a t
 
 
 def parse_assignments(text: str, option: str = "") -> dict[str, str]:
-    """``name=value,name=value`` as a dictionary.
-
-    Args:
-        text: to be parsed.
-        option: begin of a message, which names what was given.
-    """
+    """``name=value,name=value`` as a dictionary; ``option`` begins a message."""
     pairs: dict[str, str] = {}
     for item in filter(None, (part.strip() for part in text.split(","))):
         name, equals, value = (part.strip() for part in item.partition("="))
@@ -179,14 +146,7 @@ def parse_assignments(text: str, option: str = "") -> dict[str, str]:
 def true_parameters(
     bench: Bench, assignments: dict[str, str], besides: Sequence[str] = (), option: str = ""
 ) -> BrakeParameters:
-    """The bench's nominal brake with some parameters replaced.
-
-    Args:
-        bench: knows the nominal brake.
-        assignments: text by parameter.
-        besides: what else could have been given, for the message.
-        option: begin of a message, which names what was given.
-    """
+    """The bench's nominal brake with some parameters replaced; ``besides`` are named in a message, which ``option`` begins."""
     theta = bench.brake
     for name, text in assignments.items():
         if name not in PARAMETER_NAMES:
@@ -203,12 +163,7 @@ def true_parameters(
 
 
 def check_near_nominal(bench: Bench, name: str, value: float, where: str = "", got: str = "") -> None:
-    """Refuse a parameter that must be a typing error: a brake that fast would take for ever to simulate.
-
-    Raises:
-        UsageError: it is farther from nominal than by the factor FARTHEST, or not a number; the message begins with
-            ``where`` and ends with ``got``, or with the value.
-    """
+    """Refuse a parameter that must be a typing error: a brake that fast would take for ever to simulate."""
     nominal = getattr(bench.brake, name)
     low, high = nominal / FARTHEST, nominal * FARTHEST
     if not low <= value <= high:  # this way round, NaN is refused
@@ -233,12 +188,8 @@ class BrakeToSimulate(NamedTuple):
 def read_brake(text: str, bench: Bench, option: str) -> BrakeToSimulate:
     """Reads ``plant=exact,seed=3,f_v=3e-5``; what is not given is the default plant, seed 1, nominal.
 
-    Args:
-        text: one of the bench's plants, a seed of the sensors' noise, true parameters; ``charge=1`` has the node send
-            the integral of its current; ``angle_noise`` [rad] and ``velocity_noise`` [rad/s] are standard deviations of
-            sensors that are not as the bench file says.
-        bench: knows the plants.
-        option: begin of a message, which names what was given.
+    ``charge=1`` has the node send the integral of its current; ``angle_noise`` [rad] and ``velocity_noise`` [rad/s] are
+    standard deviations of sensors that are not as the bench file says. ``option`` begins a message.
     """
     given = parse_assignments(text, option)
     plant = with_tables(bench, "bench file").plant(given.pop("plant", DEFAULT_PLANT))
@@ -272,13 +223,7 @@ def _deviation(given: dict[str, str], name: str, option: str) -> float | None:
 
 
 def gaussian_noise(sensors: SensorNoise, seed: int, clock_jitter: float = 0.0) -> Noise:
-    """White Gaussian errors of sensors and clock; the same seed gives the same errors.
-
-    Args:
-        sensors: standard deviations.
-        seed: of the generator.
-        clock_jitter: standard deviation of the instant of sampling [s].
-    """
+    """White Gaussian errors of sensors and clock [s]; the same seed gives the same errors."""
     generator = np.random.default_rng(seed)
     angle_std, velocity_std = sensors.angle, sensors.velocity
 

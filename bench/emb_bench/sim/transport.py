@@ -31,14 +31,7 @@ class Device(Protocol):
 
 
 class LockstepBus:
-    """A bus with one simulated device on it and nothing else.
-
-    Args:
-        device: the device.
-        clock: the simulated clock; this transport alone moves it.
-        period_ns: the device's sampling period [ns].
-        truth: the brake's true parameters, the plant's name and the seed, for the log.
-    """
+    """A bus with one simulated device on it and nothing else; it alone moves the clock. ``truth`` is for the log."""
 
     name = "sim"
     obtained: Mapping[str, str] = {}
@@ -74,14 +67,7 @@ class LockstepBus:
 
 
 class SimTransport(LockstepBus):
-    """A bus with the simulated node on it and nothing else.
-
-    Args:
-        node: the node.
-        clock: this and what follows as for :class:`LockstepBus`.
-        period_ns: the node's sampling period [ns].
-        truth: the brake's true parameters, the plant's name and the seed, for the log.
-    """
+    """A bus with the simulated node on it and nothing else."""
 
     def __init__(self, node: BrakeNode, clock: SteppedClock, period_ns: int, truth: Mapping[str, float | str]) -> None:
         super().__init__(node, clock, period_ns, truth)
@@ -89,12 +75,7 @@ class SimTransport(LockstepBus):
 
 
 def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
-    """Open the simulated bus.
-
-    Args:
-        options: see :func:`~emb_bench.sim.simulated_brake.read_brake`.
-        bench: knows the plants.
-    """
+    """Open the simulated bus with the options of :func:`~emb_bench.sim.simulated_brake.read_brake`."""
     brake = read_brake(options, bench, "sim: ")
     node = BrakeNode(bench, load_layout(), brake.theta, brake.noise, brake.plant, charge=brake.charge)
     # Monotonic time starts where the computer's stands, so that a log has the date of its run.
