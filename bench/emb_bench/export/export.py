@@ -71,7 +71,7 @@ def write_parquet(log: RunLog, topic: str, path: Path) -> str:
 
 
 def write_csv(log: RunLog, topic: str, path: Path) -> str:
-    """Write one topic as CSV: units in the head, bytes as hex, times in nanoseconds since 1970; describes the content."""
+    """Write one topic as CSV: units in the head, bytes as hex, times in nanoseconds since 1970; says what it holds."""
     schema, tables = arrow_batches(log, topic)
     import pyarrow as pa
     from pyarrow import csv

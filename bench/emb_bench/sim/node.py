@@ -36,7 +36,7 @@ NOTHING_ASKED = math.nan  # On its way to the motor where no command is
 
 
 class BrakeNode(SimulatedBrake):
-    """A brake with its drive and sensors on the bus; with ``charge`` it sends the integral of the current before each sample."""
+    """A brake with its drive and sensors on the bus; on request it sends the charge before each sample."""
 
     def __init__(
         self,
@@ -91,8 +91,8 @@ class BrakeNode(SimulatedBrake):
     def tick(self, skipped: int = 0) -> list[Frame]:
         """Let one sampling period pass, measure at its end, and give the frames to send.
 
-        As many more as were ``skipped`` before it, because the node was late, pass without a sample: no command could answer,
-        so they are braked.
+        Periods that were ``skipped`` before it, because the node was late, had no sample: no command could answer, so
+        they are braked.
         """
         for _ in range(skipped + 1):
             asked, answered_by = self._take_command()

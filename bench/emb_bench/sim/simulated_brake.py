@@ -36,8 +36,8 @@ def sent_current(
 ) -> tuple[float, int]:
     """Current for a measurement [A], NaN for none, and the :class:`~emb_runtime.records.Reason` bits.
 
-    As :func:`emb_runtime.safety.command_limits.decide` without a limit of the slope. ``limit`` [A] is at most the law's;
-    without the shield the current is clipped to the law's, no more.
+    As :func:`emb_runtime.safety.command_limits.decide` without a limit of the slope. ``limit`` [A] is at most the
+    law's; without the shield the current is clipped to the law's, no more.
     """
     if not shield:
         return clipped(wanted, law.current), 0
@@ -58,8 +58,8 @@ def pass_period(
 ) -> tuple[float, float]:
     """Let one sample period pass, in place; gives measured angle [rad] and velocity [rad/s] at its end.
 
-    Errors are of the angle [rad], the velocity [rad/s] and the instant of the sample [s]. The state ``x`` has shape [4],
-    ``chosen`` the indices of the n unknowns, ``s`` their sensitivities, shape [n, 4], ``memory`` shape [MEMORY].
+    Errors are of the angle [rad], the velocity [rad/s] and the instant of the sample [s]. ``x`` is the state, shape
+    [4], ``chosen`` has the indices of the n unknowns, ``s`` their sensitivities, shape [n, 4].
     """
     before = float(x[1])
     advance(mechanics, p, x, current, t_s, chosen, s)
@@ -146,7 +146,7 @@ def parse_assignments(text: str, option: str = "") -> dict[str, str]:
 def true_parameters(
     bench: Bench, assignments: dict[str, str], besides: Sequence[str] = (), option: str = ""
 ) -> BrakeParameters:
-    """The bench's nominal brake with some parameters replaced; ``besides`` are named in a message, which ``option`` begins."""
+    """The bench's nominal brake with some parameters replaced; a message begins with ``option``."""
     theta = bench.brake
     for name, text in assignments.items():
         if name not in PARAMETER_NAMES:
