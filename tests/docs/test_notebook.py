@@ -30,6 +30,7 @@ def test_its_outputs_are_stored_for_a_reader_without_python() -> None:
     assert all(cell["outputs"] for cell in cells)
 
 
+@pytest.mark.slow
 def test_the_example_for_a_log_runs(tmp_path: Path) -> None:
     page = (NOTEBOOK.parents[1] / "docs" / "howto" / "read-a-log.md").read_text(encoding="utf-8")
     example, other = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)

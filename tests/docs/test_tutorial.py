@@ -25,6 +25,7 @@ def test_following_it_leaves_what_it_speaks_of(folder: Path) -> None:
     assert "<html" in (folder / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_its_estimates_are_as_it_says(folder: Path) -> None:
     first, stribeck = (api.open_run(folder / f"{name}.mcap") for name in ("first", "stribeck"))
     for run, model, fits in ((first, "exact", True), (stribeck, "exact", False), (stribeck, "stribeck", True)):

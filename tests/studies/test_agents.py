@@ -82,12 +82,16 @@ def test_every_target_has_statements_of_its_own_trainings_which_are_made_once(
     assert "of 8 statements agree" in capsys.readouterr().out
 
 
-def test_what_cannot_be_checked_is_refused_in_a_line(
-    folder: Path, made: Trainings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_option_is_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in (["fig-1.1"], ["--seeds", "0"], ["--steps", "-5"], ["--seed", "-1"]):
         refused(lambda: main([*arguments, "--out", str(tmp_path / "new")]), capsys)  # noqa: B023  # called at once
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.slow
+def test_trainings_that_do_not_belong_to_a_target_are_refused_in_a_line(
+    folder: Path, made: Trainings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     refused(lambda: main(["fig-5.2", "--steps", "300", "--out", str(folder)]), capsys)  # of other trainings
     for content in ("junk\n", '{"steps": 1}\n', "\xff", ""):
         shutil.rmtree(tmp_path / "thesis-fixed-0", ignore_errors=True)
@@ -96,6 +100,7 @@ def test_what_cannot_be_checked_is_refused_in_a_line(
         refused(lambda: main(["fig-5.3", "--out", str(tmp_path)]), capsys)
 
 
+@pytest.mark.slow
 def test_a_cut_training_makes_a_rehearsal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -104,6 +109,7 @@ def test_a_cut_training_makes_a_rehearsal(
     assert "no verdict of a training counts" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_agents_that_leave_the_limits_at_once_get_a_verdict_like_any_other(
     made: Trainings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -116,6 +122,7 @@ def test_agents_that_leave_the_limits_at_once_get_a_verdict_like_any_other(
     assert (home.agrees, home.found[:6]) == (False, "0 of 5")
 
 
+@pytest.mark.slow
 def test_a_planned_way_home_is_the_polynomial_of_six_conditions(made: Trainings) -> None:
     training = made.first("thesis-trajectory-b")
     (planned, taken), runs = ways_home(training), five(training)
@@ -134,6 +141,7 @@ def test_a_planned_way_home_is_the_polynomial_of_six_conditions(made: Trainings)
             np.testing.assert_allclose(planned[k, i, 1], derivative(1, 1e-3 * k) @ ways, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_way_home_agrees_if_it_keeps_the_limits_and_the_agent_takes_it(
     made: Trainings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,6 +194,7 @@ def test_a_return_drops_at_the_limits_if_an_experiment_left_them_in_most_of_the_
         assert drops_at_limits(curve, violations)[2] is agrees, left
 
 
+@pytest.mark.slow
 def test_an_experiment_is_recorded_until_it_leaves_the_limits(made: Trainings) -> None:
     fixed, draws = made.first("thesis-fixed"), [Draw(0, BENCH.brake), Draw(1, BENCH.brake)]
     runs = fixed.run(draws, lambda batch: np.array([6.0, 0.0]))

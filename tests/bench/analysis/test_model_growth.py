@@ -35,7 +35,9 @@ def grown(bench: Bench, true: str) -> ModelGrowth:
     return grow_model(bench, bench.plant("exact"), [data], EstimationProblem(), starts=2, seed=0)
 
 
-@pytest.mark.parametrize("true", PATHS)
+@pytest.mark.parametrize(
+    "true", ["exact", "load", *(pytest.param(n, marks=pytest.mark.slow) for n in PATHS if n not in ("exact", "load"))]
+)
 def test_the_model_grows_to_the_brake_that_was_there_and_no_further(bench: Bench, true: str) -> None:
     found = grown(bench, true)
     assert set(found.added) == PATHS[true]
@@ -60,6 +62,7 @@ def test_under_the_right_model_the_scores_are_small(bench: Bench) -> None:
     assert max(scores.values()) < 3.5
 
 
+@pytest.mark.slow
 def test_with_systematic_errors_estimated_along_a_model_grows_beside_an_offset_of_the_current(bench: Bench) -> None:
     currents, plant = currents_of(bench, "chirp"), bench.plant("exact")
     true = record(bench, bench.plant("hysteresis"), currents + 0.02, seed=3)

@@ -193,7 +193,7 @@ def test_a_variation_keeps_the_speeds_before_its_first_change_and_has_finite_one
 def test_an_annealing_tells_of_its_designs_what_their_currents_are_worth(model: str) -> None:
     p = problem("D", PARAMETER_NAMES, model=model, horizon=60)
     told = 0
-    for seed in range(40):
+    for seed in range(15):
         tracks, best = tracked(p, np.zeros((2, 60))), np.empty(60)
         rng = np.random.default_rng(seed)
         anneal.anneal(p.task, p.goal.compiled(4), 20, rng, tracks, best)
@@ -206,7 +206,7 @@ def test_an_annealing_tells_of_its_designs_what_their_currents_are_worth(model: 
             told += np.allclose(m, design.matrix, rtol=1e-6, atol=1e-9 * np.outer(unit, unit))
         lost = PRICE * abs(tracks.price[0] - tracks.price[1]) > HOPELESS
         told += lost  # one is dropped then, and its information is that of the design before
-    assert told >= 80
+    assert told >= 30
 
 
 @pytest.mark.parametrize("model", ["euler", "exact"])
@@ -241,7 +241,7 @@ def test_a_polish_gains_and_comes_back_into_the_box() -> None:
     assert merit(end) > merit(start)
 
 
-@settings(max_examples=4)
+@settings(max_examples=2)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["D", "E"]), st.sampled_from(["euler", "exact"]), st.data())
 def test_a_design_from_any_start_for_any_brake_keeps_the_limits_and_comes_home(
     seed: int, name: Name, model: str, data: st.DataObject
@@ -293,9 +293,8 @@ def test_the_same_seed_finds_the_same_design_on_any_number_of_threads() -> None:
     assert one.coarse != other.coarse
 
 
-@pytest.mark.parametrize(
-    ("params", "kind"), [(TWO, "physical"), pytest.param(("f_v",), "weighted", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("params", "kind"), [(TWO, "physical"), (("f_v",), "weighted")])
 def test_other_seeds_find_a_design_that_is_worth_the_same(params: tuple[str, ...], kind: Kind) -> None:
     goal = criterion("D", params)
     p = replace(make_problem(BENCH, goal, params, model="euler", kind=kind), horizon=60)

@@ -166,7 +166,7 @@ def test_a_clock_that_is_fast_or_slow_is_noticed_at_two_periods_and_sooner_where
 
 @pytest.mark.parametrize("ppm", [-400, 400])
 def test_two_quartzes_are_never_blamed_however_long_the_experiment(ppm: int) -> None:
-    seen = run(Lie(clock=1.0 + ppm * 1e-6, begin=0.0), law=lambda *_: 0.0, steps=12_000)
+    seen = run(Lie(clock=1.0 + ppm * 1e-6, begin=0.0), law=lambda *_: 0.0, steps=6_000)  # 2.4 periods
     assert seen.outcome.fault is None, seen.outcome.detail
 
 
@@ -185,11 +185,12 @@ def late_frames(seed: int) -> Callable[[], int]:
     return delay_ns
 
 
-@pytest.mark.parametrize("seed", range(30))
-def test_bursts_of_late_frames_are_no_wrong_clock(seed: int) -> None:
-    seen = run(Lie(clock=1.0 + 400e-6 * (-1) ** seed, begin=0.0), seed, late_frames(seed))
-    assert seen.outcome.fault in (None, Fault.INCOMPLETE), (seen.outcome.fault, seen.outcome.detail)
-    assert_inside(seen)
+@pytest.mark.parametrize("seeds", [range(10), pytest.param(range(10, 30), marks=pytest.mark.slow)], ids=str)
+def test_bursts_of_late_frames_are_no_wrong_clock(seeds: range) -> None:
+    for seed in seeds:
+        seen = run(Lie(clock=1.0 + 400e-6 * (-1) ** seed, begin=0.0), seed, late_frames(seed))
+        assert seen.outcome.fault in (None, Fault.INCOMPLETE), (seed, seen.outcome.fault, seen.outcome.detail)
+        assert_inside(seen)
 
 
 def test_a_node_that_sends_twice_in_a_period_is_told_so_and_no_error_of_the_program() -> None:

@@ -80,7 +80,7 @@ def test_the_ring_is_a_bounded_queue(operations: list[bytes | None]) -> None:
 
 def test_another_process_reads_what_this_one_writes() -> None:
     ring = Ring.create(64)
-    count = 20_000
+    count = 5_000
     with subprocess.Popen([sys.executable, "-c", PRODUCER, str(ring.fd), str(count)], pass_fds=(ring.fd,)) as producer:
         got = 0
         while got < count:
