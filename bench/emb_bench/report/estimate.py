@@ -25,7 +25,7 @@ def text(study: Study, *, verbose: bool = False) -> str:
     """Verdict, parameters, what limits them, next step; with ``verbose`` the evidence, too."""
     lines = [*stops(study), *listed("", say.outside(study)), *listed("WARNING: ", study.warnings)]
     if study.aborted and not verbose:
-        return "\n".join([*lines, "next: find the cause before the next run   (-v: values until the stop)"])
+        return "\n".join([*lines, "next: find the cause before the next run   (-v shows values until the stop)"])
     lines = [
         *lines,
         *wrapped(say.headline(study)),
@@ -95,7 +95,7 @@ def _next(study: Study) -> list[str]:
     found = [*say.remedies(study), *(say.recommendation(r) for r in study.advice[:1])]
     if study.stopped:
         found = ["find the cause of the stop before the next run"]
-    found = found or [f"emb-replay report {say.logs_of(study)} -o report.html   (-v: the evidence)"]
+    found = found or [f"emb-replay report {say.logs_of(study)} -o report.html   (-v shows the evidence)"]
     return listed("next: ", found) if len(found) == 1 else ["next", *listed("  - ", found)]
 
 

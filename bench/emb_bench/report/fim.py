@@ -73,17 +73,18 @@ def document(e: Evaluation) -> dict[str, Any]:
 def text(e: Evaluation, *, verbose: bool = False) -> str:
     """The best possible intervals; what is missing comes before any number. With ``verbose`` the criteria over time."""
     doubts, lines = [*listed("WARNING: ", say.warnings(e)), *listed("NOTE: ", say.notes(e))], _heading(e)
-    fit = f"angle {e.fit.angle:.3g}, velocity {e.fit.velocity:.3g} sigma; at most {e.fit.expected:.2f} if it fits"
+    sizes = f"angle {e.fit.angle:.3g}, velocity {e.fit.velocity:.3g} sigma"
+    fit = f"residuals of {sizes} (at most {e.fit.expected:.2f} if it fits)"
     lines += [*facts(("model", f"{e.plant.name} ({_why(e)}); {fit}")), *_unknowns(e.question)]
     if not e.fisher("weighted").matrix.any():  # which has no prior
         return "\n".join([*doubts, "no information: the record does not depend on any of these parameters", *lines])
     verdict = e.verdict().shown(e.bench.machine)
     prior = "" if e.question.prior is None else ", with the prior"
-    head = wrapped(f"best possible ± 95 % (k=2){prior}, if the sensors have noise and no systematic error")
+    head = wrapped(f"best possible ± 95 % (k=2){prior}, with sensor noise and no systematic error")
     rows = [[f.name, _half(f), say.finding(f)] for f in verdict.findings]
     head += [*(row.rstrip() for row in Table("", ("", "", ""), rows, words=(0, 2)).lines("  ")[1:])]
     head += listed("  ", say.directions(verdict))
-    head += wrapped("repeatability in emb-replay estimate is larger: systematic errors are estimated as well", 0)
+    head += wrapped("emb-replay estimate has a larger repeatability: it also estimates systematic errors", 0)
     final = e.fisher("physical").criteria().shown(e.bench.machine)
     shown = f"log det {final.log_det:.6g}, smallest eigenvalue {final.lambda_min:.4g}, condition {final.condition:.4g}"
     lines = [*head, "", *lines, *facts(("information", shown))]
@@ -109,7 +110,7 @@ def _details(e: Evaluation) -> list[str]:
     final = {kind: e.fisher(kind).criteria().shown(e.bench.machine) for kind in KINDS}
     rows = [[label, *(f"{getattr(final[kind], name):.6g}" for kind in KINDS)] for label, name in CRITERIA.items()]
     table = Table("", ("Fisher information", *KINDS), rows).lines()
-    weakest = f"least is known of {combination(final['physical'].weakest)}"
+    weakest = f"least determined: {combination(final['physical'].weakest)}"
     return ["", *table, *wrapped(f"  {weakest}"), "", *_over_time(e).lines()]
 
 

@@ -128,13 +128,13 @@ class RunTiming(NamedTuple):
 def run_timing(log: RunLog) -> RunTiming:
     """Timing of a run beside the budgets of its own bench."""
     if log.imported:
-        raise LogError(f"{log.path}: a recording of others has no loop whose timing could be told")
+        raise LogError(f"{log.path}: an imported recording has no loop, so no timing")
     t = timing(log)
     budgets = log.bench.budgets
     if t.simulated:
-        return RunTiming(log, t, (), "the time was simulated: it says nothing of any computer or bus")
+        return RunTiming(log, t, (), "simulated time says nothing about a computer or bus")
     if ran := log.metadata.get("emb.run", {}).get("time"):
-        return RunTiming(log, t, (), f"time ran {ran}: it says nothing of any computer or bus")
+        return RunTiming(log, t, (), f"time ran {ran} and says nothing about a computer or bus")
     if budgets is None:
         return RunTiming(log, t, (), "the bench description in the log has no [budgets]")
     checks = tuple(judge(t, budgets))

@@ -61,14 +61,12 @@ def headline(study: Study) -> str:
     if study.biased:
         return (
             f"NOT JUDGED: recursive least squares does not reproduce the record (chi2/n {plain(e.validation.ratio)}). "
-            "Noise biases its values; that says nothing about the model. Use --method oem."
+            "Noise biases its values; the model is not tested. Use --method oem."
         )
     if not study.model_fits:
-        return (
-            f"THE MODEL '{name}' DOES NOT FIT: the values are its best, and their intervals do not include its error."
-        )
+        return f"THE MODEL '{name}' DOES NOT FIT: its best values follow, but their intervals do not include its error."
     if not study.predicts:
-        return f"THE MODEL '{name}' DOES NOT PREDICT other records: the values hold only for the records they are from."
+        return f"THE MODEL '{name}' DOES NOT PREDICT other records: the values hold only for their own records."
     if study.identified:
         return f"The model '{name}' fits. All parameters are identified: the values may be used."
     others = len(study.unidentified) < len(e.asked.params)
@@ -116,7 +114,7 @@ def outside(study: Study) -> list[str]:
         ranges = f"ranges.{study.estimate.bench.shield.ranges} ({plain(low, 4)} to {plain(high, 4)})"
         found.append(
             f"OUTSIDE: {c.label} = {amount(c.value, c.interval, c.unit)} lies outside {ranges}: the limits were not "
-            "guaranteed. Look for what is wrong, or widen the range."
+            "guaranteed. Find the cause, or widen the range."
         )
     return found
 
@@ -137,7 +135,7 @@ def models(study: Study) -> str:
     every = "both" if len(found) == 2 else "all"
     fit = f"{every} fit" if study.choice.best.fits else "do not fit"
     return (
-        f"{names} and {found[-1].name} {fit}, and the records do not tell them apart (weights {weights}): the "
+        f"{names} and {found[-1].name} {fit}, and the records do not separate them (weights {weights}): the "
         f"intervals cover {every}"
     )
 
@@ -264,7 +262,7 @@ def remedies(study: Study) -> list[str]:
     if study.biased:
         return [f"use another method: {again} --method oem"]
     if study.model_fits and not study.predicts:
-        return ["find out what differs between the runs: the brake, its homing (--nuisance offset), or use --model"]
+        return ["find the difference between the runs: the brake, its homing (--nuisance offset); or use --model"]
     if study.apart:
         return [f"estimate from each log alone: emb-replay campaign {logs_of(study)} -o rows.csv"]
     if study.model_fits:
@@ -274,7 +272,7 @@ def remedies(study: Study) -> list[str]:
     elif "viscous_asymmetry" not in e.asked.names:
         found = ["let friction depend on the direction: --params with viscous_asymmetry, or by_direction in the map"]
     else:
-        found = ["keep to the intervals, which come from the scatter of the windows, not from a model that is right"]
+        found = ["use the intervals: they come from the scatter of the windows, and do not need a right model"]
     if study.suspects:
         found.append(f"or correct what the residuals point to: {shown_as(study.suspects[0], e.bench.machine).name}")
     if e.method == "oem":
@@ -286,7 +284,7 @@ def impact(run: Run, speed: float | None, why_not: str) -> str:
     """Effect of a loss of all commands, for any brake of the shield's set."""
     if why_not or speed is None:
         return f"unknown: {why_not}"
-    how = "the node brakes" if run.bench.node.stop == "damped" else "the node lets go"
+    how = "the node brakes" if run.bench.node.stop == "damped" else "the node switches the current off"
     if speed == 0.0:
         return f"{how}, and no brake of the set '{run.bench.shield.ranges}' reaches an end stop"
     return f"{how}, and a brake of the set may hit an end stop with {plain(speed, 3)} rad/s"
@@ -315,10 +313,10 @@ def warnings(e: Evaluation) -> list[str]:
         why = (
             "they are guesses of the map: pass --theta with an estimate"
             if e.theta_name == "nominal"
-            else "what disturbed the machine is not in the model"
+            else "the model does not include what disturbed the machine"
         )
     elif e.log.missing or e.experiment.missing:
-        why = "what was lost hides whether they are this brake's"
+        why = "the losses hide whether they are this brake's"
     else:
         why = "pass --theta or --model"
     worst = max(e.fit.angle, e.fit.velocity)

@@ -129,9 +129,9 @@ def table(lines: Sequence[CheckResult]) -> str:
 
 def _stage(f: Findings) -> CheckResult:
     says = {
-        Stage.READ_ONLY: "nothing leaves",
-        Stage.ZERO: "only 0 A leaves",
-        Stage.LIMITED: f"at most {f.plan.limit:g} A leaves",
+        Stage.READ_ONLY: "nothing is sent",
+        Stage.ZERO: "only 0 A is sent",
+        Stage.LIMITED: f"at most {f.plan.limit:g} A",
         Stage.FULL: f"up to {f.plan.limit:g} A",
     }
     where = "" if not f.start_conditions.anywhere else ", on the way home"
@@ -141,7 +141,7 @@ def _stage(f: Findings) -> CheckResult:
 def _interface(f: Findings) -> CheckResult:
     heard = f.heard
     if heard.commanded:
-        return _faulty("interface", Fault.FOREIGN_COMMAND, f"{f.bus}; commands of somebody else", "no other commander")
+        return _faulty("interface", Fault.FOREIGN_COMMAND, f"{f.bus}; commands of another sender", "no other sender")
     trouble = [f"{name} ({count})" for name, count in heard.bus_errors.items()]
     trouble += [f"{heard.dropped} frames dropped by the kernel"] if heard.dropped else []
     return _line("interface", f"{f.bus}{''.join(f'; {t}' for t in trouble)}", "open, without errors", not trouble)
@@ -151,7 +151,7 @@ def _node(f: Findings) -> CheckResult:
     status = f.heard.status
     identity = f"protocol {f.plan.layout.protocol_version}, bench {bench_identity(f.plan.bench.identity_hash):#06x}"
     if not f.heard.frames:
-        return _faulty("node", Fault.NO_NODE, "nothing heard", identity)
+        return _faulty("node", Fault.NO_NODE, "no frame came", identity)
     if why := f.start_conditions.mismatch(status):
         return _faulty("node", Fault.NODE_NOT_READY, why, identity)
     assert status is not None  # else it is a stranger
@@ -182,7 +182,7 @@ def _rate(f: Findings) -> CheckResult:
         return _faulty("samples", Fault.NO_NODE, f"{heard.pairs} sensor pairs", expected)
     rejected = [f"{name}: {why} ({n})" for name, reasons in heard.rejections.items() for why, n in reasons.items()]
     lost = heard.missing / max(1, heard.pairs + heard.missing)
-    found = f"{heard.pairs}, each {heard.period * 1e3:g} ms, {heard.missing} missing ({lost:.2g} of all), "
+    found = f"{heard.pairs}, each {heard.period * 1e3:g} ms, {heard.missing} missing ({100 * lost:.2g} %), "
     found += f"rejected {', '.join(rejected)}" if rejected else "none rejected"
     if heard.distrusted:
         return _faulty("samples", Fault.FRAMES_REJECTED, found, expected)
@@ -198,8 +198,8 @@ def _rate(f: Findings) -> CheckResult:
 def _noise(f: Findings) -> CheckResult:
     heard, noise = f.heard, f.plan.bench.noise
     expected = (
-        f"at most {SCATTER_TOLERANCE:g} times {noise.angle:g} rad and {noise.velocity:g} rad/s; the shield reckons "
-        f"with {f.plan.bench.shield.noise_sigmas:g} times that"
+        f"at most {SCATTER_TOLERANCE:g} times {noise.angle:g} rad and {noise.velocity:g} rad/s; the shield allows "
+        f"for {f.plan.bench.shield.noise_sigmas:g} times that"
     )
     if not (math.isfinite(heard.angle_scatter) and math.isfinite(heard.velocity_scatter)):
         return _line("noise at rest", "not known: no samples at rest", expected, good=False)
@@ -207,7 +207,7 @@ def _noise(f: Findings) -> CheckResult:
     good = good and heard.velocity_scatter <= SCATTER_TOLERANCE * noise.velocity
     found = f"{heard.angle_scatter:.2g} rad and {heard.velocity_scatter:.2g} rad/s"
     if heard.creep:
-        found += f", about a line: the brake is not at rest, it creeps at {heard.creep:.2g} rad/s"
+        found += f", about a line: the brake is not at rest but creeps at {heard.creep:.2g} rad/s"
     return _line("noise at rest", found, expected, good)
 
 
@@ -222,7 +222,7 @@ def _bus_load(f: Findings) -> CheckResult:
     if of_drive and f.in_process:  # in lock-step there is no other bus
         return CheckResult("bus load", of_drive, expected)
     planned = f.plan.layout.bus_load(bitrate)
-    found = f"{planned:.0%} at worst by the DBC at {bitrate} bit/s (can.bitrate), {f.heard.load:.0%} heard"
+    found = f"{planned:.0%} at worst by the DBC at {bitrate} bit/s (can.bitrate), {f.heard.load:.0%} measured"
     found += f", {f.heard.others} frames of others" if f.heard.others else ""
     found += f"; {of_drive}" if of_drive else ""
     if planned > HIGHEST_BUS_LOAD:
@@ -252,10 +252,10 @@ def _shield(f: Findings) -> CheckResult:
 
 def _slew(f: Findings) -> CheckResult:
     if not f.plan.limit:
-        return CheckResult("slew", "no current leaves", "none needed")
+        return CheckResult("slew", "no current is sent", "none needed")
     period, slew = f.plan.bench.timing.sample_time, f.plan.bench.guard.slew
     reversal = 2.0 * f.plan.limit / slew
-    expected = f"at most {period * 1e3:g} ms: the shield reckons with any current at once"
+    expected = f"at most {period * 1e3:g} ms: the shield assumes any current at once"
     found = f"{f.plan.limit:g} A to {-f.plan.limit:g} A in {reversal * 1e3:.3g} ms (guard.slew)"
     if good := reversal <= period * (1.0 + 1e-9):
         return _line("slew", found, expected, good)
@@ -266,18 +266,20 @@ def _slew(f: Findings) -> CheckResult:
 def _policy(f: Findings) -> CheckResult:
     policy = f.plan.policy
     if policy is None or f.plan.stage is Stage.READ_ONLY or f.start_conditions.anywhere:
-        return CheckResult("policy", "none decides", "none")
+        return CheckResult("policy", "none", "none")
     provenance = ", ".join(f"{name} {value}" for name, value in policy.contract.provenance.items())
     made = shorten(provenance, 80, placeholder=" …")
     parts = (f"{policy.contract.kind}, sha256 {policy.sha256[:12]}", made)
     found = "; ".join((", ".join(filter(None, parts)), *policy.warnings))
-    return _line("policy", found, "made for such a bench, its test vectors reproduced", not policy.warnings)
+    return _line("policy", found, "fits this bench, reproduces its test vectors", not policy.warnings)
 
 
 def _watchdog(f: Findings) -> CheckResult:
     if f.in_process or f.plan.stage is Stage.READ_ONLY:
         return CheckResult(
-            "watchdog", "none needed", "none: nobody else can see this bus" if f.in_process else "none: nothing leaves"
+            "watchdog",
+            "none needed",
+            "none: no other process has this bus" if f.in_process else "none: nothing is sent",
         )
     return _line("watchdog", f.watchdog or "NONE", "a process of its own, above the loop's priority", bool(f.watchdog))
 
@@ -294,7 +296,7 @@ def _realtime(f: Findings) -> CheckResult:
 
 def _core(f: Findings) -> CheckResult:
     found = f.core.text + (f"; {f.core.warning}" if f.core.warning else "")
-    return _line("core", found, "compiled where it is installed, else Python", not f.core.warning)
+    return _line("core", found, "compiled if installed, else Python", not f.core.warning)
 
 
 def _drive(f: Findings) -> CheckResult:
@@ -308,10 +310,8 @@ def _drive(f: Findings) -> CheckResult:
     if not f.plan.bench.can.mapping:
         named = f'not named by the bench file (can.mapping = "{drive.sha256}")'
     serial = f", serial number {f.plan.serial} by the operator" if f.plan.serial else ""
-    found = f"{drive.name}{serial}, mapping {named}, time-out {drive.watchdog:g} s; host or cable lost at the "
-    found += (
-        f"worst moment, and let go: below {speed:.4g} rad/s, the brake bears {drive.end_stop_speed:g}; lacks {lacks}"
-    )
+    found = f"{drive.name}{serial}, mapping {named}, time-out {drive.watchdog:g} s; after the worst loss of host or "
+    found += f"cable below {speed:.4g} rad/s, the brake withstands {drive.end_stop_speed:g}; lacks {lacks}"
     expected = "all of it accepted by name in the mapping file; the shield assumes shield.frame_age, and a host and a "
     return CheckResult("drive", found, f"{expected}cable that are not lost", Verdict.WARNING)
 
@@ -323,7 +323,7 @@ def _learning(f: Findings) -> CheckResult:
         f"sensor errors within {shield.noise_sigmas:g} deviations"
     )
     expected = (
-        "all of it true of the bench; what is wrong by a little is not noticed: friction or stiffness of another "
+        "all true of the bench; small violations are not noticed: friction or stiffness of another "
         "form, a current that lags, samples off the grid, a velocity from an observer, noise that is not as declared"
     )
     return CheckResult("learning", found, expected)

@@ -211,7 +211,7 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
     result = result_facts(fault, exit_code, outcome.detail)
     if fault is None and not ran.log.complete:
         result |= {"result": LOG_INCOMPLETE, "cause": "the log is not whole", "detail": ran.log.error}
-        result |= {"advice": "the brake and the node did what they should; the run must be made again for its data"}
+        result |= {"advice": "brake and node worked as they should; repeat the run for its data"}
     return {
         **result,
         "purpose": str(ran.run_type),
@@ -265,7 +265,7 @@ def refusal(err: EmbError, iface: str) -> dict[str, Any]:
 
 def text(s: Mapping[str, Any], details: bool = False) -> str:
     """A :func:`document` for a person: the answer and what was unusual; every count with ``details``."""
-    early = f", ended early: enough is known after {s['goal_s']:.3f} s" if s["goal_reached"] else ""
+    early = f", ended early: precise enough after {s['goal_s']:.3f} s" if s["goal_reached"] else ""
     completed = s["result"] == "done" and s["purpose"] == RunType.EXPERIMENT
     done = f"done, OUTSIDE THE RANGES ({', '.join(s['outside'])})" if s["outside"] else "done"
     lines = [f"{done}: {s['answered']} of {s['steps']} samples answered, {'home' if s['home'] else 'NOT HOME'}{early}"]
@@ -276,7 +276,7 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
         lines = [f"{ended}{where} ({s['result']}): {why}", f"  → {s['advice']}"]
     lines += [
         f"  OUTSIDE    {name} = {value:.4g} is at or beyond the border of ranges.{ranges} ({low:.4g} to {high:.4g}): "
-        "the limits were not guaranteed; look for what is wrong, or widen the range"
+        "the limits were not guaranteed; find the cause, or widen the range"
         for name, (value, low, high, ranges) in s["outside"].items()
     ]
     lines += [f"  way home   {name} the experiment: {brief(way)}" for name, way in s["homing"].items()]
@@ -291,18 +291,18 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
     lines += _unusual(s)
     if details:
         lines += [
-            f"  learnt     {name} between {low:.3f} and {high:.3f} of nominal, if what the shield assumes is true"
+            f"  learnt     {name} between {low:.3f} and {high:.3f} of nominal, if the shield's assumptions hold"
             for name, (low, high) in s["learnt"].items()
         ]
     if s["estimate"]:
-        lines.append("estimate while running ± half of the 95 % interval (k=2), if the model is right")
+        lines.append("running estimate ± 95 % (k=2), valid if the model is right")
         if not s["model_fits"]:
-            lines.append("  IT IS NOT  friction, a delay or a sensor is another: use emb-replay estimate")
+            lines.append("  THE MODEL DOES NOT FIT: friction, a delay or a sensor differs; use emb-replay estimate")
         lines += [f"  {line}" for line in estimate.words(s["estimate"])]
     missing = "" if s["log_complete"] else f", INCOMPLETE: {s['log_error']}"
     lines.append(f"log: {s['log']} ({s['log_messages']} messages, {s['log_bytes'] / 1024:.0f} KiB{missing})")
     if completed:
-        lines.append(f"next: emb-replay estimate {s['log']}   (tests the model; the final intervals)")
+        lines.append(f"next: emb-replay estimate {s['log']}   (tests the model, gives the final intervals)")
     return "\n".join(lines)
 
 
@@ -352,7 +352,7 @@ def _brake(s: Mapping[str, Any]) -> list[str]:
         f"  brake      {s['angle_min']:.2f} to {s['angle_max']:.2f} rad, top speed {s['top_speed']:.1f} rad/s, "
         f"top current {s['top_current']:.2f} A",
         f"  end        {s['end_angle']:.3f} rad, {s['end_velocity']:.1f} rad/s; then {s['last_angle']:.3f} rad, "
-        f"the node is {s['node_state']}{', at rest' if s['node_at_rest'] else ', still stopping'}"
+        f"{'at rest' if s['node_at_rest'] else 'still stopping'}, node {s['node_state']}"
         f"{_stop_reason(s['node_stop_reason'])}",
     ]
 
@@ -360,7 +360,7 @@ def _brake(s: Mapping[str, Any]) -> list[str]:
 def _counts(s: Mapping[str, Any]) -> list[str]:
     return [
         f"  commands   {s['answered']} sent, {s['confirmed']} frames seen on the bus, {s['limited']} limited by the "
-        f"shield, {s['returning']} to return, {s['clipped']} clipped, {s['not_obeyed']} came too late",
+        f"shield, {s['returning']} to return, {s['clipped']} clipped, {s['not_obeyed']} late",
         f"  samples    {s['pairs']} pairs, {s['unanswered']} without a command (send buffer full: {s['not_taken']}, "
         f"left to the node: {s['left']}), {s['missed']} periods missed, {s['rejected']} frames rejected, "
         f"{s['dropped']} dropped by the kernel",
@@ -369,14 +369,12 @@ def _counts(s: Mapping[str, Any]) -> list[str]:
 
 def _motion(s: Mapping[str, Any]) -> str:
     if s["unexplained"] is None:
-        return "not judged: too little of it, or the bench declares a lag or an age of more than two samples"
-    return (
-        f"one brake explains all but {s['unexplained']:.0f} rad/s of it, at most {s['unexplained_allowed']:.0f} may be"
-    )
+        return "not judged: too little motion, or the bench declares a lag or frames older than two samples"
+    return f"{s['unexplained']:.0f} rad/s that no single brake explains, at most {s['unexplained_allowed']:.0f} allowed"
 
 
 def _stop_reason(name: str | None) -> str:
-    return " (it has not reported its stop reason)" if name is None else f" (its stop reason: {name})"
+    return " (stop reason not reported)" if name is None else f" (stop reason {name})"
 
 
 def heard_document(heard: BusStatistics) -> dict[str, Any]:
@@ -417,7 +415,7 @@ def listen_text(s: Mapping[str, Any], lines: Sequence[CheckResult]) -> str:
     """A :func:`listen_document` for a person, with its pre-flight."""
     heard = s["heard"]
     begin = f"a run could NOT begin ({s['result']}): {s['detail']}" if s["detail"] else "a run could begin"
-    said = [begin, table(lines), f"  heard for {heard['duration']:.3f} s"]
+    said = [begin, table(lines), f"  listened for {heard['duration']:.3f} s"]
     for name, count in heard["frames"].items():
         rejected = sum(heard["rejections"].get(name, {}).values())
         rate = heard["rates"].get(name, 0.0)

@@ -192,7 +192,7 @@ FAULTS: dict[Fault, FaultInfo] = {
     ),
     Fault.NODE_NOT_READY: FaultInfo(
         "the node is not ready for a run",
-        "a brake that is elsewhere is brought to the origin by --home; else check the node, and its bench file",
+        "bring the brake to the origin with --home; else check the node and its bench file",
     ),
     Fault.SENSOR_LOST: FaultInfo(
         "the sensor frames stopped", "check node, wiring and bus load; in a virtual machine the host may have been busy"
@@ -201,23 +201,23 @@ FAULTS: dict[Fault, FaultInfo] = {
         "too many invalid or implausible sensor frames", "check DBC, wiring and sensor; the log lists each one"
     ),
     Fault.OUT_OF_LIMITS: FaultInfo(
-        "the brake left its limits", "the brake does not lie in the bench's shield ranges: widen them"
+        "the brake left its limits", "the brake is outside the bench's shield ranges: widen them"
     ),
     Fault.NODE_STOPPED: FaultInfo(
         "the node began its own safe stop",
-        "its stop reason is below; WATCHDOG: this computer answered too late; LIMIT: the brake is none of those that "
-        "the shield is for",
+        "its stop reason is below; WATCHDOG: this computer answered too late; LIMIT: the brake is outside the "
+        "bench's shield ranges",
     ),
     Fault.NOT_OBEYED: FaultInfo(
         "the node obeyed no command for too long",
-        "the computer answered too late, or the node ignores it: `emb-replay info` tells which",
+        "the computer answered too late, or the node ignores it: `emb-replay info` shows which",
     ),
     Fault.CURRENT_MISMATCH: FaultInfo(
         "the drive does not apply the current that it is commanded",
         "check the drive's current loop and its supply; a slow one needs a greater guard.current_error",
     ),
     Fault.FOREIGN_COMMAND: FaultInfo(
-        "somebody else sends commands to the node", "stop the other commander; two on one bus is never safe"
+        "another sender commands the node", "stop the other sender; two on one bus are never safe"
     ),
     Fault.POLICY_NOT_FINITE: FaultInfo(
         "the policy answered with a number that is not finite", "the actor is broken: train or export it again"
@@ -229,11 +229,11 @@ FAULTS: dict[Fault, FaultInfo] = {
         "the guard refused a command", "this is an error in the program: please report it with the log"
     ),
     Fault.WATCHDOG_TRIPPED: FaultInfo(
-        "the loop stood still, and the watchdog process has stopped the run",
+        "the loop stalled, and the watchdog process stopped the run",
         "the computer is too busy or the policy too slow: `emb-replay timing` shows which",
     ),
     Fault.WATCHDOG_LOST: FaultInfo(
-        "the watchdog process is gone or stands still", "see what ended it (out of memory?), and run again"
+        "the watchdog process ended or stalled", "find what ended it (out of memory?), and run again"
     ),
     Fault.NOT_HOME: FaultInfo(
         "the brake did not come to rest at the origin in time",
@@ -241,46 +241,46 @@ FAULTS: dict[Fault, FaultInfo] = {
     ),
     Fault.SENSORS_CONTRADICT: FaultInfo(
         "angle and velocity contradict each other",
-        "one of them drifts, is scaled, frozen or of another time: check sensor, its supply and its units",
+        "one of them drifts, is scaled, frozen or late: check the sensor, its supply and its units",
     ),
     Fault.MOTION_OUTSIDE_SET: FaultInfo(
-        "the brake moves as no brake of the set does",
-        "it is stuck, loose or outside the bench's shield ranges, or sensor or drive are scaled, frozen or late",
+        "no brake of the set moves so",
+        "the brake is stuck, loose or outside the bench's shield ranges, or sensor or drive is scaled, frozen or late",
     ),
     Fault.WRONG_POLARITY: FaultInfo(
         "the brake moves against the current",
         "motor or sensor is connected with the wrong sign: swap it, and begin again with --limit",
     ),
     Fault.DEVICE_TIME: FaultInfo(
-        "the node's clock does not go like this computer's",
-        "check the node's clock and what stamps its samples: their times cannot be used",
+        "the node's clock and this computer's disagree",
+        "check the node's clock and the source of its time stamps",
     ),
     Fault.INCOMPLETE: FaultInfo(
         "the experiment was not completed",
-        "`emb-replay info` tells what was missed; check the load of computer and bus, or the brake if it is not home",
+        "`emb-replay info` shows what is missing; check the load of computer and bus, or the brake if it is not home",
     ),
     Fault.NODE_CHANGED: FaultInfo(
-        "the node is not what it was when the run began",
-        "check its supply and who else sends: it has started anew, or another one speaks for it",
+        "the node changed during the run",
+        "it restarted, or another sender uses its identifiers: check its supply and the bus",
     ),
     Fault.SET_CONTRADICTED: FaultInfo(
-        "no brake that the shield has left as possible explains the samples",
-        "something that shield.learn takes for granted is not so (model, model_error, current_error, noise): correct "
-        "it in the bench file, or turn learning off",
+        "no brake that the shield still allows explains the samples",
+        "an assumption of shield.learn is wrong (model, model_error, current_error, noise): correct it in the bench "
+        "file, or turn learning off",
     ),
     Fault.MOTION_UNEXPLAINED: FaultInfo(
-        "no one brake explains what the node reported",
+        "no single brake explains what the node reported",
         "check the scale and drift of both sensors, the angle's zero, the reported current and the drive's gain, and "
-        "whether friction or stiffness changed meanwhile; the log is no basis for an estimate",
+        "whether friction or stiffness changed during the run; do not estimate from this log",
         EXIT_UNEXPLAINED,
     ),
     Fault.NOT_AT_REST: FaultInfo(
-        "the node did not say that it rests after the stop frames",
-        "switch the drive off before anybody comes near; then check that it obeys its stop, a mapped one its disarming",
+        "the node did not report rest after the stop frames",
+        "switch the drive off before anybody comes near; then check its stop (of a mapped drive, its disarming)",
     ),
     Fault.BUS_LOST: FaultInfo("the bus was lost", "check the interface and its cable", EXIT_BUS),
     Fault.INTERRUPTED: FaultInfo(
-        "stopped by the operator", "if the brake is not home, --home brings it there before the next run"
+        "stopped by the operator", "if the brake is not home, bring it there with --home before the next run"
     ),
     Fault.INTERNAL: FaultInfo("an error in the program", "please report it with the log"),
     Fault.SENSOR_LATE: _soft("several periods without a valid sensor pair", "check node, wiring and bus load"),
@@ -289,7 +289,8 @@ FAULTS: dict[Fault, FaultInfo] = {
         "check that another node acknowledges, and the bus load",
     ),
     Fault.FRAMES_DROPPED: _soft(
-        "the kernel dropped frames for want of buffer", "give the loop real-time priority, or raise net.core.rmem_max"
+        "the kernel's receive buffer was full, and frames were dropped",
+        "give the loop real-time priority, or raise net.core.rmem_max",
     ),
     Fault.BUS_ERRORS: _soft("the CAN controller reports errors", "check cable, termination and bit rate"),
     Fault.PERMISSION_LOST: _soft(

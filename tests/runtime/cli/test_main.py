@@ -44,7 +44,7 @@ def test_a_run_whose_log_is_removed_meanwhile_is_not_done(emb_run: EmbRun, tmp_p
     sim.when(lambda node: node.obeyed == 100, lambda _node: (tmp_path / "run.mcap").unlink())
     first, advice, *_ = emb_run.text(code=EXIT_LOG).splitlines()
     assert "LOG_INCOMPLETE" in first
-    assert "again" in advice
+    assert "repeat the run" in advice
 
 
 def test_a_folder_for_logs_that_was_made_for_nothing_is_not_left(emb_run: EmbRun, tmp_path: Path, actor: Path) -> None:

@@ -160,7 +160,7 @@ def test_what_only_warns_stands_in_its_line_alone(findings: Findings) -> None:
         (hears(findings, angle_scatter=2.1e-3), "noise at rest", "0.0021 rad"),
         (hears(findings, velocity_scatter=2.1), "noise at rest", "2.1 rad/s"),
         (hears(findings, velocity_scatter=math.nan), "noise at rest", "not known"),
-        (hears(findings, load=0.72, others=500), "bus load", "72% heard, 500 frames of others"),
+        (hears(findings, load=0.72, others=500), "bus load", "72% measured, 500 frames of others"),
         (replace(findings, free=3_000_000), "disk", "3 MiB free"),
         (replace(findings, watchdog=""), "watchdog", "NONE"),
         (replace(findings, realtime={"scheduler": "not obtained: no"}), "real time", "scheduler: not obtained: no"),
@@ -180,7 +180,7 @@ def test_with_read_only_a_tenth_of_the_samples_missing_is_a_failed_check(finding
     for missing, verdict in ((20, Verdict.WARNING), (25, Verdict.REFUSED), (170, Verdict.REFUSED)):
         assert lines_of(hears(reading, missing=missing))["samples"].verdict is verdict
     refused = refused_by(hears(reading, missing=170))
-    assert "170 missing (0.46 of all)" in str(refused)
+    assert "170 missing (46 %)" in str(refused)
     assert (refused.exit_code, refused.fault) == (EXIT_CHECK_FAILED, None)
 
 
@@ -190,7 +190,7 @@ def test_a_slew_that_cannot_turn_the_current_round_in_a_period_is_told(findings:
         (11999.0, 6.0, Verdict.WARNING, "6 A to -6 A in 1 ms"),
         (1500.0, 6.0, Verdict.WARNING, "in 8 ms (guard.slew); the way home may be 7 ms late"),
         (1500.0, 0.75, Verdict.OK, "0.75 A to -0.75 A in 1 ms"),
-        (1500.0, 0.0, Verdict.OK, "no current leaves"),
+        (1500.0, 0.0, Verdict.OK, "no current is sent"),
     ):
         bench = edited(findings, "slew          = 12000.0", f"slew = {slew}")
         line = lines_of(planned(findings, bench=bench, limit=limit))["slew"]
@@ -201,7 +201,7 @@ def test_a_slew_that_cannot_turn_the_current_round_in_a_period_is_told(findings:
 def test_a_brake_that_still_creeps_is_not_taken_for_a_noisy_sensor(findings: Findings) -> None:
     line = lines_of(hears(findings, creep=-0.07))["noise at rest"]
     assert line.verdict is Verdict.OK
-    assert "the brake is not at rest, it creeps at -0.07 rad/s" in line.found
+    assert "the brake is not at rest but creeps at -0.07 rad/s" in line.found
 
 
 def test_a_mapped_drive_is_named_with_its_serial_number_and_has_the_load_of_its_bus_judged(findings: Findings) -> None:
@@ -216,12 +216,12 @@ def test_a_mapped_drive_is_named_with_its_serial_number_and_has_the_load_of_its_
         assert f"{percent:.0f}% at worst" in lines_of(found)["bus load"].found
     busy = lines_of(hears(mapped, load=0.72, others=500))["bus load"]
     assert busy.verdict is Verdict.WARNING
-    for part in ("72% heard, 500 frames of others", "% of the drive's bus at worst"):
+    for part in ("72% measured, 500 frames of others", "% of the drive's bus at worst"):
         assert part in busy.found
     slow = planned(mapped, bench=edited(findings, *SLOW_BUS))
     assert lines_of(slow)["bus load"].verdict is Verdict.REFUSED
     alone = lines_of(replace(slow, in_process=True))["bus load"]
-    assert (alone.verdict, "heard" in alone.found) == (Verdict.OK, False)
+    assert (alone.verdict, "measured" in alone.found) == (Verdict.OK, False)
 
 
 def test_nothing_is_missed_where_nobody_else_is_on_the_bus_or_nothing_leaves(findings: Findings) -> None:

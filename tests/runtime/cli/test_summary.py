@@ -85,10 +85,13 @@ def test_every_count_and_every_trouble_has_its_words_and_an_undisturbed_run_few(
         ({"realtime": {"scheduler": "not obtained: no", "timer_slack": "1 ns"}}, "NOT OBTAINED: scheduler;"),
         ({"log": lost}, "INCOMPLETE: disk full"),
         ({"node_stop_reason": StopReason.LIMIT}, "LIMIT"),
-        ({"node_stop_reason": None}, "has not reported its stop reason"),
+        ({"node_stop_reason": None}, "stop reason not reported"),
         ({"unexplained": 3.6, "allowed": math.inf}, "not judged"),
-        ({"estimate": (0.02, 23.0, 0.01, 2e-5, 0.006, 6.6, 0.003, 6e-6), "model_fits": False}, "IT IS NOT"),
-        ({"unexplained": 3.6, "allowed": 28.4}, "all but 4 rad/s of it, at most 28"),
+        (
+            {"estimate": (0.02, 23.0, 0.01, 2e-5, 0.006, 6.6, 0.003, 6e-6), "model_fits": False},
+            "THE MODEL DOES NOT FIT",
+        ),
+        ({"unexplained": 3.6, "allowed": 28.4}, "4 rad/s that no single brake explains, at most 28"),
     )
     for changes, part in rows:
         changes |= {"counters": RunCounters(pairs=1, answered=490, unanswered=10, bus_errors=4)}
@@ -173,7 +176,7 @@ def test_the_last_estimate_is_told_with_its_interval_and_unit(bench: Bench, ran:
     interval = pytest.approx([2e-5 - 1.96e-7, 2e-5 + 1.96e-7])
     assert said["estimate"]["f_v"] == {"value": 2e-5, "deviation": 1e-7, "interval_95": interval, "unit": "N·m·s/rad"}
     lines = text(said).splitlines()
-    assert lines[0].endswith(", ended early: enough is known after 0.094 s")
+    assert lines[0].endswith(", ended early: precise enough after 0.094 s")
     assert said["goal_s"] == pytest.approx(0.094)
     for line in ("k_1 = 0.05000 ± 0.00078 N/rad   1.6 %", "f_v = 2.000e-05 ± 2.0e-07 N·m·s/rad   0.98 %"):
         assert f"  {line}" in lines

@@ -198,9 +198,7 @@ def test_it_ends_early_where_that_is_asked_for(
 ) -> None:
     path = tmp_path / "run.mcap"
     out = steady.text("--stop-when", "k_m=1%")
-    answered = re.match(
-        r"done: (\d+) of 500 samples answered, home, ended early: enough is known after 0\.\d+ s\n", out
-    )
+    answered = re.match(r"done: (\d+) of 500 samples answered, home, ended early: precise enough after 0\.\d+ s\n", out)
     assert answered is not None
     assert HOME_PAIRS < int(answered[1]) < 500
     log = steady.log()
