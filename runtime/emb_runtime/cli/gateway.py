@@ -14,7 +14,7 @@ from emb_runtime.can.interfaces import open_transport, same_bus
 from emb_runtime.can.messages import bench_identity, load_layout
 from emb_runtime.can.transport import is_private
 from emb_runtime.config.bench import load_bench
-from emb_runtime.drives.gateway import Gateway
+from emb_runtime.drives.gateway import Gateway, wait_for
 from emb_runtime.drives.mapping import PROPERTIES, Mapping, require_fit
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.drives.node import report
@@ -103,7 +103,7 @@ def _serve(args: argparse.Namespace) -> int:
     try:
         node_bus, _ = open_transport(args.node, bench, (layout.command.identifier,))
         try:
-            gateway = Gateway(mapping, bench, drive_bus, node_bus, clock)
+            gateway = Gateway(mapping, bench, drive_bus, node_bus, clock, wait_for(drive_bus, node_bus))
             if not args.no_rt:
                 realtime.obtain(cpu=args.cpu, priority=PRIORITY)
             done = "listening" if args.listen else "armed"

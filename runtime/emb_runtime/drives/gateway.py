@@ -7,6 +7,7 @@ import select
 from collections import deque
 from collections.abc import Callable
 from collections.abc import Mapping as Dictionary
+from typing import NamedTuple
 
 from emb_runtime.can.e2e import COUNTER_MODULUS
 from emb_runtime.can.interfaces import open_transport
@@ -28,6 +29,25 @@ LONGEST_SILENCE_NS = 5_000_000_000  # Time for a drive to be heard before it is 
 LINGER_NS = 1_000_000_000  # Time for which the node still reports its samples after the drive was let go [ns]
 
 
+class Port(NamedTuple):
+    """A way to and from one bus, see :class:`Transport`."""
+
+    send: Callable[[Frame], None]
+    receive: Callable[[int], Frame | None]
+
+
+def wait_for(*buses: Transport) -> Callable[[int], None]:
+    """A wait of at most a time [ns], until something has come on one of some buses."""
+    descriptors = [getattr(bus, "descriptor", None) for bus in buses]
+    readable = [each for each in descriptors if each is not None]
+    most_ns = LONGEST_WAIT_NS if len(readable) == len(buses) else LOOK_NS
+
+    def wait(longest_ns: int) -> None:
+        select.select(readable, [], [], min(longest_ns, most_ns) * 1e-9)
+
+    return wait
+
+
 class Gateway:
     """Passes samples and commands on until it is ended, or the drive is let go.
 
@@ -37,11 +57,20 @@ class Gateway:
         drive_bus: open.
         node_bus: open.
         clock: the time on both buses.
+        wait: waits at most a time [ns], until something has come.
     """
 
-    def __init__(self, mapping: Mapping, bench: Bench, drive_bus: Transport, node_bus: Transport, clock: Clock) -> None:
+    def __init__(
+        self,
+        mapping: Mapping,
+        bench: Bench,
+        drive_bus: Port | Transport,
+        node_bus: Port | Transport,
+        clock: Clock,
+        wait: Callable[[int], None],
+    ) -> None:
         self.node = DriveNode(mapping, bench, load_layout(), drive_bus.send)
-        self._drive_bus, self._node_bus, self._clock = drive_bus, node_bus, clock
+        self._drive_bus, self._node_bus, self._clock, self._wait = drive_bus, node_bus, clock, wait
         self._node_lost: BusError | None = None
         command = mapping.messages[mapping.command.message]
         sensors = (mapping.messages[name] for name in mapping.sensor_messages)
@@ -69,7 +98,7 @@ class Gateway:
                 self.node.abandon()
 
     def _serve(self, stop_requested: Callable[[], bool], ready: Callable[[], None], *, arms: bool) -> None:
-        sent = arms and self._arm(stop_requested)
+        sent = arms and self.arm(stop_requested)
         if not arms or self.node.phase is Phase.READY:
             ready()
         ended_ns = None
@@ -108,8 +137,12 @@ class Gateway:
                 break
         return problem and f"{problem}; switch it off"
 
-    def _arm(self, stop_requested: Callable[[], bool]) -> bool:
-        """Arm the drive; False if the end came first, and nothing was sent."""
+    def arm(self, stop_requested: Callable[[], bool]) -> bool:
+        """Arm the drive; False if the end came first, and nothing was sent.
+
+        Raises:
+            BusError: the drive cannot be armed, or its bus is lost.
+        """
         begin_ns = self._clock.now_ns()
         while not (stop_requested() or self._node_lost):
             now_ns = self._clock.now_ns()
@@ -139,7 +172,7 @@ class Gateway:
             BusError: the drive's bus is lost.
         """
         now_ns = self._clock.now_ns()
-        self._wait(min(self.node.due_ns(now_ns + 1) - now_ns, LONGEST_WAIT_NS))
+        self._wait(self.node.due_ns(now_ns + 1) - now_ns)
         for _ in range(MOST_FRAMES):
             if self._node_lost is not None or (frame := self._received()) is None:
                 break
@@ -181,19 +214,9 @@ class Gateway:
         except BusError as err:
             self._node_lost = err
 
-    def _wait(self, longest_ns: int) -> None:
-        descriptors = [getattr(bus, "descriptor", None) for bus in (self._drive_bus, self._node_bus)]
-        readable = [each for each in descriptors if each is not None]
-        if len(readable) < len(descriptors):
-            longest_ns = min(longest_ns, LOOK_NS)
-        select.select(readable, [], [], max(0, longest_ns) * 1e-9)
-
-
-ARM_TIMEOUT_NS = 10_000_000_000  # Longest time until the drive is armed [ns]
-
 
 class LockStepDrive:
-    """A mapped drive with its node; the drive is armed when it is made. Time moves while somebody waits for a frame.
+    """A mapped drive behind its gateway, armed when it is made. Time moves while the host waits for a frame.
 
     Args:
         mapping: the drive.
@@ -209,48 +232,43 @@ class LockStepDrive:
     obtained: Dictionary[str, str] = {}
 
     def __init__(self, mapping: Mapping, bench: Bench, bus: Transport, clock: Clock, name: str) -> None:
-        self.name, self.truth = name, bus.truth
+        self.name, self.truth, self.close = name, bus.truth, bus.close
         self._bus, self._clock = bus, clock
-        self._queue: deque[Frame] = deque()
-        self.node = DriveNode(mapping, bench, load_layout(), bus.send)
-        deadline_ns = clock.now_ns() + ARM_TIMEOUT_NS
-        while not self.node.may_arm and clock.now_ns() < deadline_ns:
-            self.receive(deadline_ns)
-            self._queue.clear()
-        if self.node.may_arm:
-            self.node.arm(clock.now_ns())
-        while self.node.phase is Phase.ARMING and clock.now_ns() < deadline_ns:
-            self.receive(deadline_ns)
-        if self.node.phase is not Phase.READY:
-            raise BusError(f"{name}: cannot arm the drive: {self.node.failure or 'it was not heard'}")
-        self._queue.clear()
+        self._deadline_ns = 1 << 62  # the arming ends by itself
+        self._of_drive, self._to_node, self._to_host = deque[Frame](), deque[Frame](), deque[Frame]()
+        drive = Port(bus.send, lambda _: _popped(self._of_drive) or bus.receive(clock.now_ns()))
+        node = Port(self._to_host.append, lambda _: _popped(self._to_node))
+        self._gateway = Gateway(mapping, bench, drive, node, clock, self._wait)
+        self.node = self._gateway.node
+        try:
+            self._gateway.arm(lambda: False)
+        except BusError as err:
+            raise BusError(f"{name}: {err}") from err
+        self._to_host.clear()
+        self.receive(clock.now_ns() + LONGEST_SILENCE_NS)  # with the first sample the node judges what came before
+        if self.node.failure:
+            raise BusError(f"{name}: the drive was let go: {self.node.failure}")
 
     def send(self, frame: Frame) -> None:
         """See :meth:`Transport.send`."""
-        now_ns = self._clock.now_ns()
-        self.node.take_host(frame, now_ns)
-        self._queue.append(frame._replace(time_ns=now_ns, own=True))
+        self._to_node.append(frame)
+        self._to_host.append(frame._replace(time_ns=self._clock.now_ns(), own=True))
 
     def receive(self, deadline_ns: int) -> Frame | None:
         """See :meth:`Transport.receive`."""
-        while not self._queue:
-            now_ns = self._clock.now_ns()
-            due_ns = self.node.due_ns(now_ns)
-            if due_ns <= now_ns:
-                self.node.tick(now_ns)
-                due_ns = self.node.due_ns(now_ns + 1)
-            frame = self._bus.receive(min(deadline_ns, due_ns))
-            now_ns = self._clock.now_ns()
-            if frame is not None:
-                self._queue.extend(self.node.take_drive(frame, now_ns))
-            self.node.tick(now_ns)  # also where frames come that make no sample: their lack is due as well
-            if frame is None and now_ns >= deadline_ns:
-                break
-        return self._queue.popleft() if self._queue else None
+        self._deadline_ns = deadline_ns
+        while not self._to_host and self._clock.now_ns() < deadline_ns:
+            self._gateway.step()
+        return _popped(self._to_host)
 
-    def close(self) -> None:
-        """See :meth:`Transport.close`."""
-        self._bus.close()
+    def _wait(self, longest_ns: int) -> None:
+        until_ns = min(self._clock.now_ns() + longest_ns, self._deadline_ns)
+        if not self._to_node and (frame := self._bus.receive(until_ns)) is not None:
+            self._of_drive.append(frame)
+
+
+def _popped(frames: deque[Frame]) -> Frame | None:
+    return frames.popleft() if frames else None
 
 
 def open_mapped(options: str, bench: Bench) -> tuple[LockStepDrive, Clock]:

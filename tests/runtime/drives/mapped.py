@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import struct
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import ClassVar
 
 import pytest
 
 from emb_bench.config.bench import Bench, parse_bench
 from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import shipped_bench_text
-from emb_runtime.drives.gateway import Gateway, LockStepDrive
+from emb_runtime.drives.gateway import LockStepDrive
 from emb_runtime.drives.mapping import Mapping
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.records import Frame
@@ -64,46 +61,6 @@ def protected(count: int, time_ns: int, current: float = 0.5, off: int = 0) -> F
     return Frame(0x014, bytes(((sum(rest) + 3 + off) & 0xFF,)) + rest, time_ns)
 
 
-class NodeBus:
-    """The bus of a node, with gateway and drive behind it: time passes while the host waits for a frame."""
-
-    obtained: ClassVar[dict[str, str]] = {}
-
-    def __init__(self, mapping: Mapping, bench: Bench, bus: SimDriveTransport, clock: SteppedClock) -> None:
-        self.name, self.truth, self.close = "node", bus.truth, bus.close
-        self._bus, self._clock, self._deadline_ns = bus, clock, clock.now_ns() + 10**12
-        self._of_drive, self._to_node, self._to_host = deque[Frame](), deque[Frame](), deque[Frame]()
-        drive_bus = SimpleNamespace(send=bus.send, receive=self._next_of_drive)
-        node_bus = SimpleNamespace(send=self._to_host.append, receive=lambda _: _popped(self._to_node))
-        gateway = Gateway(mapping, bench, drive_bus, node_bus, clock)
-        gateway._wait = self._wait  # type: ignore[method-assign]
-        self.gateway, self.node = gateway, gateway.node
-        assert gateway._arm(lambda: False)
-        self._to_host.clear()
-
-    def _next_of_drive(self, _deadline_ns: int) -> Frame | None:
-        return self._of_drive.popleft() if self._of_drive else self._bus.receive(self._clock.now_ns())
-
-    def _wait(self, longest_ns: int) -> None:
-        until_ns = min(self._clock.now_ns() + max(longest_ns, 0), self._deadline_ns)
-        if not self._to_node and (frame := self._bus.receive(until_ns)) is not None:
-            self._of_drive.append(frame)
-
-    def send(self, frame: Frame) -> None:
-        self._to_node.append(frame)
-        self._to_host.append(frame._replace(time_ns=self._clock.now_ns(), own=True))
-
-    def receive(self, deadline_ns: int) -> Frame | None:
-        self._deadline_ns = deadline_ns
-        while not self._to_host and self._clock.now_ns() < deadline_ns:
-            self.gateway.step()
-        return _popped(self._to_host)
-
-
-def _popped(frames: deque[Frame]) -> Frame | None:
-    return frames.popleft() if frames else None
-
-
 class MappedBus:
     """The bus that ``emb-run`` opens, with the drive on it.
 
@@ -121,7 +78,6 @@ class MappedBus:
         self.shift = 0
         """Periods that have passed when the bus is opened."""
         self.watchdog: float | None = WATCHDOG
-        self.over_gateway = False
         self.before_send: Callable[[Frame], object] = lambda _frame: None
 
     def edit(self, old: str, new: str) -> None:
@@ -140,10 +96,7 @@ class MappedBus:
         self.bus, self.drive = bus, bus.drive
         self.drive.periods, self.drive.watchdog = self.shift, self.watchdog
         self._wrap(bus)
-        if self.over_gateway:
-            self.transport: LockStepDrive | NodeBus = NodeBus(self.mapping, bench, bus, clock)
-        else:
-            self.transport = LockStepDrive(self.mapping, bench, bus, clock, f"map:{self.file}@sim-drive")
+        self.transport = LockStepDrive(self.mapping, bench, bus, clock, f"map:{self.file}@sim-drive")
         return self.transport, clock
 
     def _wrap(self, bus: SimDriveTransport) -> None:

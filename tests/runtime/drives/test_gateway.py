@@ -67,7 +67,7 @@ class Played:
         self.clock = SteppedClock(1_000 * MS)
         self.drive, self.host = Bus(), Bus()
         mapping, bench = load_mapping(EXAMPLES / "odrive.toml"), parse_bench(late_bench(), "bench.toml")
-        self.gateway = Gateway(mapping, bench, self.drive, self.host, self.clock)
+        self.gateway = Gateway(mapping, bench, self.drive, self.host, self.clock, lambda _ns: None)
         self.node = self.gateway.node
         self.state, self.last_fed = IDLE, 0
         self.position, self.velocity = 0.0, 0.0
@@ -149,12 +149,6 @@ class Played:
     @property
     def asked_states(self) -> list[int]:
         return [frame.data[0] for frame in self.drive.sent if frame.identifier == 0x007]
-
-
-@pytest.fixture(autouse=True)
-def no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The time of these buses passes by itself."""
-    monkeypatch.setattr("emb_runtime.drives.gateway.LOOK_NS", 0)
 
 
 @pytest.fixture
@@ -346,7 +340,7 @@ def test_a_drive_that_another_node_commands_is_not_armed() -> None:
         command = mapping.messages[mapping.command.message]
         for own in (False, True):
             it = Played()
-            gateway = Gateway(mapping, bench, it.drive, it.host, it.clock)
+            gateway = Gateway(mapping, bench, it.drive, it.host, it.clock, lambda _ns: None)
             it.drive.passes = partial(passes, it)
             it.drive.waiting.append(
                 Frame(command.identifier, bytes(command.length), extended=command.extended, own=own)
