@@ -97,7 +97,7 @@ def test_what_is_no_contract_is_refused() -> None:
         edited(lambda r: r.update(vectors=[{**v, "outputs": [0.0] * 3} for v in r["vectors"]])),
         edited(lambda r: r.update(vectors=r["vectors"][: MIN_VECTORS - 1])),
         edited(lambda r: r.update(vectors=[r["vectors"][0]] * (MAX_VECTORS + 1))),
-        *(edited(lambda r, n=n: r["provenance"].update({n: 1})) for n in ("\x1b[31m", "x\ny", "x" * 121)),  # type: ignore[misc]
+        *(edited(lambda r, n=n: r["provenance"].update({n: 1})) for n in ("\x1b[31m", "x\ny", "x\n", "x" * 121)),  # type: ignore[misc]
         GOOD.to_json().replace("0.001", "1e999", 1),
         GOOD.to_json().replace("0.001", "Infinity", 1),
         GOOD.to_json() + " " * 1_000_001,
