@@ -10,11 +10,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
-import platform
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -350,8 +348,7 @@ that play what the log recorded. Each decision (policy, clip, shield, what was s
 each safety event and the outcome must come out again, numbers to the last bit. A log that ends before its run does is
 followed as far as it goes.
 
-Rounding may differ with another ONNX Runtime, numpy, Python or processor; with differences, what is another one is
-named.
+Rounding may differ with another ONNX Runtime, numpy, Python or processor; with differences, those of the log are named.
 """
 
 
@@ -361,14 +358,6 @@ class Recorded(msgspec.Struct, frozen=True):
     purpose: Literal["experiment", "homing"]
     steps: Annotated[int, msgspec.Meta(ge=1)]  # Samples that the run was to answer
     limit: Annotated[float, msgspec.Meta(ge=0.0, le=CEILING_CURRENT)]  # Largest current that might be sent [A]
-
-
-class Version(NamedTuple):
-    """Version that a run was made with, and the version here."""
-
-    name: str
-    recorded: str
-    here: str
 
 
 @dataclass(frozen=True)
@@ -498,18 +487,6 @@ def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
     ]
 
 
-def versions(log: RunLog) -> tuple[Version, ...]:
-    """Versions in the log that differ from those here."""
-    here = {
-        "tool": f"emb-excite {metadata.version('emb-excite')}",
-        "onnxruntime": metadata.version("onnxruntime"),
-        "numpy": metadata.version("numpy"),
-        "python": platform.python_version(),
-    }
-    pairs = (Version(name, log.run.get(name, ""), value) for name, value in here.items())
-    return tuple(pair for pair in pairs if pair.recorded and pair.recorded != pair.here)
-
-
 def document(log: RunLog, again: Rerun) -> dict[str, Any]:
     """The result as plain data."""
     return {
@@ -523,17 +500,13 @@ def document(log: RunLog, again: Rerun) -> dict[str, Any]:
         "ended": again.outcome is not None,
         "home": None if again.outcome is None else again.outcome.home,
         "followed": again.followed,
-        "other_versions": [version._asdict() for version in versions(log)],
         "differences": [difference._asdict() for difference in again.differences],
     }
 
 
 def text(log: RunLog, again: Rerun) -> str:
     """Result as text."""
-    others = versions(log)
-    lines = [f"made with {v.recorded}, run again with {v.here}" for v in others if v.name == "tool"]
-    if log.missing:
-        lines.append(f"WARNING: {log.missing}")
+    lines = [f"WARNING: {log.missing}"] if log.missing else []
     counts = f"{again.decisions} decisions, {again.frames} sent frames, {again.events} events"
     if again.reproduced:
         lines.append(f"reproduced   each of {counts}")
@@ -553,7 +526,7 @@ def text(log: RunLog, again: Rerun) -> str:
     if len(again.differences) > SHOWN:
         lines.append(f"  and {len(again.differences) - SHOWN} more (--json has all)")
     if not again.reproduced:
-        lines += [
-            f"  {v.name} was {v.recorded}, here {v.here}: rounding may differ" for v in others if v.name != "tool"
-        ]
+        names = ("tool", "python", "numpy", "onnxruntime")
+        made = ", ".join(f"{name} {log.run[name]}" for name in names if name in log.run)
+        lines.append(f"  the log was made with {made}: rounding may differ with others")
     return "\n".join(lines)

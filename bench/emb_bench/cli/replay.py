@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,8 +23,10 @@ from emb_runtime.errors import (
     EXIT_CANNOT_TELL,
     EXIT_CHECK_FAILED,
     EXIT_DONE,
+    EXIT_INTERRUPTED,
     EXIT_LOG,
     EXIT_OUTSIDE,
+    EXIT_POLICY_REFUSED,
     EXIT_USAGE,
     EmbError,
     LogError,
@@ -170,15 +172,22 @@ def _command(
     return Command(summary(function), f"{summary(function)}.\n{text}", add_arguments, reported)
 
 
-ANY = {0: "done", 2: "usage: wrong argument, a file that cannot be read or written, a missing library", 130: "Ctrl-C"}
-"""Exit codes of every command, and their meanings."""
-OF_A_LOG = ANY | {6: "the log is not a log, or too damaged to say anything true from it"}
+MEANINGS: Mapping[int, str] = {
+    EXIT_DONE: "done",
+    EXIT_CHECK_FAILED: "checked, and not as it should be; or a log was left out or failed: it is named",
+    EXIT_USAGE: "usage: wrong argument, a file that cannot be read or written, a missing library, nothing to judge by",
+    EXIT_POLICY_REFUSED: "the policy in the log is refused",
+    EXIT_LOG: "the log is not a log, or too damaged or too short to say anything true from it",
+    EXIT_CANNOT_TELL: "--strict: not every acceptance criterion can be decided",
+    EXIT_OUTSIDE: "--strict: the brake is outside of the ranges for which the limits are guaranteed",
+    EXIT_INTERRUPTED: "Ctrl-C: nothing is written",
+}
+"""Exit codes and their meanings."""
+OF_A_LOG = (EXIT_DONE, EXIT_USAGE, EXIT_LOG, EXIT_INTERRUPTED)
+CHECKED = (*OF_A_LOG, EXIT_CHECK_FAILED)
 
-OF_A_RUN = OF_A_LOG | {2: f"{ANY[2]}, the log of a run that only listened (--read-only)"}
-
-CHECKED = "a run was stopped, the model does not fit, does not predict a log, or a parameter is not identified"
-OUTSIDE = "with --strict: the brake is outside of the ranges for which the limits are guaranteed"
-COMMANDS: Mapping[str, tuple[Command | str, Mapping[int, str]]] = {
+MISFIT = "a run was stopped, the model does not fit, does not predict a log, or a parameter is not identified"
+COMMANDS: Mapping[str, tuple[Command | str, Collection[int]]] = {
     "fim": (
         _command(
             api.fisher_information,
@@ -188,7 +197,7 @@ COMMANDS: Mapping[str, tuple[Command | str, Mapping[int, str]]] = {
             "bench file, so that its repeatability is larger. With -v the criteria over time, and\n"
             "the information as the thesis weights it.\n",
         ),
-        OF_A_RUN,
+        OF_A_LOG,
     ),
     "estimate": (
         _command(
@@ -198,10 +207,9 @@ COMMANDS: Mapping[str, tuple[Command | str, Mapping[int, str]]] = {
             "and the next step. Of several logs, each is also predicted from the others.\n"
             f"{METHODS}\nunknowns for --nuisance, besides the parameters:\n"
             + "".join(f"  {name:17} {row.about}\n" for name, row in PARAMETERS.items() if row.about),
-            strict=f"exit with 1 if {CHECKED}; else with {EXIT_OUTSIDE} if the brake is outside of the shield's ranges",
+            strict=f"exit with 1 if {MISFIT}; else with {EXIT_OUTSIDE} if the brake is outside of the shield's ranges",
         ),
-        OF_A_RUN
-        | {1: f"with --strict: {CHECKED}", EXIT_OUTSIDE: OUTSIDE, 6: f"{OF_A_LOG[6]}; or too short for the unknowns"},
+        (*CHECKED, EXIT_OUTSIDE),
     ),
     "report": (
         _command(
@@ -213,16 +221,7 @@ COMMANDS: Mapping[str, tuple[Command | str, Mapping[int, str]]] = {
             strict=f"exit with {EXIT_CHECK_FAILED} if a criterion failed, else {EXIT_CANNOT_TELL} if one is not "
             f"decided; without --acceptance as emb-replay estimate does",
         ),
-        OF_A_LOG
-        | {
-            0: "the page is written, from all logs",
-            1: "the page is written, but a log took no part in the estimate, too short a one among them (named on "
-            "stderr); with --strict: not accepted",
-            7: "with --strict: the page is written, and not every criterion can be decided",
-            6: "not one log can be used, or one that is held out cannot",
-            EXIT_OUTSIDE: OUTSIDE,
-            130: "Ctrl-C: nothing is written",
-        },
+        (*CHECKED, EXIT_CANNOT_TELL, EXIT_OUTSIDE),
     ),
     "campaign": (
         _command(
@@ -233,14 +232,7 @@ COMMANDS: Mapping[str, tuple[Command | str, Mapping[int, str]]] = {
             "reason. The rows are the same however many processes or machines made them; on a Ray\n"
             f"cluster all machines need emb-excite and the logs at the same paths.\n{UNKNOWNS}",
         ),
-        OF_A_LOG
-        | {
-            0: "every log was evaluated",
-            1: "some logs failed: they are named, and the others are in the result",
-            2: "usage: wrong argument, no log found, a missing library, the result cannot be written",
-            6: "every log failed",
-            130: "Ctrl-C: no result is written",
-        },
+        CHECKED,
     ),
     "info": (_command(info, _info), OF_A_LOG),
     "timing": (
@@ -252,31 +244,15 @@ COMMANDS: Mapping[str, tuple[Command | str, Mapping[int, str]]] = {
             "spare until the answer would have come too late. Judged by the [budgets] of the bench\n"
             "description inside the log. Simulated time says nothing of a computer and is not judged.\n",
         ),
-        OF_A_LOG
-        | {
-            0: "every run kept to every budget",
-            1: "a run did not keep to a budget",
-            2: "usage: wrong argument, unreadable file; or nothing to judge by: no [budgets] in the log, simulated "
-            "time",
-        },
+        CHECKED,
     ),
-    "rerun": (
-        "emb_bench.rerun",
-        OF_A_RUN
-        | {1: "something came out otherwise: the first differences are printed", 5: "the policy in the log is refused"},
-    ),
-    "repair": (
-        "emb_bench.export.repair",
-        OF_A_LOG | {6: "the log is not a log, or not one message in it can be saved"},
-    ),
+    "rerun": ("emb_bench.rerun", (*CHECKED, EXIT_POLICY_REFUSED)),
+    "repair": ("emb_bench.export.repair", OF_A_LOG),
     "export": ("emb_bench.export.export", OF_A_LOG),
-    "import": ("emb_bench.recordings.run_file", ANY),
-    "live": (
-        "emb_bench.cli.live",
-        {0: "ended by Ctrl-C, or the one log is over", 2: ANY[2], 6: "the one log is not a log, or is damaged"},
-    ),
+    "import": ("emb_bench.recordings.run_file", (EXIT_DONE, EXIT_USAGE, EXIT_INTERRUPTED)),
+    "live": ("emb_bench.cli.live", (EXIT_DONE, EXIT_USAGE, EXIT_LOG)),
 }
-"""Commands and the meanings of their exit codes, in the order of ``--help``.
+"""Commands and their exit codes, in the order of ``--help``.
 
 A text is a module with ``HELP``, ``DESCRIPTION``, ``add_arguments`` and ``run``, which is imported where it is needed.
 """
@@ -290,15 +266,13 @@ def _found(name: str) -> Command:
     return Command(module.HELP, module.DESCRIPTION, module.add_arguments, module.run)
 
 
-TOGETHER = OF_A_LOG | {1: "checked, and it is not as it should be", 5: "a policy is damaged or does not fit the bench"}
-"""Exit codes of all commands together."""
 CUT = "\nA log that was cut (kill -9, full disk) is read as far as it goes, and what is missing is said.\n"
 
 
-def epilog(codes: Mapping[int, str]) -> str:
+def epilog(codes: Collection[int]) -> str:
     """The end of a ``--help``."""
-    lines = [f"  {code:<4} {said}\n" for code, said in sorted(codes.items())]
-    return f"exit codes:\n{''.join(lines)}{CUT if 6 in codes else ''}"
+    lines = [f"  {code:<4} {MEANINGS[code]}\n" for code in sorted(codes)]
+    return f"exit codes:\n{''.join(lines)}{CUT if EXIT_LOG in codes else ''}"
 
 
 def parser(only: str | None = None) -> argparse.ArgumentParser:
@@ -306,7 +280,7 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
     p = Parser(
         prog="emb-replay",
         description="Evaluate logs of emb-run.",
-        epilog=epilog(TOGETHER) + "\nemb-replay COMMAND --help says what they mean there.\n",
+        epilog=epilog([*MEANINGS]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("--version", action="version", version=f"emb-replay {metadata.version('emb-excite')}")

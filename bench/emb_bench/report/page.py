@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from importlib import resources
 from typing import Any, NamedTuple
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -28,7 +27,7 @@ from emb_bench.logs import timing
 from emb_bench.logs.estimates import last_learnt
 from emb_bench.logs.info import info_document
 from emb_bench.logs.timing import INTERVALS, quantiles
-from emb_bench.numbers import percent, plain, seconds, signed
+from emb_bench.numbers import plain, seconds, signed
 from emb_bench.report import figures, sentences, tables
 from emb_bench.report.content import REASONS, ActiveCycles, Content, Run, StopSamples, stop_samples
 from emb_bench.report.estimate import document as estimate_document
@@ -57,7 +56,6 @@ class View:
     motion: list[Panel]
     obeyed: bool
     learnt: dict[str, list[float]]  # Ranges of the parameters, relative to nominal
-    residuals: Table | None
     timing: Table | None
     safety: Safety | None
     recorded: list[tuple[str, Mapping[str, str]]]  # Entries of the log, by their titles
@@ -129,7 +127,6 @@ def view(run: Run, prefix: str = "") -> View:
         motion=_motion(run, cycles, after),
         obeyed=cycles is not None and figures.applied_as_sent(run, cycles),
         learnt=last_learnt(log),
-        residuals=None if run.residuals is None else _residuals(run.residuals),
         timing=_intervals(run) if driven else None,
         safety=_safety(run) if driven else None,
         recorded=[*log.metadata.items(), ("attached files, SHA-256", attached)],
@@ -203,17 +200,6 @@ def _cycles(run: Run) -> ActiveCycles | None:
     except LogError:
         return None
     return cycles if len(cycles.time) else None
-
-
-def _residuals(errors: np.ndarray) -> Table:
-    rows = []
-    for i, name in enumerate(("angle", "velocity")):
-        seen = errors[np.isfinite(errors[:, i]), i]
-        if len(seen):
-            size, beyond = float(np.sqrt(np.mean(seen**2))), float(np.mean(np.abs(seen) > 2.0))
-            rows.append([name, str(len(seen)), plain(size), signed(float(seen.mean())), percent(beyond)])
-    header = ["residuals of", "samples", "root mean square [sigma]", "mean [sigma]", "beyond 2 sigma"]
-    return Table("In numbers", header, rows)
 
 
 def _intervals(run: Run) -> Table | None:
