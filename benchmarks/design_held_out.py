@@ -35,7 +35,7 @@ from emb_bench.design.polish import polish
 from emb_bench.design.problem import COARSE_SEARCHES, Problem, make_problem
 from emb_bench.design.report import check
 from emb_bench.design.search import LONG, coarse, evolved, search
-from emb_bench.information.criteria import criterion
+from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import Kind
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
@@ -63,16 +63,16 @@ def points(bench: Bench, count: int) -> list[BrakeParameters]:
 def problem_for(bench: Bench, brake: BrakeParameters, model: str, name: str) -> Problem:
     """The design problem of one line."""
     if name == "f_v":
-        goal = criterion("D", ("f_v",))
+        goal = Criterion("D")
         return make_problem(bench, goal, ("f_v",), model=model, kind="weighted", brake=brake)
-    goal = criterion("E" if name == "E" else "D", PARAMETER_NAMES)
+    goal = Criterion("E" if name == "E" else "D")
     return make_problem(bench, goal, PARAMETER_NAMES, model=model, brake=brake)
 
 
 def leaves(bench: Bench, problem: Problem, currents: Floats, name: str) -> bool:
     """True if the design leaves a limit or is not home when it is simulated once more, in plain Python."""
     kind: Kind = "weighted" if name == "f_v" else "physical"
-    goal = criterion("E" if name == "E" else "D", problem.params)
+    goal = Criterion("E" if name == "E" else "D")
     again = check(bench, problem, goal, kind, currents, problem.plant.name)
     return not (again.limits_held and again.home)
 

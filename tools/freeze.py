@@ -75,6 +75,7 @@ GONE: dict[str, str] = {
     "report/*/verdict": VERDICT,
     "fim/*/normalise_by": "the parameters of an information are always relative to theta",
     "report/*/says/runs/*/information*": "36552f31: the page has no information over time; fim has it",
+    "design/*/of": "a design is for all of its parameters",
     "estimate/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
     "report/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
     "estimate/*/bootstrap*": "36552f31: no bootstrap over runs; each record is predicted from the others",

@@ -409,10 +409,9 @@ def campaign(
 
 
 def design(
-    criterion: Literal["D", "A", "E", "Ds"] = "D",
+    criterion: Literal["D", "A", "E"] = "D",
     *,
     params: Names = PARAMETER_NAMES,
-    of: Names = (),
     theta: str | Path | Mapping[str, float] | None = None,
     model: str = DEFAULT_PLANT,
     kind: Literal["physical", "weighted"] = "physical",
@@ -426,7 +425,6 @@ def design(
     Args:
         criterion: what is optimised (default: D).
         params: unknown parameters (default: the four of the brake).
-        of: with Ds, those of the parameters that are wanted.
         theta: the brake's parameters, as name=value,...; the others are nominal.
         model: plant of the bench (default: exact).
         kind: which Fisher information (default: physical).
@@ -442,12 +440,12 @@ def design(
         UsageError: an argument is wrong, no design was found, or scipy and numba are missing.
     """
     from emb_bench.design.problem import make_problem
-    from emb_bench.information.criteria import criterion as criterion_of
+    from emb_bench.information.criteria import Criterion
     from emb_bench.sim.simulated_brake import parse_assignments, true_parameters
 
     _check({"--starts": (starts, 1), "--seed": (seed, 0)})
     its, names = load_bench(bench), _names(params)
-    goal = criterion_of(criterion, names, _names(of))
+    goal = Criterion(criterion)
     given = parse_assignments(_text_of(theta).replace("nominal", ""), "--theta: ")
     brake = true_parameters(its, given, option="--theta: ")
     problem = make_problem(its, goal, names, model=model, kind=kind, brake=brake, returns=return_home)

@@ -121,7 +121,7 @@ def test_every_reference_asks_for_what_it_asks_for_in_the_runtime() -> None:
 
 def problem(plant: str = "euler", **changes: float) -> Problem:
     brake = BENCH.brake._replace(**changes)
-    goal = Criterion("E", (0,))
+    goal = Criterion("E")
     return make_problem(BENCH, goal, ("f_v",), model=plant, kind="weighted", brake=brake, returns=True)
 
 

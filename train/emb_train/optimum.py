@@ -67,7 +67,7 @@ def optima(
     matrices = []
     for number, brake in enumerate(brakes, 1):
         tell(f"optimum on {plant}, brake {number} of {len(brakes)}")
-        goal = measure.goal(len(parameters))
+        goal = measure.goal
         problem = make_problem(bench, goal, parameters, model=plant, kind=measure.kind, brake=brake, returns=True)
         warm = [followed(problem, speeds)] if speeds else []
         found = search(problem, starts=STARTS if speeds else FIRST_STARTS, seed=SEED, warm=warm)

@@ -196,14 +196,15 @@ class Measure:
     """Comparison of a value with the optimum: by a difference in nat, by the ratio of which both are logarithms, or
     by their ratio."""
 
-    def goal(self, size: int) -> Criterion:
-        """Criterion that a design for ``size`` parameters optimises; its φ is the logarithm of what counts here."""
-        return Criterion(self.criterion, tuple(range(size)))
+    @property
+    def goal(self) -> Criterion:
+        """Criterion that a design optimises; its φ is the logarithm of what counts here."""
+        return Criterion(self.criterion)
 
     def values(self, matrices: Floats) -> Floats:
         """Of matrices without a prior, shape [N, n, n] to [N]."""
         size = matrices.shape[-1]
-        phi = self.goal(size).phi(matrices + self.prior * np.eye(size))
+        phi = self.goal.phi(matrices + self.prior * np.eye(size))
         return phi if self.against != "ratio" else np.exp(phi)
 
     def shares(self, values: Floats, optima: Floats) -> Floats:

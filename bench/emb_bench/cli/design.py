@@ -18,8 +18,7 @@ The parameters are taken as known: a design measures how good an excitation can 
 excites no brake whose parameters are unknown: on another one it leaves the limits. The
 best of many local optima is given.
 
-criteria: D log det M, A tr M^-1, E smallest eigenvalue, Ds log det of what is left for
---of when the others of --params are unknown too.
+criteria: D log det M, A tr M^-1, E smallest eigenvalue.
 
 exit codes:
   0    done; the design keeps the limits on the brake that it was made for

@@ -20,7 +20,7 @@ from emb_bench.brake.motion import STATES, advance
 from emb_bench.compiled import compiled
 from emb_bench.design.kernel import Task, excess, inform
 from emb_bench.design.problem import Problem
-from emb_bench.information.symmetric import Floats, Goal, packed_size, phi
+from emb_bench.information.symmetric import Floats, packed_size, phi
 
 VARIATIONS = 28  # For each sample of a design, that one annealing simulates
 TEMPERATURE = 2e-4  # Loss of φ that is taken at the start, on average; it falls to zero as a parabola
@@ -57,8 +57,7 @@ def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floa
     """
     tracks = tracked(problem, np.tile(speeds, (2, 1)))  # the present one and its variation
     best: Floats = tracks.u[0].copy()
-    goal = problem.goal.compiled(len(problem.params))
-    compiled(anneal)(problem.task, goal, VARIATIONS * len(speeds), rng, tracks, best)
+    compiled(anneal)(problem.task, problem.goal.compiled, VARIATIONS * len(speeds), rng, tracks, best)
     return best
 
 
@@ -110,14 +109,14 @@ def reach(task: Task, first: int, speeds: Floats, u: Floats, x: Floats) -> None:
         speeds[k] = x[k + 1, 1]
 
 
-def anneal(task: Task, goal: Goal, count: int, rng: np.random.Generator, tracks: Tracks, best: Floats) -> None:
+def anneal(task: Task, goal: int, count: int, rng: np.random.Generator, tracks: Tracks, best: Floats) -> None:
     """Vary a design ``count`` times, and go on with the variation unless it is too much worse.
 
     Of the two designs the first one is varied first; both change. ``best`` becomes the currents of the best design of
     the colder half.
     """
     box, n, rows = task.box, tracks.u.shape[1], tracks.s.shape[2]
-    packed, work = np.empty(tracks.m.shape[2]), np.empty((rows, rows))
+    work = np.empty((rows, rows))
     at, most = 0, -math.inf
     for number in range(count):
         to = 1 - at
@@ -137,8 +136,8 @@ def anneal(task: Task, goal: Goal, count: int, rng: np.random.Generator, tracks:
         inform(task, first, u, x, s, m)
         left = 1.0 - number / count
         softness = max(0.0, 2.0 * left - 1.0) * SOFTNESS
-        now = phi(goal, tracks.m[at, n], softness, packed, work) - PRICE * tracks.price[at]
-        worth = phi(goal, m[n], softness, packed, work) - PRICE * tracks.price[to]
+        now = phi(goal, tracks.m[at, n], softness, work) - PRICE * tracks.price[at]
+        worth = phi(goal, m[n], softness, work) - PRICE * tracks.price[to]
         if worth >= now - TEMPERATURE * left * left * rng.exponential():
             s[:first], m[:first] = tracks.s[at, :first], tracks.m[at, :first]
             at = to

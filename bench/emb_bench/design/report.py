@@ -130,7 +130,6 @@ class Report:
             "value": criterion.value(self.found.best.phi),
             "value_is": criterion.label,
             "params": list(p.params),
-            "of": [p.params[i] for i in criterion.wanted],
             "kind": self.kind,
             "model": p.plant.name,
             "theta": p.brake._asdict(),
@@ -244,8 +243,8 @@ def draw(report: Report, path: Path) -> None:
 def _title(report: Report) -> str:
     p, criterion = report.problem, report.criterion
     value = criterion.value(report.found.best.phi)
-    of = ", ".join(p.params[i] for i in criterion.wanted)
-    return f"{criterion.name}-optimal for {of} on the {p.plant.name} brake: {criterion.label} = {value:.6g}"
+    design = f"{criterion.name}-optimal for {', '.join(p.params)} on the {p.plant.name} brake"
+    return f"{design}: {criterion.label} = {value:.6g}"
 
 
 def _motion(axes: Any, report: Report) -> None:
@@ -281,7 +280,7 @@ def _information(axes: Any, report: Report) -> None:
             deviations[k] = np.sqrt(np.diag(spectrum.inverse()))
     known = np.isfinite(deviations).all(axis=1)
     axes[0].plot(time[known], [criterion.value(float(criterion.phi(m))) for m in history[known]], color=COLOURS[0])
-    axes[0].set_ylabel(criterion.label.replace("log det of the Schur complement", "log det (Schur)"))
+    axes[0].set_ylabel(criterion.label)
     if criterion.name in ("A", "E"):
         axes[0].set_yscale("log")
     for i, name in enumerate(params):

@@ -1,7 +1,7 @@
-"""Optimality criteria D, A, E and Ds of a Fisher information matrix: values, of one or of many, and gradients.
+"""Optimality criteria D, A and E of a Fisher information matrix: values, of one or of many, and gradients.
 
 D is log |M|, A is tr M⁻¹, E is λ_min (Atkinson, Donev and Tobias, Optimum Experimental Designs, with SAS, 2007, chapter
-10); Ds is D of some parameters while the others are unknown too. There are three ways to compute them:
+10); of some parameters while the others are unknown too D is called Ds. There are three ways to compute them:
 
 - :func:`criteria` and :func:`criteria_series` report on an experiment: accurate whatever the scales of the parameters,
   and a singular matrix has the worst values there are, never a NaN;
@@ -32,11 +32,10 @@ from emb_bench.information.symmetric import (
     MINUS_LOG_TRACE,
     SINGULAR,
     Floats,
-    Goal,
 )
 from emb_runtime.errors import UsageError
 
-Name = Literal["D", "A", "E", "Ds"]
+Name = Literal["D", "A", "E"]
 NAMES: tuple[Name, ...] = get_args(Name)
 
 FLOOR = 1e-13
@@ -147,17 +146,13 @@ class Criterion:
     """One of the criteria of :data:`NAMES`: a concave function of the Fisher information, which a search maximises."""
 
     name: Name
-    wanted: tuple[int, ...]  # Rows of M that are of interest; the others are nuisances. All of them but for Ds.
 
     def phi(self, m: Floats, softness: float = 0.0) -> Floats:
-        """φ of matrices, shape (..., p, p) to (...): log |M|, −log tr M⁻¹, log λ_min, log |M/M_nuisance|.
+        """φ of matrices, shape (..., p, p) to (...): log |M|, −log tr M⁻¹, log λ_min.
 
         With a softness above 0, E is the log of Kiefer's criterion Φ_p with p = 1/softness, (Σ λ_i^−p)^(−1/p), which is
         smooth where eigenvalues cross (Ann. Statist. 2, 1974).
         """
-        if self.name == "Ds":
-            rest = self._nuisances(m.shape[-1])
-            return _log_det(m) - _log_det(m[..., rest[:, None], rest])
         values = _eigenvalues(m)
         if self.name == "D":
             result = np.log(values).sum(axis=-1)
@@ -180,47 +175,21 @@ class Criterion:
         else:
             shares = 1.0 / values
         slope: Floats = (vectors * shares) @ vectors.T
-        if self.name == "Ds":
-            rest = self._nuisances(len(m))
-            slope[rest[:, None], rest] -= np.linalg.inv(m[rest[:, None], rest])
         return slope
 
-    def compiled(self, size: int) -> Goal:
-        """φ for compiled loops: of a singular matrix −inf."""
-        kind = {"D": LOG_DET, "A": MINUS_LOG_TRACE, "E": LOG_LAMBDA_MIN, "Ds": LOG_DET}[self.name]
-        rest = self._nuisances(size)
-        return Goal(kind, np.array([*rest, *self.wanted], np.int64), len(rest))
+    @property
+    def compiled(self) -> int:
+        """Number of φ for compiled loops, see :func:`emb_bench.information.symmetric.phi`."""
+        return {"D": LOG_DET, "A": MINUS_LOG_TRACE, "E": LOG_LAMBDA_MIN}[self.name]
 
     def value(self, phi: float) -> float:
-        """The criterion in its own unit: log |M|, tr M⁻¹, λ_min, log of the determinant of the Schur complement."""
-        return float({"D": phi, "A": np.exp(-phi), "E": np.exp(phi), "Ds": phi}[self.name])
+        """The criterion in its own unit: log |M|, tr M⁻¹, λ_min."""
+        return float({"D": phi, "A": np.exp(-phi), "E": np.exp(phi)}[self.name])
 
     @property
     def label(self) -> str:
         """Name of the value."""
-        return {"D": "log det M", "A": "tr M^-1", "E": "lambda_min", "Ds": "log det of the Schur complement"}[self.name]
-
-    def _nuisances(self, size: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-        return np.array([i for i in range(size) if i not in self.wanted], np.int64)
-
-
-def criterion(name: Name, params: Sequence[str], of: Sequence[str] = ()) -> Criterion:
-    """A criterion by name; for Ds ``of`` some of the parameters, the others being nuisances.
-
-    Raises:
-        UsageError: ``of`` does not go with the criterion, or is no proper subset of the unknowns.
-    """
-    if name != "Ds":
-        if of:
-            raise UsageError(f"a subset of the parameters goes with the criterion Ds, not with {name}")
-        return Criterion(name, tuple(range(len(params))))
-    unknown = [n for n in of if n not in params]
-    if unknown or not of or len(set(of)) != len(of) or len(of) == len(params):
-        raise UsageError(
-            f"Ds needs some, but not all, of the parameters {', '.join(params)} as those that are wanted; "
-            f"got {', '.join(of) or 'none'}"
-        )
-    return Criterion(name, tuple(sorted(params.index(n) for n in of)))
+        return {"D": "log det M", "A": "tr M^-1", "E": "lambda_min"}[self.name]
 
 
 def distances(matrices: Floats, other: Floats) -> Floats:
@@ -239,8 +208,3 @@ def _eigenvalues(m: Floats) -> Floats:
     values = np.linalg.eigvalsh(m)
     floored: Floats = np.maximum(values, np.maximum(FLOOR * values[..., -1:], 1e-300))
     return floored
-
-
-def _log_det(m: Floats) -> Floats:
-    total: Floats = np.log(_eigenvalues(m)).sum(axis=-1)
-    return total

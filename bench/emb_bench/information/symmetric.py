@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,32 +134,19 @@ def lambda_min(m: Floats, work: Floats) -> float:
     return smallest
 
 
-class Goal(NamedTuple):
-    """φ of a :class:`emb_bench.information.criteria.Criterion` of n×n matrices, for :func:`phi`."""
+def phi(criterion: int, m: Floats, softness: float, work: Floats) -> float:
+    """φ of a packed matrix by ``LOG_DET``, ``LOG_LAMBDA_MIN`` or ``MINUS_LOG_TRACE``; −inf if it is singular.
 
-    criterion: int  # ``LOG_DET``, ``LOG_LAMBDA_MIN`` or ``MINUS_LOG_TRACE``
-    order: NDArray[np.int64]  # The rows of M, nuisances first, shape (n,)
-    nuisances: int  # Their number; 0 for all but Ds
-
-
-def phi(goal: Goal, m: Floats, softness: float, packed: Floats, work: Floats) -> float:
-    """φ of a packed matrix; −inf if it is singular. ``packed``, of its shape, is scratch.
-
-    Ds is the sum of the logarithms of the last pivots if the nuisances come first. A softness rounds E's kinks, see
-    :meth:`emb_bench.information.criteria.Criterion.phi`.
+    A softness rounds E's kinks, see :meth:`emb_bench.information.criteria.Criterion.phi`.
     """
     n = work.shape[0]
-    for i in range(n):
-        for j in range(i, n):
-            a, b = goal.order[i], goal.order[j]
-            packed[packed_index(n, i, j)] = m[packed_index(n, min(a, b), max(a, b))]
-    if not cholesky(packed, work):
+    if not cholesky(m, work):
         return -math.inf
-    if goal.criterion == MINUS_LOG_TRACE:
-        return -math.log(trace_inverse(packed, work))
+    if criterion == MINUS_LOG_TRACE:
+        return -math.log(trace_inverse(m, work))
     total, smallest = 0.0, math.inf
-    if goal.criterion == LOG_DET:
-        for i in range(goal.nuisances, n):
+    if criterion == LOG_DET:
+        for i in range(n):
             total += 2.0 * math.log(work[i, i])
         return total
     orthogonalise(work)

@@ -14,16 +14,12 @@ if TYPE_CHECKING:  # a search for designs takes a second to import
 def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
     """Value of the criterion, the limits on the design's own brake, and what the design would tell."""
     d, own = report.metadata(), report.checks[0]
-    nuisances = [name for name in d["params"] if name not in d["of"]]
     brake = f"{d['model']}, {d['kind']} information, {'returns home' if d['returns'] else 'ends anywhere'}"
     optima = ", ".join(f"{value:.6g}" for value in d["local_optima"][: None if verbose else 4])
     bounds = d["cramer_rao"] or {}
     lines = facts(
         (d["value_is"], f"{d['value']:.7g}; {_verdict(own)}"),
-        (
-            "criterion",
-            f"{d['criterion']} of {', '.join(d['of'])}{' with nuisances ' if nuisances else ''}" + ", ".join(nuisances),
-        ),
+        ("criterion", f"{d['criterion']} of {', '.join(d['params'])}"),
         ("brake", brake),
         ("bounds", ", ".join(f"{name} {deviation(bound, name)}" for name, bound in bounds.items())),
         ("optima", f"{optima} ({d['starts']} starts, seed {d['seed']})"),

@@ -29,7 +29,7 @@ def ceiling(problem: Problem, criterion: Criterion) -> float:
     """
     p, box, name = problem.brake, problem.box, criterion.name
     plain = problem.plant.mechanics.solver == EXACT and problem.plant.mechanics == type(problem.plant.mechanics)()
-    if not plain or name == "Ds" or not set(problem.params) <= set(PARAMETER_NAMES):
+    if not plain or not set(problem.params) <= set(PARAMETER_NAMES):
         raise UsageError("the proved bound is for D, A and E of the thesis's parameters on the brake 'exact'")
     t_s, n = problem.sample_time, problem.horizon
     time = t_s * np.arange(n + 1)
