@@ -75,6 +75,8 @@ GONE: dict[str, str] = {
     "report/*/verdict": VERDICT,
     "fim/*/normalise_by": "the parameters of an information are always relative to theta",
     "report/*/says/runs/*/information*": "36552f31: the page has no information over time; fim has it",
+    "estimate/*/held_out*": "each of several records is predicted from the others; no other is",
+    "report/*/held_out*": "each of several records is predicted from the others; no other is",
     "design/*/of": "a design is for all of its parameters",
     "estimate/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
     "report/*/bounds*": "the range of a search is a tenth of nominal to ten times it",

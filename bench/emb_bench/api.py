@@ -239,7 +239,6 @@ def estimate(
     starts: int = STARTS,
     seed: int = 0,
     profile: bool = False,
-    hold_out: Source | Sequence[Source] = (),
     last: str | Path | None = None,
     bench: str | Path | None = None,
 ) -> Study:
@@ -260,7 +259,6 @@ def estimate(
         starts: local searches (default: 8).
         seed: of where they begin (default: 0).
         profile: likelihood profiles of all parameters (default: of those that are identified badly).
-        hold_out: log that is predicted, not estimated from; may be given more than once.
         last: JSON of an earlier estimate or report, to say what has changed since.
         bench: bench file (default: the one in the first log).
 
@@ -275,13 +273,13 @@ def estimate(
     options_of, before = _study_options(given), _last(last)
     from emb_bench.analysis.study import make_study
 
-    logs, unseen = [_driven(run) for run in _listed(runs)], [_driven(run) for run in _listed(hold_out)]
+    logs = [_driven(run) for run in _listed(runs)]
     if not logs:
         raise UsageError("expected at least one run")
     its = logs[0].bench if bench is None else load_bench(bench, analysis=True)
     say_if_compiling()
     _say(f"estimates from {', '.join(log.path.name for log in logs)}")
-    return make_study(its, logs, options_of(its), held_out=unseen, last=before)
+    return make_study(its, logs, options_of(its), last=before)
 
 
 def report(
@@ -308,14 +306,14 @@ def report(
     Raises:
         UsageError: an argument is wrong, the runs do not go together, a file cannot be written, or scipy, numba or
             matplotlib is missing.
-        LogError: not one log can be used, or one that is held out cannot.
+        LogError: not one log can be used.
     """
     page = Path(output)
     beside = page.with_suffix(".json")
     bound = inspect.signature(estimate).bind(runs, **options | {"profile": True})
     bound.apply_defaults()
     given = bound.arguments
-    files = [*_listed(runs), *_listed(given["hold_out"]), given["last"], acceptance]
+    files = [*_listed(runs), given["last"], acceptance]
     _check_page(page, beside, [entry.path if isinstance(entry, RunLog) else Path(entry) for entry in files if entry])
     require_place("--junit", None if junit is None else Path(junit), (".xml",))
     if junit is not None and acceptance is None:
@@ -334,12 +332,11 @@ def report(
     say_if_compiling()
     with replacing(page) as new_page, replacing(beside) as new_numbers:
         logs, left_out = _usable(_listed(runs))
-        unseen = [_opened(run) for run in _listed(given["hold_out"])]
         _say(f"estimates from {', '.join(log.path.name for log in logs)}, and writes {page.name}")
         own = next((log for log in logs if "bench.toml" in log.attachments), logs[-1])
         its = own.bench if given["bench"] is None else load_bench(given["bench"], analysis=True)
         made_by = f"emb-excite {metadata.version('emb-excite')}"
-        content = gather(its, logs, left_out, options_of(its), made_by, held_out=unseen, last=before, criteria=criteria)
+        content = gather(its, logs, left_out, options_of(its), made_by, last=before, criteria=criteria)
         new_numbers.write_text(as_json(document(content)) + "\n", encoding="utf-8")
         new_page.write_text(report_page(content), encoding="utf-8")
         if junit is not None and content.acceptance is not None:

@@ -54,33 +54,14 @@ class HeldOut:
 
 
 def held_out(e: Estimate, record: Experiment, *, among: int = 1) -> HeldOut:
-    """Predict a record of the same brake from an estimate of others; several share the false alarms."""
-    return _predicted(e, record, LEVEL / among)
-
-
-def leave_one_out(e: Estimate) -> tuple[HeldOut, ...]:
-    """Predict each record from an estimate of the others, made by the same method.
-
-    Raises:
-        UsageError: there is one record only.
-    """
-    count = len(e.records)
-    if count < 2:
-        raise UsageError(f"to predict each record from the others takes at least 2, got {count}")
-    found = []
-    for i, record in enumerate(e.records):
-        others = refit(e, [k for k in range(count) if k != i])
-        found.append(_predicted(others, record, LEVEL / count))
-    return tuple(found)
-
-
-def _predicted(e: Estimate, record: Experiment, level: float) -> HeldOut:
+    """Predict a record of the same brake from an estimate of others; ``among`` predictions share the false alarms."""
+    level = LEVEL / among
     if e.method == "windows":
         return _windows_predicted(e, record, level)
     problem = replace(e.problem, asked=replace(e.asked, prior=None), records=(record,))
     index = [i for i, unknown in enumerate(problem.unknowns) if unknown.record is None]
     start = problem.nominal()
-    start[index] = e.values[e.shared()] / problem.units[index]
+    start[index] = e.z[e.shared()]
     start = np.clip(start, *problem.bounds)
     at = start[index]
     scale = problem.scale(start)[index]
@@ -107,6 +88,22 @@ def _predicted(e: Estimate, record: Experiment, level: float) -> HeldOut:
     freedom = max(samples + starts - fitted, 1)
     p_value = float(special.chdtrc(freedom, end.cost))
     return HeldOut(record.name, end.cost, freedom, p_value, p_value >= level)
+
+
+def leave_one_out(e: Estimate) -> tuple[HeldOut, ...]:
+    """Predict each record from an estimate of the others, made by the same method.
+
+    Raises:
+        UsageError: there is one record only.
+    """
+    count = len(e.records)
+    if count < 2:
+        raise UsageError(f"to predict each record from the others takes at least 2, got {count}")
+    found = []
+    for i, record in enumerate(e.records):
+        others = refit(e, [k for k in range(count) if k != i])
+        found.append(held_out(others, record, among=count))
+    return tuple(found)
 
 
 def _windows_predicted(e: Estimate, record: Experiment, level: float) -> HeldOut:

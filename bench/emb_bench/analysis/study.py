@@ -15,7 +15,6 @@ import numpy as np
 from emb_bench.analysis.conclusion import Conclusion, conclude
 from emb_bench.analysis.drift import Drift, Earlier, drifts
 from emb_bench.analysis.held_out import HeldOut, leave_one_out
-from emb_bench.analysis.held_out import held_out as predict
 from emb_bench.analysis.model_choice import ModelChoice, choose_model, fit_from
 from emb_bench.analysis.model_growth import ModelGrowth, grow_model, grow_with_errors
 from emb_bench.analysis.profile import Profile, profiles
@@ -96,7 +95,7 @@ class Study:
 
     estimate: Estimate
     logs: tuple[Path, ...]  # Logs of the estimate, in the order of its records
-    warnings: tuple[str, ...]  # Defects of the logs, those held out included
+    warnings: tuple[str, ...]  # Defects of the logs
     notes: tuple[str, ...]
     """Descriptions of what was taken for the currents that acted, where that is not what was told."""
     model_reason: str
@@ -104,7 +103,6 @@ class Study:
     """Parameters of the simulated brake, if known and the same in all logs of the estimate."""
     profiles: tuple[Profile, ...]
     """Profiles of the unknowns that the records share: all, or those whose verdict may depend on one."""
-    held_out: tuple[HeldOut, ...]  # Predictions of the logs held out
     left_out: tuple[HeldOut, ...]  # Prediction of each record from the others; empty for a single record
     advice: tuple[Recommendation, ...]
     """Recommended runs, best first; empty if all parameters are identified well, or no run would help."""
@@ -194,7 +192,7 @@ class Study:
     @property
     def predicts(self) -> bool:
         """Returns True if no prediction of a record rejects the model."""
-        return _predicts(self.held_out, self.left_out)
+        return all(h.fits for h in self.left_out)
 
     @property
     def holds(self) -> bool:
@@ -252,22 +250,14 @@ class Study:
         return groups
 
 
-def make_study(
-    bench: Bench,
-    logs: Sequence[RunLog],
-    wanted: StudyOptions,
-    *,
-    held_out: Sequence[RunLog] = (),
-    last: Earlier | None = None,
-) -> Study:
+def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, last: Earlier | None = None) -> Study:
     """Estimates from logs, checks the model and draws the conclusions.
 
     Raises:
         UsageError: logs do not go together, one run is given twice, or they are too few for the options.
         LogError: a log lacks what an estimate needs.
     """
-    all_logs = [*logs, *held_out]
-    for log in all_logs:
+    for log in logs:
         if (its := other_sample_time(log, bench)) is not None:
             raise UsageError(f"{log.path}: expected a sample time of {bench.timing.sample_time:g} s, got {its:g} s")
     if (wanted.grow or wanted.model == EVERY) and wanted.method != "oem":
@@ -275,19 +265,19 @@ def make_study(
         raise UsageError(f"{option} compares models by output error: expected --method oem, got {wanted.method}")
     if wanted.grow and wanted.model == EVERY:
         raise UsageError(f"--grow begins with one model: expected the name of a plant, not --model {EVERY}")
-    plant, why = begun_with(bench, all_logs, wanted)
-    names = file_names([log.path for log in all_logs])
+    plant, why = begun_with(bench, logs, wanted)
+    names = file_names([log.path for log in logs])
     experiments: list[Experiment] = []
     warnings: list[str] = []
     notes: list[str] = []
     stops: list[Stop] = []
-    for log, shown in zip(all_logs, names, strict=True):
+    for log, shown in zip(logs, names, strict=True):
         experiment, said = _read(log, bench, shown)
         said += [] if method_of(wanted.method).gaps else _hidden(experiment)
         experiments.append(experiment)
         stop = stop_of(log, experiment, shown)
-        stops += [stop] if stop is not None and log in logs else []
-        of_which = f"{shown}: " if len(all_logs) > 1 else ""
+        stops += [stop] if stop is not None else []
+        of_which = f"{shown}: " if len(logs) > 1 else ""
         warnings += [of_which + warning for warning in said]
         notes += [of_which + note for note in experiment.notes]
 
@@ -298,16 +288,14 @@ def make_study(
     choice = growth = None
     if wanted.grow:
         growing = grow_with_errors if wanted.systematic else grow_model
-        growth = growing(
-            bench, plant, records_of(plant)[: len(logs)], wanted.asked, starts=wanted.starts, seed=wanted.seed
-        )
+        growth = growing(bench, plant, records_of(plant), wanted.asked, starts=wanted.starts, seed=wanted.seed)
         choice = growth.choice
         plant, why = choice.best.estimate.plant, f"grown: {choice.best.name}"
     elif wanted.model == EVERY:
         choice = choose_model(
             bench,
             list(bench.plants.values()),
-            lambda plant: records_of(plant)[: len(logs)],
+            records_of,
             wanted.problem(bench, plant),
             starts=wanted.starts,
             seed=wanted.seed,
@@ -316,14 +304,12 @@ def make_study(
         if choice.same:
             why += f"; {', '.join(choice.same)} left out: one of them, with the encoder's offset estimated along"
     records = records_of(plant)
-    seen, unseen = records[: len(logs)], records[len(logs) :]
-    e = _answer(wanted, bench, plant, seen, choice)
+    e = _answer(wanted, bench, plant, records, choice)
     # The likelihood of a whole recording is none of windows, and no run can be planned with what is never driven.
     found = profiles(e, of_all=wanted.profiles) if wanted.method != "windows" else ()
     advice = advise(e) if bench.machine is None else ()
     changes = () if last is None else drifts(e, last)
-    predicted = tuple(predict(e, record, among=len(unseen)) for record in unseen)
-    left_out = leave_one_out(e) if len(seen) > 1 else ()
+    left_out = leave_one_out(e) if len(records) > 1 else ()
     return Study(
         estimate=e,
         logs=tuple(log.path for log in logs),
@@ -332,12 +318,11 @@ def make_study(
         model_reason=why,
         truth=_truth(logs),
         profiles=found,
-        held_out=predicted,
         left_out=left_out,
         advice=advice,
         drifts=changes,
         conclusions=covering(
-            conclude(e, found, changes, predicts=_predicts(predicted, left_out)),
+            conclude(e, found, changes, predicts=all(h.fits for h in left_out)),
             [e.unknowns[i] for i in e.wanted()],
             choice,
         ),
@@ -384,10 +369,6 @@ def covering(
         return tuple(conclusions)
     wide = [choice.interval(unknown) for unknown in unknowns]
     return tuple(replace(c, interval=union(c.interval, other)) for c, other in zip(conclusions, wide, strict=True))
-
-
-def _predicts(*found: Sequence[HeldOut]) -> bool:
-    return all(h.fits for some in found for h in some)
 
 
 def _check_different(records: Sequence[Experiment]) -> None:

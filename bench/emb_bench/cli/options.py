@@ -29,7 +29,7 @@ METAVARS = {
     "ray": "ADDRESS",
 }
 """Words of ``--help`` for the values of options; without, those of the type."""
-LISTS = ("runs", "paths", "hold_out")  # Arguments that may be given several times
+LISTS = ("runs", "paths")  # Arguments that may be given several times
 
 
 def summary(function: Function) -> str:

@@ -185,14 +185,13 @@ def gather(
     wanted: StudyOptions,
     made_by: str,
     *,
-    held_out: Sequence[RunLog] = (),
     last: Earlier | None = None,
     criteria: Criteria | None = None,
 ) -> Content:
     """Estimates from the logs that have an experiment, and states for each other log why it is not used."""
     experiments = [_experiment(log, bench, wanted) for log in logs]
     used = [log for log, (_, why_not) in zip(logs, experiments, strict=True) if not why_not]
-    study = make_study(bench, used, wanted, held_out=held_out, last=last) if used else None
+    study = make_study(bench, used, wanted, last=last) if used else None
     single = replace(wanted, profiles=False)
     runs = []
     for log, (experiment, why_not) in zip(logs, experiments, strict=True):

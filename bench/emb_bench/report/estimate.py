@@ -53,7 +53,7 @@ def _against(study: Study) -> Iterator[str]:
     """Reasons against the model."""
     if not study.biased:
         yield from study.estimate.validation.alarms
-    yield from (f"{h.name}: {say.held_out(h)}" for h in (*study.held_out, *study.left_out) if not h.fits)
+    yield from (f"{h.name}: {say.held_out(h)}" for h in study.left_out if not h.fits)
 
 
 def _notes(study: Study) -> list[str]:
@@ -197,7 +197,7 @@ def document(study: Study) -> dict[str, Any]:
         "conclusions",
         "drifts",
     )
-    found |= _fields(study, *of_study, "held_out", "left_out", "apart", "advice")
+    found |= _fields(study, *of_study, "left_out", "apart", "advice")
     document: dict[str, Any] = to_json(found | _fields(e, "caveats", "process_noise", "load_noise", "theta"))
     return document
 

@@ -198,10 +198,7 @@ def suspects(e: Estimate) -> Table | None:
 
 def predicted(study: Study) -> Table | None:
     """Records predicted by an estimate of others."""
-    rows = [
-        [h.name, plain(h.ratio, 4), str(h.freedom), chance(h.p_value), answer(h.fits)]
-        for h in (*study.held_out, *study.left_out)
-    ]
+    rows = [[h.name, plain(h.ratio, 4), str(h.freedom), chance(h.p_value), answer(h.fits)] for h in study.left_out]
     header = ["record", "chi2/n", "samples", "p", "predicted"]
     return Table("Predictions of records that were held out", header, rows, words=(0, 4)) if rows else None
 
