@@ -184,6 +184,7 @@ def batches() -> None:
     threads = numba.get_num_threads()
     work = f"4 sensitivities, {threads} threads"
     print(f"\n{work:<36}{'[M/s]':>8}{'target':>8}{'solve_ivp, state only':>23}{'ratio':>8}")
+    rates = {}
     for name in PLANTS:
         fastest = np.inf
         for _ in range(REPEATS + 1):
@@ -194,9 +195,12 @@ def batches() -> None:
             fastest = min(fastest, time.perf_counter() - start)
         if name == "exact":
             np.testing.assert_allclose(x[0, :2], expected[-1], rtol=1e-6, atol=1e-6)
-        rate = u.size / fastest
+        rates[name] = rate = u.size / fastest
         target = f"{TARGETS[name] / 1e6:.0f}" if name in TARGETS else ""
         print(f"{f'{name}, {BATCH} brakes':<36}{rate / 1e6:>8.2f}{target:>8}{peer / 1e6:>23.4f}{rate / peer:>8.0f}")
+    said = ", ".join(f"{name} {rate / 1e6:.2g}" for name, rate in rates.items())
+    print(f"| brake with 4 sensitivities and information, {threads} threads | – | {said} M steps/s |")
+    print(f"| exact brake over scipy's `solve_ivp`, state alone: speed | – | {rates['exact'] / peer:,.0f} |")
 
 
 if __name__ == "__main__":

@@ -208,11 +208,17 @@ def main() -> None:
             )
     if args.outside:
         refused = sum(row["refused"] for row in rows)
-        print(f"range named, nothing written, no limit passed: {refused} of {len(rows)}")
+        print(
+            f"| commissioning of {len(rows)} brakes 1 to 10 % outside of one range of the data sheet: range named, "
+            f"nothing written, no limit passed | {len(rows)} | {refused} |"
+        )
         return
     done = [row for row in rows if "inside" in row]
-    print(f"completed {len(done)} of {len(rows)}; limits passed {sum(row['passed'] for row in rows)}")
-    print(f"truth inside of the written ranges: {sum(all(row['inside'].values()) for row in done)} of {len(rows)}")
+    inside, passed = sum(all(row["inside"].values()) for row in done), sum(row["passed"] for row in rows)
+    print(
+        f"| commissioning of {len(rows)} random brakes ({', '.join(args.plants)}): limits passed; truth inside of the "
+        f"written ranges | 0; {len(rows)} | {passed}; {inside} |"
+    )
     for name in PARAMETER_NAMES:
         within = sum(row["in_95"][name] for row in done)
         width = np.median([row["width"][name] for row in done])

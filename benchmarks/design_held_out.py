@@ -184,6 +184,12 @@ def main() -> None:
             f"{model:7}{name:5}{len(of)} of them: share median {statistics.median(shares):.4f}, least {min(shares):.4f}"
         )
         print(f"{'':12}{low} below 0.998; cpu s median {statistics.median(cpu):.1f}, most {max(cpu):.1f}")
+        walls, missed = [line.wall for line in of], ", **not met**" if low else ""
+        print(
+            f"| designs of {len(of)} held-out {model} brakes, {name}: below 0.998 of the best known; median, least; "
+            f"wall clock, median and most | 0; –; 60 s | {low}{missed}; {statistics.median(shares):.4f}, "
+            f"{min(shares):.4f}; {statistics.median(walls):.1f}, {max(walls):.1f} s |"
+        )
 
 
 if __name__ == "__main__":

@@ -336,6 +336,13 @@ def main() -> None:
     if wrong:
         report("all that are wrong", wrong)
     report("all", every)
+    fits, covered = [o for o in every if o.fits], np.concatenate([o.covered for o in every])
+    far, what = share(sum(o.far for o in every), len(fits)), f"{args.case}, {len(every)} records, seed {args.seed}"
+    print(f"| {what}: parameters covered | 93 to 97 % | {share(int(covered.sum()), covered.size)} |")
+    print(f"| {what}: fits, and a parameter beyond {FAR:g} total deviations | 1 % | {far} |")
+    if noticed := [o for o in wrong if not o.fits]:
+        named = share(sum(o.suspect in o.drawn.causes for o in noticed), len(noticed))
+        print(f"| {what}: the cause named first, where noticed | 80 % | {named} |")
 
 
 if __name__ == "__main__":

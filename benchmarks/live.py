@@ -69,12 +69,12 @@ def main() -> int:
                 flush=True,
             )
     ratio = float(np.median([t.busy for t in turns[True]]) / np.median([t.busy for t in turns[False]]))
-    print(f"processor time with a viewer over that without: {ratio:.3f}")
-    met = (
-        all(t.served == [t.messages, round(args.seconds * 1000) + 1] for t in turns[True])
-        and max(t.missed for t in turns[True]) <= max(t.missed for t in turns[False])
-        and ratio <= MOST_MORE
+    every = all(t.served == [t.messages, round(args.seconds * 1000) + 1] for t in turns[True])
+    print(
+        "| `emb-run --live` with a viewer of every topic and a page: processor time of the loop over that without; "
+        f"messages and samples served | {MOST_MORE}; all | {ratio:.2f}; {'all' if every else 'not all, **not met**'} |"
     )
+    met = every and max(t.missed for t in turns[True]) <= max(t.missed for t in turns[False]) and ratio <= MOST_MORE
     return EXIT_DONE if met else EXIT_CHECK_FAILED
 
 

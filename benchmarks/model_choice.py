@@ -139,12 +139,13 @@ def main() -> None:
             flush=True,
         )
     right = sum(o.right for o in outcomes)
-    print(f"\nthe right plant first:                 {share(right, len(outcomes))}, at least {100 * GOAL:.0f} % wanted")
+    what = f"the right plant of {len(bench.plants)}, {len(outcomes)} records"
+    print(f"\n| {what}: comes first | {100 * GOAL:.0f} % | {share(right, len(outcomes))} |")
     print(f"  by the held-out score alone:         {share(sum(o.predicts for o in outcomes), len(outcomes))}")
     if not args.nominal:
-        print(f"the right plant said not to fit:       {share(sum(not o.fits for o in outcomes), len(outcomes))}")
+        print(f"| {what}: said not to fit | – | {share(sum(not o.fits for o in outcomes), len(outcomes))} |")
         print(f"the right plant not excluded:          {share(sum(o.not_excluded for o in outcomes), len(outcomes))}")
-        print(f"95 % intervals of the mixture cover:   {100 * np.mean([o.covered for o in outcomes]):.1f} %")
+        print(f"| {what}: 95 % intervals cover | – | {100 * np.mean([o.covered for o in outcomes]):.1f} % |")
         print(f"95 % intervals of the first alone:     {100 * np.mean([o.alone for o in outcomes]):.1f} %")
     seconds = [o.seconds for o in outcomes]
     print(f"seconds a record takes:                median {np.median(seconds):.2f}, largest {np.max(seconds):.2f}")

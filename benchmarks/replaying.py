@@ -101,7 +101,10 @@ def long_logs(folder: Path, minutes: float) -> bool:
     for one, other in zip(found[0].values(), found[1].values(), strict=True):
         hours.append([short + share * (long - short) for short, long in zip(one, other, strict=True)])
     time_, memory = np.max(hours, axis=0)
-    print(f"an hour's log, along a straight line through both: {memory:.0f} MiB (limit {HOUR:g}), {time_:.0f} s")
+    print(
+        f"| hour of log, `fim`, along a straight line through {0.25 * minutes:g} and {minutes:g} minutes: peak memory; "
+        f"wall clock | {HOUR:g} MiB; 30 s | {memory:.0f} MiB; {time_:.0f} s |"
+    )
     return bool(memory <= HOUR)
 
 
@@ -124,8 +127,8 @@ def rate(path: Path, logs: int) -> bool:
         assert np.isfinite(told).all()
     times = times[1:]
     best = min(sum(times[k : k + BATCH]) / len(times[k : k + BATCH]) for k in range(0, len(times), BATCH))
-    shown = f"{1.0 / best:.0f} per second, in the mean {len(times) / sum(times):.0f}"
-    print(f"logs of 0.5 s for FIM, one core: {shown} (limit {RATE:g})")
+    shown = f"{1.0 / best:.0f} /s, in the mean {len(times) / sum(times):.0f} /s"
+    print(f"| logs of 0.5 s read and evaluated for both informations, one core | {RATE:g} /s | {shown} |")
     return 1.0 / best >= RATE
 
 

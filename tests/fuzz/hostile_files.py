@@ -74,7 +74,6 @@ class Judged(NamedTuple):
     """Outcome of a command."""
 
     code: int
-    seconds: float  # Wall time [s]
     cpu: float  # Processor time of all its processes [s]
     memory: int  # Of its largest process [bytes]
     said: str
@@ -418,15 +417,13 @@ def judge(hostile: Hostile, folder: Path, longest: float = 60.0) -> Judged:
     arguments = [a.replace("FILE", str(path)).replace("OUT", str(folder / "out")) for a in hostile.command[1:]]
     program: Callable[[list[str]], int] = {"emb-run": run, "emb-replay": replay}[hostile.command[0]]
     with tempfile.TemporaryFile() as said:
-        begun = time.monotonic()
         pid = os.fork()
         if pid == 0:
             _become(program, arguments, said.fileno())
         code, usage = _wait(pid, longest)
-        seconds = time.monotonic() - begun
         said.seek(0)
         text = said.read(1 << 20).decode("utf-8", "replace")
-    return Judged(code, seconds, usage.ru_utime + usage.ru_stime, usage.ru_maxrss << 10, text)
+    return Judged(code, usage.ru_utime + usage.ru_stime, usage.ru_maxrss << 10, text)
 
 
 def _become(program: Callable[[list[str]], int], arguments: list[str], output: int) -> None:

@@ -116,9 +116,10 @@ def main() -> int:
         print(f"{signal.Signals(one.number).name} after {one.moment:.3f} s: {one.fault}: {one.said.strip()[-200:]}")
     took = sorted(one.took for one in ended)
     codes = {code: sum(one.code == code for one in ended) for code in sorted({one.code for one in ended})}
+    print(f"moments of {usual:.2f} s; ended after {statistics.median(took):.3f} s in the median; exit codes {codes}")
     print(
-        f"{args.count} moments of {usual:.2f} s: {len(faults)} faults; ended after {statistics.median(took):.3f} s in "
-        f"the median, {took[-1]:.3f} s at most; exit codes {codes}"
+        "| `emb-run` after Ctrl-C or SIGTERM at a random moment: late, in a traceback, or leaving a process; longest "
+        f"| 0; {LONGEST:g} s | {len(faults)} of {args.count}; {took[-1]:.2f} s |"
     )
     return 1 if faults else 0
 

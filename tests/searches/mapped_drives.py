@@ -65,6 +65,10 @@ def main() -> int:
     print(f"{total} commands of {args.mappings} mappings in {time.perf_counter() - begin:.0f} s")
     for name, count in counts.items():
         print(f"  {name:<20} {count:>8}")
+    found = f"{counts['wrong on the bus']} of {total:,}; {counts['refused, valid']}"
+    print(
+        f"| random commands of {args.mappings} random mappings: wrong on the bus; valid and refused | 0; 0 | {found} |"
+    )
     return int(counts["wrong on the bus"] > 0 or counts["refused, valid"] > 0)
 
 

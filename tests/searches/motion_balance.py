@@ -279,7 +279,9 @@ def main() -> None:
     print(f"\n{judged} of {total} experiments are judged by the balance")
     for name, count in totals.items():
         low, high = stats.binomtest(count, total).proportion_ci(method="exact")
-        print(f"{name}: {count} of {total}, {low:.1e} to {high:.1e} at 95 % (Clopper and Pearson)")
+        what = f"honest experiments over {len(PLANTS)} plants: {name}"
+        limit = "–" if name == "model does not fit" else "1e-4"
+        print(f"| {what} | {limit} | {count} of {total}, {low:.1e} to {high:.1e} |")
 
 
 if __name__ == "__main__":

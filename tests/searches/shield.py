@@ -91,6 +91,7 @@ def show_search(n: int, seed: int) -> bool:
         report(f"{plant}, nothing declared", search(bench_for(), n // 5, seed, plant=plant))
         if declared:
             fails |= report(f"{plant}, declared", search(bench_for(**declared), n // 5, seed, plant=plant))
+    print(f"| limits passed under the shield in {n:,} adversarial episodes | 0 | {int(found.violated.sum())} |")
     print("\nHome in spite of lost commands (envelope), share of episodes:")
     print("  " + ", ".join(f"{d} {found.home[found.of(d)].mean():.3f}" for d in DROPS))
     return fails
