@@ -24,8 +24,8 @@ is chosen is said with the estimate.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -72,48 +72,169 @@ class Windows(Method):
 
     def solve(self, problem: Problem) -> Estimate:
         """As :class:`Method`."""
-        shared = problem.unknowns
-        if any(unknown.record is not None for unknown in shared):
+        if any(unknown.record is not None for unknown in problem.unknowns):
             raise UsageError(f"method windows: each window has a start of its own: leave out {', '.join(OF_A_RECORD)}")
+        points = start_points(problem, self.starts, self.seed)
         if window_of(problem) and course_of(problem):
-            cut = _enough(problem)
-            points = _points(problem, cut, start_points(problem, self.starts, self.seed))
-            weights = points[0][1]
-            searches = sorted((search(problem, cut, *point) for point in points), key=lambda pair: pair[1].cost)
-            at, ends = searches[0][0], tuple(end for _, end in searches)
-            return _finished(problem, cut, at, weights, ends, [_other(problem, at.shared) - at.shared], ())
-        problem, near, moved, said = _chosen(problem, self.starts, self.seed)
-        cut = windowed(problem)
-        begun = begun_at(cut, near)
-        weights = weights_of(cut, begun)
-        at, end = search(problem, cut, begun, weights)
-        return _finished(problem, cut, at, weights, (end,), [_other(problem, at.shared) - at.shared, *moved], said)
+            cut, said, moved = Cut(problem, points[0]), tuple[str, ...](), tuple[Floats, ...]()
+            searches = cut.searches(points)
+        else:
+            problem, near, moved, said = _chosen(problem, points)
+            cut = Cut(problem, near)
+            searches = [cut.search(near)]
+        at, ends = searches[0][0], tuple(end for _, end in searches)
+        return _finished(cut, at, ends, [_other(problem, at.shared) - at.shared, *moved], said)
 
 
-def _enough(problem: Problem) -> list[Problem]:
-    """The windows.
+class Point(NamedTuple):
+    """Values of all unknowns, scaled as in :class:`Problem`."""
 
-    Raises:
-        UsageError: there are too few for the unknowns.
-    """
-    cut, p = windowed(problem), len(problem.unknowns)
-    if len(cut) < FEWEST * p:
-        raise UsageError(
-            f"method windows: {len(cut)} windows of {window_of(problem):g} s are too few for {p} unknowns, expected at "
-            f"least {FEWEST * p}: shorter windows (--window) or a longer recording"
-        )
-    return cut
+    shared: Floats  # Shape (p,)
+    starts: Floats  # Angle and velocity at the start of each window, shape (m, 2)
 
 
-def _points(problem: Problem, cut: list[Problem], values: Sequence[Floats]) -> list[tuple[Point, list[Floats]]]:
-    """Beginnings of the searches that are carried to their ends, with the weights of the samples."""
-    begun = begun_at(cut, values[0])
-    weights = weights_of(cut, begun)
-    points = [replace(begun, shared=z) for z in values]
-    if len(points) > REFINED:  # most searches are only begun
-        costs = [search(problem, cut, point, weights, SHORT)[1].cost for point in points]
-        points = [points[i] for i in np.argsort(costs, kind="stable")[:REFINED]]
-    return [(point, weights) for point in points]
+class Window(NamedTuple):
+    """One window at a point: what it adds to the normal equations once its start is eliminated."""
+
+    errors: Floats  # Of its samples in standard deviations, shape (m,)
+    shared: Floats  # Derivatives of what is shown to the shared unknowns, shape (m, p)
+    inverse: Floats  # Pseudo-inverse of the derivatives to the start, shape (2, m)
+    own: Floats  # Derivatives to the start, shape (m, 2)
+
+    @property
+    def cost(self) -> float:
+        """Weighted sum of squares."""
+        return float(self.errors @ self.errors)
+
+    def projected(self) -> tuple[Floats, Floats]:
+        """Errors and derivatives beside what the start takes up."""
+        errors = self.errors - self.own @ (self.inverse @ self.errors)
+        return errors, self.shared - self.own @ (self.inverse @ self.shared)
+
+
+class Cut:
+    """The records of a problem in windows, weighted at shared unknowns and at the starts where they were seen."""
+
+    def __init__(self, problem: Problem, shared: Floats) -> None:
+        length = max(round(window_of(problem) / problem.bench.timing.sample_time), SHORTEST)
+        asked = replace(problem.asked, nuisances=(*problem.asked.nuisances, *START))
+        self.problem = problem
+        self.spans = [span for i in range(len(problem.records)) for span in _spans(problem, i, length)]
+        if not self.spans:
+            raise UsageError(f"method windows: no window of {length} periods has {SHORTEST} samples: expected longer")
+        self.windows = [replace(problem, asked=asked, records=(_window(problem, span),)) for span in self.spans]
+        self.begun = Point(shared, np.array([window.nominal()[-len(START) :] for window in self.windows]))
+        self.weights = [
+            window.weights(np.append(shared, start))[0]
+            for window, start in zip(self.windows, self.begun.starts, strict=True)
+        ]
+
+    def searches(self, values: Sequence[Floats]) -> list[tuple[Point, End]]:
+        """Searches from shared unknowns, best first; of several most are only begun.
+
+        Raises:
+            UsageError: there are too few windows for the unknowns.
+        """
+        p = len(self.problem.unknowns)
+        if len(self.windows) < FEWEST * p:
+            raise UsageError(
+                f"method windows: {len(self.windows)} windows of {window_of(self.problem):g} s are too few for {p} "
+                f"unknowns, expected at least {FEWEST * p}: shorter windows (--window) or a longer recording"
+            )
+        if len(values) > REFINED:
+            costs = [self.search(z, SHORT)[1].cost for z in values]
+            values = [values[i] for i in np.argsort(costs, kind="stable")[:REFINED]]
+        return sorted((self.search(z) for z in values), key=lambda pair: pair[1].cost)
+
+    def search(self, shared: Floats, evaluations: int = EVALUATIONS) -> tuple[Point, End]:
+        """One local search over what the windows share, again from better starts as long as there are any.
+
+        With fewer ``evaluations`` than ``EVALUATIONS`` the search is only begun.
+        """
+        at, end = self._descended(self.begun._replace(shared=shared), evaluations)
+        total = end.evaluations
+        for _ in range(RESTARTS if evaluations >= EVALUATIONS else 0):
+            again, lower = self._descended(self.restarted(at), evaluations)
+            total += lower.evaluations
+            better = lower.cost < (1.0 - RESTARTED) * end.cost
+            if lower.cost < end.cost:
+                at, end = again, lower
+            if not better:
+                break
+        return at, replace(end, start=tuple((shared * self.problem.units).tolist()), evaluations=total)
+
+    def _descended(self, begun: Point, evaluations: int) -> tuple[Point, End]:
+        at = begun
+
+        def residuals(shared: Floats) -> tuple[Floats, Floats]:
+            nonlocal at
+            at, windows = self.settled(at._replace(shared=shared))
+            parts = [window.projected() for window in windows]
+            return np.concatenate([errors for errors, _ in parts]), -np.concatenate([columns for _, columns in parts])
+
+        shared, end = minimise(self.problem, begun.shared, residuals, evaluations)
+        return self.settled(at._replace(shared=shared))[0], end
+
+    def restarted(self, at: Point) -> Point:
+        """Each window at the better one of its start and of where it was seen to start, parameters unchanged.
+
+        A window may have come to stick, or to move where the machine stuck, and nothing at its own start leads it back.
+        """
+        fresh, windows = self.settled(Point(at.shared, self.begun.starts))
+        better = np.array([new.cost < old.cost for old, new in zip(self.linearised(at), windows, strict=True)])
+        return Point(at.shared, np.where(better[:, None], fresh.starts, at.starts))
+
+    def linearised(self, at: Point) -> list[Window]:
+        """Contribution of each window at a point."""
+        return [self._linearised(i, at.shared, start) for i, start in enumerate(at.starts)]
+
+    def _linearised(self, i: int, shared: Floats, start: Floats) -> Window:
+        window, root, z = self.windows[i], self.weights[i], np.append(shared, start)
+        said, counts = window.predict(z, 0), root.ravel() > 0.0
+        errors = (np.nan_to_num(window.records[0].samples - said.shown) * root).ravel()[counts]
+        rows = (said.sensitivities * root[:, None]).transpose(0, 2, 1).reshape(-1, len(z))[counts] / window.scale(z)
+        own = rows[:, -len(START) :]
+        lengths = np.linalg.norm(own, axis=0)
+        unit = np.where(lengths > 0.0, lengths, 1.0)
+        inverse = np.linalg.pinv(own / unit, rcond=_LOST) / unit[:, None]
+        return Window(errors, rows[:, : -len(START)], inverse, own)
+
+    def settled(self, at: Point) -> tuple[Point, list[Window]]:
+        """The starts moved to where they fit best, the shared unknowns as they are; and the windows there."""
+        found = [self._settled(i, at.shared, start) for i, start in enumerate(at.starts)]
+        return Point(at.shared, np.array([start for start, _ in found])), [window for _, window in found]
+
+    def _settled(self, i: int, shared: Floats, start: Floats) -> tuple[Floats, Window]:
+        """Start of one window after damped Gauss-Newton steps, none of which raises the squares.
+
+        Near rest a step may be far too long: what friction holds hardly tells its start.
+        """
+        window = self._linearised(i, shared, start)
+        for _ in range(SETTLED):
+            step = window.inverse @ window.errors
+            for _ in range(HALVINGS):
+                trial = self._linearised(i, shared, start + step)
+                if trial.cost <= window.cost:
+                    break
+                step = 0.5 * step
+            else:
+                break
+            gained = window.cost - trial.cost
+            start, window = start + step, trial
+            if gained <= STILL * window.cost:
+                break
+        return start, window
+
+    def residuals(self, at: Point) -> Iterator[tuple[Span, Floats, Floats]]:
+        """Span, errors of the samples [rad, rad/s] and their weights of each window, shapes (n, 2)."""
+        for window, start, span, root in zip(self.windows, at.starts, self.spans, self.weights, strict=True):
+            shown = window.predict(np.append(at.shared, start), 0).shown
+            yield span, window.records[0].samples - shown, root
+
+    @property
+    def follows(self) -> list[bool]:
+        """True for each window that begins where the one before it ends."""
+        return [False, *(a[0] == b[0] and a[2] == b[1] for a, b in pairwise(self.spans))]
 
 
 class _Candidate(NamedTuple):
@@ -127,7 +248,7 @@ class _Candidate(NamedTuple):
     follows: list[bool]
 
 
-def _chosen(problem: Problem, starts: int, seed: int) -> tuple[Problem, Floats, tuple[Floats, ...], tuple[str, ...]]:
+def _chosen(problem: Problem, points: Sequence[Floats]) -> tuple[Problem, Floats, tuple[Floats, ...], tuple[str, ...]]:
     """Length of the windows and course of the command that the records choose.
 
     Returns:
@@ -137,10 +258,7 @@ def _chosen(problem: Problem, starts: int, seed: int) -> tuple[Problem, Floats, 
     lengths = [window_of(problem)] if window_of(problem) else _lengths(problem)
     courses = (course_of(problem),) if course_of(problem) else (HELD, LINEAR)
     first = _with(problem, lengths[len(lengths) // 2], courses[0])
-    cut = _enough(first)
-    points = _points(first, cut, start_points(first, starts, seed))
-    searches = (search(first, cut, *point) for point in points)
-    shared = min(searches, key=lambda pair: pair[1].cost)[0].shared
+    shared = Cut(first, points[0]).searches(points)[0][0].shared
     found = [_candidate(_with(problem, length, courses[0]), shared) for length in lengths]
     best = min(range(len(found)), key=lambda i: _uncertainty(found, i))
     said = []
@@ -177,18 +295,15 @@ def _with(problem: Problem, window: float, between: str) -> Problem:
 
 def _candidate(problem: Problem, shared: Floats) -> _Candidate:
     """Estimate that windows lead to from shared unknowns that are near."""
-    cut = windowed(problem)
-    begun = begun_at(cut, shared)
-    weights = weights_of(cut, begun)
-    _, windows = settled(cut, begun, weights)
+    cut = Cut(problem, shared)
+    _, windows = cut.settled(cut.begun)
     information, scores, scale = _sums(problem, shared, windows)
     spectrum = Spectrum(information)
     step = np.where(spectrum.lost, 0.0, np.linalg.pinv(information, hermitian=True) @ scores.sum(axis=0)) * scale
     parts = [(errors - columns @ step, columns) for errors, columns in (window.projected() for window in windows)]
     costs = np.array([float(errors @ errors) for errors, _ in parts])
     left = np.array([columns.T @ errors for errors, columns in parts]) * scale
-    follows = follows_on(cut)
-    return _Candidate(problem, shared + step, by_windows(information, left, follows), scale, costs, follows)
+    return _Candidate(problem, shared + step, by_windows(information, left, cut.follows), scale, costs, cut.follows)
 
 
 def _uncertainty(found: Sequence[_Candidate], i: int) -> float:
@@ -214,10 +329,7 @@ def _other(problem: Problem, shared: Floats) -> Floats:
     """The shared unknowns from windows of another length: longer ones, or shorter where those would be too few."""
     longer, shorter = (_with(problem, window_of(problem) * f, course_of(problem)) for f in (OTHER, 1.0 / OTHER))
     enough = FEWEST * len(shared) * window_of(longer) <= _seconds(problem)
-    cut = windowed(longer if enough else shorter)
-    begun = begun_at(cut, shared)
-    at, _ = search(problem, cut, begun, weights_of(cut, begun))
-    return at.shared
+    return Cut(longer if enough else shorter, shared).search(shared)[0].shared
 
 
 def _seconds(problem: Problem) -> float:
@@ -230,16 +342,14 @@ def predict_windows(problem: Problem, values: Floats) -> tuple[float, float, int
     Returns:
         Root mean square of the angle's error [rad], χ² of the samples, and its degrees of freedom.
     """
-    cut = windowed(problem)
-    begun = begun_at(cut, values / problem.units)
-    weights = weights_of(cut, begun)
-    at = restarted(cut, settled(cut, begun, weights)[0], begun, weights)
+    cut = Cut(problem, values / problem.units)
+    at = cut.restarted(cut.settled(cut.begun)[0])
     squares, samples, chi2, freedom = 0.0, 0, 0.0, 0
-    for window, z, root in zip(cut, at.all(), weights, strict=True):
-        record = window.records[0]
-        errors = (record.samples - window.predict(z, 0).shown)[record.measured]
+    for _, found, root in cut.residuals(at):
+        measured = np.isfinite(found).all(axis=1)
+        errors = found[measured]
         squares, samples = squares + float(errors[:, 0] @ errors[:, 0]), samples + len(errors)
-        chi2 += float(np.sum((errors * root[record.measured]) ** 2))
+        chi2 += float(np.sum((errors * root[measured]) ** 2))
         freedom += int((root > 0.0).sum()) - len(START)
     return math.sqrt(squares / samples), chi2, freedom
 
@@ -253,74 +363,40 @@ def _sums(problem: Problem, shared: Floats, windows: Sequence[Window]) -> tuple[
     return information, np.array([columns.T @ errors for errors, columns in parts]) * scale, scale
 
 
-def _finished(
-    problem: Problem,
-    cut: Sequence[Problem],
-    at: Point,
-    weights: Sequence[Floats],
-    ends: tuple[End, ...],
-    moved: Sequence[Floats],
-    said: tuple[str, ...],
-) -> Estimate:
+def _finished(cut: Cut, at: Point, ends: tuple[End, ...], moved: Sequence[Floats], said: tuple[str, ...]) -> Estimate:
     """Estimate of what the windows share, with its information, covariance and validation."""
-    information, scores, scale = _sums(problem, at.shared, linearised(cut, at, weights))
+    problem = cut.problem
+    information, scores, scale = _sums(problem, at.shared, cut.linearised(at))
     changes = [change / scale for change in moved]
-    covariance = by_windows(information, scores, follows_on(cut))
+    covariance = by_windows(information, scores, cut.follows)
+    residuals = tuple(np.full(record.samples.shape, np.nan) for record in problem.records)
+    for (number, begin, end), errors, root in cut.residuals(at):
+        residuals[number][begin:end] = np.where(root > 0.0, errors * root, np.nan)
     return Estimate(
         problem.solved(at.shared),
         at.shared,
         information=information,
         prior=None,
         sandwich=covariance + sum((np.outer(c, c) for c in changes), np.zeros_like(covariance)),
-        validation=_validated(cut, at, weights),
+        validation=_validated(cut, at),
         ends=ends,
-        residuals=_residuals(problem, cut, at, weights),
+        residuals=residuals,
         method="windows",
-        caveats=(*said, f"each of the {len(cut)} windows of {window_of(problem):g} s has a start of its own"),
+        caveats=(
+            *said,
+            f"each of the {len(cut.windows)} windows of {window_of(problem):g} s has a start of its own",
+        ),
     )
 
 
-def _validated(cut: Sequence[Problem], at: Point, weights: Sequence[Floats]) -> ModelValidation:
+def _validated(cut: Cut, at: Point) -> ModelValidation:
     """Tests of the model on windows spread over the records."""
-    count = len(cut)
-    few_enough = max(JUDGED // len(cut[0].records[0].currents), 2)
+    count = len(cut.windows)
+    few_enough = max(JUDGED // len(cut.windows[0].records[0].currents), 2)
     chosen = sorted({round(k) for k in np.linspace(0, count - 1, min(count, few_enough)).tolist()})
-    few = replace(cut[0], records=tuple(cut[i].records[0] for i in chosen))
-    z, roots = np.concatenate([at.shared, at.starts[chosen].T.ravel()]), [weights[i] for i in chosen]
+    few = replace(cut.windows[0], records=tuple(cut.windows[i].records[0] for i in chosen))
+    z, roots = np.concatenate([at.shared, at.starts[chosen].T.ravel()]), [cut.weights[i] for i in chosen]
     return examine(few, z, roots, few.marginal(z, roots))
-
-
-def _residuals(problem: Problem, cut: Sequence[Problem], at: Point, weights: Sequence[Floats]) -> tuple[Floats, ...]:
-    """Residuals of each record in standard deviations, NaN where lost or in no window, shape (n, 2)."""
-    found = {record.name: np.full(record.samples.shape, np.nan) for record in problem.records}
-    for window, z, root in zip(cut, at.all(), weights, strict=True):
-        name, begin, end = span_of(window)
-        errors = (window.records[0].samples - window.predict(z, 0).shown) * root
-        found[name][begin:end] = np.where(root > 0.0, errors, np.nan)
-    return tuple(found[record.name] for record in problem.records)
-
-
-@dataclass(frozen=True, eq=False)
-class Window:
-    """One window at a point: what it adds to the normal equations once its start is eliminated."""
-
-    errors: Floats  # Of its samples in standard deviations, shape (m,)
-    shared: Floats  # Derivatives of what is shown to the shared unknowns, shape (m, p)
-    inverse: Floats  # Pseudo-inverse of the derivatives to the start, shape (2, m)
-    own: Floats  # Derivatives to the start, shape (m, 2)
-
-    @property
-    def cost(self) -> float:
-        """Weighted sum of squares."""
-        return float(self.errors @ self.errors)
-
-    def projected(self) -> tuple[Floats, Floats]:
-        """Errors and derivatives beside what the start takes up."""
-        return self._beside(self.errors), self._beside(self.shared)
-
-    def _beside(self, columns: Floats) -> Floats:
-        result: Floats = columns - self.own @ (self.inverse @ columns)
-        return result
 
 
 def window_of(problem: Problem) -> float:
@@ -335,48 +411,48 @@ def course_of(problem: Problem) -> str:
     return problem.asked.between or (HELD if machine is None or machine.between == HELD else "")
 
 
-def windowed(problem: Problem) -> list[Problem]:
-    """The windows, each as a problem of its own with the angle and the velocity at its start as the last unknowns."""
-    t_s = problem.bench.timing.sample_time
-    length = max(round(window_of(problem) / t_s), SHORTEST)
-    asked = replace(problem.asked, nuisances=(*problem.asked.nuisances, *START))
-    derived = problem.plant.instruments.observer_bandwidth > 0.0
-    records = [_between(record) if course_of(problem) == LINEAR else record for record in problem.records]
-    cut = [window for record in records for window in _cut(record, length, t_s if derived else 0.0)]
-    if not cut:
-        raise UsageError(f"method windows: no window of {length} periods has {SHORTEST} samples: expected longer ones")
-    return [Problem(problem.bench, problem.plant, asked, (window,)) for window in cut]
+Span = tuple[int, int, int]
+"""Number of a record, first period of a window in it, and the one after its last."""
 
 
-def _between(record: Experiment) -> Experiment:
-    """The record with commands that go straight from stamp to stamp, of one in which they are held."""
-    following = np.append(record.currents[1:], record.currents[-1:])
-    return replace(record, currents=0.5 * (record.currents + following))
+def _spans(problem: Problem, number: int, length: int) -> Iterator[Span]:
+    """The windows of a record that have enough samples."""
+    record = problem.records[number]
+    for begin in range(0, record.periods, length):
+        end = min(begin + length, record.periods)
+        enough = record.measured[begin:end].sum() >= min(SHORTEST, length)
+        if enough and (end - begin) * 2 >= length:
+            yield number, begin, end
 
 
-def _cut(record: Experiment, length: int, t_s: float) -> list[Experiment]:
-    """The windows of a record; one that begins with lost samples starts from the last that was received.
+def _window(problem: Problem, span: Span) -> Experiment:
+    """One window; one that begins with lost samples starts from the last that was received.
 
-    An observer's velocity lags. Where it is one, and ``t_s`` is not 0, a window starts with the slope of a parabola
-    through the angles around its start: a window that starts too slow may stick where the machine did not, and then
-    nothing says which way to go.
+    A command that goes straight from stamp to stamp is the mean of both. An observer's velocity lags: instead of it a
+    window starts with the slope of a parabola through the angles around its start. One that starts too slow may stick
+    where the machine did not, and then nothing says which way to go.
     """
-    found, angle, velocity = [], record.angle, record.velocity
-    every = np.concatenate([[record.angle], record.samples[:, 0]])
-    for begin in range(0, len(record.currents), length):
-        end = min(begin + length, len(record.currents))
-        samples = record.samples[begin:end]
-        received = np.flatnonzero(np.isfinite(samples).all(axis=1))
-        if len(received) >= min(SHORTEST, length) and (end - begin) * 2 >= length:
-            late = None if record.late is None else record.late[begin:end]
-            before = float(record.currents[begin - 1]) if begin else record.before
-            currents = record.currents[begin:end]
-            name = f"{record.name}[{begin}:{end}]"
-            speed = _slope(every, begin, t_s) if t_s else velocity
-            found.append(Experiment(name, currents, samples, angle, speed, 0.0, False, late, before=before))
-        if len(received):
-            angle, velocity = samples[received[-1]].tolist()
-    return found
+    number, begin, end = span
+    record = problem.records[number]
+    currents = record.currents
+    if course_of(problem) == LINEAR:
+        currents = 0.5 * (currents + np.append(currents[1:], currents[-1:]))
+    received = np.flatnonzero(record.measured[:begin])
+    angle, velocity = record.samples[received[-1]].tolist() if len(received) else (record.angle, record.velocity)
+    if problem.plant.instruments.observer_bandwidth > 0.0:
+        angles = np.concatenate([[record.angle], record.samples[:, 0]])
+        velocity = _slope(angles, begin, problem.bench.timing.sample_time)
+    return Experiment(
+        record.name,
+        currents[begin:end],
+        record.samples[begin:end],
+        angle,
+        velocity,
+        0.0,
+        False,
+        None if record.late is None else record.late[begin:end],
+        before=float(currents[begin - 1]) if begin else record.before,
+    )
 
 
 def _slope(angles: Floats, at: int, t_s: float) -> float:
@@ -386,123 +462,6 @@ def _slope(angles: Floats, at: int, t_s: float) -> float:
     if len(near) < 3:
         return 0.0
     return float(np.polyfit((near - at) * t_s, angles[near], 2)[1])
-
-
-@dataclass(frozen=True, eq=False)
-class Point:
-    """Values of all unknowns, scaled as in :class:`Problem`."""
-
-    shared: Floats  # Shape (p,)
-    starts: Floats  # Angle and velocity at the start of each window, shape (m, 2)
-
-    def all(self) -> list[Floats]:
-        """The unknowns of each window's problem."""
-        return [np.concatenate([self.shared, start]) for start in self.starts]
-
-
-def begun_at(cut: Sequence[Problem], shared: Floats) -> Point:
-    """Each window at the start where it was seen."""
-    return Point(shared, np.array([window.nominal()[-len(START) :] for window in cut]))
-
-
-def weights_of(cut: Sequence[Problem], at: Point) -> list[Floats]:
-    """Inverse standard deviations of the samples of each window, zero where they do not count, shape (n, 2)."""
-    return [window.weights(z)[0] for window, z in zip(cut, at.all(), strict=True)]
-
-
-def linearised(cut: Sequence[Problem], at: Point, weights: Sequence[Floats]) -> list[Window]:
-    """Contribution of each window at a point."""
-    found = []
-    for window, z, root in zip(cut, at.all(), weights, strict=True):
-        said = window.predict(z, 0)
-        counts = root.ravel() > 0.0
-        errors = (np.nan_to_num(window.records[0].samples - said.shown) * root).ravel()[counts]
-        rows = (said.sensitivities * root[:, None]).transpose(0, 2, 1).reshape(-1, len(z))[counts] / window.scale(z)
-        shared, own = rows[:, : -len(START)], rows[:, -len(START) :]
-        lengths = np.linalg.norm(own, axis=0)
-        unit = np.where(lengths > 0.0, lengths, 1.0)
-        found.append(Window(errors, shared, np.linalg.pinv(own / unit, rcond=_LOST) / unit[:, None], own))
-    return found
-
-
-def settled(cut: Sequence[Problem], at: Point, weights: Sequence[Floats]) -> tuple[Point, list[Window]]:
-    """The starts moved to where they fit best, the shared unknowns as they are; and the windows there."""
-    found = [
-        _settled(window, at.shared, start, root) for window, start, root in zip(cut, at.starts, weights, strict=True)
-    ]
-    return Point(at.shared, np.array([start for start, _ in found])), [window for _, window in found]
-
-
-def _settled(problem: Problem, shared: Floats, start: Floats, weights: Floats) -> tuple[Floats, Window]:
-    """Start of one window after damped Gauss-Newton steps, none of which raises the squares.
-
-    Near rest a step may be far too long: what friction holds hardly tells its start.
-    """
-
-    def at(start: Floats) -> Window:
-        return linearised([problem], Point(shared, start[None]), [weights])[0]
-
-    window = at(start)
-    for _ in range(SETTLED):
-        step = window.inverse @ window.errors
-        for _ in range(HALVINGS):
-            trial = at(start + step)
-            if trial.cost <= window.cost:
-                break
-            step = 0.5 * step
-        else:
-            break
-        gained = window.cost - trial.cost
-        start, window = start + step, trial
-        if gained <= STILL * window.cost:
-            break
-    return start, window
-
-
-def search(
-    problem: Problem, cut: Sequence[Problem], begun: Point, weights: Sequence[Floats], evaluations: int = EVALUATIONS
-) -> tuple[Point, End]:
-    """One local search over what the windows share, again from better starts as long as there are any.
-
-    With fewer ``evaluations`` than ``EVALUATIONS`` the search is only begun.
-    """
-    at, end = _descended(problem, cut, begun, weights, evaluations)
-    total = end.evaluations
-    for _ in range(RESTARTS if evaluations >= EVALUATIONS else 0):
-        again, lower = _descended(problem, cut, restarted(cut, at, begun, weights), weights, evaluations)
-        total += lower.evaluations
-        better = lower.cost < (1.0 - RESTARTED) * end.cost
-        if lower.cost < end.cost:
-            at, end = again, lower
-        if not better:
-            break
-    origin = tuple((begun.shared * problem.units).tolist())
-    return at, replace(end, start=origin, evaluations=total)
-
-
-def _descended(
-    problem: Problem, cut: Sequence[Problem], begun: Point, weights: Sequence[Floats], evaluations: int
-) -> tuple[Point, End]:
-    at = begun
-
-    def residuals(shared: Floats) -> tuple[Floats, Floats]:
-        nonlocal at
-        at, windows = settled(cut, replace(at, shared=shared), weights)
-        parts = [window.projected() for window in windows]
-        return np.concatenate([errors for errors, _ in parts]), -np.concatenate([columns for _, columns in parts])
-
-    shared, end = minimise(problem, begun.shared, residuals, evaluations)
-    return settled(cut, replace(at, shared=shared), weights)[0], end
-
-
-def restarted(cut: Sequence[Problem], at: Point, begun: Point, weights: Sequence[Floats]) -> Point:
-    """Each window at the better one of its start and of where it was seen to start, parameters unchanged.
-
-    A window may have come to stick, or to move where the machine stuck, and nothing at its own start leads it back.
-    """
-    fresh, windows = settled(cut, Point(at.shared, begun.starts), weights)
-    better = np.array([new.cost < old.cost for old, new in zip(linearised(cut, at, weights), windows, strict=True)])
-    return Point(at.shared, np.where(better[:, None], fresh.starts, at.starts))
 
 
 def by_windows(information: Floats, scores: Floats, follows: Sequence[bool]) -> Floats:
@@ -540,16 +499,3 @@ def scatter(scores: Floats, follows: Sequence[bool]) -> Floats:
         cross = scores[lag:][together].T @ scores[:-lag][together]
         meat = meat + (1.0 - lag / (reach + 1.0)) * (cross + cross.T)
     return meat
-
-
-def span_of(window: Problem) -> tuple[str, int, int]:
-    """Name of the record that a window is of, and its first period and the one after its last."""
-    name, _, span = window.records[0].name.removesuffix("]").rpartition("[")
-    begin, end = map(int, span.split(":"))
-    return name, begin, end
-
-
-def follows_on(cut: Sequence[Problem]) -> list[bool]:
-    """True for each window that begins where the one before it ends."""
-    spans = [span_of(window) for window in cut]
-    return [False, *(a[0] == b[0] and a[2] == b[1] for a, b in pairwise(spans))]

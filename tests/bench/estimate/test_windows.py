@@ -10,7 +10,7 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import EstimationProblem
-from emb_bench.estimate.windows import begun_at, by_windows, linearised, predict_windows, weights_of, windowed
+from emb_bench.estimate.windows import Cut, by_windows, predict_windows
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.recordings.map_file import parse_map
 from emb_bench.recordings.readers import Column, recorded
@@ -99,9 +99,8 @@ def test_a_window_that_begins_at_rest_is_predicted_from_a_start_that_does_not_di
     true = {"T_c": 20.0 * TRAVEL, "f_v": 200.0 * TRAVEL**2, "J": 95.0 * TRAVEL**2, "current_offset": -3.0 * TRAVEL}
     values = np.array([true[u.name] for u in problem.unknowns])
     error, chi2, _ = predict_windows(problem, values)
-    cut = windowed(problem)
-    begun = begun_at(cut, values / problem.units)
-    seen = linearised(cut, begun, weights_of(cut, begun))
+    cut = Cut(problem, values / problem.units)
+    seen = cut.linearised(cut.begun)
     assert chi2 <= seen[0].cost
     assert error * TRAVEL < 150e-6
 
@@ -109,7 +108,7 @@ def test_a_window_that_begins_at_rest_is_predicted_from_a_start_that_does_not_di
 def test_eliminating_the_starts_gives_the_information_of_all_unknowns_together() -> None:
     e = fitted(record(Machine(), 6.0))
     problem = make_problem(e.bench, e.plant, e.records, ASKED)
-    cut = windowed(problem)
+    cut = Cut(problem, e.z).windows
     whole = make_problem(e.bench, e.plant, [w.records[0] for w in cut], cut[0].asked)
     z = whole.nominal()
     z[:4] = e.values / whole.units[:4]
