@@ -83,7 +83,7 @@ def _graph(module: nn.Module) -> onnx.ModelProto:
             verbose=False,
         )
     assert program is not None  # it is None only for the old exporter
-    model = program.model_proto
+    model: onnx.ModelProto = program.model_proto
     graph = model.graph
     del graph.value_info[:]
     parts: list[Any] = [model, graph, *graph.node, *graph.initializer, *graph.input, *graph.output]
