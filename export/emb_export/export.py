@@ -75,7 +75,9 @@ def _export(arguments: argparse.Namespace) -> str:
     if is_training and arguments.bench:
         raise UsageError("--bench: a training's actor is for the bench that it was trained on; leave it out")
     if path is None and not is_training:
-        raise UsageError("--out: expected a file to write to")
+        raise UsageError(
+            f"--out: expected a file to write to; only the folder of a training has one, and {source} is none"
+        )
     if is_training:
         from emb_export.network import network_file
 

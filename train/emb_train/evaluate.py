@@ -22,7 +22,7 @@ from emb_bench.information.symmetric import Floats
 from emb_bench.numbers import Score
 from emb_bench.report.text import WIDTH, Table
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.errors import PolicyRefusedError, UsageError, near
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
 from emb_train.closed_loop import EVERYTHING, Conditions
@@ -99,10 +99,9 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
         following = Following(kept, bench, bench.range_set(task.ranges), sticks=sticks)
         return Subject(given, bench, following, task.ranges, _other_shield(task.shield_ranges, bench))
     if not path.is_dir():
-        raise UsageError(
-            f"{given}: no such folder, and no reference of that name; there are: {ACTOR}, "
-            f"{', '.join(reference_names())}"
-        )
+        names = (ACTOR, *reference_names())
+        there = f"there are: {', '.join(names)}{near(given, names)}"
+        raise UsageError(f"{given}: no such folder, and no reference of that name; {there}")
     if bench_file is not None:
         raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
     trained = load_training(path)

@@ -13,7 +13,7 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, near
 
 FILES = resources.files("emb_train")
 WIDTH = 118  # Of a help text's lines
@@ -46,7 +46,8 @@ def preset_record(name: str) -> dict[str, Any]:
     """
     presets = _file()["preset"]
     if name not in presets:
-        raise UsageError(f"no preset is called '{name}'; there are: {', '.join(sorted(presets))}")
+        there = f"there are: {', '.join(sorted(presets))}{near(name, presets)}"
+        raise UsageError(f"no preset is called '{name}'; {there}")
     own = dict(presets[name]["ppo"])
     return {**presets[name], "preset": name, "ppo": _file()["hyper_parameters"][own.pop("base")] | own}
 

@@ -107,7 +107,9 @@ def read_last(path: Path) -> Earlier:
         return msgspec.json.decode(text, type=_Report).estimate or msgspec.json.decode(text, type=Earlier)
     except OSError as err:
         raise UsageError(f"--last {path}: {err.strerror}") from err
-    except (ValueError, msgspec.MsgspecError, RecursionError) as err:  # also UnicodeDecodeError
+    except UnicodeDecodeError as err:
+        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: not UTF-8 text") from err
+    except (ValueError, msgspec.MsgspecError, RecursionError) as err:
         raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: {_printable(str(err))}") from err
 
 

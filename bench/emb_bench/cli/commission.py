@@ -74,9 +74,12 @@ def main(argv: list[str] | None = None) -> int:
             from emb_bench.commission.commissioning import Commissioning, emb_run
         except ImportError as err:
             raise UsageError(f"{err}; pip install 'emb-excite[bench]'") from err
+        each = options(args)
+        if "--confirm" in each and (sys.stdin is None or not sys.stdin.isatty()):
+            raise UsageError("--confirm: there is nobody to ask, standard input is no terminal; --yes does not ask")
         try:
             args.folder.mkdir(parents=True, exist_ok=True)
-            result = Commissioning(args.folder, sheet, args.iface, options(args), emb_run, mention).run()
+            result = Commissioning(args.folder, sheet, args.iface, each, emb_run, mention).run()
         except OSError as err:
             raise UsageError(f"{args.folder}: {err.strerror}; expected a folder, made if there is none") from err
         show(as_json(result.document()) if args.json else str(result))

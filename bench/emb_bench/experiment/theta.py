@@ -15,7 +15,7 @@ from emb_bench.logs.log import RunLog
 from emb_bench.sim.simulated_brake import check_near_nominal, parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.config.typed import shown
-from emb_runtime.errors import LogError, UsageError
+from emb_runtime.errors import LogError, UsageError, near
 from emb_runtime.system.input_file import read_text
 
 LOG = "log"  # Name of the last running estimate in the log
@@ -67,9 +67,13 @@ def _from_file(path: str, log: RunLog, bench: Bench) -> tuple[dict[str, float], 
     try:
         return _estimated(json.loads(read_text(path, MAX_JSON_BYTES)), log, bench)
     except OSError as err:
-        raise UsageError(f"--theta: expected nominal, true, name=value or a file; {path}: {err.strerror}") from err
+        hint = near(path, ("log", "nominal", "true"))
+        expected = f"expected log, nominal, true, name=value or a file{hint}"
+        raise UsageError(f"--theta: {expected}; {path}: {err.strerror}") from err
     except UnicodeDecodeError as err:
         raise UsageError(f"{path}: expected JSON: not UTF-8 text") from err
+    except json.JSONDecodeError as err:
+        raise UsageError(f"{path}: expected the JSON of an estimate or a report, and it is no JSON: {err}") from err
     except (ValueError, RecursionError) as err:
         raise UsageError(f"{path}: {err}") from err
 

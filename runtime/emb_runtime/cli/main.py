@@ -140,6 +140,8 @@ def _reporter(page: Path) -> str:
     entries = list(metadata.entry_points(group=VIEWERS, name="report"))
     if not entries:
         raise UsageError("--report: nothing is installed that writes a page; emb_bench does: emb-excite[bench]")
+    if page.suffix not in (".html", ".htm"):
+        raise UsageError(f"--report {page}: expected a name that ends in .html or .htm")
     if not page.absolute().parent.is_dir():
         raise UsageError(f"--report: {page.absolute().parent} is no folder")
     return entries[0].value

@@ -55,5 +55,7 @@ def _part(name: str, percent: str) -> float:
     except ValueError:
         part = -1.0
     if not 0.0 < part <= 1.0:
-        raise UsageError(f"--stop-when: {name}: expected more than 0 and at most 100, as in {name}=1%, got '{percent}'")
+        raise UsageError(
+            f"--stop-when: {name}: expected a percentage above 0 % up to 100 %, as in {name}=1%, got '{percent}'"
+        )
     return part

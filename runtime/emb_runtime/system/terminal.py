@@ -128,7 +128,8 @@ class Parser(argparse.ArgumentParser):
         """The arguments; ends the program with 2 where they are wrong, with 0 after a ``--help``."""
         found, unknown = self.parse_known_args(args, namespace)
         if unknown:
-            self.error(f"no option or argument {unknown[0]}{near(unknown[0].partition('=')[0], self._known())}")
+            kind = "option" if unknown[0].startswith("-") else "argument"
+            self.error(f"unexpected {kind} {unknown[0]}{near(unknown[0].partition('=')[0], self._known())}")
         return found
 
     def error(self, message: str) -> NoReturn:
