@@ -121,18 +121,6 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
         return found
 
 
-class Units(msgspec.Struct, frozen=True, kw_only=True):
-    """Units in which results are shown; empty for those of the recording."""
-
-    angle: Annotated[
-        Literal["", "rad", "deg", "rev", "m", "mm", "um"], Meta(description="one of rad, deg, rev, m, mm, um")
-    ] = ""
-    command: Annotated[
-        Literal["", "A", "mA", "V", "1", "Nm", "mNm", "N", "kN"],
-        Meta(description="one of A, mA, V, 1, Nm, mNm, N, kN"),
-    ] = ""
-
-
 class Machine(msgspec.Struct, frozen=True, kw_only=True):
     """Known facts about the machine."""
 
@@ -142,7 +130,6 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True):
     window: Annotated[float, Meta(ge=1e-3, le=3600.0)] = 0.0  # [s]; 0: the recording chooses
     nuisances: tuple[str, ...] = ()
     by_direction: tuple[Literal["viscous_asymmetry"], ...] = ()
-    units: Units = Units()
 
     def __post_init__(self) -> None:
         """Check that the parameters make a machine."""
@@ -216,14 +203,6 @@ class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):
                 "signals.command.unit",
                 f"a command in {unit} needs [machine] k_m, known or guessed, in N·m per {unit}",
             )
-        shown = machine.units
-        if shown.command and (shown.command in CURRENT) != (unit in CURRENT):
-            raise FieldError(
-                "machine.units.command",
-                f"{unit} is what was commanded, and no conversion makes {shown.command} of it",
-            )
-        if not machine.travel and (shown.angle in LENGTH or shown.command in FORCE):
-            raise FieldError("machine.units", "lengths and forces need [machine] travel, in m per rad of the motor")
 
     @property
     def command_unit(self) -> str:
@@ -238,9 +217,8 @@ class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def shown(self) -> dict[str, str]:
-        """Units in which results are shown: those of the recording where the map does not give others."""
-        units = self.machine.units
-        return {"angle": units.angle or self.signals.angle.unit, "command": units.command or self.command_unit}
+        """Units in which results are shown: those of the recording."""
+        return {"angle": self.signals.angle.unit, "command": self.command_unit}
 
     @property
     def time_unit(self) -> float:

@@ -63,6 +63,20 @@ class Run:
         except OSError as err:
             raise LogError(f"{self.log.path}: {err.strerror}") from err
 
+    @cached_property
+    def cycles(self) -> ActiveCycles | None:
+        """Cycles of the control loop; None if the log has none, as a recording of others."""
+        try:
+            cycles = None if self.log.imported else ActiveCycles(self)
+        except LogError:
+            return None
+        return cycles if cycles is not None and len(cycles.time) else None
+
+    @cached_property
+    def after(self) -> StopSamples | None:
+        """The samples after the last cycle of a stopped run; None if it was not stopped, or its log has none."""
+        return stop_samples(self)
+
     @property
     def stop(self) -> Stop | None:
         """Its end, if the run was stopped."""
@@ -266,7 +280,7 @@ class StopSamples:
 
 
 def stop_samples(run: Run) -> StopSamples | None:
-    """The samples after the last cycle of a stopped run; None if it was not stopped, or its log has none."""
+    """What :attr:`Run.after` has."""
     if run.stop is None:
         return None
     try:

@@ -120,7 +120,7 @@ def _evidence(study: Study) -> Iterator[str]:
     found: list[Table | None] = [
         *(tables.growth_path(study), tables.models(study), tables.errors(study), tables.budget(study)),
         *(tables.residual_tests(study), tables.suspects(e), tables.systematic(e), tables.predicted(study)),
-        *(correlation, tables.minima(study)),
+        correlation,
     ]
     for table in found:
         yield from [] if table is None else table.text("  ")

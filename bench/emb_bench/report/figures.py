@@ -36,9 +36,9 @@ class Panel(NamedTuple):
     shows: str  # Description for who cannot see it
 
 
-def excitation(run: Run, cycles: ActiveCycles, after: StopSamples | None) -> Panel:
+def excitation(run: Run, cycles: ActiveCycles) -> Panel:
     """Current as requested by the policy, sent and applied; below, the reasons for their difference over time."""
-    limit, period = run.bench.limits.current, run.bench.timing.sample_time
+    limit, period, after = run.bench.limits.current, run.bench.timing.sample_time, run.after
     held = [reason for reason, where in cycles.reasons.items() if where.any()]
 
     def draw(axes: Any) -> None:
@@ -51,7 +51,7 @@ def excitation(run: Run, cycles: ActiveCycles, after: StopSamples | None) -> Pan
         if cycles.reasons[Reason.CLIPPED].any():
             above.step(time, cycles.clipped, where="post", color=COLOURS[4], label="clipped", linewidth=1.6)
         above.step(time, cycles.sent, where="post", color=COLOURS[0], label="sent after the shield", linewidth=1.3)
-        if not applied_as_sent(run, cycles) and run.experiment is not None:
+        if not applied_as_sent(run) and run.experiment is not None:
             applied = np.append(run.experiment.currents, np.nan)
             at = 1e3 * period * np.arange(len(applied))
             above.step(at, applied, where="post", label="applied by the node", **_DOTTED)
@@ -96,6 +96,16 @@ def applied(run: Run, experiment: Experiment) -> Panel:
     return Panel(svg(draw, 1, 1, (PANEL, 2.6)), f"{shown.name.capitalize()} that acted over time")
 
 
+def of_run(run: Run) -> list[Panel]:
+    """Figures of what the brake did."""
+    drawn = motion(run)
+    if run.cycles is not None:
+        drawn.append(excitation(run, run.cycles))
+    elif run.experiment is not None:
+        drawn.append(applied(run, run.experiment))
+    return drawn if run.residuals is None else [*drawn, residuals(run, run.residuals)]
+
+
 def _end(cycles: ActiveCycles) -> float:
     return float(cycles.time.max(initial=0.0))
 
@@ -109,9 +119,10 @@ def _mark_stop(axis: Any, cycles: ActiveCycles, after: StopSamples) -> None:
     axis.annotate("stopped", (at, 0.03), ha=side, va="bottom", fontsize=8.0, color=STOP, **place)
 
 
-def applied_as_sent(run: Run, cycles: ActiveCycles) -> bool:
+def applied_as_sent(run: Run) -> bool:
     """Returns True if the node applied in every period the current sent for it; False if either is unknown in one."""
-    if run.experiment is None:
+    cycles = run.cycles
+    if run.experiment is None or cycles is None:
         return False
     applied = run.experiment.currents
     steps = np.rint(cycles.time / run.bench.timing.sample_time).astype(int)
@@ -132,14 +143,12 @@ def _spans(time: Floats, where: Any, period: float) -> list[tuple[float, float]]
     return spans
 
 
-def motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) -> list[Panel]:
-    """Measured angle and velocity, and what the model predicts at the estimate, with the bench's limits.
-
-    The run has an experiment, or else cycles; ``after`` are the samples after the last cycle of a stopped run.
-    """
-    limits, period = run.bench.limits, run.bench.timing.sample_time
+def motion(run: Run) -> list[Panel]:
+    """Measured angle and velocity, and what the model predicts at the estimate, with the bench's limits."""
+    limits, period, cycles, after = run.bench.limits, run.bench.timing.sample_time, run.cycles, run.after
     if run.experiment is None:
-        assert cycles is not None
+        if cycles is None:
+            return []
         time, measured = cycles.time, np.stack([cycles.angle, cycles.velocity], axis=1)
     else:
         measured = run.experiment.all_samples

@@ -10,8 +10,7 @@ import base64
 import functools
 import hashlib
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -29,36 +28,19 @@ from emb_bench.logs.info import info_document
 from emb_bench.logs.timing import INTERVALS, quantiles
 from emb_bench.numbers import plain, seconds, signed
 from emb_bench.report import figures, sentences, tables
-from emb_bench.report.content import REASONS, ActiveCycles, Content, Run, StopSamples, stop_samples
+from emb_bench.report.content import REASONS, Content, Run
 from emb_bench.report.estimate import document as estimate_document
-from emb_bench.report.figures import Panel
 from emb_bench.report.text import Table
 from emb_bench.report.trend import panels as trend_panels
 from emb_bench.report.trend import table as run_table
 from emb_bench.report.trend import trends
-from emb_runtime.errors import BenchFileError, LogError
+from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.end_stop import end_stop_speed
 
 EVENTS = 200  # Most safety events that are shown; report.json has them all
 LONGEST = 2000  # Characters of an event that are shown; report.json has them all
 SHORT_HASH = 16  # Digits of a hash that are shown where there is no room for all
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
-
-
-@dataclass(frozen=True)
-class View:
-    """Tables and figures of one run, by their names in the template."""
-
-    run: Run
-    prefix: str  # Of the HTML identifiers of its sections; empty if it is the only run
-    cycles: ActiveCycles | None
-    after: StopSamples | None
-    motion: list[Panel]
-    obeyed: bool
-    learnt: dict[str, list[float]]  # Ranges of the parameters, relative to nominal
-    timing: Table | None
-    safety: Safety | None
-    recorded: list[tuple[str, Mapping[str, str]]]  # Entries of the log, by their titles
 
 
 class Safety(NamedTuple):
@@ -72,64 +54,27 @@ class Safety(NamedTuple):
 
 def report_page(content: Content) -> str:
     """The whole report as HTML: the verdict first, then what it rests on; evidence is folded."""
-    several = len(content.runs) > 1
+    study, several = content.shown, len(content.runs) > 1
     # Of an experiment that was cut short no value is used, nor a prediction with it.
-    shown = [replace(run, predicted=None, residuals=None) if content.shown is None else run for run in content.runs]
-    views = [view(run, f"run-{n}-" if several else "") for n, run in enumerate(shown, 1)]
+    runs = [replace(run, predicted=None, residuals=None) if study is None else run for run in content.runs]
     found = trends(content.estimated) if len(content.estimated) > 1 else []
+    correlation, pairs = (None, []) if study is None else tables.correlation(study.estimate)
     return (
         environment()
         .get_template("page.html.j2")
         .render(
             content=content,
-            study=content.shown,
-            views=views,
-            acceptance=tables.acceptance_table(content.acceptance),
-            runs=run_table(content.runs, found) if several else None,
+            study=study,
+            runs=runs,
+            figures_of=functools.cache(figures.of_run),
+            run_table=run_table(content.runs, found) if several else None,
             trends=found,
             trend_panels=trend_panels(found),
             tested=_tested(content),
-            reasons=REASONS,
-            terms=sentences.TERMS,
-            **({} if content.shown is None else _of_study(content.shown)),
+            correlation=correlation,
+            pairs=pairs,
+            profiles=figures.profiles(study.profiles, study.estimate) if study and study.profiles else None,
         )
-    )
-
-
-def _of_study(study: Study) -> dict[str, Any]:
-    """Tables and figures of the estimate, by their names in the template."""
-    e = study.estimate
-    correlation, pairs = tables.correlation(e)
-    checks = (tables.residual_tests(study), tables.suspects(e), tables.systematic(e), tables.predicted(study))
-    return {
-        "parameters": tables.parameters(study),
-        "checks": (*checks, tables.models(study), tables.growth_path(study)),
-        "drifts": tables.drifts(study) if study.drifts else None,
-        "budget": tables.budget(study),
-        "correlation": correlation,
-        "pairs": pairs,
-        "profiles": figures.profiles(study.profiles, e) if study.profiles else None,
-        "minima": tables.minima(study),
-    }
-
-
-def view(run: Run, prefix: str = "") -> View:
-    """Tables and figures of one run."""
-    log = run.log
-    cycles, after = _cycles(run), stop_samples(run)
-    driven = not log.imported
-    attached = {name: hashlib.sha256(data).hexdigest() for name, data in log.attachments.items()}
-    return View(
-        run=run,
-        prefix=prefix,
-        cycles=cycles if driven else None,
-        after=after,
-        motion=_motion(run, cycles, after),
-        obeyed=cycles is not None and figures.applied_as_sent(run, cycles),
-        learnt=last_learnt(log),
-        timing=_intervals(run) if driven else None,
-        safety=_safety(run) if driven else None,
-        recorded=[*log.metadata.items(), ("attached files, SHA-256", attached)],
     )
 
 
@@ -184,28 +129,10 @@ def _drive(run: Run) -> dict[str, str]:
     }
 
 
-def _motion(run: Run, cycles: ActiveCycles | None, after: StopSamples | None) -> list[Panel]:
-    """Figures of what the brake did."""
-    drawn = [] if cycles is None and run.experiment is None else figures.motion(run, cycles, after)
-    if run.log.imported:
-        drawn += [] if run.experiment is None else [figures.applied(run, run.experiment)]
-    elif cycles is not None:
-        drawn.append(figures.excitation(run, cycles, after))
-    return drawn if run.residuals is None else [*drawn, figures.residuals(run, run.residuals)]
-
-
-def _cycles(run: Run) -> ActiveCycles | None:
-    try:
-        cycles = ActiveCycles(run)
-    except LogError:
-        return None
-    return cycles if len(cycles.time) else None
-
-
-def _intervals(run: Run) -> Table | None:
-    """Intervals of the loop; None if no sample was answered."""
+def intervals(run: Run) -> Table | None:
+    """Intervals of the loop; None if no sample was answered, or there was none."""
     t = run.timing
-    if t is None or not len(t.response):
+    if t is None or not len(t.response) or run.log.imported:
         return None
     rows = []
     for key, words in INTERVALS.items():
@@ -217,7 +144,10 @@ def _intervals(run: Run) -> Table | None:
     return Table("Times of the loop, by the stamps in the log", header, rows)
 
 
-def _safety(run: Run) -> Safety:
+def safety(run: Run) -> Safety | None:
+    """Events and the worst that a loss of all commands would do; None of a recording of others."""
+    if run.log.imported:
+        return None
     events = run.log.events
     active = [event.time_ns for event in events if event.code == "ACTIVE"]
     begin = min(active) if active else events[0].time_ns if events else 0
@@ -256,6 +186,13 @@ def environment() -> Environment:
     made.globals |= {
         "METHODS": METHODS,
         "say": sentences,
+        "tables": tables,
+        "reasons": REASONS,
+        "obeyed": figures.applied_as_sent,
+        "learnt_of": last_learnt,
+        "intervals_of": intervals,
+        "safety_of": safety,
+        "digest": lambda data: hashlib.sha256(data).hexdigest(),
         "css": Markup(resources.files("emb_bench.report").joinpath("page.css").read_text(encoding="utf-8")),
     }
     return made

@@ -196,6 +196,12 @@ def suspects(e: Estimate) -> Table | None:
     return Table(title, ["effect", "amount", "sigma", "p"], rows) if rows else None
 
 
+def checks(study: Study) -> list[Table | None]:
+    """Tables behind the verdict on the model."""
+    e = study.estimate
+    return [residual_tests(study), suspects(e), systematic(e), predicted(study), models(study), growth_path(study)]
+
+
 def predicted(study: Study) -> Table | None:
     """Records predicted by an estimate of others."""
     rows = [[h.name, plain(h.ratio, 4), str(h.freedom), chance(h.p_value), answer(h.fits)] for h in study.left_out]
@@ -216,21 +222,6 @@ def correlation(e: Estimate) -> tuple[Table | None, list[str]]:
         f"{labels[j]} and {labels[i]}" for i in range(len(labels)) for j in range(i) if abs(matrix[i][j]) > TRADED_OFF
     ]
     return (Table("Correlation of the estimates", ["", *labels], rows), pairs) if len(labels) > 1 else (None, [])
-
-
-def minima(study: Study) -> Table | None:
-    """Minima where the local searches ended."""
-    rows = [
-        [
-            str(len(group)),
-            f"{group[0].cost:.6g}",
-            str(sum(not end.converged for end in group)),
-            *(plain(group[0].values[i] * study.estimate.shown[i].factor, 5) for i in study.estimate.wanted()),
-        ]
-        for group in study.minima
-    ]
-    header = ["searches", "chi2", "not converged", *(study.estimate.labels[i] for i in study.estimate.wanted())]
-    return Table("Local minima, best first", header, rows) if rows else None
 
 
 def drifts(study: Study) -> Table:

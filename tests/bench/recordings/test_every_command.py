@@ -24,7 +24,7 @@ WORKS: dict[str, tuple[str, ...]] = {
     "live": ("live", "RUN", "--port", "0"),
 }  # fmt: skip
 LACKS: dict[str, tuple[tuple[str, ...], str]] = {
-    "timing": (("timing", "RUN"), "no loop whose timing"),
+    "timing": (("timing", "RUN"), "no timing"),
     "rerun": (("rerun", "RUN"), "no loop to run again"),
     "export --to mjcf": (("export", "RUN", "--to", "mjcf", "-o", "OUT.xml"), "the log of a brake"),
     "estimate --method rls": (("estimate", "RUN", "--method", "rls"), "another method does"),

@@ -26,9 +26,9 @@ from emb_bench.experiment.from_log import read_experiment
 from emb_bench.figures import COLOURS
 from emb_bench.logs.log import read_log
 from emb_bench.report import figures
-from emb_bench.report.content import ActiveCycles, Content, gather
+from emb_bench.report.content import Content, gather
 from emb_bench.report.figures import applied_as_sent
-from emb_bench.report.page import document, report_page, view
+from emb_bench.report.page import document, intervals, report_page
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import EXIT_OUTSIDE
 from emb_runtime.log.ring_buffer import Attachment, EventRecord
@@ -209,9 +209,7 @@ def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate
 def test_a_difference_between_sent_and_applied_current_is_drawn(
     bench: Bench, good: Path, folder: Path, joint: Report
 ) -> None:
-    obeyed, lossy = (
-        applied_as_sent(run, ActiveCycles(run)) for run in gathered(bench, good, folder / "other.mcap").runs
-    )
+    obeyed, lossy = (applied_as_sent(run) for run in gathered(bench, good, folder / "other.mcap").runs)
     assert obeyed
     assert not lossy
     assert joint.reader.text.count("The node applied what was sent.") == 1
@@ -228,7 +226,7 @@ def test_real_time_is_in_the_table(folder: Path, bench: Bench, simulate: Simulat
     ]
     metadata = {"emb.run": {"steps": "60", "iface": "can0"}}
     real = gathered(bench, write_log(folder / "real.mcap", run, steps=60, metadata=metadata))
-    table = view(real.runs[0]).timing
+    table = intervals(real.runs[0])
     assert table is not None
     assert "343 µs" in [cell for row in table.rows for cell in row]
     page = report_page(real)
