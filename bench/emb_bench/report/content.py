@@ -280,7 +280,7 @@ class StopSamples:
 
 
 def stop_samples(run: Run) -> StopSamples | None:
-    """What :attr:`Run.after` has."""
+    """See :attr:`Run.after`."""
     if run.stop is None:
         return None
     try:
