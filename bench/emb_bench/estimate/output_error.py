@@ -57,22 +57,19 @@ class OutputError(Method):
         points = start_points(ideal, self.starts, self.seed)
         weights = ideal.weights(points[0])
         ideal, searches = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
-        searches = sorted(searches, key=lambda pair: pair[1].cost)
         for _ in range(LEFT_OUT):
             kept = _without_outliers(ideal, searches[0][0], weights)
             if kept is ideal:
                 break
             ideal, weights = kept, kept.weights(points[0])
             ideal, searches = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
-        problem = replace(problem, records=ideal.records)
-        ends = _with_systematic(problem, ideal, searches, weights)
+        problem, ends = _with_systematic(problem, ideal, searches, weights)
         if ends[0][1].cost > most(weights, len(problem.unknowns)):
             near, before = released(ideal, points[0])
             z, end = search(ideal, near, weights)
             end = replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)
             ideal, searches = _settled(ideal, [*searches, (z, end)], weights)
-            problem = replace(problem, records=ideal.records)
-            ends = _with_systematic(problem, ideal, searches, weights)
+            problem, ends = _with_systematic(problem, ideal, searches, weights)
         problem, ends = _settled(problem, ends, weights)
         best = ends[0][0]
         if problem.plant.instruments.clock_jitter > 0.0:
@@ -162,43 +159,42 @@ def settled(problem: Problem, z: Floats, end: End, weights: Sequence[Floats]) ->
 def _settled(
     problem: Problem, searches: Sequence[tuple[Floats, End]], weights: Sequence[Floats]
 ) -> tuple[Problem, list[tuple[Floats, End]]]:
-    """Searches best first, those that ended where the best one did with its new end by :func:`settled`."""
+    """Searches best first, the best minimum with its new end by :func:`settled`."""
     ordered = sorted(searches, key=lambda pair: pair[1].cost)
-    first = ordered[0][1].cost
     problem, z, end = settled(problem, *ordered[0], weights)
-    found = []
-    for own, ended in ordered:
-        same = ended.cost - first <= SAME
-        found.append((z if same else own, replace(ended, cost=end.cost, values=end.values) if same else ended))
-    found[0] = (z, end)
-    return problem, found
+    return problem, _refined(ordered, z, end)
+
+
+def _refined(searches: Sequence[tuple[Floats, End]], z: Floats, end: End) -> list[tuple[Floats, End]]:
+    """Searches best first, those that ended where the best one did with its new end."""
+    lowest = searches[0][1].cost
+    others = [
+        (z, replace(ended, cost=end.cost, values=end.values)) if ended.cost - lowest <= SAME else (own, ended)
+        for own, ended in searches[1:]
+    ]
+    return [(z, end), *others]
 
 
 def _with_systematic(
     problem: Problem, ideal: Problem, searches: Sequence[tuple[Floats, End]], weights: Sequence[Floats]
-) -> list[tuple[Floats, End]]:
+) -> tuple[Problem, list[tuple[Floats, End]]]:
     """Searches best first, the best minimum once more with the systematic errors, which ``ideal`` lacks."""
+    problem = replace(problem, records=ideal.records)
     ends = sorted(searches, key=lambda pair: pair[1].cost)
     if not problem.asked.along:
-        return ends
+        return problem, ends
     index, nominal = [problem.unknowns.index(unknown) for unknown in ideal.unknowns], problem.nominal()
 
-    def whole(own: Sequence[float] | Floats) -> Floats:
+    def whole(own: Sequence[float]) -> tuple[float, ...]:
         values = nominal * problem.units
         values[index] = own
-        return values
+        return tuple(values.tolist())
 
-    lowest = ends[0][1].cost
-    z, best = search(problem, np.clip(whole(ends[0][1].values) / problem.units, *problem.bounds), weights)
-    found = []
-    for own, end in ends:
-        same = end.cost - lowest <= SAME
-        start = tuple(whole(end.start).tolist())
-        values = best.values if same else tuple(whole(end.values).tolist())
-        after = replace(end, cost=best.cost if same else end.cost, values=values, start=start)
-        found.append((z if same else whole(own * ideal.units) / problem.units, after))
-    found[0] = (z, replace(found[0][1], evaluations=ends[0][1].evaluations + best.evaluations))
-    return found
+    wider = [replace(end, values=whole(end.values), start=whole(end.start)) for _, end in ends]
+    found = [(np.array(end.values) / problem.units, end) for end in wider]
+    z, best = search(problem, np.clip(found[0][0], *problem.bounds), weights)
+    best = replace(best, start=wider[0].start, evaluations=wider[0].evaluations + best.evaluations)
+    return problem, _refined(found, z, best)
 
 
 def most(weights: Sequence[Floats], unknowns: int) -> float:
