@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from emb_bench.brake.parameters import SI, Quantity, quantity
+import msgspec
+
+from emb_bench.brake.parameters import SI, quantity
 from emb_bench.config.bench import Bench
 from emb_bench.experiment.evaluation import NO_ERRORS, SystematicErrors
 from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import RunLog
 from emb_bench.sim.simulated_brake import check_near_nominal, parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
-from emb_runtime.config.typed import shown
 from emb_runtime.errors import LogError, UsageError, near
 from emb_runtime.system.input_file import read_text
 
@@ -62,77 +60,63 @@ def _running(log: RunLog, bench: Bench) -> dict[str, float]:
     return values
 
 
+class _Value(msgspec.Struct, frozen=True):
+    value: float
+
+
+class _Record(msgspec.Struct, frozen=True):
+    name: str
+
+
+class _Estimate(msgspec.Struct, frozen=True):
+    """An estimate, as far as a record is evaluated at it."""
+
+    parameters: dict[str, float | _Value]
+    systematic: dict[str, float | _Value] = {}
+    records: tuple[_Record, ...] = ()
+
+
+class _Report(msgspec.Struct, frozen=True):
+    estimate: _Estimate | None = None
+
+
 def _from_file(path: str, log: RunLog, bench: Bench) -> tuple[dict[str, float], SystematicErrors]:
-    """Parameters in a file, and systematic errors that were estimated with them."""
+    """Parameters in the document of an estimate or a report [SI], and systematic errors of the log there.
+
+    Parameters and systematic errors trade off with each other: only together do they explain the record.
+    """
     try:
-        return _estimated(json.loads(read_text(path, MAX_JSON_BYTES)), log, bench)
+        text = read_text(path, MAX_JSON_BYTES).encode()
+        found = msgspec.json.decode(text, type=_Report).estimate or msgspec.json.decode(text, type=_Estimate)
     except OSError as err:
         hint = near(path, ("log", "nominal", "true"))
         expected = f"expected log, nominal, true, name=value or a file{hint}"
         raise UsageError(f"--theta: {expected}; {path}: {err.strerror}") from err
-    except UnicodeDecodeError as err:
-        raise UsageError(f"{path}: expected JSON: not UTF-8 text") from err
-    except json.JSONDecodeError as err:
-        raise UsageError(f"{path}: expected the JSON of an estimate or a report, and it is no JSON: {err}") from err
-    except (ValueError, RecursionError) as err:
-        raise UsageError(f"{path}: {err}") from err
-
-
-def _estimated(found: Any, log: RunLog, bench: Bench) -> tuple[dict[str, float], SystematicErrors]:
-    """Parameters in the document of an estimate or a report [SI], and systematic errors of a log there.
-
-    Parameters and systematic errors trade off with each other: only together do they explain the record.
-
-    Raises:
-        ValueError: it is no such document.
-    """
-    if isinstance(found, dict) and isinstance(found.get("estimate"), dict):
-        found = found["estimate"]
-    parameters = found.get("parameters") if isinstance(found, dict) else None
-    if not isinstance(parameters, dict):
-        raise ValueError("expected the JSON of 'emb-replay estimate --json' or of a report, and it is none")
+    except (ValueError, msgspec.MsgspecError, RecursionError) as err:  # also UnicodeDecodeError
+        wanted = "expected the JSON of 'emb-replay estimate --json' or of a report"
+        raise UsageError(f"{path}: {wanted}: {err}") from err
     names = PARAMETER_NAMES if bench.machine is None else (*PARAMETER_NAMES, "J")
-    known = _named(parameters, {name: quantity(bench.machine, name) for name in names}, "a positive number")
-    if not known:
-        raise ValueError(f"expected an estimate of some of {', '.join(names)}, and it has none of them")
-    along = found.get("systematic")
-    return known, NO_ERRORS if not isinstance(along, dict) else _errors(along, _names(found.get("records")), log, bench)
+    shown = {name: quantity(bench.machine, name) for name in names}
+    values = {n: _number(found.parameters[q.name]) / q.factor for n, q in shown.items() if q.name in found.parameters}
+    if not values:
+        raise UsageError(f"{path}: expected an estimate of some of {', '.join(names)}, and it has none of them")
+    return values, _errors(found, path, log, bench)
 
 
-def _errors(along: Mapping[str, Any], records: list[str], log: RunLog, bench: Bench) -> SystematicErrors:
+def _errors(found: _Estimate, path: str, log: RunLog, bench: Bench) -> SystematicErrors:
     """Systematic errors of a log in an estimate of some records; the encoder's offset is each record's own."""
     limits = {"current_offset": bench.limits.current, "delay": 1.0, "velocity_gain": 1.0}
-    labels = {name: Quantity(quantity(bench.machine, name).name, "", 1.0) for name in limits}
+    labels = {name: quantity(bench.machine, name).name for name in limits}
+    records = [Path(record.name).name for record in found.records]
     if log.path.name in records:
-        own = f"[{records.index(log.path.name)}]" if len(records) > 1 else ""
         limits["offset"] = bench.limits.angle[1] - bench.limits.angle[0]
-        labels["offset"] = Quantity(f"offset{own}", "", 1.0)
-    values = _named(along, labels, "a number")
+        labels["offset"] = f"offset[{records.index(log.path.name)}]" if len(records) > 1 else "offset"
+    values = {n: _number(found.systematic[label]) for n, label in labels.items() if label in found.systematic}
     for name, value in values.items():
         if not abs(value) < limits[name]:  # this way round, NaN is refused
-            raise ValueError(f"{name}: expected less than {limits[name]:g} {SI[name]}, got {value!r}")
+            raise UsageError(f"{path}: {name}: expected less than {limits[name]:g} {SI[name]}, got {value!r}")
     return SystematicErrors(**values)
 
 
-def _names(records: Any) -> list[str]:
-    """File names of the records of an estimate; none where the document has no list of them."""
-    listed = records if isinstance(records, list) else []
-    return [Path(str(record["name"])).name for record in listed if isinstance(record, dict) and "name" in record]
-
-
-def _named(entries: Mapping[str, Any], labels: Mapping[str, Quantity], expected: str) -> dict[str, float]:
-    """Values of a table of the document, by our names [SI]: numbers, or tables with a ``value``, by label."""
-    found = {}
-    for name, label in labels.items():
-        if label.name in entries:
-            entry = entries[label.name]
-            value = entry.get("value") if isinstance(entry, dict) else entry
-            found[name] = _number(value, label.name, expected) / label.factor
-    return found
-
-
-def _number(value: object, name: str, expected: str) -> float:
-    """A number of a file."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{name}: expected {expected}, got {shown(value)}")
-    return float(value)
+def _number(entry: float | _Value) -> float:
+    return entry.value if isinstance(entry, _Value) else entry
