@@ -114,11 +114,7 @@ def read_last(path: Path) -> Earlier:
 
 
 def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
-    """Compare what all records share with an earlier estimate, as far as both have it.
-
-    Raises:
-        UsageError: it has no parameter in common with this one.
-    """
+    """Compare what all records share with an earlier estimate, as far as both have it."""
     then = last.parameters
     common = [i for i in now.shared() if i in now.wanted() and now.labels[i] in then]
     if not common:

@@ -91,11 +91,7 @@ def held_out(e: Estimate, record: Experiment, *, among: int = 1) -> HeldOut:
 
 
 def leave_one_out(e: Estimate) -> tuple[HeldOut, ...]:
-    """Predict each record from an estimate of the others, made by the same method.
-
-    Raises:
-        UsageError: there is one record only.
-    """
+    """Predict each record from an estimate of the others, made by the same method."""
     count = len(e.records)
     if count < 2:
         raise UsageError(f"to predict each record from the others takes at least 2, got {count}")

@@ -144,11 +144,7 @@ def _normal(e: Estimate, unknown: Unknown) -> tuple[float, float] | None:
 def choose_model(
     bench: Bench, plants: Sequence[Plant], records_of: RecordsOf, asked: EstimationProblem, *, starts: int, seed: int
 ) -> ModelChoice:
-    """Fits every plant and ranks them.
-
-    Raises:
-        UsageError: there is no record, or too few samples.
-    """
+    """Fits every plant and ranks them."""
     ordered = sorted(plants, key=lambda plant: (plant.name != DEFAULT_PLANT, plant.mechanics, plant.instruments))
 
     def problems(asked: EstimationProblem) -> list[Problem]:

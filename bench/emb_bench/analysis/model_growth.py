@@ -75,11 +75,7 @@ class ModelGrowth:
 def grow_model(
     bench: Bench, plant: Plant, records: Sequence[Experiment], asked: EstimationProblem, *, starts: int, seed: int
 ) -> ModelGrowth:
-    """Adds features to a plant until the records ask for nothing more.
-
-    Raises:
-        UsageError: the plant is not solved exactly, or there are too few samples.
-    """
+    """Adds features to a plant until the records ask for nothing more."""
     if plant.mechanics.solver != EXACT:
         raise UsageError(f"plant '{plant.name}': expected one that is solved exactly: others have no features to add")
     first = method_of("oem")(bench, plant, asked, starts=starts, seed=seed).fit(records)
@@ -123,9 +119,6 @@ def grow_with_errors(
     """Growth as of :func:`grow_model`, and where no model fits so, with the bench's systematic errors estimated along.
 
     With them a record tells features apart less well; without them, where there are some, no feature explains it.
-
-    Raises:
-        UsageError: see :func:`grow_model`.
     """
     found = grow_model(bench, plant, records, asked, starts=starts, seed=seed)
     along = with_systematic(asked, bench, plant)

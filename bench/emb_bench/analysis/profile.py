@@ -128,11 +128,7 @@ def _bent(e: Estimate, i: int) -> bool:
 
 
 def profile(e: Estimate, label: str) -> Profile:
-    """The likelihood profile of one unknown, by its label.
-
-    Raises:
-        UsageError: there is no such unknown.
-    """
+    """The likelihood profile of one unknown, by its label."""
     if label not in e.labels:
         raise UsageError(f"no profile of '{label}': expected one of {', '.join(e.labels)}")
     i = e.labels.index(label)

@@ -153,11 +153,7 @@ class Study:
         }  # fmt: skip
 
     def plot(self) -> Any:
-        """A figure of matplotlib: total interval and repeatability of each parameter, relative to its value.
-
-        Raises:
-            UsageError: matplotlib is missing.
-        """
+        """A figure of matplotlib: total interval and repeatability of each parameter, relative to its value."""
         figure, axes = for_notebook(1, (7.0, 1.0 + 0.5 * len(self)))
         for row, c in enumerate(self):
             low, high = (100.0 * (end / c.value - 1.0) for end in c.interval)
@@ -171,11 +167,7 @@ class Study:
         return figure
 
     def to_dataframe(self) -> Any:
-        """A pandas frame with a row for each parameter, the columns those of :meth:`to_dict`.
-
-        Raises:
-            UsageError: pyarrow or pandas is missing.
-        """
+        """A pandas frame with a row for each parameter, the columns those of :meth:`to_dict`."""
         rows = [{"name": label, **row} for label, row in self.to_dict().items()]
         try:
             import pyarrow as pa
@@ -334,11 +326,7 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
 
 
 def begun_with(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions) -> tuple[Plant, str]:
-    """The plant that a study of logs begins with, and the reason for it.
-
-    Raises:
-        UsageError: the logs are of different brakes, or the bench has no such plant.
-    """
+    """The plant that a study of logs begins with, and the reason for it."""
     if wanted.model is not None:
         return bench.plant(DEFAULT_PLANT if wanted.model == EVERY else wanted.model), "asked for"
     name, why = (DEFAULT_PLANT, "to begin with") if wanted.grow else _model(logs)
@@ -375,9 +363,6 @@ def _check_different(records: Sequence[Experiment]) -> None:
     """Refuse a run that is given twice, whatever its files are called and however much of it each of them holds.
 
     Two runs never have the same noise; counted twice one would halve its variance, and predict itself.
-
-    Raises:
-        UsageError: a run is given twice.
     """
     for i, record in enumerate(records):
         for other in records[:i]:

@@ -102,11 +102,7 @@ class Bench(driven.Bench):
     machine: Machine | None  # A machine that is no brake of ours, for analysis only; None for a brake, which is driven
 
     def plant(self, name: str) -> Plant:
-        """The named brake to simulate or to evaluate with.
-
-        Raises:
-            BenchFileError: no plant has that name.
-        """
+        """The named brake to simulate or to evaluate with."""
         try:
             return self.plants[name]
         except KeyError:
@@ -128,11 +124,7 @@ def load_bench(path: str | Path | None = None, *, analysis: bool = False) -> Ben
 
 
 def parse_bench(text: str, source: str, *, analysis: bool = False) -> Bench:
-    """Turn the text of a bench file into checked records; ``source`` and ``analysis`` as for :func:`load_bench`.
-
-    Raises:
-        BenchFileError: see :func:`load_bench`.
-    """
+    """Turn the text of a bench file into checked records; ``source`` and ``analysis`` as for :func:`load_bench`."""
     if not analysis:
         return with_tables(driven.parse_bench(text, source), source)
     document = parse_document(text, source)

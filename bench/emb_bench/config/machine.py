@@ -47,11 +47,7 @@ class Units:
     command: str = ""
 
     def check(self, linear: bool) -> None:
-        """Refuse an unknown unit, and a length or a force where the machine turns.
-
-        Raises:
-            FieldError: there is one.
-        """
+        """Refuse an unknown unit, and a length or a force where the machine turns."""
         known = {"angle": (*ANGLE, *(LENGTH if linear else ())), "command": (*CURRENT, *TORQUE)}
         known["command"] += tuple(FORCE) if linear else ()
         for key, units in known.items():

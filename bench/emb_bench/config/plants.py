@@ -102,11 +102,7 @@ _NEEDED = {"stribeck_exponent": "stribeck_velocity", "hysteresis_travel": "hyste
 
 
 def read_plant(name: str, document: Mapping[str, Any], source: str) -> Plant:
-    """A plant of a bench file's ``[plants]`` table.
-
-    Raises:
-        BenchFileError: a key is unknown, of the wrong type or out of range, or a feature does not go with the solver.
-    """
+    """A plant of a bench file's ``[plants]`` table."""
     at = f"{source}: plants.{key_text((name,))}"
     if name in BUILT_IN:
         raise BenchFileError(f"{at}: this name is taken by the built-in plant")

@@ -140,10 +140,6 @@ def make_problem(
         kind: ``physical`` or ``weighted`` information.
         brake: the known parameters; nominal without.
         returns: True if the brake has to be home at the end.
-
-    Raises:
-        UsageError: no name, an unknown name, or one that comes twice; or instruments that change the information.
-        BenchFileError: there is no plant of that name.
     """
     if not params:
         raise UsageError(f"expected at least one parameter of {', '.join(PARAMETERS)}")

@@ -55,11 +55,7 @@ class Check:
 
 
 def check(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, currents: Floats, plant_name: str) -> Check:
-    """Checks a sequence of currents on a brake: its criteria, and whether it keeps the bench's limits there.
-
-    Raises:
-        BenchFileError: there is no plant of that name.
-    """
+    """Checks a sequence of currents on a brake: its criteria, and whether it keeps the bench's limits there."""
     plant = bench.plant(plant_name)
     t_s, p, m = problem.sample_time, problem.brake, plant.mechanics
     parts = PARTS if m.solver == EXACT else 1
@@ -171,11 +167,7 @@ class Report:
 
 
 def make_report(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, *, starts: int, seed: int) -> Report:
-    """Search for a design, and simulate it again on its own brake and on ``CHECKED``.
-
-    Raises:
-        UsageError: no design was found.
-    """
+    """Search for a design, and simulate it again on its own brake and on ``CHECKED``."""
     found = search(problem, starts=starts, seed=seed)
     plants = dict.fromkeys((problem.plant.name, *CHECKED))
     return Report(
@@ -192,11 +184,7 @@ def make_report(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind
 
 
 def write(report: Report, path: Path) -> None:
-    """Write the design as CSV: the metadata as one line of JSON behind ``#``, then the columns.
-
-    Raises:
-        UsageError: the file cannot be written.
-    """
+    """Write the design as CSV: the metadata as one line of JSON behind ``#``, then the columns."""
     columns, text = report.columns(), io.StringIO(newline="")
     text.write(f"# {report.json()}\n")
     rows = csv.writer(text, lineterminator="\n")
@@ -207,11 +195,7 @@ def write(report: Report, path: Path) -> None:
 
 
 def read_design(path: Path, bench: Bench) -> tuple[Floats, str]:
-    """Currents of a design that :func:`write` wrote [A], shape (horizon,); and a description with a hash.
-
-    Raises:
-        UsageError: the file cannot be read, is no design, or was made for another bench.
-    """
+    """Currents of a design that :func:`write` wrote [A], shape (horizon,); and a description with a hash."""
     try:
         head, *rows = read_bytes(path, MAX_DESIGN_BYTES).decode().splitlines()
         metadata = json.loads(head.removeprefix("#"))
@@ -229,11 +213,7 @@ def read_design(path: Path, bench: Bench) -> tuple[Floats, str]:
 
 
 def draw(report: Report, path: Path) -> None:
-    """Write the figure; the ending of the name is the format.
-
-    Raises:
-        UsageError: matplotlib is missing, or the file cannot be written.
-    """
+    """Write the figure; the ending of the name is the format."""
     with drawn(path, 5, 1, _title(report), (8.0, 9.0), sharex=True) as axes:
         _motion(axes[:3, 0], report)
         _information(axes[3:, 0], report)

@@ -81,9 +81,6 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
     """The best design of many searches; the same seed finds the same design, whatever the number of workers.
 
     ``starts`` are coarse searches, ``workers`` threads, 0 for one per processor, ``warm`` currents to begin with too.
-
-    Raises:
-        UsageError: nothing that was found keeps the limits.
     """
     seeds = np.random.SeedSequence(seed).spawn(starts + GROWING)
     draws = [np.random.default_rng(s) for s in seeds[starts:]]

@@ -37,13 +37,7 @@ class Method(ABC):
     gaps: ClassVar[bool] = True  # Currents of periods without a report are unknown to it, or left out
 
     def fit(self, experiments: Sequence[Experiment]) -> Estimate:
-        """Estimate from one experiment, or from several of the same brake.
-
-        Raises:
-            UsageError: there is no experiment, start or measured sample, or the method or the model cannot estimate the
-                parameters.
-            LogError: there are too few samples.
-        """
+        """Estimate from one experiment, or from several of the same brake."""
         asked, caveats = self.asked, tuple[str, ...]()
         if (asked.systematic or asked.allowed) and not self.systematic:
             asked, caveats = replace(asked, systematic={}, allowed={}), (IDEAL_SENSORS,)

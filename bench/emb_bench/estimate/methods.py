@@ -18,12 +18,7 @@ from emb_runtime.errors import UsageError
 
 
 def method_of(name: str) -> type[Method]:
-    """The method of a name, a key of ``METHODS``.
-
-    Raises:
-        UsageError: there is none.
-        ImportError: scipy or numba is missing.
-    """
+    """The method of a name, a key of ``METHODS``."""
     match name:
         case "oem":
             from emb_bench.estimate.output_error import OutputError

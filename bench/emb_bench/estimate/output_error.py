@@ -204,11 +204,7 @@ def most(weights: Sequence[Floats], unknowns: int) -> float:
 
 
 def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
-    """Starts of the searches: the nominal brake, then uniform draws from the prior's or else the shield's ranges.
-
-    Raises:
-        UsageError: ``starts`` is below 1.
-    """
+    """Starts of the searches: the nominal brake, then uniform draws from the prior's or else the shield's ranges."""
     if starts < 1:
         raise UsageError(f"expected at least 1 start, got {starts}")
     bench, first = problem.bench, problem.nominal()

@@ -397,12 +397,7 @@ def by_record(errors: Floats, weights: Sequence[Floats]) -> list[Floats]:
 
 
 def make_problem(bench: Bench, plant: Plant, records: Sequence[Experiment], asked: EstimationProblem) -> Problem:
-    """Makes the problem to be solved, and checks that it can be.
-
-    Raises:
-        UsageError: there is no record, or the model cannot estimate an unknown.
-        LogError: there are too few measured samples.
-    """
+    """Makes the problem to be solved, and checks that it can be."""
     check_model(plant, asked.names)
     if not records:
         raise UsageError("expected at least one record")

@@ -130,11 +130,7 @@ class Cut:
         ]
 
     def searches(self, values: Sequence[Floats]) -> list[tuple[Point, End]]:
-        """Searches from shared unknowns, best first; of several most are only begun.
-
-        Raises:
-            UsageError: there are too few windows for the unknowns.
-        """
+        """Searches from shared unknowns, best first; of several most are only begun."""
         p = len(self.problem.unknowns)
         if len(self.windows) < FEWEST * p:
             raise UsageError(

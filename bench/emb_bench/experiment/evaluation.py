@@ -208,11 +208,7 @@ class Question:
     prior: Ranges | None = None  # Ranges of the parameters known before the experiment
 
     def __post_init__(self) -> None:
-        """Check the names.
-
-        Raises:
-            UsageError: a name is unknown, comes twice or is missing, or no given parameter varies in the prior.
-        """
+        """Check the names."""
         if not any(self.params):
             raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
         check_unknowns(self.names)

@@ -69,9 +69,6 @@ def criteria(matrix: Any, params: Sequence[str], interest: Sequence[str] | None 
     """D, A, E, condition number and the worst identified combination of an FIM, or of a subset of its parameters.
 
     The parameters that are of no ``interest`` are unknown nuisances: the Schur complement is judged (Ds-optimality).
-
-    Raises:
-        UsageError: the matrix is not square, not finite, or has a negative diagonal element; or the subset is not one.
     """
     names = list(params if interest is None else interest)
     if not names or not set(names) <= set(params):

@@ -106,9 +106,6 @@ def uniform_prior(ranges: Ranges, params: Sequence[str], reference: BrakeParamet
 
     Returns:
         Diagonal, shape (len(params), len(params)).
-
-    Raises:
-        UsageError: a parameter does not vary in these ranges, or is none of the brake's.
     """
     check_unknowns(params)
     diagonal = []
@@ -146,29 +143,18 @@ class Fisher:
 
         Relative, or in the unknown's unit; inf if the data do not identify it. With a
         prior it is the spread after a Gaussian one of the same variance, to first order, and no bound.
-
-        Raises:
-            UsageError: this is the weighted FIM, which bounds nothing.
         """
         self._physical()
         deviations = np.sqrt(np.diag(Spectrum(self.matrix).inverse()))
         return dict(zip(self.params, deviations.tolist(), strict=True))
 
     def correlation(self) -> Floats:
-        """Correlations of the estimates, shape (len(params), len(params)), see :meth:`Spectrum.correlation`.
-
-        Raises:
-            UsageError: this is the weighted FIM, which has no estimates.
-        """
+        """Correlations of the estimates, shape (len(params), len(params)), see :meth:`Spectrum.correlation`."""
         self._physical()
         return Spectrum(self.matrix).correlation()
 
     def verdict(self, ranges: Ranges | None = None) -> Identifiability:
-        """Identifiability of each parameter, with ``ranges`` in which it is known to lie.
-
-        Raises:
-            UsageError: this is the weighted FIM, which bounds nothing.
-        """
+        """Identifiability of each parameter, with ``ranges`` in which it is known to lie."""
         self._physical()
         return judge(self.matrix, self.params, self.prior, _borders(self.params, self.theta, ranges))
 
@@ -209,9 +195,6 @@ def fisher(
 
     Rows of nuisances come after those of ``params``; what is not named is known. The prior is the FIM of all of them
     before the first sample; ``measured`` is False for a lost sample.
-
-    Raises:
-        UsageError: ``currents`` is not one row of finite numbers, or a parameter is unknown, comes twice or is missing.
     """
     if not params:
         raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")

@@ -39,9 +39,6 @@ class Spectrum:
     """Eigenvalues of M scaled to a unit diagonal: as accurate as M allows whatever its scales are.
 
     Parameters without any information are kept apart, so that a flat direction is a combination of the others.
-
-    Raises:
-        UsageError: the matrix is not square, not finite, or has a negative diagonal element.
     """
 
     def __init__(self, matrix: Any) -> None:
@@ -216,9 +213,6 @@ def judge(
         prior: the part of it that was known beforehand.
         borders: distance of a parameter's value to the lower and to the upper border of its range, in the same
             relative units, negative if it lies outside.
-
-    Raises:
-        UsageError: the matrix is not square, not finite, or has a negative diagonal element.
     """
     spectrum = Spectrum(matrix)
     correlation = spectrum.correlation()
