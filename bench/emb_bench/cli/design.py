@@ -9,7 +9,7 @@ from pathlib import Path
 
 from emb_bench import api
 from emb_bench.cli.options import add, add_output_options, answer, given, summary
-from emb_bench.figures import ENDINGS, require_place
+from emb_bench.figures import require_place
 from emb_runtime.errors import EXIT_DONE, EmbError
 from emb_runtime.system.terminal import Parser, complain
 
@@ -39,7 +39,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--version", action="version", version=f"emb-design {metadata.version('emb-excite')}")
     add(p, api.design)
     p.add_argument("-o", "--output", type=Path, metavar="FILE", help="file to write: design.csv")
-    p.add_argument("--plot", type=Path, metavar="FILE", help="figure to write: .png, .pdf or .svg")
     add_output_options(p)
     return p
 
@@ -56,16 +55,11 @@ def main(argv: list[str] | None = None) -> int:
 
 def _design(args: argparse.Namespace) -> None:
     require_place("--output", args.output, (".csv",))
-    require_place("--plot", args.plot, ENDINGS)
     report = api.design(**given(args, api.design))
     if args.output is not None:
         from emb_bench.design.report import write
 
         write(report, args.output)
-    if args.plot is not None:
-        from emb_bench.design.report import draw
-
-        draw(report, args.plot)
     from emb_bench.report.design import text
 
     answer(args, report.metadata, lambda verbose: text(report, str(args.output or ""), verbose=verbose))

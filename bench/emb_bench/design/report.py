@@ -13,19 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.brake.parameters import UNITS
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EXACT
 from emb_bench.design.problem import PARTS, Problem
 from emb_bench.design.search import Found, search
-from emb_bench.figures import COLOURS, DASHED, GREY, drawn
 from emb_bench.information.criteria import Criterion, criteria
-from emb_bench.information.fisher import Kind, fisher, information_over_time, weights_of
-from emb_bench.information.identifiability import Spectrum
+from emb_bench.information.fisher import Kind, fisher
 from emb_bench.information.symmetric import Floats
 from emb_bench.output import replacing
 from emb_bench.sim.open_loop import simulate
-from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
 from emb_runtime.system.terminal import as_json
@@ -154,17 +150,6 @@ class Report:
             "velocity": design.states[:, 1],
         }
 
-    def information(self) -> Floats:
-        """The FIM after each sample, shape (n, p, p)."""
-        run = simulate(
-            self.problem.plant.mechanics,
-            self.problem.brake,
-            self.found.best.currents,
-            self.problem.sample_time,
-            self.problem.params,
-        )
-        return information_over_time(run.sensitivities, weights_of(self.bench, self.kind))
-
 
 def make_report(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, *, starts: int, seed: int) -> Report:
     """Search for a design, and simulate it again on its own brake and on ``CHECKED``."""
@@ -210,68 +195,3 @@ def read_design(path: Path, bench: Bench) -> tuple[Floats, str]:
     if current.shape != (bench.timing.horizon + 1,) or not np.isfinite(current).all():
         raise UsageError(f"{path}: expected {bench.timing.horizon + 1} finite currents, got shape {current.shape}")
     return current[:-1], f"{label}, sha256 {hashlib.sha256(current.tobytes()).hexdigest()[:12]}"
-
-
-def draw(report: Report, path: Path) -> None:
-    """Write the figure; the ending of the name is the format."""
-    with drawn(path, 5, 1, _title(report), (8.0, 9.0), sharex=True) as axes:
-        _motion(axes[:3, 0], report)
-        _information(axes[3:, 0], report)
-        axes[-1, 0].set_xlabel("time [ms]")
-
-
-def _title(report: Report) -> str:
-    p, criterion = report.problem, report.criterion
-    value = criterion.value(report.found.best.phi)
-    design = f"{criterion.name}-optimal for {', '.join(p.params)} on the {p.plant.name} brake"
-    return f"{design}: {criterion.label} = {value:.6g}"
-
-
-def _motion(axes: Any, report: Report) -> None:
-    columns, limits = report.columns(), report.bench.limits
-    time = 1e3 * columns["time"]
-    panels = (
-        ("current", "current [A]", (-limits.current, limits.current)),
-        ("velocity", "velocity [rad/s]", (-limits.velocity, limits.velocity)),
-        ("angle", "angle [rad]", limits.angle),
-    )
-    for axis, (name, label, border) in zip(axes, panels, strict=True):
-        for value in border:
-            axis.axhline(value, **DASHED)
-        axis.axhline(0.0, color="#cccccc", linewidth=0.8)
-        if name == "current":
-            axis.step(time, columns[name], where="post", color=COLOURS[0], linewidth=1.1)
-        else:
-            axis.plot(time, columns[name], color=COLOURS[0])
-        axis.set_ylabel(label)
-        margin = 0.06 * (border[1] - border[0])
-        axis.set_ylim(border[0] - margin, border[1] + margin)
-    axes[0].set_title("dashed: limits", color=GREY, fontsize=8.0)
-    axes[0].set_xlim(0.0, time[-1])
-
-
-def _information(axes: Any, report: Report) -> None:
-    history, criterion, params = report.information(), report.criterion, report.problem.params
-    time = 1e3 * report.problem.sample_time * np.arange(1, len(history) + 1)
-    deviations = np.full((len(history), len(params)), np.nan)
-    for k, matrix in enumerate(history):
-        spectrum = Spectrum(matrix)
-        if not spectrum.singular:
-            deviations[k] = np.sqrt(np.diag(spectrum.inverse()))
-    known = np.isfinite(deviations).all(axis=1)
-    axes[0].plot(time[known], [criterion.value(float(criterion.phi(m))) for m in history[known]], color=COLOURS[0])
-    axes[0].set_ylabel(criterion.label)
-    if criterion.name in ("A", "E"):
-        axes[0].set_yscale("log")
-    for i, name in enumerate(params):
-        unit = UNITS.get(name)
-        scale = 1.0 if unit else 100.0
-        symbol = f"${name}$" if name in BrakeParameters._fields else name
-        label = f"{symbol} [{unit}]" if unit else symbol
-        axes[1].plot(time[known], scale * deviations[known, i], color=COLOURS[i % len(COLOURS)], label=label)
-    axes[1].set_yscale("log")
-    top = 1e2 if known.any() else 1.0
-    least = float(np.nanmin(100.0 * deviations)) if known.any() else 0.1
-    axes[1].set_ylim(0.5 * least, max(top, 2.0 * least))
-    axes[1].set_ylabel("Cramér-Rao bound [%]" if report.kind == "physical" else "weighted deviation [%]")
-    axes[1].legend(ncols=len(params), loc="upper right")
