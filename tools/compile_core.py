@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "emb_runtime"
 FOLDER = ROOT / "runtime" / PACKAGE / "native"
 LEFT_OUT = {
-    "can.interfaces": "opens a bus, once; subclasses of another package's classes",
+    "can.interfaces": "opens a bus, once",
     "control.actor": "an interface, and an actor that wants nothing",
     "control.stop_condition": "four comparisons, which a test's double may answer as well",
     "estimator.estimate": "formats the estimate, once",

@@ -113,8 +113,8 @@ def simulate(
     Raises:
         EmbError: an argument is wrong, the policy does not fit the bench, or the log cannot be written.
     """
+    from emb_runtime.cli.experiment import experiment
     from emb_runtime.cli.options import parser, prepare
-    from emb_runtime.cli.repeat import experiment
     from emb_runtime.cli.session import Console
 
     options = {"plant": plant, "seed": seed, **(parameters or {})}
@@ -127,7 +127,7 @@ def simulate(
         arguments.append("--quick")
     plan = prepare(parser().parse_args(arguments))
     unattended = Console(stop_requested=lambda: False, show=lambda *_: None, may_arm=lambda _: True)
-    experiment(plan, plan.iface, Path(log), unattended)
+    experiment(plan, Path(log), unattended)
     return open_run(log)
 
 

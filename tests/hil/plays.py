@@ -38,7 +38,6 @@ class Play:
     before: tuple[dict[str, Any], ...] = ()  # Done before anything is started
     node_bus: str = "vcan0"
     run_bus: str = "vcan0"
-    iface: str = ""  # Of both programs, if it is no SocketCAN bus
     log: str = ""  # Where the log goes, if not into the ordinary memory
     linger: float = 0.8  # How long the bus is watched after the run's end [s]
     node_lost: bool = False  # The fault takes the node away, so its stop cannot be seen
@@ -55,8 +54,8 @@ class Play:
     def plan(self, folder: Path) -> dict[str, Any]:
         """What the stage is told; benches and actors are in the folder."""
         log = self.log or f"/dev/shm/{self.name}.mcap"
-        run = ["--iface", self.iface or self.run_bus, "--json", "--yes", "--log", log, *self.options]
-        node = ["--iface", self.iface or self.node_bus]
+        run = ["--iface", self.run_bus, "--json", "--yes", "--log", log, *self.options]
+        node = ["--iface", self.node_bus]
         gateway: list[str] = []
         if self.drive:
             kind, mapping = "polled" if self.drive == "mit" else "late", f"{EXAMPLES / self.drive}.toml"
@@ -232,10 +231,6 @@ PLAYS = (
         (_signal("run", "SIGKILL", WHEN, stops=3),), may_lose=IN_HAND, policy="robbed of the lock",
     ),
     Play("giant", "a policy gone mad", ("POLICY_BEYOND_CONTRACT",), (3,), policy="giant", stops=False),
-    Play(
-        "multicast", "nothing, on python-can's udp_multicast", ("done",), (0,), before=({"do": "multicast"},),
-        iface="udp_multicast:239.74.163.2", stops=False, stop_frames=None,
-    ),
     _lying("lie_drift_30", "its angle drifts by 30 rad/s", CONTRADICT, drift=30.0),
     _lying("lie_drift_45", "its angle drifts by 45 rad/s", CONTRADICT, drift=45.0),
     _lying("lie_offset", "its velocity is 40 rad/s too high", CONTRADICT, OUTSIDE, offset=40.0),

@@ -19,7 +19,6 @@ import os
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 import time
 import tomllib
@@ -236,11 +235,6 @@ class Stage:
         for pid in victims:
             os.kill(pid, signal.SIGKILL)
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-
-    def do_multicast(self, _action: dict[str, Any]) -> None:
-        """Let the loopback carry multicast."""
-        for command in ("ip link set lo up multicast on", "ip route replace 224.0.0.0/4 dev lo"):
-            subprocess.run(command.split(), check=True)
 
     def do_restart_node(self, _action: dict[str, Any]) -> None:
         assert self.node is not None

@@ -55,7 +55,7 @@ def edited(tmp_path: Path) -> Edited:
 @pytest.fixture
 def sim(monkeypatch: pytest.MonkeyPatch) -> Sim:
     spy = Sim()
-    for module in ("repeat", "main"):
+    for module in ("experiment", "main"):
         monkeypatch.setattr(
             f"emb_runtime.cli.{module}.open_transport",
             lambda iface, bench, identifiers=None: (

@@ -97,14 +97,10 @@ class EmbRun:
         """What it prints."""
         return self.streams(*arguments, code=code)[0]
 
-    def documents(self, *arguments: str, code: int = 0) -> list[dict[str, Any]]:
-        """What it prints with ``--json``."""
-        return [json.loads(line) for line in self.text(*arguments, "--json", code=code).splitlines()]
-
     def document(self, *arguments: str, code: int = 0) -> dict[str, Any]:
-        """The same where it is one."""
-        (found,) = self.documents(*arguments, code=code)
-        return found
+        """What it prints with ``--json``."""
+        (line,) = self.text(*arguments, "--json", code=code).splitlines()
+        return dict(json.loads(line))
 
     def refused(self, reason: str, *arguments: str, code: int = 2) -> None:
         """It must say no with this reason, in one line."""

@@ -22,7 +22,6 @@ from emb_bench.output import replacing
 from emb_bench.parallel import Lost, shared_out, shared_out_on_ray
 from emb_runtime.errors import UsageError
 from emb_runtime.records import HOMING_LOG, LISTEN_ONLY_LOG
-from emb_runtime.system.realtime import processors
 
 SUFFIX = ".mcap"
 PASSED_OVER = (HOMING_LOG + SUFFIX, LISTEN_ONLY_LOG + SUFFIX)  # Logs of emb-run that hold no experiment
@@ -51,7 +50,7 @@ def run_campaign(
     sources, evaluate = find(paths), partial(evaluate_one, options=options)
     with replacing(output) as beside:
         if ray is None:
-            numbered = in_processes(evaluate, sources, jobs or len(processors()), time_limit)
+            numbered = in_processes(evaluate, sources, jobs or os.cpu_count() or 1, time_limit)
         else:
             numbered = on_ray(evaluate, sources, jobs, time_limit, ray)
         rows = mark_copies(_in_order(len(sources), numbered))

@@ -8,7 +8,6 @@ from importlib import metadata
 from pathlib import Path
 
 from emb_bench.config.bench import load_bench
-from emb_runtime.can.transport import is_private
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import Parser, as_json, complain, mention, show
 
@@ -45,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--json", action="store_true", help="print the result as JSON")
     p.add_argument("--version", action="version", version=f"emb-commission {metadata.version('emb-excite')}")
     each = p.add_argument_group("for each run of emb-run, see there")
-    for option, value in (("--drive", "FILE@BUS"), ("--operator", "NAME"), ("--serial", "TEXT"), ("--cpu", "N")):
+    for option, value in (("--drive", "FILE@BUS"), ("--operator", "NAME"), ("--serial", "TEXT")):
         each.add_argument(option, metavar=value)
     for option in ("--no-rt", "--no-watchdog", "--long-timeouts"):
         each.add_argument(option, action="store_true")
@@ -55,11 +54,11 @@ def parser() -> argparse.ArgumentParser:
 def options(args: argparse.Namespace) -> list[str]:
     """Options of each run. On a bus that another program can be on, each one is confirmed."""
     given = [f"--{name.replace('_', '-')}" for name in ("no_rt", "no_watchdog", "long_timeouts") if getattr(args, name)]
-    for name in ("drive", "operator", "serial", "cpu"):
+    for name in ("drive", "operator", "serial"):
         if getattr(args, name) is not None:
             given += [f"--{name}", getattr(args, name)]
     bus = args.iface.rpartition("@")[2] if args.iface.startswith("map:") else args.iface
-    in_process = bus.partition(":")[0] in ("sim", "sim-drive") or is_private(bus)
+    in_process = bus.partition(":")[0] in ("sim", "sim-drive")
     if args.yes:
         return [*given, "--yes"]
     return [*given, "--confirm"] if args.confirm or not in_process else given

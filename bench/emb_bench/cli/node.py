@@ -58,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("--iface", required=True, help="SocketCAN interface (vcan0, can0) or python-can BACKEND:CHANNEL")
+    p.add_argument("--iface", required=True, help="SocketCAN interface (vcan0, can0)")
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
     p.add_argument(
         "--brake", default="", metavar="plant=stribeck,f_v=3e-5,...",

@@ -34,7 +34,7 @@ _SELECT_LIMIT: Final = 1024  # FD_SETSIZE
 _SFF_MASK: Final = 0x7FF  # the hot path's, as plain numbers
 _MSG_CONFIRM: Final = 0x800
 _MSG_DONTWAIT: Final = 0x40
-STEP_SLACK_NS: Final = 1_000_000  # A wall clock that stepped by less than a sample time is not noticed [ns]
+_STEP_SLACK_NS: Final = 1_000_000  # A wall clock that stepped by less than a sample time is not noticed [ns]
 
 
 class TransmitQueueFullError(BusError):
@@ -46,7 +46,7 @@ class Transport(Protocol):
 
     @property
     def name(self) -> str:
-        """Name given by the user: ``can0``, ``sim``, ``virtual:test``."""
+        """Name given by the user: ``can0``, ``sim``."""
         ...
 
     @property
@@ -282,7 +282,7 @@ class SocketCan:
         The queue was empty just before, so the frame cannot be older than that, nor younger than the deadline.
         """
         time_ns = datagram.wall_ns - self._wall_offset_ns
-        if not empty_ns - STEP_SLACK_NS <= time_ns <= deadline_ns + STEP_SLACK_NS:
+        if not empty_ns - _STEP_SLACK_NS <= time_ns <= deadline_ns + _STEP_SLACK_NS:
             self._wall_offset_ns = self._clock.wall_offset_ns()
 
     def _lose(self, code: int | None) -> BusError:
@@ -295,8 +295,3 @@ class SocketCan:
         else:
             self._lost = f"{self.name}: the socket failed: {os.strerror(code) if code else 'no reason given'}"
         return BusError(self._lost)
-
-
-def is_private(name: str) -> bool:
-    """Returns True if only this process can open a bus of that name; one of the kernel may be called "virtual" too."""
-    return name.startswith("virtual:")

@@ -10,9 +10,8 @@ from importlib import metadata
 from pathlib import Path
 from textwrap import dedent
 
-from emb_runtime.can.interfaces import open_transport, same_bus
+from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import bench_identity, load_layout
-from emb_runtime.can.transport import is_private
 from emb_runtime.config.bench import load_bench
 from emb_runtime.drives.gateway import Gateway, wait_for
 from emb_runtime.drives.mapping import PROPERTIES, Mapping, require_fit
@@ -50,8 +49,8 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("mapping", type=Path, metavar="FILE", help="mapping file of the drive (TOML)")
-    p.add_argument("--drive", required=True, metavar="BUS", help="bus of the drive: can0, or BACKEND:CHANNEL")
-    p.add_argument("--node", required=True, metavar="BUS", help="bus of the node: vcan0, can1, or BACKEND:CHANNEL")
+    p.add_argument("--drive", required=True, metavar="BUS", help="bus of the drive: can0")
+    p.add_argument("--node", required=True, metavar="BUS", help="bus of the node: vcan0, can1")
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench description, that of emb-run")
     p.add_argument(
         "--serial", default="", metavar="TEXT", help="serial number on the drive, which has no other identity"
@@ -60,7 +59,6 @@ def parser() -> argparse.ArgumentParser:
         "--listen", action="store_true", help="send nothing to a drive that broadcasts: samples only, nothing is armed"
     )
     p.add_argument("--yes", action="store_true", help="do not ask before the drive is armed")
-    p.add_argument("--cpu", type=int, metavar="N", help="pin to this processor")
     p.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")
     p.add_argument("--json", action="store_true", help="print the counts at the end as JSON")
     p.add_argument("--version", action="version", version=f"emb-gateway {metadata.version('emb-excite')}")
@@ -80,7 +78,7 @@ def _serve(args: argparse.Namespace) -> int:
     bench, mapping = load_bench(args.bench), load_mapping(args.mapping)
     require_fit(mapping, bench)
     layout = load_layout()
-    if same_bus(args.drive, args.node):
+    if args.drive == args.node:
         raise UsageError(
             f"--node {args.node}: expected another bus than the drive's, whose identifiers differ in meaning"
         )
@@ -88,7 +86,7 @@ def _serve(args: argparse.Namespace) -> int:
         raise UsageError(
             f"--listen: {mapping.name} sends nothing unless it is asked; only a drive that broadcasts is heard"
         )
-    if "no_identity" in mapping.lost and not (args.serial or args.listen or is_private(args.drive)):
+    if "no_identity" in mapping.lost and not (args.serial or args.listen):
         raise UsageError(
             f"{mapping.name} does not say what it is, and nobody has: expected --serial TEXT, the number on the drive"
         )
@@ -99,13 +97,13 @@ def _serve(args: argparse.Namespace) -> int:
         raise SafetyStopError("stopped by the operator before anything was sent")
     infos = mapping.messages.values()
     identifiers = None if any(info.extended for info in infos) else tuple(info.identifier for info in infos)
-    drive_bus, clock = open_transport(args.drive, bench, identifiers, mapping.bitrate)
+    drive_bus, clock = open_transport(args.drive, bench, identifiers)
     try:
         node_bus, _ = open_transport(args.node, bench, (layout.command.identifier,))
         try:
             gateway = Gateway(mapping, bench, drive_bus, node_bus, clock, wait_for(drive_bus, node_bus))
             if not args.no_rt:
-                realtime.obtain(cpu=args.cpu, priority=PRIORITY)
+                realtime.obtain(PRIORITY)
             done = "listening" if args.listen else "armed"
             try:
                 gateway.run(stop, lambda: mention(f"{mapping.name}: {done}, node on {args.node}"), arms=not args.listen)

@@ -10,14 +10,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.cli import summary
+from emb_runtime.cli.experiment import experiment
 from emb_runtime.cli.options import Ask, Plan, Stage, log_folder, log_path, names_a_file, parser, prepare
 from emb_runtime.cli.preflight import CheckResult, RefusedError, Verdict, table
-from emb_runtime.cli.repeat import campaign, experiment
-from emb_runtime.cli.session import Bus, Console, listen_only, unpinned
+from emb_runtime.cli.session import Bus, Console, listen_only
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError, UsageError
 from emb_runtime.records import LISTEN_ONLY_LOG
@@ -88,7 +87,7 @@ def main(argv: list[str] | None = None) -> int:
             with log_folder(plan.log), shown(plan):
                 if plan.stage is Stage.READ_ONLY:
                     return _read(plan, console)
-                return _campaign(plan, console) if plan.repeat > 1 else _experiment(plan, console)
+                return _experiment(plan, console)
         except RefusedError as err:
             if plan.json:
                 show(as_json(summary.refusal(err, plan.iface)))
@@ -127,12 +126,12 @@ def shown(plan: Plan) -> Iterator[None]:
 
 def _experiment(plan: Plan, console: Console) -> int:
     reporter = None if plan.report is None else _reporter(plan.report)
-    done = experiment(plan, plan.iface, log_path(plan.log), console)
-    show(as_json(done.document) if plan.json else summary.text(done.document, plan.verbose))
-    if reporter is not None and done.document["log"] is not None:
-        reported = _report(reporter, done.document["log"], plan)
-        return done.exit_code or reported
-    return done.exit_code
+    document, exit_code = experiment(plan, log_path(plan.log), console)
+    show(as_json(document) if plan.json else summary.text(document, plan.verbose))
+    if reporter is not None and document["log"] is not None:
+        reported = _report(reporter, document["log"], plan)
+        return exit_code or reported
+    return exit_code
 
 
 def _reporter(page: Path) -> str:
@@ -149,21 +148,8 @@ def _reporter(page: Path) -> str:
 
 def _report(module: str, log: str, plan: Plan) -> int:
     """Have a process without the real-time settings of this one estimate, and write the page; its exit code."""
-    with unpinned(plan):
-        command = [sys.executable, "-P", "-m", module, "report", log, "--output", str(plan.report)]
-        return subprocess.run(command, stdout=sys.stderr if plan.json else None, check=False).returncode
-
-
-def _campaign(plan: Plan, console: Console) -> int:
-    def report(number: int, document: dict[str, Any]) -> None:
-        line = f"run {number} of {plan.repeat}: {summary.brief(document)}"
-        show(as_json(document | {"run": number}) if plan.json else line)
-
-    exit_code, results = campaign(plan, console, report)
-    if not plan.json:
-        counts = ", ".join(f"{count} {result}" for result, count in results.items())
-        show(f"{sum(results.values())} of {plan.repeat} runs: {counts}; logs in {plan.log}")
-    return exit_code
+    command = [sys.executable, "-P", "-m", module, "report", log, "--output", str(plan.report)]
+    return subprocess.run(command, stdout=sys.stderr if plan.json else None, check=False).returncode
 
 
 def _read(plan: Plan, console: Console) -> int:

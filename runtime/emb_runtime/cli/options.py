@@ -13,7 +13,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from emb_runtime.can.interfaces import same_bus
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
@@ -23,14 +22,12 @@ from emb_runtime.learning.assumptions import make_assumptions
 from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
-from emb_runtime.system import realtime
 from emb_runtime.system.terminal import Parser, one_line
 
 if TYPE_CHECKING:
     from emb_runtime.drives.mapping import Mapping
 
 LONGEST_READING = 86_400.0  # Longest ``--read-only`` [s]
-MOST_RUNS = 10_000
 LIVE_PORT = 8765  # Port that viewers propose
 QUICK_GOAL = "0.6%"
 """Standard deviation of each parameter, as a part of its value, at which an experiment with ``--quick`` ends: 95 % of
@@ -45,9 +42,8 @@ does not fit. Results go to standard output, the table and progress to standard 
 
 EPILOG = """\
 with --json:
-  One document on a line: the outcome, what was counted, the pre-flight lines, and the ways home. With --repeat one such
-  line per run (JSON Lines). A pre-flight that refuses has a document too; what is wrong before it has a line on
-  standard error only.
+  One document on a line: the outcome, what was counted, the pre-flight lines, and the ways home. A pre-flight that
+  refuses has a document too; what is wrong before it has a line on standard error only.
 
 the simulated bus:
   --iface sim:KEY=VALUE,... where KEY is seed, of the sensors' noise (default 1); plant, one of the bench file's
@@ -66,7 +62,6 @@ exit codes:
   8  no one brake explains what the node reported: a sensor, its zero, the reported current, or the drive is wrong
   9  with --strict: the experiment was completed, and the brake's estimate lies outside the ranges of the bench file, so
      that the limits were not guaranteed
-  With --repeat: that of the first run that failed.
 
 examples:
   emb-run --iface sim --json                        the shipped actor on the simulated brake, in lock-step
@@ -77,7 +72,6 @@ examples:
   emb-run --iface can0 --limit 1 --home             third: at most 1 A, and back to the origin if it ends elsewhere
   emb-run --iface can0 --quick                      all four parameters to about 1 % in a tenth of a second, and home
   emb-run --quick --stop-when k_1=1%,f_v=5%         as short as what has to be known allows
-  emb-run --iface can0 --repeat 20 --log runs/      twenty experiments, each from the origin
   emb-hil --slow 100 -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0'
                                                     where the kernel has no CAN
 """
@@ -132,11 +126,7 @@ class Plan:
     limit: float  # Largest current that may leave [A]
     stop_condition: StopCondition | None  # Precision of the estimate at which an experiment ends early
     home: bool
-    repeat: int
     log: Path  # Log path as given by the user: a file, or a folder
-    cpu: int | None
-    processors: frozenset[int]
-    """Processors of this process: the recorder and the watchdog keep them when the loop is pinned."""
     real_time: bool
     watchdog: bool
     ask: Ask
@@ -162,8 +152,7 @@ def parser() -> argparse.ArgumentParser:
     what = p.add_argument_group("what is run")
     what.add_argument(
         "--iface", default="sim", metavar="NAME",
-        help="SocketCAN interface (can0, vcan0), 'sim' (lock-step, no CAN needed) or python-can BACKEND:CHANNEL "
-        "(default: sim)",
+        help="SocketCAN interface (can0, vcan0), or 'sim' (lock-step, no CAN needed; the default)",
     )  # fmt: skip
     what.add_argument(
         "--drive", metavar="FILE@BUS",
@@ -213,6 +202,12 @@ def parser() -> argparse.ArgumentParser:
         "-v", "--verbose", action="store_true", help="print every check of the pre-flight and every count"
     )
 
+    what.add_argument(
+        "--home", action="store_true",
+        help="bring the brake to the origin if it is elsewhere, before the experiment and after it; each way home is "
+        "guarded like a run and has a log of its own, ...-home.mcap",
+    )  # fmt: skip
+
     stage = p.add_argument_group("stage: how much of the chain may act (default: all of it)")
     one = stage.add_mutually_exclusive_group()
     one.add_argument("--read-only", action="store_true", help="only listen, log, and say what is on the bus")
@@ -225,28 +220,15 @@ def parser() -> argparse.ArgumentParser:
     asking.add_argument(
         "--confirm", action="store_true",
         help="show the pre-flight and ask before anything is armed (default where the bus is real and standard input "
-        "is a terminal); a campaign asks once",
+        "is a terminal)",
     )  # fmt: skip
     asking.add_argument("--yes", action="store_true", help="do not ask")
 
-    campaign = p.add_argument_group("campaign")
-    campaign.add_argument(
-        "--home", action="store_true",
-        help="bring the brake to the origin if it is elsewhere, before the experiment and after it; each way home is "
-        "guarded like a run and has a log of its own, ...-home.mcap",
-    )  # fmt: skip
-    campaign.add_argument(
-        "--repeat", type=int, default=1, metavar="N",
-        help="N experiments, one log each, with --home in between; sim:seed=K counts up. Ends after a fault that wants "
-        "to be looked at first, or if the brake does not come home",
-    )  # fmt: skip
-
     machine = p.add_argument_group("real time")
-    machine.add_argument("--cpu", type=int, metavar="N", help="pin the loop to this processor")
     machine.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")
     machine.add_argument(
         "--no-watchdog", action="store_true",
-        help="no watchdog process: for an adapter that cannot be opened twice",
+        help="no watchdog process: for a bus without a brake",
     )  # fmt: skip
 
     machine.add_argument(
@@ -265,25 +247,17 @@ def prepare(args: argparse.Namespace) -> Plan:
     bench, layout = load_bench(args.bench), load_layout()
     stage, limit = _stage(args, bench)
     steps, listen = _duration(args, bench)
-    processors = realtime.processors()
     if stage is not Stage.READ_ONLY and not args.long_timeouts:
         bench.refuse_long_timeouts()
-    if args.cpu is not None and args.cpu not in processors:
-        raise UsageError(f"--cpu: expected one of {sorted(processors)}, got {args.cpu}")
-    if not 1 <= args.repeat <= MOST_RUNS:
-        raise UsageError(f"--repeat: expected 1 to {MOST_RUNS} runs, got {args.repeat}")
-    if stage is Stage.READ_ONLY and (args.home or args.repeat > 1):
-        raise UsageError("--read-only: sends nothing, so --home and --repeat have nothing to do")
+    if stage is Stage.READ_ONLY and args.home:
+        raise UsageError("--read-only: sends nothing, so --home has nothing to do")
     if stage is Stage.READ_ONLY and (args.stop_when is not None or args.quick):
         option = "--stop-when" if args.stop_when is not None else "--quick"
         raise UsageError(f"--read-only: runs no experiment that {option} could end")
-    if args.report is not None and (stage is Stage.READ_ONLY or args.repeat > 1):
-        option = "--read-only" if stage is Stage.READ_ONLY else "--repeat"
-        raise UsageError(f"--report: one experiment has a page, and {option} makes none or many: emb-replay report")
+    if args.report is not None and stage is Stage.READ_ONLY:
+        raise UsageError("--report: an experiment has a page, and --read-only makes none")
     if stage is Stage.ZERO and args.home:
         raise UsageError("--zero: no brake comes home with 0 A; turn it by hand, or use --limit")
-    if args.repeat > 1 and names_a_file(args.log):
-        raise UsageError(f"--repeat: needs a folder for its logs, and --log {args.log} is a file")
     if args.confirm and (sys.stdin is None or not sys.stdin.isatty()):
         raise UsageError("--confirm: there is nobody to ask, standard input is no terminal; --yes does not ask")
     period = layout.command.cycle_time
@@ -307,11 +281,8 @@ def prepare(args: argparse.Namespace) -> Plan:
         listen=listen,
         stage=stage,
         limit=limit,
-        home=args.home or (args.repeat > 1 and stage is not Stage.ZERO),
-        repeat=args.repeat,
+        home=args.home,
         log=args.log,
-        cpu=args.cpu,
-        processors=processors,
         real_time=not args.no_rt,
         watchdog=not args.no_watchdog,
         ask=Ask.ALWAYS if args.confirm else Ask.NEVER if args.yes else Ask.REAL_BUS,
@@ -339,7 +310,7 @@ def _drive(iface: str, given: str | None, bench: Bench) -> MappedDrive | None:
         name, at, bus = given.rpartition("@")
         if not (name and at and bus) or file is not None:
             raise UsageError(f"--drive '{given}': expected FILE@BUS (drive.toml@can0), and a bus in --iface")
-        if same_bus(iface, bus):
+        if iface == bus:
             raise UsageError(
                 f"--drive '{given}': expected another bus than --iface, whose identifiers differ in meaning"
             )

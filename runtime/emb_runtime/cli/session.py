@@ -1,21 +1,19 @@
 """One run on an open bus: watchdog, real time, pre-flight, leave of the operator, recorder, loop, and what came of it.
 
-The recorder and the watchdog are processes of their own. They are started where the loop is not pinned to, whether it
-is already or not; of its scheduling they inherit nothing.
+The recorder and the watchdog are processes of their own; of the loop's scheduling they inherit nothing.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from emb_runtime.can.messages import Layout
-from emb_runtime.can.transport import Transport, is_private
+from emb_runtime.can.transport import Transport
 from emb_runtime.cli.bus_monitor import BusMonitor, BusStatistics, is_alarming, listen
 from emb_runtime.cli.options import Plan
 from emb_runtime.cli.preflight import CheckResult, Findings, RefusedError, check, interrupted, refuse
@@ -33,7 +31,6 @@ from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.state_machine import Event, Fault, StateMachine, timeouts
 from emb_runtime.safety.watchdog import WatchdogHandle
 from emb_runtime.system import compiled_core, realtime
-from emb_runtime.system.child_process import HAS_CHILD_PROCESSES
 from emb_runtime.system.clock import Clock
 from emb_runtime.system.terminal import as_json
 
@@ -56,7 +53,7 @@ class Bus:
     @property
     def in_process(self) -> bool:
         """Returns True if nobody but this process can be on it."""
-        return self.simulated or is_private(self.transport.name)
+        return self.simulated
 
     def pass_over(self, frame: Frame, layout: Layout) -> None:
         """Drop a frame, unless it is alarming."""
@@ -87,7 +84,7 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
     actor: Actor = Still() if homing else plan.policy
     with ExitStack() as stack:
         watchdog = _watch(plan, bus, stack)
-        obtained = realtime.obtain(cpu=plan.cpu) if plan.real_time and not bus.simulated else None
+        obtained = realtime.obtain() if plan.real_time and not bus.simulated else None
         start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=homing)
         heard = observe(plan, bus, start_conditions, console.stop_requested)
         duration = steps * plan.bench.timing.sample_time
@@ -96,8 +93,7 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
         refuse(lines)
         if not console.may_arm(bus):
             raise interrupted("before anything was sent", lines)
-        with unpinned(plan):
-            recorder = start_recorder(plan, bus, run_type, path, lines, steps)
+        recorder = start_recorder(plan, bus, run_type, path, lines, steps)
         outcome = result = None
         try:
             push_clock(recorder, bus.clock)
@@ -212,29 +208,12 @@ def push_clock(recorder: Recorder, clock: Clock) -> None:
     recorder.push_clock(now_ns, now_ns + clock.wall_offset_ns())
 
 
-@contextmanager
-def unpinned(plan: Plan) -> Iterator[None]:
-    """Run on every processor that the user gave us: a child keeps what it is started with."""
-    if not HAS_CHILD_PROCESSES:
-        yield
-        return
-    pinned = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, plan.processors)
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, pinned)
-
-
 def _watch(plan: Plan, bus: Bus, stack: ExitStack) -> WatchdogHandle | None:
     """Start the watchdog, where another process can be on the bus; it ends with the stack."""
     if bus.in_process or not plan.watchdog:
         return None
     try:
-        with unpinned(plan):
-            watchdog = WatchdogHandle.start(
-                bus.transport, plan.bench, plan.bench.watch.heartbeat, real_time=plan.real_time
-            )
+        watchdog = WatchdogHandle.start(bus.transport, plan.bench, plan.bench.watch.heartbeat, real_time=plan.real_time)
     except BusError as err:
         raise BusError(f"{err}; --no-watchdog runs without one") from err
     stack.callback(watchdog.finish)

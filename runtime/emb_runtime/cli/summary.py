@@ -138,7 +138,6 @@ def header(
         estimates=estimates,
         learns=learns,
         drive_bus=plan.drive.bus if plan.drive is not None else "",
-        drive_bitrate=plan.drive.mapping.bitrate if plan.drive is not None else 0,
     )
 
 

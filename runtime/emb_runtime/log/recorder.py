@@ -2,8 +2,6 @@
 
 The file is written by a process of its own (:mod:`emb_runtime.log.recorder_process`), which outlives this one: if the
 runtime is killed, it writes what the ring still holds and closes the file properly.
-
-Start the recorder before any real-time setting is made, or its process inherits scheduling and affinity.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from msgspec import convert
 
 from emb_runtime.can.codec import FrameRejectedError, Signal
 from emb_runtime.can.messages import CHARGE
-from emb_runtime.can.transport import Transport
+from emb_runtime.can.transport import SocketCan
 from emb_runtime.errors import BusError, EmbError, LogError
 from emb_runtime.log import mcap_schema
 from emb_runtime.log.ring_buffer import (
@@ -43,6 +43,7 @@ from emb_runtime.log.ring_buffer import (
 )
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.system import child_process
+from emb_runtime.system.clock import MonotonicClock
 from emb_runtime.system.realtime import step_back
 
 CHUNK = 256 * 1024  # Bytes after which a chunk is closed
@@ -204,7 +205,7 @@ class Recording:
         self._inbox = b""
         self._output = output
         self._path = Path(document["path"])
-        self._drive_bus = _open_drive_bus(header)
+        self._drive_bus = SocketCan(header.drive_bus, MonotonicClock()) if header.drive_bus else None
         self.writer = LogWriter(output, header)
         self.lost = 0  # Records that could not be written
         self.error = ""  # The first failure to write
@@ -312,17 +313,6 @@ class Recording:
         except OSError as err:
             self.error = f"writing failed: {err.strerror}"
             self.lost += 1
-
-
-def _open_drive_bus(header: LogHeader) -> Transport | None:
-    if not header.drive_bus:
-        return None
-    # Only here: each run waits for the imports of this process.
-    from emb_runtime.can.interfaces import open_transport
-    from emb_runtime.config.bench import parse_bench
-
-    (bench,) = (attachment.data for attachment in header.attachments if attachment.name == "bench.toml")
-    return open_transport(header.drive_bus, parse_bench(bench.decode(), "bench.toml"), bitrate=header.drive_bitrate)[0]
 
 
 def _time(record: Record) -> int:

@@ -155,7 +155,6 @@ class LogHeader:
     estimates: Sequence[tuple[str, str]] = ()  # Names and units of what is estimated
     learns: bool = False  # The shield learns which brakes are possible
     drive_bus: str = ""  # Bus of a mapped drive, whose frames the recorder reads by itself; "" for none
-    drive_bitrate: int = 0  # Of that bus [bit/s]
 
 
 class FrameRecord(NamedTuple):

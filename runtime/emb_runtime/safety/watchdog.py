@@ -3,8 +3,6 @@
 The process (:mod:`emb_runtime.safety.watchdog_process`) stands beside the loop, not in it: it sends the stop frames
 when the loop is stopped, killed, hung in a call or blocked on the GIL, and cannot send any more itself.
 Behind it stands the node's own watchdog, which needs nobody on this computer.
-
-Start it before any real-time setting is made, or its process inherits the affinity.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ import time
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 
-from emb_runtime.can.transport import SocketCan, Transport, is_private
+from emb_runtime.can.transport import SocketCan, Transport
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
 from emb_runtime.safety.heartbeat import Heartbeat
@@ -77,7 +75,7 @@ class WatchdogHandle:
             BusError: this bus cannot be watched or not opened twice, or the process did not start in time.
         """
         name = transport.name
-        if transport.truth is not None or is_private(name):
+        if transport.truth is not None:
             raise BusError(f"{name}: only this process can open this bus, so no watchdog can; run without one")
         # The loop's socket goes along, so that the bus can be taken away from it.
         sockets = [transport.descriptor] if isinstance(transport, SocketCan) else []

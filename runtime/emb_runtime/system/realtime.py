@@ -22,27 +22,19 @@ WAKE_UP_LATENCY = "/dev/cpu_dma_latency"
 _awake: int | None = None  # Its descriptor
 
 
-def obtain(cpu: int | None = None, priority: int = PRIORITY) -> dict[str, str]:
+def obtain(priority: int = PRIORITY) -> dict[str, str]:
     """Ask for real-time behaviour, and give what was obtained, or why not, per setting.
 
-    Call it last before the loop: after warm-up, and after every child was started. None leaves the affinity alone.
+    Call it last before the loop: after warm-up, and after every child was started.
     """
     return {
         "garbage_collector": _freeze_garbage(),
         "timer_slack": _timer_slack(),
         "huge_pages": _no_huge_pages(),
         "idle_states": _stay_awake(),
-        "affinity": _pin(cpu),
         "memory_lock": _lock_memory(),
         "scheduler": _fifo(priority),
     }
-
-
-def processors() -> frozenset[int]:
-    """Processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return frozenset(os.sched_getaffinity(0))
-    return frozenset(range(os.cpu_count() or 1))
 
 
 def step_back() -> None:
@@ -94,15 +86,6 @@ def _set(option: int, obtained: str) -> str:
     if libc.prctl(option, ctypes.c_ulong(1), *zeros) != 0:
         return f"not obtained: {os.strerror(ctypes.get_errno())}"
     return obtained
-
-
-def _pin(cpu: int | None) -> str:
-    if cpu is not None:
-        try:
-            os.sched_setaffinity(0, {cpu})
-        except (OSError, ValueError, OverflowError) as err:
-            return f"not obtained: {err}"
-    return ",".join(str(n) for n in sorted(os.sched_getaffinity(0)))
 
 
 def _lock_memory() -> str:

@@ -6,6 +6,7 @@ import signal
 from collections import deque
 from collections.abc import Iterator
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,7 +15,7 @@ from emb_bench.sim.node import BrakeNode
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import CurrentCommand, Frame
-from emb_runtime.system.clock import SteppedClock
+from emb_runtime.system.clock import MonotonicClock, SteppedClock
 
 MS = 1_000_000
 
@@ -111,6 +112,10 @@ def _handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-def test_a_node_on_a_bus_of_python_can_ends_after_its_duration(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--iface", "virtual:node", "--duration", "0.2", "--no-rt", "--json"]) == 0
+def test_a_node_that_nobody_commands_ends_after_its_duration(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus, clock = SimpleNamespace(send=lambda _: None, receive=lambda _: None, close=lambda: None), MonotonicClock()
+    monkeypatch.setattr("emb_bench.cli.node.open_transport", lambda *_: (bus, clock))
+    assert main(["--iface", "can0", "--duration", "0.2", "--no-rt", "--json"]) == 0
     assert '"obeyed": 0' in capsys.readouterr().out

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import re
 import shutil
 import signal
@@ -220,7 +221,7 @@ def test_a_start_that_a_few_samples_at_rest_tell_is_not_taken_for_exact(
 ) -> None:
     sim, log = Sim(), tmp_path / "run.mcap"
     sim.angle = -0.1
-    monkeypatch.setattr("emb_runtime.cli.repeat.open_transport", lambda _iface, bench, _ids: sim.open("", bench))
+    monkeypatch.setattr("emb_runtime.cli.experiment.open_transport", lambda _iface, bench, _ids: sim.open("", bench))
     assert in_process(["--iface", "sim", "--log", str(log), "--json"])["exit_code"] == 0
     own = read_experiment(read_log(log))
     assert own.x0() != (0.0, 0.0)
@@ -285,13 +286,13 @@ def test_a_simulated_brake_keeps_its_parameters_and_any_other_bus_stays_as_it_is
     assert simulated("sim:k_m=0.03, seed = 7", bench, 2).startswith("sim:k_m=0.03,")
     assert simulated("sim:k_m=0.03, seed = 7", bench, 2).endswith(f"velocity_noise={bench.noise.velocity},seed=9")
     assert simulated("map:d@x.toml@sim-drive:vesc", bench, 0).startswith("map:d@x.toml@sim-drive:vesc,k_m=")
-    for iface in ("can0", "sim0", "virtual:x", "map:d@x.toml@can0", "can0@sim0"):
+    for iface in ("can0", "sim0", "map:d@x.toml@can0", "can0@sim0"):
         assert simulated(iface, bench, 3) == iface
 
 
 def test_every_step_is_confirmed_unless_told_otherwise_or_nobody_else_is_on_the_bus() -> None:
-    real = ("can0", "virtual", "sim0", "pcan:PCAN_USBBUS1", "map:d@x.toml@can0", "map:drive.toml@virtual", "can0@sim")
-    private = ("sim", "sim:seed=3", "virtual:x", "map:d@x.toml@sim-drive:vesc")
+    real = ("can0", "sim0", "map:d@x.toml@can0", "can0@sim")
+    private = ("sim", "sim:seed=3", "map:d@x.toml@sim-drive:vesc")
     for iface in (*real, *private):
         for more in ([], ["--yes"], ["--confirm"]):
             given = commission.options(commission.parser().parse_args(["brake", "--iface", iface, *more]))
@@ -311,15 +312,38 @@ def test_what_cannot_be_done_is_a_line_and_an_exit_code(tmp_path: Path, capfd: p
     assert not (tmp_path / "brake").exists()
 
 
+SILENT = """
+import time
+from emb_runtime.system.clock import MonotonicClock
+class Silent:
+    name, truth, obtained = "silent", None, {}
+    def send(self, frame): pass
+    def receive(self, deadline_ns): time.sleep(max(0, deadline_ns - time.monotonic_ns()) * 1e-9)
+    def close(self): pass
+def opened(options, bench): return Silent(), MonotonicClock()
+"""
+"""A bus on which nobody is, as a registered transport."""
+
+
 @pytest.fixture
 def begun(tmp_path: Path) -> Callable[[str], subprocess.Popen[str]]:
     """``emb-commission`` in a process of its own, as soon as the log of a step grows."""
     (tmp_path / "sheet.toml").write_text(sheet_text())
+    (tmp_path / "silent-0.dist-info").mkdir()
+    entry = "[emb_runtime.transports]\nsilent = silent:opened\n"
+    (tmp_path / "silent-0.dist-info" / "entry_points.txt").write_text(entry)
+    (tmp_path / "silent.py").write_text(SILENT)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), os.environ.get("PYTHONPATH", "")))}
 
     def begin(step: str) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "emb_bench.cli.commission", "brake", "--bench", "sheet.toml", "--iface"]
         process = subprocess.Popen(
-            [*command, "virtual:nobody"], cwd=tmp_path, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+            [*command, "silent", "--yes"],
+            cwd=tmp_path,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
         )
         while not (tmp_path / "brake" / step).exists() and process.poll() is None:
             time.sleep(0.05)

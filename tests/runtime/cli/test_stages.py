@@ -6,22 +6,19 @@ import json
 import signal
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import ClassVar, cast
+from typing import ClassVar
 
 import pytest
 
 from emb_bench.logs.log import read_log
 from emb_bench.sim.node import BrakeNode
 from emb_runtime.can.messages import Layout
-from emb_runtime.can.transport import Transport
 from emb_runtime.cli.session import Bus
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
 from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.watchdog import WatchdogHandle, WatchdogResult
-from emb_runtime.system.clock import SteppedClock
 from tests.actors import constant_actor
 from tests.runtime.operating import Edited, EmbRun, Keyboard, Sim
 
@@ -174,14 +171,6 @@ def test_a_real_bus_asks_the_terminal_unless_told_not_to(
     emb_run.text("--no-watchdog", code=3)
     assert sim.sent == []
     emb_run.text("--no-watchdog", "--yes")
-
-
-@pytest.mark.parametrize(
-    ("name", "alone"), [("virtual:x", True), ("virtual", False), ("virtual0", False), ("sim", False)]
-)
-def test_a_can_interface_of_the_kernel_is_a_real_bus_whatever_it_is_called(name: str, alone: bool) -> None:
-    transport = cast(Transport, SimpleNamespace(name=name, truth=None))
-    assert Bus(name, transport, SteppedClock()).in_process is alone
 
 
 # --- the watchdog ---------------------------------------------------------------------------------------------------

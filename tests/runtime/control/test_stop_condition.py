@@ -15,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.cli.replay import main as emb_replay
-from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.control.core import HOME_PAIRS
 from emb_runtime.control.stop_condition import REACHED, parse_stop_condition
@@ -217,9 +216,3 @@ def test_it_ends_early_where_that_is_asked_for(
 
 def test_where_nothing_is_estimated_nothing_can_be_stopped_for(steady: EmbRun) -> None:
     steady.refused("--stop-when", "--stop-when", "k_1=1%", "--read-only")
-
-
-def test_a_campaign_asks_each_run_anew(steady: EmbRun, tmp_path: Path) -> None:
-    runs = steady.documents("--log", str(tmp_path), "--repeat", "2", "--stop-when", "k_m=2%")
-    assert [run["goal_reached"] for run in runs] == [True, True]
-    assert all(read_log(Path(run["log"])).tables["/estimate"]["step"][0] == 0 for run in runs)

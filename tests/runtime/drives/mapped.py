@@ -141,7 +141,7 @@ def runner(
         monkeypatch.setattr(f"emb_runtime.{module}.HAS_CHILD_PROCESSES", False)
     text = late_bench(polled=name == "mit")
     bus = MappedBus(name, text, tmp_path)
-    for module in ("repeat", "main"):
+    for module in ("experiment", "main"):
         monkeypatch.setattr(f"emb_runtime.cli.{module}.open_transport", bus.open)
     actor, bench = tmp_path / "actor.onnx", tmp_path / "late.toml"
     actor.write_bytes(constant_actor(bus.bench, current))

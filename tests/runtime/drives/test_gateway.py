@@ -432,7 +432,6 @@ def test_wrong_arguments_are_one_line_before_anything_is_opened(
     odrive, mit = str(EXAMPLES / "odrive.toml"), str(EXAMPLES / "mit.toml")
     for arguments, reason, code in (
         ([odrive, "--drive", "can0", "--node", "can0", "--serial", "7"], "expected another bus", 2),
-        ([odrive, "--drive", "can0", "--node", "socketcan:can0", "--serial", "7"], "expected another bus", 2),
         ([mit, "--drive", "can0", "--node", "vcan0", "--listen", "--bench", str(polled)], "only a drive that", 2),
         ([odrive, "--drive", "can0", "--node", "vcan0"], "expected --serial TEXT", 2),
         ([odrive, "--drive", "nosuch0", "--node", "vcan0", "--serial", "7", "--yes"], "nosuch0", 4),

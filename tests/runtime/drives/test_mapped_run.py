@@ -187,9 +187,9 @@ def test_a_mapping_that_does_not_fit_the_bench_is_refused_before_anything_is_sen
 
 def test_options_that_name_no_drive_and_bus_are_refused(odrive: tuple[MappedBus, EmbRun]) -> None:
     bus, emb_run = odrive
-    emb_run.refused("expected another bus", "--iface", "can0", "--drive", f"{bus.file}@socketcan:can0")
+    emb_run.refused("expected another bus", "--iface", "can0", "--drive", f"{bus.file}@can0")
     emb_run.refused("expected FILE@BUS", "--drive", f"{bus.file}@can0")  # in lock-step it is known already
     bench = parse_bench(late_bench(), "bench.toml")
-    for options in ("@can0", f"{bus.file}@", f"{bus.file}@sim", "a@map:b@can0", f"{bus.file}@virtual:x"):
+    for options in ("@can0", f"{bus.file}@", f"{bus.file}@sim", "a@map:b@can0"):
         with pytest.raises(UsageError):
             open_mapped(options, bench)

@@ -266,10 +266,9 @@ def test_what_it_obtained_of_real_time_is_told(bus: Bus, bench: Bench) -> None:
     assert settings["scheduler"] == "FIFO 90" or settings["scheduler"].startswith("not obtained: ")
 
 
-@pytest.mark.parametrize("bus_of_one", [transport(name="sim", truth={"f_v": 2e-5}), transport(name="virtual:test")])
-def test_a_bus_that_nobody_else_can_open_is_refused(bench: Bench, bus_of_one: Transport) -> None:
+def test_a_bus_that_nobody_else_can_open_is_refused(bench: Bench) -> None:
     with pytest.raises(BusError, match="only this process can open this bus"):
-        WatchdogHandle.start(bus_of_one, bench, 0.005)
+        WatchdogHandle.start(transport(name="sim", truth={"f_v": 2e-5}), bench, 0.005)
 
 
 def test_a_bus_that_cannot_be_opened_a_second_time_is_told_in_one_line(bench: Bench) -> None:

@@ -1,11 +1,7 @@
-"""One experiment with its ways home, and many of them."""
+"""One experiment with its ways home."""
 
 from __future__ import annotations
 
-import re
-from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +9,7 @@ from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import StopReason
 from emb_runtime.cli import summary
 from emb_runtime.cli.bus_monitor import BusStatistics
-from emb_runtime.cli.options import Plan, log_path
+from emb_runtime.cli.options import Plan
 from emb_runtime.cli.session import Bus, Console, conduct, observe
 from emb_runtime.control.result import may_go_home
 from emb_runtime.control.start_conditions import Bounds, StartConditions
@@ -21,21 +17,14 @@ from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError
 from emb_runtime.records import HOMING_LOG, RunType
 
 
-@dataclass(frozen=True)
-class ExperimentResult:
-    """Result of an experiment and its ways home."""
-
-    document: dict[str, Any]
-    """See :func:`emb_runtime.cli.summary.document`; of the way home, where that failed before the experiment."""
-    exit_code: int
-    goes_on: bool  # The next experiment may follow
-    truth: dict[str, str]  # True parameters of a simulated bus
-
-
-def experiment(plan: Plan, iface: str, path: Path, console: Console) -> ExperimentResult:
+def experiment(plan: Plan, path: Path, console: Console) -> tuple[dict[str, Any], int]:
     """Run one experiment on a bus, and bring the brake home before and after it where that is asked for and needed.
 
     The log must not exist; those of the ways home are called alike.
+
+    Returns:
+        The document, see :func:`emb_runtime.cli.summary.document`; of the way home, where that failed before the
+        experiment. And the exit code.
 
     Raises:
         RefusedError: the pre-flight or the operator refused; nothing was sent.
@@ -45,59 +34,24 @@ def experiment(plan: Plan, iface: str, path: Path, console: Console) -> Experime
     # The kernel keeps what is not in the DBC away: a babbling stranger must not cost the loop its period. Another
     # commander still shows, for he uses an identifier of the DBC; --read-only shows all that is on the bus.
     identifiers = tuple(message.identifier for message in plan.layout.known)
-    transport, clock = open_transport(iface, plan.bench, identifiers)
-    bus = Bus(iface, transport, clock)
-    truth = {name: str(value) for name, value in (transport.truth or {}).items()}
+    transport, clock = open_transport(plan.iface, plan.bench, identifiers)
+    bus = Bus(plan.iface, transport, clock)
     try:
         homing: dict[str, Any] = {}
         if plan.home and _is_away(plan, _observe(plan, bus, console)):
             way = conduct(plan, bus, RunType.HOMING, _beside(path, "before"), console)
-            homing["before"] = summary.document(plan, iface, way)
+            homing["before"] = summary.document(plan, plan.iface, way)
             if way.exit_code != EXIT_DONE:
-                return ExperimentResult(homing["before"], way.exit_code, False, truth)
+                return homing["before"], way.exit_code
         ran = conduct(plan, bus, RunType.EXPERIMENT, path, console)
-        document = summary.document(plan, iface, ran) | {"homing": homing}
-        exit_code, goes_on = document["exit_code"], ran.outcome.fault is None
+        document = summary.document(plan, plan.iface, ran) | {"homing": homing}
+        exit_code: int = document["exit_code"]
         if plan.home and may_go_home(ran.outcome) and not console.stop_requested():
             way_code = _go_home(plan, bus, path, console, homing)
-            exit_code, goes_on = exit_code or way_code, way_code == EXIT_DONE
+            exit_code = exit_code or way_code
     finally:
         transport.close()
-    return ExperimentResult(document, exit_code, goes_on, truth)
-
-
-def campaign(plan: Plan, console: Console, report: Callable[[int, dict[str, Any]], None]) -> tuple[int, Counter[str]]:
-    """Run one experiment after the other, and report each with its number from 1 and its document.
-
-    Returns:
-        The exit code of the first run that failed, and how often each result came.
-    """
-    results: Counter[str] = Counter()
-    exit_code, iface = EXIT_DONE, plan.iface
-    for number in range(1, plan.repeat + 1):
-        try:
-            done = experiment(plan, iface, log_path(plan.log), console)
-        except EmbError as err:
-            done = ExperimentResult(summary.refusal(err, iface), err.exit_code, False, {})
-        report(number, done.document)
-        results[done.document["result"]] += 1
-        exit_code = exit_code or done.exit_code
-        if console.stop_requested():
-            exit_code = exit_code or EXIT_SAFETY_STOP
-        if not done.goes_on or console.stop_requested():
-            break
-        iface = with_next_seed(iface, done.truth)
-    return exit_code, results
-
-
-def with_next_seed(iface: str, truth: dict[str, str]) -> str:
-    """The simulated bus again, with other noise; any other bus as it is."""
-    if "seed" not in truth:
-        return iface
-    seed = int(truth["seed"]) + 1
-    name, _, options = iface.partition(":")
-    kept = [option for option in options.split(",") if option and not re.match(r"\s*seed\s*=", option)]
-    return f"{name}:{','.join([*kept, f'seed={seed}'])}"
+    return document, exit_code
 
 
 def _observe(plan: Plan, bus: Bus, console: Console) -> BusStatistics:

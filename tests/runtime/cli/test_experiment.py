@@ -1,8 +1,7 @@
-"""Experiments with their ways home, and many of them in a row."""
+"""Experiments with their ways home."""
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,8 @@ import pytest
 from emb_bench.logs.log import read_log
 from emb_bench.sim.node import STATUS_PERIODS, BrakeNode
 from emb_runtime.can.messages import StopReason
-from emb_runtime.cli.repeat import with_next_seed
 from emb_runtime.config.bench import Bench
-from emb_runtime.errors import BusError
 from emb_runtime.records import NodeState
-from emb_runtime.system import compiled_core
-from emb_runtime.system.compiled_core import Core
 from tests.actors import constant_actor
 from tests.runtime.operating import Edited, EmbRun, Sim
 
@@ -133,83 +128,3 @@ def test_a_node_that_is_gone_after_the_experiment_leaves_the_brake_nobody_knows_
     document = short.document("--bench", hasty, "--home", code=3)
     assert (document["result"], document["answered"]) == ("NOT_AT_REST", 200)
     assert document["homing"] == {}  # a person should look first
-
-
-def test_a_campaign_is_one_log_and_one_line_per_run_with_other_noise_in_each(
-    short: EmbRun, tmp_path: Path, sim: Sim
-) -> None:
-    found = short.documents("--iface", "sim:f_v=3e-5,seed=7", "--repeat", "3")
-    assert [(d["run"], d["result"], d["home"]) for d in found] == [(n, "done", True) for n in (1, 2, 3)]
-    assert sim.opened == ["f_v=3e-5,seed=7", "f_v=3e-5,seed=8", "f_v=3e-5,seed=9"]
-    assert sorted(d["log"] for d in found) == sorted(map(str, (tmp_path / "logs").iterdir()))
-    assert {read_log(Path(d["log"])).metadata["emb.truth"]["seed"] for d in found} == {"7", "8", "9"}
-
-
-def test_a_campaign_in_words_is_a_line_per_run_and_a_summary(
-    short: EmbRun, sim: Sim, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    compared = Core(compiled=True, text="compiled")  # without a warning, whichever core runs the tests
-    monkeypatch.setattr(compiled_core, "running", lambda: compared)
-    out, err = short.streams("--repeat", "2")
-    lines = out.splitlines()
-    assert [line[:19] for line in lines[:2]] == ["run 1 of 2: done: 2", "run 2 of 2: done: 2"]
-    assert lines[2].startswith("2 of 2 runs: 2 done; logs in ")
-    assert err.count("pre-flight: ") == 1
-
-
-def test_a_campaign_ends_after_a_fault_that_wants_to_be_looked_at(short: EmbRun, sim: Sim) -> None:
-    strong = ("--iface", "sim:k_m=0.06,f_v=1e-6,T_c=2e-4")
-    found = short.documents("--duration", "0.5", *strong, "--repeat", "3", code=3)
-    assert [d["result"] for d in found] == ["MOTION_OUTSIDE_SET"]
-
-
-def test_ctrl_c_ends_the_present_run_safely_and_the_campaign(short: EmbRun, sim: Sim) -> None:
-    def second_run(node: BrakeNode) -> bool:
-        return len(sim.opened) == 2 and node.obeyed == 50
-
-    sim.when(second_run, lambda _node: signal.raise_signal(signal.SIGINT))
-    found = short.documents("--repeat", "5", code=3)
-    assert [d["result"] for d in found] == ["done", "INTERRUPTED"]
-    assert read_log(Path(found[1]["log"])).complete
-    assert sim.currents[-3:] == [0.0, 0.0, 0.0]
-
-
-def test_a_campaign_whose_node_goes_away_says_so_in_its_last_document(short: EmbRun, sim: Sim) -> None:
-    sim.change = lambda frame: None if len(sim.opened) == 2 else frame
-    found = short.documents("--repeat", "5", code=4)
-    assert [d["result"] for d in found] == ["done", "NO_NODE"]
-    assert found[1]["log"] is None
-
-
-def test_a_bus_that_is_lost_between_two_runs_is_told_as_one(short: EmbRun, sim: Sim) -> None:
-    def unplug(_node: BrakeNode) -> None:
-        raise BusError("can0: the interface has disappeared")
-
-    sim.when(lambda node: len(sim.opened) == 2 and node.samples == 10, unplug)
-    found = short.documents("--repeat", "3", code=4)
-    assert [(d["result"], d["exit_code"]) for d in found] == [("done", 0), ("BUS_LOST", 4)]
-
-
-def test_ctrl_c_between_two_runs_ends_the_campaign_and_is_no_success(
-    short: EmbRun, sim: Sim, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def pressed(_document: object) -> str:
-        signal.raise_signal(signal.SIGINT)
-        return "done"
-
-    monkeypatch.setattr("emb_runtime.cli.main.summary.brief", pressed)
-    assert "1 of 3 runs: 1 done" in short.text("--repeat", "3", code=3)
-
-
-@pytest.mark.parametrize(
-    ("iface", "truth", "following"),
-    [
-        ("sim", {"seed": "1"}, "sim:seed=2"),
-        ("sim:plant=exact", {"seed": "1"}, "sim:plant=exact,seed=2"),
-        ("sim:seed=9,f_v=3e-5", {"seed": "9"}, "sim:f_v=3e-5,seed=10"),
-        ("can0", {}, "can0"),
-        ("virtual:t", {}, "virtual:t"),
-    ],
-)
-def test_only_a_bus_that_has_a_seed_gets_the_next_one(iface: str, truth: dict[str, str], following: str) -> None:
-    assert with_next_seed(iface, truth) == following
