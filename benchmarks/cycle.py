@@ -36,8 +36,8 @@ from emb_bench.logs.timing import Floats, timing
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.receiver import Reception
 from emb_runtime.can.transport import SocketCan, Transport
+from emb_runtime.cli import experiment, session
 from emb_runtime.cli import main as run
-from emb_runtime.cli import repeat, session
 from emb_runtime.config.bench import Bench
 from emb_runtime.control import core, loop
 from emb_runtime.control.result import Outcome
@@ -135,7 +135,7 @@ def run_once(
         def open_it(_iface: str, _bench: Bench, *_: Any, **__: Any) -> tuple[Transport, Clock]:
             return local_bus(end, clock), clock
 
-        stack.enter_context(mock.patch.object(repeat, "open_transport", open_it))
+        stack.enter_context(mock.patch.object(experiment, "open_transport", open_it))
         stack.enter_context(mock.patch.object(session, "Loop", lambda **given: _Counted(loop.Loop(**given), busy)))
         for said, (owner, name) in (watched or {}).items():
             stack.enter_context(_stopwatch(owner, name, steps[said]))
