@@ -115,7 +115,8 @@ def _handlers() -> Iterator[None]:
 def test_a_node_that_nobody_commands_ends_after_its_duration(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bus, clock = SimpleNamespace(send=lambda _: None, receive=lambda _: None, close=lambda: None), MonotonicClock()
+    bus = SimpleNamespace(name="can0", send=lambda _: None, receive=lambda _: None, close=lambda: None)
+    clock = MonotonicClock()
     monkeypatch.setattr("emb_bench.cli.node.open_transport", lambda *_: (bus, clock))
     assert main(["--iface", "can0", "--duration", "0.2", "--no-rt", "--json"]) == 0
     assert '"obeyed": 0' in capsys.readouterr().out
