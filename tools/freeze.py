@@ -59,76 +59,16 @@ COMMANDS = {
 CYCLES, FRAMES = "/cycle", ["/can/rx", "/can/tx"]
 """Topics of a log."""
 RENAMED: dict[str, str] = {}
-"""Keys of JSON documents: the new name, and the frozen one. ``{"identified": "told"}``."""
-RENAMED_FROZEN = {"told": "identified"}
-"""Frozen keys and their new names, where other frozen documents have the new name already."""
-SUMMARY = "a campaign's JSON has the field names of its records as keys; the file of rows has log det of each"
-VERDICT = "a sentence: the text has it, not the JSON"
-RUN_THAT_HELPS = "36552f31: a run that would help stands once, in advice"
+"""Keys of JSON documents: the new name, and the frozen one."""
 GONE: dict[str, str] = {
-    "campaign/all/says/log_det*": SUMMARY,
-    "campaign/all/says/weighted_log_det*": SUMMARY,
-    "campaign/all/says/misfits*": SUMMARY,
-    "campaign/all/says/*/of": SUMMARY,
-    "campaign/all/says/*/why": SUMMARY,
-    "fim/*/verdict": VERDICT,
-    "report/*/verdict": VERDICT,
-    "fim/*/normalise_by": "the parameters of an information are always relative to theta",
-    "report/*/says/runs/*/information*": "36552f31: the page has no information over time; fim has it",
     "estimate/*/held_out*": "each of several records is predicted from the others; no other is",
     "report/*/held_out*": "each of several records is predicted from the others; no other is",
     "design/*/of": "a design is for all of its parameters",
     "estimate/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
     "report/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
-    "estimate/*/bootstrap*": "36552f31: no bootstrap over runs; each record is predicted from the others",
-    "*/conclusions/*/help": RUN_THAT_HELPS,
-    "*/conclusions/*/run": RUN_THAT_HELPS,
-    "*/conclusions/*/deviation_after": RUN_THAT_HELPS,
-    "campaign/all/says/campaigns*": "the rows have the folder of each run",
-    "info/*/says/metadata/emb.run/first_*": "14a0cd8: the first move has one limit, so that no log says which",
 }
-"""Patterns of frozen paths, ``section/name/key/...``, that are no more, each with the commit that says why."""
-REST = "0abcadc: a run is watched until the node is at rest, and recorded so far"
-ESTIMATE = "a38226b: the estimate is the runtime's, no longer rounded to single precision"
-DOUBLE = "8c3e4e84: estimates in double precision: a current is a step of its signal off here and there"
-FITS = "8c3e4e84: of a bench only limits and sample time decide whether a policy is refused"
-WINDOWS = "8dba46e: windows begin at a state whose squares fell"
-TOTAL = "the total allows for inertia and the scale of the angle, and its parts add in quadrature; no value changes"
-GATEWAY = "emb-gateway: a mapped drive is armed before the run: noise of other samples, no counts of its node"
-EXPLAINED: dict[str, str] = {
-    "estimate/*/warnings": "36552f31: a run that was stopped is in 'stopped', not among the warnings",
-    "runs/stiff/says/*": REST,
-    "runs/*/says/estimate/*": ESTIMATE,
-    "runs/not finite/says/log_messages": ESTIMATE,
-    "runs/beyond contract/says/log_messages": ESTIMATE,
-    "runs/another bench/*": FITS,
-    "logs/*/says/estimate/*": ESTIMATE,
-    "logs/*/says/*": DOUBLE,
-    "logs/*/frames": DOUBLE,
-    "info/*/says/largest/*": DOUBLE,
-    "info/*/says/metadata/emb.end/*": DOUBLE,
-    "rerun/lossy/says/differences/*": DOUBLE,
-    "info/*/says/estimate/*": ESTIMATE,
-    "logs/aborted/*": REST,
-    "info/aborted/says/*": REST,
-    "estimate/emps windows/says/*": WINDOWS,
-    "estimate/*/says/parameters/*/deviation": TOTAL,
-    "estimate/*/says/parameters/*/interval_95*": TOTAL,
-    "estimate/*/says/parameters/*/left_open*": TOTAL,
-    "estimate/*/says/systematic/*/deviation": TOTAL,
-    "campaign/all/says/parameters/*/estimate/*": TOTAL,
-    "campaign/all/says/campaigns/*/means/*": TOTAL,
-    "campaign/all/says/misfit": SUMMARY,
-    "campaign/all/says/parameters/*/cramer_rao": SUMMARY,
-    "demo/fim/numbers": "the text of fim has half of the 95 % interval in place of standard deviations",
-    "*/mapped/*": GATEWAY,
-    "demo/run/numbers": "76c82d4: the summary has a line on the motion",
-    "design/D of two/*": "d35eddd: an annealing moves the Euler brake as every other, with a third of the variations",
-    "estimate/clean windows/says/parameters/*/sandwich": "ee3542a: the start of each window is at its minimum",
-    "estimate/damaged oem/says/misfit/suspects/play/*": "19e394e: a secant has the shift of an early command too",
-    "campaign/all/says/parameters/*/estimate/constancy/mean": "19e394e: weights, by the same score of the damaged log",
-    "campaign/all/says/campaigns/*/means/*/mean": "19e394e: weights, by the same score of the damaged log",
-}
+"""Patterns of frozen paths, ``section/name/key/...``, that are no more, and why."""
+EXPLAINED: dict[str, str] = {}
 """The same, of values that differ on purpose."""
 
 # ---- what is kept of a document ----------------------------------------------------------------------------------
@@ -925,18 +865,12 @@ def main() -> int:
     return code
 
 
-def _with_new_names(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {RENAMED_FROZEN.get(key, key): _with_new_names(entry) for key, entry in value.items()}
-    return [_with_new_names(entry) for entry in value] if isinstance(value, list) else value
-
-
 def compared(section: str, old: Any, new: Any, words: bool) -> int:
     """Print what differs; 1 if something does."""
     if "emps" not in str(list(new)):
         old = {key: value for key, value in old.items() if not key.startswith("emps")}
     comparison = Comparison(section, words)
-    comparison.compare(section, _with_new_names(old), json.loads(json.dumps(new)))
+    comparison.compare(section, old, json.loads(json.dumps(new)))
     for line in comparison.differences:
         say(line)
     found, explained = len(comparison.differences), len(comparison.explained)
