@@ -24,7 +24,7 @@ from emb_train.cli import main
 from emb_train.closed_loop import Batch, Conditions
 from emb_train.evaluate import Settings, Subject, document, evaluate, open_subject, references, text
 from emb_train.optimum import followed, optima, searchable
-from emb_train.play import MEASURES, Draw, Played, fresh_draws, mean_score, play, reference_excitation
+from emb_train.play import MEASURES, Draw, Law, Played, fresh_draws, mean_score, play
 from tests.commands import refused
 from tests.train.trainings import HORIZON
 
@@ -50,7 +50,7 @@ def test_what_was_played_has_the_information_that_plain_python_computes_from_the
     draws = fresh_draws(WIDE, seed=5, count=3)
     excited = parse_excitation("square:period=0.2,amplitude=3", BENCH)
     for name in ("euler", "exact"):
-        outcome = play(BENCH, WIDE, PARAMETER_NAMES, reference_excitation(excited), draws, name, PHYSICAL)
+        outcome = play(BENCH, WIDE, PARAMETER_NAMES, Law(excited.law), draws, name, PHYSICAL)
         plant = BENCH.plant(name)
         for i, draw in enumerate(draws):
             rng = np.random.default_rng(draw.seed)

@@ -30,6 +30,7 @@ from emb_train.optimum import optima, searchable
 from emb_train.play import (
     Currents,
     Excitation,
+    Law,
     Measure,
     Outcome,
     Seen,
@@ -37,7 +38,6 @@ from emb_train.play import (
     mean_score,
     middle_of,
     play,
-    reference_excitation,
 )
 from emb_train.ppo import DeployedActor
 from emb_train.presets import reference_names
@@ -136,7 +136,7 @@ def references(bench: Bench) -> dict[str, Excitation]:
     """Every reference excitation by name, constant current of either sign among them."""
     limit = bench.limits.current
     names = [*COMPARED, *(f"step:amplitude={u:g}" for u in (limit, -limit))]
-    return {name: reference_excitation(parse_excitation(name, bench)) for name in names}
+    return {name: Law(parse_excitation(name, bench).law) for name in names}
 
 
 @dataclass(frozen=True)

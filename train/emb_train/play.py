@@ -60,7 +60,7 @@ class Played(Excitation):
 
 
 class Law(Excitation):
-    """A reference excitation that answers one measurement at a time, such as constant-speed."""
+    """A reference excitation, which answers one measurement at a time."""
 
     def __init__(self, law: reference.Law) -> None:
         self._law = law
@@ -68,11 +68,6 @@ class Law(Excitation):
     def __call__(self, seen: Seen) -> Currents:
         """See :class:`Excitation`."""
         return np.array([self._law(angle, velocity, int(step)) for angle, velocity, step, _ in seen.tolist()])
-
-
-def reference_excitation(excited: reference.Excitation) -> Excitation:
-    """One of :mod:`emb_bench.excitation`, for many experiments."""
-    return Law(excited.law) if excited.currents is None else Played(excited.currents)
 
 
 Results = TypeVar("Results", bound="Outcome")

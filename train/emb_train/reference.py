@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -105,9 +105,7 @@ def wanted_current(model: Model, state: State, scale: Scale, box: Box, table: An
 
 
 MAX_STORED_BYTES = 1 << 20  # Of a file; the tuned ones have some kilobytes
-
-Form = Literal["blind", "quadratic"]
-FORMS: tuple[Form, ...] = get_args(Form)  # Constants, or polynomials of the second degree in the estimate's logarithms
+Form = Literal["blind", "quadratic"]  # Constants, or polynomials of the second degree in the estimate's logarithms
 Row = Annotated[tuple[float, ...], Meta(min_length=TERMS, max_length=TERMS)]
 Samples = Annotated[int, Meta(ge=0, le=OLDEST_FRAME)]
 
