@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -18,7 +18,7 @@ from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench, load_bench
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Limits, Noise, Ranges
 from emb_runtime.errors import BenchFileError
-from emb_runtime.safety.shield import NO_PAST, shield, successor, window
+from emb_runtime.safety.shield import shield, successor, window
 from emb_runtime.safety.shield_design import ShieldLaw, chatter_excess, damped_excess, make_law
 from tests.properties.shield_climb import climb
 from tests.properties.shield_search import (
@@ -42,7 +42,6 @@ from tests.properties.shield_search import (
     coasting_induction,
     draw_brakes,
     fine_piece,
-    in_safe_set,
     induction,
     lagging_induction,
     search,
@@ -273,19 +272,6 @@ def in_envelope() -> st.SearchStrategy[BrakeParameters]:
 
 
 shares = st.floats(-1.0, 1.0)
-
-
-@settings(max_examples=300, deadline=None)
-@given(in_envelope(), st.floats(-10.0, 100.0), st.floats(-500.0, 500.0), shares, shares, st.floats(-6.0, 6.0))
-def test_a_state_of_the_set_is_followed_by_one(
-    p: BrakeParameters, x: float, v: float, angle_error: float, velocity_error: float, wanted: float
-) -> None:
-    law = make_law(SHIPPED)
-    excess = excess_of(law)
-    assume(in_safe_set(law, excess, x, v, 0.0))
-    angle, velocity = x + angle_error * law.angle_noise, v + velocity_error * law.velocity_noise
-    u, _ = shield(law, angle, velocity, wanted, NO_PAST, 100)
-    assert in_safe_set(law, excess, *euler_step(p, x, v, u, law.sample_time), 1e-9)
 
 
 @settings(max_examples=300, deadline=None)

@@ -28,7 +28,7 @@ from emb_bench.config.plants import Instruments, Mechanics
 from emb_bench.sim.instruments import MEMORY as INSTRUMENTS_MEMORY
 from emb_bench.sim.instruments import command, settle
 from emb_bench.sim.node import REST_TIME, REST_TRAVEL
-from emb_bench.sim.simulated_brake import pass_period
+from emb_bench.sim.simulated_brake import pass_period, sent_current
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.control.loop import STOP_LISTEN_NS
@@ -49,7 +49,7 @@ from emb_runtime.safety.motion_balance import (
 from emb_runtime.safety.sensor_monitor import MEMORY, judge, largest_current
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
-from emb_runtime.safety.shield import NO_PAST, damped_current, shield, window
+from emb_runtime.safety.shield import NO_PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from emb_train.reference import Box, box_of, stored, wanted_current
 from tests.searches.sensor_monitor import COMMAND_LOST, COVERED, SAMPLE_LOST, Script, covered, draw, tail
@@ -112,12 +112,7 @@ def fly(
             elif periods == 0:
                 wanted = wanted_current(model, state, scale, box, table, reference)
             limit = largest_current(law, limits, memory, law.current)
-            u, _ = shield(law, angle, velocity, wanted, past, k)
-            if not -limit <= u <= limit:
-                u = min(max(u, -limit), limit)
-                low, high = window(law, angle, velocity, past)
-                if not low <= u <= high:
-                    u = math.nan
+            u, _ = sent_current(law, True, angle, velocity, wanted, past, k, limit)
             if periods > 0 or script.losses[m, k] == COMMAND_LOST:
                 u = math.nan
             if periods == 0:

@@ -25,8 +25,8 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Instruments, Mechanics
 from emb_bench.sim.instruments import MEMORY as INSTRUMENTS_MEMORY
 from emb_bench.sim.instruments import command, settle
-from emb_bench.sim.simulated_brake import pass_period
-from emb_runtime.config.bench import BrakeParameters, Ranges
+from emb_bench.sim.simulated_brake import pass_period, sent_current
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.safety.sensor_monitor import (
     DOWN_FROM,
     HONEST,
@@ -45,7 +45,7 @@ from emb_runtime.safety.sensor_monitor import (
     unseen_speed,
 )
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
-from emb_runtime.safety.shield import NO_PAST, damped_current, shield, window
+from emb_runtime.safety.shield import NO_PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from tests.properties.shield_search import (
     bang_bang,
@@ -56,9 +56,11 @@ from tests.properties.shield_search import (
     few_reversals,
     levels,
     nothing,
+    of_plant,
     periodic,
     wait_then_push,
     white,
+    within_stiffness,
 )
 
 Floats = NDArray[np.float64]
@@ -165,12 +167,7 @@ def fly(
         verdict = HONEST
         for k in range(law.steps):
             limit = largest_current(law, limits, memory, law.current) if first else law.current
-            u, _ = shield(law, told[0], told[1], script.wanted[m, k], past, k)
-            if not -limit <= u <= limit:
-                u = min(max(u, -limit), limit)
-                low, high = window(law, told[0], told[1], past)
-                if not low <= u <= high:
-                    u = math.nan
+            u, _ = sent_current(law, True, told[0], told[1], script.wanted[m, k], past, k, limit)
             if periods > 0 or script.losses[m, k] == COMMAND_LOST:
                 u = math.nan
             own = damped_current(
@@ -283,7 +280,8 @@ def draw(
     unit = np.where(flat, rng.uniform(-math.sqrt(3.0), math.sqrt(3.0), shape), rng.standard_normal(shape))
     errors = np.zeros((m, n + 1, 3))
     errors[:, :, :2] = unit * [bench.noise.angle, bench.noise.velocity]
-    brakes = draw_brakes(rng, _with_stiffness_inside(bench, plant), m)
+    box, farthest = bench.range_set(bench.shield.ranges), bench.limits.angle[1]
+    brakes = draw_brakes(rng, within_stiffness(box, of_plant(bench.plant(plant).mechanics), farthest), m)
     losses = np.zeros((m, n), np.int64)
     rate = np.where(rng.random((m, 1)) < 0.5, 0.0, 0.2 * rng.random((m, 1)) ** 3)
     losses[rng.random((m, n)) < rate] = COMMAND_LOST
@@ -298,15 +296,6 @@ def draw(
         duties=np.full(m, duty),
         onsets=rng.integers(0, onset + 1, m),
     )
-
-
-def _with_stiffness_inside(bench: Bench, plant: str) -> Ranges:
-    """The shield's set, with k_1 so that F_cl / x of a plant's curve and hysteresis stays inside it."""
-    box, farthest = bench.range_set(bench.shield.ranges), bench.limits.angle[1]
-    m = bench.plant(plant).mechanics
-    steeper = 1.0 + m.quadratic * farthest + m.cubic * farthest * farthest
-    low = box.low._replace(k_1=box.low.k_1 / (1.0 - m.hysteresis))
-    return replace(box, low=low, high=box.high._replace(k_1=box.high.k_1 / (steeper * (1.0 + m.hysteresis))))
 
 
 def results(bench: Bench, script: Script, plant: str = "euler", first: bool = True) -> Floats:

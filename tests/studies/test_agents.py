@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from pathlib import Path
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 from emb_bench.config.bench import load_bench
-from emb_train.cli import main as emb_train
 from emb_train.play import Draw
 from emb_train.training import METRICS, Training, load_preset
 from studies.thesis import agents, trainings
@@ -209,9 +207,3 @@ def test_an_experiment_is_recorded_until_it_leaves_the_limits(made: Trainings) -
     np.testing.assert_array_equal(current, np.tile(np.repeat([6.0, -6.0], 10), 15))  # a period of 20 ms
     trajectory = made.first("thesis-trajectory-b")
     assert phases(trajectory).sum() == pytest.approx(on_grid(trajectory).returns.mean())
-
-
-def test_a_training_without_a_shield_says_who_evaluates_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert emb_train(["ppo", "thesis-random", "--steps", "300", "--out", str(tmp_path / "a")]) == 0
-    assert "the study of the thesis shows what it does" in capsys.readouterr().out
-    assert json.loads((tmp_path / "a" / METRICS).read_text())["iteration"] == 1
