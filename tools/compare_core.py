@@ -366,8 +366,9 @@ def _estimator(dice: random.Random) -> Iterator[Any]:
             state = kalman.follow(model, state, *seen, float(step), current)
             levels = [dice.uniform(-1.0, 1.0) for _ in range(3)]
             switches = [dice.uniform(0.0, 0.1) for _ in range(2)]
-            wanted = speed_loop.follow_reference(model, state, scale, levels, switches, float(step))
-            yield state, kalman.believed(model, state), kalman.deviations(model, state), wanted
+            believed = kalman.believed(model, state)
+            wanted = speed_loop.follow_reference(model, state, believed, scale, levels, switches, float(step))
+            yield state, believed, kalman.deviations(model, state), wanted
             current = dice.uniform(-6.0, 6.0)
             push = model.motor * current - model.spring * max(angle, 0.0) - model.viscous * velocity
             angle += 1e-3 * velocity

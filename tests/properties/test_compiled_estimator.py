@@ -5,7 +5,7 @@ from __future__ import annotations
 from emb_bench.compiled import compiled
 from emb_runtime.config.bench import load_bench
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.estimator.kalman import follow, start
+from emb_runtime.estimator.kalman import believed, follow, start
 from emb_runtime.estimator.speed_loop import follow_reference, scale_of
 
 BENCH = load_bench()
@@ -19,5 +19,5 @@ def test_compiled_for_the_batch_it_has_the_same_bits() -> None:
         for sample in SAMPLES:
             plain, fast = follow(model, plain, *sample), compiled(follow)(model, fast, *sample)
             assert plain == fast
-            asked = model, plain, scale_of(BENCH), (1.0, -1.0), (0.0131,), 6.0
+            asked = model, plain, believed(model, plain), scale_of(BENCH), (1.0, -1.0), (0.0131,), 6.0
             assert follow_reference(*asked) == compiled(follow_reference)(*asked)

@@ -99,9 +99,10 @@ def wanted_current(model: Model, state: State, scale: Scale, box: Box, table: An
         table: of the reference, see :func:`set_reference`.
         reference: work space, shape [2 n − 1].
     """
-    set_reference(table, features(box, believed(model, state)), reference)
+    parameters = believed(model, state)
+    set_reference(table, features(box, parameters), reference)
     levels = (len(reference) + 1) // 2
-    return follow_reference(model, state, scale, reference[:levels], reference[levels:], state.step)
+    return follow_reference(model, state, parameters, scale, reference[:levels], reference[levels:], state.step)
 
 
 MAX_STORED_BYTES = 1 << 20  # Of a file; the tuned ones have some kilobytes

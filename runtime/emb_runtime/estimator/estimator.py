@@ -38,14 +38,20 @@ class Estimator:
         self.state = follow(self.model, self.state, angle, velocity, step, applied)
 
     @property
-    def values(self) -> Four:
-        """k_m, k_1, T_c and f_v in SI units."""
-        return _in_si(believed(self.model, self.state), self.model.nominal)
+    def relative(self) -> Four:
+        """k_m, k_1, T_c and f_v relative to their nominal values, within their ranges."""
+        return believed(self.model, self.state)
+
+    def in_si(self, relative: Four) -> Four:
+        """Relative parameters, or their deviations, in SI units."""
+        k_m, k_1, t_c, f_v = relative
+        nominal = self.model.nominal
+        return k_m * nominal[0], k_1 * nominal[1], t_c * nominal[2], f_v * nominal[3]
 
     @property
     def parameters(self) -> tuple[float, ...]:
         """k_m, k_1, T_c and f_v in SI units, then their standard deviations."""
-        return self.values + _in_si(deviations(self.model, self.state), self.model.nominal)
+        return self.in_si(self.relative) + self.in_si(deviations(self.model, self.state))
 
     @property
     def fits(self) -> bool:
@@ -58,8 +64,3 @@ class Estimator:
         numbers = self.parameters
         chosen = tuple(numbers[i] for i in self._varied)
         return chosen if all(map(math.isfinite, chosen)) else ()
-
-
-def _in_si(relative: Four, nominal: Four) -> Four:
-    k_m, k_1, t_c, f_v = relative
-    return k_m * nominal[0], k_1 * nominal[1], t_c * nominal[2], f_v * nominal[3]

@@ -17,7 +17,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from emb_runtime.config.bench import Bench
-from emb_runtime.estimator.kalman import Four, Model, State, believed, direction
+from emb_runtime.estimator.kalman import Four, Model, State, direction
 from emb_runtime.estimator.stick_slip import sign
 
 
@@ -54,18 +54,20 @@ def share_after(switch: float, step: float, horizon: float) -> float:
     return min(max(step + 1.0 - horizon * switch, 0.0), 1.0)
 
 
-def follow_reference(model: Model, state: State, scale: Scale, levels: Any, switches: Any, step: float) -> float:
+def follow_reference(
+    model: Model, state: State, parameters: Four, scale: Scale, levels: Any, switches: Any, step: float
+) -> float:
     """Current for the period that begins now, at the sample ``step`` [A].
 
     Args:
         model: of the estimator.
         state: estimate of the newest sample.
+        parameters: relative, within their ranges.
         scale: of levels and switches.
         levels: n speeds, −1..1.
         switches: n − 1 times, 0..1.
         step: of the newest sample.
     """
-    parameters = believed(model, state)
     total, before, last = 0.0, 1.0, len(levels) - 1
     for i in range(last + 1):
         after = min(before, share_after(switches[i], step, scale.horizon)) if i < last else 0.0

@@ -66,14 +66,16 @@ class Policy:
         """
         inputs, outputs = self._inference.inputs, self._inference.outputs
         if self._is_reference:
-            inputs[0], inputs[1], inputs[2], inputs[3] = estimator.values
+            parameters = estimator.relative
+            inputs[0], inputs[1], inputs[2], inputs[3] = estimator.in_si(parameters)
             self._inference.run()
             if not all(map(math.isfinite, outputs)):
                 return math.nan
             if max(map(abs, outputs)) > self._greatest:
                 return 2.0 * self.contract.limits.current
             levels, switches = outputs[: self._levels], outputs[self._levels :]
-            return follow_reference(estimator.model, estimator.state, self._scale, levels, switches, step)
+            model, state = estimator.model, estimator.state
+            return follow_reference(model, state, parameters, self._scale, levels, switches, step)
         inputs[0], inputs[1], inputs[2] = angle, velocity, step * self._sample_time
         if self._estimates:
             for i, number in enumerate(estimator.parameters):

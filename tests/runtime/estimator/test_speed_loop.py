@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from emb_bench.brake import euler
 from emb_runtime.config.bench import BrakeParameters, load_bench
-from emb_runtime.estimator.kalman import State, believed, make_model, start
+from emb_runtime.estimator.kalman import State, make_model, start
 from emb_runtime.estimator.speed_loop import current_for, follow_reference, scale_of, share_after
 
 BENCH = load_bench()
@@ -59,7 +59,8 @@ def wanted(levels: list[float], switches: list[float], step: float) -> float:
     """Mean level of the coming period, by the current of a loop so slow that it is proportional."""
     slow = SCALE._replace(gain=1e-6)
     state, model = state_at(-1.0, 0.0), EXACT._replace(coulomb=0.0)
-    return follow_reference(model, state, slow, levels, switches, step) / (1e-6 * SCALE.speed / 1e-3 / model.motor)
+    proportional = 1e-6 * SCALE.speed / 1e-3 / model.motor
+    return follow_reference(model, state, UNIT, slow, levels, switches, step) / proportional
 
 
 def test_levels_hold_between_their_switches_and_in_the_period_of_a_switch_by_their_shares() -> None:
@@ -74,10 +75,5 @@ def test_levels_hold_between_their_switches_and_in_the_period_of_a_switch_by_the
     assert found == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0])
 
 
-def test_it_believes_the_estimate_within_its_range_only() -> None:
-    free = state_at(10.0, 50.0, (9.0, 1.0, 1.0, 1.0))
-    edge = free._replace(mean=(10.0, 50.0, 1.5, 1.0, 1.0, 1.0))
-    assert believed(MODEL, free) == believed(MODEL, edge)
-    ask = [follow_reference(MODEL, s, SCALE, [0.1], [], 0.0) for s in (free, edge)]
-    assert ask[0] == ask[1] != 0.0
+def test_the_scale_is_the_benchs() -> None:
     assert (scale_of(BENCH, 0.3), scale_of(BENCH).gain) == ((500.0, 500.0, 0.3), 1.0)

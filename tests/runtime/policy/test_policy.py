@@ -24,6 +24,7 @@ from onnx import TensorProto, helper
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimator import Estimator
+from emb_runtime.estimator.kalman import believed
 from emb_runtime.estimator.speed_loop import follow_reference, scale_of
 from emb_runtime.policy.contract import (
     CONTRACT_KEY,
@@ -212,8 +213,18 @@ def test_a_reference_is_followed_by_the_speed_loop_at_the_benchs_scale() -> None
         policy = load_policy(reference_actor(BENCH, gain=0.5), bench)
         for step in (0.0, 150.0, 199.0, 200.0, 400.0):
             scale = scale_of(bench, 0.5)
-            wanted = follow_reference(estimator.model, estimator.state, scale, (0.5, -0.25), (0.4,), step)
+            model, state = estimator.model, estimator.state
+            wanted = follow_reference(model, state, believed(model, state), scale, (0.5, -0.25), (0.4,), step)
             assert policy.act(0.0, 0.0, step, estimator) == wanted
+
+
+def test_the_speed_loop_takes_an_estimate_within_its_range_only() -> None:
+    policy, estimator = load_policy(reference_actor(BENCH, gain=0.01), BENCH), Estimator(BENCH)
+    found = []
+    for k_m in (9.0, estimator.model.high[0], 1.0):
+        estimator.state = estimator.state._replace(mean=(10.0, 50.0, k_m, 1.0, 1.0, 1.0))
+        found.append(policy.act(10.0, 50.0, 0.0, estimator))
+    assert found[0] == found[1] != found[2]
 
 
 def test_a_reference_that_is_not_finite_or_beyond_its_contract_asks_for_a_current_that_is_so_too() -> None:
