@@ -88,7 +88,11 @@ def main() -> int:
     print(f"core: {taken.text}; {plain.answered} of {samples} samples answered; {plain.said}")
     quantiles = (50.0, 90.0, 99.0, 99.9, 100.0)
     print(f"{'':34}" + "".join(f"{q:9g} %" for q in quantiles))
-    for said, values in (("pair arrived to pair in hand", plain.age), ("pair in hand to command sent", plain.work)):
+    for said, values in (
+        ("pair arrived to pair in hand", plain.age),
+        ("pair in hand to command sent", plain.work),
+        ("pair arrived to command sent", plain.age + plain.work),
+    ):
         print(f"{said:34}" + "".join(f"{1e6 * v:8.1f} us" for v in np.percentile(values, quantiles)))
     print(
         f"processor time per cycle, waiting excluded: {1e6 * plain.busy:.1f} us, {plain.busy / 1e-3:.1%} of the period"
