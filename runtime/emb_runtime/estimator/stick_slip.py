@@ -33,7 +33,7 @@ REST: Final = 1e-5  # Standard deviation of the velocity below which a brake is 
 DOUBT: Final = 2.0
 """Factor on the standard deviation of the velocity that decides whether a brake sticks: there the errors are not
 Gaussian, and the filter does not recover from taking a moving brake for one that sticks."""
-FARTHEST: Final = 12.0  # Standard deviations from a kink beyond which its effect is zero
+FARTHEST: Final = 12.0  # Standard deviations from a kink beyond which it has no effect
 
 
 class Accelerations(NamedTuple):
@@ -108,11 +108,16 @@ def move(
     """
     toward, strength = 1.0 if now.pull >= 0.0 else -1.0, abs(now.pull)
     braked, driven = strength + now.coulomb, strength - now.coulomb
-    r = max(driven, 0.0) / braked
     forward = toward if v == 0.0 else sign(v)
     x1, v1 = slide(now, x, v, t, forward)
-    ahead, wide = toward * v, DOUBT * spread_along
-    stops = forward * v1 < 0.0
+    ahead, wide, stops = toward * v, DOUBT * spread_along, forward * v1 < 0.0
+    damped = now.damping * t
+    full, half = t * (1.0 - 0.5 * damped), t * t * (0.5 - damped / 6.0)
+    started, kept = (ahead + REST) / spread, (ahead + t * driven) / wide
+    first, second = (ahead + t * braked) / spread_against, min(started, kept)
+    if not stops and (max(first, second) <= -FARTHEST or min(first, second) >= FARTHEST):  # it slides for certain
+        return Motion(x1, v1, t, half, -forward * half, 1.0, full, -forward * full, 0.0, 0.0)
+    r = max(driven, 0.0) / braked
     # One that moves with a pull that drives it has stopped at the start, if at all; any other stops at the end.
     otherwise = 0.0 if min(ahead + REST, driven) > 0.0 else t
     before = t * v / (v - v1) if stops else otherwise
@@ -120,11 +125,8 @@ def move(
     if stops:
         v1 *= r  # 0 if it moved in the direction of the pull, which is then too weak
         x1 = x + 0.5 * (v * before + v1 * after)
-    started, kept = (ahead + REST) / spread, (ahead + t * driven) / wide
     sooner = started < kept
     width = spread if sooner else wide
-    first = min(max((ahead + t * braked) / spread_against, -FARTHEST), FARTHEST)
-    second = min(max(min(started, kept), -FARTHEST), FARTHEST)
     not_against, along = normal(first), normal(second)
     against = 1.0 - not_against
     stopped = max(1.0 - against - along, 0.0)
@@ -137,7 +139,7 @@ def move(
     uncertain = (1.0 - certain * certain) * along * along * max(width * width - spread * spread, 0.0)
     # The same where it stops on the way, and has the rest of the period to break away in.
     doubt = DOUBT * math.sqrt(max(spread_along * spread_along - spread * spread, REST * REST))
-    leaving = min(max(t * driven / doubt, -FARTHEST), FARTHEST)
+    leaving = t * driven / doubt
     released = normal(leaving)
     sure, share = max(2.0 * released - 1.0, 0.0), (t - before) / t if ahead < 0.0 else 0.0
     wide = share * doubt
@@ -146,8 +148,6 @@ def move(
     uncertain += stopped * wide * wide * unsure
     if ahead < 0.0:
         after *= sure
-    damped = now.damping * t
-    full, half = t * (1.0 - 0.5 * damped), t * t * (0.5 - damped / 6.0)
     sliding, leaning = against + certain * along, toward * (against - certain * along)
     reversing, turned, rest = r * before, r * after, 0.5 * after * after
     way = before * (0.5 * before + turned)

@@ -11,7 +11,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, s
 from emb_runtime.errors import BenchFileError
 from emb_runtime.estimator.estimate import by_name, words
 from emb_runtime.estimator.estimator import Estimator, estimated
-from emb_runtime.estimator.kalman import follow, start
+from emb_runtime.estimator.kalman import MISFIT, follow, start
 
 BENCH = load_bench()
 SAMPLES = [(0.0, 0.3, 0.0, 0.0), (0.02, 15.0, 1.0, 6.0), (0.4, 80.0, 6.0, 6.0), (0.45, 60.0, 7.0, -6.0)]
@@ -53,6 +53,9 @@ def test_it_takes_samples_and_begins_anew() -> None:
         assert estimator.parameters == estimator.estimate != Estimator(BENCH).estimate
         estimator.begin()
         assert estimator.state == fresh == start(estimator.model)
+        assert estimator.fits
+        estimator.state = fresh._replace(worst=1.01 * MISFIT)
+        assert not estimator.fits
 
 
 def test_an_estimate_that_is_not_finite_is_none() -> None:

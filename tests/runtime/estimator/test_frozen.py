@@ -23,7 +23,9 @@ BENCH = load_bench()
 
 def test_a_period_is_the_frozen_one() -> None:
     for (pull, coulomb, damping, spring, *state), expected in FROZEN["move"]:
-        assert list(move(Accelerations(pull, coulomb, damping, spring), *state)) == expected
+        # Its kinks reached 12 standard deviations far and no farther.
+        found = list(move(Accelerations(pull, coulomb, damping, spring), *state))
+        assert found == pytest.approx(expected, rel=0.0, abs=1e-30)
     for arguments, expected in FROZEN["contact"]:
         assert list(contact(*arguments)) == expected
     assert [sign(v) for v in (-2.0, 0.0, 3.0)] == [-1.0, 0.0, 1.0]

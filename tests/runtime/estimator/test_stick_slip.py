@@ -17,6 +17,7 @@ from emb_runtime.estimator.stick_slip import (
     excess,
     move,
     normal,
+    slide,
 )
 
 SURE = 1e-9
@@ -71,6 +72,22 @@ def test_a_brake_that_stops_and_may_break_away_is_known_no_better_than_a_sample_
         assert math.hypot(explained, math.sqrt(found.kinked)) > scatter
         assert found.velocity == pytest.approx(float(np.mean(ends)), abs=1.5 * scatter)
         assert abs(found.velocity_by_pull) <= T_S
+
+
+def test_a_brake_that_surely_slides_has_no_stop_and_no_kink() -> None:
+    for v in (12.5, -40.0):  # with the pull, and against it: 12.5 and 18 deviations from standstill
+        for pull in (2e4, -2e4):
+            found = move(Accelerations(pull, 2200.0, 4.7, 0.0), 5.0, math.copysign(v, v * pull), T_S, 1.0, 1.0, 1.0)
+            assert (found.stopped, found.kinked) == (0.0, 0.0)
+    driven = Accelerations(2e4, 2200.0, 4.7, 0.0)
+    assert move(driven, 5.0, 11.5, T_S, 1.0, 1.0, 1.0).kinked > 0.0
+    assert move(driven, 5.0, -300.0, T_S, 100.0, 1.0, 100.0).kinked > 0.0
+
+
+def test_a_brake_that_turns_around_at_the_very_end_of_a_period_is_driven_against_friction_from_there_on() -> None:
+    now = Accelerations(2e4, 2000.0, 5.0, 5e4)
+    found = move(now, 50.0, -22.1765, T_S, SURE, SURE, SURE)
+    assert found.velocity == pytest.approx(18.0 / 22.0 * slide(now, 50.0, -22.1765, T_S, -1.0)[1])
 
 
 def test_contact_in_a_period_is_its_integral_over_the_path() -> None:
