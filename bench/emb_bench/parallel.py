@@ -8,6 +8,7 @@ Ctrl-C. A process whose parent has died reads the end of its pipe and ends as we
 from __future__ import annotations
 
 import logging
+import math
 import multiprocessing
 import os
 import shutil
@@ -23,7 +24,7 @@ from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, TypeVar
 
 from emb_bench import ONE_THREAD
-from emb_runtime.errors import EmbError, UsageError
+from emb_runtime.errors import UsageError
 
 LOCAL = "local"  # Address that stands for a Ray started here, on this machine
 
@@ -36,23 +37,21 @@ Result = TypeVar("Result")
 
 
 class Lost(NamedTuple):
-    """Record of a piece of work whose process ended before the work was done."""
+    """A piece of work that was not done, and why, in words that follow its name."""
 
-    how: str  # Manner of the process's end, in words that follow its name
-    exit_code: int  # Of the process; a signal's number, negative
-    seconds: float  # Time for which it had the piece [s]
+    why: str
 
 
 def shared_out(
-    work: Callable[[Piece], Result], pieces: Sequence[Piece], jobs: int
+    work: Callable[[Piece], Result], pieces: Sequence[Piece], jobs: int, time_limit: float
 ) -> Generator[tuple[int, Result | Lost], None, None]:
     """Each piece's number and result, as they come, with at most ``jobs`` processes at work.
 
-    The work is a function that another process can import, or a ``functools.partial`` of one. Closed or interrupted, it
-    ends its processes at once.
+    The work raises nothing and returns something; it is a function that another process can import, or a
+    ``functools.partial`` of one. A process that takes longer than the limit [s] is ended. Closed or interrupted, all
+    are ended at once.
     """
-    waiting = iter(enumerate(pieces))
-    busy: dict[Any, tuple[_Worker, int]] = {}
+    waiting, busy = iter(enumerate(pieces)), dict[Any, tuple[_Worker, int]]()
 
     def give_next(worker: _Worker | None) -> None:
         if (piece := next(waiting, None)) is not None:
@@ -66,14 +65,20 @@ def shared_out(
         for _ in range(jobs):
             give_next(None)
         while busy:
-            for pipe in connection.wait(list(busy)):
-                worker, number = busy[pipe]
-                result = worker.take()
-                del busy[pipe]
-                if isinstance(result, Lost):
-                    worker.end()
-                give_next(None if isinstance(result, Lost) else worker)
-                yield number, result
+            left = min(worker.begun for worker, _ in busy.values()) + time_limit - time.monotonic()
+            ready = connection.wait(list(busy), None if math.isinf(left) else max(left, 0.0))
+            for pipe, (worker, number) in [*busy.items()]:
+                result: Any = None
+                if pipe in ready:
+                    result = worker.take()
+                elif time.monotonic() >= worker.begun + time_limit:
+                    result = Lost(f"not evaluated within {time_limit:g} s")
+                if result is not None:
+                    del busy[pipe]
+                    if isinstance(result, Lost):
+                        worker.end()
+                    give_next(None if isinstance(result, Lost) else worker)
+                    yield number, result
     finally:
         for worker, _ in busy.values():
             worker.end()
@@ -84,7 +89,7 @@ class _Worker:
 
     def __init__(self, work: Callable[[Any], Any]) -> None:
         self.pipe, theirs = _SPAWN.Pipe()
-        self._begun = time.monotonic()
+        self.begun = math.inf  # Monotonic time since which it works on its piece [s]
         self._process = _SPAWN.Process(target=_work, args=(theirs, work), daemon=True)
         if sys.platform != "win32":
             resource_tracker.ensure_running()  # started along with the first process, it would end the waiting
@@ -93,22 +98,21 @@ class _Worker:
         theirs.close()
 
     def give(self, piece: Any) -> None:
-        self._begun = time.monotonic()
+        self.begun = math.inf
         with suppress(OSError):  # a process that has ended is noticed when the result is taken
             self.pipe.send(piece)
 
     def take(self) -> Any:
-        """The result that has arrived, or :class:`Lost` if the process has ended; raises the error of the work."""
+        """The result that has arrived, or None where the work on it begins; :class:`Lost` if the process has ended."""
         try:
-            result, error = self.pipe.recv()
+            result = self.pipe.recv()
         except (EOFError, OSError):
-            seconds = time.monotonic() - self._begun
             self._process.join()
             code = self._process.exitcode or 0
             how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-            return Lost(how, code, seconds)
-        if error is not None:
-            raise error
+            return Lost(f"the process that evaluated it {how}")
+        if result is None:
+            self.begun = time.monotonic()
         return result
 
     def end(self) -> None:
@@ -123,12 +127,8 @@ def _work(pipe: Connection, work: Callable[[Any], Any]) -> None:
     with suppress(EOFError, OSError):
         while True:
             piece = pipe.recv()
-            result, error = None, None
-            try:
-                result = work(piece)
-            except EmbError as err:
-                error = err
-            pipe.send((result, error))
+            pipe.send(None)  # it begins
+            pipe.send(work(piece))
 
 
 @contextmanager
@@ -149,17 +149,21 @@ def _start_settings() -> Iterator[None]:
 
 
 def shared_out_on_ray(
-    work: Callable[[Piece], Result], pieces: Sequence[Piece], jobs: int | None, address: str, command: str
+    work: Callable[[Piece], Result],
+    pieces: Sequence[Piece],
+    jobs: int | None,
+    time_limit: float,
+    address: str,
 ) -> Generator[tuple[int, Result | Lost], None, None]:
     """Each piece's number and result, as they come, of tasks of Ray at an address, or of one started here (``LOCAL``).
 
-    The work raises nothing. ``command`` is the one that needs Ray, for the message if it is not installed.
+    The work raises nothing. A task that takes longer than the limit [s] is ended.
     """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # else Ray reports to its makers that it is used
     try:
         import ray
     except ImportError as err:
-        raise UsageError(f"{command} --ray needs ray: pip install 'emb-excite[ray]'") from err
+        raise UsageError("--ray needs ray: pip install 'emb-excite[ray]'") from err
     # The path of a socket may have 107 characters, and Ray's lie deep inside its folder.
     folder = tempfile.mkdtemp(prefix="ray-", dir="/tmp") if address == LOCAL else None
     own: dict[str, Any] = {"num_cpus": jobs, "include_dashboard": False, "_temp_dir": folder} if folder else {}
@@ -170,7 +174,7 @@ def shared_out_on_ray(
             ray.init(address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **own)
         except (OSError, OverflowError, RuntimeError, ValueError) as err:
             raise UsageError(f"--ray: Ray at '{address}' cannot be used: {err}") from err
-        yield from _run_tasks(ray, work, pieces, jobs)
+        yield from _run_tasks(ray, work, pieces, jobs, time_limit)
     finally:
         ray.shutdown()
         if folder is not None:
@@ -185,20 +189,24 @@ def _require_answer(address: str) -> None:
 
 
 def _run_tasks(
-    ray: Any, work: Callable[[Piece], Result], pieces: Sequence[Piece], jobs: int | None
+    ray: Any, work: Callable[[Piece], Result], pieces: Sequence[Piece], jobs: int | None, time_limit: float
 ) -> Generator[tuple[int, Result | Lost], None, None]:
     task = ray.remote(lambda piece: work(piece)).options(max_retries=_RETRIES)
     most = jobs or max(1, int(ray.cluster_resources().get("CPU", 1)))
     waiting, running = iter(enumerate(pieces)), dict[Any, tuple[int, float]]()
     while True:
         while len(running) < most and (job := next(waiting, None)) is not None:
-            running[task.remote(job[1])] = job[0], time.monotonic()
+            running[task.remote(job[1])] = job[0], time.monotonic() + time_limit
         if not running:
             return
-        ready, _ = ray.wait(list(running))
+        ready, _ = ray.wait(list(running), timeout=max(0.0, min(end for _, end in running.values()) - time.monotonic()))
+        late = [one for one, (_, end) in running.items() if one not in ready and time.monotonic() >= end]
+        for reference in late:
+            ray.cancel(reference, force=True)
+            yield running.pop(reference)[0], Lost(f"not evaluated within {time_limit:g} s")
         for reference in ready:
-            number, begun = running.pop(reference)
+            number, _ = running.pop(reference)
             try:
                 yield number, ray.get(reference)
             except ray.exceptions.RayError as err:
-                yield number, Lost(f"was lost ({type(err).__name__})", 1, time.monotonic() - begun)
+                yield number, Lost(f"the process that evaluated it was lost ({type(err).__name__})")

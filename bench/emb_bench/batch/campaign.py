@@ -5,11 +5,9 @@ Logs are shared out to processes or to Ray: one that dies, or takes too long, co
 
 from __future__ import annotations
 
-import faulthandler
 import os
-import signal
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing
 from functools import partial
 from pathlib import Path, PurePath
 
@@ -25,8 +23,6 @@ from emb_runtime.records import HOMING_LOG, LISTEN_ONLY_LOG
 
 SUFFIX = ".mcap"
 PASSED_OVER = (HOMING_LOG + SUFFIX, LISTEN_ONLY_LOG + SUFFIX)  # Logs of emb-run that hold no experiment
-OUT_OF_TIME = -signal.SIGALRM if hasattr(signal, "SIGALRM") else 1
-"""Exit code of a process whose time for a log is up: that signal ends it, or what Windows has instead."""
 Evaluate = Callable[[Source], Row]  # A function that another process can import; a ``functools.partial`` of one as well
 
 
@@ -131,47 +127,20 @@ def in_processes(
     evaluate: Evaluate, sources: Sequence[Source], jobs: int, time_limit: float
 ) -> Generator[tuple[int, Row], None, None]:
     """Each log's number and row, as they come, evaluated in processes of this machine."""
-    with closing(shared_out(partial(_in_time, evaluate, time_limit), sources, jobs)) as rows:
-        for number, row in rows:
-            yield number, _failed(sources[number], row, time_limit) if isinstance(row, Lost) else row
+    return _rows(sources, shared_out(evaluate, sources, jobs, time_limit))
 
 
 def on_ray(
     evaluate: Evaluate, sources: Sequence[Source], jobs: int | None, time_limit: float, address: str
 ) -> Generator[tuple[int, Row], None, None]:
     """Each log's number and row, as they come, evaluated on Ray, whose machines have the logs at the same paths."""
-    in_time = partial(_in_time, evaluate, time_limit)
-    for number, row in shared_out_on_ray(in_time, sources, jobs, address, "emb-replay campaign"):
-        if isinstance(row, Lost):
-            why = f"it {row.how}: out of memory, a fault, or longer than {time_limit:g} s"
-            row = failed(sources[number], f"{sources[number].path}: the process that evaluated it ended ({why})")
-        yield number, row
+    return _rows(sources, shared_out_on_ray(evaluate, sources, jobs, time_limit, address))
 
 
-def _in_time(evaluate: Evaluate, time_limit: float, source: Source) -> Row:
-    with limited_to(time_limit):
-        return evaluate(source)
-
-
-def _failed(source: Source, lost: Lost, time_limit: float) -> Row:
-    if lost.exit_code == OUT_OF_TIME and lost.seconds >= time_limit:
-        return failed(source, f"{source.path}: not evaluated within {time_limit:g} s")
-    return failed(source, f"{source.path}: the process that evaluated it {lost.how}")
-
-
-@contextmanager
-def limited_to(seconds: float) -> Iterator[None]:
-    """End this process with ``OUT_OF_TIME`` if what is inside takes longer; compiled code ends as well."""
-    if not hasattr(signal, "setitimer"):
-        with Path(os.devnull).open("w") as nowhere:
-            faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
-            try:
-                yield
-            finally:
-                faulthandler.cancel_dump_traceback_later()
-        return
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+def _rows(
+    sources: Sequence[Source], numbered: Generator[tuple[int, Row | Lost], None, None]
+) -> Generator[tuple[int, Row], None, None]:
+    with closing(numbered):
+        for number, row in numbered:
+            path = sources[number].path
+            yield number, failed(sources[number], f"{path}: {row.why}") if isinstance(row, Lost) else row
