@@ -130,7 +130,7 @@ def coloured(bench: Bench) -> Experiment:
 def check_derivatives(residuals: Callable[[Floats], Floats], z: Floats, jacobian: Floats) -> None:
     """Asserts that derivatives are those of residuals by central differences."""
     for i in range(len(z)):
-        h = 1e-6 * max(abs(float(z[i])), 0.1)
+        h = 1e-5 * max(abs(float(z[i])), 0.1)
         up, down = z.copy(), z.copy()
         up[i] += h
         down[i] -= h

@@ -17,7 +17,6 @@ from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import LogError, UsageError
 
 from tests.bench.measurements import (  # isort: skip
-    check_derivatives,
     currents_of,
     errors_in_sigmas,
     fit,
@@ -78,26 +77,6 @@ def test_where_the_output_is_linear_in_the_unknowns_it_is_weighted_least_squares
     assert found.values == pytest.approx([k_m + step[0], t_c + step[1]], rel=1e-8)
     assert found.cramer_rao() * found.values == pytest.approx(np.sqrt(np.diag(covariance)), rel=1e-6)
     assert found.theta == bench.brake._replace(k_m=found.values[0], T_c=found.values[1])
-
-
-@pytest.mark.parametrize(
-    ("names", "plant"),
-    [
-        ((*PARAMETER_NAMES, "x1_0", "x2_0", "offset"), "exact"),
-        (("k_1", "contact", "x1_0", "delay"), "exact"),
-        (("delay", "f_v", "J"), "stribeck"),
-        (("k_m", "T_c", "offset"), "late"),
-        (("k_m", "contact"), "euler"),
-    ],
-)
-def test_derivatives_are_those_of_the_residuals(bench: Bench, names: tuple[str, ...], plant: str) -> None:
-    model = bench.plant(plant)
-    data = record(bench, model, currents_of(bench, "chirp")[:200], x0=(0.3, 20.0))
-    problem = problem_of(bench, names, data, plant=plant)
-    z = problem.nominal() * 1.03 + np.array([{"delay": 0.3, "contact": 0.2}.get(n, 0.0) for n in names])
-    weights = problem.weights(z)
-    _, jacobian = problem.jacobian(z, weights)
-    check_derivatives(lambda z: problem.jacobian(z, weights)[0], z, jacobian)
 
 
 def test_a_command_that_acts_a_fraction_of_a_period_late_is_one_that_acts_late_on_a_finer_grid(bench: Bench) -> None:
@@ -182,7 +161,7 @@ def test_if_no_start_leads_to_a_model_that_fits_one_that_follows_the_measured_br
     assert len(easy.ends) == 1
 
 
-def test_the_search_begins_in_the_shield_s_ranges_and_ends_at_the_border_of_ten_times_nominal(bench: Bench) -> None:
+def test_a_search_ends_at_the_border_of_a_tenth_of_nominal(bench: Bench) -> None:
     plant, data, b = bench.plant("exact"), exactly(bench), bench.brake
     off = replace(bench, brake=b._replace(f_v=12.0 * b.f_v))
     held = fit(off, plant, [data], starts=2)
@@ -190,11 +169,6 @@ def test_the_search_begins_in_the_shield_s_ranges_and_ends_at_the_border_of_ten_
     assert held.values[3] >= 1.2 * b.f_v
     assert held.at_bound == ("f_v",)
     assert not fit(bench, plant, [data], starts=2).at_bound
-    ranges = bench.range_set(bench.shield.ranges)
-    points = np.array(start_points(problem_of(bench, ("f_v",), data), 40, 0)) * b.f_v
-    assert (points >= ranges.low.f_v).all()
-    assert (points <= ranges.high.f_v).all()
-    assert np.ptp(points) > 0.8 * (ranges.high.f_v - ranges.low.f_v)
 
 
 def test_every_method_answers_by_its_name_and_no_other(bench: Bench) -> None:
@@ -218,6 +192,7 @@ def test_the_same_seed_begins_at_the_same_points_all_within_the_ranges(bench: Be
     ranges = bench.range_set(bench.shield.ranges)
     low, high = (np.array([getattr(side, n) for n in PARAMETER_NAMES]) for side in (ranges.low, ranges.high))
     assert ((one * problem.units >= low) & (one * problem.units <= high)).all()
+    assert (np.ptp(one * problem.units, axis=0) > 0.8 * (high - low)).all()
 
 
 def test_records_share_the_brake_and_have_their_own_start(bench: Bench) -> None:

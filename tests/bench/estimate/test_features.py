@@ -35,35 +35,36 @@ def test_features_are_estimated_with_a_plant_that_lacks_them(bench: Bench, plant
         assert getattr(e.plant.mechanics, name) == value
 
 
-@pytest.mark.parametrize("plant", [*OF, "rough"])
-def test_their_derivatives_are_finite_differences_of_the_residuals(bench: Bench, plant: str) -> None:
-    names = OF.get(plant, ("break_away", "stribeck_velocity", "f_l", "quadratic", "hysteresis", "current_lag"))
-    asked = EstimationProblem(PARAMETER_NAMES, names)
-    problem = Problem(
-        bench, bench.plant(plant), asked, (record(bench, bench.plant(plant), currents_of(bench, "multisine")[:150]),)
-    )
-    z = problem.nominal()
-    weights = problem.weights(z)
-    derivatives = problem.jacobian(z, weights)[1]
-    for i in range(len(z)):
-        step = np.zeros(len(z))
-        step[i] = 3e-5 * z[i]
-        above, below = (problem.jacobian(z + side * step, weights)[0] for side in (1.0, -1.0))
-        slope = (above - below) / (2.0 * step[i])
-        assert np.abs(slope - derivatives[:, i]).max() < 1e-3 * np.abs(slope).max(), problem.unknowns[i].name
+SYSTEMATIC = ("offset", "current_offset", "delay", "velocity_gain")
+AWAY = {"x1_0": 0.02, "offset": 0.01, "contact": 0.2, "current_offset": 0.03, "delay": 0.3, "velocity_gain": 0.01}
+"""Values of those unknowns at which derivatives are compared."""
 
 
-@pytest.mark.parametrize("late", [-0.04, 0.3])
-@pytest.mark.parametrize("plant", ["exact", "late", "offset"])
-def test_derivatives_to_systematic_errors_are_finite_differences_of_the_residuals(
-    bench: Bench, plant: str, late: float
+@pytest.mark.parametrize(
+    ("plant", "names", "delay"),
+    [
+        ("exact", (*PARAMETER_NAMES, "x1_0", "x2_0", "offset"), 0.3),
+        ("exact", ("k_1", "contact", "x1_0", "delay"), 0.3),
+        ("stribeck", ("delay", "f_v", "J"), 0.3),
+        ("late", ("k_m", "T_c", "offset"), 0.3),
+        ("euler", ("k_m", "contact"), 0.3),
+        *((plant, (*PARAMETER_NAMES, *features), 0.3) for plant, features in OF.items()),
+        ("rough", ("break_away", "stribeck_velocity", "f_l", "quadratic", "hysteresis", "current_lag"), 0.3),
+        *(
+            (plant, ("k_m", "f_v", "x1_0", *SYSTEMATIC), d)
+            for plant in ("exact", "late", "offset")
+            for d in (-0.04, 0.3)
+        ),
+    ],
+)
+def test_derivatives_are_finite_differences_of_the_residuals(
+    bench: Bench, plant: str, names: tuple[str, ...], delay: float
 ) -> None:
-    known = {"offset": 0.01, "current_offset": 0.05, "delay": 0.3, "velocity_gain": 0.02}
-    data = record(bench, bench.plant(plant), currents_of(bench, "multisine")[:150])
-    problem = Problem(bench, bench.plant(plant), EstimationProblem(("k_m", "f_v"), systematic=known), (data,))
-    assert [u.name for u in problem.unknowns[2:]] == ["x1_0", *known]
-    away = {"x1_0": 0.02, "offset": 0.01, "current_offset": 0.03, "delay": late, "velocity_gain": 0.01}
-    z = problem.nominal() + np.array([away.get(u.name, 0.01) for u in problem.unknowns])
+    model = bench.plant(plant)
+    data = record(bench, model, currents_of(bench, "multisine")[:150], x0=(0.3, 20.0))
+    asked = EstimationProblem(names, systematic=dict.fromkeys({*SYSTEMATIC} & {*names}, 0.1))
+    problem = Problem(bench, model, asked, (data,))
+    z = problem.nominal() * 1.03 + np.array([(AWAY | {"delay": delay}).get(u.name, 0.0) for u in problem.unknowns])
     weights = problem.weights(z)
     check_derivatives(lambda z: problem.jacobian(z, weights)[0], z, problem.jacobian(z, weights)[1])
 
