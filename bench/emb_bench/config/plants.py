@@ -34,29 +34,19 @@ class Mechanics(NamedTuple):
     """
 
     solver: int = EXACT  # Index in ``SOLVERS``: Euler with sign(), or exact between events
-    break_away: Annotated[float, Meta(ge=1, le=5)] = (
-        1.0  # T_s0 / T_c: the static friction, at least the Coulomb friction
-    )
+    break_away: Annotated[float, Meta(ge=1, le=5)] = 1.0  # T_s0 / T_c: static over Coulomb friction
     stribeck_velocity: Annotated[float, Meta(ge=1, le=500)] = 0.0
     """Speed at which the static friction has decayed, eq. 3.5 [rad/s]; 0: it acts at rest only."""
-    stribeck_exponent: Annotated[float, Meta(ge=1, le=4)] = 2.0  # δ_σ of eq. 3.5.
-    f_l: Annotated[float, Meta(ge=0, le=1e-4)] = (
-        0.0  # Load-dependent static friction, T_s = T_s0 + f_l F_cl, eq. 3.6 [m].
-    )
+    stribeck_exponent: Annotated[float, Meta(ge=1, le=4)] = 2.0  # δ_σ of eq. 3.5
+    f_l: Annotated[float, Meta(ge=0, le=1e-4)] = 0.0  # Static friction by load, T_s = T_s0 + f_l F_cl, eq. 3.6 [m]
     quadratic: Annotated[float, Meta(ge=0, le=1)] = 0.0
     """F_cl = k_1 x (1 + quadratic x + cubic x²), eq. 3.9 with k_1 as the slope at contact [1/rad]."""
     cubic: Annotated[float, Meta(ge=0, le=1)] = 0.0  # [1/rad²]
     hysteresis: Annotated[float, Meta(ge=0, le=0.5)] = 0.0
     """Share by which the clamping force is higher on applying and lower on releasing (section 3.2.1)."""
-    hysteresis_travel: Annotated[float, Meta(ge=0.01, le=100)] = (
-        1.0  # Travel over which it goes from the middle to one side [rad]
-    )
-    current_lag: Annotated[float, Meta(ge=SHORTEST_LAG, le=0.1)] = (
-        0.0  # Time constant of the current loop [s]; 0: the current is there at once
-    )
-    viscous_asymmetry: Annotated[float, Meta(ge=-0.9, le=0.9)] = (
-        0.0  # f_v (1 + it) in the positive direction, f_v (1 − it) in the negative
-    )
+    hysteresis_travel: Annotated[float, Meta(ge=0.01, le=100)] = 1.0  # From the middle to one side [rad]
+    current_lag: Annotated[float, Meta(ge=SHORTEST_LAG, le=0.1)] = 0.0  # Time constant of the current [s]; 0: none
+    viscous_asymmetry: Annotated[float, Meta(ge=-0.9, le=0.9)] = 0.0  # f_v (1 ± it) by the direction of motion
     play: Annotated[float, Meta(ge=0, le=10)] = 0.0
     """Travel of the motor after a turn until the clamp, and with it the clamping force, follows it [rad]."""
 
@@ -65,13 +55,9 @@ class Instruments(NamedTuple):
     """Instruments between the brake and the bus."""
 
     command_delay: Annotated[int, Meta(ge=0, le=LONGEST_DELAY)] = 0  # Samples that a command waits before it acts
-    measurement_delay: Annotated[int, Meta(ge=0, le=LONGEST_DELAY)] = (
-        0  # Samples that a measurement waits before it is sent
-    )
+    measurement_delay: Annotated[int, Meta(ge=0, le=LONGEST_DELAY)] = 0  # The same of a measurement
     encoder_offset: Annotated[float, Meta(ge=-10, le=10)] = 0.0  # Reading of the encoder at the true origin [rad]
-    clock_jitter: Annotated[float, Meta(ge=0, le=1e-3)] = (
-        0.0  # Standard deviation of the instant of a measurement, white [s]
-    )
+    clock_jitter: Annotated[float, Meta(ge=0, le=1e-3)] = 0.0  # Deviation of the instant of a measurement, white [s]
     observer_bandwidth: Annotated[float, Meta(ge=300, le=2000)] = 0.0
     """The velocity is that of a tracking observer of the measured angle with this bandwidth [rad/s]; 0: it is a
     measurement of its own, as in the thesis. Below 300 the noise of its velocity is correlated over so long that a fit

@@ -438,17 +438,8 @@ def _window(problem: Problem, span: Span) -> Experiment:
     if problem.plant.instruments.observer_bandwidth > 0.0:
         angles = np.concatenate([[record.angle], record.samples[:, 0]])
         velocity = _slope(angles, begin, problem.bench.timing.sample_time)
-    return Experiment(
-        record.name,
-        currents[begin:end],
-        record.samples[begin:end],
-        angle,
-        velocity,
-        0.0,
-        False,
-        None if record.late is None else record.late[begin:end],
-        before=float(currents[begin - 1]) if begin else record.before,
-    )
+    part = replace(record, currents=currents).part(begin, end)
+    return replace(part, angle=angle, velocity=velocity, slack=0.0, from_origin=False, assumed=None, places=None)
 
 
 def _slope(angles: Floats, at: int, t_s: float) -> float:
