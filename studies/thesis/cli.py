@@ -12,12 +12,12 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
 from emb_runtime.system.terminal import complain, mention, show
 from studies.thesis.determinant_facts import protected_facts, unprotected_facts
-from studies.thesis.facts import Fact, facts_text
+from studies.thesis.facts import Fact, Statement, facts_text
 from studies.thesis.oscillator import oscillator_facts
 from studies.thesis.two_parameters import two_parameter_facts
 
 PROGRAM = "python -m studies.thesis"
-ANALYSIS: Mapping[str, Callable[[Bench], list[Fact]]] = {
+ANALYSIS: Mapping[str, Callable[[Bench], list[Statement]]] = {
     "fig-4.2": unprotected_facts,
     "fig-4.3": protected_facts,
     "fig-5.1": oscillator_facts,
@@ -86,7 +86,7 @@ def _run(args: argparse.Namespace) -> str:
     if min(args.seeds, 1 if args.steps is None else args.steps) < 1 or args.seed < 0:
         raise UsageError("expected --seeds and --steps of at least 1, and a --seed of at least 0")
     bench = load_bench()
-    facts = [fact for name in names if name in ANALYSIS for fact in ANALYSIS[name](bench)]
+    facts = [Fact(name, *statement) for name in names if name in ANALYSIS for statement in ANALYSIS[name](bench)]
     if trained := [name for name in names if name in TRAININGS]:
         from studies.thesis.agents import agent_facts
         from studies.thesis.trainings import Trainings

@@ -21,11 +21,7 @@ from numpy.typing import NDArray
 from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.config.bench import Bench
 from emb_bench.information.criteria import criteria
-from emb_bench.information.fisher import (
-    Weights,
-    information_over_time,
-    thesis_weights,
-)
+from emb_bench.information.fisher import Weights, information_over_time, thesis_weights
 from emb_bench.information.symmetric import Floats, information, log_det, pack
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters

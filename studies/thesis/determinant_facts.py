@@ -11,7 +11,7 @@ from emb_bench.config.bench import Bench
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES
 from studies.thesis.determinant import AMPLITUDE, EPSILON, SETTLED, SPIKE, protected, unprotected
-from studies.thesis.facts import Fact
+from studies.thesis.facts import Statement
 
 SIZE = len(PARAMETER_NAMES)
 LARGEST_SINGLE = math.log10(float(np.finfo(np.float32).max))
@@ -19,10 +19,9 @@ LARGEST_DOUBLE = math.log10(float(np.finfo(np.float64).max))
 ROUNDING = 1e-9  # Relative difference that rounding may leave between two ways to compute the same
 
 
-def unprotected_facts(bench: Bench) -> list[Fact]:
+def unprotected_facts(bench: Bench) -> list[Statement]:
     """Fig. 4.2, and the same with the largest current allowed."""
     f, strongest = unprotected(bench, AMPLITUDE), unprotected(bench, bench.limits.current)
-    figure = "fig-4.2"
     regular = f.ranks == SIZE
     negative = f.determinants_single < 0.0
     late = np.flatnonzero(negative & regular) + 1
@@ -33,23 +32,20 @@ def unprotected_facts(bench: Bench) -> list[Fact]:
     jump_single = _largest_jump(f.conditions_single)
     decades = float(strongest.log_exact[-1]) / math.log(10.0)
     return [
-        Fact(
-            figure,
+        (
             "4.4",
             "the determinant is negative at some samples, where its logarithm is no number: log |M| has gaps",
             f"at {f.amplitude:g} A in single precision, PyTorch's default, {len(late)} samples have |M| < 0 after |M| "
             f"has become regular ({_spans(late)}); in double precision {negative_double}",
             len(late) > 0,
         ),
-        Fact(
-            figure,
+        (
             "4.4",
             "a determinant of a Fisher information cannot be negative: these come from rounding",
             f"computed in rational numbers, {negative_exact} of {len(f.signs_exact)} determinants are negative",
             negative_exact == 0,
         ),
-        Fact(
-            figure,
+        (
             "4.4",
             "at several intervals the condition number spikes: there the matrix is nearly singular",
             f"the spikes are {'there without rounding' if jump > SPIKE else 'rounding'} too: from one sample to the "
@@ -57,23 +53,20 @@ def unprotected_facts(bench: Bench) -> list[Fact]:
             f"in double; the two differ by up to {ratio:.3g} times (after sample {SETTLED})",
             bool(jump > SPIKE),
         ),
-        Fact(
-            figure,
+        (
             "4.4",
             "each sample updates the Fisher information by a matrix of rank one",
             f"there are two outputs: the rank of an increment is {f.increment_rank}",
             f.increment_rank == 1,
         ),
-        Fact(
-            figure,
+        (
             "4.4",
             "the determinant cannot be other than zero before n samples, n the number of parameters",
             f"from rest |M| is first regular at sample {first} of n = {SIZE}; not for the rank of the increments, but "
             "because each of the first samples tells one combination of parameters more",
             first >= SIZE,
         ),
-        Fact(
-            figure,
+        (
             "4.4",
             "the determinant grows so fast that this could lead to an overflow",
             f"{len(strongest.log_exact)} samples at {strongest.amplitude:g} A reach 1e{decades:.1f}; single precision "
@@ -83,10 +76,9 @@ def unprotected_facts(bench: Bench) -> list[Fact]:
     ]
 
 
-def protected_facts(bench: Bench) -> list[Fact]:
+def protected_facts(bench: Bench) -> list[Statement]:
     """Fig. 4.3, and the equations behind it."""
     f, cured = unprotected(bench, AMPLITUDE), protected(bench, AMPLITUDE, EPSILON)
-    figure = "fig-4.3"
     start = SIZE * math.log(cured.epsilon)
     gaps = int((~np.isfinite(cured.log_normalised)).sum())
     failing = {epsilon: count for epsilon, count in cured.failures_single.items() if count}
@@ -102,16 +94,14 @@ def protected_facts(bench: Bench) -> list[Fact]:
     third = float(cured.log_normalised[-1] - cured.log_alpha[-1] - cured.log_det[-1])
     total, final = float(cured.rewards.sum()), float(cured.log_det[-1])
     return [
-        Fact(
-            figure,
+        (
             "4.4.2",
             "initialised and normalised, |M| is positive and its logarithm continuous",
             f"in double precision, with epsilon = {cured.epsilon:g}, {gaps} of {len(cured.rewards)} samples have no "
             "logarithm",
             gaps == 0,
         ),
-        Fact(
-            figure,
+        (
             "4.4.1",
             "a sufficiently small epsilon I keeps the matrix from being singular to the computer",
             "in single precision it does not: |M| is not positive at "
@@ -119,52 +109,45 @@ def protected_facts(bench: Bench) -> list[Fact]:
             + ". It has to be larger than the rounding of the largest element; in double precision any serves",
             not failing,
         ),
-        Fact(
-            figure,
+        (
             "4.4.2",
             "the condition number grows continuously as the experiment goes on",
             f"it rises to {cured.conditions[peak]:.2g} at sample {peak + 1} and falls to {cured.conditions[-1]:.2g} at "
             "the end: every sample tells more of the worst-known direction",
             bool((np.diff(cured.conditions) > 0.0).all()),
         ),
-        Fact(
-            figure,
+        (
             "eq. 4.34",
             "every eigenvalue of the sum grows by epsilon",
             f"to {shift:.1g} of the largest eigenvalue, which is rounding",
             shift < ROUNDING,
         ),
-        Fact(
-            figure,
+        (
             "4.4.1",
             "the initialisation hardly changes the result",
             f"log |M| at the end grows by {effect:.1g}",
             abs(effect) < 1e-3,
         ),
-        Fact(
-            figure,
+        (
             "eq. 4.36",
             "the normalisation leaves the step rewards unchanged",
             f"they differ from log |M_k| - log |M_(k-1)| by {unchanged:.1g} at most (after sample {SETTLED})",
             unchanged < 1e-6,
         ),
-        Fact(
-            figure,
+        (
             "eq. 4.36, third line",
             "alpha_k |M_k| stands for the normalised determinant",
             f"that is |alpha_k M_k| = alpha_k^n |M_k|: at the end their logarithms differ by {third:.3g}",
             abs(third) < ROUNDING,
         ),
-        Fact(
-            figure,
+        (
             "eq. 4.39",
             "with alpha_k as printed the normalised determinant stays near that of the initial matrix",
             f"its logarithm ends {drift_printed:.3g} away from it, half of what |M| has grown; with the ratio "
             f"alpha_k / alpha_(k-1) in place of alpha_k it ends {drift:.2g} away",
             drift_printed < 1.0,
         ),
-        Fact(
-            figure,
+        (
             "eq. 4.12",
             "the step rewards add up to log |M_n|",
             f"they add up to {total:.4g}, log |M_n| is {final:.4g}: what they begin from, log |M_init| = {start:.4g}, "

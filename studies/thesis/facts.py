@@ -12,6 +12,8 @@ DIFFERS = "does not follow"
 SUGGESTED = "only suggested"
 """Verdict on what the thesis calls possible: a number beside it, which proves nothing against it."""
 WIDTH = 120  # Width of the text
+Statement = tuple[str, str, str, bool | None]
+"""Source, claim, result, and whether the two agree: a :class:`Fact` without its figure."""
 _MARGIN = " " * 19
 _HANGING: Any = {"subsequent_indent": _MARGIN, "break_long_words": False, "break_on_hyphens": False}
 

@@ -19,9 +19,8 @@ from emb_bench.config.bench import Bench
 from emb_bench.information.fisher import Weights, physical_weights, thesis_weights
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import BrakeParameters
-from studies.thesis.facts import Fact
+from studies.thesis.facts import Statement
 
-FIGURE = "fig-5.1"
 SWITCH = 0.2  # s, when input 2 stops
 STARTS = 30  # Random beginnings of the search for a better velocity than a constant one
 
@@ -82,13 +81,13 @@ def inputs(bench: Bench) -> tuple[Input, Input]:
     return driven(bench, full), driven(bench, np.where(times < SWITCH - 1e-9, fast, 0.0))
 
 
-def oscillator_facts(bench: Bench) -> list[Fact]:
+def oscillator_facts(bench: Bench) -> list[Statement]:
     """Checks the statements of section 5.1, and of 5.2.1 about the same curve."""
     first, second = inputs(bench)
     return [*_constant_facts(bench, first), *_bound_facts(bench, first), *_stopped_facts(bench, second)]
 
 
-def _constant_facts(bench: Bench, first: Input) -> list[Fact]:
+def _constant_facts(bench: Bench, first: Input) -> list[Statement]:
     p, t_s = bench.brake, bench.timing.sample_time
     exact = oscillator(p)
     peak = int(np.argmax(np.abs(first.s[:, 0])))
@@ -101,45 +100,39 @@ def _constant_facts(bench: Bench, first: Input) -> list[Fact]:
     share_physical = _angle_share(first, physical_weights(bench.noise))
     total = float((share * first.increments).sum() / first.increments.sum())
     return [
-        Fact(
-            FIGURE,
+        (
             "eq. 5.9",
             "the damping ratio is 0.2407",
             f"{exact.damping:.4f}",
             abs(exact.damping - 0.2407) < 5e-5,
         ),
-        Fact(
-            FIGURE,
+        (
             "5.1.1",
             "at a constant 500 rad/s the sensitivity a peaks at approximately 0.34 s",
             f"Euler at {euler_peak:.3f} s, the closed form pi / (w0 sqrt(1 - zeta^2)) at {exact.peak_time:.4f} s: "
             f"0.33 s rounded; the peaks are {abs(first.s[peak, 0]):.2f} and {top:.2f} rad",
             abs(euler_peak - 0.34) <= 0.01 and abs(exact.peak_time - 0.34) <= 0.01,
         ),
-        Fact(
-            FIGURE,
+        (
             "5.1.1",
             "from the peak of a on, the increment falls as well",
             f"from {euler_highest:.4g} at {euler_peak:.3f} s to {after[-1]:.4g} at the end",
             bool((np.diff(first.increments[peak:]) < 0.0).all()),
         ),
-        Fact(
-            FIGURE,
+        (
             "5.2.1",
             "the largest increment within 500 ms at full speed is about 1.3e5",
             f"Euler {euler_highest:.4g}, closed form {highest:.4g}",
             abs(euler_highest - 1.3e5) <= 0.05e5 and abs(highest - 1.3e5) <= 0.05e5,
         ),
-        Fact(
-            FIGURE,
+        (
             "5.1.1",
             "the increment is decided by a far more than by b",
             f"of the sum, {100.0 * total:.5f} % come from a; b decides {int((share < 0.5).sum())} of {len(share)} "
             "samples, those in which a has not begun to move",
             total > 0.9,
         ),
-        Fact(
-            FIGURE,
+        (
             "5.1.1",
             "that a counts for so much is due to the sensors' noise",
             f"of the ratio of the weights of a^2 and b^2 the noise makes {_noise_factor(bench):.3g}, and the division "
@@ -150,7 +143,7 @@ def _constant_facts(bench: Bench, first: Input) -> list[Fact]:
     ]
 
 
-def _bound_facts(bench: Bench, first: Input) -> list[Fact]:
+def _bound_facts(bench: Bench, first: Input) -> list[Statement]:
     fast = bench.limits.velocity
     response = response_matrix(bench)
     weights = thesis_weights(bench.noise, bench.limits)
@@ -163,16 +156,14 @@ def _bound_facts(bench: Bench, first: Input) -> list[Fact]:
     ceiling = float(np.abs(quadratic).sum()) * fast**2 / constant
     later = int(np.argmax(reach > (1.0 + 1e-6) * np.abs(first.s[:, 0]))) + 1
     return [
-        Fact(
-            FIGURE,
+        (
             "5.1.1",
             "the increments at constant full speed are the upper limit of what any input reaches",
             f"sample by sample only until {later * bench.timing.sample_time:.3f} s: a velocity that changes its sign "
             f"half a swing before the end has there an increment {gain:.3g} times as large",
             gain < 1.01,
         ),
-        Fact(
-            FIGURE,
+        (
             "5.1.1",
             "constant full speed is the optimal velocity: the sum of the increments is largest",
             f"a search over switched velocities from {STARTS} beginnings ends at {best:.6f} of its sum at best; that "
@@ -182,7 +173,7 @@ def _bound_facts(bench: Bench, first: Input) -> list[Fact]:
     ]
 
 
-def _stopped_facts(bench: Bench, second: Input) -> list[Fact]:
+def _stopped_facts(bench: Bench, second: Input) -> list[Statement]:
     t_s = bench.timing.sample_time
     stop = round(SWITCH / t_s)
     a, increments = np.abs(second.s[:, 0]), second.increments
@@ -193,30 +184,26 @@ def _stopped_facts(bench: Bench, second: Input) -> list[Fact]:
     decayed = float(np.mean(decay))
     expected = oscillator(bench.brake).overshoot
     return [
-        Fact(
-            FIGURE,
+        (
             "5.1.1",
             "when input 2 stops at 0.2 s, a decreases rapidly",
             f"its size goes on growing for {1e3 * (peak + 1 - stop) * t_s:.0f} ms, from {a[stop - 1]:.1f} to "
             f"{a[peak]:.1f} rad, since b is not zero; else the increment could not grow either",
             bool(a[peak] <= a[stop - 1]),
         ),
-        Fact(
-            FIGURE,
+        (
             "5.1.1",
             "after the stop the increment grows for a while before it decays",
             f"from {increments[stop - 1]:.4g} to {increments[peak]:.4g} at {(peak + 1) * t_s:.3f} s",
             bool(increments[peak] > increments[stop - 1]),
         ),
-        Fact(
-            FIGURE,
+        (
             "5.1.1",
             "a then swings about zero, less and less",
             f"each swing is {decayed:.3f} of the one before; the closed form says {expected:.3f}",
             all(ratio < 1.0 for ratio in decay) and abs(decayed - expected) < 0.01,
         ),
-        Fact(
-            FIGURE,
+        (
             "5.1.1",
             "the effect has not vanished when the 0.5 s are over",
             f"the last increment is {increments[-1]:.4g}, {100.0 * increments[-1] / increments[peak]:.2g} % of the "

@@ -14,9 +14,8 @@ from emb_bench.excitation import Response, parse_excitation, run_excitation
 from emb_bench.information.criteria import criteria
 from emb_bench.information.fisher import information_over_time, thesis_weights
 from emb_bench.sim.open_loop import simulate
-from studies.thesis.facts import Fact
+from studies.thesis.facts import Statement
 
-FIGURE = "sec-6.1"
 PARAMS = ("f_v", "k_1")
 FASTEST = "constant-speed:turn=0.2"
 EXCITATIONS = (FASTEST, "square", "chirp", "multisine")
@@ -58,7 +57,7 @@ def excited(bench: Bench, text: str) -> Excited:
     return Excited(excitation.name, response, s, np.diff(history, axis=0, prepend=np.zeros((1, 2, 2))))
 
 
-def two_parameter_facts(bench: Bench) -> list[Fact]:
+def two_parameter_facts(bench: Bench) -> list[Statement]:
     """Checks the statements of section 6.1."""
     runs = [excited(bench, name) for name in EXCITATIONS]
     weights = thesis_weights(bench.noise, bench.limits)
@@ -70,15 +69,13 @@ def two_parameter_facts(bench: Bench) -> list[Fact]:
     correlations = {run.name: run.correlation for run in runs}
     dets = {name: _free_log_det(bench, name) for name in (FASTEST, "square")}
     return [
-        Fact(
-            FIGURE,
+        (
             "eq. 6.3",
             "the product of the matrices is the printed increment, 100 a^2 + b^2 / 250000 and so on",
             f"the two differ by {printed:.1g} of the largest element, over {len(runs)} excitations",
             printed < ROUNDING,
         ),
-        Fact(
-            FIGURE,
+        (
             "6.1",
             "the stiffness is told better at a greater angle",
             "held at rest, the increment of k_1 settles at "
@@ -86,8 +83,7 @@ def two_parameter_facts(bench: Bench) -> list[Fact]:
             + ": 100 x1^2, for c settles at -x1",
             all(abs(value / (weights.angle * angle**2) - 1.0) < 0.01 for angle, value in held.items()),
         ),
-        Fact(
-            FIGURE,
+        (
             "eq. 6.1",
             "out of contact only the input of c and d vanishes; the matrix keeps its spring",
             f"by eq. 3.13 the spring goes as well. Kept, it changes the diagonal of the FIM by "
@@ -95,15 +91,13 @@ def two_parameter_facts(bench: Bench) -> list[Fact]:
             f"{100.0 * literal['constant-speed']:.2g} % with constant-speed",
             literal[worst] < 0.01,
         ),
-        Fact(
-            FIGURE,
+        (
             "6.1",
             "the two parameters are correlated through 100 a c + b d / 250000",
             "of the two estimates, " + ", ".join(f"{value:+.3f} with {name}" for name, value in correlations.items()),
             max(map(abs, correlations.values())) > 0.1,
         ),
-        Fact(
-            FIGURE,
+        (
             "6.2.2",
             "it can be suggested that periodic inputs help these two parameters efficiently; compared for this: the "
             "20 ms, 6 A square wave",

@@ -37,7 +37,7 @@ def runs() -> list[two_parameters.Excited]:
 
 @pytest.fixture(scope="module")
 def facts() -> list[Fact]:
-    return [fact for figure in ANALYSIS.values() for fact in figure(BENCH)]
+    return [Fact(name, *statement) for name, of in ANALYSIS.items() for statement in of(BENCH)]
 
 
 def fact(facts: list[Fact], figure: str, words: str) -> Fact:
@@ -196,7 +196,7 @@ def test_the_numbers_that_the_thesis_prints(facts: list[Fact]) -> None:
 
 def test_a_wrong_parameter_changes_the_verdicts() -> None:
     soft = replace(BENCH, brake=BENCH.brake._replace(k_1=12.0))
-    found = oscillator.oscillator_facts(soft)
+    found = [Fact("fig-5.1", *statement) for statement in oscillator.oscillator_facts(soft)]
     assert not fact(found, "fig-5.1", "0.2407").agrees
     assert not fact(found, "fig-5.1", "0.34 s").agrees
     assert not fact(found, "fig-5.1", "1.3e5").agrees
