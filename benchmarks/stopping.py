@@ -75,7 +75,7 @@ def goals(brakes: np.ndarray, folder: Path) -> None:
     )
     for name in ACTORS:
         path = folder / f"{name}.onnx"
-        path.write_bytes(reference_file(name, bench)[0])
+        path.write_bytes(reference_file(name, bench))
         for plant in PLANTS:
             early, seconds, z, worst = 0, [], [], np.zeros(len(GOAL))
             for i, brake in enumerate(brakes):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from emb_bench.config.bench import Bench
-from emb_export.file import OPSET, policy_file, versions
+from emb_export.file import OPSET, bounds, policy_file, versions
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import SAMPLE
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
@@ -27,8 +27,8 @@ from emb_train.training import load_training
 OBSERVATIONS = 2000
 
 
-def network_file(directory: Path) -> tuple[bytes, float, str]:
-    """The file of a training, its largest difference from the network as a part of the limit, and its origin.
+def network_file(directory: Path) -> tuple[bytes, str]:
+    """The file of a training, and its origin in words.
 
     Raises:
         UsageError: the directory holds no usable training.
@@ -53,9 +53,10 @@ def network_file(directory: Path) -> tuple[bytes, float, str]:
         **versions("torch", "onnxscript"),
     }
     ranges = bench.range_set(training.ranges)
-    data, difference = policy_file(_graph(actor), bench, "current", SAMPLE, seen, wanted, provenance, ranges)
+    fields = {"kind": "current", "inputs": SAMPLE, "ranges": bounds(ranges)}
+    data = policy_file(_graph(actor), bench, seen, wanted, provenance, **fields)
     score = f"iteration {trained.iteration} of {training.ppo.iterations}, which returned {trained.score:.6g}"
-    return data, difference, f"the trained network, of {score} on brakes that no training draws"
+    return data, f"the trained network, of {score} on brakes that no training draws"
 
 
 def observations(bench: Bench) -> NDArray[np.float32]:

@@ -28,7 +28,7 @@ PHYSICAL = Conditions(information="physical")
 @pytest.mark.parametrize("quick", [False, True])
 def test_a_shipped_file_is_its_reference(bench: Bench, quick: bool) -> None:
     kept, policy = stored(REFERENCES[quick]), load_policy(shipped_actor_path(quick), bench)
-    assert policy.data == reference_file(REFERENCES[quick], bench)[0]
+    assert policy.data == reference_file(REFERENCES[quick], bench)
     assert (policy.warnings, policy.contract.provenance["plant"]) == ([], DEFAULT_PLANT)
     assert len(policy.data) < 10_000
     ranges = bench.range_set("pm50")
@@ -74,7 +74,7 @@ def test_it_runs_on_a_bench_of_ones_own_as_one_made_for_that_bench_does() -> Non
             text = text.replace(old, new)
         bench = parse_bench(text, what)
         ranges = bench.range_set("pm50")
-        made = load_policy(reference_file(REFERENCES[False], bench)[0], bench)
+        made = load_policy(reference_file(REFERENCES[False], bench), bench)
         values = []
         for policy in (load_policy(shipped_actor_path(), bench), made):
             played = play(
