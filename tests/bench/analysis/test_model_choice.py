@@ -102,7 +102,7 @@ def test_the_interval_of_one_model_is_gaussian_and_that_of_two_holds_95_percent_
 
 def test_a_study_with_all_models_says_which_it_took_and_why(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
     log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave, options="plant=stribeck")))
-    found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=2))
+    found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=1))
     assert found.estimate.plant.name == "stribeck"
     said = document(found)
     # With the encoder's offset estimated along, 'offset' is 'exact'.
@@ -142,7 +142,7 @@ def test_of_models_that_are_all_alike_the_simplest_one_answers(
 ) -> None:
     """A brake that goes away from the clamp has no curve, no hysteresis and no play."""
     log = square_log(tmp_path, simulate, "exact", 100, -1.0)
-    found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=2))
+    found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=1))
     assert found.estimate.plant.name == "exact"
     assert {"exact", "cubic", "hysteresis", "play"} <= {*document(found)["not_told_apart"]}
 
@@ -168,9 +168,9 @@ def test_plants_are_compared_with_the_errors_that_the_bench_cannot_exclude(bench
     data = replace(record(bench, plant, currents + 0.02, seed=3), currents=currents)
     asked = EstimationProblem()
     models = [bench.plant(name) for name in ("exact", "stribeck", "hysteresis", "lag")]
-    without = choose_model(bench, models, lambda _: [data], asked, starts=4, seed=0)
+    without = choose_model(bench, models, lambda _: [data], asked, starts=1, seed=0)
     assert not without.best.fits
-    found = choose_model(bench, models, lambda _: [data], with_systematic(asked, bench, plant), starts=4, seed=0)
+    found = choose_model(bench, models, lambda _: [data], with_systematic(asked, bench, plant), starts=1, seed=0)
     assert found.best.name == "hysteresis"
     assert found.best.fits
     assert "delay" not in {c.name: c for c in found.candidates}["lag"].estimate.asked.along
@@ -178,7 +178,9 @@ def test_plants_are_compared_with_the_errors_that_the_bench_cannot_exclude(bench
     assert e.values[e.labels.index("current_offset")] == pytest.approx(0.02, rel=0.2)
 
 
-@pytest.mark.parametrize("options", [{"model": EVERY}, {"model": "stribeck", "grow": True}])
+@pytest.mark.parametrize(
+    "options", [pytest.param({"model": EVERY}, marks=pytest.mark.slow), {"model": "stribeck", "grow": True}]
+)
 def test_the_answer_allows_for_the_errors_of_the_bench_as_with_one_model(
     bench: Bench, tmp_path: Path, simulate: Simulate, options: dict[str, Any]
 ) -> None:

@@ -220,7 +220,7 @@ def test_on_a_brake_that_nothing_disturbs_it_is_output_error(bench: Bench) -> No
     assert found.method == "pem"
 
 
-@pytest.mark.parametrize("plant", ["stribeck", "hysteresis", "late"])
+@pytest.mark.parametrize("plant", ["stribeck", "hysteresis", pytest.param("late", marks=pytest.mark.slow)])
 def test_what_the_model_lacks_is_not_taken_for_a_good_fit(bench: Bench, plant: str) -> None:
     data = record(bench, bench.plant(plant), currents_of(bench, "chirp"))
     found = estimate(bench, "exact", [data])

@@ -53,6 +53,7 @@ def test_a_machine_that_is_known_only_by_position_and_force_is_found() -> None:
         assert found[name][0] == pytest.approx(true, rel=0.01)
 
 
+@pytest.mark.slow
 def test_friction_by_direction_is_found_where_it_is_asked_for() -> None:
     asked = EstimationProblem(("T_c", "f_v", "J", "viscous_asymmetry"), ("current_offset",))
     data = record(BY_DIRECTION)
@@ -137,7 +138,7 @@ def test_windows_that_disagree_widen_the_covariance_and_neighbours_count_togethe
 OPEN = MAP.replace("window = 0.5\n", "")
 
 
-@pytest.mark.parametrize("straight", [False, True])
+@pytest.mark.parametrize("straight", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_record_chooses_the_course_of_the_command_that_was_simulated(straight: bool) -> None:
     e = fitted(record(Machine(), 4.0, straight=straight), text=OPEN)
     assert e.asked.between == ("linear" if straight else "held")
