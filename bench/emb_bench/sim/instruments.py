@@ -35,13 +35,7 @@ MEMORY = 3 * LONGEST_DELAY + 2
 
 
 def settle(instruments: Instruments, memory: Any, angle: float) -> None:
-    """Begin with a brake that has long rested at ``angle`` [rad] without a command; what is on its way has no noise.
-
-    Args:
-        instruments: what lies between.
-        memory: shape [MEMORY], overwritten.
-        angle: true angle [rad].
-    """
+    """Begin with a brake that has long rested at an angle [rad] without a command; overwrites ``memory``."""
     for i in range(LONGEST_DELAY):
         memory[_COMMANDS + i] = 0.0
         memory[_ANGLES + i] = angle + instruments.encoder_offset
@@ -66,26 +60,13 @@ def measure(
     angle_error: float,
     velocity_error: float,
 ) -> tuple[float, float]:
-    """Angle and velocity that are sent at the end of a period. To be called once a period.
+    """Angle [rad] and velocity [rad/s] that are sent at the end of a period. To be called once a period.
 
-    A sample that is taken ``late`` sees the brake go on as it went through the period: the angle is right to second
+    A sample that is taken ``late`` [s] sees the brake go on as it went through the period: the angle is right to second
     order and the velocity to first. The error is late²/2 respectively late times the difference between the mean
-    acceleration of the period and the one at its end, for 20 µs at most 6e-6 rad and 0.6 rad/s, where full braking ends
-    in standstill. Nothing reaches the brake before the sample is out, so that there is no other current to be seen.
-
-    Args:
-        instruments: what lies between.
-        memory: shape [MEMORY], changed.
-        t_s: the period [s].
-        x1: true angle [rad].
-        x2: true velocity [rad/s].
-        acceleration: mean of the period that ends [rad/s²].
-        late: how much later than it should the sample is taken, negative if earlier [s].
-        angle_error: noise of the encoder [rad].
-        velocity_error: noise of the velocity, where that is a measurement of its own [rad/s].
-
-    Returns:
-        Angle [rad] and velocity [rad/s].
+    acceleration of the period [rad/s²] and the one at its end, for 20 µs at most 6e-6 rad and 0.6 rad/s, where full
+    braking ends in standstill. Nothing reaches the brake before the sample is out, so that there is no other current to
+    be seen.
     """
     y1 = x1 + late * (x2 + 0.5 * late * acceleration) + instruments.encoder_offset + angle_error
     if instruments.observer_bandwidth > 0.0:
@@ -107,13 +88,9 @@ def observe(instruments: Instruments, memory: Any, t_s: float, y1: float) -> flo
 
 
 def observer_gains(bandwidth: float, t_s: float) -> tuple[float, float]:
-    """α and β of the observer.
+    """α and β of the observer of a bandwidth ω_o [rad/s].
 
     The filter's poles solve z² − (2 − α − β) z + (1 − α) = 0, so that α = 1 − |z|² and β = 1 + |z|² − 2 Re z.
-
-    Args:
-        bandwidth: ω_o [rad/s].
-        t_s: sampling period [s].
     """
     radius = math.exp(-DAMPING * bandwidth * t_s)
     real = radius * math.cos(math.sqrt(1.0 - DAMPING * DAMPING) * bandwidth * t_s)
@@ -121,13 +98,7 @@ def observer_gains(bandwidth: float, t_s: float) -> tuple[float, float]:
 
 
 def observer_noise(bandwidth: float, t_s: float, angle_noise: float) -> float:
-    """Standard deviation of the observer's velocity under white noise of the angle [rad/s].
-
-    Args:
-        bandwidth: ω_o [rad/s].
-        t_s: sampling period [s].
-        angle_noise: standard deviation [rad].
-    """
+    """Standard deviation [rad/s] of an observer's velocity under white noise of the angle [rad]."""
     alpha, beta = observer_gains(bandwidth, t_s)
     return angle_noise / t_s * math.sqrt(2.0 * beta * beta / (alpha * (4.0 - 2.0 * alpha - beta)))
 

@@ -49,15 +49,10 @@ def simulate(
     params: Sequence[str] = (),
     x0: tuple[float, float] = (0.0, 0.0),
 ) -> Trajectory:
-    """Moves a brake through a sequence of currents; limits are not applied.
+    """Moves a brake through a sequence of currents [A]; limits are not applied.
 
-    Args:
-        mechanics: how the brake moves.
-        p: its parameters.
-        currents: what acts in each period [A], length n. Before the first one no current acted.
-        t_s: period [s].
-        params: names of the unknown parameters, any of ``PARAMETERS`` in any order; none gives the states alone.
-        x0: angle [rad] and velocity [rad/s] at the start. Unless ``x1_0`` and ``x2_0`` are among the parameters, known.
+    Before the first period [s] no current acted. ``params`` are any of ``PARAMETERS`` in any order; none gives the
+    states alone. Angle [rad] and velocity [rad/s] at the start are known unless ``x1_0`` and ``x2_0`` are among them.
     """
     check_unknowns(params)
     chosen, s = no_sensitivity(params)
@@ -97,21 +92,11 @@ def trajectory(
     s: Floats,
     gaps: int = 0,
 ) -> tuple[Floats, Floats]:
-    """Whole states and sensitivities at all instants, from those at the first one.
+    """States and sensitivities at all instants, from those at the first one.
 
-    Args:
-        loop: :func:`march`, as it is or compiled.
-        mechanics: how the brake moves.
-        p: its parameters.
-        acting: the input.
-        chosen: indices of the parameters in ``PARAMETERS``, shape (m,).
-        x: state at the start, shape (STATES,).
-        s: sensitivities at the start, shape (m, SENSITIVE).
-        gaps: unknowns of the gaps, 0 or all g + 2 h: the currents of ``pulses`` [per A], then angle and velocity at
-            the end of each of ``breaks``.
-
-    Returns:
-        Shapes (n + 1, STATES) and (n + 1, m + gaps, SENSITIVE).
+    Shapes (n + 1, STATES) and (n + 1, m + gaps, SENSITIVE) of m parameters ``chosen``. ``gaps`` is 0, or all g + 2 h
+    unknowns of the gaps: the currents of ``pulses`` [per A], then angle and velocity at the end of each of ``breaks``.
+    ``loop`` is :func:`march`, as it is or compiled.
     """
     n = len(acting.currents)
     states, sensitivities = np.empty((n + 1, STATES)), np.zeros((n + 1, len(chosen) + gaps, SENSITIVE))
@@ -209,17 +194,9 @@ def feedback(
     t_s: float,
     x0: tuple[float, float] = (0.0, 0.0),
 ) -> Iterator[tuple[float, float, float]]:
-    """Plays a feedback law against a brake, without end: currents that answer the true state at the begin of a period.
+    """The current of each period [A], angle [rad] and velocity [rad/s] at its end, without end, under a feedback law.
 
-    Args:
-        mechanics: how the brake moves.
-        p: its parameters.
-        law: angle [rad], velocity [rad/s] and number of the period to a current [A].
-        t_s: period [s].
-        x0: angle [rad] and velocity [rad/s] at the start.
-
-    Yields:
-        The current of each period [A], and angle [rad] and velocity [rad/s] at its end.
+    The law takes the true angle [rad] and velocity [rad/s] at the begin of a period and its number.
     """
     x = rest()
     x[:2] = x0
@@ -231,11 +208,7 @@ def feedback(
 
 
 def fast_loop(periods: int) -> Callable[..., None]:
-    """Returns :func:`march`, compiled where that pays or has been done; equal results.
-
-    Args:
-        periods: how many are to be gone through.
-    """
+    """Returns :func:`march`, compiled where that pays for so many periods, or has been done; equal results."""
     if periods < WORTH_COMPILING and "numba" not in sys.modules:
         return march
     from emb_bench.compiled import compiled
