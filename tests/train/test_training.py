@@ -124,7 +124,7 @@ def test_a_reference_is_searched_for_and_a_ctrl_c_keeps_what_was_found(
         *("viscous", "quadratic", 7),
         ["emb-train", "reference", "viscous"],
     )
-    assert f"{kept.score:.6g} on brakes that no step had" in capsys.readouterr().out
+    assert f"{kept.score:.6g}" in capsys.readouterr().out
     blind, found = tmp_path / "blind", tmp_path / "found"
     command[1], options = "four-d", ["--command-delay", "1", "2", "--gain", "0.3"]
     assert main([*command, "--form", "blind", "--begin=1,-1,0,0.3,0.6", *options, "--out", str(blind)]) == 0
