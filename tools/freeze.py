@@ -63,6 +63,7 @@ RENAMED: dict[str, str] = {}
 GONE: dict[str, str] = {
     "estimate/*/held_out*": "each of several records is predicted from the others; no other is",
     "report/*/held_out*": "each of several records is predicted from the others; no other is",
+    "design/*/coarse_optima*": "of a search the designs that keep the limits are told, not where each began",
     "design/*/of": "a design is for all of its parameters",
     "estimate/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
     "report/*/bounds*": "the range of a search is a tenth of nominal to ten times it",

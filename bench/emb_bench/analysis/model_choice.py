@@ -1,10 +1,8 @@
 """Choice of a model: plants fitted to the records and ranked, and the interval that covers those left over.
 
-Every plant is fitted by output error with the same unknowns, and with the systematic errors that the bench cannot
-exclude, as far as it can have them: without these the brake that was there does not fit a record with one of them, and
-another plant that makes up for it in part comes first. The fit of the simplest plant is a start for all others, and the
-fit without systematic errors one for that with them; whichever does not explain the records from there is started anew
-from the best of the others.
+Every plant is fitted by output error with the same unknowns, and with the systematic errors that it can have. The fit
+of the simplest plant is a start for all others, and the fit without systematic errors one for that with them; whichever
+does not explain the records from there is started anew from the best of the others.
 
 *Likelihood.* −2 log L = Σ e²/σ² + Σ log σ² over all samples. The variance counts, because it is part of the model: a
 jittering clock makes samples of a fast brake uncertain. A model in which the velocity is an observer's has no noise of
@@ -12,11 +10,11 @@ its own in it: given the angles its velocity follows, to the last digits that ar
 the angles, and that of the difference between the velocity sent and the one that the observer's recursion gives from
 three samples in a row, whose variance is taken from the record.
 
-*Criteria* (Burnham and Anderson, Model Selection and Multimodel Inference, 2nd ed., 2002, chapter 6): AIC adds 2 and
-BIC log n for each unknown, but none for the systematic errors that are estimated along, which have priors. The
-*held-out score* needs no count of unknowns: the logarithm of the density that a model fitted to a part of the records
-gives to the rest (Laplace's approximation, an uncertainty of 100 % before the records). The part is all but one of
-several records, each in its turn, or the first half of a single one.
+*Criteria* (Burnham and Anderson, Model Selection and Multimodel Inference, 2nd ed., 2002, chapter 6): BIC adds log n
+for each unknown, but none for the systematic errors that are estimated along, which have priors. The *held-out score*
+needs no count of unknowns: the logarithm of the density that a model fitted to a part of the records gives to the rest
+(Laplace's approximation, an uncertainty of 100 % before the records). The part is all but one of several records, each
+in its turn, or the first half of a single one.
 
 *Weights.* A model's weight is exp(−BIC/2) over the sum of all; where the records tell models apart, one has all of it.
 The interval of a parameter is that of the mixture of the models' Gaussians with these weights, so that it covers both
@@ -58,7 +56,6 @@ class Candidate:
     name: str  # Of the plant, or what was added to it
     estimate: Estimate = field(repr=False)
     deviance: float  # −2 log L, but for a constant that all models share
-    aic: float
     bic: float
     held_out: float  # Logarithm of the density of what was held out, but for a constant that all models share
     weight: float = 0.0  # Share of it in the answer
@@ -245,9 +242,7 @@ def candidate(name: str, e: Estimate) -> Candidate:
     """A fitted model with its criteria."""
     samples = sum(int(record.measured.sum()) for record in e.records) * 2
     deviance, count = _deviance(e.problem, e.z), len(e.wanted())
-    return Candidate(
-        name, e, deviance, deviance + 2.0 * count, deviance + count * math.log(samples), held_out_score(e, deviance)
-    )
+    return Candidate(name, e, deviance, deviance + count * math.log(samples), held_out_score(e, deviance))
 
 
 def ranked(candidates: Sequence[Candidate]) -> ModelChoice:

@@ -131,7 +131,6 @@ class Report:
             "seed": self.seed,
             "starts": self.starts,
             "local_optima": [criterion.value(d.phi) for d in self.found.designs],
-            "coarse_optima": [criterion.value(phi) for phi in self.found.coarse],
             "cramer_rao": self.bounds(),
             "checks": [asdict(c) for c in self.checks],
         }

@@ -65,7 +65,6 @@ class Found:
 
     best: Design
     designs: tuple[Design, ...]  # The polished ones within the limits, best first: local optima, or near one
-    coarse: tuple[float, ...]  # φ less a price, that each coarse search ended with, best first
 
 
 class Table(NamedTuple):
@@ -89,7 +88,6 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
         for wave in np.array_split(np.arange(starts), WAVES):
             found = list(tables)
             tables += pool.map(lambda i, f=found: coarse(problem, JOURNEYS[i % len(JOURNEYS)], seeds[i], f), wave)
-        values = sorted((table.value for table in tables), reverse=True)
         for growth in range(GROWTHS):
             tables = _diverse(tables, GROWING - growth)
             tables = list(pool.map(lambda table, rng: grown(problem, table, rng), tables, draws))
@@ -115,7 +113,7 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
             "try more starts, or check whether the brake can come home in time"
         )
     others = sorted((d for d in polished if d.feasible and d.phi < best.phi), key=_rank, reverse=True)
-    return Found(best, (best, *others), tuple(values))
+    return Found(best, (best, *others))
 
 
 def _diverse(tables: Sequence[Table], count: int) -> list[Table]:

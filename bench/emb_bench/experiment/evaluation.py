@@ -90,16 +90,8 @@ class ModelEvaluator:
     an observer is run along the plant's own angle. Its noise is coloured, so that its mean square scatters more than
     that of white noise.
 
-    Args:
-        bench: noise, limits and sample time.
-        plant: how the brake moves, and what lies between it and the bus.
-        theta: its parameters.
-        x0: true angle [rad] and velocity [rad/s] at the start.
-        errors: systematic errors besides; they count in the information and in the fit.
-        names: the unknowns.
-        start: the physical information before the first sample, shape (p, p); none without.
-        periods: how long the whole experiment is.
-        instants: periods after which the information is to be kept, in ascending order.
+    Systematic ``errors`` count in the information and in the fit. The physical information before the first sample is
+    ``start``, shape (p, p); the information is kept after the ``instants`` of the ``periods``, in ascending order.
     """
 
     def __init__(

@@ -160,7 +160,7 @@ def document(study: Study) -> dict[str, Any]:
         },
         "parameters": _parameters(study),
         "models": [
-            _fields(c, "fits", "deviance", "aic", "bic", "weight")
+            _fields(c, "fits", "deviance", "bic", "weight")
             | {"model": c.name, "held_out_log_density": c.held_out, "changes": choice.changes(c)}
             | {"chi2_per_freedom": c.estimate.validation.ratio}
             for c in (choice.candidates if choice is not None else ())

@@ -97,14 +97,14 @@ def models(study: Study) -> Table | None:
     names = [change.name for change in study.choice.changes(best)]
     for c in study.choice.candidates:
         changes = [f"{change.percent:+.2g} % ({change.deviations:+.1f})" for change in study.choice.changes(c)]
-        differences = [f"{value:.1f}" for value in (c.bic - best.bic, c.aic - best.aic, c.held_out - best.held_out)]
+        differences = [f"{value:.1f}" for value in (c.bic - best.bic, c.held_out - best.held_out)]
         cells = [NOTHING] * len(changes) if c is best else changes
         rows.append(
             [c.name, answer(c.fits), plain(c.estimate.validation.ratio), *differences, percent(c.weight), *cells]
         )
-    header = ["model", "fits", "chi2/n", "BIC", "AIC", "held-out", "weight", *names]
+    header = ["model", "fits", "chi2/n", "BIC", "held-out", "weight", *names]
     title = (
-        "Models, best first. BIC, AIC and held-out log density: difference from the first model. Parameters: change "
+        "Models, best first. BIC and held-out log density: difference from the first model. Parameters: change "
         "from the first model's values, and (in its standard deviations)"
     )
     return Table(title, header, rows, words=(0, 1))

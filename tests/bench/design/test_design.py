@@ -277,8 +277,7 @@ def test_the_same_seed_finds_the_same_design_on_any_number_of_threads() -> None:
     one, two = (search(p, starts=2, seed=5, workers=workers) for workers in (1, 2))
     other = search(p, starts=2, seed=6, workers=1)
     np.testing.assert_array_equal(one.best.currents, two.best.currents)
-    assert one.coarse == two.coarse
-    assert one.coarse != other.coarse
+    assert (one.best.currents != other.best.currents).any()
 
 
 @pytest.mark.slow
