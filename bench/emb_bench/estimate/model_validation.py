@@ -21,6 +21,7 @@ not estimated, beside those that were.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,8 +31,8 @@ from scipy import special
 from emb_bench.brake.motion import Floats
 from emb_bench.config.machine import Machine
 from emb_bench.estimate.prediction import Marginal, Problem, by_record
-from emb_bench.estimate.records import Independence, ModelValidation, Suspect, Whiteness, chance
-from emb_bench.estimate.suspects import Scores, Shown, Simulated, explained, score, shown_as
+from emb_bench.estimate.records import Independence, ModelValidation, Whiteness, chance
+from emb_bench.estimate.suspects import Shown, Simulated, explained, score, shown_as
 
 Bools = NDArray[np.bool_]
 
@@ -98,27 +99,17 @@ def examine(
     independence = {OUTPUTS[n]: _independence(problem, n, every, whole, counts, model, freedom) for n in outputs}
     seen = shown or Simulated(problem, z, weights)
     disturbed = disturbance is not None and disturbance.p_value < share
-    scores = score(problem, z, every, found.jacobian, model, seen, chi2 / freedom, disturbed=disturbed)
-    chi2_p = float(special.chdtrc(freedom, chi2))
-    together = Independence(scores.statistic, scores.p_value, 0.0, 0) if scores.suspects else None
-    alarms, notes, suspected = _words(
-        chi2 / freedom, chi2_p, expected, whiteness, independence, disturbance, scores, problem.bench.machine
-    )
     low, high = expected.tolist()
-    return ModelValidation(
-        chi2=chi2,
-        freedom=freedom,
-        expected=(low, high),
-        chi2_p=chi2_p,
-        whiteness=whiteness,
-        independence=independence,
-        suspects=scores.suspects,
-        budget=scores.budget,
-        suspected=suspected,
-        together=together,
-        alarms=alarms,
-        notes=notes,
+    tested = ModelValidation(
+        chi2,
+        freedom,
+        (low, high),
+        float(special.chdtrc(freedom, chi2)),
+        whiteness,
+        independence,
+        *score(problem, z, every, found.jacobian, model, seen, chi2 / freedom, disturbed=disturbed),
     )
+    return _judged(tested, disturbance, problem.bench.machine)
 
 
 def _share(disturbance: Disturbance | None) -> float:
@@ -141,42 +132,33 @@ def significant(p_values: Mapping[str, float]) -> frozenset[str]:
     return frozenset(name for name, _ in ordered[:count])
 
 
-def _words(
-    ratio: float,
-    chi2_p: float,
-    expected: Floats,
-    whiteness: dict[str, Whiteness],
-    independence: dict[str, Independence],
-    disturbance: Disturbance | None,
-    scores: Scores,
-    machine: Machine | None,
-) -> tuple[tuple[str, ...], tuple[str, ...], tuple[Suspect, ...]]:
-    """Alarms, notes, and the suspects that an alarm is about."""
-    alarms, notes = [], []
-    tests = {"size": chi2_p} | {f"current of {name}": test.p_value for name, test in independence.items()}
-    tests |= {f"score of {suspect.name}": suspect.p_value for suspect in scores.suspects}
-    if scores.suspects:
-        tests["scores"] = scores.p_value
+def _judged(m: ModelValidation, disturbance: Disturbance | None, machine: Machine | None) -> ModelValidation:
+    """Tests with their alarms, notes, and the suspects that an alarm is about."""
+    alarms, notes, whiteness = [], [], m.whiteness
+    tests = {"size": m.chi2_p} | {f"current of {name}": test.p_value for name, test in m.independence.items()}
+    tests |= {f"score of {suspect.name}": suspect.p_value for suspect in m.suspects}
+    if m.together is not None:
+        tests["scores"] = m.together.p_value
     if disturbance is not None:
         tests |= {f"whiteness of {name}": test.p_value for name, test in whiteness.items()}
     alarming = significant(tests)
     share = _share(disturbance)
-    depends = [n for n in independence if f"current of {n}" in alarming]
+    depends = [n for n in m.independence if f"current of {n}" in alarming]
     coloured = [
         n
         for n, test in whiteness.items()
         if (test.p_value < share / len(whiteness) if disturbance is None else f"whiteness of {n}" in alarming)
     ]
-    suspected = tuple(s for s in scores.suspects if f"score of {s.name}" in alarming)
+    suspected = tuple(s for s in m.suspects if f"score of {s.name}" in alarming)
     if "size" in alarming:
         why = (
             ""
             if depends or coloured or suspected
             else ", without any pattern: the noise may be larger than the bench says"
         )
-        alarms.append(f"the residuals are too large: chi2/n {ratio:.4g}, at most {expected[1]:.3f} expected{why}")
+        alarms.append(f"the residuals are too large: chi2/n {m.ratio:.4g}, at most {m.expected[1]:.3f} expected{why}")
     for name in depends:
-        test = independence[name]
+        test = m.independence[name]
         alarms.append(
             f"the residuals of the {name} depend on the current: F = {test.statistic:.3g}, {chance(test.p_value)}, "
             f"largest correlation {test.correlation:+.2f} with the current of {test.lag} periods before"
@@ -184,10 +166,10 @@ def _words(
     if suspected:
         others = ", ".join(shown_as(s, machine).name for s in suspected[1:4])
         alarms.append(explained(suspected[0], machine) + (f"; less likely: {others}" if others else ""))
-    elif "scores" in alarming:
+    elif m.together is not None and "scores" in alarming:
         alarms.append(
-            f"the residuals look like several effects together that the model lacks (chi2 {scores.statistic:.4g} of "
-            f"{scores.rank}, {chance(scores.p_value)})"
+            "the residuals look like several effects together that the model lacks (chi2 "
+            f"{m.together.statistic:.4g} of {m.together.rank}, {chance(m.together.p_value)})"
         )
     if disturbance is not None and disturbance.p_value < share:
         notes.append(
@@ -195,9 +177,9 @@ def _words(
             f"{disturbance.ratio:.4g}, {chance(disturbance.p_value)}); the intervals, and what a further run is said "
             "to bring, allow for it"
         )
-    if ratio < expected[0]:
+    if m.ratio < m.expected[0]:
         notes.append(
-            f"the residuals are smaller than the bench's noise: chi2/n {ratio:.4g}, at least {expected[0]:.3f} "
+            f"the residuals are smaller than the bench's noise: chi2/n {m.ratio:.4g}, at least {m.expected[0]:.3f} "
             "expected: the noise in the bench file, and all uncertainties, are too large"
         )
     for name in coloured:
@@ -213,7 +195,7 @@ def _words(
             )
         else:
             alarms.append(f"{said}: what disturbs the brake or its sensors is not white, or the model is another")
-    return tuple(alarms), tuple(notes), suspected
+    return replace(m, suspected=suspected, alarms=tuple(alarms), notes=tuple(notes))
 
 
 def taken(gaps: Floats, samples: int) -> int:

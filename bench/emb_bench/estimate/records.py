@@ -197,6 +197,15 @@ class Suspect:
 
 
 @dataclass(frozen=True)
+class JointScore:
+    """Score test of all suspects together."""
+
+    statistic: float  # χ² of the residuals in the space of the effects
+    rank: int
+    p_value: float
+
+
+@dataclass(frozen=True)
 class Contribution:
     """Entry of the uncertainty budget: an effect that is not estimated."""
 
@@ -216,10 +225,10 @@ class ModelValidation:
     independence: Mapping[str, Independence]  # By output
     suspects: tuple[Suspect, ...]  # Most suspicious first
     budget: tuple[Contribution, ...]  # Effects that the total allows for
-    suspected: tuple[Suspect, ...]  # Those that an alarm is about
-    together: Independence | None  # Test of all suspects together; its correlation and lag are zero
-    alarms: tuple[str, ...]  # Reasons for which the model does not fit; empty if it may
-    notes: tuple[str, ...]
+    together: JointScore | None  # None without a suspect
+    suspected: tuple[Suspect, ...] = ()  # Those that an alarm is about
+    alarms: tuple[str, ...] = ()  # Reasons for which the model does not fit; empty if it may
+    notes: tuple[str, ...] = ()
 
     @property
     def ratio(self) -> float:

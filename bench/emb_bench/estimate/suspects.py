@@ -25,7 +25,7 @@ from emb_bench.brake.parameters import PARAMETERS, SI, Parameter, Quantity, quan
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import EXACT, Mechanics
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import ANGLE_SCALE, DRIFTS, Contribution, Suspect, has_time_for_a_delay
+from emb_bench.estimate.records import ANGLE_SCALE, DRIFTS, Contribution, JointScore, Suspect, has_time_for_a_delay
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 SLOW = 30.0  # Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]
@@ -104,17 +104,6 @@ ALONE = DRIFTS[1:]
 """Effects that are no part of the test of all together, which noise with a slow colour would fail by them."""
 OF_THE_SPRING = ("k_1", "k_1_drift", "contact", "play", "f_l", "quadratic", "cubic", "hysteresis")
 """Effects that a machine without a spring cannot have."""
-
-
-@dataclass(frozen=True, eq=False)
-class Scores:
-    """All suspects, and the test of them together."""
-
-    suspects: tuple[Suspect, ...]  # Most suspicious first
-    budget: tuple[Contribution, ...]  # Effects that the total allows for
-    statistic: float  # χ² of the residuals in the space of all the effects together
-    rank: int
-    p_value: float
 
 
 def held(problem: Problem) -> tuple[str, ...]:
@@ -220,8 +209,8 @@ def score(
     ratio: float,
     *,
     disturbed: bool = False,
-) -> Scores:
-    """Score tests of all effects that are not estimated.
+) -> tuple[tuple[Suspect, ...], tuple[Contribution, ...], JointScore | None]:
+    """Score tests of all effects that are not estimated: most suspicious first, their budget, all of them together.
 
     Args:
         problem: records and model.
@@ -267,12 +256,12 @@ def score(
         p = float(special.ndtr(-away) if EFFECTS[name].positive else 2.0 * special.ndtr(-abs(away)))
         found.append(Suspect(name, amount, sigmas / max(ratio, 1e-300) ** 0.5, p))
     if not found:
-        return Scores((), tuple(budget), 0.0, 0, 1.0)
+        return (), tuple(budget), None
     left, values, _ = np.linalg.svd(np.stack(beside_all, axis=1), full_matrices=False)
     kept = left[:, values > 1e-3]
     statistic, rank = float(np.sum((kept.T @ errors) ** 2)), kept.shape[1]
     p_value = float(special.chdtrc(rank, statistic / max(ratio, 1.0)))
-    return Scores(_ranked(found), tuple(budget), statistic, rank, p_value)
+    return _ranked(found), tuple(budget), JointScore(statistic, rank, p_value)
 
 
 def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
