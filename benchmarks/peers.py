@@ -6,7 +6,7 @@ Brakes with an even seed are as the model says, with the four parameters within 
 error of ``ERRORS`` besides. Each is driven on the simulated bench as ``emb-run`` does it, and each program gets the
 currents that acted, the samples and their noise. All fit ``exact``, the model without the error, from the nominal
 values. The scipy script and lmfit share :func:`simulated`, which a careful user would write; mujoco gets the file that
-``emb-replay export --to mjcf`` writes, in steps of 0.1 ms.
+``emb-replay export -o brake.xml`` writes, in steps of 0.1 ms.
 
 A parameter is wrong if it lies further than 3 of its stated deviations from the truth. An answer is usable if the
 program calls it so. The three do not test the model; beside their verdict stands what a chi-square test at 1 %, written

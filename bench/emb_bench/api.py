@@ -44,7 +44,19 @@ if TYPE_CHECKING:  # scipy, numba, matplotlib and pyarrow come with the extra [b
     from emb_bench.report.content import Content
 
 __all__ = [
-    *("Run", "campaign", "design", "draw", "estimate", "fisher_information", "open_run", "report", "simulate", "topic"),
+    *(
+        "Run",
+        "campaign",
+        "design",
+        "draw",
+        "estimate",
+        "export",
+        "fisher_information",
+        "open_run",
+        "report",
+        "simulate",
+        "topic",
+    ),
 ]
 
 Source = RunLog | str | Path
@@ -179,6 +191,33 @@ def draw(run: Source, axes: Sequence[Axes]) -> None:
     from emb_bench.export.picture import draw_on
 
     draw_on(_opened(run), axes)
+
+
+def export(
+    run: Source,
+    output: str | Path,
+    *,
+    topic: str | None = None,
+    theta: str | Path | Mapping[str, float] | None = None,
+) -> str:
+    """A part of a run for another tool: a picture, one topic as a table with units, or the brake as a MuJoCo model.
+
+    Args:
+        run: MCAP file of emb-run.
+        output: file to write: a picture (.png, .svg, .pdf), a table (.csv, .parquet) or a model (.xml) by its ending.
+        topic: of a table (default: /cycle, the control cycles).
+        theta: parameters of a model, as for fim (default: log, and nominal where it has no estimate).
+
+    Returns:
+        A description of what the file holds.
+
+    Raises:
+        UsageError: an argument is wrong, a library is missing, or the file cannot be written.
+        LogError: the topic cannot be decoded, or the run has no control cycles.
+    """
+    from emb_bench.export.export import write
+
+    return write(_opened(run), Path(output), topic, _text_of(theta))
 
 
 def fisher_information(

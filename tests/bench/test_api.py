@@ -124,7 +124,7 @@ def test_what_a_user_tries_first_works(log: Path, tmp_path: Path) -> None:
 
 def test_a_topic_is_the_table_that_emb_replay_export_writes(log: Path, tmp_path: Path) -> None:
     path = tmp_path / "estimate.parquet"
-    assert replay.main(["export", str(log), "--to", "parquet", "--topic", "/estimate", "-o", str(path)]) == 0
+    assert replay.main(["export", str(log), "--topic", "/estimate", "-o", str(path)]) == 0
     found = api.topic(api.open_run(log), "/estimate")
     assert found.equals(pq.read_table(path), check_metadata=True)
     assert found.schema.field("f_v").metadata == {b"unit": "N·m·s/rad".encode()}

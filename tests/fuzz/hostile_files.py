@@ -99,7 +99,7 @@ LOG_COMMANDS = (
     ("emb-replay", "timing", "FILE"),
     ("emb-replay", "estimate", "FILE", "--params", "f_v"),
     ("emb-replay", "repair", "FILE", "-o", "OUT.mcap"),
-    ("emb-replay", "export", "FILE", "--to", "csv", "-o", "OUT"),
+    ("emb-replay", "export", "FILE", "-o", "OUT.csv"),
     ("emb-replay", "rerun", "FILE"),
 )
 

@@ -94,6 +94,15 @@ def _accepted(content: Content, *, strict: bool) -> int:
     return EXIT_CHECK_FAILED if content.stops else _strict(content.study)
 
 
+def _export(args: argparse.Namespace) -> int:
+    log = api.open_run(args.run)
+    holds = api.export(**given(args, api.export) | {"run": log})
+    warning = f"WARNING: {log.missing}\n" if log.missing else ""
+    document = {"log": str(args.run), "file": str(args.output), "holds": holds, "missing": log.missing}
+    answer(args, lambda: document, lambda _: f"{warning}{args.output}: {holds}")
+    return EXIT_DONE
+
+
 def _campaign(args: argparse.Namespace) -> int:
     found = api.campaign(**given(args, api.campaign))
     from emb_bench.batch.summary import document, text
@@ -248,7 +257,10 @@ COMMANDS: Mapping[str, tuple[Command | str, Collection[int]]] = {
     ),
     "rerun": ("emb_bench.rerun", (*CHECKED, EXIT_POLICY_REFUSED)),
     "repair": ("emb_bench.export.repair", OF_A_LOG),
-    "export": ("emb_bench.export.export", OF_A_LOG),
+    "export": (
+        _command(api.export, _export, "The frames on the bus go to BLF, ASC and others by can_logconvert RUN FILE.\n"),
+        OF_A_LOG,
+    ),
     "import": ("emb_bench.recordings.run_file", (EXIT_DONE, EXIT_USAGE, EXIT_INTERRUPTED)),
     "live": ("emb_bench.cli.live", (EXIT_DONE, EXIT_USAGE, EXIT_LOG)),
 }

@@ -1,8 +1,7 @@
-"""``emb-replay export``: a topic of a log as a table, a picture of the run, or its brake as a model of MuJoCo."""
+"""A topic of a log as a table, a picture of the run, or its brake as a model of MuJoCo."""
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,12 +10,12 @@ from typing import Any
 from numpy.typing import NDArray
 
 from emb_bench.export.mjcf import write_mjcf
-from emb_bench.export.picture import ENDINGS, draw_run
-from emb_bench.logs.log import UNIX_TIME, RunLog, read_log
+from emb_bench.export.picture import ENDINGS as PICTURES
+from emb_bench.export.picture import draw_run
+from emb_bench.logs.log import UNIX_TIME, RunLog
 from emb_bench.logs.mcap_file import Column
 from emb_bench.output import replacing
-from emb_runtime.errors import EXIT_DONE, UsageError
-from emb_runtime.system.terminal import as_json, show
+from emb_runtime.errors import UsageError
 
 
 def arrow_batches(log: RunLog, topic: str) -> tuple[Any, Iterator[Any]]:
@@ -89,55 +88,21 @@ def write_csv(log: RunLog, topic: str, path: Path) -> str:
     return f"{log.counts[topic]} rows of {topic}"
 
 
-TABLES = {"csv": write_csv, "parquet": write_parquet}  # Formats of one topic as a table
-FORMATS = (*TABLES, "plot", "mjcf")
-MODEL_ENDINGS = (".xml", ".mjcf")
+TABLES = {".csv": write_csv, ".parquet": write_parquet}
+MODEL = (".xml", ".mjcf")
+FORMATS = (*PICTURES, *TABLES, *MODEL)  # Endings of what is written
 CYCLE = "/cycle"
 
-HELP = "a topic of the log as CSV or Parquet, a picture of the run, or the brake for MuJoCo"
-DESCRIPTION = """\
-Write a part of a log for another tool.
 
-  csv parquet  one topic as a table, with units: the control cycles, or --topic
-  plot         a picture of the run, PNG, SVG or PDF by the ending of FILE
-  mjcf         the brake as a model of MuJoCo, .xml, with the parameters that --theta names
-
-A table's FILE ends as its format is called. The frames on the bus go to BLF, ASC and others by can_logconvert LOG FILE.
-"""
-
-
-def add_arguments(p: argparse.ArgumentParser) -> None:
-    """Adds the command's options."""
-    p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
-    p.add_argument("--to", choices=FORMATS, required=True, help="what to write")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write")
-    p.add_argument("--topic", metavar="TOPIC", help=f"for {' and '.join(TABLES)}: which one (default: {CYCLE})")
-    p.add_argument(
-        "--theta", metavar="THETA",
-        help="for mjcf: parameters of the brake: log for the running estimate, nominal, true, name=value,..., or the "
-        "JSON of an estimate or report (default: log, and nominal where it has no estimate)",
-    )  # fmt: skip
-    p.add_argument("--json", action="store_true", help="print JSON")
-
-
-def run(args: argparse.Namespace) -> int:
-    """Export a log; returns the exit code."""
-    if args.topic is not None and args.to not in TABLES:
-        raise UsageError(f"--topic: expected with --to {' or '.join(TABLES)}, got it with --to {args.to}")
-    if args.theta is not None and args.to != "mjcf":
-        raise UsageError(f"--theta: expected with --to mjcf, got it with --to {args.to}")
-    endings = {"plot": ENDINGS, "mjcf": MODEL_ENDINGS}.get(args.to, (f".{args.to}",))
-    if args.output.suffix.lower() not in endings:
-        raise UsageError(f"{args.output}: expected a file that ends in {', '.join(endings)} with --to {args.to}")
-    log = read_log(args.log)
-    if args.to == "plot":
-        written = draw_run(log, args.output)
-    elif args.to == "mjcf":
-        written = write_mjcf(log, args.theta or "", args.output)
-    else:
-        written = TABLES[args.to](log, args.topic or CYCLE, args.output)
-    if args.json:
-        show(as_json({"log": str(args.log), "file": str(args.output), "holds": written, "missing": log.missing}))
-    else:
-        show("\n".join([f"WARNING: {log.missing}"] * bool(log.missing) + [f"{args.output}: {written}"]))
-    return EXIT_DONE
+def write(log: RunLog, path: Path, topic: str | None, theta: str) -> str:
+    """Write a picture, a topic as a table, or the brake as a model, by the ending of the file; says what it holds."""
+    ending = path.suffix.lower()
+    if ending not in FORMATS:
+        raise UsageError(f"--output {path}: expected a file that ends in {', '.join(FORMATS)}")
+    if topic is not None and ending not in TABLES:
+        raise UsageError(f"--topic: expected with a file that ends in {' or '.join(TABLES)}, got {path}")
+    if theta and ending not in MODEL:
+        raise UsageError(f"--theta: expected with a file that ends in {' or '.join(MODEL)}, got {path}")
+    if ending in PICTURES:
+        return draw_run(log, path)
+    return TABLES[ending](log, topic or CYCLE, path) if ending in TABLES else write_mjcf(log, theta, path)

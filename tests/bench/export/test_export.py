@@ -51,7 +51,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 def test_the_csv_of_the_cycles_has_every_field_with_its_unit(path: Path, run: SimRun, tmp_path: Path) -> None:
     out = tmp_path / "run.csv"
-    assert export(path, "--to", "csv", "-o", out) == 0
+    assert export(path, "-o", out) == 0
     rows = rows_of(out)
     titles = list(rows[0])
     assert [title.split(" [")[0] for title in titles] == ["time", "unix_time", *CycleRecord._fields]
@@ -69,14 +69,14 @@ def test_the_csv_of_the_cycles_has_every_field_with_its_unit(path: Path, run: Si
 
 def test_any_topic_can_be_a_table(path: Path, run: SimRun, tmp_path: Path) -> None:
     out = tmp_path / "out.csv"
-    assert export(path, "--to", "csv", "-o", out, "--topic", "/can/tx") == 0
+    assert export(path, "-o", out, "--topic", "/can/tx") == 0
     sent = [frame for frame in run.journal.frames if frame.own]
     rows = rows_of(out)
     assert [bytes.fromhex(row["data"]) for row in rows] == [frame.data for frame in sent]
     assert [row["is_extended"] for row in rows] == ["false"] * len(sent)
     for topic, count in read_log(path).counts.items():
         out = tmp_path / f"{topic.replace('/', '_')}.csv"
-        assert export(path, "--to", "csv", "-o", out, "--topic", topic) == 0
+        assert export(path, "-o", out, "--topic", topic) == 0
         assert len(rows_of(out)) == count
 
 
@@ -84,7 +84,7 @@ def test_parquet_has_the_same_numbers_and_units_and_says_what_is_missing(path: P
     cut, out = tmp_path / "cut.mcap", tmp_path / "out.parquet"
     cut.write_bytes(path.read_bytes()[:-5])
     log = read_log(cut)
-    assert export(cut, "--to", "parquet", "-o", out) == 0
+    assert export(cut, "-o", out) == 0
     table = pq.read_table(out)
     assert table.column_names == ["time", "unix_time", *CycleRecord._fields]
     for name in ("angle", "velocity", "sent_current", "policy_current", "step", "send_time_ns"):
@@ -106,7 +106,7 @@ def test_a_value_that_does_not_exist_is_null_in_parquet(simulate: Simulate, tmp_
     records = run.journal.records
     records[:] = [r._replace(policy_current=math.nan) if isinstance(r, CycleRecord) else r for r in records]
     source = write_log(tmp_path / "nan.mcap", run, steps=STEPS)
-    assert export(source, "--to", "parquet", "-o", tmp_path / "out.parquet") == 0
+    assert export(source, "-o", tmp_path / "out.parquet") == 0
     assert pq.read_table(tmp_path / "out.parquet")["policy_current"].null_count == len(run.journal.cycles)
 
 
@@ -127,9 +127,9 @@ def test_a_picture_says_what_is_in_it(path: Path, tmp_path: Path, monkeypatch: p
 def test_mujoco_moves_the_exported_brake_as_the_log_has_it(simulate: Simulate, tmp_path: Path) -> None:
     path = write_log(tmp_path / "long.mcap", simulate(square, steps=300), steps=300)
     out, record = tmp_path / "brake.xml", read_experiment(read_log(path))
-    assert export(path, "--to", "mjcf", "-o", out, "--theta", "f_v=3e-5") == 0
+    assert export(path, "-o", out, "--theta", "f_v=3e-5") == 0
     assert mujoco.MjModel.from_xml_path(str(out)).joint("motor").damping[0] == 3e-5
-    assert export(path, "--to", "mjcf", "-o", tmp_path / "true.xml", "--theta", "true") == 0
+    assert export(path, "-o", tmp_path / "true.xml", "--theta", "true") == 0
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "true.xml"))
     data, steps = mujoco.MjData(model), round(1e-3 / model.opt.timestep)
     for current, (angle, velocity) in zip(record.currents, record.samples, strict=True):
@@ -158,22 +158,22 @@ def test_no_line_is_drawn_through_periods_that_were_missed() -> None:
 def test_an_incomplete_log_is_exported_with_a_warning_first(path: Path, tmp_path: Path, replay: Replay) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(path.read_bytes()[:-5])
-    for form in FORMATS:
-        out = tmp_path / (f"out.{form}" if form != "plot" else "out.png")
-        said = replay.text("export", cut, "--to", form, "-o", out).splitlines()
+    for ending in FORMATS:
+        out = tmp_path / f"out{ending}"
+        said = replay.text("export", cut, "-o", out).splitlines()
         assert said[0].startswith("WARNING: the file is cut at byte")
         assert said[1].startswith(f"{out}: ")
         assert out.stat().st_size > 100
-    document = replay.document("export", cut, "--to", "csv", "-o", tmp_path / "2.csv")
+    document = replay.document("export", cut, "-o", tmp_path / "2.csv")
     assert document["holds"] == f"{read_log(path).counts['/cycle']} rows of /cycle"
     assert document["missing"].startswith("the file is cut")
 
 
 def test_a_missing_extra_is_named(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, replay: Replay) -> None:
-    for form, name, module in (("csv", "out.csv", "pyarrow"), ("plot", "out.png", "matplotlib")):
+    for name, module in (("out.csv", "pyarrow"), ("out.png", "matplotlib")):
         with monkeypatch.context() as missing:
             missing.setitem(sys.modules, module, None)
-            said = replay.refused("export", path, "--to", form, "-o", tmp_path / name)
+            said = replay.refused("export", path, "-o", tmp_path / name)
         assert "pip install 'emb-excite[bench]'" in said
         assert not (tmp_path / name).exists()
 
@@ -181,12 +181,12 @@ def test_a_missing_extra_is_named(path: Path, tmp_path: Path, monkeypatch: pytes
 def test_a_picture_needs_control_cycles(tmp_path: Path, run: SimRun, replay: Replay) -> None:
     run.journal.records[:] = [r for r in run.journal.records if not isinstance(r, CycleRecord)]
     source = write_log(tmp_path / "none.mcap", run, steps=STEPS)
-    said = replay.refused("export", source, "--to", "plot", "-o", tmp_path / "out.png", code=6)
+    said = replay.refused("export", source, "-o", tmp_path / "out.png", code=6)
     assert "not one control cycle is in this log" in said
 
 
 def test_a_long_log_is_written_batch_by_batch(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert export(path, "--to", "csv", "-o", tmp_path / "1.csv") == 0
+    assert export(path, "-o", tmp_path / "1.csv") == 0
     batches: list[int] = []
     plain = RunLog.batches
 
@@ -197,12 +197,12 @@ def test_a_long_log_is_written_batch_by_batch(path: Path, tmp_path: Path, monkey
 
     monkeypatch.setattr("emb_bench.logs.log.BATCH", 1)  # as if each chunk were as much as one may hold
     monkeypatch.setattr(RunLog, "batches", counted)
-    assert export(path, "--to", "csv", "-o", tmp_path / "2.csv") == 0
+    assert export(path, "-o", tmp_path / "2.csv") == 0
     assert len(batches) > 3
     assert (tmp_path / "2.csv").read_bytes() == (tmp_path / "1.csv").read_bytes()
     log = read_log(path)
     for n, (topic, count) in enumerate(log.counts.items()):  # the first batches have nothing of some topics
-        assert export(path, "--to", "parquet", "-o", tmp_path / f"{n}.parquet", "--topic", topic) == 0
+        assert export(path, "-o", tmp_path / f"{n}.parquet", "--topic", topic) == 0
         table = pq.read_table(tmp_path / f"{n}.parquet")
         assert table.num_rows == count
         for name in ("data", "text", "message"):
