@@ -31,9 +31,7 @@ from emb_runtime.errors import UsageError
 
 LEVEL = 0.01  # Chance of a false alarm with the right model, for all predictions together
 
-_DETERMINED = (
-    1e-7  # share of the largest singular value, columns of unit length, from which on a direction is determined
-)
+_DETERMINED = 1e-7  # share of the largest singular value, columns of unit length, from which a direction is determined
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ where two explain the records. Models that do not fit beside one that does have 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -152,10 +152,9 @@ def choose_model(
     first = method_of("oem")(bench, ordered[0], simplest.asked, starts=starts, seed=seed).fit(simplest.records)
     fits = _from_the_best([fit_from(problem, first) for problem in trusting])
     if asked.systematic:
-        fits = _from_the_best([_fit(own, fit.known()) for own, fit in zip(problems(asked), fits, strict=True)])
+        fits = _from_the_best([fit_from(own, fit) for own, fit in zip(problems(asked), fits, strict=True)])
     if not any(fit.explains for fit in fits):
-        near = fits[0].known()
-        fits = _from_the_best([fits[0], *(_fit(fit.problem, near, follow=True) for fit in fits[1:])])
+        fits = _from_the_best([fits[0], *(fit_from(fit.problem, fits[0], follow=True) for fit in fits[1:])])
     found = [candidate(fit.problem.plant.name, fit.finished()) for fit in fits]
     kept = {model_of(c.estimate.plant, asked): c for c in reversed(ranked(found).candidates)}
     names = {c.name for c in kept.values()}
@@ -181,11 +180,6 @@ class Fit(NamedTuple):
         """χ²/n."""
         return self.end.cost / max(sum(int(np.sum(root > 0.0)) for root in self.weights), 1)
 
-    def known(self) -> dict[Unknown, float]:
-        """Values in SI units."""
-        values = self.z * self.problem.units
-        return dict(zip(self.problem.unknowns, values.tolist(), strict=True))
-
     def finished(self) -> Estimate:
         """Estimate with its tests."""
         return finished(self.problem, self.z, self.weights, (self.end,))
@@ -197,7 +191,7 @@ def _from_the_best(fits: Sequence[Fit]) -> list[Fit]:
     again = []
     for fit in fits:
         worse = not fit.explains and fit is not near
-        again.append(min(fit, _fit(fit.problem, near.known()), key=lambda fit: fit.end.cost) if worse else fit)
+        again.append(min(fit, fit_from(fit.problem, near), key=lambda fit: fit.end.cost) if worse else fit)
     return again
 
 
@@ -214,16 +208,13 @@ def _asked_of(bench: Bench, plant: Plant, asked: EstimationProblem) -> Estimatio
     return with_systematic(asked, bench, plant) if asked.systematic else asked
 
 
-def fit_from(problem: Problem, e: Estimate, *, follow: bool = False) -> Fit:
+def fit_from(problem: Problem, near: Estimate | Fit, *, follow: bool = False) -> Fit:
     """Output error, started from where another model ended.
 
     With ``follow`` a filter leads there, which follows the measured brake and has few local minima.
     """
-    return _fit(problem, dict(zip(e.unknowns, e.values.tolist(), strict=True)), follow)
-
-
-def _fit(problem: Problem, known: Mapping[Unknown, float], follow: bool = False) -> Fit:
-    start = problem.started(known)
+    values = (near.z * near.problem.units).tolist()
+    start = problem.started(dict(zip(near.problem.unknowns, values, strict=True)))
     if follow:
         start, _ = released(problem, start)
     weights = problem.weights(start)

@@ -130,17 +130,7 @@ def make_problem(
     brake: BrakeParameters | None = None,
     returns: bool = True,
 ) -> Problem:
-    """A design problem on a bench.
-
-    Args:
-        bench: limits, noise, timing, what counts as home, and the nominal brake.
-        goal: what is maximised.
-        params: the unknowns; other parameters are known.
-        model: name of the plant.
-        kind: ``physical`` or ``weighted`` information.
-        brake: the known parameters; nominal without.
-        returns: True if the brake has to be home at the end.
-    """
+    """A design problem on a bench, of the nominal brake without another one; with ``returns`` it has to come home."""
     if not params:
         raise UsageError(f"expected at least one parameter of {', '.join(PARAMETERS)}")
     check_unknowns(params)
