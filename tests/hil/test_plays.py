@@ -15,15 +15,20 @@ import pytest
 from emb_bench.cli.replay import main as replay
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import load_bench
+from tests.drives import SHIPPED
 from tests.hil.judge import ANGLE, STATUS, WATCHDOG_MS, Seen, judge, seen
 from tests.hil.plays import COMMAND, PLAYS, ROOT, SLOWLY, VELOCITY, Play, perform
 from tests.independent import DATABASE
 
-NIGHTLY = ("lie_", "mapped_")
-"""Their faults are also played in lock-step: tests/runtime/control/test_lies.py, tests/runtime/drives."""
-CASES = [
-    pytest.param(play, id=play.name, marks=pytest.mark.slow if play.name.startswith(NIGHTLY) else ()) for play in PLAYS
-]
+WHOLE = tuple(f"mapped_{drive}" for drive in SHIPPED)  # Undisturbed runs of drives behind the gateway
+
+
+def is_nightly(play: Play) -> bool:
+    """Faults of nodes and drives, which are also played in lock-step: test_lies.py, tests/runtime/drives."""
+    return play.name.startswith(("lie_", "mapped_")) and play.name not in WHOLE
+
+
+CASES = [pytest.param(play, id=play.name, marks=pytest.mark.slow if is_nightly(play) else ()) for play in PLAYS]
 NAMED = {play.name: play for play in PLAYS}
 UNHEARD = ("loop_stopped", "loop_killed", "loop_hung", "loop_robbed")
 """The loop cannot send its stop frames: the watchdog does."""
@@ -155,9 +160,7 @@ def test_what_the_killed_left_can_be_evaluated(played: Played, capsys: pytest.Ca
     assert log.missing.split(";")[0] in unwrapped(capsys)
 
 
-DRIVE_FRAMES = {"mapped_odrive": (0x00E, 0x009), "mapped_zero": (0x00E, 0x009), "mapped_vesc": (0x105, 0x905)}
-DRIVE_FRAMES["mapped_mit"] = (1, 2)
-WHOLE = ("mapped_odrive", "mapped_vesc", "mapped_mit", "mapped_zero")
+DRIVE_FRAMES = ((0x00E, 0x009), (0x105, 0x905), (1, 2))  # Commands and samples of the three
 
 
 def gateway(it: Any) -> dict[str, str]:
@@ -165,23 +168,32 @@ def gateway(it: Any) -> dict[str, str]:
     return counts
 
 
-@pytest.mark.slow
-@pytest.mark.plays(*WHOLE, *(f"{drive}_host" for drive in WHOLE[:3]), "mapped_left", "mapped_gateway", "mapped_down")
-def test_a_mapped_drive_answers_every_sample_and_is_let_go_when_its_host_dies(played: Played) -> None:
-    for name in WHOLE:
+def is_whole(it: Any) -> None:
+    """Each sample was answered by the drive, and nothing was refused."""
+    assert (it.summary["answered"], it.summary["not_obeyed"], it.summary["log_complete"]) == (500, 0, True)
+    assert (it.summary["watchdog"]["tripped"], gateway(it)["drive_frames_refused"]) == ("", "0")
+    assert it.report["gateways"][0]["exit"] == 0, it.report["gateways"][0]["err"]
+
+
+@pytest.mark.plays(*WHOLE)
+def test_a_drive_behind_the_gateway_answers_every_sample_and_its_frames_are_in_the_log(played: Played) -> None:
+    for name, (commands, samples) in zip(WHOLE, DRIVE_FRAMES, strict=True):
         it = played(name)
-        assert (it.summary["answered"], it.summary["not_obeyed"], it.summary["log_complete"]) == (500, 0, True), name
-        assert (it.summary["watchdog"]["tripped"], gateway(it)["drive_frames_refused"]) == ("", "0"), name
-        assert it.report["gateways"][0]["exit"] == 0, it.report["gateways"][0]["err"]
-        commands, samples = DRIVE_FRAMES[name]
+        is_whole(it)
         logged = read_log(it.log).tables["/drive/rx"]["id"].tolist()
-        assert logged.count(commands) >= 500  # of the gateway, beside what the drive sends
-        assert logged.count(samples) >= 500
+        assert logged.count(commands) >= 500, name  # of the gateway, beside what the drive sends
+        assert logged.count(samples) >= 500, name
     assert gateway(played("mapped_odrive"))["drive_time_out"].startswith("let go within 0.01")
-    assert gateway(played("mapped_zero"))["drive_too_late"] == ""
-    assert played("mapped_zero").told[0]["top_speed"] == 0.0
-    for drive in WHOLE[:3]:
-        assert played(f"{drive}_host").told[0]["top_speed"] > 300.0  # it was killed in motion
+
+
+@pytest.mark.slow
+@pytest.mark.plays(*(f"{name}_host" for name in WHOLE), "mapped_zero", "mapped_left", "mapped_gateway", "mapped_down")
+def test_a_mapped_drive_is_let_go_when_its_host_dies_and_gets_no_current_with_zero(played: Played) -> None:
+    zero = played("mapped_zero")
+    is_whole(zero)
+    assert (gateway(zero)["drive_too_late"], zero.told[0]["top_speed"]) == ("", 0.0)
+    for name in WHOLE:
+        assert played(f"{name}_host").told[0]["top_speed"] > 300.0  # it was killed in motion
     left = played("mapped_left")
     assert left.told[0]["top_speed"] <= load_bench().limits.velocity  # the gateway brakes by itself
     for name, code in (("mapped_left", 3), ("mapped_down", 4)):

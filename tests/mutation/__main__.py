@@ -57,6 +57,7 @@ TESTS = {
     "estimator.speed_loop": ("test_frozen.py", "test_speed_loop.py"),
     "estimator.estimator": ("test_estimator.py",),
     "drives.wire_guard": ("test_wire_guard.py",),
+    "drives.gateway": ("test_gateway.py",),
     "drives.time_out_proof": ("test_time_out_proof.py",),
 }
 """The tests of each module of emb_runtime: the fast ones, and none that runs compiled code."""

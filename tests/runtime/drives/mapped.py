@@ -11,7 +11,7 @@ import pytest
 from emb_bench.config.bench import Bench, parse_bench
 from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import shipped_bench_text
-from emb_runtime.drives.gateway import LockStepDrive
+from emb_runtime.drives.lock_step import LockStepDrive
 from emb_runtime.drives.mapping import Mapping
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.records import Frame

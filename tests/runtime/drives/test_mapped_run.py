@@ -15,7 +15,7 @@ from emb_bench.api import fisher_information, open_run
 from emb_bench.cli.replay import main as emb_replay
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import parse_bench
-from emb_runtime.drives.gateway import open_mapped
+from emb_runtime.drives.lock_step import open_mapped
 from emb_runtime.drives.mapping import PROPERTIES, require_fit
 from emb_runtime.drives.node import Phase
 from emb_runtime.errors import UsageError
