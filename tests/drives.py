@@ -6,6 +6,8 @@ import random
 import struct
 from pathlib import Path
 
+from emb_runtime.config.bench import shipped_bench_text
+
 EXAMPLES = Path(__file__).parents[1] / "examples" / "drives"
 SHIPPED = ("odrive", "vesc", "mit")
 LIMIT = 6.0  # Largest current of the mappings drawn [A]
@@ -18,6 +20,13 @@ BO_ 800 Sensors: 8 Drive
 """
 _SENSOR_TYPES = "SIG_VALTYPE_ 800 Angle : 1;\nSIG_VALTYPE_ 800 Velocity : 1;\n"
 _ALWAYS = ["no_answers", "no_echo", "no_device_time", "no_identity", "hold_on_loss", "no_counter", "no_crc"]
+
+
+def late_bench(polled: bool = False) -> str:
+    """The shipped bench file with the age of frames that a mapped drive has."""
+    age = "[1, 1]" if polled else "[0, 1]"
+    text = shipped_bench_text().replace("frame_age     = [0, 0]", f"frame_age     = {age}")
+    return text + "\n[plants.late-command]\ncommand_delay = 1\n"
 
 
 class RandomMapping:

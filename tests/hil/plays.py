@@ -16,8 +16,7 @@ from typing import Any
 
 from emb_runtime.config.bench import load_bench, parse_bench
 from tests.actors import constant_actor
-from tests.drives import EXAMPLES, SHIPPED
-from tests.runtime.drives.mapped import late_bench
+from tests.drives import EXAMPLES, SHIPPED, late_bench
 
 ROOT = Path(__file__).parents[2]
 COMMAND, VELOCITY = 0x80, 0x101

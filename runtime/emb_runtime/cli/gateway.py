@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import select
 import sys
 import time
 from collections.abc import Callable
@@ -12,8 +13,9 @@ from textwrap import dedent
 
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import bench_identity, load_layout
+from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import load_bench
-from emb_runtime.drives.gateway import Gateway, wait_for
+from emb_runtime.drives.gateway import Gateway
 from emb_runtime.drives.mapping import PROPERTIES, Mapping, require_fit
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.drives.node import report
@@ -24,6 +26,8 @@ from emb_runtime.system.terminal import ARM_QUESTION, Parser, StopRequest, as_js
 
 PRIORITY = realtime.PRIORITY + 5  # Above the loop's, below its watchdog's
 LOOK = 0.05  # Time between two looks at the keyboard [s]
+LOOK_NS = 200_000  # Time between two looks at a bus that cannot be waited for [ns]
+LONGEST_WAIT_NS = 10_000_000  # Time between two looks at the operator's end [ns]
 DESCRIPTION = """\
 Put a node that speaks emb.dbc between a drive that does not, on one bus, and emb-run, on another. The drive is armed by
 the mapping file's sequence, after it has proved that it lets go by its own time-out, and is armed as long as this runs:
@@ -117,6 +121,18 @@ def _serve(args: argparse.Namespace) -> int:
     if late := gateway.node.times.too_late:
         mention(f"emb-gateway: TOO LATE: {late}")
     return EXIT_CHECK_FAILED if late else EXIT_DONE
+
+
+def wait_for(*buses: Transport) -> Callable[[int], None]:
+    """A wait of at most a time [ns], until something has come on one of some buses."""
+    descriptors = [getattr(bus, "descriptor", None) for bus in buses]
+    readable = [each for each in descriptors if each is not None]
+    most_ns = LONGEST_WAIT_NS if len(readable) == len(buses) else LOOK_NS
+
+    def wait(longest_ns: int) -> None:
+        select.select(readable, [], [], min(longest_ns, most_ns) * 1e-9)
+
+    return wait
 
 
 def _description(mapping: Mapping, bench: str, identity: int, speed: float, serial: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import select
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -17,12 +16,10 @@ from emb_runtime.errors import BusError, SafetyStopError
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import Clock
 
-LOOK_NS = 200_000  # Time between two looks at a bus that cannot be waited for [ns]
-LONGEST_WAIT_NS = 10_000_000  # Time between two looks at the operator's end [ns]
 MOST_FRAMES = 64  # Frames of one bus that are taken at once: a babbling bus must not hold up the other
-LISTEN_NS = 50_000_000  # Least time for which the drive's bus is observed before it is armed [ns]
-LONGEST_SILENCE_NS = 5_000_000_000  # Time for a drive to be heard before it is armed [ns]
-LINGER_NS = 1_000_000_000  # Time for which the node still reports its samples after the drive was let go [ns]
+LISTEN = 0.05  # Least time for which the drive's bus is observed before it is armed [s]
+LONGEST_SILENCE = 5.0  # Time for a drive to be heard before it is armed [s]
+LINGER = 1.0  # Time for which the node still reports its samples after the drive was let go [s]
 
 
 class Port(NamedTuple):
@@ -30,18 +27,6 @@ class Port(NamedTuple):
 
     send: Callable[[Frame], None]
     receive: Callable[[int], Frame | None]
-
-
-def wait_for(*buses: Transport) -> Callable[[int], None]:
-    """A wait of at most a time [ns], until something has come on one of some buses."""
-    descriptors = [getattr(bus, "descriptor", None) for bus in buses]
-    readable = [each for each in descriptors if each is not None]
-    most_ns = LONGEST_WAIT_NS if len(readable) == len(buses) else LOOK_NS
-
-    def wait(longest_ns: int) -> None:
-        select.select(readable, [], [], min(longest_ns, most_ns) * 1e-9)
-
-    return wait
 
 
 class Gateway:
@@ -105,9 +90,9 @@ class Gateway:
                 if self.node.phase in (Phase.OFF, Phase.FAILED):
                     break
             elif arms and ended_ns is None and self.node.phase in (Phase.OFF, Phase.FAILED):
-                ended_ns = self._clock.now_ns() + LINGER_NS
+                ended_ns = self._after(LINGER)
         problem = self._release_problem() if sent else ""
-        failure = self._failure(stopped=ended_ns is not None and not stop_requested())
+        failure = self._failure(stopped=not stop_requested())
         if problem:
             raise BusError(f"{failure}; {problem}" if failure else problem)
         if failure is not None:
@@ -124,7 +109,7 @@ class Gateway:
 
     def _release_problem(self) -> str:
         """Reason why the drive may still be armed; empty if it reports within a time that it is not."""
-        deadline_ns = self._clock.now_ns() + LINGER_NS
+        deadline_ns = self._after(LINGER)
         while (problem := self.node.release_problem) and self._clock.now_ns() < deadline_ns:
             try:
                 self.step()
@@ -139,12 +124,11 @@ class Gateway:
         Raises:
             BusError: the drive cannot be armed, or its bus is lost.
         """
-        begin_ns = self._clock.now_ns()
+        listened_ns, silent_ns = self._after(LISTEN), self._after(LONGEST_SILENCE)
         while not (stop_requested() or self._node_lost):
-            now_ns = self._clock.now_ns()
-            if self.node.may_arm and now_ns > begin_ns + LISTEN_NS:
+            if self.node.may_arm and self._clock.now_ns() > listened_ns:
                 break
-            if now_ns > begin_ns + LONGEST_SILENCE_NS:
+            if self._clock.now_ns() > silent_ns:
                 raise BusError("no samples of the drive: check that it is on, on this bus, with this DBC")
             self.step()
             if self._is_commanded:
@@ -170,7 +154,7 @@ class Gateway:
         now_ns = self._clock.now_ns()
         self._wait(self.node.due_ns(now_ns + 1) - now_ns)
         for _ in range(MOST_FRAMES):
-            if self._node_lost is not None or (frame := self._received()) is None:
+            if (frame := self._received()) is None:
                 break
             if not (frame.own or frame.error):
                 self.node.take_host(frame, self._clock.now_ns())
@@ -184,6 +168,10 @@ class Gateway:
                 if ours.identifier == self._layout.status.identifier:
                     self._pass_on(self._counts())
         self.node.tick(self._clock.now_ns())
+
+    def _after(self, seconds: float) -> int:
+        """Time so much later than now [ns]."""
+        return self._clock.now_ns() + int(seconds * 1e9)
 
     def _counts(self) -> Frame:
         """The counts for the host's log; they go with each status."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping as Dictionary
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.transport import Transport
 from emb_runtime.config.bench import Bench
-from emb_runtime.drives.gateway import LONGEST_SILENCE_NS, Gateway, Port
+from emb_runtime.drives.gateway import LONGEST_SILENCE, Gateway, Port
 from emb_runtime.drives.mapping import Mapping, require_fit
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import BusError, UsageError
@@ -46,7 +46,8 @@ class LockStepDrive:
         except BusError as err:
             raise BusError(f"{name}: {err}") from err
         self._to_host.clear()
-        self.receive(clock.now_ns() + LONGEST_SILENCE_NS)  # with the first sample the node judges what came before
+        # With its first sample the node judges what came before.
+        self.receive(clock.now_ns() + round(LONGEST_SILENCE * 1e9))
         if self.node.failure:
             raise BusError(f"{name}: the drive was let go: {self.node.failure}")
 

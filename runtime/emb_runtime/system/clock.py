@@ -2,17 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
-import sys
 import time
 from typing import Protocol
-
-_TIMER_ABSTIME = 1
-_clock_nanosleep = ctypes.CDLL(None).clock_nanosleep if sys.platform == "linux" else None
-
-
-class _Timespec(ctypes.Structure):
-    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
 
 
 class Clock(Protocol):
@@ -53,13 +44,8 @@ class MonotonicClock:
 
     def sleep_until(self, time_ns: int) -> int:
         """Wait until a monotonic time [ns]; gives the time that it is then, which may be later."""
-        # Absolute, so that being interrupted between reading the clock and sleeping makes nothing later.
-        wake = _Timespec(*divmod(time_ns, 1_000_000_000))
         while (now_ns := time.monotonic_ns()) < time_ns:
-            if _clock_nanosleep is None:
-                time.sleep((time_ns - now_ns) * 1e-9)
-            else:
-                _clock_nanosleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(wake), None)
+            time.sleep((time_ns - now_ns) * 1e-9)
         return now_ns
 
 

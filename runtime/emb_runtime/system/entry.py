@@ -9,9 +9,8 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from typing import Any
 
-from emb_runtime.errors import EXIT_INTERRUPTED, UsageError
+from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, UsageError
 
 
 def start(
@@ -46,6 +45,8 @@ def start(
         return main()
     except KeyboardInterrupt as err:
         message = str(err) or message
+    except BrokenPipeError:  # ``--help | head``: argparse of Python 3.11.2 lets it through
+        return EXIT_DONE
     finally:
         _flush()
         gc.freeze()  # or Python searches all that was imported for garbage before it ends: a fifth of a short command
@@ -63,25 +64,9 @@ def _prepare_streams() -> None:
             os.fstat(descriptor)
         except OSError:
             os.open(os.devnull, os.O_RDWR)
-    sys.stdout, sys.stderr = _taking_all(sys.stdout), _taking_all(sys.stderr)
-
-
-class _Output(io.TextIOWrapper):
-    """Output that a lost reader (``| head``) does not fail: argparse of Python 3.11.2 prints without a care for it."""
-
-    def write(self, text: str, /) -> int:
-        try:
-            return super().write(text)
-        except BrokenPipeError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
-            return len(text)
-
-
-def _taking_all(stream: Any) -> Any:
-    """The stream with a sign in place of each that its encoding lacks; a result must not fail for one."""
-    if type(stream) is not io.TextIOWrapper:  # none, or somebody else's
-        return stream
-    return _Output(stream.buffer, stream.encoding, "backslashreplace", line_buffering=stream.line_buffering)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # none, or somebody else's
+            stream.reconfigure(errors="backslashreplace")  # a sign for each that its encoding lacks
 
 
 def _flush() -> None:

@@ -20,8 +20,7 @@ from emb_runtime.cli.main import main
 from emb_runtime.config.bench import PARAMETER_NAMES, parse_bench
 from emb_runtime.records import Frame
 from tests.actors import constant_actor
-from tests.drives import EXAMPLES
-from tests.runtime.drives.mapped import late_bench
+from tests.drives import EXAMPLES, late_bench
 
 
 def run(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[RunLog, list[float]]:

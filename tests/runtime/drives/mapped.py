@@ -10,7 +10,6 @@ import pytest
 
 from emb_bench.config.bench import Bench, parse_bench
 from emb_runtime.can.transport import Transport
-from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.drives.lock_step import LockStepDrive
 from emb_runtime.drives.mapping import Mapping
 from emb_runtime.drives.mapping_file import load_mapping
@@ -18,17 +17,10 @@ from emb_runtime.records import Frame
 from emb_runtime.system.clock import SteppedClock
 from simulated_drives import WATCHDOG, SimDriveTransport, SimulatedDrive, open_sim_drive
 from tests.actors import constant_actor
-from tests.drives import EXAMPLES
+from tests.drives import EXAMPLES, late_bench
 from tests.runtime.operating import EmbRun
 
 Change = Callable[[Frame], Frame | None]
-
-
-def late_bench(polled: bool = False) -> str:
-    """The shipped bench file with the age of frames that a mapped drive has."""
-    age = "[1, 1]" if polled else "[0, 1]"
-    text = shipped_bench_text().replace("frame_age     = [0, 0]", f"frame_age     = {age}")
-    return text + "\n[plants.late-command]\ncommand_delay = 1\n"
 
 
 def protected_odrive() -> tuple[str, str]:

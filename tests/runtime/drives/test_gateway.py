@@ -14,17 +14,17 @@ from types import SimpleNamespace
 import pytest
 
 from emb_runtime.can.messages import StopReason, load_layout
+from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.cli import gateway as cli
 from emb_runtime.config.bench import parse_bench
-from emb_runtime.drives.gateway import LISTEN_NS, Gateway
+from emb_runtime.drives.gateway import LISTEN, MOST_FRAMES, Gateway
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.drives.node import ARMED_PERIODS, LONGEST_STOP_PERIODS, READY_SAMPLES, DriveNode, Phase
 from emb_runtime.errors import BusError, SafetyStopError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 from emb_runtime.system import terminal
 from emb_runtime.system.clock import SteppedClock
-from tests.drives import EXAMPLES
-from tests.runtime.drives.mapped import late_bench
+from tests.drives import EXAMPLES, late_bench
 
 MS = 1_000_000
 LAYOUT = load_layout()
@@ -39,18 +39,22 @@ class Bus:
     def __init__(self) -> None:
         self.waiting: deque[Frame] = deque()
         self.sent: list[Frame] = []
-        self.error: BusError | None = None
+        self.send_error: BusError | None = None
+        self.receive_error: BusError | None = None
         self.passes: Callable[[], None] = lambda: None
 
+    def lose(self, error: BusError) -> None:
+        self.send_error = self.receive_error = error
+
     def send(self, frame: Frame) -> None:
-        if self.error is not None:
-            raise self.error
+        if self.send_error is not None:
+            raise self.send_error
         self.sent.append(frame)
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        del deadline_ns
-        if self.error is not None:
-            raise self.error
+        assert deadline_ns == 0  # it only looks
+        if self.receive_error is not None:
+            raise self.receive_error
         if not self.waiting:
             self.passes()
             return None
@@ -67,7 +71,8 @@ class Played:
         self.clock = SteppedClock(1_000 * MS)
         self.drive, self.host = Bus(), Bus()
         mapping, bench = load_mapping(EXAMPLES / "odrive.toml"), parse_bench(late_bench(), "bench.toml")
-        self.gateway = Gateway(mapping, bench, self.drive, self.host, self.clock, lambda _ns: None)
+        self.waits: list[int] = []
+        self.gateway = Gateway(mapping, bench, self.drive, self.host, self.clock, self.waits.append)
         self.node = self.gateway.node
         self.state, self.last_fed = IDLE, 0
         self.position, self.velocity = 0.0, 0.0
@@ -96,12 +101,7 @@ class Played:
         return self.host.sent[before:]
 
     def command(self, current: float, answers: int = 0, enable: bool = True) -> None:
-        """An answer to the newest sample, or to another."""
-        newest = next(f for f in reversed(self.host.sent) if f.identifier == LAYOUT.angle.identifier)
-        counter = (LAYOUT.decode_angle(newest).counter + answers) % 15
-        frame = LAYOUT.encode_command(CurrentCommand(self.counter, counter, current, enable))
-        self.counter = (self.counter + 1) % 15
-        self.host.waiting.append(frame)
+        self.host.waiting.append(answer(self, current, answers, enable))
         self.gateway.step()
 
     def arm(self) -> None:
@@ -170,6 +170,62 @@ def test_the_drive_proves_its_time_out_before_it_is_armed_and_then_gets_0_a(play
     for _ in range(20):
         assert state_of(played.period()) is NodeState.IDLE
     assert played.torques[left:] == [0.0] * 20
+
+
+def ended_at(played: Played, period: int) -> bool:
+    return played.periods >= period
+
+
+def test_the_bus_is_observed_for_a_time_before_the_drive_is_armed_and_an_end_by_then_arms_nothing() -> None:
+    for end, armed in ((51, False), (52, True)):
+        played = Played()
+        played.serve(10**9)
+        assert played.gateway.arm(partial(ended_at, played, end)) is armed
+        assert bool(played.drive.sent) is armed
+
+
+def test_it_waits_until_the_next_thing_is_due_and_takes_some_frames_of_each_bus(played: Played) -> None:
+    played.gateway.step()
+    assert played.waits == [MS + 1]
+    played.period()
+    played.gateway.step()
+    assert played.waits[-1] == 750_000  # the newest sample is to be answered by then
+    played.host.waiting += [Frame(0x700, b"")] * 100
+    played.drive.waiting += [Frame(0x700, b"")] * 100
+    played.gateway.step()
+    assert (len(played.host.waiting), len(played.drive.waiting)) == (100 - MOST_FRAMES, 100 - MOST_FRAMES) == (36, 36)
+    looks: list[int] = []
+    played.host.waiting.clear()
+    played.host.passes = lambda: looks.append(1)
+    played.gateway.step()
+    assert looks == [1]
+
+
+def answer(played: Played, current: float, answers: int = 0, enable: bool = True) -> Frame:
+    """An answer to the newest sample, or to another."""
+    newest = next(f for f in reversed(played.host.sent) if f.identifier == LAYOUT.angle.identifier)
+    counter = (LAYOUT.decode_angle(newest).counter + answers) % 15
+    frame = LAYOUT.encode_command(CurrentCommand(played.counter, counter, current, enable))
+    played.counter = (played.counter + 1) % 15
+    return frame
+
+
+def test_echoes_and_error_frames_of_the_host_s_bus_are_no_commands(played: Played) -> None:
+    played.arm()
+    for kind in ("own", "error"):
+        played.period()
+        played.host.waiting.append(answer(played, 2.0)._replace(own=kind == "own", error=kind == "error"))
+        played.gateway.step()
+    assert (played.node.counts.refused, played.node.phase) == (0, Phase.READY)
+
+
+def test_a_frame_for_which_the_host_s_bus_has_no_room_is_lost_and_nothing_else(played: Played) -> None:
+    def full() -> None:
+        played.host.send_error = TransmitQueueFullError("vcan0: full")
+
+    played.serve(300, full)
+    played.gateway.run(lambda: played.periods > 400, lambda: None, arms=True)
+    assert (played.periods, played.node.phase) == (402, Phase.OFF)
 
 
 def test_a_command_in_time_becomes_a_torque_and_the_next_sample_names_it(played: Played) -> None:
@@ -246,8 +302,25 @@ def run(played: Played, periods: int, then: Callable[[], None] = lambda: None, *
 
 
 def test_the_operator_s_end_lets_the_drive_go_and_is_no_error(played: Played) -> None:
-    assert run(played, 400) == ["ready"]
-    assert (played.node.phase, played.state, played.asked_states[-1]) == (Phase.OFF, IDLE, IDLE)
+    assert run(played, 1500) == ["ready"]
+    assert (played.periods, played.node.phase, played.state) == (1502, Phase.OFF, IDLE)
+    assert played.asked_states[-1] == IDLE
+
+
+def test_an_end_in_the_middle_of_a_run_waits_for_the_node_s_stop_however_long_that_takes(played: Played) -> None:
+    def driven() -> None:
+        played.host.waiting.append(answer(played, 1.0))
+        played.drive.passes, passes = moving, played.drive.passes
+        moved.append(passes)
+
+    def moving() -> None:
+        played.position, played.velocity = played.position + 0.0005, 2.0
+        moved[0]()
+
+    moved: list[Callable[[], None]] = []
+    assert run(played, 300, driven) == ["ready"]
+    assert (played.node.phase, played.node.stop_reason) == (Phase.OFF, StopReason.DISABLED)
+    assert LONGEST_STOP_PERIODS <= played.periods - 300 <= LONGEST_STOP_PERIODS + 10
 
 
 def test_the_counts_go_to_the_host_with_each_status(played: Played) -> None:
@@ -263,23 +336,30 @@ def test_the_counts_go_to_the_host_with_each_status(played: Played) -> None:
 
 
 def test_listening_sends_nothing(played: Played) -> None:
-    assert run(played, 50, arms=False) == ["ready"]
+    assert run(played, 1500, arms=False) == ["ready"]
     assert played.drive.sent == []
-    assert len(played.host.sent) >= 98
+    assert len(played.host.sent) >= 2998
 
 
 def test_every_other_end_is_an_error_with_the_drive_let_go() -> None:
     down = BusError("it is down")
-    for happens, reason in (
-        (lambda it: setattr(it.host, "error", down), "it is down"),
-        (lambda it: setattr(it.drive, "error", down), "it is down"),
-        (lambda it: setattr(it, "velocity", 50.0), "angle and velocity contradict each other"),
-        (lambda it: setattr(it.node, "_periods", ARMED_PERIODS), "let go after a stop, reason NEVER_COMMANDED"),
+    linger = 1000  # Periods in which the node still reports its samples
+    for happens, reason, periods in (
+        (lambda it: setattr(it.host, "receive_error", down), "it is down", 301),
+        (lambda it: setattr(it.host, "send_error", down), "it is down", 301),
+        (lambda it: it.drive.lose(down), "it is down", 300),
+        (lambda it: setattr(it, "velocity", 50.0), "angle and velocity contradict each other", 303 + linger),
+        (lambda it: setattr(it.node, "_periods", ARMED_PERIODS), "a stop, reason NEVER_COMMANDED", 300 + linger),
     ):
         played = Played()
         with pytest.raises((BusError, SafetyStopError), match=reason):
             run(played, 5000, partial(happens, played))
-        assert played.drive.error or played.asked_states[-1] == IDLE
+        assert played.drive.send_error or played.asked_states[-1] == IDLE
+        assert played.periods == periods, reason
+    played = Played()
+    with pytest.raises(SafetyStopError, match="contradict"):  # the operator ends it after that
+        run(played, 400, lambda: setattr(played, "velocity", 50.0))
+    assert played.periods == 401
 
 
 def test_a_release_that_is_not_confirmed_is_an_error_after_the_reason_of_the_end() -> None:
@@ -292,7 +372,8 @@ def test_a_release_that_is_not_confirmed_is_an_error_after_the_reason_of_the_end
         it.ignores, it.velocity = True, 50.0
 
     def deaf_host(it: Played) -> None:
-        it.ignores, it.host.error = True, BusError("vcan0 is down")
+        it.ignores = True
+        it.host.lose(BusError("vcan0 is down"))
 
     def dumb(it: Played) -> None:
         it.drive.passes = lambda: it.clock.advance_to(it.clock.now_ns() + MS)
@@ -302,26 +383,32 @@ def test_a_release_that_is_not_confirmed_is_an_error_after_the_reason_of_the_end
         it.ignores = True
         it.serve(401, partial(dumb, it))
 
+    def lost(it: Played) -> None:
+        it.ignores = True
+        it.serve(420, partial(it.drive.lose, BusError("can0 is down")))
+
     for happens, reason in (
         (stubborn, f"^the drive {armed}; switch it off"),
         (contradicting, f"angle and velocity contradict each other.*; the drive {armed}"),
         (deaf_host, f"vcan0 is down; the drive {armed}"),
         (dumb, f"silent for 3 periods; the drive {nothing}"),
         (unplugged, armed),
+        (lost, f"{armed}: can0 is down; switch it off"),
     ):
         played = Played()
         with pytest.raises(BusError, match=reason):
             run(played, 400, partial(happens, played))
         assert played.asked_states[-1] == IDLE
+        assert happens is not stubborn or played.periods == 401 + 1000
 
 
 def test_an_end_before_the_drive_is_heard_sends_nothing_and_is_not_ready() -> None:
     for periods, error in ((3, None), (10**9, BusError("vcan0 is down"))):
         played = Played()
-        played.host.error = error
         if error is None:
             assert run(played, periods) == []
         else:
+            played.host.lose(error)
             with pytest.raises(BusError, match="vcan0 is down"):
                 run(played, periods)
         assert played.drive.sent == []
@@ -333,19 +420,19 @@ def test_a_drive_that_another_node_commands_is_not_armed() -> None:
         it.periods += 1
 
     def ended(it: Played) -> bool:
-        return it.periods > LISTEN_NS // MS - 5
+        return it.periods > LISTEN * 1000 - 5
 
     for name in ("odrive", "mit"):
         mapping, bench = load_mapping(EXAMPLES / f"{name}.toml"), parse_bench(late_bench(name == "mit"), "bench.toml")
         command = mapping.messages[mapping.command.message]
-        for own in (False, True):
+        for own, error in ((False, False), (True, False), (False, True)):
             it = Played()
             gateway = Gateway(mapping, bench, it.drive, it.host, it.clock, lambda _ns: None)
             it.drive.passes = partial(passes, it)
             it.drive.waiting.append(
-                Frame(command.identifier, bytes(command.length), extended=command.extended, own=own)
+                Frame(command.identifier, bytes(command.length), extended=command.extended, own=own, error=error)
             )
-            if own:
+            if own or error:
                 gateway.run(partial(ended, it), lambda: None, arms=True)
             else:
                 with pytest.raises(BusError, match="another node commands it"):
@@ -354,7 +441,7 @@ def test_a_drive_that_another_node_commands_is_not_armed() -> None:
 
 
 def test_an_end_while_the_drive_is_armed_lets_it_go_and_is_not_ready(played: Played) -> None:
-    assert run(played, LISTEN_NS // MS + 5) == []
+    assert run(played, round(LISTEN * 1000) + 5) == []
     assert (played.node.phase, played.asked_states[-1]) == (Phase.OFF, IDLE)
 
 
@@ -370,9 +457,11 @@ def test_a_defect_leaves_with_0_a_and_the_disarming(played: Played) -> None:
 def test_a_drive_that_is_silent_or_cannot_be_armed_is_an_error_and_nothing_is_commanded() -> None:
     silent = Played()
     silent.drive.passes = lambda: silent.clock.advance_to(silent.clock.now_ns() + MS)
+    begin_ns = silent.clock.now_ns()
     with pytest.raises(BusError, match="no samples of the drive"):
         silent.gateway.run(lambda: False, lambda: None, arms=True)
     assert silent.drive.sent == []
+    assert silent.clock.now_ns() - begin_ns == 5_001 * MS
     deaf = Played()
     deaf.ignores = True
     with pytest.raises(BusError, match="cannot arm the drive: the drive did not become active"):

@@ -20,8 +20,8 @@ from emb_runtime.drives.mapping import PROPERTIES, require_fit
 from emb_runtime.drives.node import Phase
 from emb_runtime.errors import UsageError
 from tests.actors import constant_actor
-from tests.drives import SHIPPED
-from tests.runtime.drives.mapped import MappedBus, late_bench, runner, within_limits
+from tests.drives import SHIPPED, late_bench
+from tests.runtime.drives.mapped import MappedBus, runner, within_limits
 from tests.runtime.operating import EmbRun
 
 pytestmark = pytest.mark.usefixtures("handlers")
