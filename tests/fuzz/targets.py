@@ -13,7 +13,8 @@ from dataclasses import replace
 from random import Random
 from typing import NamedTuple
 
-from emb_runtime.can.messages import FrameRejectedError, load_layout
+from emb_runtime.can.codec import FrameRejectedError
+from emb_runtime.can.messages import load_layout
 from emb_runtime.can.receiver import Reception
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import Bench, load_bench

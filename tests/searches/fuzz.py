@@ -21,7 +21,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from random import Random
 
-from emb_runtime.can.messages import FrameRejectedError, load_layout
+from emb_runtime.can.codec import FrameRejectedError
+from emb_runtime.can.messages import load_layout
 from emb_runtime.records import Frame
 from tests.fuzz import runs
 from tests.fuzz.runs import HangError

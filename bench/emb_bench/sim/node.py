@@ -18,8 +18,9 @@ import math
 
 from emb_bench.config.plants import BUILT_IN, DEFAULT_PLANT, Plant
 from emb_bench.sim.simulated_brake import Noise, SimulatedBrake
+from emb_runtime.can.codec import Signal
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck
-from emb_runtime.can.messages import Layout, Signal, StopReason, bench_identity
+from emb_runtime.can.messages import Layout, StopReason, bench_identity
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.errors import FrameError
 from emb_runtime.records import CurrentCommand, Frame, NodeState

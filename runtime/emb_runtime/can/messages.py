@@ -14,24 +14,10 @@ from functools import cache
 from importlib import resources
 from typing import Any, Final, NamedTuple
 
-from emb_runtime.can.codec import Fault, FrameRejectedError, Message, Signal, generate, parse
+from emb_runtime.can.codec import Message, generate, parse
 from emb_runtime.can.generated import Field, generate_codec
 from emb_runtime.errors import FrameError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
-
-__all__ = [
-    "AngleFrame",
-    "Fault",
-    "FrameRejectedError",
-    "Layout",
-    "Message",
-    "Signal",
-    "StatusFrame",
-    "StopReason",
-    "VelocityFrame",
-    "bench_identity",
-    "load_layout",
-]
 
 CHARGE: Final = "EMB_Charge"  # Name of the message that a node need not send
 GATEWAY: Final = "EMB_Gateway"  # Name of a message that the layouts of logs before it do not have

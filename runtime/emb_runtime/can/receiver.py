@@ -23,8 +23,9 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Final
 
+from emb_runtime.can.codec import FrameRejectedError, Message
 from emb_runtime.can.e2e import CounterCheck
-from emb_runtime.can.messages import AngleFrame, FrameRejectedError, Layout, Message, StatusFrame, StopReason
+from emb_runtime.can.messages import AngleFrame, Layout, StatusFrame, StopReason
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.system.clock import TimeUnwrapper

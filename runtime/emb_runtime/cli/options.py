@@ -249,13 +249,12 @@ def prepare(args: argparse.Namespace) -> Plan:
     steps, listen = _duration(args, bench)
     if stage is not Stage.READ_ONLY and not args.long_timeouts:
         bench.refuse_long_timeouts()
-    if stage is Stage.READ_ONLY and args.home:
-        raise UsageError("--read-only: sends nothing, so --home has nothing to do")
-    if stage is Stage.READ_ONLY and (args.stop_when is not None or args.quick):
-        option = "--stop-when" if args.stop_when is not None else "--quick"
-        raise UsageError(f"--read-only: runs no experiment that {option} could end")
-    if args.report is not None and stage is Stage.READ_ONLY:
-        raise UsageError("--report: an experiment has a page, and --read-only makes none")
+    of_an_experiment = {
+        "--home": args.home, "--quick": args.quick, "--stop-when": args.stop_when, "--report": args.report
+    }  # fmt: skip
+    for option, value in of_an_experiment.items():
+        if stage is Stage.READ_ONLY and value:
+            raise UsageError(f"--read-only: sends nothing, so {option} has nothing to do")
     if stage is Stage.ZERO and args.home:
         raise UsageError("--zero: no brake comes home with 0 A; turn it by hand, or use --limit")
     if args.confirm and (sys.stdin is None or not sys.stdin.isatty()):

@@ -18,8 +18,9 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 
+from emb_runtime.can.codec import Signal
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck, LeakyCount
-from emb_runtime.can.messages import Layout, Signal, StopReason, bench_identity
+from emb_runtime.can.messages import Layout, StopReason, bench_identity
 from emb_runtime.can.receiver import Reception
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import Bench

@@ -15,14 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import convert, to_builtins
 
+from emb_runtime.can.codec import Fault, FrameRejectedError, Message
 from emb_runtime.can.e2e import check
 from emb_runtime.can.generated import Codec, Field, generate_codec
 from emb_runtime.can.messages import (
     AngleFrame,
-    Fault,
-    FrameRejectedError,
     Layout,
-    Message,
     StatusFrame,
     StopReason,
     VelocityFrame,

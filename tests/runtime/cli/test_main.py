@@ -93,7 +93,7 @@ def test_a_run_ends_with_its_page_where_that_is_asked_for_and_possible(
     assert command[2:] == ["-m", "emb_bench.cli.replay", "report", str(tmp_path / "run.mcap"), "--output", str(page)]
     (tmp_path / "run.mcap").unlink()
     emb_run.refused("is no folder", "--report", str(tmp_path / "none" / "page.html"))
-    emb_run.refused("--report: an experiment has a page", "--report", str(page), "--read-only")
+    emb_run.refused("so --report has nothing to do", "--report", str(page), "--read-only")
     monkeypatch.setattr("emb_runtime.cli.main.metadata.entry_points", lambda **_: [])
     emb_run.refused("nothing is installed that writes a page", "--report", str(page))
     assert not (tmp_path / "run.mcap").exists()
