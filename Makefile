@@ -84,7 +84,6 @@ night: $(VENV)/.dev
 	$(BIN)/python -m tests.searches.hostile_files --count 2000
 	$(BIN)/python -m tests.searches.damaged_logs
 	$(BIN)/python -m tests.searches.interrupt
-	$(BIN)/python -m tests.searches.mapped_drives
 	$(BIN)/python tools/compare_core.py
 	$(BIN)/python -m tests.mutation
 

@@ -1,4 +1,4 @@
-"""What the reception should make of frames, and the state machine of events, told plainly and anew."""
+"""What the reception should make of frames, told plainly and anew."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame, NodeState, SensorSample
-from emb_runtime.safety.state_machine import Event, Fault
 from tests.independent import Values, read
 
 COMMAND, ANGLE, VELOCITY, STATUS = 0x080, 0x100, 0x101, 0x102
@@ -121,74 +120,3 @@ class ReceptionModel:
 
     def _good(self, which: int) -> None:
         self.errors[which] = max(self.errors[which] - 1, 0)
-
-
-class MachineModel:
-    """Where a run should stand, by name."""
-
-    def __init__(self, bench: Bench) -> None:
-        self._watch = bench.watch
-        self.state = "INIT"
-        self.fault: Fault | None = None
-        self._since_ns = self._heard_ns = 0
-        self._late = False
-
-    @property
-    def reached(self) -> tuple[str, Fault | None, bool]:
-        """State, first fault that latched, and whether the soft limit of missed periods has been passed."""
-        return self.state, self.fault, self._late
-
-    def possible(self) -> list[Event]:
-        """The events that lead on from here."""
-        return [Event[name] for state, name in WAYS if state == self.state] or [Event.TIME]
-
-    def step(self, event: Event | Fault, now_ns: int) -> bool:
-        """Take an event; False if it cannot happen here."""
-        if isinstance(event, Fault):
-            if event < FIRST_SOFT_FAULT:
-                self._fail(event, now_ns)
-        elif event is Event.TIME:
-            self._wait(now_ns)
-        elif event is Event.PAIR:
-            if self.state in ("INIT", "OVER"):
-                return False
-            self._heard_ns, self._late = now_ns, False
-        elif (self.state, event.name) in WAYS:
-            self._go(WAYS[self.state, event.name], now_ns)
-        else:
-            return False
-        return True
-
-    def _go(self, state: str, now_ns: int) -> None:
-        self.state, self._since_ns = state, now_ns
-
-    def _fail(self, fault: Fault, now_ns: int) -> None:
-        if self.state == "OVER":
-            return
-        self.fault = self.fault or fault
-        if self.state in ("INIT", "SILENT"):
-            self._go("OVER", now_ns)
-        elif self.state != "STOPPING":
-            self._go("STOPPING", now_ns)
-
-    def _wait(self, now_ns: int) -> None:
-        if self.state == "SILENT" and now_ns - self._since_ns >= self._watch.start_timeout * 1e9:
-            self._fail(Fault.NODE_NOT_READY if self._heard_ns else Fault.NO_NODE, now_ns)
-        elif self.state in ("ARMED", "ACTIVE", "HOMING"):
-            overdue_ns = now_ns - self._heard_ns - MS // 2
-            if overdue_ns >= self._watch.stop_missed * MS:
-                self._fail(Fault.SENSOR_LOST, now_ns)
-            else:
-                self._late = self._late or overdue_ns >= self._watch.soft_missed * MS
-
-
-FIRST_SOFT_FAULT = 100
-WAYS = {
-    ("INIT", "PREPARED"): "SILENT",
-    ("SILENT", "NODE_READY"): "ARMED",
-    ("ARMED", "BEGIN"): "ACTIVE",
-    ("ARMED", "BEGIN_HOMING"): "HOMING",
-    ("ACTIVE", "FINISHED"): "STOPPING",
-    ("HOMING", "FINISHED"): "STOPPING",
-    ("STOPPING", "STOPPED"): "OVER",
-}

@@ -1,4 +1,4 @@
-"""What is fuzzed, each against an account of it that is written anew: decoder, reception, state machine, guard.
+"""What is fuzzed, each against an account of it that is written anew: reception and guard.
 
 A target plays one sequence of choices and says how much that was. It raises :class:`ViolationError` for what must not
 be; every other exception that leaves it is a finding as well.
@@ -13,7 +13,6 @@ from dataclasses import replace
 from random import Random
 from typing import NamedTuple
 
-from emb_runtime.can.codec import FrameRejectedError
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.receiver import Reception
 from emb_runtime.can.transport import TransmitQueueFullError
@@ -21,20 +20,13 @@ from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame, NodeState, RunState, SensorSample
 from emb_runtime.safety.guard import Guard, GuardRejectedError
-from emb_runtime.safety.state_machine import FAULTS, Event, Fault, Run, StopError, may_enable, may_send, step, timeouts
-from tests.fuzz.model import MachineModel, ReceptionModel
+from emb_runtime.safety.state_machine import StopError
+from tests.fuzz.model import ReceptionModel
 from tests.fuzz.stream import COMMAND, MS, Stream, anything, chance, damaged
-from tests.independent import encoded, protected, read
+from tests.independent import protected, read
 
 LENGTH = 100  # Frames or events in a sequence
 BENCH, LAYOUT = load_bench(), load_layout()
-MESSAGES = {message.identifier: message for message in LAYOUT.known}
-TYPED: dict[int, Callable[[Frame], tuple[object, ...]]] = {
-    LAYOUT.command.identifier: LAYOUT.decode_command,
-    LAYOUT.angle.identifier: LAYOUT.decode_angle,
-    LAYOUT.velocity.identifier: LAYOUT.decode_velocity,
-    LAYOUT.status.identifier: LAYOUT.decode_status,
-}
 
 
 class Played(NamedTuple):
@@ -52,38 +44,6 @@ def demand(holds: bool, *what: object) -> None:
     """Raise a :class:`ViolationError` unless it holds."""
     if not holds:
         raise ViolationError(" ".join(map(str, what)))
-
-
-def decoder(draw: Random) -> Played:
-    """Frames of all kinds are read or rejected as by cantools and the AUTOSAR library; what is read can be said."""
-    for _ in range(LENGTH):
-        frame = valid_frame(draw) if chance(draw, 60) else anything(draw)
-        if chance(draw, 50):
-            frame = damaged(draw, frame)
-        expected = read(frame)
-        try:
-            values = MESSAGES[frame.identifier].decode(frame)
-        except (KeyError, FrameRejectedError):
-            values = None
-        demand(values == expected, frame, "is", values, "expected", expected)
-        if frame.identifier in TYPED:
-            try:
-                said = TYPED[frame.identifier](frame)
-            except FrameRejectedError:
-                said = None
-            demand((said is None) == (expected is None), frame, "decoded to", said)
-        if values is not None:
-            again = encoded(frame.identifier, values)
-            demand(again.data == frame.data, frame, "is written as", again)
-    return Played(LENGTH)
-
-
-def valid_frame(draw: Random) -> Frame:
-    """A frame of ours that says anything that it may."""
-    message = draw.choice(list(LAYOUT.messages.values()))
-    raws = [draw.randint(s.raw_minimum, s.raw_maximum) for s in message.signals[1:]]
-    word = sum((raw & s.mask) << s.shift for raw, s in zip(raws, message.signals[1:], strict=True))
-    return Frame(message.identifier, protected(message.identifier, word.to_bytes(message.length, "little")[1:]))
 
 
 def reception(draw: Random) -> Played:
@@ -110,33 +70,6 @@ def compare(taken: Reception, model: ReceptionModel) -> None:
         key = 0 if state.name == "pair" else state.identifier
         demand(state.errors.errors == model.errors[key], state.name, "leaky count", state.errors.errors)
         demand(state.errors.last == model.counters.get(key), state.name, "stored counter", state.errors.last)
-
-
-def machine(draw: Random) -> Played:
-    """Every event in every state at every time leads where the table says, and no way leads back from a stop."""
-    times, run, model = timeouts(BENCH), Run(), MachineModel(BENCH)
-    now_ns, stopped = draw.randint(0, 10**12), False
-    for _ in range(LENGTH):
-        now_ns += draw.choice([0, 1, MS // 2, MS, MS, MS, 5 * MS, 19 * MS, 20 * MS, 400 * MS, 5000 * MS, -MS])
-        event: Event | Fault = draw.choice([*Event, Event.PAIR, Event.TIME, Event.TIME])
-        if chance(draw, 10):
-            event = draw.choice(list(Fault))
-        elif chance(draw, 60):  # on to the next state, so that all are reached
-            event = draw.choice(model.possible())
-        try:
-            run = step(times, run, event, now_ns)
-            possible = True
-        except ValueError:
-            possible = False
-        expected = model.step(event, now_ns)
-        demand(possible == expected, event.name, "was possible:", possible, run)
-        reached = (run.state.name, run.fault, run.late)
-        demand(reached == model.reached, event.name, "led to", reached, "expected", model.reached)
-        stopped = stopped or run.state in (RunState.STOPPING, RunState.OVER)
-        demand(not (stopped and may_enable(run.state)), "enabled again", run)
-        demand(run.fault is None or (FAULTS[run.fault].latched and stopped), "did not stop", run)
-        demand(may_send(run.state) or not may_enable(run.state), run)
-    return Played(LENGTH)
 
 
 SLEW = 1500.05
@@ -244,8 +177,6 @@ class GuardModel:
 
 
 TARGETS: dict[str, Callable[[Random], Played]] = {
-    "decoder": decoder,
     "reception": reception,
-    "machine": machine,
     "guard": guard,
 }

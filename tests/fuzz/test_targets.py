@@ -7,16 +7,11 @@ from random import Random
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from emb_runtime.can.codec import Message
 from emb_runtime.can.e2e import CounterCheck
 from emb_runtime.can.receiver import Reception
-from emb_runtime.records import Frame, RunState
-from emb_runtime.safety import state_machine
+from emb_runtime.records import Frame
 from emb_runtime.safety.guard import Guard
-from emb_runtime.safety.state_machine import Event, Fault
 from tests.fuzz import runs
 from tests.fuzz.targets import TARGETS, Played, ViolationError
 
@@ -35,27 +30,7 @@ def test_nothing_is_found_in_a_few_random_sequences(name: str) -> None:
     assert any(p.commands > 0 for p in played) == (name in ("guard", "loop"))
 
 
-@pytest.mark.parametrize("name", TARGETS)
-@settings(max_examples=20)
-@given(draw=st.randoms(use_true_random=False))
-def test_nothing_is_found_whatever_hypothesis_chooses(name: str, draw: Random) -> None:
-    assert 0 < TARGETS[name](draw).items <= 110
-
-
 # --- a fuzzer that finds nothing may be blind: each target must find what is planted -------------------------------
-
-
-def reserved_bits_are_ignored(patch: Patch) -> None:
-    decode = Message.decode
-
-    def careless(self: Message, frame: Frame) -> dict[str, Any]:
-        object.__setattr__(self, "reserved", 0)
-        return decode(self, frame)
-
-    originals = {id(m): m.reserved for m in runs.LAYOUT.messages.values()}
-    patch.setattr(Message, "decode", careless)
-    for message in runs.LAYOUT.messages.values():  # so that undoing puts them back
-        patch.setitem(message.__dict__, "reserved", originals[id(message)])
 
 
 def a_rejected_counter_is_stored(patch: Patch) -> None:
@@ -70,19 +45,6 @@ def a_rejected_counter_is_stored(patch: Patch) -> None:
 
 def permission_never_ends(patch: Patch) -> None:
     patch.setattr(Reception, "inhibit_reason", lambda *_: "")
-
-
-def a_run_that_stops_can_be_begun_again(patch: Patch) -> None:
-    patch.setitem(state_machine._NEXT, (RunState.STOPPING, Event.BEGIN), RunState.ACTIVE)
-
-
-def the_first_fault_is_forgotten(patch: Patch) -> None:
-    faulted = state_machine._faulted
-
-    def careless(run: state_machine.Run, fault: Fault, now_ns: int) -> state_machine.Run:
-        return faulted(run._replace(fault=None), fault, now_ns)
-
-    patch.setattr(state_machine, "_faulted", careless)
 
 
 def the_slew_is_not_limited(patch: Patch) -> None:
@@ -113,11 +75,8 @@ def the_loop_fails_at_what_it_does_not_know(patch: Patch) -> None:
 @pytest.mark.parametrize(
     ("name", "plant"),
     [
-        ("decoder", reserved_bits_are_ignored),
         ("reception", a_rejected_counter_is_stored),
         ("reception", permission_never_ends),
-        ("machine", a_run_that_stops_can_be_begun_again),
-        ("machine", the_first_fault_is_forgotten),
         ("guard", the_slew_is_not_limited),
         ("guard", an_old_sample_is_good_enough),
         ("guard", the_guard_mends_what_it_should_reject),
