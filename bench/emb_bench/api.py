@@ -44,19 +44,8 @@ if TYPE_CHECKING:  # scipy, numba, matplotlib and pyarrow come with the extra [b
     from emb_bench.report.content import Content
 
 __all__ = [
-    *(
-        "Run",
-        "campaign",
-        "design",
-        "draw",
-        "estimate",
-        "export",
-        "fisher_information",
-        "open_run",
-        "report",
-        "simulate",
-        "topic",
-    ),
+    *("Run", "campaign", "design", "draw", "estimate", "export", "fisher_information", "open_run", "report"),
+    *("simulate", "topic"),
 ]
 
 Source = RunLog | str | Path

@@ -325,14 +325,6 @@ def test_a_sensor_frame_that_is_missing_or_other_is_reported(recorded: Callable[
     assert not result.reproduced
 
 
-def test_another_actor_decides_otherwise_from_its_first_other_wish_on(
-    recorded: Callable[..., Driven], again: Again
-) -> None:
-    result = again(recorded(), lambda a, v, k: square(a, v, k) if k < 80 else 0.5)
-    assert min(d.step for d in result.differences if d.step is not None) == 80
-    assert result.differences[0][:3] == (80, "policy_current", "-3.0")
-
-
 def test_a_tally_that_differs_is_reported(recorded: Callable[..., Driven], again: Again) -> None:
     run = recorded()
     counters = replace(run.outcome.counters, answered=149)

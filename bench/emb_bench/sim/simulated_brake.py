@@ -153,10 +153,7 @@ def true_parameters(
             known = (*PARAMETER_NAMES, *besides)
             said = f"'{name}' is not a parameter; expected one of {', '.join(known)}{near(name, known)}"
             raise UsageError(f"{option}{said}")
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
+        value = _number(text)
         check_near_nominal(bench, name, value, option, got=f"'{text}'")
         theta = theta._replace(**{name: value})
     return theta
@@ -209,14 +206,19 @@ def read_brake(text: str, bench: Bench, option: str) -> BrakeToSimulate:
     return BrakeToSimulate(theta, plant, noise, int(seed), charge == "1")
 
 
+def _number(text: str) -> float:
+    """NaN for what is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def _deviation(given: dict[str, str], name: str, option: str) -> float | None:
     text = given.pop(name, None)
     if text is None:
         return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = _number(text)
     if not 0.0 <= value < math.inf:
         raise UsageError(f"{option}{name}: expected a standard deviation from 0 on, got '{text}'")
     return value

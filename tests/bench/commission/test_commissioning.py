@@ -23,7 +23,7 @@ import pytest
 
 from emb_bench.cli import commission
 from emb_bench.commission import examination
-from emb_bench.commission.bench_file import working_text
+from emb_bench.commission.bench_file import MEASURED, working_text
 from emb_bench.commission.commissioning import Commissioned, Commissioning, Run, StepFailedError, simulated
 from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_bench.experiment.from_log import read_experiment
@@ -126,6 +126,8 @@ def test_delays_and_noise_are_found(done: tuple[Path, Commissioned]) -> None:
     assert (rest.noise.angle, rest.noise.velocity) == pytest.approx((NOISE.angle, NOISE.velocity), rel=0.1)
     written = load_bench(folder / "bench.toml")
     assert written.shield.frame_age == (0, 2)
+    instruments = written.plants[MEASURED].instruments
+    assert instruments.command_delay == instruments.measurement_delay == 1
     assert NOISE.angle <= written.noise.angle <= 1.4 * NOISE.angle
 
 

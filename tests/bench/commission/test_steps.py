@@ -296,14 +296,6 @@ def test_play_of_the_gear_widens_the_range_of_the_friction_by_the_torque_of_half
     assert "and by the play" in found_text(sheet, found(sheet, identified=one), LOGS)
 
 
-def test_delays_that_were_found_are_declared() -> None:
-    late = parse_bench(sheet_text(frame_age="[0, 3]"), "sheet")
-    findings = found(late, current=replace(CURRENT, delay=1), identified=identification(late, measurement_delay=1))
-    bench = parse_bench(found_text(late, findings, LOGS), "found")
-    assert bench.shield.frame_age == (0, 2)
-    assert bench.plants[MEASURED].instruments.command_delay == bench.plants[MEASURED].instruments.measurement_delay == 1
-
-
 def test_a_drive_that_does_not_say_which_command_it_obeyed_may_be_a_sample_later() -> None:
     late = parse_bench(sheet_text(frame_age="[0, 3]"), "sheet")
     text = found_text(late, found(late, current=replace(CURRENT, uncertain=1)), LOGS)
