@@ -130,7 +130,6 @@ class SocketCan:
         self._clock = clock
         self._wait_readable = wait_readable
         self._dropped = 0
-        self._lost, self._lost_ns = "", 0
         try:
             self._socket = open_socket()
         except (OSError, AttributeError) as err:  # AttributeError: Python was built where there is no AF_CAN
@@ -179,7 +178,7 @@ class SocketCan:
             ) from err
         # Binding to an interface that is down succeeds and leaves the error pending; reading it clears it.
         if (pending := sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)) != 0:
-            raise self._lose(pending)
+            raise self._loss(pending)
 
     @property
     def descriptor(self) -> int:
@@ -202,24 +201,14 @@ class SocketCan:
                     f"{self.name}: transmit queue full, frame {frame.identifier:#05x} dropped; "
                     "is anything on the bus to acknowledge?"
                 ) from err
-            raise self._lose(err.errno) from err
+            raise self._loss(err.errno) from err
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """See :meth:`Transport.receive`.
-
-        The kernel reports link-down once. Later time-outs raise too, until a frame newer than that arrives.
-        """
+        """See :meth:`Transport.receive`; the kernel reports that the interface has gone down once."""
         datagram = self._read()
-        if datagram is None:
-            datagram = self._wait(deadline_ns) if deadline_ns > 0 else None
-            if datagram is None:
-                if self._lost:
-                    raise BusError(self._lost)
-                return None
-        frame = self._frame(datagram)
-        if self._lost and frame.time_ns > self._lost_ns:
-            self._lost = ""
-        return frame
+        if datagram is None and deadline_ns > 0:
+            datagram = self._wait(deadline_ns)
+        return None if datagram is None else self._frame(datagram)
 
     def close(self) -> None:
         """See :meth:`Transport.close`."""
@@ -242,7 +231,7 @@ class SocketCan:
         except BlockingIOError:
             return None
         except OSError as err:
-            raise self._lose(err.errno) from err
+            raise self._loss(err.errno) from err
         wall_ns, dropped = 0, None
         for _level, kind, value in control:
             if kind == _SO_TIMESTAMPNS:
@@ -285,13 +274,12 @@ class SocketCan:
         if not empty_ns - _STEP_SLACK_NS <= time_ns <= deadline_ns + _STEP_SLACK_NS:
             self._wall_offset_ns = self._clock.wall_offset_ns()
 
-    def _lose(self, code: int | None) -> BusError:
-        """Remember that the bus is lost."""
-        self._lost_ns = self._clock.now_ns()
+    def _loss(self, code: int | None) -> BusError:
+        """The error about a lost bus."""
         if code == errno.ENETDOWN:
-            self._lost = f"{self.name}: the interface is down; `ip link set {self.name} up`"
+            reason = f"the interface is down; `ip link set {self.name} up`"
         elif code in (errno.ENODEV, errno.ENXIO):
-            self._lost = f"{self.name}: the interface has disappeared; is the adapter still plugged in?"
+            reason = "the interface has disappeared; is the adapter still plugged in?"
         else:
-            self._lost = f"{self.name}: the socket failed: {os.strerror(code) if code else 'no reason given'}"
-        return BusError(self._lost)
+            reason = f"the socket failed: {os.strerror(code) if code else 'no reason given'}"
+        return BusError(f"{self.name}: {reason}")
