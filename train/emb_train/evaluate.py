@@ -28,6 +28,7 @@ from emb_runtime.policy.trial import admit_policy
 from emb_train.closed_loop import EVERYTHING, Conditions
 from emb_train.optimum import optima, searchable
 from emb_train.play import (
+    APPLIED,
     Currents,
     Excitation,
     Law,
@@ -45,8 +46,6 @@ from emb_train.reference import Following, PolicyFile, stored
 from emb_train.training import load_training
 from emb_train.trial import Task
 
-MEASURED_COLUMNS = 3  # Angle, velocity and step: what a network observes
-
 
 class Network(Excitation):
     """A network as an excitation, :class:`emb_train.ppo.DeployedActor` for one; no exploration."""
@@ -57,7 +56,7 @@ class Network(Excitation):
     def __call__(self, seen: Seen) -> Currents:
         """See :class:`Excitation`."""
         with torch.no_grad():
-            currents = self._module(torch.from_numpy(np.ascontiguousarray(seen[:, :MEASURED_COLUMNS])))
+            currents = self._module(torch.from_numpy(np.ascontiguousarray(seen[:, :APPLIED])))
         return np.array(currents[:, 0].numpy(), np.float64)
 
 
