@@ -249,13 +249,7 @@ class Task:
         return self.measure.values(outcome.matrices)
 
 
-_FOUR = Task(
-    name="four-d",
-    parameters=PARAMETER_NAMES,
-    ranges="pm50",
-    shield_ranges="envelope",
-    criterion="D",
-)
+_FOUR = Task(name="four-d", parameters=PARAMETER_NAMES, ranges="pm50", shield_ranges="envelope", criterion="D")
 _CREEP_FIRST = (-0.2, -0.007, 1.0, -1.0, 0.005, 0.94, -0.23, 0.02, 0.21, 0.42, 0.71, 0.96, 0.965)
 """A probe, then k_1 and f_v by a creep, two full strokes, and what is left of the time."""
 TASKS: Mapping[str, Task] = {
