@@ -77,7 +77,7 @@ def test_every_target_has_statements_of_its_own_trainings_which_are_made_once(
     names = [f"thesis-{n}-{s}" for n in both for s in (0, 1)] + [f"thesis-{n}-0" for n in once]
     assert sorted(path.name for path in folder.iterdir()) == sorted(names)
     assert main(["fig-5.2", "fig-4.2", "--out", str(folder)]) == 0
-    assert "of 8 statements agree" in capsys.readouterr().out
+    assert capsys.readouterr().out.count("fig-") == 2
 
 
 def test_a_wrong_option_is_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
