@@ -107,7 +107,7 @@ def examine(
         float(special.chdtrc(freedom, chi2)),
         whiteness,
         independence,
-        *score(problem, z, every, found.jacobian, model, seen, chi2 / freedom, disturbed=disturbed),
+        *score(problem, z, found, model, seen, chi2 / freedom, disturbed=disturbed),
     )
     return _judged(tested, disturbance, problem.bench.machine)
 

@@ -24,7 +24,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import PARAMETERS, SI, Parameter, Quantity, quantity
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import EXACT, Mechanics
-from emb_bench.estimate.prediction import Problem
+from emb_bench.estimate.prediction import Marginal, Problem
 from emb_bench.estimate.records import ANGLE_SCALE, DRIFTS, Contribution, JointScore, Suspect, has_time_for_a_delay
 from emb_runtime.config.bench import PARAMETER_NAMES
 
@@ -202,8 +202,7 @@ def _with(m: Mechanics, name: str, step: float) -> Mechanics | None:
 def score(
     problem: Problem,
     z: Floats,
-    errors: Floats,
-    jacobian: Floats,
+    left: Marginal,
     model: Floats,
     shown: Shown,
     ratio: float,
@@ -212,17 +211,10 @@ def score(
 ) -> tuple[tuple[Suspect, ...], tuple[Contribution, ...], JointScore | None]:
     """Score tests of all effects that are not estimated: most suspicious first, their budget, all of them together.
 
-    Args:
-        problem: records and model.
-        z: the estimate.
-        errors: all residuals, samples first, shape (m,).
-        jacobian: their derivatives, shape (m, len(z)).
-        model: orthonormal basis of its columns.
-        shown: what is shown at the estimate.
-        ratio: χ²/n, by which the noise may be larger than the bench says.
-        disturbed: True if the model of the residuals has a disturbance that was found in the records.
+    The residuals are ``left`` at the estimate, ``model`` is a basis of what they are fitted with, orthonormal, and the
+    noise may be larger than the bench says by the ``ratio`` χ²/n. ``disturbed`` says that a disturbance was found.
     """
-    names = held(problem)
+    names, errors, jacobian = held(problem), left.residuals, left.jacobian
     blocks = [shown.columns(i, names) for i in range(len(problem.records))] if names else []
     added = secants(problem, z, shown)
     every = {
@@ -257,8 +249,8 @@ def score(
         found.append(Suspect(name, amount, sigmas / max(ratio, 1e-300) ** 0.5, p))
     if not found:
         return (), tuple(budget), None
-    left, values, _ = np.linalg.svd(np.stack(beside_all, axis=1), full_matrices=False)
-    kept = left[:, values > 1e-3]
+    axes, values, _ = np.linalg.svd(np.stack(beside_all, axis=1), full_matrices=False)
+    kept = axes[:, values > 1e-3]
     statistic, rank = float(np.sum((kept.T @ errors) ** 2)), kept.shape[1]
     p_value = float(special.chdtrc(rank, statistic / max(ratio, 1.0)))
     return _ranked(found), tuple(budget), JointScore(statistic, rank, p_value)
