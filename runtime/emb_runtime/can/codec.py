@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from importlib.metadata import distribution
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from emb_runtime.can import e2e
 from emb_runtime.errors import FrameError
@@ -140,6 +140,15 @@ class Message:
     def worst_bits(self) -> int:
         """Most bits that one frame takes on the bus, see :func:`worst_bits`."""
         return worst_bits(self.length)
+
+
+def from_document(found: Mapping[str, Any]) -> Message:
+    """A message of its fields as JSON has them; by hand, since a compiled record does not tell the types of its own."""
+    signals = (
+        Signal(**{**signal, "choices": {int(value): name for value, name in signal["choices"].items()}})
+        for signal in found["signals"]
+    )
+    return Message(**{**found, "signals": tuple(signals)})
 
 
 def worst_bits(length: int, *, extended: bool = False) -> int:

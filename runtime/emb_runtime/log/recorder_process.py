@@ -16,6 +16,7 @@ import select
 import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -25,7 +26,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from msgspec import convert
 
-from emb_runtime.can.codec import FrameRejectedError, Signal
+from emb_runtime.can.codec import FrameRejectedError, Signal, from_document
 from emb_runtime.can.messages import CHARGE
 from emb_runtime.can.transport import SocketCan
 from emb_runtime.errors import BusError, EmbError, LogError
@@ -197,7 +198,8 @@ class Recording:
     """One recording: the ring at one end, the file at the other."""
 
     def __init__(self, ring: Ring, document: Mapping[str, Any], output: BinaryIO) -> None:
-        header = convert(document["header"], LogHeader, str_keys=True)
+        messages = tuple(map(from_document, document["header"]["messages"]))
+        header = replace(convert({**document["header"], "messages": ()}, LogHeader), messages=messages)
         self._ring = ring
         self._parent = int(document["parent"])
         self._simulated, self._offset = header.simulated, header.wall_offset_ns

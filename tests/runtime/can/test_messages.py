@@ -13,9 +13,9 @@ import e2e.p01
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec import convert, to_builtins
+from msgspec import to_builtins
 
-from emb_runtime.can.codec import Fault, FrameRejectedError, Message
+from emb_runtime.can.codec import Fault, FrameRejectedError, Message, from_document
 from emb_runtime.can.e2e import check
 from emb_runtime.can.generated import Codec, Field, generate_codec
 from emb_runtime.can.messages import (
@@ -364,7 +364,7 @@ def test_the_dbc_may_place_the_signals_elsewhere() -> None:
 
 def test_the_layout_reads_back_from_its_own_text_and_each_message_from_the_document_of_a_process() -> None:
     document = json.loads(json.dumps(to_builtins(LAYOUT.known, str_keys=True)))
-    assert convert(document, tuple[Message, ...], str_keys=True) == LAYOUT.known
+    assert tuple(map(from_document, document)) == LAYOUT.known
     again = load_layout(LAYOUT.text)
     assert (again.known, again.text) == (LAYOUT.known, LAYOUT.text)
     assert again.encode_command(COMMAND) == GOLDEN["EMB_Command"][2]
