@@ -96,8 +96,11 @@ def amount(value: float, interval: tuple[float, float], unit: str) -> str:
 
 
 def signed(value: float, form: str = "+.3g") -> str:
-    """A number with its sign."""
-    return f"{value:{form}}".replace("-", "−") if math.isfinite(value) else plain(value)
+    """A number with its sign; one that rounds to zero has none."""
+    if not math.isfinite(value):
+        return plain(value)
+    text = f"{value:{form}}"
+    return text.lstrip("+-") if float(text) == 0.0 else text.replace("-", "−")
 
 
 def percent(share: float) -> str:

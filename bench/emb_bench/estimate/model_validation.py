@@ -161,40 +161,40 @@ def _judged(m: ModelValidation, disturbance: Disturbance | None, machine: Machin
         test = m.independence[name]
         alarms.append(
             f"the residuals of the {name} depend on the current: F = {test.statistic:.3g}, {chance(test.p_value)}, "
-            f"largest correlation {test.correlation:+.2f} with the current of {test.lag} periods before"
+            f"largest correlation {test.correlation:+.2f} with the current {test.lag} periods earlier"
         )
     if suspected:
         others = ", ".join(shown_as(s, machine).name for s in suspected[1:4])
         alarms.append(explained(suspected[0], machine) + (f"; less likely: {others}" if others else ""))
     elif m.together is not None and "scores" in alarming:
         alarms.append(
-            "the residuals look like several effects together that the model lacks (chi2 "
+            "the model lacks several effects together (chi2 "
             f"{m.together.statistic:.4g} of {m.together.rank}, {chance(m.together.p_value)})"
         )
     if disturbance is not None and disturbance.p_value < share:
         notes.append(
             f"the brake is disturbed by more than the sensors' noise: {disturbance.said} (likelihood ratio "
-            f"{disturbance.ratio:.4g}, {chance(disturbance.p_value)}); the intervals, and what a further run is said "
-            "to bring, allow for it"
+            f"{disturbance.ratio:.4g}, {chance(disturbance.p_value)}); the intervals and the recommended run "
+            "allow for it"
         )
     if m.ratio < m.expected[0]:
         notes.append(
             f"the residuals are smaller than the bench's noise: chi2/n {m.ratio:.4g}, at least {m.expected[0]:.3f} "
             "expected: the noise in the bench file, and all uncertainties, are too large"
         )
-    for name in coloured:
-        white = whiteness[name]
-        said = (
-            f"the residuals of the {name} are correlated in time (Ljung-Box {white.statistic:.4g} at {white.lags} "
-            f"lags, {chance(white.p_value)})"
+    if coloured:
+        tested = "; ".join(
+            f"{white.statistic:.4g} at {white.lags} lags, {chance(white.p_value)}"
+            for white in (m.whiteness[name] for name in coloured)
         )
+        said = f"the residuals of the {' and '.join(coloured)} are correlated in time (Ljung-Box {tested})"
         if disturbance is None:
             notes.append(
-                f"{said}: the model may be right all the same, if what is disturbed are the sensors; but then the "
-                "standard deviations by Fisher information are wrong"
+                f"{said}: if only the sensors are disturbed, the model may be right, but the standard deviations by "
+                "Fisher information are wrong"
             )
         else:
-            alarms.append(f"{said}: what disturbs the brake or its sensors is not white, or the model is another")
+            alarms.append(f"{said}: the disturbance of the brake or its sensors is not white, or the model is wrong")
     return replace(m, suspected=suspected, alarms=tuple(alarms), notes=tuple(notes))
 
 

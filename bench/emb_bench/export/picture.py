@@ -17,7 +17,7 @@ from emb_runtime.records import NodeState, Reason, RunState
 ENDINGS = (".png", ".svg", ".pdf")
 ROWS = 5  # Axes of a picture, one above the other
 CURRENTS = (  # field, label, colour, width, period after or before the sample; what is drawn last lies on top
-    ("policy_current", "wanted", COLOURS[4], 3.5, "post"),
+    ("policy_current", "requested", COLOURS[4], 3.5, "post"),
     ("clipped_current", "clipped", COLOURS[5], 1.5, "post"),
     ("sent_current", "sent", COLOURS[0], 1.0, "post"),
     ("applied_current", "applied", COLOURS[1], 0.7, "pre"),

@@ -47,7 +47,7 @@ def excitation(run: Run, cycles: ActiveCycles) -> Panel:
             above.axhline(value, **DASHED)
         above.axhline(0.0, **FAINT)
         time = 1e3 * cycles.time
-        above.step(time, cycles.wanted, where="post", color=COLOURS[5], label="wanted by the policy", linewidth=2.6)
+        above.step(time, cycles.wanted, where="post", color=COLOURS[5], label="requested by the policy", linewidth=2.6)
         if cycles.reasons[Reason.CLIPPED].any():
             above.step(time, cycles.clipped, where="post", color=COLOURS[4], label="clipped", linewidth=1.6)
         above.step(time, cycles.sent, where="post", color=COLOURS[0], label="sent after the shield", linewidth=1.3)
@@ -77,7 +77,7 @@ def excitation(run: Run, cycles: ActiveCycles) -> Panel:
     ratios = (6, len(held)) if held else (1,)
     drawn = svg(draw, len(ratios), 1, (PANEL, 2.5 + 0.22 * len(held)), sharex=True, height_ratios=ratios)
     return Panel(
-        drawn, "Current over time: wanted by the policy, clipped, sent and applied, with marks where they differ"
+        drawn, "Current over time: requested by the policy, clipped, sent and applied, with marks where they differ"
     )
 
 

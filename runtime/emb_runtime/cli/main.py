@@ -127,7 +127,8 @@ def shown(plan: Plan) -> Iterator[None]:
 def _experiment(plan: Plan, console: Console) -> int:
     reporter = None if plan.report is None else _reporter(plan.report)
     document, exit_code = experiment(plan, log_path(plan.log), console)
-    show(as_json(document) if plan.json else summary.text(document, plan.verbose))
+    text = as_json(document) if plan.json else summary.text(document, plan.verbose)
+    show(text.partition("\n")[0] if plan.quiet else text)
     if reporter is not None and document["log"] is not None:
         reported = _report(reporter, document["log"], plan)
         return exit_code or reported

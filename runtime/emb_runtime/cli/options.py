@@ -133,6 +133,7 @@ class Plan:
     live: int | None  # Port at which the run is shown
     json: bool
     verbose: bool
+    quiet: bool  # The verdict only
     strict: bool = False  # An estimate outside the ranges is no success
     report: Path | None = None  # Page to write after the run
     drive: MappedDrive | None = None  # The node is its gateway
@@ -197,10 +198,12 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     what.add_argument("--operator", default="", metavar="NAME", help="who makes the run, for the log and its report")
     what.add_argument("--serial", default="", metavar="TEXT", help="serial number of the device, for the log")
-    what.add_argument("--json", action="store_true", help="print the summary as JSON")
-    what.add_argument(
+    output = what.add_mutually_exclusive_group()
+    output.add_argument("--json", action="store_true", help="print the summary as JSON")
+    output.add_argument(
         "-v", "--verbose", action="store_true", help="print every check of the pre-flight and every count"
     )
+    output.add_argument("-q", "--quiet", action="store_true", help="print the verdict only")
 
     what.add_argument(
         "--home", action="store_true",
@@ -288,6 +291,7 @@ def prepare(args: argparse.Namespace) -> Plan:
         live=_live(args.live),
         json=args.json,
         verbose=args.verbose,
+        quiet=args.quiet,
         strict=args.strict,
         report=args.report,
         drive=_drive(args.iface, args.drive, bench),

@@ -293,7 +293,7 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
             f"  learnt     {name} between {low:.3f} and {high:.3f} of nominal, if the shield's assumptions hold"
             for name, (low, high) in s["learnt"].items()
         ]
-    if s["estimate"]:
+    if s["estimate"] and (details or s["result"] in ("done", LOG_INCOMPLETE)):
         lines.append("running estimate ± 95 % (k=2), valid if the model is right")
         if not s["model_fits"]:
             lines.append("  THE MODEL DOES NOT FIT: friction, a delay or a sensor differs; use emb-replay estimate")

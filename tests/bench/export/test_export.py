@@ -118,7 +118,7 @@ def test_a_picture_says_what_is_in_it(path: Path, tmp_path: Path, monkeypatch: p
         draw_run(read_log(cut), tmp_path / f"out.{ending}")
         assert (tmp_path / f"out.{ending}").read_bytes().startswith(magic)
     text = (tmp_path / "out.svg").read_text(encoding="utf-8")
-    for word in ("angle [rad]", "velocity [rad/s]", "current [A]", "wanted", "applied", "returning", "run stopping"):
+    for word in ("angle [rad]", "velocity [rad/s]", "current [A]", "requested", "applied", "returning", "run stopping"):
         assert f">{word}<" in text
     assert "cut.mcap" in text
     assert "the log is NOT complete" in text

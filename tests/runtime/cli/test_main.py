@@ -36,6 +36,10 @@ def test_an_experiment_is_run_logged_and_summed_up(emb_run: EmbRun, actor: Path)
     assert log.attachments["bench.toml"].decode() == shipped_bench_text()
 
 
+def test_quiet_prints_the_verdict_alone(emb_run: EmbRun) -> None:
+    assert emb_run.text("-q") == "done: 500 of 500 samples answered, home\n"
+
+
 def test_a_run_whose_log_is_removed_meanwhile_is_not_done(emb_run: EmbRun, tmp_path: Path, sim: Sim) -> None:
     sim.when(lambda node: node.obeyed == 100, lambda _node: (tmp_path / "run.mcap").unlink())
     summary = emb_run.document(code=EXIT_LOG)
