@@ -6,7 +6,7 @@ import os
 # imported: not beside a control loop, and not from a bench computer.
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 
-if os.environ.get("EMB_CORE") == "compiled":  # in every process, for tests and measurements
+if os.environ.get("EMB_CORE") == "compiled":  # in every command, for tests and measurements
     from emb_runtime.system import compiled_core
 
     compiled_core.take_or_end()

@@ -61,6 +61,7 @@ class Child:
                 stdout=subprocess.PIPE,
                 pass_fds=(*fds, fd),
                 process_group=0,
+                env=os.environ | {"EMB_CORE": "python"},  # msgspec reads no compiled record
             )
         answer = self.answer(timeout)
         if "ready" not in answer:

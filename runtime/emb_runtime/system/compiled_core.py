@@ -5,8 +5,8 @@ A wheel for one kind of processor has them beside the sources, from which mypyc 
 imports them by itself: :func:`choose`, which ``emb-run`` calls before it imports anything else, puts a finder in front
 of Python's own. Every other command works with the sources.
 
-``EMB_CORE`` decides otherwise: ``python`` takes the sources, ``compiled`` the compiled core in every process of this
-environment.
+``EMB_CORE`` decides otherwise: ``python`` takes the sources, ``compiled`` the compiled core in every command of this
+environment. The processes that a command starts take the sources.
 """
 
 from __future__ import annotations
