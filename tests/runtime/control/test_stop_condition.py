@@ -22,7 +22,6 @@ from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimate import LOST, Quantity
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.records import Reason
-from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import Fault
 from tests.actors import constant_actor
 from tests.conftest import FunctionActor, SimRun, Simulate
@@ -153,12 +152,6 @@ def test_a_policy_that_answers_no_number_on_the_way_home_is_stopped_as_ever(simu
     actor = FunctionActor(lambda _y, _v, k: math.nan if k == 90 else 6.0)
     run = simulate(actor=actor, stop_condition=At(80))
     assert (run.outcome.fault, run.outcome.goal_reached) == (Fault.POLICY_NOT_FINITE, True)
-
-
-def test_the_view_of_time_on_the_way_home_is_late_but_never_beyond_the_end() -> None:
-    law = make_law(BENCH)
-    late = law.steps - 2 - math.ceil(law.settling / law.sample_time)
-    assert 0 < late < law.steps - 2
 
 
 # emb-run --------------------------------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ import contextlib
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -81,21 +80,6 @@ def test_while_stopping_only_the_stop_frame_leaves(guard: Guard, bus: Bus) -> No
 
 def test_a_disabled_command_with_a_current_is_refused(guard: Guard, bus: Bus) -> None:
     refused(guard, bus, command(0.5, enable=False), "disabled, but with 0.5 A")
-
-
-def test_no_other_identifier_leaves(guard: Guard, bus: Bus) -> None:
-    for identifier in set(range(0x800)) - {0x80}:
-        refused(guard, bus, command()._replace(identifier=identifier), "not a classical data frame of this message")
-
-
-@pytest.mark.parametrize("change", [{"extended": True}, {"remote": True}, {"error": True}])
-def test_no_other_kind_of_frame_leaves(guard: Guard, bus: Bus, change: dict[str, Any]) -> None:
-    refused(guard, bus, command()._replace(**change), "not a classical data frame of this message")
-
-
-@pytest.mark.parametrize("length", [n for n in range(9) if n != 5])
-def test_no_other_length_leaves(guard: Guard, bus: Bus, length: int) -> None:
-    refused(guard, bus, Frame(0x80, (command().data + bytes(8))[:length]), "wrong length")
 
 
 def test_the_counter_must_follow(guard: Guard, bus: Bus) -> None:
@@ -324,7 +308,6 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
                 mentions.add((path.relative_to(folder).as_posix(), ast.unparse(node)))
     assert mentions == {
         ("can/transport.py", "self._socket.send"),
-        ("can/interfaces.py", "self._bus.send"),
         ("safety/guard.py", "self._send"),
         ("cli/session.py", "bus.transport.send"),  # handed to the guard, and kept by nobody else
         ("control/loop.py", "core.guard.send"),
@@ -333,14 +316,16 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
         ("drives/wire_guard.py", "self._send"),  # the second guard
         ("drives/arming.py", "self._send"),  # the node's own method, which hands each frame to the second guard
         ("drives/gateway.py", "drive_bus.send"),  # handed to the node, and by it to the second guard
-        ("drives/gateway.py", "bus.send"),
+        ("drives/lock_step.py", "bus.send"),
         ("drives/gateway.py", "self._node_bus.send"),  # samples and status of the node, to the loop
         ("drives/mapping_file.py", "of.send"),  # a key of the file
     }
     owner = (folder / "drives" / "node.py").read_text(encoding="utf-8")
     assert "WireGuard(mapping, bench.limits.current, send)" in owner
     opener = (folder / "drives" / "gateway.py").read_text(encoding="utf-8")
-    assert opener.count("bus.send)") == 2  # of two buses, and in lock-step
+    assert "DriveNode(mapping, bench, load_layout(), drive_bus.send)" in opener
+    stepper = (folder / "drives" / "lock_step.py").read_text(encoding="utf-8")
+    assert "drive = Port(bus.send, " in stepper
     session = (folder / "cli" / "session.py").read_text(encoding="utf-8")
     assert "Guard(plan.layout, plan.bench, bus.transport.send" in session
 

@@ -122,14 +122,6 @@ def test_a_period_is_missed_when_it_is_half_a_period_overdue(n: int, period_ns: 
     assert missed(times, run, overdue_ns - 1) == max(0, n - 1)
 
 
-def test_the_first_fault_that_latches_is_the_run_s() -> None:
-    run = Run(RunState.ACTIVE)
-    for fault in (Fault.FRAMES_DROPPED, Fault.INTERRUPTED, Fault.BUS_LOST, Fault.INTERNAL):
-        run = step(TIMES, run, fault, 5)
-    assert run.fault is Fault.INTERRUPTED
-    assert step(TIMES, step(TIMES, run, Event.STOPPED, 6), Fault.BUS_LOST, 7).fault is Fault.INTERRUPTED
-
-
 @given(st.lists(st.tuples(st.sampled_from([*Event, *Fault]), st.integers(0, 10**10)), max_size=60))
 def test_whatever_happens_a_fault_stays_and_only_stopping_follows_what_may_have_sent(
     events: list[tuple[Event | Fault, int]],
