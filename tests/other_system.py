@@ -23,7 +23,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, NoReturn
 
 LIBRARIES = """
-    asyncio can can.interfaces.udp_multicast can.interfaces.virtual cantools concurrent.futures.process gymnasium jinja2
+    asyncio can cantools concurrent.futures.process gymnasium jinja2
     logging.handlers matplotlib.backends.backend_agg matplotlib.figure mcap.writer multiprocessing.connection
     multiprocessing.popen_spawn_posix multiprocessing.queues multiprocessing.resource_tracker
     multiprocessing.synchronize numba numpy onnx onnxruntime pandas
