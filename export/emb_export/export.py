@@ -33,9 +33,9 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = Parser(
         prog="emb-export",
-        description="Write a policy for emb-run as one ONNX file with its contract, and prove that it computes what it "
-        "was made of: a reference that follows the running estimate, a sequence of currents, an optimal design, or the "
-        "actor of a training.",
+        description="Write a policy for emb-run as one ONNX file with its contract, and prove that both compute the\n"
+        "same. Source: a reference that follows the running estimate, a sequence of currents, an optimal design,\n"
+        "or the actor of a training.",
         epilog=EPILOG.format(sequences=wrapped(list(EXCITATIONS)), references=wrapped(reference_names())),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

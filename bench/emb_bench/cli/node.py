@@ -53,8 +53,9 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = Parser(
         prog="emb-node",
-        description="A simulated electromechanical brake as a CAN node with its own clock: it measures, obeys fresh, "
-        "valid, enabled commands only, brakes each period that has none, and begins a safe stop when they stop coming.",
+        description="A simulated electromechanical brake as a CAN node with its own clock. It measures, and obeys\n"
+        "only fresh, valid, enabled commands. It brakes in a period without one, and begins a safe stop\n"
+        "when commands stop.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -183,10 +183,10 @@ def _command(
 
 MEANINGS: Mapping[int, str] = {
     EXIT_DONE: "done",
-    EXIT_CHECK_FAILED: "checked, and not as it should be; or a log was left out or failed: it is named",
+    EXIT_CHECK_FAILED: "a check failed; or a log was left out or failed, and is named",
     EXIT_USAGE: "usage: wrong argument, a file that cannot be read or written, a missing library, nothing to judge by",
     EXIT_POLICY_REFUSED: "the policy in the log is refused",
-    EXIT_LOG: "the log is not a log, or too damaged or too short to say anything true from it",
+    EXIT_LOG: "not a log, or too damaged or too short for a result",
     EXIT_CANNOT_TELL: "--strict: not every acceptance criterion can be decided",
     EXIT_OUTSIDE: "--strict: the brake is outside of the ranges for which the limits are guaranteed",
     EXIT_INTERRUPTED: "Ctrl-C: nothing is written",
@@ -278,7 +278,7 @@ def _found(name: str) -> Command:
     return Command(module.HELP, module.DESCRIPTION, module.add_arguments, module.run)
 
 
-CUT = "\nA log that was cut (kill -9, full disk) is read as far as it goes, and what is missing is said.\n"
+CUT = "\nA cut log (kill -9, full disk) is read as far as it goes, and the missing part is named.\n"
 
 
 def epilog(codes: Collection[int]) -> str:

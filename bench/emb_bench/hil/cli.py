@@ -40,8 +40,8 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--host", action="store_true", help="on this kernel or not at all")
-    where.add_argument("--uml", action="store_true", help="in a User-Mode Linux kernel, whatever this one can")
+    where.add_argument("--host", action="store_true", help="only on this kernel")
+    where.add_argument("--uml", action="store_true", help="always in a User-Mode Linux kernel")
     parser.add_argument("--root", action="store_true", help="the command is root in the kernel (not on the host)")
     parser.add_argument("--slow", type=int, default=1, metavar="N",
                         help="--uml, N times slower than this computer, which then disturbs it N times less; "

@@ -34,16 +34,16 @@ QUICK_GOAL = "0.6%"
 the errors are then within 1.2 %."""
 
 DESCRIPTION = """\
-Run one excitation experiment: read the brake's sensors at 1 kHz over CAN, let the policy decide, keep it inside the
-limits (clip, envelope shield, guard, watchdog process), log everything to one MCAP file, and stop safely on every way
-out. Before anything is armed, a pre-flight table says what was found on the bus and on this computer, and refuses what
-does not fit. Results go to standard output, the table and progress to standard error.
+Run one excitation experiment. emb-run reads the brake's sensors at 1 kHz over CAN, evaluates the policy, keeps the
+brake inside its limits (clip, envelope shield, guard, watchdog process), and logs everything to one MCAP file. Every
+exit path stops the brake safely. Before anything is armed, a pre-flight checks bus and computer, and refuses a run if
+a check fails. Results go to standard output, the pre-flight and progress to standard error.
 """
 
 EPILOG = """\
 with --json:
-  One document on a line: the outcome, what was counted, the pre-flight lines, and the ways home. A pre-flight that
-  refuses has a document too; what is wrong before it has a line on standard error only.
+  One document on a line: outcome, counts, pre-flight lines, and ways home. A pre-flight that refuses prints a document
+  too; an earlier error prints only a line on standard error.
 
 the simulated bus:
   --iface sim:KEY=VALUE,... where KEY is seed, of the sensors' noise (default 1); plant, one of the bench file's
@@ -53,15 +53,15 @@ the simulated bus:
 
 exit codes:
   0  the experiment was completed, and its log is whole; with --read-only: the node is ready
-  1  with --read-only: too many of the node's samples did not come
+  1  with --read-only: too many samples of the node are missing
   2  usage: wrong argument, unreadable file, bench file refused, log cannot be written
   3  safety stop: a fault, Ctrl-C or SIGTERM ended the run with stop frames, or came before anything was sent
   4  bus: the interface cannot be opened, was lost, or no node is on it
   5  the policy was refused: damaged, or made for another bench
   6  the experiment was completed, but its log is not whole (disk full, recorder killed)
-  8  no one brake explains what the node reported: a sensor, its zero, the reported current, or the drive is wrong
-  9  with --strict: the experiment was completed, and the brake's estimate lies outside the ranges of the bench file, so
-     that the limits were not guaranteed
+  8  no single brake explains what the node reported: a sensor, its zero, the reported current, or the drive is wrong
+  9  with --strict: the experiment was completed, but the estimate lies outside the ranges of the bench file: the limits
+     were not guaranteed
 
 examples:
   emb-run --iface sim --json                        the shipped actor on the simulated brake, in lock-step
@@ -70,8 +70,8 @@ examples:
   emb-run --iface can0 --read-only --duration 10    first contact with a bench: what is on the bus
   emb-run --iface can0 --zero                       second: the whole chain, but 0 A
   emb-run --iface can0 --limit 1 --home             third: at most 1 A, and back to the origin if it ends elsewhere
-  emb-run --iface can0 --quick                      all four parameters to about 1 % in a tenth of a second, and home
-  emb-run --quick --stop-when k_1=1%,f_v=5%         as short as what has to be known allows
+  emb-run --iface can0 --quick                      all four parameters to about 1 % in a tenth of a second
+  emb-run --quick --stop-when k_1=1%,f_v=5%         ends when these two are precise enough
   emb-hil --slow 100 -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0'
                                                     where the kernel has no CAN
 """
@@ -164,15 +164,14 @@ def parser() -> argparse.ArgumentParser:
     actor.add_argument("--policy", type=Path, metavar="FILE", help="actor as ONNX with its contract (default: shipped)")
     actor.add_argument(
         "--quick", action="store_true",
-        help="the shipped actor for a short experiment: it ends, by the shield's way home, as soon as all four "
-        f"parameters are known to about 1%% (deviations below {QUICK_GOAL}%, so that 95%% of the errors are within "
-        "1.2%%), or as --stop-when says",
+        help="the shipped actor for a short experiment: it returns home and ends when all four parameters are known to "
+        f"about 1%% (deviations below {QUICK_GOAL}%, so that 95%% of the errors are within 1.2%%), or as --stop-when "
+        "says",
     )  # fmt: skip
     what.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
     what.add_argument(
         "--log", type=_place, default=Path("runs"), metavar="FILE|DIR",
-        help="MCAP file to write, a name with a suffix; any other is a folder for one named after the time "
-        "(default: runs/)",
+        help="MCAP file to write (a name with a suffix), or a folder for a file named after the time (default: runs/)",
     )  # fmt: skip
     what.add_argument(
         "--duration", type=float, metavar="S",
@@ -180,8 +179,8 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     what.add_argument(
         "--stop-when", metavar="NAME=P%[,...]",
-        help="end the experiment early, by the shield's way home, once the standard deviations of the running estimate "
-        "are below these parts of its values: k_1=1%%,f_v=5%%",
+        help="return home and end early when the standard deviations of the running estimate are below these shares of "
+        "its values: k_1=1%%,f_v=5%%",
     )  # fmt: skip
     what.add_argument(
         "--live", nargs="?", type=int, const=LIVE_PORT, metavar="PORT",
@@ -196,7 +195,7 @@ def parser() -> argparse.ArgumentParser:
         "--strict", action="store_true",
         help="exit code 9 if the estimate lies outside the ranges of the bench file, for which the limits hold",
     )  # fmt: skip
-    what.add_argument("--operator", default="", metavar="NAME", help="who makes the run, for the log and its report")
+    what.add_argument("--operator", default="", metavar="NAME", help="name of the operator, for the log and its report")
     what.add_argument("--serial", default="", metavar="TEXT", help="serial number of the device, for the log")
     output = what.add_mutually_exclusive_group()
     output.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -207,17 +206,17 @@ def parser() -> argparse.ArgumentParser:
 
     what.add_argument(
         "--home", action="store_true",
-        help="bring the brake to the origin if it is elsewhere, before the experiment and after it; each way home is "
-        "guarded like a run and has a log of its own, ...-home.mcap",
+        help="bring the brake to the origin before and after the experiment; each way home is guarded like a run and "
+        "has its own log, ...-home.mcap",
     )  # fmt: skip
 
     stage = p.add_argument_group("stage: how much of the chain may act (default: all of it)")
     one = stage.add_mutually_exclusive_group()
     one.add_argument("--read-only", action="store_true", help="only listen, log, and say what is on the bus")
-    one.add_argument("--zero", action="store_true", help="the whole chain, but only 0 A may leave")
+    one.add_argument("--zero", action="store_true", help="the whole chain, but only 0 A is sent")
     one.add_argument(
         "--limit", type=float, metavar="A",
-        help="at most this current may leave; where the shield needs more, the node brakes by itself",
+        help="send at most this current; if the shield needs more, the node brakes by itself",
     )  # fmt: skip
     asking = stage.add_mutually_exclusive_group()
     asking.add_argument(
@@ -228,7 +227,7 @@ def parser() -> argparse.ArgumentParser:
     asking.add_argument("--yes", action="store_true", help="do not ask")
 
     machine = p.add_argument_group("real time")
-    machine.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")
+    machine.add_argument("--no-rt", action="store_true", help="do not change scheduling and memory locking")
     machine.add_argument(
         "--no-watchdog", action="store_true",
         help="no watchdog process: for a bus without a brake",
