@@ -83,7 +83,7 @@ def test_numbers_are_written_for_people() -> None:
     of_two: dict[Callable[[float, float], str], list[tuple[float, float, str]]] = {
         around: [(2.5e-5, np.inf, "2.5 × 10⁻⁵"), (-6e-7, 0.48, "0.00 ± 0.48"), (2e-9, 4e-7, "(0.0 ± 4.0) × 10⁻⁷")],
         between: [(-np.inf, 2.0, "−∞ to 2"), (2.1586e-5, 2.1598e-5, "(2.1586 to 2.1598) × 10⁻⁵")],
-        share_between: [(-8e-6, 7.9e-6, "−8 to +8 ppm"), (-8e-6, 0.02, "−0.0 to +2.0 %"), (-np.inf, 0.02, "−∞ to 2 %")],
+        share_between: [(-8e-6, 7.9e-6, "−8 to +8 ppm"), (-8e-6, 0.02, "0.0 to +2.0 %"), (-np.inf, 0.02, "−∞ to 2 %")],
     }
     for both, pairs in of_two.items():
         for first, second, text in pairs:
