@@ -101,7 +101,7 @@ def test_coloured_noise_is_a_note_and_widens_the_deviations_from_the_residuals(b
     """Output error does not need white noise, its bound does."""
     found = fit(bench, "exact", [coloured(bench)])
     assert found.validation.fits
-    assert sum("are correlated in time" in note for note in found.validation.notes) == 2
+    assert sum("of the angle and velocity are correlated in time" in note for note in found.validation.notes) == 1
     assert (found.robust() > 1.3 * found.cramer_rao()).all()
 
 
