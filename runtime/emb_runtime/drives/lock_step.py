@@ -38,7 +38,9 @@ class LockStepDrive:
         self._deadline_ns = 1 << 62  # the arming ends by itself
         self._of_drive, self._to_node, self._to_host = deque[Frame](), deque[Frame](), deque[Frame]()
         drive = Port(bus.send, lambda _: _popped(self._of_drive) or bus.receive(clock.now_ns()))
-        node = Port(self._to_host.append, lambda _: _popped(self._to_node))
+        node = Port(
+            lambda frame: self._to_host.append(frame._replace(time_ns=clock.now_ns())), lambda _: _popped(self._to_node)
+        )
         self._gateway = Gateway(mapping, bench, drive, node, clock, self._wait)
         self.node = self._gateway.node
         try:

@@ -278,7 +278,7 @@ def test_the_page_in_a_browser_shows_every_sample_and_estimate(shipped: Path, tm
             page.wait(whole)
         assert page.value("cycles.map(c => c.angle)") == log.cycles["angle"][cycles].tolist()
         assert page.value("estimates.length") == log.counts["/estimate"]
-        page.wait("document.querySelectorAll('canvas').length === 4")
+        page.wait("document.querySelectorAll('canvas').length === 4 && !waiting")  # the last estimate is drawn
         rows = page.value("[...document.querySelectorAll('#estimate tr')].map(r => r.innerText.split('\\t'))")
         assert [row[0] for row in rows] == [f"{name} [{unit}]" for name, unit in UNITS.items()]
         for name, (_, value, half, relative) in zip(UNITS, rows, strict=True):

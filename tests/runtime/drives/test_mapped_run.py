@@ -68,6 +68,7 @@ def test_the_log_has_the_mapping_and_reruns(odrive: tuple[MappedBus, EmbRun], tm
     assert log.attachments["drive.toml"] == bus.mapping.text.encode()
     assert log.attachments["drive.dbc"] == bus.mapping.dbc_text.encode()
     assert {frame.identifier for frame in bus.sent} - {0} == {0x00B, 0x007, 0x00E, 0x018}
+    assert log.span[1] - log.span[0] == pytest.approx(0.7e9, abs=0.1e9)  # each frame has its time, the gateway's, too
     assert emb_replay(["rerun", str(tmp_path / "run.mcap")]) == 0
 
 
