@@ -67,9 +67,18 @@ GONE: dict[str, str] = {
     "design/*/of": "a design is for all of its parameters",
     "estimate/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
     "report/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
+    "info/*/says/messages//log": "an internal error's place is in its event's detail",
 }
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, and why."""
-EXPLAINED: dict[str, str] = {}
+JOINED = "one note says that the residuals of both signals are correlated in time"
+STAMPED = "what a lock-step gateway sends has its time, and its frames count"
+EXPLAINED: dict[str, str] = {
+    "estimate/*/says/misfit/notes": JOINED,
+    "estimate/*/says/misfit/alarms": JOINED,
+    "logs/mapped/*": STAMPED,
+    "info/mapped/says/messages//*": STAMPED,
+    "info/mapped/says/duration": "the arming of a lock-step drive takes one sample more",
+}
 """The same, of values that differ on purpose."""
 
 # ---- what is kept of a document ----------------------------------------------------------------------------------
@@ -78,7 +87,7 @@ LEFT_OUT = (
     "log path root campaign page result_file made_by version bench_sha256 sha256 identity_hash bench_hash "
     "policy_sha256 policy_provenance command tool core python numpy onnxruntime kernel began start_time time_of_day "
     "log_bytes wall_time evaluated_by other_versions policy_evaluated_by emb.preflight preflight starts attachments "
-    "bytes file realtime disk conclusions theta advice "
+    "bytes file number realtime disk conclusions theta advice "
     "caveats words unit p_value trend iface"
 )
 """Keys that say when, where and by which version, and those that repeat others."""
