@@ -59,44 +59,23 @@ mass = 80.0
 F_c = 15.0
 F_v = 150.0
 """
-SYMMETRIC = EstimationProblem(("J", "f_v", "T_c"), ("current_offset",))
-DIRECTED = EstimationProblem(("J", "f_v", "T_c", "viscous_asymmetry"), ("current_offset",))
+ASKED = EstimationProblem(("J", "f_v", "T_c"), ("current_offset",))
 PUBLISHED = {"M": 95.1089, "F_v": 203.5034, "F_c": 20.3935, "offset": -3.1648}
-PUBLISHED_BY_DIRECTION = {"M": 95.1540, "F_v+": 166.7061, "F_v-": 240.4236, "F_c+": 20.1440, "F_c-": 20.6277}
 
 
 def of_machine(e: Estimate) -> dict[str, tuple[float, float]]:
-    """Values and halves of the 95 % intervals in SI units of the linear machine, the last two by direction."""
+    """Values and halves of the 95 % intervals in SI units of the linear machine."""
     low, high = e.intervals().T
     pairs = zip(e.values.tolist(), (0.5 * (high - low)).tolist(), strict=True)
     values = dict(zip((u.name for u in e.unknowns), pairs, strict=True))
     found = {"M": _times(values["J"], TRAVEL**-2)}
-    if "viscous_asymmetry" not in values:
-        found |= {"F_v": _times(values["f_v"], TRAVEL**-2), "F_c": _times(values["T_c"], 1.0 / TRAVEL)}
-        value, half = values["current_offset"]  # ours drives the machine, the published one opposes the command
-        return found | {"offset": (-value / TRAVEL, half / TRAVEL)}
-    names = [u.name for u in e.unknowns]
-    scale = e.scale
-    covariance = e.sandwich * np.outer(scale, scale)
-    v, share = e.values[names.index("f_v")], e.values[names.index("viscous_asymmetry")]
-    c, offset = e.values[names.index("T_c")], e.values[names.index("current_offset")]
-    for sign, mark in ((1.0, "+"), (-1.0, "-")):
-        slope = np.zeros(len(names))
-        slope[names.index("f_v")], slope[names.index("viscous_asymmetry")] = 1.0 + sign * share, sign * v
-        found[f"F_v{mark}"] = v * (1.0 + sign * share) * TRAVEL**-2, 1.96 * TRAVEL**-2 * _deviation(slope, covariance)
-    for sign, mark in ((1.0, "+"), (-1.0, "-")):  # a force against the motion: the offset adds to it or takes from it
-        slope = np.zeros(len(names))
-        slope[names.index("T_c")], slope[names.index("current_offset")] = 1.0, -sign
-        found[f"F_c{mark}"] = (c - sign * offset) / TRAVEL, 1.96 / TRAVEL * _deviation(slope, covariance)
-    return found
+    found |= {"F_v": _times(values["f_v"], TRAVEL**-2), "F_c": _times(values["T_c"], 1.0 / TRAVEL)}
+    value, half = values["current_offset"]  # ours drives the machine, the published one opposes the command
+    return found | {"offset": (-value / TRAVEL, half / TRAVEL)}
 
 
 def _times(pair: tuple[float, float], factor: float) -> tuple[float, float]:
     return pair[0] * factor, pair[1] * factor
-
-
-def _deviation(slope: Floats, covariance: Floats) -> float:
-    return float(np.sqrt(slope @ covariance @ slope))
 
 
 def least_squares(position: Floats, force: Floats) -> Floats:
@@ -125,15 +104,14 @@ def main() -> None:
         other = None if arguments.other is None else _record(arguments.other, Path(folder) / "other.mcap")
         bench = read_log(Path(folder) / "first.mcap").bench
     plant = bench.plant("recorded")
-    for asked, published in ((SYMMETRIC, PUBLISHED), (DIRECTED, PUBLISHED_BY_DIRECTION)):
-        begun = time.process_time()
-        e = method_of("windows")(bench, plant, asked, starts=2).fit([whole])
-        fits = "fits" if e.validation.fits else "DOES NOT FIT"
-        print(f"the model {fits}; {time.process_time() - begun:.1f} s of the processor")
-        print("".join(f"  - {caveat}\n" for caveat in e.caveats), end="")
-        for name, (value, half) in of_machine(e).items():
-            covers = "covers" if abs(value - published[name]) <= half else "does NOT cover"
-            print(f"  {name:7} {value:9.3f} ± {half:6.3f}, {covers} the published {published[name]:.3f}")
+    begun = time.process_time()
+    e = method_of("windows")(bench, plant, ASKED, starts=2).fit([whole])
+    fits = "fits" if e.validation.fits else "DOES NOT FIT"
+    print(f"the model {fits}; {time.process_time() - begun:.1f} s of the processor")
+    print("".join(f"  - {caveat}\n" for caveat in e.caveats), end="")
+    for name, (value, half) in of_machine(e).items():
+        covers = "covers" if abs(value - PUBLISHED[name]) <= half else "does NOT cover"
+        print(f"  {name:7} {value:9.3f} ± {half:6.3f}, {covers} the published {PUBLISHED[name]:.3f}")
     if other is None:
         middle = len(whole.currents) // 2
         first, held = _part(whole, 0, middle), _part(whole, middle, len(whole.currents))
@@ -143,27 +121,23 @@ def main() -> None:
         print("held back: the other recording, predicted in windows of 0.5 s from the first")
     position = np.concatenate([[first.angle], first.samples[:, 0]]) * TRAVEL
     scipy = least_squares(position, np.append(first.currents, first.currents[-1]) / TRAVEL)
-    plain, directed = (
-        method_of("windows")(bench, plant, asked, starts=2).fit([first]) for asked in (SYMMETRIC, DIRECTED)
-    )
+    own = method_of("windows")(bench, plant, ASKED, starts=2).fit([first])
     for name, asked, values in (
-        ("ours, symmetric", plain.asked, plain.values),
-        ("ours, by direction", directed.asked, directed.values),
-        ("scipy alone", SYMMETRIC, _ours(*scipy.tolist())),
-        ("published, symmetric", SYMMETRIC, _ours(*PUBLISHED.values())),
-        ("published, by direction", DIRECTED, _ours(95.1540, 203.5649, 20.38585, -0.24185, -0.18105)),
+        ("ours", own.asked, own.values),
+        ("scipy alone", ASKED, _ours(*scipy.tolist())),
+        ("published", ASKED, _ours(*PUBLISHED.values())),
     ):
         errors = []
         for between in ("held", "linear"):
             problem = make_problem(bench, plant, [held], replace(asked, window=0.5, between=between))
             errors.append(f"{between} {1e6 * predict_windows(problem, values)[0] * TRAVEL:.1f} um")
-        own = f", estimated as {asked.between} in windows of {asked.window:g} s" if asked.between else ""
-        print(f"  {name:24} root mean square with the command {', '.join(errors)}{own}")
+        chosen = f", estimated as {asked.between} in windows of {asked.window:g} s" if asked.between else ""
+        print(f"  {name:12} root mean square with the command {', '.join(errors)}{chosen}")
 
 
-def _ours(mass: float, viscous: float, coulomb: float, offset: float, *share: float) -> Floats:
+def _ours(mass: float, viscous: float, coulomb: float, offset: float) -> Floats:
     """Unknowns in coordinates of the motor; the published offset opposes the command, ours adds to it."""
-    return np.array([mass * TRAVEL**2, viscous * TRAVEL**2, coulomb * TRAVEL, *share, -offset * TRAVEL])
+    return np.array([mass * TRAVEL**2, viscous * TRAVEL**2, coulomb * TRAVEL, -offset * TRAVEL])
 
 
 def _record(path: Path, log: Path) -> Experiment:

@@ -37,9 +37,7 @@ def advance(
     if mechanics.solver == EULER:
         advance_euler(p, x, u, t_s, chosen, s)
     elif is_plain(mechanics):
-        advance_exact(p, x, u, t_s, chosen, s, 0.0)
-    elif mechanics.viscous_asymmetry != 0.0:  # which goes with no other feature
-        advance_exact(p, x, u, t_s, chosen, s, mechanics.viscous_asymmetry)
+        advance_exact(p, x, u, t_s, chosen, s)
     else:
         advance_extended(mechanics, p, x, u, t_s, chosen, s)
 

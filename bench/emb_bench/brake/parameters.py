@@ -202,9 +202,6 @@ PARAMETERS: Mapping[str, Parameter] = {
         positive=True,
         addition="lag of the current",
     ),
-    "viscous_asymmetry": Parameter(
-        "1", False, "share by which f_v is larger in the positive direction and smaller in the negative", -0.9, 0.9
-    ),
 }
 
 _index = list(PARAMETERS).index
@@ -227,7 +224,6 @@ HYSTERESIS = _index("hysteresis")
 CURRENT_LAG = _index("current_lag")
 CURRENT_OFFSET = _index("current_offset")
 VELOCITY_GAIN = _index("velocity_gain")
-VISCOUS_ASYMMETRY = _index("viscous_asymmetry")
 PLAY = _index("play")
 COMMAND = len(PARAMETERS)
 """Current that is commanded in the period at hand, and in no other [A]: what is unknown where a report was lost."""

@@ -12,7 +12,7 @@ from msgspec import Meta
 
 import emb_runtime.config.bench as driven
 from emb_bench.config.machine import Machine
-from emb_bench.config.plants import BUILT_IN, DIRECTED, Plant, read_plant
+from emb_bench.config.plants import BUILT_IN, Plant, read_plant
 from emb_runtime.config.bench import PARAMETER_NAMES, REMEDY, checked_bench, parse_document, read_bench_text
 from emb_runtime.config.typed import SMALLEST, NotNegative, parse_toml, read
 from emb_runtime.errors import BenchFileError, near
@@ -144,10 +144,7 @@ def with_tables(bench: driven.Bench, source: str) -> Bench:
         return bench
     tables = read(_Tables, dict(bench.tables), source, BenchFileError, remedy=REMEDY, smallest=SMALLEST)
     plants = dict(BUILT_IN)
-    for name, table in tables.plants.items():
-        plants[name] = plant = read_plant(name, table, source)
-        if tables.machine is None and plant.mechanics.viscous_asymmetry != 0.0:
-            raise BenchFileError(f"{source}: plants.{name}: {DIRECTED} goes with [machine] only")
+    plants |= {name: read_plant(name, table, source) for name, table in tables.plants.items()}
     common = {f.name: getattr(bench, f.name) for f in fields(driven.Bench)}
     return Bench(**common, budgets=tables.budgets, plants=plants, systematic=tables.systematic, machine=tables.machine)
 

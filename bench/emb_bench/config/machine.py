@@ -34,7 +34,7 @@ TORQUE: Mapping[str, float] = {"Nm": 1.0, "mNm": 1e-3}  # Newton metres in each
 FORCE: Mapping[str, float] = {"N": 1.0, "kN": 1e3}
 """Newtons in each; a linear machine's, which its ``travel`` turns into a torque."""
 
-Parameter = Literal["k_m", "k_1", "T_c", "f_v", "J", "viscous_asymmetry"]
+Parameter = Literal["k_m", "k_1", "T_c", "f_v", "J"]
 PARAMETERS = get_args(Parameter)  # Parameters of a machine that can be of interest
 Window = Annotated[float, Meta(ge=1e-3, le=3600)]
 

@@ -46,7 +46,6 @@ class Mechanics(NamedTuple):
     """Share by which the clamping force is higher on applying and lower on releasing (section 3.2.1)."""
     hysteresis_travel: Annotated[float, Meta(ge=0.01, le=100)] = 1.0  # From the middle to one side [rad]
     current_lag: Annotated[float, Meta(ge=SHORTEST_LAG, le=0.1)] = 0.0  # Time constant of the current [s]; 0: none
-    viscous_asymmetry: Annotated[float, Meta(ge=-0.9, le=0.9)] = 0.0  # f_v (1 ± it) by the direction of motion
     play: Annotated[float, Meta(ge=0, le=10)] = 0.0
     """Travel of the motor after a turn until the clamp, and with it the clamping force, follows it [rad]."""
 
@@ -81,7 +80,6 @@ BUILT_IN = {
     DEFAULT_PLANT: Plant(DEFAULT_PLANT, Mechanics(solver=EXACT), Instruments()),
 }
 
-DIRECTED = "viscous_asymmetry"  # Friction by direction, which goes with no other feature of the mechanics
 EVERY = "all"  # Name for all plants together, which no plant may have
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")  # it stands in tables and in sim:plant=NAME,f_v=3e-5
 _NEEDED = {"stribeck_exponent": "stribeck_velocity", "hysteresis_travel": "hysteresis"}  # Keys without effect alone
@@ -116,8 +114,6 @@ def _contradictions(given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     for key in features:
         if (solver := given.get("solver", "exact")) != "exact":
             yield key, f'goes with solver = "exact", not with "{solver}"'
-        if DIRECTED in given and key != DIRECTED:
-            yield key, f"does not go with {DIRECTED}: expected one of the two"
         if (needed := _NEEDED.get(key, key)) not in given:
             yield key, f"has no effect without {needed}"
     if {"play", "hysteresis"} <= {*given}:

@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import NamedTuple
 
-from emb_bench.brake.motion import is_plain
 from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS
 from emb_bench.config.bench import Bench
-from emb_bench.config.plants import DIRECTED, EXACT, Plant
+from emb_bench.config.plants import EXACT, Plant
 from emb_bench.experiment.evaluation import Question, SystematicErrors
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
@@ -129,11 +128,6 @@ def check_model(plant: Plant, names: Sequence[str]) -> None:
             "have it"
         )
     m = plant.mechanics
-    alone = is_plain(m._replace(viscous_asymmetry=0.0)) and not features
-    if DIRECTED in names and (m.solver != EXACT or not alone):
-        raise UsageError(
-            f"plant '{plant.name}': {DIRECTED}: expected a plant that is solved exactly and has no other feature"
-        )
     with_play, with_hysteresis = (getattr(m, name) > 0.0 or name in features for name in ("play", "hysteresis"))
     if with_play and with_hysteresis and {"play", "hysteresis"} & {*features}:
         raise UsageError(

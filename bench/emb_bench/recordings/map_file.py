@@ -129,7 +129,6 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True):
     travel: Positive = 0.0  # Metres per radian of a linear machine; 0 for one that turns
     window: Annotated[float, Meta(ge=1e-3, le=3600.0)] = 0.0  # [s]; 0: the recording chooses
     nuisances: tuple[str, ...] = ()
-    by_direction: tuple[Literal["viscous_asymmetry"], ...] = ()
 
     def __post_init__(self) -> None:
         """Check that the parameters make a machine."""
@@ -172,7 +171,7 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True):
     def unknown(self) -> tuple[str, ...]:
         """Parameters to be estimated."""
         guess = self._of_the_motor("guess")
-        return (*(name for name in PARAMETERS if name in guess), *self.by_direction)
+        return tuple(name for name in PARAMETERS if name in guess)
 
 
 class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):

@@ -269,8 +269,6 @@ def remedies(study: Study) -> list[str]:
         return []
     if e.bench.machine is None:
         found = [f"find a model that explains the record: {again} --model all, or --grow"]
-    elif "viscous_asymmetry" not in e.asked.names:
-        found = ["let friction depend on the direction: --params with viscous_asymmetry, or by_direction in the map"]
     else:
         found = ["use the intervals: they come from the scatter of the windows, and do not need a right model"]
     if study.suspects:

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, no_sensit
 from emb_bench.brake.parameters import FEATURES as NAMED
 from emb_bench.brake.parameters import PARAMETERS, scale
 from emb_bench.config.bench import load_bench
-from emb_bench.config.plants import DIRECTED, EULER, EXACT, Mechanics
+from emb_bench.config.plants import EULER, EXACT, Mechanics
 
 BENCH = load_bench()
 P = BENCH.brake
@@ -28,17 +27,12 @@ FEATURES = {
     "cubic": 1e-5,
     "hysteresis": 0.1,
     "current_lag": 0.002,
-    "viscous_asymmetry": -0.2,
     "play": 0.3,
 }
 
 
 def start() -> Floats:
     return np.array([5.0, 20.0, 0.0, 1.0])
-
-
-def advance_directed(m: Mechanics, p: Any, x: Floats, u: float, t_s: float, chosen: Any, s: Floats) -> None:
-    advance_exact(p, x, u, t_s, chosen, s, m.viscous_asymmetry)
 
 
 def moved(m: Mechanics) -> tuple[Floats, Floats]:
@@ -56,8 +50,7 @@ def with_feature(name: str) -> Mechanics:
     [
         (Mechanics(EULER), lambda _, *arguments: advance_euler(*arguments)),
         (Mechanics(EXACT), lambda _, *arguments: advance_exact(*arguments)),
-        *((with_feature(name), advance_extended) for name in FEATURES if name != DIRECTED),
-        (with_feature(DIRECTED), advance_directed),
+        *((with_feature(name), advance_extended) for name in FEATURES),
     ],
 )
 def test_each_brake_is_moved_by_its_own_solver(m: Mechanics, solver: Callable[..., None]) -> None:

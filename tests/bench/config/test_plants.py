@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from emb_bench.config.bench import Bench, parse_bench
-from emb_bench.config.plants import DIRECTED, EXACT, Instruments, Mechanics, Plant
+from emb_bench.config.plants import EXACT, Instruments, Mechanics, Plant
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import BenchFileError
 
@@ -32,7 +32,7 @@ def test_the_shipped_bench_has_a_plant_for_every_feature(bench: Bench) -> None:
         if value != ideal[key]
     }
     # 2 and 1 rad are both the default and the sources' values.
-    assert changed == set(ideal) - {"stribeck_exponent", "hysteresis_travel", DIRECTED}
+    assert changed == set(ideal) - {"stribeck_exponent", "hysteresis_travel"}
     assert all(name == plant.name for name, plant in bench.plants.items())
 
 

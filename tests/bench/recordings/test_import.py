@@ -208,7 +208,7 @@ def test_the_map_in_the_documentation_is_whole(tmp_path: Path) -> None:
     check(path)
     machine = read_log(path).bench.machine
     assert machine is not None
-    assert machine.unknown == ("T_c", "f_v", "J", "viscous_asymmetry")
+    assert machine.unknown == ("T_c", "f_v", "J")
 
 
 def test_the_document_of_an_import_is_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
