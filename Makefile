@@ -8,6 +8,7 @@
 # make package   wheels, with the compiled core and without, and sdist: checked, installed in an empty environment, run
 # make lint | bench | docs | clean
 # make study-thesis | study-reproduce   the thesis's analysis, its trainings (hours), into build/
+# make figures   the rows of docs/figures.md, measured anew (a day)
 # make proof   the shield's argument checked by machine for every brake of the set
 # PYTHON=python3.12 picks the interpreter, VENV=DIR the place of the environment, WORKERS=N how many share the tests.
 
@@ -80,11 +81,14 @@ night: $(VENV)/.dev
 	$(BIN)/python -m tests.searches.learning_shield --episodes 5000
 	$(BIN)/python -m tests.searches.learning_shield --episodes 1000 --break all
 	$(BIN)/python -m tests.searches.sensor_monitor --experiments 100000
+	$(BIN)/python -m tests.searches.motion_balance --experiments 60000
+	$(BIN)/python -m tests.searches.lies
 	$(BIN)/python -m tests.searches.fuzz
 	$(BIN)/python -m tests.searches.hostile_files --count 2000
 	$(BIN)/python -m tests.searches.damaged_logs
 	$(BIN)/python -m tests.searches.interrupt
 	$(BIN)/python tools/compare_core.py
+	$(BIN)/python -m tools.proof
 	$(BIN)/python -m tests.mutation
 
 # The compiled core lies beside the sources afterwards. Beyond the values, which are compared bit for bit, the compiler may
@@ -135,10 +139,14 @@ clean:
 docs: $(VENV)/.dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-.PHONY: study-thesis study-reproduce proof
+.PHONY: study-thesis study-reproduce figures proof
 
 study-thesis: $(VENV)/.dev
 	$(BIN)/python -m studies.thesis
+
+# A day; python -m tools.figures TEXT measures some of them.
+figures: $(VENV)/.dev
+	$(BIN)/python -m tools.figures
 
 study-reproduce: $(VENV)/.dev
 	$(BIN)/python -m studies.thesis trainings --out build/trainings

@@ -10,6 +10,7 @@ made of the same lies, run this file with that version's Python.
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import Any
 
 from emb_runtime.can.messages import bench_identity
@@ -45,6 +46,7 @@ NEW: dict[str, tuple[Lie, ...]] = {
     "stiffness changes to": tuple(Lie(stiffness=k, begin=0.25) for k in (0.5, 0.8, 1.3)),
 }
 """Kinds that were not among those found by the first attack."""
+UNDETECTED = 7  # Named in docs/explanation/sensor-monitor.md
 
 
 def played(lie: Lie, policy: Policy, goal: str, seed: int = 1) -> tuple[str, int, float, float, LyingNode]:
@@ -74,8 +76,8 @@ def size_of(lie: Lie) -> str:
     return ", ".join(f"{name} {value:g}" for name, value in told.items() if name != "blind") or "-"
 
 
-def main() -> None:
-    """Print the table."""
+def main() -> int:
+    """Print the table; 1 if more lies are called done than the page names, or an honest run is not."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--quick", action="store_true", help="the actor and the stop condition of emb-run --quick")
     p.add_argument("kinds", nargs="*", help="some of the kinds; all without")
@@ -84,7 +86,7 @@ def main() -> None:
     goal = ",".join(f"{q.name}=0.6%" for q in estimated(BENCH)) if arguments.quick else ""
     print("| kind | lie | result | exit | unexplained [rad/s] | stated deviation | true angle [rad] | speed [rad/s] |")
     print("|---|---|---|---|---|---|---|---|", flush=True)
-    total = done = 0
+    total = done = refused = 0
     for kind, lies in {**KNOWN, **NEW}.items():
         for lie in lies if not arguments.kinds or kind in arguments.kinds else ():
             result, code, unexplained, stated, node = played(lie, policy, goal)
@@ -93,9 +95,13 @@ def main() -> None:
                 f"{node.lowest:.1f} .. {node.highest:.1f} | {node.fastest:.0f} |",
                 flush=True,
             )
-            total, done = total + (kind != "honest"), done + (kind != "honest" and result == "done")
+            if kind == "honest":
+                refused += result != "done"
+            else:
+                total, done = total + 1, done + (result == "done")
     print(f"| {total} lies of a node: called done | – | {done} |")
+    return 1 if refused or done > UNDETECTED else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
