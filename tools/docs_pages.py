@@ -2,8 +2,8 @@
 
 mkdocs calls :func:`on_config` and :func:`on_files` at each build. ``reference/modules/`` has a page for each
 sub-package and module of the four packages, ``reference/commands.md`` the ``--help`` of every command and sub-command.
-The tables of CAN messages and log topics and the advice for faults replace a marker in pages that are written by hand.
-``python -m tools.docs_pages`` writes the table of rooms into ``docs/architecture.md`` itself.
+The tables of rooms, CAN messages and log topics and the advice for faults replace a marker in pages that are written by
+hand.
 """
 
 from __future__ import annotations
@@ -78,14 +78,7 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     for marker, tables in MARKERS.items():
         if marker in markdown:
             markdown = markdown.replace(marker, tables())
-    return with_rooms(markdown)
-
-
-def with_rooms(markdown: str) -> str:
-    """A page whose part between the two markers of the rooms, if it has them, is the table of today's rooms."""
-    begin, end = ROOMS_MARKERS
-    before, _, rest = markdown.partition(begin)
-    return f"{before}{begin}\n{rooms_table()}\n{end}{rest.partition(end)[2]}" if rest else markdown
+    return markdown
 
 
 def rooms_table() -> str:
@@ -217,19 +210,9 @@ def faults_tables() -> str:
     return "\n".join(lines)
 
 
-ROOMS_MARKERS = ("<!-- rooms -->", "<!-- end of rooms -->")
 MARKERS = {
+    "<!-- rooms -->": rooms_table,
     "<!-- messages -->": messages_tables,
     "<!-- topics -->": topics_tables,
     "<!-- faults -->": faults_tables,
 }
-
-
-def main() -> None:
-    """Write the table of rooms into the page of the architecture, for those who read it without the site."""
-    page = ROOT / "docs" / "architecture.md"
-    page.write_text(with_rooms(page.read_text(encoding="utf-8")), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
