@@ -83,6 +83,7 @@ night: $(VENV)/.dev
 	$(BIN)/python -m tests.searches.sensor_monitor --experiments 100000
 	$(BIN)/python -m tests.searches.motion_balance --experiments 60000
 	$(BIN)/python -m tests.searches.lies
+	$(BIN)/python -m tests.searches.kills
 	$(BIN)/python -m tests.searches.fuzz
 	$(BIN)/python -m tests.searches.hostile_files --count 2000
 	$(BIN)/python -m tests.searches.damaged_logs

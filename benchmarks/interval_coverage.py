@@ -336,7 +336,8 @@ def main() -> None:
     if wrong:
         report("all that are wrong", wrong)
     report("all", every)
-    fits, covered = [o for o in every if o.fits], np.concatenate([o.covered for o in every])
+    fits = [o for o in every if o.fits]
+    covered = np.concatenate([o.repeats if args.case == "repeatability" else o.covered for o in every])
     far, what = share(sum(o.far for o in every), len(fits)), f"{args.case}, {len(every)} records, seed {args.seed}"
     print(f"| {what}: parameters covered | 93 to 97 % | {share(int(covered.sum()), covered.size)} |")
     print(f"| {what}: fits, and a parameter beyond {FAR:g} total deviations | 1 % | {far} |")
