@@ -36,7 +36,14 @@ def actor(tmp_path: Path, bench: Bench) -> Path:
 
 
 @pytest.fixture
-def emb_run(tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str]) -> EmbRun:
+def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Recorder and trial of the policy run in this process: starting theirs takes most of a short run's time."""
+    for module in ("log.recorder", "log.ring_buffer", "policy.trial"):
+        monkeypatch.setattr(f"emb_runtime.{module}.HAS_CHILD_PROCESSES", False)
+
+
+@pytest.fixture
+def emb_run(tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str], one_process: None) -> EmbRun:
     """emb-run with an actor of constant current, and a log that need not be named."""
     return EmbRun(("--policy", str(actor)), capsys, tmp_path / "run.mcap")
 

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("handlers")
 
 
 @pytest.fixture
-def short(tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str]) -> EmbRun:
+def short(tmp_path: Path, actor: Path, capsys: pytest.CaptureFixture[str], one_process: None) -> EmbRun:
     """emb-run with a short experiment, whose logs come into a folder."""
     return EmbRun(("--policy", str(actor), "--duration", "0.2"), capsys, tmp_path / "logs")
 

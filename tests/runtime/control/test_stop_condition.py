@@ -158,7 +158,9 @@ def test_a_policy_that_answers_no_number_on_the_way_home_is_stopped_as_ever(simu
 
 
 @pytest.fixture
-def steady(tmp_path: Path, bench: Bench, handlers: None, capsys: pytest.CaptureFixture[str]) -> EmbRun:
+def steady(
+    tmp_path: Path, bench: Bench, handlers: None, one_process: None, capsys: pytest.CaptureFixture[str]
+) -> EmbRun:
     path = tmp_path / "steady.onnx"
     path.write_bytes(constant_actor(bench, 3.0))
     return EmbRun(("--policy", str(path)), capsys, tmp_path / "run.mcap")

@@ -128,9 +128,7 @@ def within_limits(bus: MappedBus) -> None:
 def runner(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, current: float = 6.0
 ) -> tuple[MappedBus, EmbRun]:
-    """``emb-run`` with a mapped drive and an actor of constant current; recorder and trial of the actor run here."""
-    for module in ("log.recorder", "log.ring_buffer", "policy.trial"):
-        monkeypatch.setattr(f"emb_runtime.{module}.HAS_CHILD_PROCESSES", False)
+    """``emb-run`` with a mapped drive and an actor of constant current."""
     text = late_bench(polled=name == "mit")
     bus = MappedBus(name, text, tmp_path)
     for module in ("experiment", "main"):

@@ -20,7 +20,7 @@ from simulated_drives import SimulatedDrive
 from tests.drives import SHIPPED
 from tests.runtime.drives.mapped import PROTECTED, Change, MappedBus, protected, rests_below, runner, within_limits
 
-pytestmark = pytest.mark.usefixtures("handlers")
+pytestmark = pytest.mark.usefixtures("handlers", "one_process")
 Break = Callable[[MappedBus], object]
 
 

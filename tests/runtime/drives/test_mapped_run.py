@@ -24,7 +24,7 @@ from tests.drives import SHIPPED, late_bench
 from tests.runtime.drives.mapped import MappedBus, runner, within_limits
 from tests.runtime.operating import EmbRun
 
-pytestmark = pytest.mark.usefixtures("handlers")
+pytestmark = pytest.mark.usefixtures("handlers", "one_process")
 
 
 @pytest.fixture
