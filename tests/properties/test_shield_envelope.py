@@ -1,9 +1,11 @@
-"""The envelope shield holds the limits for every brake of its set, whatever the policy says: proved by search."""
+"""The envelope shield holds the limits for every brake of its set, whatever the policy says: a slice of the search.
+
+``tests/searches/shield.py`` runs it at length; that one period keeps the safe set is proved (``tools/proof``).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +13,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from emb_bench.brake.euler import step as euler_step
 from emb_bench.compiled import compiled
@@ -19,7 +20,7 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Limits, Noise, Ranges
 from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.shield import shield, successor, window
-from emb_runtime.safety.shield_design import ShieldLaw, chatter_excess, damped_excess, make_law
+from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from tests.properties.shield_climb import climb
 from tests.properties.shield_search import (
     COASTING,
@@ -39,20 +40,11 @@ from tests.properties.shield_search import (
     Floats,
     Found,
     bench_with,
-    coasting_induction,
-    draw_brakes,
     fine_piece,
-    induction,
-    lagging_induction,
     search,
 )
 
 SHIPPED = load_bench()
-Induction = Callable[[ShieldLaw, Floats, Floats, NDArray[np.bool_]], int]
-
-
-def excess_of(law: ShieldLaw) -> float:
-    return damped_excess(law.motor_low, law.friction_low, law.current, law.damping_velocity, law.sample_time)
 
 
 def assert_held_and_home(found: Found, home: bool = True) -> None:
@@ -65,7 +57,7 @@ def assert_held_and_home(found: Found, home: bool = True) -> None:
 
 
 def test_no_policy_noise_or_lost_command_breaks_a_limit_for_any_brake_of_the_envelope() -> None:
-    found = search(SHIPPED, 6000, seed=1)
+    found = search(SHIPPED, 3000, seed=1)
     assert_held_and_home(found)
     assert np.abs(found.rows[found.obeyed, END_ANGLE]).max() < 0.25
     # The search went where it hurts, with everything it has.
@@ -89,26 +81,26 @@ OLDEST = ("frame ages 0..5", "frame ages 5..5", "frame ages 2..4")
 
 @pytest.mark.parametrize("what", HELD)
 def test_whatever_is_declared_holds_the_limits_and_comes_home(what: str) -> None:
-    found = search(bench_with(**HELD[what]), 500, seed=2)
+    found = search(bench_with(**HELD[what]), 200, seed=2)
     assert set(found.labels[:, 2]) == set(range(len(DROPS)))
     assert_held_and_home(found, home=what not in OLDEST)
 
 
 @pytest.mark.parametrize("plant", PLANTS)
 def test_a_brake_whose_features_are_declared_is_held_and_comes_home(plant: str) -> None:
-    found = search(bench_with(**PLANTS[plant]), 400, seed=21, plant=plant)
+    found = search(bench_with(**PLANTS[plant]), 150, seed=21, plant=plant)
     assert set(found.labels[:, 3]) == {FINE, PLANT}
     assert_held_and_home(found)
 
 
 def test_the_coasting_envelope_needs_no_brake_when_commands_are_lost() -> None:
-    found = search(bench_with(**COASTING), 800, seed=25, freewheel=True)
+    found = search(bench_with(**COASTING), 300, seed=25, freewheel=True)
     assert_held_and_home(found)
     assert found.rows[found.of("killed"), LAST_SPEED].max() < 60.0  # it rests, or creeps under Euler's sign()
 
 
 def test_a_kill_at_any_moment_ends_at_rest_inside_the_limits() -> None:
-    found = search(SHIPPED, 1000, seed=4, drops=("killed",))
+    found = search(SHIPPED, 400, seed=4, drops=("killed",))
     assert found.of("killed").all()
     assert not found.violated.any(), found.describe(int(np.flatnonzero(found.violated)[0]))
     # At rest, or creeping back under a wound spring slower than the speed from which the damped stop brakes fully.
@@ -116,13 +108,13 @@ def test_a_kill_at_any_moment_ends_at_rest_inside_the_limits() -> None:
 
 
 def test_one_lost_command_in_ten_still_comes_home() -> None:
-    found = search(SHIPPED, 1000, seed=5, drops=("some",))
+    found = search(SHIPPED, 400, seed=5, drops=("some",))
     assert not found.violated.any()
     assert found.home.all()
 
 
 def test_a_brake_near_the_nominal_one_is_let_nearly_to_full_speed() -> None:
-    rows = search(SHIPPED, 800, seed=6, truth="viscous", drops=("none",)).rows
+    rows = search(SHIPPED, 400, seed=6, truth="viscous", drops=("none",)).rows
     assert np.quantile(rows[:, CRUISE_OUT], 0.9) > 470.0
     assert np.quantile(rows[:, CRUISE_HOME], 0.9) > 450.0
 
@@ -159,7 +151,7 @@ def test_every_bench_that_is_not_refused_is_held() -> None:
         except BenchFileError:
             refused += 1
             continue
-        found = search(bench, 150, seed=held)
+        found = search(bench, 100, seed=held)
         assert not found.violated.any(), f"{bench.limits} {found.describe(int(np.flatnonzero(found.violated)[0]))}"
         held += 1
     assert refused > held  # the checks are not idle
@@ -169,7 +161,7 @@ def test_every_bench_that_is_not_refused_is_held() -> None:
 
 
 def test_a_brake_outside_the_set_breaks_the_limits() -> None:
-    found = search(bench_with(ranges="viscous"), 500, seed=7, truth="envelope", drops=("none",))
+    found = search(bench_with(ranges="viscous"), 200, seed=7, truth="envelope", drops=("none",))
     assert found.violated.mean() > 0.1
     assert not found.home.all()
 
@@ -181,18 +173,18 @@ def test_a_law_without_its_margin_breaks_the_limits_when_commands_are_lost() -> 
 
 
 def test_a_law_made_for_fresh_frames_breaks_the_limits_with_late_ones() -> None:
-    assert search(SHIPPED, 500, seed=9, law=make_law(SHIPPED), ages=(0, 1)).violated.mean() > 0.05
+    assert search(SHIPPED, 200, seed=9, law=make_law(SHIPPED), ages=(0, 1)).violated.mean() > 0.05
 
 
 def test_a_node_that_freewheels_breaks_the_limits() -> None:
-    found = search(SHIPPED, 1000, seed=10, drops=("killed",), freewheel=True)
+    found = search(SHIPPED, 300, seed=10, drops=("killed",), freewheel=True)
     assert found.violated.mean() > 0.05
     assert found.rows[found.violated, LAST_SPEED].max() > 300.0
 
 
 @pytest.mark.parametrize("plant", ["lag", "rough"])
 def test_a_lag_that_is_not_declared_breaks_the_limits(plant: str) -> None:
-    assert search(SHIPPED, 300, seed=23, plant=plant).violated.mean() > 0.1
+    assert search(SHIPPED, 150, seed=23, plant=plant).violated.mean() > 0.1
 
 
 def test_half_of_the_lag_is_not_enough() -> None:
@@ -201,68 +193,16 @@ def test_half_of_the_lag_is_not_enough() -> None:
 
 def test_hill_climbing_finds_no_way_out() -> None:
     for declared in ({}, ROUGH, COASTING, {"frame_age": (0, 5)}):
-        assert climb(bench_with(**declared), 30, 40, seed=26).min() > 0.0
+        assert climb(bench_with(**declared), 20, 30, seed=26).min() > 0.0
 
 
 def test_hill_climbing_finds_the_way_out_of_a_law_without_its_margin() -> None:
     law = make_law(SHIPPED)
     careless = law._replace(bottom=law.bottom - 0.3, top=law.top + 0.3)
-    assert climb(SHIPPED, 30, 40, seed=26, law=careless).min() < 0.0
+    assert climb(SHIPPED, 20, 30, seed=26, law=careless).min() < 0.0
 
 
-# --- One step of the induction ---------------------------------------------------------------------------------------
-
-
-def failures(law: ShieldLaw, bench: Bench, excess: float, n: int) -> tuple[int, int]:
-    rng = np.random.default_rng(11)
-    failed = np.zeros(n, dtype=np.bool_)
-    chatter = chatter_excess(law.friction_low, law.friction_high, law.sample_time)
-    brakes = draw_brakes(rng, bench.range_set(bench.shield.ranges), n)
-    tried = compiled(induction)(law, excess, chatter, brakes, rng.random((n, 10)), failed)
-    return tried, int(failed.sum())
-
-
-@pytest.mark.parametrize("ranges", ["envelope", "viscous", "viscous-stiffness"])
-def test_the_safe_set_is_kept_by_the_shield_by_the_damped_stop_and_by_full_braking(ranges: str) -> None:
-    bench = bench_with(ranges=ranges)
-    law = make_law(bench)
-    tried, failed = failures(law, bench, excess_of(law), 200_000)
-    assert tried > 150_000
-    assert failed == 0
-
-
-def test_a_set_with_too_small_a_share_of_the_margin_is_not_kept() -> None:
-    law = make_law(SHIPPED)
-    careless = law._replace(bottom=law.bottom - 0.03, top=law.top + 0.03)
-    assert failures(careless, SHIPPED, excess_of(law) - 0.03, 200_000)[1] > 0
-
-
-def extension_failures(induction: Induction, draws: int, bench: Bench, law: ShieldLaw) -> tuple[int, int]:
-    rng = np.random.default_rng(27)
-    failed = np.zeros(60_000, dtype=np.bool_)
-    brakes = draw_brakes(rng, bench.range_set(bench.shield.ranges), len(failed))
-    tried = compiled(induction)(law, brakes, rng.random((len(failed), draws)), failed)
-    return tried, int(failed.sum())
-
-
-def test_one_period_keeps_what_is_safe_with_a_lagging_current() -> None:
-    bench = bench_with(current_lag=0.002)
-    law = make_law(bench)
-    tried, failed = extension_failures(lagging_induction, 16, bench, law)
-    assert tried > 50_000
-    assert failed == 0
-    forgetful = law._replace(kept=0.0)  # as if the current were there at once
-    assert extension_failures(lagging_induction, 16, bench, forgetful)[1] > 0
-
-
-def test_one_period_keeps_what_can_coast() -> None:
-    bench = bench_with(**COASTING)
-    law = make_law(bench)
-    tried, failed = extension_failures(coasting_induction, 10, bench, law)
-    assert tried > 50_000
-    assert failed == 0
-    optimistic = law._replace(friction_low=1.5 * law.friction_low)
-    assert extension_failures(coasting_induction, 10, bench, optimistic)[1] > 0
+# --- One step ---------------------------------------------------------------------------------------------------------
 
 
 def in_envelope() -> st.SearchStrategy[BrakeParameters]:
@@ -354,7 +294,7 @@ def answers(law: ShieldLaw, inputs: Floats, out: Floats) -> None:
 def test_compiled_and_plain_answers_are_the_same_bits(declared: dict[str, Any]) -> None:
     law = make_law(bench_with(**declared))
     rng = np.random.default_rng(12)
-    n = 4000
+    n = 2000
     inputs = np.column_stack(
         [rng.uniform(-11, 101, n), rng.uniform(-520, 520, n), *rng.uniform(-7, 7, (6, n)), rng.integers(0, 500, n)]
     ).astype(np.float64)

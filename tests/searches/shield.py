@@ -3,8 +3,8 @@
     python -m tests.searches.shield [--episodes 20000] [--seed 0]
 
 Searches for violations with adversarial episodes on three brakes (forward Euler, a finer one with an exact standstill,
-the bench's plants) and by hill climbing, breaks each assumption in turn to show that the search can fail, samples the
-induction steps, and measures what a freewheeling node would do.
+the bench's plants) and by hill climbing, breaks each assumption in turn to show that the search can fail, and measures
+what a freewheeling node would do.
 """
 
 from __future__ import annotations
@@ -16,13 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench, load_bench
 from emb_runtime.config.bench import Ranges
-from emb_runtime.safety.shield_design import chatter_excess, damped_excess, make_law
+from emb_runtime.safety.shield_design import make_law
 from tests.properties.shield_climb import climb
 from tests.properties.shield_search import (
-    COASTING,
     DROPS,
     END_ANGLE,
     END_VELOCITY,
@@ -34,10 +32,6 @@ from tests.properties.shield_search import (
     PLANTS,
     SLOWEST,
     Found,
-    coasting_induction,
-    draw_brakes,
-    induction,
-    lagging_induction,
     search,
 )
 
@@ -132,38 +126,6 @@ def show_broken(n: int, seed: int) -> bool:
     return not finds
 
 
-def show_induction(n: int, seed: int) -> bool:
-    """States of the safe set that one step takes out of it; whether there are any."""
-    outside = 0
-    print("\nOne step of the induction: states of the safe set that leave it")
-    for name in ("envelope", "pm50", "viscous", "viscous-stiffness"):
-        bench = bench_for(name)
-        law = make_law(bench)
-        excess = damped_excess(law.motor_low, law.friction_low, law.current, law.damping_velocity, law.sample_time)
-        chatter = chatter_excess(law.friction_low, law.friction_high, law.sample_time)
-        rng = np.random.default_rng(seed)
-        tried = left = 0
-        for _ in range(max(1, n // 500_000)):
-            failed = np.zeros(500_000, dtype=np.bool_)
-            brakes = draw_brakes(rng, bench.range_set(name), len(failed))
-            tried += compiled(induction)(law, excess, chatter, brakes, rng.random((len(failed), 10)), failed)
-            left += int(failed.sum())
-        outside += left
-        print(f"  {name:20s} {left} of {tried}; margin used: damped stop {excess:.3f} rad, chatter {chatter:.3f} rad")
-    for name, declared, kept, width in (
-        ("current_lag 2 ms", {"current_lag": 0.002}, lagging_induction, 16),
-        ("coasting", COASTING, coasting_induction, 10),
-    ):
-        bench = bench_for(**declared)
-        rng = np.random.default_rng(seed)
-        failed = np.zeros(min(n, 1_000_000), dtype=np.bool_)
-        brakes = draw_brakes(rng, bench.range_set("envelope"), len(failed))
-        tried = compiled(kept)(make_law(bench), brakes, rng.random((len(failed), width)), failed)
-        outside += int(failed.sum())
-        print(f"  {name:20s} {int(failed.sum())} of {tried}")
-    return outside > 0
-
-
 def main() -> int:
     """Print all figures; 1 if the shield fails, or a search that must find what is broken does not."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -174,7 +136,6 @@ def main() -> int:
     fails = show_search(n, seed)
     fails |= show_climbs(n // 5, seed)
     fails |= show_broken(max(n // 5, 1), seed)
-    fails |= show_induction(20 * n, seed)
     return 1 if fails else 0
 
 
