@@ -113,49 +113,29 @@ class Verdict:
     """What came of a play."""
 
     wrong: tuple[str, ...]  # What must not be
-    result: str
     stop_ms: float | None
     """From the last period that obeyed a command to the node's safe stop, device time; None if there was no stop."""
-    reaction_ms: float | None
-    """From the fault to the first sample that reports the stop, bus time; of a lying node to the stop itself."""
-    angle: tuple[float, float]  # True angle, lowest and highest [rad]; NaN of a node that was killed
-    top_speed: float  # True [rad/s]
     frames_lost: int | None
     """Frames of the node and of ours on the bus up to the last current that the log has not; None without a log."""
 
 
 def judge(it: Seen) -> Verdict:
     """Judge a play."""
-    result = it.summary.get("result", "")
-    wrong = [*_ended_wrongly(it, result), *illegal(it), *stop_frames(it)]
-    stop_ms, stop = safe_stop(it.samples())
+    wrong = [*_ended_wrongly(it, it.summary.get("result", "")), *illegal(it), *stop_frames(it)]
+    stop_ms = safe_stop(it.samples())
     if it.play.stops and not it.play.node_lost:
-        if stop is None or stop_ms is None:
+        if stop_ms is None:
             wrong.append("the node never began its stop")
         elif stop_ms > WATCHDOG_MS + 2.0:
             wrong.append(f"the stop began after {stop_ms:.1f} ms")
-    struck = [time_ns for _, time_ns in it.report["done"]][:1]
-    told = it.told
-    low = min((node["angle_min"] for node in told), default=float("nan"))
-    high = max((node["angle_max"] for node in told), default=float("nan"))
-    speed = max((node["top_speed"] for node in told), default=float("nan"))
-    reaction_ms = (stop.time_ns - struck[0]) * 1e-6 if stop is not None and struck and it.play.stops else None
-    if it.play.lie:
-        reaction_ms = next((node["detected_ms"] for node in told), None)
     highest = 500.0
     if it.play.drive and it.play.actions:  # nothing brakes a drive that has let go
         highest = released_speed(load_bench(it.log.parent / "late.toml"), DRIVE_TIME_OUT)
-    if low < -10.0 or high > 100.0 or speed > highest:
-        wrong.append(f"limits passed: {low:.2f} to {high:.2f} rad, {speed:.1f} rad/s")
-    return Verdict(
-        wrong=tuple(wrong),
-        result=result or f"killed ({it.report['run']['exit']})",
-        stop_ms=stop_ms,
-        reaction_ms=reaction_ms,
-        angle=(low, high),
-        top_speed=speed,
-        frames_lost=lost(it),
-    )
+    for node in it.told:
+        low, high, speed = node["angle_min"], node["angle_max"], node["top_speed"]
+        if low < -10.0 or high > 100.0 or speed > highest:
+            wrong.append(f"limits passed: {low:.2f} to {high:.2f} rad, {speed:.1f} rad/s")
+    return Verdict(tuple(wrong), stop_ms, lost(it))
 
 
 def _ended_wrongly(it: Seen, result: str) -> list[str]:
@@ -242,13 +222,11 @@ STRUCK: dict[str, Callable[[Seen], bool]] = {
 """That the fault was on the bus, of plays that may end as if there had been none."""
 
 
-def safe_stop(samples: list[Sampled]) -> tuple[float | None, Sampled | None]:
-    """Device time from the last period that obeyed a command to the node's stop [ms]; the sample that reports it."""
+def safe_stop(samples: list[Sampled]) -> float | None:
+    """Device time from the last period that obeyed a command to the node's stop [ms]; None without either."""
     stop = next((s for s in samples if s.state == STOPPING), None)
-    if stop is None:
-        return None, None
-    obeyed = [s.device_ms for s in samples if s.obeyed != NO_COMMAND and s.at < stop.at]
-    return (stop.device_ms - obeyed[-1] if obeyed else None), stop
+    obeyed = [s.device_ms for s in samples if stop is not None and s.obeyed != NO_COMMAND and s.at < stop.at]
+    return stop.device_ms - obeyed[-1] if stop is not None and obeyed else None
 
 
 def lost(it: Seen) -> int | None:

@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +44,6 @@ class Play:
     """Frames that the log may lack: what the loop had in hand when it was killed, or what a killed recorder had."""
     stops: bool = True  # The fault must end in the node's safe stop before the experiment's own end
     stop_frames: int | None = 3  # Last commands on the bus, all disabled; None if some may be lost or are a stranger's
-    lie: dict[str, Any] = field(default_factory=dict)
-    """Fields of :class:`tests.lying.node.Lie`: the node is that one, and not emb-node."""
     policy: str = ""  # How it fails: "giant" asks for too much, others are of :mod:`tests.hil.failing_policy`
     drive: str = ""  # Simulated drive in place of the node, behind its mapping
     options: tuple[str, ...] = ()  # Further ones of emb-run
@@ -63,7 +61,7 @@ class Play:
             node += ["--drive", self.drive]
             gateway = [mapping, "--drive", self.node_bus, "--node", self.run_bus, "--serial", "simulated", *bench]
             gateway += ["--yes", "--json"]
-        elif not self.lie:
+        else:
             node.append("--json")
         if self.policy:
             run += ["--policy", str(folder / ("giant.onnx" if self.policy == "giant" else "constant.onnx"))]
@@ -75,11 +73,6 @@ def _signal(to: str, name: str, after: int = 0, pause: float = 0.0, stops: int =
     return {"do": "signal", "to": to, "signal": name, "after": after, "pause": pause, "stops": stops}
 
 
-def _lying(name: str, what: str, *results: str, **lie: Any) -> Play:
-    """A node that lies: its own account of its stop is one of its lies, so that is not judged."""
-    return Play(name, what, results, (3,), node_lost=True, lie={"begin": 0.15, **lie})
-
-
 def _mapped(name: str, what: str, drive: str, results: tuple[str, ...], code: int, *actions: Any, **more: Any) -> Play:
     return Play(
         f"mapped_{name}", what, results, (code,), actions, drive=drive, stops=False, stop_frames=None,
@@ -87,8 +80,6 @@ def _mapped(name: str, what: str, drive: str, results: tuple[str, ...], code: in
     )  # fmt: skip
 
 
-CONTRADICT, OUTSIDE, POLARITY = "SENSORS_CONTRADICT", "MOTION_OUTSIDE_SET", "WRONG_POLARITY"
-REJECTED = "FRAMES_REJECTED"
 WHEN = 150  # Commands after which a fault strikes: the brake is fast and far out
 LATE = 400  # The same, for what needs some of the log to be on disk
 IN_HAND = 3  # Frames that wait for the next record
@@ -230,26 +221,6 @@ PLAYS = (
         (_signal("run", "SIGKILL", WHEN, stops=3),), may_lose=IN_HAND, policy="robbed of the lock",
     ),
     Play("giant", "a policy gone mad", ("POLICY_BEYOND_CONTRACT",), (3,), policy="giant", stops=False),
-    _lying("lie_drift_30", "its angle drifts by 30 rad/s", CONTRADICT, drift=30.0),
-    _lying("lie_drift_45", "its angle drifts by 45 rad/s", CONTRADICT, drift=45.0),
-    _lying("lie_offset", "its velocity is 40 rad/s too high", CONTRADICT, OUTSIDE, offset=40.0),
-    _lying("lie_scale", "angle and velocity are said a third as large", OUTSIDE, scale=0.33, begin=0.0),
-    _lying("lie_motor", "the motor turns the other way", POLARITY, motor=-1, begin=0.0),
-    _lying("lie_sensors", "both sensors count the other way", POLARITY, sensors=-1, begin=0.0),
-    _lying("lie_clock_jump", "its clock jumps by 0.5 s", "DEVICE_TIME", CONTRADICT, clock_jump=0.5),
-    _lying(
-        "lie_hidden_jump", "its clock jumps by 13 ms, its angle by -5 rad", "DEVICE_TIME", CONTRADICT,
-        clock_jump=0.013, clock_jump_angle=-5.0,
-    ),
-    _lying("lie_clock_fast", "its clock is 1 % fast", "DEVICE_TIME", CONTRADICT, clock=1.01, begin=0.0),
-    _lying("lie_clock_slow", "its clock is 5 % slow", "DEVICE_TIME", CONTRADICT, REJECTED, clock=0.95, begin=0.0),
-    _lying("lie_jumps", "every other angle is 5 rad off", "FRAMES_REJECTED", jump=5.0, duty=0.5),
-    _lying("lie_crc", "the CRC of every other velocity frame is wrong", "FRAMES_REJECTED", crc=True, duty=0.5),
-    _lying("lie_deaf", "half of the commands are not obeyed", "NOT_OBEYED", deaf=True, duty=0.5),
-    _lying("lie_deaf_30", "30 % of the commands are not obeyed", "NOT_OBEYED", "INCOMPLETE", deaf=True, duty=0.3),
-    _lying("lie_braking", "it brakes with 20 A every other period", "CURRENT_MISMATCH", current=20.0, duty=0.5),
-    _lying("lie_idle", "it says IDLE every tenth period", "NODE_CHANGED", idle=True, duty=0.1),
-    _lying("lie_identity", "its status is of another bench", "NODE_CHANGED", identity=1),
     *(_mapped(drive, "nothing", drive, ("done",), 0) for drive in SHIPPED),
     _mapped("zero", "nothing, with --zero", "odrive", ("done",), 0, options=("--zero",)),
     *(

@@ -34,10 +34,8 @@ import emb_runtime.cli.gateway
 import emb_runtime.cli.main
 import emb_runtime.safety.watchdog_process  # its bytecode and what it imports are then in the page cache
 import simulated_drives
-import tests.lying.on_bus
 from emb_bench.hil import link
-from emb_runtime.can.messages import bench_identity, load_layout
-from emb_runtime.config.bench import load_bench
+from emb_runtime.can.messages import load_layout
 from emb_runtime.records import CurrentCommand, Frame
 from tests.drives import EXAMPLES
 from tests.hil import bus_faults
@@ -45,7 +43,6 @@ from tests.hil.failing_policy import make_it_hang
 from tests.hil.sniffer import FRAME, open_socket, read, wait_until
 
 LAYOUT = load_layout()
-IDENTITY = bench_identity(load_bench().identity_hash)
 COMMAND, VELOCITY = LAYOUT.command.identifier, LAYOUT.velocity.identifier
 PATIENCE = 120.0  # For anything that must come [s]
 BABBLER = 97  # Real-time priority, above the node's: other nodes on a bus ask nobody
@@ -165,12 +162,8 @@ class Stage:
 
     def start_node(self) -> None:
         """Start the node, and wait until it says that it is on the bus."""
-        lie = self.play["lie"]
-        lying = ["--iface", self.bus, "--identity", str(IDENTITY), "--lie", json.dumps(lie)]
-        program, arguments = (tests.lying.on_bus.main, lying) if lie else (emb_bench.cli.node.main, self.play["node"])
-        if self.play["drive"]:
-            program = simulated_drives.main
-        node = Child(program, arguments, self.folder, "node")
+        program = simulated_drives.main if self.play["drive"] else emb_bench.cli.node.main
+        node = Child(program, self.play["node"], self.folder, "node")
         self.node = node
         assert wait_until(lambda: node.err.exists() and b"\n" in node.err.read_bytes(), PATIENCE), "no node"
         if self.play["gateway"]:

@@ -24,8 +24,8 @@ WHOLE = tuple(f"mapped_{drive}" for drive in SHIPPED)  # Undisturbed runs of dri
 
 
 def is_nightly(play: Play) -> bool:
-    """Faults of nodes and drives, which are also played in lock-step: test_lies.py, tests/runtime/drives."""
-    return play.name.startswith(("lie_", "mapped_")) and play.name not in WHOLE
+    """Faults of mapped drives, which are also played in lock-step: tests/runtime/drives."""
+    return play.name.startswith("mapped_") and play.name not in WHOLE
 
 
 CASES = [pytest.param(play, id=play.name, marks=pytest.mark.slow if is_nightly(play) else ()) for play in PLAYS]
