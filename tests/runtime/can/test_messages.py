@@ -11,7 +11,7 @@ from typing import Any
 import cantools.database
 import e2e.p01
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import to_builtins
 
@@ -258,11 +258,12 @@ def test_the_crc_of_any_bytes_is_judged_as_by_an_independent_library(message: Me
     assert (fault not in (Fault.CRC, Fault.COUNTER)) == e2e.p01.e2e_p01_check(bytearray(payload), message.data_id)
 
 
-@pytest.mark.parametrize(("message", "other"), list(itertools.permutations(MESSAGES, 2)), ids=lambda m: m.name)
 @given(body=st.binary(min_size=7, max_size=7))
-def test_a_frame_of_one_message_never_passes_for_another(message: Message, other: Message, body: bytes) -> None:
-    payload = with_crc(message, body[: other.length - 1]).data
-    assert fault_of(other, Frame(other.identifier, payload)) is Fault.CRC
+@settings(max_examples=25)
+def test_a_frame_of_one_message_never_passes_for_another(body: bytes) -> None:
+    for message, other in itertools.permutations(MESSAGES, 2):
+        payload = with_crc(message, body[: other.length - 1]).data
+        assert fault_of(other, Frame(other.identifier, payload)) is Fault.CRC
 
 
 def test_a_frame_is_rejected_for_its_kind_length_counter_and_reserved_bits() -> None:

@@ -55,7 +55,7 @@ def go_home(simulate: Simulate) -> GoHome:
     return run
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     angle=st.one_of(st.floats(-9.6, 99.6), st.sampled_from((-9.6, -0.6, 0.6, 24.0, 99.6))),
     theta=st.one_of(CORNER, INSIDE),
@@ -73,7 +73,7 @@ def test_every_brake_of_the_set_comes_home_from_anywhere_in_bounded_time(
     assert_within_limits(run)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     angle=st.floats(-9.6, 99.6),
     theta=CORNER,

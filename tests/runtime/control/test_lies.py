@@ -18,7 +18,7 @@ from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.control.actor import Actor
 from emb_runtime.control.result import Outcome
-from emb_runtime.policy.policy import load_policy, shipped_actor_path
+from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.records import Frame
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.system.clock import SteppedClock
@@ -88,6 +88,7 @@ def run(
     steps: int = BENCH.timing.horizon,
     bench: Bench = BENCH,
     actor: Actor | None = None,
+    **core: Any,
 ) -> Seen:
     node = LyingNode(bench_identity(bench.identity_hash), lie, seed)
     bus, journal = LyingBus(node, delay_ns), Journal()
@@ -97,7 +98,7 @@ def run(
         "now_ns": bus.clock.now_ns,
         "push": journal.push,
     }
-    outcome = make_loop(bench, actor or FunctionActor(law), steps, **driven).run()
+    outcome = make_loop(bench, actor or FunctionActor(law), steps, **driven, **core).run()
     detected = None if bus.stopped is None or node.began is None else bus.stopped - node.began
     return Seen(outcome, node, journal, detected)
 
@@ -164,7 +165,7 @@ def test_a_clock_that_is_fast_or_slow_is_noticed_at_two_periods_and_sooner_where
         assert moving.detected <= at_rest.detected
 
 
-@pytest.mark.parametrize("ppm", [-400, 400])
+@pytest.mark.parametrize("ppm", [-400, pytest.param(400, marks=pytest.mark.slow)])
 def test_two_quartzes_are_never_blamed_however_long_the_experiment(ppm: int) -> None:
     seen = run(Lie(clock=1.0 + ppm * 1e-6, begin=0.0), law=lambda *_: 0.0, steps=6_000)  # 2.4 periods
     assert seen.outcome.fault is None, seen.outcome.detail
@@ -185,7 +186,7 @@ def late_frames(seed: int) -> Callable[[], int]:
     return delay_ns
 
 
-@pytest.mark.parametrize("seeds", [range(10), pytest.param(range(10, 30), marks=pytest.mark.slow)], ids=str)
+@pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 30), marks=pytest.mark.slow)], ids=str)
 def test_bursts_of_late_frames_are_no_wrong_clock(seeds: range) -> None:
     for seed in seeds:
         seen = run(Lie(clock=1.0 + 400e-6 * (-1) ** seed, begin=0.0), seed, late_frames(seed))
@@ -214,7 +215,7 @@ SHARES: dict[str, tuple[Lie, Fault]] = {
 def test_a_share_above_a_fifth_ends_the_run_and_a_tenth_is_survived_and_reported(name: str) -> None:
     """Jumps, wrong CRCs, commands not obeyed, and a braking current of 20 A."""
     lie, fault = SHARES[name]
-    for percent in (25, 30, 50, 70, 90):
+    for percent in (25, 50, 90):
         seen = run(replace(lie, duty=percent / 100))
         expected = {fault, Fault.INCOMPLETE, Fault.NOT_OBEYED, Fault.NODE_STOPPED}
         assert seen.outcome.fault in expected, (percent, seen.outcome.fault, seen.outcome.detail)
@@ -274,9 +275,9 @@ SENSORS = (Fault.SENSORS_CONTRADICT, Fault.MOTION_OUTSIDE_SET, Fault.WRONG_POLAR
 
 
 def test_an_angle_that_drifts_beside_the_velocity_and_a_velocity_that_is_off_end_the_run() -> None:
-    drifts = ((5.0, 80), (10.0, 40), (30.0, 12), (45.0, 8), (100.0, 8))
+    drifts = ((5.0, 80), (30.0, 12), (100.0, 8))
     lies = [(Lie(drift=sign * drift, begin=0.1), within) for drift, within in drifts for sign in (1.0, -1.0)]
-    lies += [(Lie(offset=offset, begin=0.1), 30) for offset in (40.0, -40.0, 15.0, -10.0, 5.0, -5.0)]
+    lies += [(Lie(offset=offset, begin=0.1), 30) for offset in (40.0, -10.0, 5.0, -5.0)]
     for lie, within in lies:
         seen = run(lie)
         assert seen.outcome.fault in SENSORS, (lie, seen.outcome.detail)
@@ -318,7 +319,7 @@ def test_a_wrong_polarity_is_waited_out_within_the_slew_that_the_guard_allows() 
     assert_inside(seen)
 
 
-@pytest.mark.parametrize("percent", [10, 30, 50, 70, 90])
+@pytest.mark.parametrize("percent", [10, 50, 90])
 @pytest.mark.parametrize("lie", [Lie(offset=40.0), Lie(sensors=-1), Lie(scale=0.5)], ids=["offset", "sensors", "scale"])
 def test_a_sensor_that_lies_now_and_then_never_drives_the_brake_out_of_its_limits(lie: Lie, percent: int) -> None:
     seen = run(Lie(**{**vars(lie), "duty": percent / 100}))
@@ -330,38 +331,34 @@ def test_a_sensor_that_lies_now_and_then_never_drives_the_brake_out_of_its_limit
 # --- what changes slowly or is wrong from the start: a whole run judged ---------------------------------------------
 
 UNEXPLAINED: dict[str, Lie] = {
-    "scale slides by 1/s": Lie(slide=1.0, blind=True, begin=0.0),
     "scale slides by 0.5/s": Lie(slide=0.5, blind=True, begin=0.0),
     "scale slides by -0.5/s": Lie(slide=-0.5, blind=True, begin=0.0),
     "scale swings": Lie(wave=0.1, blind=True, begin=0.0),
     "angle curved": Lie(curve=0.001, blind=True, begin=0.0),
     "zero at 5 rad": Lie(zero=5.0, blind=True),
     "zero at -5 rad": Lie(zero=-5.0, blind=True),
-    "zero at 10 rad": Lie(zero=10.0, blind=True),
-    "zero at 20 rad": Lie(zero=20.0, blind=True),
     "both drift by 5 rad/s": Lie(both=5.0, blind=True),
-    "both drift by -5 rad/s": Lie(both=-5.0, blind=True),
     "both drift by 5 rad/s with losses": Lie(both=5.0, blind=True, lost=0.05),
-    "current times 1.5": Lie(gain=1.5),
     "current times 0.8": Lie(gain=0.8),
-    "current grows by 1/s": Lie(gain_rate=1.0),
     "current grows by -0.5/s": Lie(gain_rate=-0.5),
     "current swings": Lie(gain_wave=0.1, begin=0.0),
-    "reported current +0.4 A": Lie(reported=0.4, begin=0.0),
     "reported current -0.4 A": Lie(reported=-0.4, begin=0.0),
     "reported current +0.1 A": Lie(reported=0.1, begin=0.0),
     "unreported current 0.4 A": Lie(offset_current=0.4, begin=0.0),
     "dead band of 1 A": Lie(dead=1.0, begin=0.0),
-    "friction grows threefold": Lie(friction_rate=3.0, begin=0.0),
     "friction doubles": Lie(friction_rate=1.0, begin=0.0),
     "stiffness halves": Lie(stiffness=0.5, begin=0.25),
 }
-"""All of these were called done with exit code 0; the shipped actor drives."""
+"""All of these were called done with exit code 0; the shipped actor drives. tests/searches/lies.py plays 61."""
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    return load_policy(shipped_actor_path(), BENCH)
 
 
 @pytest.mark.parametrize("name", UNEXPLAINED)
-def test_what_no_one_brake_explains_is_not_done(name: str) -> None:
-    policy = load_policy(shipped_actor_path(), BENCH)
+def test_what_no_one_brake_explains_is_not_done(name: str, policy: Policy) -> None:
     seen = run(UNEXPLAINED[name], actor=policy)
     assert seen.outcome.fault is Fault.MOTION_UNEXPLAINED, (seen.outcome.fault, seen.outcome.detail)
     assert "MOTION_UNEXPLAINED" in seen.journal.codes
@@ -371,8 +368,7 @@ def test_what_no_one_brake_explains_is_not_done(name: str) -> None:
     assert seen.node.fastest <= 580.0  # what remains: docs/explanation/sensor-monitor.md
 
 
-def test_an_honest_node_under_the_shipped_actor_is_explained_with_and_without_losses() -> None:
-    policy = load_policy(shipped_actor_path(), BENCH)
+def test_an_honest_node_under_the_shipped_actor_is_explained_with_and_without_losses(policy: Policy) -> None:
     for seed, lie in enumerate((HONEST, Lie(lost=0.02), Lie(lost=0.05), HONEST)):
         outcome = run(lie, seed, actor=policy).outcome
         assert outcome.fault is None, outcome.detail
@@ -383,8 +379,8 @@ def test_an_honest_node_under_the_shipped_actor_is_explained_with_and_without_lo
 
 
 @pytest.mark.parametrize("lie", [Lie(zero=2.0), Lie(zero=-2.0), Lie(slide=0.2, begin=0.0), Lie(gain_rate=0.2)], ids=str)
-def test_what_stays_unseen_keeps_within_what_the_page_says(lie: Lie) -> None:
-    seen = run(replace(lie, blind=True), actor=load_policy(shipped_actor_path(), BENCH))
+def test_what_stays_unseen_keeps_within_what_the_page_says(lie: Lie, policy: Policy) -> None:
+    seen = run(replace(lie, blind=True), actor=policy)
     assert seen.node.lowest >= -3.5
     assert seen.node.highest <= 80.0
     assert seen.node.fastest <= 522.0

@@ -111,7 +111,7 @@ def test_what_is_no_condition_is_refused_in_one_line() -> None:
 def test_once_it_is_reached_the_brake_comes_home_and_it_ends(simulate: Simulate) -> None:
     lengths = {}
     for law in LAWS:
-        for at in (0, 60, 150, 300, 400, 480, 499) if law in ("forward", "square") else (150, 400):
+        for at in (0, 60, 150, 480, 499) if law == "forward" else (150, 400):
             run = ended(simulate, law, at)
             assert (run.outcome.fault, run.outcome.home, run.outcome.goal_reached) == (None, True, True)
             assert run.journal.codes == ["SILENT", "ARMED", "ACTIVE", REACHED, "STOPPING", "OVER"]
@@ -139,7 +139,7 @@ def test_once_it_is_reached_the_brake_comes_home_and_it_ends(simulate: Simulate)
     law=st.sampled_from(sorted(LAWS)),
     plant=st.sampled_from(["euler", "exact"]),
 )
-@settings(max_examples=25)
+@settings(max_examples=12)
 def test_every_corner_of_the_set_comes_home_within_its_limits(
     simulate: Simulate, corner: tuple[float, ...], at: int, law: str, plant: str
 ) -> None:

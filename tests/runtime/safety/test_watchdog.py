@@ -194,21 +194,17 @@ def test_a_loop_that_is_killed_is_stopped_for_and_the_watchdog_ends(bus: Bus, ho
     assert bus.rest() == []
 
 
-def test_letting_go_of_the_watchdog_after_disarming_sends_nothing(bus: Bus, bench: Bench) -> None:
-    watchdog = watchdog_of(bus, bench, heartbeat=60.0)
-    watchdog.pulse.arm(time.monotonic_ns())
-    watchdog.pulse.disarm()
-    result = watchdog.finish()
-    assert (result.tripped, result.frames, result.error) == ("", 0, "")
-    assert bus.rest() == []
-
-
-def test_letting_go_of_the_watchdog_while_armed_sends_the_stop_frames(bus: Bus, bench: Bench) -> None:
-    watchdog = watchdog_of(bus, bench, heartbeat=60.0)
-    watchdog.pulse.arm(time.monotonic_ns())
-    result = watchdog.finish()
-    assert (result.tripped, result.frames, result.error) == ("gone", 3, "")
-    assert bus.rest() == stop_frames(0, 1, 2, answers=0)
+def test_letting_go_of_the_watchdog_sends_the_stop_frames_while_armed_and_nothing_after_disarming(
+    bus: Bus, bench: Bench
+) -> None:
+    for disarmed, tripped, frames in ((True, "", []), (False, "gone", stop_frames(0, 1, 2, answers=0))):
+        watchdog = watchdog_of(bus, bench, heartbeat=60.0)
+        watchdog.pulse.arm(time.monotonic_ns())
+        if disarmed:
+            watchdog.pulse.disarm()
+        result = watchdog.finish()
+        assert (result.tripped, result.frames, result.error) == (tripped, len(frames), "")
+        assert bus.rest() == frames
 
 
 def test_the_report_says_when_it_tripped_and_after_which_silence(bus: Bus, bench: Bench) -> None:
@@ -250,16 +246,14 @@ def test_a_watchdog_that_does_not_answer_is_ended(bus: Bus, bench: Bench) -> Non
     wait_until_gone(watchdog.pid)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_the_watchdog_leaves_signals_to_the_runtime(bus: Bus, bench: Bench, number: signal.Signals) -> None:
-    watchdog = watchdog_of(bus, bench, heartbeat=60.0)
-    os.kill(watchdog.pid, number)
-    assert watchdog.finish().error == ""
-
-
-def test_what_it_obtained_of_real_time_is_told(bus: Bus, bench: Bench) -> None:
+def test_the_watchdog_leaves_signals_to_the_runtime_and_what_it_obtained_of_real_time_is_told(
+    bus: Bus, bench: Bench
+) -> None:
     watchdog = WatchdogHandle.start(transport(bus), bench, 60.0)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        os.kill(watchdog.pid, number)
     result = watchdog.finish()
+    assert result.error == ""
     settings = result.realtime
     assert settings["garbage_collector"] == "frozen, off"
     assert result.trailer()["watchdog_rt_garbage_collector"] == "frozen, off"
