@@ -9,18 +9,26 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_runtime.config.bench import Noise
 from tests.properties.learning_mutants import MUTANTS, broken
-from tests.properties.learning_search import Found, episodes, search, setting_for
+from tests.properties.learning_search import (
+    FASTEST,
+    HIGHEST,
+    LOWEST,
+    SLOWEST,
+    Found,
+    episodes,
+    search,
+    setting_for,
+)
 
-BLOCK = 2000  # Episodes between two lines of what is done
-
-
+WRONG = ("outside", "falsified", "violated", "away")
 UNDECLARED = (0.0, 1e-3)
 DECLARED = (50.0, 0.05)  # Errors of model [rad/s²] and current [A]: those of the shipped bench, and greater ones
 
@@ -54,44 +62,21 @@ def bench_of(case: Case) -> Bench:
     return replace(bench, shield=bench.shield._replace(model_error=model_error, current_error=current_error))
 
 
-Counts = dict[str, Any]
-
-
-def count(found: Found) -> Counts:
-    """Tallies of a search."""
-    r = found.rows
-    return {
-        "episodes": len(r),
-        "outside": int(found.outside.sum()),
-        "falsified": int(found.falsified.sum()),
-        "violating": int(found.violated.sum()),
-        "away": int(found.away.sum()),
-        "lossless": int(found.lossless.sum()),
-        "angle": [float(r[:, 2].min()), float(r[:, 3].max())],
-        "velocity": [float(r[:, 4].min()), float(r[:, 5].max())],
-    }
-
-
-def summed(counts: list[Counts]) -> Counts:
-    """Tallies of several searches together."""
-    total = {key: sum(c[key] for c in counts) for key in counts[0] if key not in ("angle", "velocity")}
-    for key in ("angle", "velocity"):
-        total[key] = [min(c[key][0] for c in counts), max(c[key][1] for c in counts)]
-    return total
-
-
 HEAD = (
     "| case | episodes | outside | falsified | violating | not home¹ | angle [rad] | velocity [rad/s] |\n"
     "|---|---|---|---|---|---|---|---|"
 )
 
 
-def line(name: str, c: Counts) -> None:
-    """One line of a table."""
+def line(name: str, found: list[Found]) -> None:
+    """One line of a table: several searches together."""
+    rows = np.concatenate([f.rows for f in found])
+    sums = [sum(int(getattr(f, key).sum()) for f in found) for key in (*WRONG, "lossless")]
+    outside, falsified, violating, away, lossless = sums
     print(
-        f"| {name} | {c['episodes']} | {c['outside']} | {c['falsified']} | {c['violating']} | "
-        f"{c['away']} of {c['lossless']} | {c['angle'][0]:.2f} .. {c['angle'][1]:.2f} | "
-        f"{c['velocity'][0]:.1f} .. {c['velocity'][1]:.1f} |",
+        f"| {name} | {len(rows)} | {outside} | {falsified} | {violating} | {away} of {lossless} | "
+        f"{rows[:, LOWEST].min():.2f} .. {rows[:, HIGHEST].max():.2f} | "
+        f"{rows[:, SLOWEST].min():.1f} .. {rows[:, FASTEST].max():.1f} |",
         flush=True,
     )
 
@@ -101,22 +86,20 @@ def show_search(n: int, seed: int) -> bool:
     everything = []
     print(HEAD)
     for case in cases():
-        bench, counts = bench_of(case), []
-        for block in range(seed * 1_000_000, seed * 1_000_000 + -(-n // BLOCK)):
-            found = search(setting_for(bench, case.flow), bench, min(BLOCK, n), block)
-            tell(found)
-            counts.append(count(found))
-        line(case.name, summed(counts))
-        everything += counts
-    total = summed(everything)
-    line("all", total)
-    return any(total[key] for key in ("outside", "falsified", "violating", "away"))
+        bench = bench_of(case)
+        found = search(setting_for(bench, case.flow), bench, n, seed)
+        for i in np.flatnonzero(wrong_in(found))[:1]:
+            print(found.describe(int(i)), file=sys.stderr)
+        line(case.name, [found])
+        everything.append(found)
+    line("all", everything)
+    return any(wrong_in(found).any() for found in everything)
 
 
-def tell(found: Found) -> None:
-    """The first episode in which something went wrong, in words."""
-    for i in np.flatnonzero(found.outside | found.falsified | found.violated | found.away)[:1]:
-        print(found.describe(int(i)), file=sys.stderr)
+def wrong_in(found: Found) -> NDArray[np.bool_]:
+    """Episodes in which something went wrong."""
+    wrong: NDArray[np.bool_] = np.logical_or.reduce([getattr(found, key) for key in WRONG])
+    return wrong
 
 
 def show_mutants(names: list[str], n: int, seed: int) -> bool:

@@ -214,10 +214,9 @@ PLACES = (*HANDED_IN, *(OURS if isfunction(SensorMonitor.check) else ()))
 """Of the compiled core only what is handed in can be replaced."""
 
 
-@pytest.mark.parametrize("watched", [False, True])
 @pytest.mark.parametrize("place", PLACES)
 def test_whatever_is_raised_in_a_run_stop_frames_follow_and_nothing_else(
-    place: str, watched: bool, simulate: Simulate, layout: Layout
+    place: str, simulate: Simulate, layout: Layout
 ) -> None:
     for kind in (*FAULTS, *LEAVING):
         for after in (0, 10) if kind in (HostileError, KeyboardInterrupt) else (10,):
@@ -225,7 +224,7 @@ def test_whatever_is_raised_in_a_run_stop_frames_follow_and_nothing_else(
             with pytest.MonkeyPatch.context() as patch:
                 if place in OURS:
                     plant(patch, place, planted.at)
-                end = ended(planted, simulate, layout, watched)
+                end = ended(planted, simulate, layout, watched=True)
             row = f"{kind.__name__} after {after} frames: {end}, {planted.sent}"
             assert planted.raised == 1, row
             assert end == FAULTS.get(kind, kind), row
