@@ -6,6 +6,7 @@ sums over a window are taken anew each time, and the ρ of least volume is a roo
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -359,12 +360,8 @@ def placed(a: Assumptions, angle: tuple[float, float], velocity: tuple[float, fl
 
 
 @pytest.mark.parametrize("flow", [True, False])
-@pytest.mark.parametrize("angle", CORNERS["angle"])
-@pytest.mark.parametrize("velocity", CORNERS["velocity"])
-def test_a_period_leads_to_the_extremes_over_all_brakes_in_every_corner(
-    flow: bool, angle: tuple[float, float], velocity: tuple[float, float]
-) -> None:
-    for u in (-6.0, -1.0, 0.0, 1.0, 6.0):
+def test_a_period_leads_to_the_extremes_over_all_brakes_in_every_corner(flow: bool) -> None:
+    for angle, velocity, u in itertools.product(CORNERS["angle"], CORNERS["velocity"], (-6.0, -1.0, 0.0, 1.0, 6.0)):
         a = assumed(flow)._replace(model_error=3.0)
         state, r = placed(a, angle, velocity)
         assert bounded._advance(a, state, u, 0.02) == r.advance(u, 0.02)
@@ -373,20 +370,20 @@ def test_a_period_leads_to_the_extremes_over_all_brakes_in_every_corner(
 
 
 @pytest.mark.parametrize("angle", CORNERS["angle"])
-@pytest.mark.parametrize("u", [-5.0, -1.0, 0.0, 1.0, 5.0])
 def test_along_the_flow_a_direction_is_certain_if_no_brake_can_be_stopped_within_the_period(
-    angle: tuple[float, float], u: float
+    angle: tuple[float, float],
 ) -> None:
     """From the speed on that the strongest friction, the model's error and the pad take; a hair on either side."""
     a = assumed(True)._replace(model_error=3.0)
     t, thick = a.sample_time, a.viscous * a.high[3]
-    motor = [a.motor * k * u for k in (a.low[0], a.high[0])]
-    above = max(motor) - a.spring * a.low[1] * max(angle[0], 0.0) + 3.0
-    below = min(motor) - a.spring * a.high[1] * max(angle[1], 0.0) - 3.0
     friction, pulled = a.coulomb * a.high[2], a.spring * a.high[1] * a.speed
-    peak = max(above, -below) + friction + thick * a.speed + t * pulled
-    pad = 0.5 * t * t * (pulled + thick * peak)
-    for slowing, sign in ((friction - below, 1.0), (friction + above, -1.0)):
+    for u, sign in itertools.product((-5.0, -1.0, 0.0, 1.0, 5.0), (1.0, -1.0)):
+        motor = [a.motor * k * u for k in (a.low[0], a.high[0])]
+        above = max(motor) - a.spring * a.low[1] * max(angle[0], 0.0) + 3.0
+        below = min(motor) - a.spring * a.high[1] * max(angle[1], 0.0) - 3.0
+        peak = max(above, -below) + friction + thick * a.speed + t * pulled
+        pad = 0.5 * t * t * (pulled + thick * peak)
+        slowing = friction - below if sign > 0.0 else friction + above
         least = (pad + t * slowing) / (1.0 - t * thick)
         for speed, certain in ((least + 1e-6, least > 0.0), (least - 1e-6, False), (0.0, False), (-0.5, False)):
             ends = sorted([sign * speed, sign * (speed + 9.0)])
@@ -422,11 +419,12 @@ def box_of(*ends: float) -> list[float]:
     return state
 
 
-@pytest.mark.parametrize("i", range(4))
-@pytest.mark.parametrize("f", [-8.0, -0.5, 0.5, 8.0])
-def test_a_side_of_the_box_is_cut_at_the_strip_and_a_rounding_beyond(i: int, f: float) -> None:
-    f1, f2, f3, f4 = (f if j == i else 0.0 for j in range(4))
-    for least, most in ((0.75, 9.0), (-9.0, 1.25), (0.75, 1.25), (0.5, 1.5), (-9.0, 9.0)):
+STRIPS = ((0.75, 9.0), (-9.0, 1.25), (0.75, 1.25), (0.5, 1.5), (-9.0, 9.0))
+
+
+def test_a_side_of_the_box_is_cut_at_the_strip_and_a_rounding_beyond() -> None:
+    for i, f, (least, most) in itertools.product(range(4), (-8.0, -0.5, 0.5, 8.0), STRIPS):
+        f1, f2, f3, f4 = (f if j == i else 0.0 for j in range(4))
         state, ends = box_of(0.5, 1.5), sorted([f * least, f * most])
         bounded._cut_box(state, f1, f2, f3, f4, ends[0], ends[1])
         assert state[FALSIFIED] == 0.0

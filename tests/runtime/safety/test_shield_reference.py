@@ -74,6 +74,14 @@ def drawn_law(rng: Random) -> ShieldLaw:
     )
 
 
+def draws() -> Iterator[Random]:
+    """A generator of numbers for each of so many states of each seed."""
+    for seed in SEEDS:
+        rng = Random(seed)
+        for _ in range(STATES):
+            yield rng
+
+
 def drawn_state(rng: Random, law: ShieldLaw) -> tuple[float, float]:
     """Angle and velocity, often where something changes: at the limits, at contact, at rest."""
     angle = rng.choice(
@@ -135,10 +143,8 @@ def moved(law: ShieldLaw, box: Box, u_low: float, u_high: float) -> Box:
     return xl + law.sample_time * min(vl, low), xh + law.sample_time * max(vh, high), low, high
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_successor_box_is_that_of_the_extreme_brakes(seed: int) -> None:
-    rng = Random(seed)
-    for _ in range(STATES):
+def test_the_successor_box_is_that_of_the_extreme_brakes() -> None:
+    for rng in draws():
         law = drawn_law(rng)
         xl, xh, vl, vh = measured(law, *drawn_state(rng, law))
         box = rng.choice([(xl, xh, vl, vh), (xl, xh, vl := rng.uniform(-3.0, 3.0), vl + rng.uniform(0.01, 3.0))])
@@ -220,20 +226,16 @@ def assert_exact(
         assert -full <= end <= law.current
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_window_is_what_every_brake_of_the_box_can_be_held_from(seed: int) -> None:
-    rng = Random(seed)
-    for _ in range(STATES):
+def test_the_window_is_what_every_brake_of_the_box_can_be_held_from() -> None:
+    for rng in draws():
         law = drawn_law(rng)
         state = drawn_state(rng, law)
         ends = window(law, *state, NO_PAST)
         assert_exact(law, [measured(law, *state)], state[1], ends, law.current, held_by_braking)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_coasting_window_is_what_friction_alone_can_hold(seed: int) -> None:
-    rng = Random(seed)
-    for _ in range(STATES):
+def test_the_coasting_window_is_what_friction_alone_can_hold() -> None:
+    for rng in draws():
         law = drawn_law(rng)._replace(coasting=True, homeward_speed=rng.uniform(50.0, 300.0))
         angle, velocity = drawn_state(rng, law._replace(top=law.apex))
         velocity *= rng.choice([1.0, 0.3])
@@ -310,10 +312,8 @@ def held_with_lag(law: ShieldLaw, box: Box, u: float, sign: float, flowing: floa
     return True
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_window_of_a_current_that_follows_late_is_what_either_motor_can_be_held_from(seed: int) -> None:
-    rng = Random(seed)
-    for _ in range(STATES):
+def test_the_window_of_a_current_that_follows_late_is_what_either_motor_can_be_held_from() -> None:
+    for rng in draws():
         law = drawn_law(rng)._replace(lag=rng.uniform(0.5e-3, 2e-3), kept=rng.uniform(0.3, 0.7))
         angle, velocity = drawn_state(rng, law)
         past = drawn_past(rng, law)
@@ -425,10 +425,8 @@ def test_late_measurements_are_rolled_on_to_where_the_way_home_begins(ages: tupl
         assert_returns_at(law, state, past, (min(xl), max(xh), min(vl), max(vh)))
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_way_home_of_a_late_current_begins_after_what_flows_has_decayed(seed: int) -> None:
-    rng = Random(seed)
-    for _ in range(STATES):
+def test_the_way_home_of_a_late_current_begins_after_what_flows_has_decayed() -> None:
+    for rng in draws():
         law = drawn_law(rng)._replace(lag=rng.uniform(1e-3, 3e-3), kept=rng.uniform(0.2, 0.6))
         state, past = inner_state(rng, law), drawn_past(rng, law)
         flowing = sum((1.0 - law.kept) * law.kept**n * u for n, u in enumerate(past))
@@ -463,10 +461,8 @@ def homeward_current(law: ShieldLaw, x: float, v: float, left: float) -> float:
     return home * acceleration / motor
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_on_the_way_home_the_current_follows_the_planned_speed(seed: int) -> None:
-    rng = Random(seed)
-    for _ in range(STATES):
+def test_on_the_way_home_the_current_follows_the_planned_speed() -> None:
+    for rng in draws():
         law = drawn_law(rng)._replace(committed=10.0, settling=0.1)
         law = law._replace(current=rng.choice([law.current, 500.0]))
         angle, velocity = inner_state(rng, law)
@@ -591,10 +587,8 @@ def test_where_both_sides_ask_for_full_braking_it_is_against_the_motion(velocity
     assert window(law, 0.0, velocity, NO_PAST) == (full, full)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_what_is_wanted_is_cut_to_the_window_and_what_is_no_number_counts_as_zero(seed: int) -> None:
-    rng = Random(seed)
-    for _ in range(STATES):
+def test_what_is_wanted_is_cut_to_the_window_and_what_is_no_number_counts_as_zero() -> None:
+    for rng in draws():
         law = drawn_law(rng)._replace(reserve=-1e9, committed=0.0)
         state = drawn_state(rng, law)
         lowest, highest = window(law, *state, NO_PAST)
