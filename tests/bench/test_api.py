@@ -14,6 +14,7 @@ from numpy.testing import assert_array_equal
 from emb_bench import api
 from emb_bench.cli import design, replay
 from emb_runtime.cli import main as emb_run
+from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import UsageError
 
 
@@ -64,11 +65,15 @@ def test_an_estimate_is_that_of_emb_replay_estimate(log: Path, capsys: pytest.Ca
     ]
 
 
-def test_a_design_is_that_of_emb_design(capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--criterion", "E", "--params", "k_1,f_v", "--theta", "f_v=3e-5", "--starts", "1", "--seed", "3"]
-    found = printed(capsys, design.main([*options, "--model", "euler", "--no-return-home", "--json"]))
+def test_a_design_is_that_of_emb_design(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    short = tmp_path / "short.toml"
+    text = shipped_bench_text().replace("horizon     = 500", "horizon     = 50")
+    short.write_text(text, encoding="utf-8")
+    options = ["--criterion", "A", "--params", "k_m,T_c", "--theta", "f_v=3e-5", "--starts", "1", "--seed", "3"]
+    options += ["--bench", str(short), "--model", "euler", "--no-return-home", "--json"]
+    found = printed(capsys, design.main(options))
     report = api.design(
-        "E", params=("k_1", "f_v"), theta={"f_v": 3e-5}, starts=1, seed=3, model="euler", return_home=False
+        "A", params=("k_m", "T_c"), theta={"f_v": 3e-5}, starts=1, seed=3, bench=short, model="euler", return_home=False
     )
     assert json.loads(report.json()) == found
 
