@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
+from pyarrow import parquet
 
 from emb_bench.cli.replay import COMMANDS, main
-from tests.bench.linear_machine import MAP, Machine, record
 
 WORKS: dict[str, tuple[str, ...]] = {
     "info": ("info", "RUN"),
@@ -34,30 +39,57 @@ LACKS: dict[str, tuple[tuple[str, ...], str]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> str:
-    folder = tmp_path_factory.mktemp("others")
-    rows = zip(*(column.tolist() for column in record(Machine(), 2.0)), strict=True)
-    (folder / "r.csv").write_text("t,x,F\n" + "".join(f"{t!r},{x!r},{f!r}\n" for t, x, f in rows))
-    (folder / "map.toml").write_text(MAP.replace("window = 0.5", "window = 0.05"))
-    out = folder / "run.mcap"
-    assert main(["import", str(folder / "r.csv"), "--map", str(folder / "map.toml"), "-o", str(out)]) == 0
-    return str(out)
-
-
 def called(words: tuple[str, ...], run: str, folder: Path) -> int:
     return main([run if w == "RUN" else w.replace("OUT", str(folder / "out")) for w in words])
 
 
+class Saying(NamedTuple):
+    """What a command printed, and where it has written."""
+
+    out: str
+    folder: Path
+
+
+Say = Callable[[str], Saying]
+
+
+@pytest.fixture(scope="module")
+def say(run: str, tmp_path_factory: pytest.TempPathFactory) -> Say:
+    """Calls a command that works, once."""
+
+    @cache
+    def of(name: str) -> Saying:
+        folder = tmp_path_factory.mktemp("said")
+        with contextlib.redirect_stdout(io.StringIO()) as out:
+            assert called(WORKS[name], run, folder) in (0, 1)
+        return Saying(out.getvalue(), folder)
+
+    return of
+
+
 @pytest.mark.parametrize("name", WORKS)
-def test_a_command_works_and_says_nothing_of_a_loop(
-    name: str, run: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    capsys.readouterr()
-    assert called(WORKS[name], run, tmp_path) in (0, 1)
-    said = capsys.readouterr().out
+def test_a_command_works_and_says_nothing_of_a_loop(name: str, say: Say) -> None:
     for nonsense in ("missed", "unanswered", "returning home", "braked by the node", "nan", "sensor to command"):
-        assert nonsense not in said
+        assert nonsense not in say(name).out
+
+
+def test_an_estimate_prints_a_linear_machine_in_kilograms_and_newtons(say: Say) -> None:
+    said = say("estimate").out
+    for label, unit in (("mass", "kg"), ("F_c", "N"), ("F_v", "N·s/m")):
+        line = next(line for line in said.splitlines() if line.startswith(f"{label} "))
+        assert f" {unit} " in line
+    for foreign in ("kg·m²", "N·m ", "rad ", "T_c", "f_v", "stiffness", "hysteresis"):
+        assert foreign not in said
+    assert "only ratios do without" in said.replace("\n    ", " ")
+
+
+def test_the_report_shows_the_machine_and_nothing_of_a_loop_or_a_limit(say: Say) -> None:
+    page = (say("report").folder / "out.html").read_text(encoding="utf-8")
+    for own in ("mass", "N·s/m", "Force that acted over time", "Residuals of angle over time"):
+        assert own in page
+    assert "residuals of the velocity" not in page  # which the recording does not have
+    for foreign in ("kg·m²", "shield", "the node", 'id="safety"', 'id="timing"', "rad/s, limit"):
+        assert foreign not in page
 
 
 @pytest.mark.parametrize("name", LACKS)
@@ -72,11 +104,8 @@ def test_a_command_says_in_one_line_what_it_lacks(
     assert "\n" not in said
 
 
-def test_a_row_of_a_campaign_has_no_counts_of_a_loop_and_no_date(run: str, tmp_path: Path) -> None:
-    from pyarrow import parquet
-
-    assert called(("campaign", "RUN", "-o", "OUT.parquet", "--params", "J,T_c,f_v", "--jobs", "1"), run, tmp_path) == 0
-    row = parquet.read_table(tmp_path / "out.parquet").to_pylist()[0]
+def test_a_row_of_a_campaign_has_no_counts_of_a_loop_and_no_date(say: Say) -> None:
+    row = parquet.read_table(say("campaign").folder / "out.parquet").to_pylist()[0]
     assert row["error"] is None
     assert [row[name] for name in ("missed", "clipped", "limited", "returning", "start_time")] == [None] * 5
 
