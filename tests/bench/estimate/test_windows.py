@@ -47,8 +47,13 @@ def of_machine(e: Estimate) -> dict[str, tuple[float, float]]:
     return found
 
 
-def test_a_machine_that_is_known_only_by_position_and_force_is_found() -> None:
-    found = of_machine(fitted(record(Machine())))
+@pytest.fixture(scope="module")
+def plain() -> Estimate:
+    return fitted(record(Machine()))
+
+
+def test_a_machine_that_is_known_only_by_position_and_force_is_found(plain: Estimate) -> None:
+    found = of_machine(plain)
     for name, true in (("J", 95.0), ("f_v", 200.0), ("T_c", 20.0), ("current_offset", -3.0)):
         assert found[name][0] == pytest.approx(true, rel=0.01)
 
@@ -72,12 +77,11 @@ def test_intervals_cover_the_truth_of_a_machine_under_a_disturbance_that_is_not_
     assert sum(covered) >= 10  # of 12; 11 are expected
 
 
-def test_what_is_estimated_from_one_recording_predicts_another() -> None:
-    e = fitted(record(Machine()))
+def test_what_is_estimated_from_one_recording_predicts_another(plain: Estimate) -> None:
     bench, data = made(record(Machine(), 3.0, phase=1.0))
-    problem = make_problem(bench, e.plant, [data], ASKED)
-    error, _, _ = predict_windows(problem, e.values)
-    wrong, _, _ = predict_windows(problem, e.values * 1.2)
+    problem = make_problem(bench, plain.plant, [data], ASKED)
+    error, _, _ = predict_windows(problem, plain.values)
+    wrong, _, _ = predict_windows(problem, plain.values * 1.2)
     assert error * TRAVEL < 2e-6
     assert wrong > 5.0 * error
 
@@ -132,7 +136,8 @@ def test_windows_that_disagree_widen_the_covariance_and_neighbours_count_togethe
 OPEN = MAP.replace("window = 0.5\n", "")
 
 
-@pytest.mark.parametrize("straight", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("straight", [False, True])
 def test_a_record_chooses_the_course_of_the_command_that_was_simulated(straight: bool) -> None:
     e = fitted(record(Machine(), 4.0, straight=straight), text=OPEN)
     assert e.asked.between == ("linear" if straight else "held")
@@ -156,13 +161,13 @@ def test_a_course_that_the_record_does_not_tell_is_covered_by_the_intervals() ->
 
 
 def test_a_length_and_a_course_that_are_said_are_taken() -> None:
-    data = record(Machine(), 3.0)
-    e = fitted(data, replace(ASKED, window=0.1), OPEN)
-    assert e.asked.window == 0.1
+    data = record(Machine(), 2.0)
+    e = fitted(data, replace(ASKED, window=0.15), OPEN)
+    assert e.asked.window == 0.15
     assert not any("were chosen (tried: " in said for said in e.caveats)
     assert any("the command is held" in said for said in e.caveats)
     for between in ("held", "linear"):
-        text = MAP.replace("window = 0.5", "window = 0.1").replace('unit = "N"', f'unit = "N"\nbetween = "{between}"')
+        text = MAP.replace("window = 0.5", "window = 0.15").replace('unit = "N"', f'unit = "N"\nbetween = "{between}"')
         assert not any(said.startswith("the command ") for said in fitted(data, text=text).caveats)
 
 
