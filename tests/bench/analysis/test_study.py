@@ -142,7 +142,7 @@ def test_an_interval_that_holds_zero_identifies_nothing(bench: Bench) -> None:
 
 
 def test_two_brakes_in_one_call_are_said_to_fit_each_alone(bench: Bench, log: Log) -> None:
-    options = StudyOptions(EstimationProblem(), starts=2, model="exact")
+    options = StudyOptions(EstimationProblem(), starts=1, model="exact")
     first, other = log("plant=exact,seed=1"), log("plant=exact,seed=2,k_m=0.0225")
     study = make_study(bench, [first, other], options)
     assert study.apart[0].name == "k_m"
