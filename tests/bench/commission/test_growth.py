@@ -52,15 +52,20 @@ def test_a_single_experiment_grows_no_model(bench: Bench, tmp_path: Path, simula
     assert found.objections
 
 
-def test_a_plain_brake_stays_plain_and_features_that_do_not_explain_larger_experiments_are_added_to(
-    bench: Bench, tmp_path: Path, simulate: Simulate
-) -> None:
+def test_a_plain_brake_stays_plain(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
     plain = identified(bench, logs_of(tmp_path, simulate, "exact"))
     assert plain.fits
     assert (plain.model, plain.features, plain.jitter) == ("exact", {}, 0.0)
     low, high = plain.intervals["k_m"]
     assert high - low < bench.systematic.inertia * plain.values["k_m"]  # the shield shares the error of J
     assert holds_the_truth(bench, plain)
+
+
+@pytest.mark.slow
+def test_features_that_do_not_explain_larger_experiments_are_added_to(
+    bench: Bench, tmp_path: Path, simulate: Simulate
+) -> None:
+    plain = identified(bench, logs_of(tmp_path, simulate, "exact", (1,)))
     before = replace(plain, model="exact + hysteresis", features={"hysteresis": 0.01})
     found = identified(bench, logs_of(tmp_path, simulate, "cubic"), before)
     assert found.fits
@@ -68,6 +73,7 @@ def test_a_plain_brake_stays_plain_and_features_that_do_not_explain_larger_exper
     assert holds_the_truth(bench, found)
 
 
+@pytest.mark.slow
 def test_a_jitter_of_the_sampling_is_found_where_the_residuals_grow_with_the_speed(
     bench: Bench, tmp_path: Path, simulate: Simulate
 ) -> None:
