@@ -90,7 +90,7 @@ def assert_reproduced(result: Rerun, run: Driven) -> None:
 # --- what happened is reproduced ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("options", ["seed=1", "seed=9", "plant=exact", "plant=stribeck", "plant=lag"])
+@pytest.mark.parametrize("options", ["seed=1", "plant=stribeck", "plant=lag"])
 def test_every_decision_of_the_shipped_actor_is_reproduced_on_every_brake(
     recorded: Callable[..., Driven], bench: Bench, layout: Layout, tmp_path: Path, options: str
 ) -> None:
@@ -429,7 +429,7 @@ def run(tmp_path: Path, bench: Bench, capsys: pytest.CaptureFixture[str]) -> Run
     return execute
 
 
-@pytest.mark.parametrize("stage", [["--zero"], ["--limit", "0.7"], ["--limit", "3"]])
+@pytest.mark.parametrize("stage", [["--zero"], ["--limit", "0.7"]])
 def test_a_run_of_any_stage_is_reproduced_with_its_limit(run: Run, stage: list[str], replay: Replay) -> None:
     result = replay.document("rerun", run(*stage))
     assert (result["decisions"], result["frames"], result["ended"]) == (501, 503, True)
@@ -489,11 +489,12 @@ def test_a_way_home_is_counted_and_timed_like_an_experiment(homed: Path, replay:
     assert timing["samples"] == np.count_nonzero(homing)
 
 
-@pytest.mark.parametrize("command", ["fim", "rerun", "estimate"])
-def test_a_log_of_mere_listening_is_refused_as_a_wrong_use(run: Run, command: str, replay: Replay) -> None:
-    err = replay.refused(command, run("--read-only"))
-    assert "nothing was driven" in err
-    assert "--read-only" in err
+def test_a_log_of_mere_listening_is_refused_as_a_wrong_use(run: Run, replay: Replay) -> None:
+    listened = run("--read-only")
+    for command in ("fim", "rerun", "estimate"):
+        err = replay.refused(command, listened)
+        assert "nothing was driven" in err
+        assert "--read-only" in err
 
 
 def test_a_folder_of_logs_is_searched_for_experiments_only(homed: Path, run: Run) -> None:
