@@ -137,7 +137,10 @@ def followed(kind: str, delay: int, count: int, plant: str = "exact") -> tuple[l
     return found, batch.brakes[:, COLUMNS] / NOMINAL
 
 
-@pytest.mark.parametrize(("kind", "delay"), [("random", 0), ("random", 2), ("constant", 1), ("tuned", 0), ("tuned", 2)])
+AT_NIGHT = [pytest.param(*row, marks=pytest.mark.slow) for row in (("random", 2), ("constant", 1), ("tuned", 0))]
+
+
+@pytest.mark.parametrize(("kind", "delay"), [("random", 0), ("tuned", 2), *AT_NIGHT])
 def test_errors_are_as_large_as_the_filter_says_whatever_the_delay(kind: str, delay: int) -> None:
     found, truth = followed(kind, delay, 200)
     for states in found:
