@@ -31,8 +31,8 @@ def dying(log: Source) -> Row:
         os.kill(os.getpid(), signal.Signals[log.log.partition("-")[0]])
     if log.log.startswith("exit"):
         os._exit(int(log.log[4:]))
-    while log.log.startswith("hang"):
-        pass
+    if log.log == "hang":
+        signal.pause()
     return Row(log.root, log.campaign, log.log, exit_reason=" ".join(os.environ[name] for name in sorted(ONE_THREAD)))
 
 
