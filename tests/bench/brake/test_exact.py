@@ -134,7 +134,7 @@ def oracle(p: BrakeParameters, currents: Floats, x0: tuple[float, float]) -> Flo
 def test_trajectories_are_those_of_a_general_integrator_with_events() -> None:
     happened = Counter[str]()
 
-    @settings(max_examples=250, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+    @settings(max_examples=120, deadline=None, suppress_health_check=list(HealthCheck), database=None)
     @given(cases())
     def property_holds(case: Case) -> None:
         p, currents, x0 = case

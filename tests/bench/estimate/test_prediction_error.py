@@ -205,7 +205,7 @@ def test_a_load_that_walks_is_told_from_a_velocity_that_does(bench: Bench, seed:
 
 def test_on_a_brake_that_nothing_disturbs_it_is_output_error(bench: Bench) -> None:
     plant, currents, still, alarms = bench.plant("exact"), currents_of(bench, "chirp"), 0, 0
-    for seed in range(6):
+    for seed in range(3):
         data = record(bench, plant, currents, seed=seed)
         found = estimate(bench, plant, [data])
         other = fit(bench, plant, [data])
