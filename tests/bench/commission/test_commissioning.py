@@ -154,6 +154,7 @@ def test_it_goes_on_where_the_logs_end_and_comes_to_the_same(done: tuple[Path, C
     assert json.dumps(again.document())
 
 
+@pytest.mark.slow
 def test_a_mapped_drive_is_commissioned_up_to_its_first_move(tmp_path: Path) -> None:
     with pytest.raises(EnoughError):
         on_a_drive(tmp_path, up_to("5-free-stroke")).run()

@@ -67,7 +67,9 @@ def say(run: str, tmp_path_factory: pytest.TempPathFactory) -> Say:
     return of
 
 
-@pytest.mark.parametrize("name", WORKS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "estimate --method pem" else n for n in WORKS]
+)
 def test_a_command_works_and_says_nothing_of_a_loop(name: str, say: Say) -> None:
     for nonsense in ("missed", "unanswered", "returning home", "braked by the node", "nan", "sensor to command"):
         assert nonsense not in say(name).out
