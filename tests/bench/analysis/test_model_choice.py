@@ -46,12 +46,10 @@ def chosen(bench: Bench, true: str, currents: Floats, models: list[str], runs: i
     return choose_model(bench, plants, records, EstimationProblem(), starts=4, seed=0)
 
 
-OTHERS = ("exact", "play", "lag", "offset", "jitter", "observer")
+OTHERS = ("exact", "hysteresis", "play", "lag", "offset", "jitter", "observer")
 
 
-@pytest.mark.parametrize(
-    "true", ["stribeck", "hysteresis", "late", *(pytest.param(n, marks=pytest.mark.slow) for n in OTHERS)]
-)
+@pytest.mark.parametrize("true", ["stribeck", "late", *(pytest.param(n, marks=pytest.mark.slow) for n in OTHERS)])
 def test_the_plant_that_was_there_comes_first_and_tells_its_parameters(bench: Bench, true: str) -> None:
     found = chosen(bench, true, currents_of(bench, "chirp"), list(bench.plants))
     assert found.best.name == true

@@ -78,7 +78,7 @@ def test_a_drift_of_the_stiffness_is_to_prediction_error_a_load_that_walks_whose
     assert low < bench.brake.k_1 < high
 
 
-@pytest.mark.parametrize(("name", "drift"), [("k_1", 0.01), ("k_1", 0.03), ("T_c", 0.03)])
+@pytest.mark.parametrize(("name", "drift"), [("k_1", 0.03), ("T_c", 0.03)])
 def test_the_interval_holds_what_a_drift_that_a_walk_followed_began_and_ended_with(
     bench: Bench, name: str, drift: float
 ) -> None:
