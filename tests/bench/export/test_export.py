@@ -24,20 +24,9 @@ from emb_runtime.config.bench import load_bench
 from emb_runtime.records import CycleRecord, RunState
 
 from tests.bench.conftest import Replay  # isort: skip
+from tests.bench.export.conftest import STEPS  # isort: skip
 from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
-
-STEPS = 30
-
-
-@pytest.fixture
-def run(simulate: Simulate) -> SimRun:
-    return simulate(square, steps=STEPS)
-
-
-@pytest.fixture
-def path(tmp_path: Path, run: SimRun) -> Path:
-    return write_log(tmp_path / "run.mcap", run, steps=STEPS)
 
 
 def export(*arguments: str | Path) -> int:

@@ -21,10 +21,7 @@ from emb_bench.logs.log import read_log
 from emb_runtime.errors import LogError
 
 from tests.bench.conftest import Replay  # isort: skip
-from tests.bench.simulated_logs import square, write_log  # isort: skip
-from tests.conftest import FIXTURE_KEPT, SimRun, Simulate  # isort: skip
-
-STEPS = 60
+from tests.conftest import FIXTURE_KEPT  # isort: skip
 
 
 class Seen(NamedTuple):
@@ -60,16 +57,6 @@ def seen(path: Path) -> Seen:
 
 def facts(messages: list[tuple[str, Message]]) -> list[tuple[Any, ...]]:
     return [(topic, m.log_time, m.publish_time, m.sequence, m.data) for topic, m in messages]
-
-
-@pytest.fixture
-def run(simulate: Simulate) -> SimRun:
-    return simulate(square, steps=STEPS)
-
-
-@pytest.fixture
-def path(tmp_path: Path, run: SimRun) -> Path:
-    return write_log(tmp_path / "run.mcap", run, steps=STEPS)
 
 
 def test_a_cut_log_is_repaired_to_its_last_whole_chunk(path: Path, tmp_path: Path) -> None:
