@@ -36,7 +36,7 @@ def grown(bench: Bench, true: str) -> ModelGrowth:
 
 
 @pytest.mark.parametrize(
-    "true", ["exact", "load", *(pytest.param(n, marks=pytest.mark.slow) for n in PATHS if n not in ("exact", "load"))]
+    "true", [n if n in ("exact", "stribeck") else pytest.param(n, marks=pytest.mark.slow) for n in PATHS]
 )
 def test_the_model_grows_to_the_brake_that_was_there_and_no_further(bench: Bench, true: str) -> None:
     found = grown(bench, true)

@@ -167,7 +167,7 @@ def test_in_contact_it_is_the_damped_oscillator_of_the_textbook() -> None:
     assert delta / math.sqrt(spring / BRAKE.J) == pytest.approx(0.2407, abs=5e-5)  # the thesis's ζ
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(cases())
 def test_the_instants_of_all_events_of_a_period_are_found_by_few_evaluations_of_the_series(case: Case) -> None:
     # A simulated node has a part of its period for them: where a search went on by bisection, its sample came late.
