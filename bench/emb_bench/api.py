@@ -275,9 +275,9 @@ def estimate(
     Args:
         runs: MCAP files of emb-run, of one brake, which are taken together.
         params: parameters to estimate (default: the four of the brake; what the map of a recording guesses).
-        nuisance: unknowns to estimate besides (default: none, or what the map of a recording says).
+        nuisance: further unknowns to estimate (default: none, or what the map of a recording says).
         method: see above (default: oem; windows for a recording).
-        model: plant of the bench to estimate with, or 'all': each is fitted, and the best answers (default: the one
+        model: plant of the bench to estimate with, or 'all': each is fitted, and the best is used (default: the one
             that was simulated; exact where a log does not say).
         grow: begin with the model, or exact, and add the features that the logs ask for.
         systematic: 'bench' also estimates sensor offsets, gain and delay, with priors from [systematic] of the bench
@@ -285,7 +285,7 @@ def estimate(
         prior: name of ranges in the bench file in which the parameters are known to lie (default: none).
         window: length of the windows [s], with method windows (default: what the map says, or 0.5).
         starts: local searches (default: 8).
-        seed: of where they begin (default: 0).
+        seed: seed of the starts of these searches (default: 0).
         profile: likelihood profiles of all parameters (default: of those that are identified badly).
         last: JSON of an earlier estimate or report, to say what has changed since.
         bench: bench file (default: the one in the first log).
@@ -397,10 +397,10 @@ def campaign(
         method: see above, or 'none' for information alone (default: oem).
         model: plant to estimate with (default: the one that was simulated; exact where a log does not say).
         params: parameters to estimate (default: the four of the brake).
-        nuisance: unknowns to estimate besides (default: none).
+        nuisance: further unknowns to estimate (default: none).
         prior: name of ranges in the bench file in which the parameters are known to lie (default: none).
         starts: local searches (default: 8).
-        seed: of where they begin (default: 0).
+        seed: seed of the starts of these searches (default: 0).
         bench: bench file (default: the one in each log).
         jobs: logs at a time (default: one for each processor).
         time_limit: longest time for one log [s]; one that takes longer has failed (default: 600).
@@ -453,9 +453,9 @@ def design(
         theta: the brake's parameters, as name=value,...; the others are nominal.
         model: plant of the bench (default: exact).
         kind: which Fisher information (default: physical).
-        return_home: whether the brake has to come home; else it may end anywhere within the limits.
+        return_home: the brake returns home at the end; else it ends anywhere within the limits.
         starts: coarse searches (default: 18).
-        seed: of the random starts (default: 0).
+        seed: seed of the random starts (default: 0).
         bench: bench file (default: the shipped one).
 
     Returns:
@@ -557,9 +557,12 @@ def _study_options(given: Mapping[str, Any]) -> Callable[[Bench], StudyOptions]:
 
     def of(bench: Bench) -> StudyOptions:
         prior = None if given["prior"] is None else bench.range_set(given["prior"])
+        method = given["method"] or ("oem" if bench.machine is None else "windows")
+        if given["window"] and method != "windows":
+            raise UsageError(f"--window: the method {method} has no windows; leave it out, or add --method windows")
         return StudyOptions(
             EstimationProblem(*_unknowns(*unknowns, bench), prior, window=given["window"]),
-            given["method"] or ("oem" if bench.machine is None else "windows"),
+            method,
             given["model"],
             given["starts"],
             given["seed"],

@@ -38,7 +38,7 @@ from emb_bench.sim.open_loop import feedback
 from emb_bench.sim.simulated_brake import clipped, parse_assignments, sent_current
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.control.actor import Actor
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, near
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.safety.sensor_monitor import CONFIRMED, MEMORY, begin, judge, largest_current
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
@@ -110,7 +110,8 @@ def excitation(name: str, bench: Bench, **parameters: float) -> Excitation:
     known = {parameter.name: parameter for parameter in parameters_of(name, bench)}
     for given in parameters:
         if given not in known:
-            raise UsageError(f"{name}: no parameter '{given}'; expected some of {', '.join(known)}")
+            expected = f"expected some of {', '.join(known)}{near(given, known)}"
+            raise UsageError(f"{name}: no parameter '{given}'; {expected}")
     values = {key: _checked(name, known[key], parameters.get(key, known[key].default)) for key in known}
     built = _SIGNALS[name](bench, **values)
     if not isinstance(built, np.ndarray):
@@ -148,7 +149,7 @@ def parameters_of(name: str, bench: Bench) -> tuple[Parameter, ...]:
         "step": (amplitude(0.25), time("at", 0.0, 0.0)),
     }
     if name not in table:
-        raise UsageError(f"no excitation is called '{name}'; expected one of {', '.join(table)}")
+        raise UsageError(f"no excitation is called '{name}'; expected one of {', '.join(table)}{near(name, table)}")
     return table[name]
 
 

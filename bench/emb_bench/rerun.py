@@ -343,12 +343,12 @@ SHOWN = 10  # Most differences that are printed; JSON has all
 
 HELP = "run the loop again from the log: does it decide the same?"
 DESCRIPTION = """\
-Run the loop of emb-run once more, with the policy, the bench and the DBC that the log carries, on a bus and a clock
-that play what the log recorded. Each decision (policy, clip, shield, what was sent and why), each frame that was sent,
-each safety event and the outcome must come out again, numbers to the last bit. A log that ends before its run does is
-followed as far as it goes.
+Run the control loop again with the policy, bench file and DBC of the log, and compare. Bus and clock give the frames
+and times that the log recorded. Each decision (policy, clip, shield, sent current, its reason), each sent frame, each
+safety event and the outcome must be the same, numbers to the last bit. A cut log is compared up to its end.
 
-Rounding may differ with another ONNX Runtime, numpy, Python or processor; with differences, those of the log are named.
+Rounding may differ with another ONNX Runtime, numpy, Python or processor. If a decision differs, the versions of the
+log are printed too.
 """
 
 

@@ -33,9 +33,8 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = Parser(
         prog="emb-export",
-        description="Write a policy for emb-run as one ONNX file with its contract, and prove that both compute the\n"
-        "same. Source: a reference that follows the running estimate, a sequence of currents, an optimal design,\n"
-        "or the actor of a training.",
+        description="Write a policy for emb-run as one ONNX file with its contract, and check that the file computes\n"
+        "the same as its source: a reference, a sequence of currents, a design, or the actor of a training.",
         epilog=EPILOG.format(sequences=wrapped(list(EXCITATIONS)), references=wrapped(reference_names())),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -74,9 +73,7 @@ def _export(arguments: argparse.Namespace) -> str:
     if is_training and arguments.bench:
         raise UsageError("--bench: a training's actor is for the bench that it was trained on; leave it out")
     if path is None and not is_training:
-        raise UsageError(
-            f"--out: expected a file to write to; only the folder of a training has one, and {source} is none"
-        )
+        raise UsageError(f"{source} is no folder of a training: name the file to write, as in --out actor.onnx")
     if is_training:
         from emb_export.network import network_file
 

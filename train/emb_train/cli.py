@@ -38,7 +38,7 @@ examples:
   emb-train ppo single-viscous --out run && emb-export run
   emb-train evaluate mine/actor.onnx four-d-exact-blind --plant exact
 
-Ctrl-C ends a command and keeps the best so far.
+Ctrl-C ends a command and keeps the best result so far.
 
 exit codes: 0 done, 1 training diverged, 2 usage, 5 an ONNX file is refused, 130 interrupted (Ctrl-C)
 """
@@ -46,27 +46,27 @@ REFERENCE_EPILOG = """\
 tasks:
 {tasks}
 
-DIR becomes reference.json, which emb-export takes, bench.toml and metrics.jsonl. The search begins with the task's
-blind reference, with another one (--begin) or with a kept one (--start). Ctrl-C ends it: the reference so far, or what
-it began with where that is better, is kept.
+DIR contains reference.json (the input of emb-export), bench.toml and metrics.jsonl. The search begins with the task's
+blind reference, with other levels (--begin), or with an earlier reference (--start). Ctrl-C ends it and keeps the best
+reference so far.
 """
 PPO_EPILOG = """\
 presets:
 {presets}
 
-DIR becomes actor.safetensors, the actor that did best on brakes that no training draws; training.json; bench.toml;
-metrics.jsonl. Ctrl-C ends the training: the best actor so far is there.
+DIR contains actor.safetensors (the actor with the best validation), training.json, bench.toml and metrics.jsonl. The
+validation uses brakes that no training draws. Ctrl-C ends the training and keeps the best actor so far.
 """
 EVALUATE_EPILOG = """\
 POLICY: the folder of a training, an ONNX file, 'actor' for the shipped one, a reference's .json file, or one of
 {references}
 
 criteria: D, A and E of the physical information with the prior of +-50 %; 'weighted' is the smallest eigenvalue of the
-thesis's weighted information, for one parameter that information itself. All relative to the true parameters.
+thesis's weighted information. All are relative to the true parameters.
 
-The optimum is what the search of emb-design finds if the brake is known, on the thesis's brakes (euler, exact; a plant
-that differs from exact in its instruments alone is held against exact). It takes minutes for the first brake, a quarter
-of a minute for each other. Ctrl-C ends the evaluation: plants that are done are shown.
+The optimum is the result of emb-design for the known brake. It exists for the plants euler and exact; a plant that
+differs from exact only in its instruments is compared with exact. It takes minutes for the first brake and 15 s for
+each further one. Ctrl-C ends the evaluation and shows the plants so far.
 """
 
 
@@ -92,7 +92,7 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(
         "reference",
-        "learn the reference that a running estimate and a speed loop follow: the main way, in minutes",
+        "learn a reference: speeds that depend on the running estimate (the main way, takes minutes)",
         REFERENCE_EPILOG.format(tasks=listed(TASKS)),
     )
     _add_reference(c)
@@ -104,7 +104,7 @@ def parser() -> argparse.ArgumentParser:
     _add_ppo(c)
     c = command(
         "evaluate",
-        "play policies on fresh brakes, beside every reference excitation and the known-parameter optimum",
+        "compare policies with every reference excitation and the known-parameter optimum, on new brakes",
         EVALUATE_EPILOG.format(references=wrapped(reference_names())),
     )
     _add_evaluate(c)
@@ -125,21 +125,23 @@ def _add_reference(p: argparse.ArgumentParser) -> None:
         default="quadratic",
         help="levels and switches that are constant, or quadratic in the estimate (default: %(default)s)",
     )
-    p.add_argument("--start", metavar="NAME|FILE", help="kept reference to begin with: a packaged one, or a JSON file")
+    p.add_argument("--start", metavar="NAME|FILE", help="reference to begin with: a packaged one, or a JSON file")
     p.add_argument(
-        "--begin", type=_blind, metavar="NUMBERS", help="levels, then switches, such as --begin=1,-1,-0.01,0.3,0.6"
+        "--begin", type=_blind, metavar="NUMBERS", help="levels, then switching times: --begin=1,-1,-0.01,0.3,0.6"
     )
-    p.add_argument("--steps", type=_at_least(1), default=400, metavar="N", help="of evolution (default: %(default)s)")
-    p.add_argument("--plant", default=DEFAULT_PLANT, metavar="NAME", help="of the bench (default: %(default)s)")
+    p.add_argument(
+        "--steps", type=_at_least(1), default=400, metavar="N", help="steps of the search (default: %(default)s)"
+    )
+    p.add_argument("--plant", default=DEFAULT_PLANT, metavar="NAME", help="plant of the brakes (default: %(default)s)")
     _add_late(p)
     p.add_argument(
         "--gain",
         type=_gain,
         default=1.0,
         metavar="X",
-        help="of the speed loop; less than 1 where commands act late (default: %(default)s)",
+        help="gain of the speed loop; less than 1 if commands act late (default: %(default)s)",
     )
-    _add_common(p, "of the search and of the brakes")
+    _add_common(p, "seed of the search and of the brakes")
 
 
 def _add_ppo(p: argparse.ArgumentParser) -> None:
@@ -151,18 +153,26 @@ def _add_ppo(p: argparse.ArgumentParser) -> None:
         metavar="N",
         help="environment steps in total, rounded up to whole iterations (default: the preset's)",
     )
-    p.add_argument("--plant", metavar="NAME", help="plant of the bench that the brakes are (default: the preset's)")
+    p.add_argument("--plant", metavar="NAME", help="plant of the brakes (default: the preset's)")
     _add_late(p)
-    _add_common(p, "of everything random")
+    _add_common(p, "seed of everything random")
 
 
 def _add_evaluate(p: argparse.ArgumentParser) -> None:
-    p.add_argument("policies", nargs="+", metavar="POLICY", help="what is evaluated; several give an interval as well")
-    p.add_argument("--criterion", choices=CRITERIA, default="D", help="by what (default: %(default)s)")
-    p.add_argument("--ranges", metavar="NAME", help="where brakes are drawn from, by name (default: the policy's)")
-    p.add_argument("--draws", type=_at_least(2), default=200, metavar="N", help="brakes (default: %(default)s)")
     p.add_argument(
-        "--plant", default="euler,exact", metavar="NAMES", help="of the bench, or 'all' (default: %(default)s)"
+        "policies", nargs="+", metavar="POLICY", help="policies to evaluate; the first is compared with the others"
+    )
+    p.add_argument(
+        "--criterion", choices=CRITERIA, default="D", help="measure of the information (default: %(default)s)"
+    )
+    p.add_argument(
+        "--ranges", metavar="NAME", help="name of the ranges that brakes are drawn from (default: the policy's)"
+    )
+    p.add_argument(
+        "--draws", type=_at_least(2), default=200, metavar="N", help="number of brakes (default: %(default)s)"
+    )
+    p.add_argument(
+        "--plant", default="euler,exact", metavar="NAMES", help="plants of the bench, or 'all' (default: %(default)s)"
     )
     p.add_argument(
         "--optimum",
@@ -174,7 +184,7 @@ def _add_evaluate(p: argparse.ArgumentParser) -> None:
     p.add_argument("--json", action="store_true", help="print JSON, with the values of every draw")
     p.add_argument("--out", type=Path, metavar="DIR", help="also write evaluation.txt and evaluation.json there")
     _add_late(p)
-    _add_common(p, "of brakes and noise; never those of a training")
+    _add_common(p, "seed of brakes and noise, which no training uses")
 
 
 def _add_late(p: argparse.ArgumentParser) -> None:
@@ -184,7 +194,7 @@ def _add_late(p: argparse.ArgumentParser) -> None:
         nargs=2,
         metavar=("LEAST", "MOST"),
         default=(0, 0),
-        help="of each experiment, beside the plant's own; the shield covers it [samples] (default: 0 0)",
+        help="delay of the commands, drawn for each experiment and covered by the shield [samples] (default: 0 0)",
     )
 
 

@@ -257,7 +257,7 @@ def _scene(a: Settings) -> str:
         f"{a.measure.label} of {', '.join(a.parameters)}, relative to the true values; {a.draws} brakes drawn from the "
         f"ranges '{a.ranges}' for evaluation alone, seed {a.seed}; the same brakes and noise for all, all behind the "
         f"same {shield}. Brackets are 95 % intervals over the draws. 'left': experiments that left the limits and were "
-        "stopped there; 'home': share that ended at the origin; 'ahead': the first policy's measure less that of the "
+        "stopped there; 'home': share that ended at the origin; 'ahead': the first policy's measure minus that of the "
         f"line, paired by draw.{own if c.varies else ''}"
     )
 

@@ -210,7 +210,8 @@ def load_training(folder: Path) -> Trained:
             msgspec.json.decode(read_bytes(folder / CONFIGURATION, LARGEST_FILE)), f"{folder / CONFIGURATION}"
         )
     except (OSError, msgspec.DecodeError) as err:
-        raise UsageError(f"{folder}: not the folder of a training: cannot read {CONFIGURATION}: {err}") from err
+        why = err.strerror if isinstance(err, OSError) else err
+        raise UsageError(f"{folder}: not the folder of a training: cannot read {CONFIGURATION}: {why}") from err
     bench = load_bench(folder / BENCH)
     actor = training.untrained_actor(bench)
     try:

@@ -13,7 +13,7 @@ from emb_bench.analysis.several_runs import Constancy, constancy
 from emb_bench.batch.row import NONE, Options, Parameter, Row, is_relative, unit_of
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE, NORMAL_95
-from emb_bench.numbers import NOTHING, plain
+from emb_bench.numbers import NOTHING, plain, spread
 from emb_bench.report.sentences import INTERVALS, p_value
 from emb_bench.report.text import Table, listed, wrapped
 
@@ -203,7 +203,8 @@ def _agreement(c: Campaign) -> Iterator[str]:
         yield f"the runs agree on {', '.join(agreed)}"
     for name, test in several.items():
         if not test.constant:
-            yield f"{name}: the runs do NOT agree ({p_value(test.p_value)}); scatter {test.scatter:.3g} times as stated"
+            scatter = f"scatter {test.scatter:.3g} times the stated one"
+            yield f"{name}: the runs do NOT agree ({p_value(test.p_value)}); {scatter}"
 
 
 def _notes(c: Campaign) -> Iterator[str]:
@@ -235,4 +236,4 @@ def parameter_table(c: Campaign) -> Table:
 
 def _share(half: float, size: float) -> str:
     """Half an interval: in percent of a size, or as it is where the size is 0."""
-    return f"{plain(100.0 * half / abs(size), 2)} %" if size else plain(half, 2)
+    return spread(half / abs(size), True, 2) if size and math.isfinite(half) else plain(half, 2)

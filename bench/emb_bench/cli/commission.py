@@ -12,16 +12,16 @@ from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import Parser, as_json, complain, mention, show
 
 EPILOG = """\
-Each step is a run of emb-run behind shield, guard and watchdog, with its policy and its log in DIR, and rests on what
-those before it have found. The same command goes on with the first step that has no completed log. The bench file that
-is found is DIR/bench.toml.
+Each step is a run of emb-run behind shield, guard and watchdog, and uses the results of the steps before. Its policy
+and log are in DIR. After an interruption the same command continues with the first step that has no completed log. The
+result is the bench file DIR/bench.toml.
 
 exit codes:
   0    done
-  2    usage: wrong argument, a file that cannot be read or written, a parameter outside of the data sheet's ranges
+  2    usage: wrong argument, a file that cannot be read or written, a parameter outside the data sheet's ranges
   3    a step was stopped, or contradicts the data sheet
-  4 to 8 as emb-run, whose run ended so
-  130  Ctrl-C while a log was examined
+  4 to 8  exit code of an emb-run that failed
+  130  Ctrl-C while a log was evaluated
 """
 
 
@@ -43,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
     asking.add_argument("--yes", action="store_true", help="do not ask")
     p.add_argument("--json", action="store_true", help="print the result as JSON")
     p.add_argument("--version", action="version", version=f"emb-commission {metadata.version('emb-excite')}")
-    each = p.add_argument_group("for each run of emb-run, see there")
+    each = p.add_argument_group("passed to each emb-run (see emb-run --help)")
     for option, value in (("--drive", "FILE@BUS"), ("--operator", "NAME"), ("--serial", "TEXT")):
         each.add_argument(option, metavar=value)
     for option in ("--no-rt", "--no-watchdog", "--long-timeouts"):
@@ -75,7 +75,7 @@ def main(argv: list[str] | None = None) -> int:
             raise UsageError(f"{err}; pip install 'emb-excite[bench]'") from err
         each = options(args)
         if "--confirm" in each and (sys.stdin is None or not sys.stdin.isatty()):
-            raise UsageError("--confirm: there is nobody to ask, standard input is no terminal; --yes does not ask")
+            raise UsageError("--confirm: expected a terminal on standard input; --yes runs without asking")
         try:
             args.folder.mkdir(parents=True, exist_ok=True)
             result = Commissioning(args.folder, sheet, args.iface, each, emb_run, mention).run()

@@ -14,9 +14,9 @@ from emb_runtime.errors import EXIT_DONE, EmbError
 from emb_runtime.system.terminal import Parser, complain
 
 EPILOG = """\
-The parameters are taken as known: a design measures how good an excitation can be. It
-excites no brake whose parameters are unknown: on another one it leaves the limits. The
-best of many local optima is given.
+A design is for known parameters: it shows how good an excitation can be. Do not use it on
+a brake with other parameters, which would leave its limits. The result is the best of many
+local optima.
 
 criteria: D log det M, A tr M^-1, E smallest eigenvalue.
 

@@ -13,11 +13,11 @@ from emb_bench.live.serve import HOST, PORT, Server
 from emb_runtime.errors import EXIT_DONE, LogError, UsageError
 from emb_runtime.system.terminal import mention
 
-HELP = "shows runs while they go on: on a page in the browser, or in Foxglove"
+HELP = "show runs while they go on: on a page in the browser, or in Foxglove"
 DESCRIPTION = """\
-Follow the logs that appear in a folder, as they are written: on a page of the browser, and for Foxglove and Lichtblick
-over the Foxglove WebSocket protocol (open the address as a connection, with the layout of the documentation). It only
-reads files, and a run is the same with it and without. Ctrl-C ends it. emb-run --live shows one run.
+Show the logs that appear in a folder while they are written: on a page in the browser, and in Foxglove and Lichtblick
+over the Foxglove WebSocket protocol (open the address as a connection, with the layout of the documentation). The
+command only reads files and does not affect a run. Ctrl-C ends it. emb-run --live shows one run.
 """
 
 
@@ -25,7 +25,7 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options."""
     p.add_argument(
         "place", type=Path, nargs="?", default=Path("runs"), metavar="DIR|LOG",
-        help="folder whose new logs are shown, or one log; it need not exist yet, where it lies must (default: runs/)",
+        help="folder whose new logs are shown, or one log; its parent folder must exist (default: runs/)",
     )  # fmt: skip
     p.add_argument("--host", default=HOST, help="address to listen at (default: %(default)s, this computer only)")
     p.add_argument("--port", type=int, default=PORT, help="port to listen at; 0 for a free one (default: %(default)s)")

@@ -183,12 +183,12 @@ def _command(
 
 MEANINGS: Mapping[int, str] = {
     EXIT_DONE: "done",
-    EXIT_CHECK_FAILED: "a check failed; or a log was left out or failed, and is named",
-    EXIT_USAGE: "usage: wrong argument, a file that cannot be read or written, a missing library, nothing to judge by",
+    EXIT_CHECK_FAILED: "a check failed, or a log could not be used (it is named)",
+    EXIT_USAGE: "usage: wrong argument, a file that cannot be read or written, a missing library, or no budgets",
     EXIT_POLICY_REFUSED: "the policy in the log is refused",
     EXIT_LOG: "not a log, or too damaged or too short for a result",
     EXIT_CANNOT_TELL: "--strict: not every acceptance criterion can be decided",
-    EXIT_OUTSIDE: "--strict: the brake is outside of the ranges for which the limits are guaranteed",
+    EXIT_OUTSIDE: "--strict: the brake is outside the ranges for which the limits are guaranteed",
     EXIT_INTERRUPTED: "Ctrl-C: nothing is written",
 }
 """Exit codes and their meanings."""
@@ -201,10 +201,10 @@ COMMANDS: Mapping[str, tuple[Command | str, Collection[int]]] = {
         _command(
             api.fisher_information,
             _fim,
-            "Intervals are the Cramer-Rao bound of sensors that have noise and no systematic error: no\n"
+            "Intervals are the Cramer-Rao bound for sensors with noise and without systematic errors: no\n"
             "method can do better. emb-replay estimate also estimates the systematic errors of the\n"
-            "bench file, so that its repeatability is larger. With -v the criteria over time, and\n"
-            "the information as the thesis weights it.\n",
+            "bench file, so its repeatability is larger. -v adds the criteria over time, and the\n"
+            "information as the thesis weights it.\n",
         ),
         OF_A_LOG,
     ),
@@ -212,11 +212,11 @@ COMMANDS: Mapping[str, tuple[Command | str, Collection[int]]] = {
         _command(
             api.estimate,
             _estimate,
-            "The verdict on the model comes first; then each parameter, what limits its interval,\n"
-            "and the next step. Of several logs, each is also predicted from the others.\n"
+            "The verdict on the model comes first, then each parameter, the largest part of its\n"
+            "uncertainty, and the next step. Of several logs, each is also predicted from the others.\n"
             f"{METHODS}\nunknowns for --nuisance, besides the parameters:\n"
             + "".join(f"  {name:17} {row.about}\n" for name, row in PARAMETERS.items() if row.about),
-            strict=f"exit with 1 if {MISFIT}; else with {EXIT_OUTSIDE} if the brake is outside of the shield's ranges",
+            strict=f"exit with 1 if {MISFIT}; else with {EXIT_OUTSIDE} if the brake is outside the shield's ranges",
         ),
         (*CHECKED, EXIT_OUTSIDE),
     ),
@@ -224,9 +224,9 @@ COMMANDS: Mapping[str, tuple[Command | str, Collection[int]]] = {
         _command(
             api.report,
             _report,
-            "The verdict comes first, then what it rests on. The page needs nothing but itself, on\n"
-            "the screen and on paper. A log that cannot be used is named and left out; a run without\n"
-            f"an experiment is reported without an estimate.\n{UNKNOWNS}",
+            "The verdict comes first, then the evidence. The page is one file for screen and paper. A\n"
+            "log that cannot be used is named and left out. A run without an experiment is reported\n"
+            f"without an estimate.\n{UNKNOWNS}",
             strict=f"exit with {EXIT_CHECK_FAILED} if a criterion failed, else {EXIT_CANNOT_TELL} if one is not "
             f"decided; without --acceptance as emb-replay estimate does",
         ),
@@ -236,10 +236,10 @@ COMMANDS: Mapping[str, tuple[Command | str, Collection[int]]] = {
         _command(
             api.campaign,
             _campaign,
-            "A row says what the run was, its Fisher information at the bench's nominal brake, and\n"
-            "an estimate of the parameters. A log that cannot be evaluated becomes a row with the\n"
-            "reason. The rows are the same however many processes or machines made them; on a Ray\n"
-            f"cluster all machines need emb-excite and the logs at the same paths.\n{UNKNOWNS}",
+            "A row has the identity of the run, its Fisher information at the bench's nominal brake,\n"
+            "and an estimate of the parameters. A log that cannot be evaluated becomes a row with the\n"
+            "reason. The rows do not depend on the number of processes or machines. On a Ray cluster\n"
+            f"all machines need emb-excite and the logs at the same paths.\n{UNKNOWNS}",
         ),
         CHECKED,
     ),
@@ -248,10 +248,10 @@ COMMANDS: Mapping[str, tuple[Command | str, Collection[int]]] = {
         _command(
             timing,
             _timing,
-            "How long each part of a control cycle took, from the stamps that the run made itself:\n"
-            "sample to sample, sample to loop, deciding, sending, sensor to command, and the time to\n"
-            "spare until the answer would have come too late. Judged by the [budgets] of the bench\n"
-            "description inside the log. Simulated time says nothing of a computer and is not judged.\n",
+            "How long each part of a control cycle took, by the time stamps in the log: sample to\n"
+            "sample, sample to loop, decision, sending, sensor to command, and the time left before\n"
+            "the answer would have been late. The times are compared with [budgets] of the bench file\n"
+            "in the log. Simulated time is not judged.\n",
         ),
         CHECKED,
     ),

@@ -64,12 +64,10 @@ class Commissioned:
 
     def __str__(self) -> str:
         one = self.identified
-        fits = (
-            "the residuals do not speak against it" if one.fits else f"NO model explains the experiments{one.reasons()}"
-        )
-        lines = [f"done: {len(self.logs)} steps, {self.runs} runs now; model {one.model}: {fits}"]
+        fits = "the residual tests accept it" if one.fits else f"NO model explains the experiments{one.reasons()}"
+        lines = [f"done: {len(self.logs)} steps, {self.runs} new runs; model {one.model}: {fits}"]
         lines += [f"  {name:<4} {low:.5g} to {high:.5g} {one.units[name]}" for name, (low, high) in self.ranges.items()]
-        return "\n".join([*lines, f"  bench file {self.bench}: each number in it says where it comes from"])
+        return "\n".join([*lines, f"  bench file {self.bench}: a comment behind each measured number gives its source"])
 
 
 class Commissioning:
@@ -103,7 +101,7 @@ class Commissioning:
             finding = row.examine(log, self._experiments(), self._sheet, found)
             found = row.judge(finding, self._sheet, found)
             self._logs[name] = log
-            self._say(f"  found: {finding or 'nothing to object to'}")
+            self._say(f"  found: {finding or 'no fault'}")
         assert found.identified is not None
         ranges = measured_ranges(self._sheet, found.identified)
         return Commissioned(self._folder / FOUND, ranges, found, tuple(self._logs.values()), self._runs)
@@ -151,12 +149,12 @@ class Commissioning:
     # --- runs -------------------------------------------------------------------------------------------------------
 
     def _run(self, step: Step, bench: Bench, found: Findings) -> Path:
-        self._say(f"{step.name}: {step.purpose}\n  relies on {step.rests_on}")
+        self._say(f"{step.name}: {step.purpose}\n  uses {step.rests_on}")
         path = self._folder / (FOUND if step.name == FULL else WORKING)
         if bench.identity_hash != self._identity:
             self._identity = bench.identity_hash
             identity = bench_identity(bench.identity_hash)
-            self._say(f"  the node has to be set up for {path}, bench identity {identity:#06x}")
+            self._say(f"  set up the node for {path}, bench identity {identity:#06x}")
         policy, log = self._folder / f"{step.name}.onnx", self._attempts(step.name)[-1]
         policy.write_bytes(policy_file(step, bench))
         arguments = ["--iface", simulated(self._iface, self._sheet, self._runs), "--bench", str(path)]

@@ -66,11 +66,11 @@ def break_away(bench: Bench) -> tuple[float, float]:
 
 
 def _listen(name: str, work: Bench, _: Findings) -> Step:
-    return Step(name, "listen, send nothing", "nothing", LISTENING, _everywhere(work), ("--read-only",))
+    return Step(name, "listen, send nothing", "no earlier step", LISTENING, _everywhere(work), ("--read-only",))
 
 
 def _chain(name: str, work: Bench, _: Findings) -> Step:
-    return Step(name, "the whole chain with 0 A", "noise and clock at rest", SHORT, _everywhere(work), ("--zero",))
+    return Step(name, "the whole chain with 0 A", "noise and clock of step 1", SHORT, _everywhere(work), ("--zero",))
 
 
 def _current(name: str, work: Bench, _: Findings) -> Step:
@@ -78,7 +78,7 @@ def _current(name: str, work: Bench, _: Findings) -> Step:
     return Step(
         name,
         f"sign, scale and latency of the current with {1e3 * amplitude:.0f} mA, which moves no brake of the data sheet",
-        "least friction and strongest motor of the data sheet",
+        "the data sheet's least friction and strongest motor",
         SHORT,
         Window(-work.shield.home_angle, work.shield.home_angle, work.shield.home_velocity),
         ("--limit", repr(amplitude)),  # no way home with a current whose sign and scale are not known yet
@@ -93,7 +93,7 @@ def _first_move(name: str, work: Bench, _: Findings) -> Step:
     return Step(
         name,
         f"a current that rises to {most:.2f} A at most until the brake moves, in either direction",
-        "greatest friction and weakest motor of the data sheet; sign and scale of the current",
+        "the data sheet's greatest friction and weakest motor; sign and scale of the current",
         work.timing.duration,
         Window(-1.0, 1.0, 10.0),
         ("--limit", repr(most), "--home"),
@@ -121,9 +121,9 @@ def _full(name: str, bench: Bench, _: Findings) -> Step:
     window = Window(0.7 * limits.angle[0], REACH * limits.angle[1], FULL_SPEED * limits.velocity)
     return _excited(
         name,
-        f"an experiment with the bench file that was found: {limits.current:g} A, up to {window.highest:.0f} rad and "
+        f"an experiment with the new bench file: {limits.current:g} A, up to {window.highest:.0f} rad and "
         f"{window.speed:.0f} rad/s",
-        "all of it",
+        "all results",
         bench,
         window,
         limits.current,

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 from msgspec import Meta
 
 from emb_runtime.config.typed import SMALLEST, key_text, read, shown
-from emb_runtime.errors import BenchFileError
+from emb_runtime.errors import BenchFileError, near
 
 Solver = Literal["euler", "exact"]
 SOLVERS: tuple[Solver, ...] = get_args(Solver)
@@ -96,7 +96,10 @@ def read_plant(name: str, document: Mapping[str, Any], source: str) -> Plant:
     solver = document.get("solver", "exact")
     if solver not in SOLVERS:
         raise BenchFileError(f"{at}.solver: expected one of {', '.join(SOLVERS)}, got {shown(solver)}")
-    # Features of the mechanics; what is none of them is of the instruments, or unknown.
+    known = {*Mechanics._fields, *Instruments._fields}
+    if unknown := [key for key in document if key not in known]:
+        expected = f"expected some of {', '.join(sorted(known))}{near(unknown[0], known)}"
+        raise BenchFileError(f"{at}.{key_text((unknown[0],))}: unknown key; {expected}")
     features = {key: value for key, value in document.items() if key in Mechanics._fields}
     features["solver"] = SOLVERS.index(solver)
     others = {key: value for key, value in document.items() if key not in Mechanics._fields}

@@ -18,7 +18,7 @@ from emb_bench.experiment.experiment import Experiment
 from emb_runtime.errors import UsageError
 
 IDEAL_SENSORS = (
-    "the bench's systematic errors ([systematic]) are not estimated along by this method, and its intervals do not "
+    "the bench's systematic errors ([systematic]) are not estimated by this method, and its intervals do not "
     "allow for them; --method oem does so"
 )
 """Caveat of a method that has no unknowns for systematic errors."""

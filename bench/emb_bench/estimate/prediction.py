@@ -412,5 +412,5 @@ def too_few(plant: Plant, asked: EstimationProblem, samples: int, records: int) 
     if samples * outputs >= unknowns:
         return ""
     asked_for = len(replace(asked, systematic={}).unknowns(records))
-    also = f" and the {unknowns - asked_for} that are estimated along" if unknowns > asked_for else ""
+    also = f" and {unknowns - asked_for} systematic errors" if unknowns > asked_for else ""
     return f"{'1 sample is' if samples == 1 else f'{samples} samples are'} too few for {asked_for} unknowns{also}"

@@ -328,4 +328,4 @@ def explained(s: Suspect, machine: Machine | None = None) -> str:
     said = effect.effect
     for parameter in PARAMETER_NAMES:
         said = said.replace(parameter, quantity(machine, parameter).name)
-    return f"{said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma): {effect.remedy}"
+    return f"{said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma); remedy: {effect.remedy}"

@@ -63,4 +63,4 @@ def write_mjcf(log: RunLog, theta: str, path: Path) -> str:
     text = mjcf(log.bench, brake)
     with replacing(path) as beside:
         beside.write_text(text, encoding="utf-8")
-    return f"a model of MuJoCo, parameters: {name}"
+    return f"a MuJoCo model, parameters: {name}"

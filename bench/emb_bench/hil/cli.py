@@ -40,12 +40,12 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--host", action="store_true", help="only on this kernel")
-    where.add_argument("--uml", action="store_true", help="always in a User-Mode Linux kernel")
+    where.add_argument("--host", action="store_true", help="use this kernel or fail")
+    where.add_argument("--uml", action="store_true", help="always use a User-Mode Linux kernel")
     parser.add_argument("--root", action="store_true", help="the command is root in the kernel (not on the host)")
     parser.add_argument("--slow", type=int, default=1, metavar="N",
-                        help="--uml, N times slower than this computer, which then disturbs it N times less; "
-                        "idle time is skipped (default 1: real time)")  # fmt: skip
+                        help="--uml with a clock N times slower, so that delays of this computer count N times "
+                        "less; idle time is skipped (default 1: real time)")  # fmt: skip
     parser.add_argument("--timeout", type=float, metavar="S", help="end the command after S seconds, start-up included")
     parser.add_argument("--memory", type=int, default=2048, metavar="MB", help="memory of the kernel (default 2048)")
     return parser

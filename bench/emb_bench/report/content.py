@@ -33,7 +33,7 @@ REASONS = {
     Reason.LIMITED: "kept inside the limits by the shield",
     Reason.RETURNING: "the shield returns home",
     Reason.MISSED: "no sample in time, nothing sent",
-    Reason.LEFT: "out of reach of slew or limit, left to the node",
+    Reason.LEFT: "needed current beyond slew or limit: the node brakes",
 }
 """Reasons for which the sent current differs from the one that the policy requested, in words."""
 
@@ -166,7 +166,7 @@ class Content:
         """Reason for each log that was given and not used, beginning with its name."""
         return [
             *(f"{entry.path.name}: left out: {entry.words}" for entry in self.left_out),
-            *(f"{run.name}: takes no part in the estimate: {run.why_not}" for run in self.runs if run.why_not),
+            *(f"{run.name}: not used in the estimate: {run.why_not}" for run in self.runs if run.why_not),
         ]
 
     @property

@@ -116,7 +116,7 @@ def _mark_stop(axis: Any, cycles: ActiveCycles, after: StopSamples) -> None:
     side, shift = ("right", -3) if _end(cycles) > 0.3 * after.end else ("left", 3)
     axis.axvline(at, color=STOP, linewidth=1.4)
     place: Any = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "xytext": (shift, 0)}
-    axis.annotate("stopped", (at, 0.03), ha=side, va="bottom", fontsize=8.0, color=STOP, **place)
+    axis.annotate("stopped", (at, 0.7), ha=side, va="bottom", fontsize=8.0, color=STOP, **place)
 
 
 def applied_as_sent(run: Run) -> bool:

@@ -33,7 +33,7 @@ def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
         ("response", _delays(d)),
     )
     if estimate := d.get("estimate"):
-        lines += ["", *wrapped("estimated while running; ± is half of the 95 % interval, if the model is right", 0)]
+        lines += ["", *wrapped("running estimate ± 95 % (k=2), valid if the model is right", 0)]
         lines += [
             f"  {name}  {around(q['value'], NORMAL_95 * q['deviation'])} {q['unit']}" for name, q in estimate.items()
         ]
@@ -72,7 +72,7 @@ def _loop(c: Mapping[str, int]) -> tuple[tuple[str, str], ...]:
         (
             "commands",
             f"{c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home, "
-            f"{c['left']} left to the node",
+            f"{c['left']} braked by the node",
         ),
     )
 
@@ -101,7 +101,7 @@ def _listed(title: str, entries: Mapping[str, str]) -> list[str]:
 
 def _why(end: Mapping[str, str]) -> str:
     """Reasons of the loop and of the node."""
-    said = [end.get("detail", ""), f"the node's stop reason: {end['node_stop_reason']}" if _stopped(end) else ""]
+    said = [end.get("detail", ""), f"stop reason of the node: {end['node_stop_reason']}" if _stopped(end) else ""]
     return f" ({'; '.join(filter(None, said))})" if any(said) else ""
 
 
@@ -132,9 +132,9 @@ def run_timing(log: RunLog) -> RunTiming:
     t = timing(log)
     budgets = log.bench.budgets
     if t.simulated:
-        return RunTiming(log, t, (), "simulated time says nothing about a computer or bus")
+        return RunTiming(log, t, (), "the time is simulated")
     if ran := log.metadata.get("emb.run", {}).get("time"):
-        return RunTiming(log, t, (), f"time ran {ran} and says nothing about a computer or bus")
+        return RunTiming(log, t, (), f"the time ran {ran}")
     if budgets is None:
         return RunTiming(log, t, (), "the bench description in the log has no [budgets]")
     checks = tuple(judge(t, budgets))

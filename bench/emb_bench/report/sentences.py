@@ -64,7 +64,10 @@ def headline(study: Study) -> str:
             "Noise biases its values; the model is not tested. Use --method oem."
         )
     if not study.model_fits:
-        return f"THE MODEL '{name}' DOES NOT FIT: its best values follow, but their intervals do not include its error."
+        return (
+            f"THE MODEL '{name}' DOES NOT FIT: the best values follow, but their intervals do not include the error "
+            "of the model."
+        )
     if not study.predicts:
         return f"THE MODEL '{name}' DOES NOT PREDICT other records: the values hold only for their own records."
     if study.identified:
@@ -272,7 +275,9 @@ def remedies(study: Study) -> list[str]:
     else:
         found = ["use the intervals: they come from the scatter of the windows, and do not need a right model"]
     if study.suspects:
-        found.append(f"or correct what the residuals point to: {shown_as(study.suspects[0], e.bench.machine).name}")
+        found.append(
+            f"or correct the largest effect in the residuals: {shown_as(study.suspects[0], e.bench.machine).name}"
+        )
     if e.method == "oem":
         found.append("if no model explains the record, something may disturb the brake: --method pem")
     return found

@@ -13,7 +13,7 @@ from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
 from emb_bench.estimate.records import NORMAL_95
 from emb_bench.estimate.suspects import shown_as
 from emb_bench.information.identifiability import TRADED_OFF
-from emb_bench.numbers import NOTHING, SMALL, amount, around, chance, percent, plain, share, signed
+from emb_bench.numbers import NOTHING, SMALL, amount, around, chance, percent, plain, share, signed, spread
 from emb_bench.report.sentences import drift, limit
 from emb_bench.report.text import Cell, Table
 
@@ -67,7 +67,7 @@ def _half(half: float, size: float) -> str:
     """Half an interval: in percent of a size, or as it is where the size is 0."""
     if not math.isfinite(half):
         return NOTHING
-    return f"{plain(100.0 * half / abs(size), 2)} %" if size else plain(half, 2)
+    return spread(half / abs(size), True, 2) if size and math.isfinite(half) else plain(half, 2)
 
 
 def _errors(study: Study) -> list[list[str]]:
@@ -148,8 +148,8 @@ def budget(study: Study) -> Table:
         )
     header = ["parameter", "noise", "sensors", "J, angle", "effects", "total", "by residuals", "largest"]
     title = (
-        "Uncertainty budget, each half of a 95 % interval (k=2): sensor noise, systematic errors of the sensors, "
-        "inertia and scale of the angle, effects that the record cannot exclude; by the scatter of the residuals"
+        "Uncertainty budget, each half of a 95 % interval (k=2). Noise and systematic errors of the sensors; inertia "
+        "and scale of the angle; effects that the record cannot exclude. For comparison: from the scatter of the residuals"
     )
     return Table(title, header, rows, words=(0, 7))
 

@@ -136,7 +136,8 @@ def parse_assignments(text: str, option: str = "") -> dict[str, str]:
     for item in filter(None, (part.strip() for part in text.split(","))):
         name, equals, value = (part.strip() for part in item.partition("="))
         if not equals or not name or not value:
-            raise UsageError(f"{option}expected name=value,name=value, got '{item}'")
+            point = "; write numbers with a point" if item[:1].isdigit() else ""
+            raise UsageError(f"{option}expected name=value,name=value, got '{item}'{point}")
         if name in pairs:
             raise UsageError(f"{option}'{name}' is given twice")
         pairs[name] = value

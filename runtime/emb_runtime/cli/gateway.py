@@ -29,17 +29,19 @@ LOOK = 0.05  # Time between two looks at the keyboard [s]
 LOOK_NS = 200_000  # Time between two looks at a bus that cannot be waited for [ns]
 LONGEST_WAIT_NS = 10_000_000  # Time between two looks at the operator's end [ns]
 DESCRIPTION = """\
-Put a node that speaks emb.dbc between a drive that does not, on one bus, and emb-run, on another. The drive is armed by
-the mapping file's sequence, after it has proved that it lets go by its own time-out, and is armed as long as this runs:
-it gets 0 A while no run commands it. The node brakes by itself as any node, and a second guard reads each frame that
-leaves. After a stop that emb-run did not ask for the drive is let go, and this ends.
+Translate between a drive with a protocol of its own, on one bus, and emb-run with emb.dbc, on another bus.
+
+The gateway first tests that the drive's own time-out switches the current off. Then it arms the drive by the sequence
+of the mapping file. The drive stays armed until the gateway ends; without a run it gets 0 A. The gateway is a node: it
+brakes by itself if no command comes. A second guard checks each frame to the drive. After a stop that emb-run did not
+request, the gateway disarms the drive and ends.
 """
 EPILOG = """\
 exit codes:
-  0  ended by Ctrl-C or SIGTERM, the drive is let go
-  1  the same, but answers acted later than shield.frame_age declares
+  0  ended by Ctrl-C or SIGTERM, the drive is disarmed
+  1  the same, but commands acted later than shield.frame_age declares
   2  usage: wrong argument, a file that is refused
-  3  the drive was let go: a stop that emb-run did not ask for, sensors that contradict each other, a refused frame
+  3  drive disarmed after a stop that emb-run did not request, sensors that contradict each other, or a refused frame
   4  a bus is lost, or the drive cannot be armed
 """
 
@@ -55,7 +57,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("mapping", type=Path, metavar="FILE", help="mapping file of the drive (TOML)")
     p.add_argument("--drive", required=True, metavar="BUS", help="bus of the drive: can0")
     p.add_argument("--node", required=True, metavar="BUS", help="bus of the node: vcan0, can1")
-    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description, that of emb-run")
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench file, the same as for emb-run")
     p.add_argument(
         "--serial", default="", metavar="TEXT", help="serial number on the drive, which has no other identity"
     )

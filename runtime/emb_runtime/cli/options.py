@@ -46,16 +46,18 @@ with --json:
   too; an earlier error prints only a line on standard error.
 
 the simulated bus:
-  --iface sim:KEY=VALUE,... where KEY is seed, of the sensors' noise (default 1); plant, one of the bench file's
-  (default exact); a parameter of the true brake: k_m, k_1, T_c, f_v (default nominal); angle_noise,
-  velocity_noise, standard deviations of its sensors (default: the bench file's); or charge, 1 for a node that
-  sends the integral of its current along (default 0).
+  --iface sim:KEY=VALUE,... with the keys
+    k_m, k_1, T_c, f_v          true parameters of the brake, SI units (default: nominal)
+    plant                       plant of the bench file (default: exact)
+    seed                        seed of the sensor noise (default: 1)
+    angle_noise, velocity_noise standard deviations of the sensors [rad, rad/s] (default: the bench file's)
+    charge                      1: the node also sends the integral of its current (default: 0)
 
 exit codes:
   0  the experiment was completed, and its log is whole; with --read-only: the node is ready
   1  with --read-only: too many samples of the node are missing
   2  usage: wrong argument, unreadable file, bench file refused, log cannot be written
-  3  safety stop: a fault, Ctrl-C or SIGTERM ended the run with stop frames, or came before anything was sent
+  3  safety stop: a fault, Ctrl-C or SIGTERM ended the run; stop frames were sent unless nothing had been sent before
   4  bus: the interface cannot be opened, was lost, or no node is on it
   5  the policy was refused: damaged, or made for another bench
   6  the experiment was completed, but its log is not whole (disk full, recorder killed)
@@ -69,7 +71,7 @@ examples:
   emb-run --iface sim:plant=stribeck                one of the plants in the bench file (--write-bench shows them)
   emb-run --iface can0 --read-only --duration 10    first contact with a bench: what is on the bus
   emb-run --iface can0 --zero                       second: the whole chain, but 0 A
-  emb-run --iface can0 --limit 1 --home             third: at most 1 A, and back to the origin if it ends elsewhere
+  emb-run --iface can0 --limit 1 --home             third: at most 1 A, and back to the origin afterwards
   emb-run --iface can0 --quick                      all four parameters to about 1 % in a tenth of a second
   emb-run --quick --stop-when k_1=1%,f_v=5%         ends when these two are precise enough
   emb-hil --slow 100 -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0'
@@ -157,16 +159,16 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     what.add_argument(
         "--drive", metavar="FILE@BUS",
-        help="the node is emb-gateway, for the drive of this mapping file: the pre-flight and the log have what the "
-        "drive lacks, and the log the frames of its bus, to which nothing is sent",
+        help="the node is an emb-gateway with this mapping file; the pre-flight lists missing properties of the drive, "
+        "and the log also records the drive's bus, to which emb-run sends nothing",
     )  # fmt: skip
     actor = what.add_mutually_exclusive_group()
     actor.add_argument("--policy", type=Path, metavar="FILE", help="actor as ONNX with its contract (default: shipped)")
     actor.add_argument(
         "--quick", action="store_true",
-        help="the shipped actor for a short experiment: it returns home and ends when all four parameters are known to "
-        f"about 1%% (deviations below {QUICK_GOAL}%, so that 95%% of the errors are within 1.2%%), or as --stop-when "
-        "says",
+        help="use the shipped actor for a short experiment: it returns home and ends when all four parameters are "
+        f"known to about 1%% (standard deviations below {QUICK_GOAL}%, so that 95%% of the errors are within 1.2%%), "
+        "or at the precision of --stop-when",
     )  # fmt: skip
     what.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
     what.add_argument(
@@ -175,7 +177,7 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     what.add_argument(
         "--duration", type=float, metavar="S",
-        help="shorter experiment (default: the policy's horizon); with --read-only, how long to listen",
+        help="shorter experiment [s] (default: the policy's horizon); with --read-only, how long to listen",
     )  # fmt: skip
     what.add_argument(
         "--stop-when", metavar="NAME=P%[,...]",
@@ -212,11 +214,11 @@ def parser() -> argparse.ArgumentParser:
 
     stage = p.add_argument_group("stage: how much of the chain may act (default: all of it)")
     one = stage.add_mutually_exclusive_group()
-    one.add_argument("--read-only", action="store_true", help="only listen, log, and say what is on the bus")
+    one.add_argument("--read-only", action="store_true", help="only listen, log, and list the traffic on the bus")
     one.add_argument("--zero", action="store_true", help="the whole chain, but only 0 A is sent")
     one.add_argument(
         "--limit", type=float, metavar="A",
-        help="send at most this current; if the shield needs more, the node brakes by itself",
+        help="send at most this current [A]; if the shield needs more, the node brakes by itself",
     )  # fmt: skip
     asking = stage.add_mutually_exclusive_group()
     asking.add_argument(
@@ -260,7 +262,7 @@ def prepare(args: argparse.Namespace) -> Plan:
     if stage is Stage.ZERO and args.home:
         raise UsageError("--zero: no brake comes home with 0 A; turn it by hand, or use --limit")
     if args.confirm and (sys.stdin is None or not sys.stdin.isatty()):
-        raise UsageError("--confirm: there is nobody to ask, standard input is no terminal; --yes does not ask")
+        raise UsageError("--confirm: expected a terminal on standard input; --yes runs without asking")
     period = layout.command.cycle_time
     if abs(bench.timing.sample_time - period) > 1e-9:
         raise BenchFileError(

@@ -296,7 +296,7 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
     if s["estimate"] and (details or s["result"] in ("done", LOG_INCOMPLETE)):
         lines.append("running estimate ± 95 % (k=2), valid if the model is right")
         if not s["model_fits"]:
-            lines.append("  THE MODEL DOES NOT FIT: friction, a delay or a sensor differs; use emb-replay estimate")
+            lines.append("  THE MODEL DOES NOT FIT: friction, a delay or a sensor differs from the model")
         lines += [f"  {line}" for line in estimate.words(s["estimate"])]
     missing = "" if s["log_complete"] else f", INCOMPLETE: {s['log_error']}"
     lines.append(f"log: {s['log']} ({s['log_messages']} messages, {s['log_bytes'] / 1024:.0f} KiB{missing})")
@@ -350,8 +350,8 @@ def _brake(s: Mapping[str, Any]) -> list[str]:
     return [
         f"  brake      {s['angle_min']:.2f} to {s['angle_max']:.2f} rad, top speed {s['top_speed']:.1f} rad/s, "
         f"top current {s['top_current']:.2f} A",
-        f"  end        {s['end_angle']:.3f} rad, {s['end_velocity']:.1f} rad/s; then {s['last_angle']:.3f} rad, "
-        f"{'at rest' if s['node_at_rest'] else 'still stopping'}, node {s['node_state']}"
+        f"  end        {s['end_angle']:.3f} rad, {s['end_velocity']:.1f} rad/s; after the stop "
+        f"{s['last_angle']:.3f} rad, {'at rest' if s['node_at_rest'] else 'still stopping'}, node {s['node_state']}"
         f"{_stop_reason(s['node_stop_reason'])}",
     ]
 
@@ -359,9 +359,9 @@ def _brake(s: Mapping[str, Any]) -> list[str]:
 def _counts(s: Mapping[str, Any]) -> list[str]:
     return [
         f"  commands   {s['answered']} sent, {s['confirmed']} frames seen on the bus, {s['limited']} limited by the "
-        f"shield, {s['returning']} to return, {s['clipped']} clipped, {s['not_obeyed']} late",
+        f"shield, {s['returning']} returning home, {s['clipped']} clipped, {s['not_obeyed']} late",
         f"  samples    {s['pairs']} pairs, {s['unanswered']} without a command (send buffer full: {s['not_taken']}, "
-        f"left to the node: {s['left']}), {s['missed']} periods missed, {s['rejected']} frames rejected, "
+        f"braked by the node: {s['left']}), {s['missed']} periods missed, {s['rejected']} frames rejected, "
         f"{s['dropped']} dropped by the kernel",
     ]
 
@@ -369,7 +369,7 @@ def _counts(s: Mapping[str, Any]) -> list[str]:
 def _motion(s: Mapping[str, Any]) -> str:
     if s["unexplained"] is None:
         return "not judged: too little motion, or the bench declares a lag or frames older than two samples"
-    return f"{s['unexplained']:.0f} rad/s that no single brake explains, at most {s['unexplained_allowed']:.0f} allowed"
+    return f"unexplained velocity {s['unexplained']:.0f} rad/s, limit {s['unexplained_allowed']:.0f} rad/s"
 
 
 def _stop_reason(name: str | None) -> str:

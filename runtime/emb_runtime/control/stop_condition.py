@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, near
 from emb_runtime.estimator.estimate import Quantity
 
 REACHED = "KNOWN_ENOUGH"  # Code of the event that says so in the log
@@ -42,7 +42,8 @@ def parse_stop_condition(text: str, estimates: Sequence[Quantity]) -> StopCondit
     for item in text.split(","):
         name, _, percent = item.partition("=")
         if (name := name.strip()) not in names:
-            raise UsageError(f"--stop-when: expected one of {', '.join(names)}, which are estimated, got '{name}'")
+            expected = f"--stop-when: expected one of {', '.join(names)}, which are estimated"
+            raise UsageError(f"{expected}, got '{name}'{near(name, names)}")
         if names.index(name) in parts:
             raise UsageError(f"--stop-when: {name} is named twice")
         parts[names.index(name)] = _part(name, percent.strip())

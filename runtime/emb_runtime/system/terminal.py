@@ -15,7 +15,7 @@ import re
 import select
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 from emb_runtime.errors import EmbError, UsageError, near
@@ -117,6 +117,10 @@ def confirmed(question: str, stop_requested: Callable[[], bool], wait: Callable[
     return False
 
 
+NUMBERS: Mapping[Any, str] = {int: "a whole number", float: "a number, with a point for decimals"}
+"""Types of an option that takes a number, and what to write."""
+
+
 class Parser(argparse.ArgumentParser):
     """A command line whose wrong use is one line, with the option or the command that may have been meant."""
 
@@ -135,6 +139,14 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Say what is wrong in one line, and end the program."""
         self.exit(UsageError.exit_code, f"{self.prog}: {escaped(message)} (see {self.prog} --help)\n")
+
+    def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
+        try:
+            return super()._get_value(action, arg_string)
+        except argparse.ArgumentError:
+            if action.type not in NUMBERS:
+                raise
+            raise argparse.ArgumentError(action, f"expected {NUMBERS[action.type]}, got '{arg_string}'") from None
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:

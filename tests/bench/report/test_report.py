@@ -162,7 +162,7 @@ def test_what_was_left_out_or_is_missing_comes_before_the_verdict(joint: Report)
     text = joint.reader.text
     verdict = text.index("Verdict")
     assert text.index("broken.mcap: left out: not an MCAP file") < verdict
-    assert text.index("never.mcap: takes no part in the estimate: no experiment in this log") < verdict
+    assert text.index("never.mcap: not used in the estimate: no experiment in this log") < verdict
     assert joint.numbers["left_out"][0]["why"].startswith("not an MCAP file")
     assert "3 samples were lost" in text
     lost = joint.numbers["runs"][1]
@@ -212,7 +212,7 @@ def test_a_difference_between_sent_and_applied_current_is_drawn(
     obeyed, lossy = (applied_as_sent(run) for run in gathered(bench, good, folder / "other.mcap").runs)
     assert obeyed
     assert not lossy
-    assert joint.reader.text.count("The node applied what was sent.") == 1
+    assert joint.reader.text.count("The node applied the sent current in every period.") == 1
 
 
 def test_real_time_is_in_the_table(folder: Path, bench: Bench, simulate: Simulate) -> None:

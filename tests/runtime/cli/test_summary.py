@@ -91,7 +91,7 @@ def test_every_count_and_every_trouble_has_its_words_and_an_undisturbed_run_few(
             {"estimate": (0.02, 23.0, 0.01, 2e-5, 0.006, 6.6, 0.003, 6e-6), "model_fits": False},
             "THE MODEL DOES NOT FIT",
         ),
-        ({"unexplained": 3.6, "allowed": 28.4}, "4 rad/s that no single brake explains, at most 28"),
+        ({"unexplained": 3.6, "allowed": 28.4}, "unexplained velocity 4 rad/s, limit 28 rad/s"),
     )
     for changes, part in rows:
         changes |= {"counters": RunCounters(pairs=1, answered=490, unanswered=10, bus_errors=4)}
