@@ -78,7 +78,7 @@ def optima(
 
 
 def followed(problem: Problem, speeds: Sequence[float]) -> Floats:
-    """Currents with which a known brake has these speeds at the ends of the samples, as far as the limit lets it."""
+    """Currents [A] that give a known brake these speeds [rad/s] at the samples' ends, within the current limit."""
     p, t_s, limit = problem.brake, problem.sample_time, problem.box.current
 
     def law(x1: float, x2: float, k: int) -> float:

@@ -51,7 +51,7 @@ def merit(design: Design) -> float:
 
 
 def polish(problem: Problem, currents: Floats, settings: Settings) -> Design:
-    """A local optimum near a sequence of currents, shape (n,)."""
+    """A local optimum near a sequence of currents [A], shape (n,)."""
     largest = problem.box.current
     best = problem.design(np.clip(currents, -largest, largest))
     step = _Step(problem, best)

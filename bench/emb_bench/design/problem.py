@@ -54,7 +54,7 @@ class Problem:
         return replace(self, box=inner)
 
     def design(self, currents: Floats) -> Design:
-        """Simulate a sequence of currents."""
+        """Simulate a sequence of currents [A], one per sample, shape (n,)."""
         task = self.task
         acting = held(currents, self.sample_time)
         x, s = trajectory(compiled(march), task.mechanics, task.brake, acting, task.chosen, rest(), task.start)

@@ -149,7 +149,8 @@ def budget(study: Study) -> Table:
     header = ["parameter", "noise", "sensors", "J, angle", "effects", "total", "by residuals", "largest"]
     title = (
         "Uncertainty budget, each half of a 95 % interval (k=2). Noise and systematic errors of the sensors; inertia "
-        "and scale of the angle; effects that the record cannot exclude. For comparison: from the scatter of the residuals"
+        "and scale of the angle; effects that the record cannot exclude. For comparison: by the scatter of the "
+        "residuals"
     )
     return Table(title, header, rows, words=(0, 7))
 

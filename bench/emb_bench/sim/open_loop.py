@@ -77,7 +77,7 @@ class Input(NamedTuple):
 
 
 def held(currents: Floats, t_s: float, late: float = 0.0) -> Input:
-    """Input that is known in every period."""
+    """Input of currents [A] that are known in every period of ``t_s`` [s], ``late`` periods late."""
     none = np.zeros(0, np.int64)
     return Input(currents, t_s, late, none, none, np.zeros((0, 2)))
 
