@@ -49,7 +49,7 @@ class Operator:
         quiet = self._plan.json and not self._asks(bus)
         if shown and not quiet:
             mention(table(shown))
-        elif not self._seen and not quiet:
+        elif not self._seen and not quiet and not self._plan.quiet:
             mention(f"pre-flight: {len(lines)} checks, all ok (-v shows them)")
         self._seen = True
 

@@ -43,7 +43,7 @@ def test_an_experiment_is_run_logged_and_summed_up(processes: EmbRun, actor: Pat
 
 
 def test_quiet_prints_the_verdict_alone(emb_run: EmbRun) -> None:
-    assert emb_run.text("-q") == "done: 500 of 500 samples answered, home\n"
+    assert emb_run.streams("-q") == ("done: 500 of 500 samples answered, home\n", "")
 
 
 def test_a_run_whose_log_is_removed_meanwhile_is_not_done(emb_run: EmbRun, tmp_path: Path, sim: Sim) -> None:
