@@ -270,7 +270,7 @@ def main(argv: list[str] | None = None) -> int:
     p = argparse.ArgumentParser(description="A brake behind a simulated drive, on a bus, with its own clock.")
     p.add_argument("--iface", required=True)
     p.add_argument("--drive", required=True, choices=sorted(DRIVES))
-    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench file (default: the shipped drum brake)")
     p.add_argument("--brake", default="", metavar="plant=exact,f_v=3e-5,...", help="as for emb-node")
     args = p.parse_args(argv)
     bench = load_bench(args.bench)

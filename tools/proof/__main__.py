@@ -23,7 +23,7 @@ def main(argv: list[str] | None = None) -> int:
         description="Check the argument that the envelope shield keeps the limits, for every brake of a bench's set.",
         epilog="exit codes: 0 every lemma is proved; 1 one is not; 2 wrong usage, bench, or no solver; 130 interrupted",
     )
-    parser.add_argument("--bench", metavar="FILE", help="bench description; the shipped one without it")
+    parser.add_argument("--bench", metavar="FILE", help="bench file; the shipped one without it")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     args = parser.parse_args(argv)
     try:

@@ -113,7 +113,7 @@ def parser() -> argparse.ArgumentParser:
 
 def _add_common(p: argparse.ArgumentParser, seed: str) -> None:
     p.add_argument("--seed", type=_at_least(0), default=0, metavar="S", help=f"{seed} (default: %(default)s)")
-    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench file (default: the shipped drum brake)")
 
 
 def _add_reference(p: argparse.ArgumentParser) -> None:

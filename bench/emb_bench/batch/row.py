@@ -37,7 +37,7 @@ class Options:
     nuisances: tuple[str, ...] = ()
     model: str | None = None  # Plant to evaluate with; None is the one that each log was made with
     prior: str | None = None  # Set of ranges
-    bench_text: str | None = None  # A bench description for all logs; None is the one in each log
+    bench_text: str | None = None  # A bench file for all logs; None is the one in each log
     starts: int = STARTS  # Local searches
     seed: int = 0
 

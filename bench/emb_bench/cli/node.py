@@ -60,7 +60,7 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument("--iface", required=True, help="SocketCAN interface (vcan0, can0)")
-    p.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
+    p.add_argument("--bench", type=Path, metavar="FILE", help="bench file (default: the shipped drum brake)")
     p.add_argument(
         "--brake", default="", metavar="plant=stribeck,f_v=3e-5,...",
         help="as for `emb-run --iface sim:`: one of the bench's plants, true parameters (default: nominal), seed (1), "

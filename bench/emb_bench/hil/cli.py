@@ -17,12 +17,12 @@ from emb_runtime.system.terminal import Parser, complain, mention
 
 _USAGE = "emb-hil [--host | --uml] [--root] [--slow N] [--timeout S] [--memory MB] -- COMMAND..."
 _EPILOG = f"""\
-Where vcan0 exists and is up, the command runs here, in place of emb-hil. Else it runs in a kernel and sees your files,
-working directory, environment and user; /proc, /sys, /dev, /run and /dev/shm are the kernel's own. Standard input is
-empty. Ctrl-C and SIGTERM reach the command, a second one kills.
+If vcan0 exists and is up, the command runs on this kernel. Otherwise it runs in a User-Mode Linux kernel, with your
+files, working directory, environment and user; /proc, /sys, /dev, /run and /dev/shm are those of that kernel. Standard
+input is empty. Ctrl-C and SIGTERM reach the command; a second one kills it.
 
-exit status: the command's own (128 + n where signal n ended it, 126 or 127 where it could not be started);
-{EXIT_TIMEOUT} time limit reached, {EXIT_BUS} vcan0 cannot be had or the kernel died, {EXIT_USAGE} wrong usage."""
+exit status: that of the command (128 + n if signal n ended it, 126 or 127 if it could not be started);
+{EXIT_TIMEOUT} time limit reached, {EXIT_BUS} no vcan0 or the kernel died, {EXIT_USAGE} wrong usage."""
 
 _LIMITED = ("timeout", "--kill-after=10")
 _MAKE = f"`sudo ip link add dev {INTERFACE} type vcan && sudo ip link set {INTERFACE} up`"

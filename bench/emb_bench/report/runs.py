@@ -136,9 +136,9 @@ def run_timing(log: RunLog) -> RunTiming:
     if ran := log.metadata.get("emb.run", {}).get("time"):
         return RunTiming(log, t, (), f"the time ran {ran}")
     if budgets is None:
-        return RunTiming(log, t, (), "the bench description in the log has no [budgets]")
+        return RunTiming(log, t, (), "the bench file in the log has no [budgets]")
     checks = tuple(judge(t, budgets))
-    return RunTiming(log, t, checks, "" if checks else "the [budgets] of the bench description in the log are empty")
+    return RunTiming(log, t, checks, "" if checks else "the [budgets] of the bench file in the log are empty")
 
 
 def timing_document(entry: RunTiming) -> dict[str, Any]:

@@ -66,7 +66,7 @@ exit codes:
      were not guaranteed
 
 examples:
-  emb-run --iface sim --json                        the shipped actor on the simulated brake, in lock-step
+  emb-run --iface sim --json                        the shipped policy on the simulated brake, in lock-step
   emb-run --iface sim:seed=3,f_v=4e-5               another brake, other noise
   emb-run --iface sim:plant=stribeck                one of the plants in the bench file (--write-bench shows them)
   emb-run --iface can0 --read-only --duration 10    first contact with a bench: what is on the bus
@@ -163,14 +163,16 @@ def parser() -> argparse.ArgumentParser:
         "and the log also records the drive's bus, to which emb-run sends nothing",
     )  # fmt: skip
     actor = what.add_mutually_exclusive_group()
-    actor.add_argument("--policy", type=Path, metavar="FILE", help="actor as ONNX with its contract (default: shipped)")
+    actor.add_argument(
+        "--policy", type=Path, metavar="FILE", help="policy as ONNX file with its contract (default: the shipped one)"
+    )
     actor.add_argument(
         "--quick", action="store_true",
-        help="use the shipped actor for a short experiment: it returns home and ends when all four parameters are "
+        help="use the shipped policy for a short experiment: it returns home and ends when all four parameters are "
         f"known to about 1%% (standard deviations below {QUICK_GOAL}%, so that 95%% of the errors are within 1.2%%), "
         "or at the precision of --stop-when",
     )  # fmt: skip
-    what.add_argument("--bench", type=Path, metavar="FILE", help="bench description (default: the shipped drum brake)")
+    what.add_argument("--bench", type=Path, metavar="FILE", help="bench file (default: the shipped drum brake)")
     what.add_argument(
         "--log", type=_place, default=Path("runs"), metavar="FILE|DIR",
         help="MCAP file to write (a name with a suffix), or a folder for a file named after the time (default: runs/)",
@@ -241,7 +243,7 @@ def parser() -> argparse.ArgumentParser:
         "that has other work",
     )  # fmt: skip
 
-    p.add_argument("--write-bench", type=Path, metavar="FILE", help="write the shipped bench description and exit")
+    p.add_argument("--write-bench", type=Path, metavar="FILE", help="write the shipped bench file and exit")
     p.add_argument("--version", action="version", version=f"emb-run {metadata.version('emb-excite')}")
     return p
 
