@@ -11,7 +11,7 @@ the angles, and that of the difference between the velocity sent and the one tha
 three samples in a row, whose variance is taken from the record.
 
 *Criteria* (Burnham and Anderson, Model Selection and Multimodel Inference, 2nd ed., 2002, chapter 6): BIC adds log n
-for each unknown, but none for the systematic errors that are estimated along, which have priors. The *held-out score*
+for each unknown, but none for the systematic errors that are estimated too, which have priors. The *held-out score*
 needs no count of unknowns: the logarithm of the density that a model fitted to a part of the records gives to the rest
 (Laplace's approximation, an uncertainty of 100 % before the records). The part is all but one of several records, each
 in its turn, or the first half of a single one.
@@ -81,7 +81,7 @@ class ModelChoice:
 
     candidates: tuple[Candidate, ...]
     same: tuple[str, ...] = ()
-    """Plants that are left out: one that fits better is the same but for an offset that is estimated along."""
+    """Plants that are left out: one that fits better is the same but for an offset that is estimated too."""
 
     @property
     def best(self) -> Candidate:

@@ -116,7 +116,7 @@ def grow_model(
 def grow_with_errors(
     bench: Bench, plant: Plant, records: Sequence[Experiment], asked: EstimationProblem, *, starts: int, seed: int
 ) -> ModelGrowth:
-    """Growth as of :func:`grow_model`, and where no model fits so, with the bench's systematic errors estimated along.
+    """Growth as of :func:`grow_model`, and where no model fits so, with the bench's systematic errors estimated too.
 
     With them a record tells features apart less well; without them, where there are some, no feature explains it.
     """
@@ -163,7 +163,7 @@ def _possible(plant: Plant, asked: EstimationProblem, names: Sequence[str]) -> b
 
 
 def _problem(plant: Plant, asked: EstimationProblem, near: Estimate, names: Sequence[str]) -> Problem:
-    """Problem with additions; what they leave no room for is no longer estimated along: a delay beside a lag."""
+    """Problem with additions; what they leave no room for is no longer estimated too: a delay beside a lag."""
     found = _with(asked, names)
     if found.systematic:
         found = with_systematic(found, near.bench, plant)

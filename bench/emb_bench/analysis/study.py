@@ -85,7 +85,7 @@ class StudyOptions:
     systematic: bool = True  # True to estimate the bench's systematic errors along
 
     def problem(self, bench: Bench, plant: Plant) -> EstimationProblem:
-        """The unknowns of a plant, with the systematic errors that it can have where they are estimated along."""
+        """The unknowns of a plant, with the systematic errors that it can have where they are estimated too."""
         return with_systematic(self.asked, bench, plant) if self.systematic else self.asked
 
 
@@ -294,7 +294,7 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
         )
         plant, why = choice.best.estimate.plant, f"the best of {len(choice.candidates)}"
         if choice.same:
-            why += f"; {', '.join(choice.same)} left out: one of them, with the encoder's offset estimated along"
+            why += f"; {', '.join(choice.same)} left out: one of them, with the encoder's offset estimated too"
     records = records_of(plant)
     e = _answer(wanted, bench, plant, records, choice)
     # The likelihood of a whole recording is none of windows, and no run can be planned with what is never driven.

@@ -1,7 +1,7 @@
 """The one table of what can be estimated from a record: parameters of a brake, of its features and its instruments.
 
 The thesis identifies k_m, k_1, T_c and f_v. The others are what the record depends on besides: nuisances that are
-estimated along, or constants whose error has a price. All that the tool says or does with a parameter by its name
+estimated too, or constants whose error has a price. All that the tool says or does with a parameter by its name
 follows from its row here: index, unit, range of a search, score test, remedy.
 
 A machine that is no brake has names and units of its own: a linear servo has a mass in kg, not an inertia in kg·m². The

@@ -146,7 +146,7 @@ class Estimate:
         return [i for i, unknown in enumerate(self.unknowns) if unknown.record is None]
 
     def wanted(self) -> list[int]:
-        """Indices of the unknowns that were asked for: all but the systematic errors that are estimated along."""
+        """Indices of the unknowns that were asked for: all but the systematic errors that are estimated too."""
         return [i for i, unknown in enumerate(self.unknowns) if unknown.name not in self.asked.along]
 
     def shared_information(self) -> Floats:

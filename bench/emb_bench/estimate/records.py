@@ -15,7 +15,7 @@ from emb_runtime.errors import UsageError
 from emb_runtime.estimator import estimate
 
 SYSTEMATIC = SystematicErrors._fields
-"""Systematic errors that are estimated along by default, each with the prior of the bench file."""
+"""Systematic errors that are estimated too by default, each with the prior of the bench file."""
 DRIFTS = tuple(f"{name}_drift" for name in PARAMETER_NAMES)
 """Linear changes of the parameters, as shares of them from the begin of a run to its end."""
 ANGLE_SCALE = "angle_scale"  # Relative error of the angle's scale
@@ -55,7 +55,7 @@ class EstimationProblem(Question):
     """Parameters to be estimated; a prior is taken as a Gaussian of the same mean and variance."""
 
     systematic: Mapping[str, float] = field(default_factory=dict)
-    """Systematic errors that are estimated along: standard deviation of the prior, by name; inf without a prior."""
+    """Systematic errors that are estimated too: standard deviation of the prior, by name; inf without a prior."""
     allowed: Mapping[str, float] = field(default_factory=dict)
     """Effects that are not estimated and that the total allows for: standard deviation of the prior, by name."""
     window: float = 0.0
@@ -66,7 +66,7 @@ class EstimationProblem(Question):
 
     @property
     def along(self) -> tuple[str, ...]:
-        """Unknowns that are estimated along without being asked for; with the encoder's offset, the true start."""
+        """Unknowns that are estimated too without being asked for; with the encoder's offset, the true start."""
         named = dict.fromkeys(("x1_0", *self.systematic) if "offset" in self.systematic else self.systematic)
         return tuple(name for name in named if name not in self.names)
 
@@ -98,7 +98,7 @@ def has_time_for_a_delay(plant: Plant) -> bool:
 
 
 def with_systematic(asked: EstimationProblem, bench: Bench, plant: Plant) -> EstimationProblem:
-    """The problem with what the bench cannot exclude and the plant can have: estimated along, or allowed for."""
+    """The problem with what the bench cannot exclude and the plant can have: estimated too, or allowed for."""
     known: dict[str, float] = asdict(bench.systematic)
     timed = has_time_for_a_delay(plant) and "current_lag" not in asked.names
     observed = plant.instruments.observer_bandwidth > 0.0  # its velocity is no measurement of its own

@@ -174,7 +174,7 @@ def residual_tests(study: Study) -> Table:
 
 
 def systematic(e: Estimate) -> Table | None:
-    """Systematic errors that were estimated along, with the priors of the bench file."""
+    """Systematic errors that were estimated too, with the priors of the bench file."""
     rows = []
     for unknown, label, value, own in zip(e.unknowns, e.labels, e.values, e.deviations(), strict=True):
         if unknown.name in e.asked.along and unknown.name in e.asked.systematic:

@@ -36,7 +36,7 @@ class Arming:
         if self._proof is not None and self._proof.done:
             return f"let go within {self._proof.seen_ns * 1e-9:.3f} s without a command"
         if self._mapping.state is None:
-            return "not provable: the drive does not say whether it is armed"
+            return "not provable: the drive does not report whether it is armed"
         return "not proved yet"
 
     def begin(self, now_ns: int) -> None:

@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from cantools.database.can import Database
 
 PROPERTIES = {
-    "no_answers": "the drive does not say which sample a command answers: a late command acts late",
-    "no_echo": "the drive does not say which command it obeys: that one was obeyed is assumed",
-    "no_device_time": "the drive does not stamp its samples: their times are this computer's, on a grid",
-    "no_identity": "the drive does not say what it is: nothing refuses the wrong one",
-    "hold_on_loss": "without host or cable the drive holds its last current for its time-out, then lets go",
+    "no_answers": "the drive does not check which sample a command answers: a late command still acts",
+    "no_echo": "the drive does not report which command it obeyed: every sent command counts as obeyed",
+    "no_device_time": "the samples have no time stamps of the drive: this computer's times are used, on a grid",
+    "no_identity": "the drive has no identity on the bus: a wrong drive is not refused",
+    "hold_on_loss": "without host or cable the drive holds its last current for its time-out, then switches it off",
     "no_counter": "the sensor messages have no counter: a repeated one is not noticed, nor is a frozen sensor at rest",
     "no_crc": "the sensor messages have no checksum of their own",
     "no_command_crc": "the command message has no checksum of its own",
-    "no_current": "the current is not measured: what was commanded is assumed to flow",
-    "no_state": "the drive does not say whether it is armed: that it obeys and that its time-out acts is assumed",
-    "relative_k_m": "the command is no current: k_m is known as a multiple of per_ampere only",
+    "no_current": "the current is not measured: the commanded current is used instead",
+    "no_state": "the drive does not report whether it is armed: its time-out cannot be proved",
+    "relative_k_m": "the command is not a current: only the ratio of k_m to per_ampere is known",
 }
 """Properties that a drive may lack, and what is lost with each. Each must be accepted by name."""
 
@@ -227,7 +227,7 @@ def require_fit(mapping: Mapping, bench: Bench) -> None:
     if (worst := released_speed(bench, mapping.watchdog)) > mapping.end_stop_speed:
         raise MappingError(
             f"{mapping.name}: node.end_stop_speed: without host or cable the drive holds its current for "
-            f"{mapping.watchdog:g} s and lets go: the brake may reach {worst:.4g} rad/s, and bears "
+            f"{mapping.watchdog:g} s, then switches it off: the brake may reach {worst:.4g} rad/s, and bears "
             f"{mapping.end_stop_speed:g} rad/s; narrow the bench's limits"
         )
     if (load := mapping.bus_load(bench.timing.sample_time)) > HIGHEST_BUS_LOAD:

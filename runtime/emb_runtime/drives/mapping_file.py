@@ -148,7 +148,7 @@ class _Node(Struct, kw_only=True):
         float,
         Meta(gt=0, le=LONGEST_NODE_WATCHDOG),
         _says(
-            f"the drive's own time-out, above 0 to {LONGEST_NODE_WATCHDOG:g} s: a drive that never lets go by itself "
+            f"the drive's own time-out, above 0 to {LONGEST_NODE_WATCHDOG:g} s: a drive without one "
             "is not commanded, and no key accepts it"
         ),
     ]

@@ -103,7 +103,7 @@ def test_a_study_with_all_models_says_which_it_took_and_why(bench: Bench, tmp_pa
     found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=1))
     assert found.estimate.plant.name == "stribeck"
     said = document(found)
-    # With the encoder's offset estimated along, 'offset' is 'exact'.
+    # With the encoder's offset estimated too, 'offset' is 'exact'.
     assert [*{model["model"] for model in said["models"]} ^ {*bench.plants}] == said["models_left_out"] == ["offset"]
     assert said["models"][0]["model"] == said["model"] == "stribeck"
     assert sum(model["weight"] for model in said["models"]) == pytest.approx(1.0)
@@ -161,7 +161,7 @@ def test_models_that_were_tried_while_growing_and_fit_as_well_are_named_too(
 
 
 def test_plants_are_compared_with_the_errors_that_the_bench_cannot_exclude(bench: Bench) -> None:
-    """20 mA that nobody reported: without them estimated along no plant explains the record."""
+    """20 mA that nobody reported: without them estimated too no plant explains the record."""
     currents, plant = currents_of(bench, "chirp"), bench.plant("hysteresis")
     data = replace(record(bench, plant, currents + 0.02, seed=3), currents=currents)
     asked = EstimationProblem()
