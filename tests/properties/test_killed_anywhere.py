@@ -31,7 +31,7 @@ class Killed(BaseException):
     """Stands for kill -9: whoever catches it can neither send nor receive any more."""
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     policy=st.sampled_from(sorted(POLICIES)),
     where=st.tuples(*[st.sampled_from([0.0, 1.0, 0.5]) for _ in PARAMETER_NAMES]),
