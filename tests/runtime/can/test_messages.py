@@ -125,6 +125,7 @@ def test_typed_decoders_read_what_the_typed_encoders_wrote() -> None:
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
 @given(data=st.data())
+@settings(max_examples=50)
 def test_encoding_equals_cantools_and_an_independent_crc(message: Message, data: st.DataObject) -> None:
     values: dict[str, float] = {}
     for signal in message.signals[1:]:
@@ -138,6 +139,7 @@ def test_encoding_equals_cantools_and_an_independent_crc(message: Message, data:
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
 @given(data=st.data())
+@settings(max_examples=50)
 def test_a_frame_with_a_right_crc_decodes_to_its_values_or_is_rejected_as_cantools_would(
     message: Message, data: st.DataObject
 ) -> None:
@@ -251,6 +253,7 @@ def test_no_single_or_double_bit_error_of_any_frame_at_all_can_pass(message: Mes
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
 @given(data=st.data())
+@settings(max_examples=50)
 def test_the_crc_of_any_bytes_is_judged_as_by_an_independent_library(message: Message, data: st.DataObject) -> None:
     payload = data.draw(st.binary(min_size=message.length, max_size=message.length))
     fault = fault_of(message, Frame(message.identifier, payload))

@@ -147,13 +147,13 @@ class Planted:
     """A run in which one place raises: ``often`` times, from its first call on after so many frames have left."""
 
     def __init__(self, place: str, kind: type[BaseException], *, after: int = 10, often: int = 1) -> None:
-        self._place, self._kind, self._after, self._often = place, kind, after, often
+        self.place, self._kind, self._after, self._often = place, kind, after, often
         self.raised = 0
         self.sent: list[bool] = []
         """Enable bit of each frame that left."""
 
     def at(self, place: str) -> None:
-        if place == self._place and len(self.sent) >= self._after and self.raised < self._often:
+        if place == self.place and len(self.sent) >= self._after and self.raised < self._often:
             self.raised += 1
             raise self._kind("in the way")
 
@@ -189,25 +189,28 @@ class Planted:
 def ended(planted: Planted, simulate: Simulate, layout: Layout, watched: bool) -> Fault | type[BaseException] | None:
     """The fault of a run, or what it raised."""
     pulse: Heartbeat = Heartbeat.create(1e9, SteppedClock(10**15).now_ns()) if watched else Unwatched()
-    try:
-        fault: Fault | type[BaseException] | None = planted.run(simulate, layout, pulse).fault
-    except BaseException as err:
-        fault = type(err)
+    with pytest.MonkeyPatch.context() as patch:
+        if planted.place in OURS:
+            plant(patch, planted)
+        try:
+            fault: Fault | type[BaseException] | None = planted.run(simulate, layout, pulse).fault
+        except BaseException as err:
+            fault = type(err)
     if isinstance(pulse, Heartbeat):
         pulse.close()
     return fault
 
 
-def plant(monkeypatch: pytest.MonkeyPatch, place: str, at: Callable[[str], None]) -> None:
+def plant(patch: pytest.MonkeyPatch, planted: Planted) -> None:
     """Put a place of our own into the way of its method."""
-    owner, name = OURS[place]
+    owner, name = OURS[planted.place]
     method = getattr(owner, name)
 
     def call(*arguments: Any, **named: Any) -> Any:
-        at(place)
+        planted.at(planted.place)
         return method(*arguments, **named)
 
-    monkeypatch.setattr(owner, name, call)
+    patch.setattr(owner, name, call)
 
 
 PLACES = (*HANDED_IN, *(OURS if isfunction(SensorMonitor.check) else ()))
@@ -221,10 +224,7 @@ def test_whatever_is_raised_in_a_run_stop_frames_follow_and_nothing_else(
     for kind in (*FAULTS, *LEAVING):
         for after in (0, 10) if kind in (HostileError, KeyboardInterrupt) else (10,):
             planted = Planted(place, kind, after=after)
-            with pytest.MonkeyPatch.context() as patch:
-                if place in OURS:
-                    plant(patch, place, planted.at)
-                end = ended(planted, simulate, layout, watched=True)
+            end = ended(planted, simulate, layout, watched=True)
             row = f"{kind.__name__} after {after} frames: {end}, {planted.sent}"
             assert planted.raised == 1, row
             assert end == FAULTS.get(kind, kind), row
@@ -241,10 +241,7 @@ def test_what_is_raised_for_ever_keeps_no_stop_frame_back_that_can_leave(
 ) -> None:
     for kind in (HostileError, SystemExit, KeyboardInterrupt):
         planted = Planted(place, kind, after=10, often=1 << 30)
-        with pytest.MonkeyPatch.context() as patch:
-            if place in OURS:
-                plant(patch, place, planted.at)
-            end = ended(planted, simulate, layout, watched=False)
+        end = ended(planted, simulate, layout, watched=False)
         row = f"{kind.__name__}: {end}, {planted.sent}"
         assert end == FAULTS.get(kind, kind), row
         stops = 0 if place in SILENCING else STOP_FRAMES
@@ -258,10 +255,7 @@ def test_what_is_raised_in_the_stop_keeps_no_other_stop_frame_back(
     for kind in (HostileError, TypeError, BusError, KeyboardInterrupt, SystemExit, GeneratorExit):
         for after in (40, 41, 42):  # before each of the stop frames
             planted = Planted(place, kind, after=after)
-            with pytest.MonkeyPatch.context() as patch:
-                if place in OURS:
-                    plant(patch, place, planted.at)
-                end = ended(planted, simulate, layout, watched=True)
+            end = ended(planted, simulate, layout, watched=True)
             row = f"{kind.__name__} after {after} frames: {end}, {planted.sent}"
             assert planted.raised == 1, row
             assert end in ((kind,) if kind in LEAVING else (None, FAULTS[kind])), row
