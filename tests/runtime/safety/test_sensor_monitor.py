@@ -6,7 +6,6 @@ sensors are played by the loop (test_lies.py, test_homing.py) and by the search 
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import pytest
@@ -29,7 +28,6 @@ from emb_runtime.safety.sensor_monitor import (
 )
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield_design import make_law
-from emb_runtime.safety.state_machine import Fault, StopError
 
 BENCH = load_bench()
 LAW = make_law(BENCH)
@@ -38,17 +36,6 @@ TS = 1e-3
 
 
 # --- hostile numbers --------------------------------------------------------------------------------------------------
-
-
-def test_what_is_no_number_contradicts() -> None:
-    for bad, place in itertools.product([math.nan, math.inf, -math.inf, 1e300, -1e300], range(4)):
-        numbers = [0.0, 0.0, 0.0, 0.0]
-        numbers[place] = bad
-        memory = [0.0] * MEMORY
-        begin(memory, 0.0, 0.0)
-        angle, velocity, command, reported = numbers
-        assert judge(LAW, LIMITS, memory, TS, angle, velocity, True, command, reported) == CONTRADICTING
-        assert all(map(math.isfinite, memory))
 
 
 @pytest.mark.parametrize("elapsed", [math.nan, math.inf, -math.inf, 0.0, -TS, 1e9])
@@ -78,17 +65,6 @@ def test_whatever_comes_the_memory_stays_finite(
 
 def sample(angle: float, velocity: float) -> SensorSample:
     return SensorSample(0, angle, velocity, 0, 0, 0.0, 15, NodeState.ACTIVE)
-
-
-def test_the_monitor_of_a_run_raises_the_fault_with_sum_and_threshold() -> None:
-    monitor = SensorMonitor(LAW, LIMITS)
-    monitor.begin(sample(0.0, 0.0))
-    for k in range(1, 7):
-        monitor.check(TS, sample(0.02 * k, 0.0), False, 0.0)
-    with pytest.raises(StopError) as caught:
-        monitor.check(TS, sample(0.14, 0.0), False, 0.0)
-    assert caught.value.fault is Fault.SENSORS_CONTRADICT
-    assert f"threshold {LIMITS.travel:.2f} rad" in caught.value.detail
 
 
 def test_at_rest_at_the_origin_the_first_move_is_the_full_current_and_far_from_it_the_gentle_one() -> None:
@@ -149,20 +125,3 @@ def test_a_monitor_that_has_heard_nothing_limits_the_first_move_already() -> Non
     fresh, begun = SensorMonitor(LAW, LIMITS), SensorMonitor(LAW, LIMITS)
     begun.begin(sample(0.0, 0.0))
     assert fresh.largest_current(100.0) == begun.largest_current(100.0) < 20.0
-
-
-# --- a brake that is left to friction ---------------------------------------------------------------------------------
-
-
-def test_the_wait_is_longer_by_what_the_last_current_may_have_added_unseen() -> None:
-    waits = []
-    for current in (0.0, 5.0, -5.0):
-        monitor = SensorMonitor(LAW, LIMITS)
-        monitor.begin(sample(0.0, 0.0))
-        monitor.check(TS, SensorSample(0, 0.0, 0.0, 0, 0, current, 15, NodeState.ACTIVE), True, current)
-        waits.append(monitor.coasting_time(sample(0.0, 10.0)))
-    speed = 10.0 + LAW.velocity_noise
-    assert waits[0] == pytest.approx(2.0 * speed / LAW.friction_low)
-    fastest = speed + LAW.motor_high * 5.0 * LIMITS.lag
-    spring = LAW.spring_high * LAW.angle_noise
-    assert waits[1] == waits[2] == pytest.approx(fastest / (LAW.friction_low - spring))
