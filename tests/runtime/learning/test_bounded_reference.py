@@ -6,7 +6,6 @@ sums over a window are taken anew each time, and the ρ of least volume is a roo
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -361,7 +360,7 @@ def placed(a: Assumptions, angle: tuple[float, float], velocity: tuple[float, fl
 
 @pytest.mark.parametrize("flow", [True, False])
 def test_a_period_leads_to_the_extremes_over_all_brakes_in_every_corner(flow: bool) -> None:
-    for angle, velocity, u in itertools.product(CORNERS["angle"], CORNERS["velocity"], (-6.0, -1.0, 0.0, 1.0, 6.0)):
+    for angle, velocity, u in product(CORNERS["angle"], CORNERS["velocity"], (-6.0, -1.0, 0.0, 1.0, 6.0)):
         a = assumed(flow)._replace(model_error=3.0)
         state, r = placed(a, angle, velocity)
         assert bounded._advance(a, state, u, 0.02) == r.advance(u, 0.02)
@@ -377,7 +376,7 @@ def test_along_the_flow_a_direction_is_certain_if_no_brake_can_be_stopped_within
     a = assumed(True)._replace(model_error=3.0)
     t, thick = a.sample_time, a.viscous * a.high[3]
     friction, pulled = a.coulomb * a.high[2], a.spring * a.high[1] * a.speed
-    for u, sign in itertools.product((-5.0, -1.0, 0.0, 1.0, 5.0), (1.0, -1.0)):
+    for u, sign in product((-5.0, -1.0, 0.0, 1.0, 5.0), (1.0, -1.0)):
         motor = [a.motor * k * u for k in (a.low[0], a.high[0])]
         above = max(motor) - a.spring * a.low[1] * max(angle[0], 0.0) + 3.0
         below = min(motor) - a.spring * a.high[1] * max(angle[1], 0.0) - 3.0
@@ -423,7 +422,7 @@ STRIPS = ((0.75, 9.0), (-9.0, 1.25), (0.75, 1.25), (0.5, 1.5), (-9.0, 9.0))
 
 
 def test_a_side_of_the_box_is_cut_at_the_strip_and_a_rounding_beyond() -> None:
-    for i, f, (least, most) in itertools.product(range(4), (-8.0, -0.5, 0.5, 8.0), STRIPS):
+    for i, f, (least, most) in product(range(4), (-8.0, -0.5, 0.5, 8.0), STRIPS):
         f1, f2, f3, f4 = (f if j == i else 0.0 for j in range(4))
         state, ends = box_of(0.5, 1.5), sorted([f * least, f * most])
         bounded._cut_box(state, f1, f2, f3, f4, ends[0], ends[1])
