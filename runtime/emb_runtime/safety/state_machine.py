@@ -245,7 +245,7 @@ FAULTS: dict[Fault, FaultInfo] = {
         "one of them drifts, is scaled, frozen or late: check the sensor, its supply and its units",
     ),
     Fault.MOTION_OUTSIDE_SET: FaultInfo(
-        "no brake of the set moves so",
+        "no brake in the ranges of the shield moves like this",
         "the brake is stuck, loose or outside the bench's shield ranges, or sensor or drive is scaled, frozen or late",
     ),
     Fault.WRONG_POLARITY: FaultInfo(
