@@ -300,7 +300,7 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
         lines += [f"  {line}" for line in estimate.words(s["estimate"])]
     missing = "" if s["log_complete"] else f", INCOMPLETE: {s['log_error']}"
     lines.append(f"log: {s['log']} ({s['log_messages']} messages, {s['log_bytes'] / 1024:.0f} KiB{missing})")
-    if completed:
+    if completed and s["limit"] > 0.0:
         lines.append(f"next: emb-replay estimate {s['log']}   (tests the model, gives the final intervals)")
     return "\n".join(lines)
 
