@@ -111,16 +111,16 @@ class Filter:
         start = problem.opening(z, i, (*START, *names))
         innovations, shares = np.zeros((n, 2)), np.zeros((n, len(names), 2))
         given = FilterInput(
-            record.currents + start.current_offset + added,
+            record.currents + start.errors.current_offset + added,
             problem.bench.timing.sample_time,
-            max(start.late, 0.0),
+            max(start.errors.delay, 0.0),
             problem.plant.instruments.measurement_delay,
             np.nan_to_num(record.samples) + shifted,
             np.zeros(n) if record.late is None else record.late,
             self._unreported(i),
             root,
             start.contact + start.offset,
-            1.0 + start.velocity_gain,
+            1.0 + start.errors.velocity_gain,
             self.walk,
             self.load,
         )
@@ -128,8 +128,8 @@ class Filter:
         covariance = self._uncertainty(i)
         loop = compiled(march_filtered)
         loop(moves, start.p, given, start.chosen, start.x, start.s, covariance, held, gain, results)
-        if start.late < 0.0:  # to first order, as in the simulation
-            innovations -= start.late * shares[:, names.index("delay")]
+        if start.errors.delay < 0.0:  # to first order, as in the simulation
+            innovations -= start.errors.delay * shares[:, names.index("delay")]
         return innovations, shares
 
     def _unreported(self, record: int) -> Floats:

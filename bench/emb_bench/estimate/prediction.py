@@ -11,15 +11,14 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
-from emb_bench.brake.parameters import COMMAND, DELAY, FEATURES, OFFSET, PARAMETERS, VELOCITY_GAIN, scale
+from emb_bench.brake.parameters import COMMAND, FEATURES, PARAMETERS, scale
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Mechanics, Plant
 from emb_bench.estimate.records import EstimationProblem, Unknown, check_model, searched
-from emb_bench.experiment.evaluation import later
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import uniform_prior, weights_along
-from emb_bench.sim.open_loop import Input, march, trajectory
+from emb_bench.sim.open_loop import Input, SystematicErrors, later, march, show, trajectory
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError, UsageError
 
@@ -30,7 +29,7 @@ class Prediction(NamedTuple):
     shown: Floats  # Angle [rad] and velocity [rad/s] at the end of each period, shape (n, 2)
     sensitivities: Floats
     """Of ``shown`` to the unknowns of this record, shape (n, names, 2), as in ``open_loop.Trajectory``."""
-    states: Floats  # Of the brake at the n + 1 instants around the periods, shape (n + 1, 2)
+    states: Floats  # Of the brake at the instants that are shown, and at the one before, shape (n + 1, 2)
     gaps: Floats  # Sensitivities of ``shown`` to the unknowns of the record's gaps, shape (n, gap_unknowns, 2)
 
 
@@ -59,17 +58,7 @@ class Opening(NamedTuple):
     s: Floats
     contact: float  # Angle of the contact [rad]
     offset: float  # Offset of the encoder [rad]
-    late: float  # Share of a period by which commands act late
-    current_offset: float  # Current that acts beyond what is recorded [A]
-    velocity_gain: float  # Relative error of the velocity's scale
-
-
-def _at_the_stamps(late: Floats, x2_0: float, t_s: float, shown: Floats, sensitivities: Floats) -> None:
-    """Move what is shown to when it was: the brake goes on as it went through the period, as in ``instruments``."""
-    acceleration = np.diff(shown[:, 1], prepend=x2_0) / t_s
-    shown[:, 0] += late * (shown[:, 1] + 0.5 * late * acceleration)
-    shown[:, 1] += late * acceleration
-    sensitivities[:, :, 0] += late[:, None] * sensitivities[:, :, 1]
+    errors: SystematicErrors  # The same offset, and all others
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,11 +181,13 @@ class Problem:
             x1 = 0.0  # with an unknown encoder offset the brake rests at the origin, unless its start is estimated too
         # A contact elsewhere is a brake that lies elsewhere, for nothing else depends on the place.
         contact = own.get("contact", 0.0)
-        x, current_offset = rest(), own.get("current_offset", 0.0)
+        errors = SystematicErrors(
+            offset, own.get("current_offset", 0.0), own.get("delay", 0.0), own.get("velocity_gain", 0.0)
+        )
+        x = rest()
         x[0], x[1] = own.get("x1_0", x1) - contact, own.get("x2_0", x2)
-        x[3] = self.records[record].before + current_offset
-        late, gain = own.get("delay", 0.0), own.get("velocity_gain", 0.0)
-        return Opening(self.theta(z), x, *no_sensitivity(names), contact, offset, late, current_offset, gain)
+        x[3] = self.records[record].before + errors.current_offset
+        return Opening(self.theta(z), x, *no_sensitivity(names), contact, offset, errors)
 
     def names(self, record: int) -> tuple[str, ...]:
         """The unknowns that a record depends on, in the order of ``columns``."""
@@ -215,36 +206,22 @@ class Problem:
 
         Another brake moves by ``mechanics``; ``added`` is a current that acts besides [A].
         """
-        data, instruments, t_s = self.records[record], self.plant.instruments, self.bench.timing.sample_time
-        at, delay = self.opening(z, record, (*self.names(record), *besides)), instruments.measurement_delay
+        data, t_s, delay = self.records[record], self.bench.timing.sample_time, self.plant.instruments.measurement_delay
+        at = self.opening(z, record, (*self.names(record), *besides))
         acting = Input(
-            data.currents + at.current_offset + added,
+            data.currents + at.errors.current_offset + added,
             t_s,
-            max(at.late, 0.0),
+            max(at.errors.delay, 0.0),
             data.gaps[0],
             self.breaks(record),
             self.places(record) - [at.contact, 0.0],
         )
         moves = self.mechanics(z) if mechanics is None else mechanics
         whole, moved = trajectory(compiled(march), moves, at.p, acting, at.chosen, at.x, at.s, data.gap_unknowns)
-        late, count = max(at.late, 0.0), len(at.chosen)
-        chosen = np.concatenate([at.chosen, np.full(data.gap_unknowns, COMMAND)])
-        states, shifts = whole[:, :2].copy(), moved[:, :, :2].copy()
-        states[:, 0] += at.contact
-        shifts[1:, chosen == DELAY] /= 1.0 - late  # of the samples, not of the start
-        if at.late < 0.0:  # to first order: what acts early does so by thousandths of a period
-            states += at.late * shifts[:, chosen == DELAY].sum(axis=1)
-        shifts[:, chosen == OFFSET, 0] += 1.0
-        first, sensitivities = shifts[:1], shifts[1:]
-        bias = np.array([at.offset, 0.0])
-        shown = later(states[1:] + bias, delay, states[:1] + bias)
-        sensitivities = later(sensitivities, delay, first)
-        if data.late is not None:
-            _at_the_stamps(data.late, states[0, 1], t_s, shown, sensitivities)
-        sensitivities[:, :, 1] *= 1.0 + at.velocity_gain
-        sensitivities[:, chosen == VELOCITY_GAIN, 1] += shown[:, 1:]
-        shown[:, 1] *= 1.0 + at.velocity_gain
-        return Prediction(shown, sensitivities[:, :count], states, sensitivities[:, count:])
+        whole[:, 0] += at.contact
+        count, chosen = len(at.chosen), np.concatenate([at.chosen, np.full(data.gap_unknowns, COMMAND)])
+        shown = show(later(whole, delay), later(moved, delay), chosen, at.errors, data.late, t_s)
+        return Prediction(shown.samples, shown.sensitivities[:, :count], shown.states, shown.sensitivities[:, count:])
 
     def breaks(self, record: int) -> Integers:
         """Periods at whose ends the brake is found again after a longer gap: those of the first sample that shows it.
@@ -269,7 +246,7 @@ class Problem:
         for i, record in enumerate(self.records):
             instruments = self.plant.instruments
             along = weights_along(self.bench, "physical", instruments, self.predict(z, i).states)
-            root = np.sqrt(later(along, instruments.measurement_delay)) * record.measured[:, None]
+            root = np.sqrt(along) * record.measured[:, None]
             root[later(record.inside.astype(np.float64), instruments.measurement_delay) > 0.0] = 0.0
             result.append(root)
         return result

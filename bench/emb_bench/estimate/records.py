@@ -9,7 +9,8 @@ from typing import NamedTuple
 from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EXACT, Plant
-from emb_bench.experiment.evaluation import Question, SystematicErrors
+from emb_bench.experiment.evaluation import Question
+from emb_bench.sim.open_loop import SystematicErrors
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator import estimate

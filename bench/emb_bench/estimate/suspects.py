@@ -166,7 +166,7 @@ def _drifts(problem: Problem, z: Floats, record: int, shown: Floats) -> tuple[Fl
     clamped = np.maximum(angle, 0.0)
     p, share = at.p, (np.arange(n) + 0.5) / n - 0.5
     torques = (
-        p.k_m * (data.currents + at.current_offset),
+        p.k_m * (data.currents + at.errors.current_offset),
         -p.gamma * p.k_1 * 0.5 * (clamped[1:] + clamped[:-1]),
         -p.T_c * direction,
         -p.f_v * 0.5 * (velocity[1:] + velocity[:-1]),

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from emb_bench.brake.motion import no_sensitivity, rest
-from emb_bench.brake.parameters import DELAY, OFFSET, VELOCITY_GAIN
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT, IMPORTED_PLANT, THESIS_PLANT, Plant
 from emb_bench.experiment.experiment import Experiment
@@ -21,23 +19,20 @@ from emb_bench.information.identifiability import Identifiability
 from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import RunLog
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
-from emb_bench.sim.open_loop import check_unknowns, fast_loop, held, trajectory
+from emb_bench.sim.open_loop import (
+    NO_ERRORS,
+    Shown,
+    SystematicErrors,
+    check_unknowns,
+    fast_loop,
+    held,
+    show,
+    trajectory,
+)
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import LogError, UsageError
 
 KINDS: tuple[Kind, ...] = ("physical", "weighted")
-
-
-class SystematicErrors(NamedTuple):
-    """Systematic errors of bench and sensors, beyond those that belong to the plant."""
-
-    offset: float | None = None  # Reading of the encoder at the origin [rad]; None takes the plant's
-    current_offset: float = 0.0  # Current that acts beyond what the node reports [A]
-    delay: float = 0.0  # By which commands act late [samples], above -1 and below 1; below 0, samples are late
-    velocity_gain: float = 0.0  # Relative error of the velocity's scale
-
-
-NO_ERRORS = SystematicErrors()
 
 
 @dataclass(frozen=True)
@@ -60,26 +55,6 @@ class Fit:
     def fits(self) -> bool:
         """True if there are samples, and they differ no more than the sensors' noise explains."""
         return self.samples > 0 and self.angle <= self.expected and self.velocity <= self.expected  # not with NaN
-
-
-class _DelayLine:
-    """Rows that are seen some samples later; until then the first ones are what was seen ``before``."""
-
-    def __init__(self, delay: int) -> None:
-        self._delay = delay
-        self._waiting: Floats | None = None
-
-    def __call__(self, rows: Floats, before: Floats) -> Floats:
-        if self._waiting is None:
-            self._waiting = np.repeat(before, self._delay, axis=0)
-        every = np.concatenate([self._waiting, rows])
-        self._waiting = every[len(rows) :]
-        return every[: len(rows)]
-
-
-def later(samples: Floats, delay: int, before: Floats | None = None) -> Floats:
-    """Samples, shape (n, ...), as they are seen ``delay`` samples later; until then ``before``, or the first one."""
-    return _DelayLine(delay)(samples, samples[:1] if before is None else before)
 
 
 class ModelEvaluator:
@@ -107,71 +82,63 @@ class ModelEvaluator:
         periods: int = 0,
         instants: Sequence[int] = (),
     ) -> None:
-        if errors.offset is not None:
-            plant = replace(plant, instruments=plant.instruments._replace(encoder_offset=errors.offset))
+        if errors.offset is None:
+            errors = errors._replace(offset=plant.instruments.encoder_offset)
         self._bench, self._plant, self._theta, self._errors = bench, plant, theta, errors
-        self._unknowns = len(names)
-        early = ("delay",) if errors.delay < 0.0 else ()
-        self._chosen, self._s = no_sensitivity((*names, *early))
-        self._x = rest()
-        self._x[:2] = x0
-        self._x[3] = errors.current_offset
+        early = ("delay",) if errors.delay < 0.0 and "delay" not in names else ()
+        self._unknowns, (self._chosen, begun) = len(names), no_sensitivity((*names, *early))
+        x = rest()
+        x[:2] = x0
+        x[3] = errors.current_offset
+        # Those of the instants that the next samples show, up to the one at which the next period begins.
+        shown = plant.instruments.measurement_delay + 1
+        self._x, self._s = np.repeat(x[None], shown, axis=0), np.repeat(begun[None], shown, axis=0)
         nothing = np.zeros((len(names), len(names)))
         self._totals: dict[Kind, Floats] = {"physical": nothing if start is None else start, "weighted": nothing}
         self._kept: dict[Kind, list[Floats]] = {kind: [np.empty((0, *nothing.shape))] for kind in KINDS}
         self._instants = np.asarray(instants, np.int64)
         self._loop = fast_loop(periods)
         self._done = 0
-        delay = plant.instruments.measurement_delay
-        self._lines = {name: _DelayLine(delay) for name in (*KINDS, "sensitivities", "shown", "deviations")}
         self._memory = np.zeros(MEMORY)
-        settle(plant.instruments, self._memory, x0[0])
+        settle(plant.instruments._replace(encoder_offset=self._errors.offset or 0.0), self._memory, x0[0])
         self._squares, self._samples = np.zeros(2), 0
 
     def take(self, piece: Experiment) -> None:
         """Go through the next periods of the experiment."""
-        chosen, mechanics, t_s = self._chosen, self._plant.mechanics, self._bench.timing.sample_time
-        currents, late = piece.currents + self._errors.current_offset, max(self._errors.delay, 0.0)
-        acting = held(currents, t_s, late)
-        x, moved = trajectory(self._loop, mechanics, self._theta, acting, chosen, self._x, self._s)
-        self._x, self._s = x[-1], moved[-1]
-        states, s = x[:, :2].copy(), moved[1:, : self._unknowns, :2].copy()
-        if self._errors.delay < 0.0:  # to first order: what acts early does so by thousandths of a period
-            states += self._errors.delay * moved[:, -1, :2]
-        chosen = chosen[: self._unknowns]
-        s[:, chosen == DELAY] /= 1.0 - late
-        s[:, chosen == OFFSET, 0] += 1.0
-        s[:, :, 1] *= 1.0 + self._errors.velocity_gain
-        s[:, chosen == VELOCITY_GAIN, 1] += states[1:, 1:2]
-        if len(chosen):
-            self._inform(piece, states, self._lines["sensitivities"](s, np.zeros_like(s[:1])))
-        self._compare(piece, states)
-        self._done += len(piece.currents)
+        n, t_s = piece.periods, self._bench.timing.sample_time
+        acting = held(piece.currents + self._errors.current_offset, t_s, max(self._errors.delay, 0.0))
+        x, moved = trajectory(
+            self._loop, self._plant.mechanics, self._theta, acting, self._chosen, self._x[-1], self._s[-1]
+        )
+        self._x, self._s = np.concatenate([self._x, x[1:]]), np.concatenate([self._s, moved[1:]])
+        shown = show(self._x[: n + 1], self._s[: n + 1], self._chosen, self._errors)
+        self._x, self._s = self._x[n:], self._s[n:]
+        if self._unknowns:
+            self._inform(piece, shown)
+        self._compare(piece, shown)
+        self._done += n
 
-    def _inform(self, piece: Experiment, states: Floats, s: Floats) -> None:
+    def _inform(self, piece: Experiment, shown: Shown) -> None:
         wanted = self._instants - self._done
-        wanted = wanted[(wanted >= 0) & (wanted < len(s))]
+        wanted = wanted[(wanted >= 0) & (wanted < piece.periods)]
         for kind in KINDS:
-            weights = weights_along(self._bench, kind, self._plant.instruments, states)
-            seen = self._lines[kind](weights, weights[:1])
-            history = information_over_time(s, seen, self._totals[kind], piece.measured)
+            weights = weights_along(self._bench, kind, self._plant.instruments, shown.states)
+            s = shown.sensitivities[:, : self._unknowns]
+            history = information_over_time(s, weights, self._totals[kind], piece.measured)
             self._totals[kind] = history[-1]
             self._kept[kind].append(history[wanted])
 
-    def _compare(self, piece: Experiment, states: Floats) -> None:
+    def _compare(self, piece: Experiment, shown: Shown) -> None:
         """Add up how far the samples lie from what the instruments show of the motion, but for their noise."""
         instruments, t_s = self._plant.instruments, self._bench.timing.sample_time
-        offset = np.array([instruments.encoder_offset, 0.0])
-        shown = states[1:] + offset
         jitter_only = instruments._replace(observer_bandwidth=0.0)
-        deviations = weights_along(self._bench, "physical", jitter_only, states) ** -0.5
+        deviations = weights_along(self._bench, "physical", jitter_only, shown.states) ** -0.5
+        samples = shown.samples
         if instruments.observer_bandwidth > 0.0:
-            shown[:, 1] = [observe(instruments, self._memory, t_s, float(angle)) for angle in shown[:, 0]]
+            observed = [observe(instruments, self._memory, t_s, float(angle)) for angle in samples[:, 0]]
+            samples[:, 1] = (1.0 + self._errors.velocity_gain) * np.array(observed)
             deviations[:, 1] = observer_noise(instruments.observer_bandwidth, t_s, 1.0) * deviations[:, 0]
-        shown = self._lines["shown"](shown, states[:1] + offset)
-        shown[:, 1] *= 1.0 + self._errors.velocity_gain
-        deviations = self._lines["deviations"](deviations, deviations[:1])
-        seen = ((piece.samples - shown) / deviations)[piece.measured]
+        seen = ((piece.samples - samples) / deviations)[piece.measured]
         self._squares += np.sum(seen**2, axis=0)
         self._samples += len(seen)
 

@@ -30,6 +30,18 @@ from emb_runtime.errors import UsageError, near
 WORTH_COMPILING = 20_000  # Periods from which on loading the compiled functions takes less time than they save
 
 
+class SystematicErrors(NamedTuple):
+    """Systematic errors of bench and sensors, beyond those that belong to the plant."""
+
+    offset: float | None = None  # Reading of the encoder at the origin [rad]; None takes the plant's
+    current_offset: float = 0.0  # Current that acts beyond what the node reports [A]
+    delay: float = 0.0  # By which commands act late [samples], above -1 and below 1; below 0, samples are late
+    velocity_gain: float = 0.0  # Relative error of the velocity's scale
+
+
+NO_ERRORS = SystematicErrors()
+
+
 class Trajectory(NamedTuple):
     """Motion of a brake and its sensitivities."""
 
@@ -58,11 +70,8 @@ def simulate(
     chosen, s = no_sensitivity(params)
     x = rest()
     x[:2] = x0
-    states, sensitivities = trajectory(march, mechanics, p, held(_finite(currents), t_s), chosen, x, s)
-    shown = sensitivities[1:, :, :2].copy()
-    shown[:, chosen == OFFSET, 0] += 1.0
-    shown[:, chosen == VELOCITY_GAIN, 1] += states[1:, 1:2]
-    return Trajectory(states[:, :2].copy(), shown)
+    shown = show(*trajectory(march, mechanics, p, held(_finite(currents), t_s), chosen, x, s), chosen)
+    return Trajectory(shown.states, shown.sensitivities)
 
 
 class Input(NamedTuple):
@@ -103,6 +112,50 @@ def trajectory(
     states[0], sensitivities[0, : len(chosen)] = x, s
     loop(mechanics, p, acting if gaps else acting._replace(pulses=acting.pulses[:0]), chosen, states, sensitivities)
     return states, sensitivities
+
+
+class Shown(NamedTuple):
+    """Samples of undisturbed sensors along a motion."""
+
+    states: Floats  # True angle [rad] and velocity [rad/s] at all n + 1 instants, shape (n + 1, 2)
+    samples: Floats  # Angle [rad] and velocity [rad/s] at the ends of the n periods, shape (n, 2)
+    sensitivities: Floats  # Of the samples, shape (n, m, 2), as in :class:`Trajectory`
+
+
+def show(
+    x: Floats,
+    s: Floats,
+    chosen: Integers,
+    errors: SystematicErrors = NO_ERRORS,
+    late: Floats | None = None,
+    t_s: float = 0.0,
+) -> Shown:
+    """Samples along the states ``x`` of n + 1 instants, with their sensitivities ``s`` to the unknowns ``chosen``.
+
+    The states are those of commands that act late by ``errors.delay``, if that is not negative: commands that act
+    early are counted here, to first order, for which the delay has to be among the unknowns. Each sample is taken
+    ``late`` [s] after its period of ``t_s`` [s], shape (n,), as in :mod:`emb_bench.sim.instruments`.
+    """
+    states, shifts = x[:, :2].copy(), s[:, :, :2].copy()
+    shifts[:, chosen == DELAY] /= 1.0 - max(errors.delay, 0.0)
+    if errors.delay < 0.0:
+        states += errors.delay * shifts[:, np.argmax(chosen == DELAY)]
+    shifts[:, chosen == OFFSET, 0] += 1.0
+    samples, sensitivities = states[1:] + np.array([errors.offset or 0.0, 0.0]), shifts[1:]
+    if late is not None:  # the brake goes on as it went through the period
+        acceleration = np.diff(states[:, 1]) / t_s
+        samples[:, 0] += late * (samples[:, 1] + 0.5 * late * acceleration)
+        samples[:, 1] += late * acceleration
+        sensitivities[:, :, 0] += late[:, None] * sensitivities[:, :, 1]
+    sensitivities[:, :, 1] *= 1.0 + errors.velocity_gain
+    sensitivities[:, chosen == VELOCITY_GAIN, 1] += samples[:, 1:]
+    samples[:, 1] *= 1.0 + errors.velocity_gain
+    return Shown(states, samples, sensitivities)
+
+
+def later(rows: Floats, delay: int) -> Floats:
+    """Rows, shape (n, ...), as they are seen ``delay`` rows later; until then the first one."""
+    return np.concatenate([np.repeat(rows[:1], delay, axis=0), rows])[: len(rows)]
 
 
 def march(mechanics: Mechanics, p: BrakeParameters, acting: Input, chosen: Integers, x: Floats, s: Floats) -> None:

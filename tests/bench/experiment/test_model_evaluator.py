@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from emb_bench.config.bench import Bench
-from emb_bench.experiment.evaluation import NO_ERRORS, ModelEvaluator, SystematicErrors
+from emb_bench.experiment.evaluation import ModelEvaluator
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.sim.open_loop import simulate
+from emb_bench.sim.open_loop import NO_ERRORS, SystematicErrors, simulate
 
 FINE = 20  # Steps of the simulation in a period
 CURRENTS = np.repeat([2.0, -1.5, 1.0, 0.3], 20)
