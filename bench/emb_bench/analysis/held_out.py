@@ -67,22 +67,22 @@ def held_out(e: Estimate, record: Experiment, *, among: int = 1) -> HeldOut:
     known[:, index] = _root(e.shared_information() / np.outer(scale, scale))
     weights = problem.weights(start)
     if record.gap_unknowns and e.method != "pem":
-        problem, _, _ = settled(problem, *search(problem, start, weights), weights)
+        problem, _ = settled(problem, search(problem, start, weights), weights)
     parts = _errors(e, problem, start, weights)
 
     def residuals(z: Floats) -> tuple[Floats, Floats]:
         errors, rows = parts(z)
         return np.concatenate([errors, known[:, index] @ (z[index] - at)]), np.concatenate([rows, known])
 
-    z, end = minimise(problem, start, residuals)
-    rows = residuals(z)[1]
+    end = minimise(problem, start, residuals)
+    rows = residuals(end.z)[1]
     fitted = _rank(rows) - _rank(known)
     samples = int(sum((root > 0.0).sum() for root in weights))
     measured = sum(root.size for root in weights)
     starts = len(rows) - len(known) - measured
     if e.method != "pem":
         starts -= record.gap_unknowns
-        fitted += taken(problem.marginal(z, weights).basis, measured)
+        fitted += taken(problem.marginal(end.z, weights).basis, measured)
     freedom = max(samples + starts - fitted, 1)
     p_value = float(special.chdtrc(freedom, end.cost))
     return HeldOut(record.name, end.cost, freedom, p_value, p_value >= level)

@@ -36,7 +36,7 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
-from emb_bench.estimate.output_error import REWEIGHTED, finished, most, search, settled
+from emb_bench.estimate.output_error import finished, most, reweighted, search, settled
 from emb_bench.estimate.prediction import Problem, make_problem
 from emb_bench.estimate.records import NORMAL_95, End, EstimationProblem, Unknown, has_time_for_a_delay, with_systematic
 from emb_bench.estimate.search import released
@@ -166,9 +166,13 @@ class Fit(NamedTuple):
     """End of a search, whose residuals have not been tested."""
 
     problem: Problem
-    z: Floats
     weights: list[Floats]
     end: End
+
+    @property
+    def z(self) -> Floats:
+        """The unknowns, scaled as in ``problem``."""
+        return self.end.z
 
     @property
     def explains(self) -> bool:
@@ -216,17 +220,14 @@ def fit_from(problem: Problem, near: Estimate | Fit, *, follow: bool = False) ->
     values = (near.z * near.problem.units).tolist()
     start = problem.started(dict(zip(near.problem.unknowns, values, strict=True)))
     if follow:
-        start, _ = released(problem, start)
+        start = released(problem, start).z
     weights = problem.weights(start)
-    z, end = search(problem, start, weights, WRONG)
-    if not end.converged and end.cost <= 2.0 * most(weights, len(z)):
-        z, end = search(problem, z, weights)
-    problem, z, end = settled(problem, z, end, weights)
-    if problem.plant.instruments.clock_jitter > 0.0:
-        for _ in range(REWEIGHTED):
-            weights = problem.weights(z)
-            z, end = search(problem, z, weights, WRONG)
-    return Fit(problem, z, weights, end)
+    end = search(problem, start, weights, WRONG)
+    if not end.converged and end.cost <= 2.0 * most(weights, len(start)):
+        end = search(problem, end.z, weights)
+    problem, end = settled(problem, end, weights)
+    end, weights = reweighted(problem, end, weights, WRONG)
+    return Fit(problem, weights, end)
 
 
 def candidate(name: str, e: Estimate) -> Candidate:
@@ -283,7 +284,7 @@ def held_out_score(e: Estimate, deviance: float) -> float:
             half = e.records[0].until(max(len(e.records[0].currents) // 2, 1))
             problem, own = replace(e.problem, records=(half,)), list(range(len(e.z)))
         start = e.z[own]
-        there, _ = search(problem, start, problem.weights(start), WRONG)
+        there = search(problem, start, problem.weights(start), WRONG).z
         score -= 0.5 * (deviance - _deviance(problem, there) + volume - _volume(problem, there))
     return score
 

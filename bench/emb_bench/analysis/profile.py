@@ -22,7 +22,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import NORMAL_95, searched
+from emb_bench.estimate.records import NORMAL_95, End, searched
 from emb_bench.estimate.search import minimise
 from emb_bench.information.identifiability import GROSS
 from emb_runtime.errors import UsageError
@@ -134,15 +134,14 @@ def profile(e: Estimate, label: str) -> Profile:
     i = e.labels.index(label)
     problem, start = e.problem, np.clip(e.z, *e.problem.bounds)
     weights = problem.weights(start)
-    z, end = search(problem, start, weights)
-    found = end.cost
-    sides = _sides(e, problem, weights, i, z, found)
+    first = end = search(problem, start, weights)
+    sides = _sides(e, problem, weights, i, end)
     for _ in range(MINIMA):
         lowest = min((side.points[-1] for side in sides), key=lambda point: point.rise)
         if lowest.rise > -BETTER:
             break
-        z, end = search(problem, lowest.z, weights)
-        sides = _sides(e, problem, weights, i, z, end.cost)
+        end = search(problem, lowest.z, weights)
+        sides = _sides(e, problem, weights, i, end)
     below, above = sides
     points = [*below.points[:0:-1], *above.points]
     unit = float(problem.units[i])
@@ -153,7 +152,7 @@ def profile(e: Estimate, label: str) -> Profile:
         (True, False): "open above",
         (False, False): "flat",
     }[below.closed, above.closed]
-    minimum = float(z[i]) * unit
+    minimum = float(end.z[i]) * unit
     half = NORMAL_95 * float(e.cramer_rao()[i] * e.scale[i])
     open_sides = tuple(
         OpenSide(above, last.rise, float(last.z[i]) * unit, last.rise >= LEVEL)
@@ -168,14 +167,13 @@ def profile(e: Estimate, label: str) -> Profile:
         shape=shape,
         fisher=(minimum - half, minimum + half),
         minimum=minimum,
-        fell=found - end.cost if end.cost < found - BETTER else 0.0,
+        fell=first.cost - end.cost if end.cost < first.cost - BETTER else 0.0,
         open_sides=open_sides,
     )
 
 
-def _sides(
-    e: Estimate, problem: Problem, weights: Sequence[Floats], i: int, z: Floats, cost: float
-) -> tuple[_Side, _Side]:
+def _sides(e: Estimate, problem: Problem, weights: Sequence[Floats], i: int, minimum: End) -> tuple[_Side, _Side]:
+    z, cost = minimum.z, minimum.cost
     deviation = float(e.cramer_rao()[i] * problem.scale(z)[i])
     low, high = (float(border[i]) for border in problem.bounds)
     below = _walk(problem, weights, i, z, cost, low, min(STEP * deviation, SHARE * (z[i] - low)))
@@ -208,7 +206,8 @@ def _walk(
             before = points[-2].z
             start += (here - before) * (move / (here[i] - before[i]))
         start[i] = border if move == left else here[i] + move
-        found, end = minimise(problem, np.clip(start, *problem.bounds), held)
+        end = minimise(problem, np.clip(start, *problem.bounds), held)
+        found = end.z
         found[i] = start[i]  # a search begins strictly inside its bounds
         grown = end.cost - cost - rise
         if grown > LARGE and abs(move) > CLIFF * abs(border - float(z[i])):

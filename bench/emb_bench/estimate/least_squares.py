@@ -80,12 +80,11 @@ class RecursiveLeastSquares(Method):
             [len(part) for part, _ in parts],
         )
         cost = float(left @ left + known @ known)
-        values, nominal = tuple((z * problem.units).tolist()), tuple(problem.units.tolist())
         return finished(
             problem,
             z,
             problem.weights(z),
-            (End(cost, values, nominal, True, used),),
+            (End(z, cost, np.ones(len(z)), True, used),),
             information=information,
             sandwich=spread,
             method="rls",

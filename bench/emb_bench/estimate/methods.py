@@ -51,5 +51,5 @@ def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
         return method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit(problem.records)
     start = np.clip(e.z[own], *problem.bounds)
     weights = problem.weights(start)
-    problem, z, end = settled(problem, *search(problem, start, weights), weights)
-    return finished(problem, z, weights, (end,), validation=e.validation)
+    problem, end = settled(problem, search(problem, start, weights), weights)
+    return finished(problem, end.z, weights, (end,), validation=e.validation)

@@ -56,28 +56,23 @@ class OutputError(Method):
         ideal = replace(problem, asked=replace(problem.asked, systematic={}))
         points = start_points(ideal, self.starts, self.seed)
         weights = ideal.weights(points[0])
-        ideal, searches = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
+        ideal, ends = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
         for _ in range(LEFT_OUT):
-            kept = _without_outliers(ideal, searches[0][0], weights)
+            kept = _without_outliers(ideal, ends[0].z, weights)
             if kept is ideal:
                 break
             ideal, weights = kept, kept.weights(points[0])
-            ideal, searches = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
-        problem, ends = _with_systematic(problem, ideal, searches, weights)
-        if ends[0][1].cost > most(weights, len(problem.unknowns)):
-            near, before = released(ideal, points[0])
-            z, end = search(ideal, near, weights)
-            end = replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)
-            ideal, searches = _settled(ideal, [*searches, (z, end)], weights)
-            problem, ends = _with_systematic(problem, ideal, searches, weights)
-        problem, ends = _settled(problem, ends, weights)
-        best = ends[0][0]
-        if problem.plant.instruments.clock_jitter > 0.0:
-            for _ in range(REWEIGHTED):
-                weights = problem.weights(best)
-                best, end = search(problem, best, weights)
-            ends[0] = (best, replace(end, start=ends[0][1].start))
-        return finished(problem, best, weights, tuple(end for _, end in ends))
+            ideal, ends = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
+        problem, wider = _with_systematic(problem, ideal, ends, weights)
+        if wider[0].cost > most(weights, len(problem.unknowns)):
+            near = released(ideal, points[0])
+            end = search(ideal, near.z, weights)
+            end = replace(end, start=near.start, evaluations=near.evaluations + end.evaluations)
+            ideal, ends = _settled(ideal, [*ends, end], weights)
+            problem, wider = _with_systematic(problem, ideal, ends, weights)
+        problem, ends = _settled(problem, wider, weights)
+        first, weights = reweighted(problem, ends[0], weights)
+        return finished(problem, first.z, weights, (replace(first, start=ends[0].start), *ends[1:]))
 
 
 def _without_outliers(problem: Problem, z: Floats, weights: Sequence[Floats]) -> Problem:
@@ -135,7 +130,7 @@ def of_losses(problem: Problem) -> tuple[str, ...]:
     return tuple(said)
 
 
-def settled(problem: Problem, z: Floats, end: End, weights: Sequence[Floats]) -> tuple[Problem, Floats, End]:
+def settled(problem: Problem, end: End, weights: Sequence[Floats]) -> tuple[Problem, End]:
     """The end of a search, with what the gaps of the records hold searched along from there.
 
     A search sees the gaps linearly around what the records hold of them. Here the simulation follows each step in both,
@@ -145,56 +140,62 @@ def settled(problem: Problem, z: Floats, end: End, weights: Sequence[Floats]) ->
         The problem whose records hold what was found in their gaps, and the search's new end. Without gaps, the same.
     """
     if not any(record.gap_unknowns for record in problem.records):
-        return problem, z, end
-    count = len(z)
-    found, after = minimise(
+        return problem, end
+    count = len(end.z)
+    after = minimise(
         problem,
-        np.concatenate([z, problem.in_gaps()]),
+        np.concatenate([end.z, problem.in_gaps()]),
         lambda both: problem.filled(both[count:]).joint(both[:count], weights),
     )
-    after = replace(after, start=end.start, evaluations=end.evaluations + after.evaluations)
-    return problem.filled(found[count:]), found[:count], after
+    evaluations = end.evaluations + after.evaluations
+    found = replace(after, z=after.z[:count], start=end.start, evaluations=evaluations)
+    return problem.filled(after.z[count:]), found
 
 
-def _settled(
-    problem: Problem, searches: Sequence[tuple[Floats, End]], weights: Sequence[Floats]
-) -> tuple[Problem, list[tuple[Floats, End]]]:
+def reweighted(
+    problem: Problem, end: End, weights: list[Floats], evaluations: int = EVALUATIONS
+) -> tuple[End, list[Floats]]:
+    """Where the clock jitters, the end of further searches in which the weights follow the motion, and these."""
+    if problem.plant.instruments.clock_jitter > 0.0:
+        for _ in range(REWEIGHTED):
+            weights = problem.weights(end.z)
+            end = search(problem, end.z, weights, evaluations)
+    return end, weights
+
+
+def _settled(problem: Problem, ends: Sequence[End], weights: Sequence[Floats]) -> tuple[Problem, list[End]]:
     """Searches best first, the best minimum with its new end by :func:`settled`."""
-    ordered = sorted(searches, key=lambda pair: pair[1].cost)
-    problem, z, end = settled(problem, *ordered[0], weights)
-    return problem, _refined(ordered, z, end)
+    ordered = sorted(ends, key=lambda end: end.cost)
+    problem, best = settled(problem, ordered[0], weights)
+    return problem, _refined(ordered, best)
 
 
-def _refined(searches: Sequence[tuple[Floats, End]], z: Floats, end: End) -> list[tuple[Floats, End]]:
+def _refined(ends: Sequence[End], best: End) -> list[End]:
     """Searches best first, those that ended where the best one did with its new end."""
-    lowest = searches[0][1].cost
-    others = [
-        (z, replace(ended, cost=end.cost, values=end.values)) if ended.cost - lowest <= SAME else (own, ended)
-        for own, ended in searches[1:]
-    ]
-    return [(z, end), *others]
+    lowest = ends[0].cost
+    others = [replace(end, z=best.z, cost=best.cost) if end.cost - lowest <= SAME else end for end in ends[1:]]
+    return [best, *others]
 
 
 def _with_systematic(
-    problem: Problem, ideal: Problem, searches: Sequence[tuple[Floats, End]], weights: Sequence[Floats]
-) -> tuple[Problem, list[tuple[Floats, End]]]:
+    problem: Problem, ideal: Problem, ends: Sequence[End], weights: Sequence[Floats]
+) -> tuple[Problem, list[End]]:
     """Searches best first, the best minimum once more with the systematic errors, which ``ideal`` lacks."""
     problem = replace(problem, records=ideal.records)
-    ends = sorted(searches, key=lambda pair: pair[1].cost)
+    ends = sorted(ends, key=lambda end: end.cost)
     if not problem.asked.along:
         return problem, ends
-    index, nominal = [problem.unknowns.index(unknown) for unknown in ideal.unknowns], problem.nominal()
+    index = [problem.unknowns.index(unknown) for unknown in ideal.unknowns]
 
-    def whole(own: Sequence[float]) -> tuple[float, ...]:
-        values = nominal * problem.units
-        values[index] = own
-        return tuple(values.tolist())
+    def whole(own: Floats) -> Floats:
+        z = problem.nominal()
+        z[index] = own
+        return z
 
-    wider = [replace(end, values=whole(end.values), start=whole(end.start)) for _, end in ends]
-    found = [(np.array(end.values) / problem.units, end) for end in wider]
-    z, best = search(problem, np.clip(found[0][0], *problem.bounds), weights)
+    wider = [replace(end, z=whole(end.z), start=whole(end.start)) for end in ends]
+    best = search(problem, np.clip(wider[0].z, *problem.bounds), weights)
     best = replace(best, start=wider[0].start, evaluations=wider[0].evaluations + best.evaluations)
-    return problem, _refined(found, z, best)
+    return problem, _refined(wider, best)
 
 
 def most(weights: Sequence[Floats], unknowns: int) -> float:
@@ -220,10 +221,8 @@ def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
     return points
 
 
-def search(
-    problem: Problem, start: Floats, weights: Sequence[Floats], evaluations: int = EVALUATIONS
-) -> tuple[Floats, End]:
-    """One local search of the simulation nearest to the samples: where it ended, and its record."""
+def search(problem: Problem, start: Floats, weights: Sequence[Floats], evaluations: int = EVALUATIONS) -> End:
+    """One local search of the simulation nearest to the samples."""
     return minimise(problem, start, lambda z: problem.jacobian(z, weights), evaluations)
 
 

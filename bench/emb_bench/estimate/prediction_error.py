@@ -47,15 +47,16 @@ class PredictionError(Method):
         """As :class:`Method`."""
         points = start_points(problem, self.starts, self.seed)
         followed = [converge(Filter(problem, strong(problem)), point) for point in points]
-        first = int(np.argmin([end.cost for _, end in followed]))
-        found, near, ratio = likely(problem, followed[first][0])
-        searches = []
-        for i, (z, before) in enumerate(followed):
-            z, end = converge(found, near if i == first else z)
-            searches.append((z, replace(end, start=before.start, evaluations=before.evaluations + end.evaluations)))
-        searches = [(z, replace(end, cost=found.deviance(z, problem.weights(z)))) for z, end in searches]
-        searches.sort(key=lambda pair: pair[1].cost)
-        best = searches[0][0]
+        first = int(np.argmin([end.cost for end in followed]))
+        found, near, ratio = likely(problem, followed[first].z)
+        ends = []
+        for i, before in enumerate(followed):
+            end = converge(found, near if i == first else before.z)
+            deviance = found.deviance(end.z, problem.weights(end.z))
+            evaluations = before.evaluations + end.evaluations
+            ends.append(replace(end, cost=deviance, start=before.start, evaluations=evaluations))
+        ends.sort(key=lambda end: end.cost)
+        best = ends[0].z
         weights = problem.weights(best)
         gains = found.gains(best, weights)
         errors, jacobian = found.jacobian(best, weights, gains)
@@ -66,7 +67,7 @@ class PredictionError(Method):
             problem,
             best,
             weights,
-            tuple(end for _, end in searches),
+            tuple(ends),
             innovations,
             validation,
             method="pem",
@@ -148,7 +149,7 @@ def _least(found: Filter, start: Floats) -> tuple[Floats, float]:
     Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 58, 1971).
     """
     problem = found.problem
-    z, _ = converge(found, start)
+    z = converge(found, start).z
     weights = problem.weights(z)
     _, jacobian = found.jacobian(z, weights, found.gains(z, weights))
     low, high = problem.bounds

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import NamedTuple
 
+from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EXACT, Plant
@@ -150,14 +151,14 @@ def check_model(plant: Plant, names: Sequence[str]) -> None:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class End:
     """End of a local search, and its start."""
 
+    z: Floats  # The unknowns, scaled as in :class:`~emb_bench.estimate.prediction.Problem`
     cost: float
     """Weighted sum of squares, prior included; under a disturbance, minus twice the logarithm of the likelihood."""
-    values: tuple[float, ...]  # SI units, in the order of the unknowns
-    start: tuple[float, ...]  # Start, in the form of ``values``
+    start: Floats  # Start, in the form of ``z``
     converged: bool
     evaluations: int
 

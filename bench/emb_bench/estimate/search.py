@@ -35,11 +35,11 @@ def minimise(
     start: Floats,
     residuals: Callable[[Floats], tuple[Floats, Floats]],
     evaluations: int = EVALUATIONS,
-) -> tuple[Floats, End]:
+) -> End:
     """One local search for the least sum of squares within the bounds.
 
-    What follows the unknowns of the problem in ``start`` is searched along without bounds. ``residuals`` gives those of
-    a z with their derivatives.
+    What follows the unknowns of the problem in ``start`` is searched along without bounds, and is in the end too.
+    ``residuals`` gives those of a z with their derivatives.
     """
     known: dict[bytes, tuple[Floats, Floats]] = {}
     low, high = problem.bounds
@@ -65,11 +65,7 @@ def minimise(
         gtol=1e-12,
         max_nfev=evaluations,
     )
-    values, origin = found.x[: len(low)] * problem.units, start[: len(low)] * problem.units
-    end = End(
-        2.0 * float(found.cost), tuple(values.tolist()), tuple(origin.tolist()), found.status > 0, int(found.nfev)
-    )
-    return found.x, end
+    return End(found.x, 2.0 * float(found.cost), start, found.status > 0, int(found.nfev))
 
 
 def strong(problem: Problem) -> float:
@@ -83,26 +79,26 @@ def strong_load(problem: Problem) -> float:
     return problem.bench.noise.velocity * brake.J / (brake.k_m * t_s * math.sqrt(t_s))
 
 
-def converge(found: Filter, start: Floats) -> tuple[Floats, End]:
-    """One local search under a disturbance: where it ended, and its record."""
+def converge(found: Filter, start: Floats) -> End:
+    """One local search under a disturbance."""
     problem, z, evaluations = found.problem, start, 0
     for _ in range(ROUNDS):
         weights = problem.weights(z)
         gains = found.gains(z, weights)
-        after, end = minimise(problem, z, partial(found.jacobian, weights=weights, gains=gains))
-        _, jacobian = found.jacobian(after, weights, gains)
+        end = minimise(problem, z, partial(found.jacobian, weights=weights, gains=gains))
+        _, jacobian = found.jacobian(end.z, weights, gains)
         evaluations += end.evaluations
-        moved = float(np.linalg.norm(jacobian @ (after - z)))
-        z = after
+        moved = float(np.linalg.norm(jacobian @ (end.z - z)))
+        z = end.z
         if moved < STAYS or (found.walk == found.load == 0.0 and problem.plant.instruments.clock_jitter == 0.0):
             break
-    return z, replace(end, start=tuple((start * problem.units).tolist()), evaluations=evaluations)
+    return replace(end, start=start, evaluations=evaluations)
 
 
-def released(problem: Problem, start: Floats) -> tuple[Floats, End]:
+def released(problem: Problem, start: Floats) -> End:
     """Minimum that a filter leads to which follows the measured brake at first, and is the simulation in the end."""
     z, evaluations = start, 0
     for share in RELEASE:
-        z, end = converge(Filter(problem, share * strong(problem)), z)
-        evaluations += end.evaluations
-    return z, replace(end, start=tuple((start * problem.units).tolist()), evaluations=evaluations)
+        end = converge(Filter(problem, share * strong(problem)), z)
+        z, evaluations = end.z, evaluations + end.evaluations
+    return replace(end, start=start, evaluations=evaluations)

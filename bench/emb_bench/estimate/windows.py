@@ -157,7 +157,7 @@ class Cut:
                 at, end = again, lower
             if not better:
                 break
-        return at, replace(end, start=tuple((shared * self.problem.units).tolist()), evaluations=total)
+        return at, replace(end, start=shared, evaluations=total)
 
     def _descended(self, begun: Point, evaluations: int) -> tuple[Point, End]:
         at = begun
@@ -168,8 +168,8 @@ class Cut:
             parts = [window.projected() for window in windows]
             return np.concatenate([errors for errors, _ in parts]), -np.concatenate([columns for _, columns in parts])
 
-        shared, end = minimise(self.problem, begun.shared, residuals, evaluations)
-        return self.settled(at._replace(shared=shared))[0], end
+        end = minimise(self.problem, begun.shared, residuals, evaluations)
+        return self.settled(at._replace(shared=end.z))[0], end
 
     def restarted(self, at: Point) -> Point:
         """Each window at the better one of its start and of where it was seen to start, parameters unchanged.

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.analysis.study import Study, file_names
+from emb_bench.brake.motion import Floats
 from emb_bench.documents import to_json
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import METHODS
@@ -182,7 +183,7 @@ def document(study: Study) -> dict[str, Any]:
         ],
         "starts": [
             _fields(end, "cost", "converged", "evaluations")
-            | {"values": _shown(e, end.values), "from": _shown(e, end.start)}
+            | {"values": _shown(e, end.z), "from": _shown(e, end.start)}
             for end in e.ends
         ],
     }
@@ -206,8 +207,9 @@ def _fields(record: object, *names: str) -> dict[str, Any]:
     return {name: getattr(record, name) for name in names}
 
 
-def _shown(e: Estimate, values: tuple[float, ...]) -> dict[str, float]:
+def _shown(e: Estimate, z: Floats) -> dict[str, float]:
     """Values of the unknowns by label, in the units that they are shown in."""
+    values = (z * e.problem.units).tolist()
     return {label: value * shown.factor for label, value, shown in zip(e.labels, values, e.shown, strict=True)}
 
 
