@@ -20,9 +20,9 @@ from scipy import special
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.innovations import Filter
-from emb_bench.estimate.methods import refit
+from emb_bench.estimate.method import method_of
 from emb_bench.estimate.model_validation import taken
-from emb_bench.estimate.output_error import search, settled
+from emb_bench.estimate.output_error import finished, search, settled
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.search import minimise
 from emb_bench.estimate.windows import predict_windows
@@ -86,6 +86,20 @@ def held_out(e: Estimate, record: Experiment, *, among: int = 1) -> HeldOut:
     freedom = max(samples + starts - fitted, 1)
     p_value = float(special.chdtrc(freedom, end.cost))
     return HeldOut(record.name, end.cost, freedom, p_value, p_value >= level)
+
+
+def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
+    """Estimates again from some of the records, any of them as often as it is to count, by the same method.
+
+    Output error begins where the estimate is. The model validation is not repeated: it is that of the first estimate.
+    """
+    problem, own = e.problem.part(chosen)
+    if e.method != "oem":
+        return method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit(problem.records)
+    start = np.clip(e.z[own], *problem.bounds)
+    weights = problem.weights(start)
+    problem, end = settled(problem, search(problem, start, weights), weights)
+    return finished(problem, end.z, weights, (end,), validation=e.validation)
 
 
 def leave_one_out(e: Estimate) -> tuple[HeldOut, ...]:

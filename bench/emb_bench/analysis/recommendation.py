@@ -146,7 +146,7 @@ def _rows(e: Estimate, problem: Problem, z: Floats) -> Floats:
     """
     weights = problem.weights(z)
     if e.process_noise > 0.0 or e.load_noise > 0.0:
-        played = replace(problem.records[0], samples=problem.predict(z, 0).shown)
+        played = replace(problem.records[0], samples=problem.predict(z, 0).samples)
         found = Filter(replace(problem, records=(played,)), e.process_noise, e.load_noise)
         rows = found.jacobian(z, weights, found.gains(z, weights))[1]
     else:

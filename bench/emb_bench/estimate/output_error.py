@@ -155,7 +155,7 @@ def settled(problem: Problem, end: End, weights: Sequence[Floats]) -> tuple[Prob
 def reweighted(
     problem: Problem, end: End, weights: list[Floats], evaluations: int = EVALUATIONS
 ) -> tuple[End, list[Floats]]:
-    """Where the clock jitters, the end of further searches in which the weights follow the motion, and these."""
+    """The end of further searches with weights that follow the motion, and these; without jitter of the clock none."""
     if problem.plant.instruments.clock_jitter > 0.0:
         for _ in range(REWEIGHTED):
             weights = problem.weights(end.z)

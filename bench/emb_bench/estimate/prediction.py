@@ -18,19 +18,9 @@ from emb_bench.config.plants import Mechanics, Plant
 from emb_bench.estimate.records import EstimationProblem, Unknown, check_model, searched
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import uniform_prior, weights_along
-from emb_bench.sim.open_loop import Input, SystematicErrors, later, march, show, trajectory
+from emb_bench.sim.open_loop import Input, SystematicErrors, Trajectory, later, march, show, trajectory
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError, UsageError
-
-
-class Prediction(NamedTuple):
-    """Prediction of one record by a model."""
-
-    shown: Floats  # Angle [rad] and velocity [rad/s] at the end of each period, shape (n, 2)
-    sensitivities: Floats
-    """Of ``shown`` to the unknowns of this record, shape (n, names, 2), as in ``open_loop.Trajectory``."""
-    states: Floats  # Of the brake at the instants that are shown, and at the one before, shape (n + 1, 2)
-    gaps: Floats  # Sensitivities of ``shown`` to the unknowns of the record's gaps, shape (n, gap_unknowns, 2)
 
 
 class Marginal(NamedTuple):
@@ -201,8 +191,8 @@ class Problem:
         *,
         mechanics: Mechanics | None = None,
         added: Floats | float = 0.0,
-    ) -> Prediction:
-        """Predicts a record, with sensitivities to its unknowns and to those ``besides``, which come last.
+    ) -> Trajectory:
+        """Predicts a record, with sensitivities to its unknowns, to those ``besides``, and to those of its gaps.
 
         Another brake moves by ``mechanics``; ``added`` is a current that acts besides [A].
         """
@@ -219,9 +209,8 @@ class Problem:
         moves = self.mechanics(z) if mechanics is None else mechanics
         whole, moved = trajectory(compiled(march), moves, at.p, acting, at.chosen, at.x, at.s, data.gap_unknowns)
         whole[:, 0] += at.contact
-        count, chosen = len(at.chosen), np.concatenate([at.chosen, np.full(data.gap_unknowns, COMMAND)])
-        shown = show(later(whole, delay), later(moved, delay), chosen, at.errors, data.late, t_s)
-        return Prediction(shown.samples, shown.sensitivities[:, :count], shown.states, shown.sensitivities[:, count:])
+        chosen = np.concatenate([at.chosen, np.full(data.gap_unknowns, COMMAND)])
+        return show(later(whole, delay), later(moved, delay), chosen, at.errors, data.late, t_s)
 
     def breaks(self, record: int) -> Integers:
         """Periods at whose ends the brake is found again after a longer gap: those of the first sample that shows it.
@@ -280,9 +269,10 @@ class Problem:
         """
         parts, columns = [], []
         for i, (record, root) in enumerate(zip(self.records, weights, strict=True)):
-            said = self.predict(z, i)
-            parts.append((np.nan_to_num(record.samples - said.shown) * root, said.sensitivities * root[:, None]))
-            columns.append((said.gaps * root[:, None]).transpose(0, 2, 1).reshape(root.size, -1))
+            said, asked = self.predict(z, i), len(self.columns(i))
+            rows = said.sensitivities * root[:, None]
+            parts.append((np.nan_to_num(record.samples - said.samples) * root, rows[:, :asked]))
+            columns.append(rows[:, asked:].transpose(0, 2, 1).reshape(root.size, -1))
         residuals, rows = self.stacked(z, parts)
         count = sum(record.gap_unknowns for record in self.records)
         if not count:

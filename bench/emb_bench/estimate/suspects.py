@@ -72,12 +72,13 @@ class Simulated:
 
     def columns(self, record: int, names: tuple[str, ...]) -> Floats:
         """As :class:`Shown`."""
-        columns = self.problem.predict(self.z, record, names).sensitivities[:, -len(names) :]
+        own = len(self.problem.columns(record))
+        columns = self.problem.predict(self.z, record, names).sensitivities[:, own : own + len(names)]
         return columns * self.weights[record][:, None]
 
     def shown(self, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
         """As :class:`Shown`."""
-        return self.problem.predict(self.z, record, mechanics=mechanics, added=added).shown * self.weights[record]
+        return self.problem.predict(self.z, record, mechanics=mechanics, added=added).samples * self.weights[record]
 
     def whitened(self, record: int, shift: Floats) -> Floats:
         """As :class:`Shown`."""
@@ -85,7 +86,7 @@ class Simulated:
 
     def motion(self, record: int) -> Floats:
         """As :class:`Shown`."""
-        return self.problem.predict(self.z, record).shown
+        return self.problem.predict(self.z, record).samples
 
 
 _COOL = "keep the motor cool, or use a shorter run"

@@ -187,7 +187,7 @@ class Cut:
     def _linearised(self, i: int, shared: Floats, start: Floats) -> Window:
         window, root, z = self.windows[i], self.weights[i], np.append(shared, start)
         said, counts = window.predict(z, 0), root.ravel() > 0.0
-        errors = (np.nan_to_num(window.records[0].samples - said.shown) * root).ravel()[counts]
+        errors = (np.nan_to_num(window.records[0].samples - said.samples) * root).ravel()[counts]
         rows = (said.sensitivities * root[:, None]).transpose(0, 2, 1).reshape(-1, len(z))[counts] / window.scale(z)
         own = rows[:, -len(START) :]
         lengths = np.linalg.norm(own, axis=0)
@@ -224,7 +224,7 @@ class Cut:
     def residuals(self, at: Point) -> Iterator[tuple[Span, Floats, Floats]]:
         """Span, errors of the samples [rad, rad/s] and their weights of each window, shapes (n, 2)."""
         for window, start, span, root in zip(self.windows, at.starts, self.spans, self.weights, strict=True):
-            shown = window.predict(np.append(at.shared, start), 0).shown
+            shown = window.predict(np.append(at.shared, start), 0).samples
             yield span, window.records[0].samples - shown, root
 
     @property

@@ -21,8 +21,8 @@ from emb_bench.logs.log import RunLog
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_bench.sim.open_loop import (
     NO_ERRORS,
-    Shown,
     SystematicErrors,
+    Trajectory,
     check_unknowns,
     fast_loop,
     held,
@@ -118,7 +118,7 @@ class ModelEvaluator:
         self._compare(piece, shown)
         self._done += n
 
-    def _inform(self, piece: Experiment, shown: Shown) -> None:
+    def _inform(self, piece: Experiment, shown: Trajectory) -> None:
         wanted = self._instants - self._done
         wanted = wanted[(wanted >= 0) & (wanted < piece.periods)]
         for kind in KINDS:
@@ -128,7 +128,7 @@ class ModelEvaluator:
             self._totals[kind] = history[-1]
             self._kept[kind].append(history[wanted])
 
-    def _compare(self, piece: Experiment, shown: Shown) -> None:
+    def _compare(self, piece: Experiment, shown: Trajectory) -> None:
         """Add up how far the samples lie from what the instruments show of the motion, but for their noise."""
         instruments, t_s = self._plant.instruments, self._bench.timing.sample_time
         jitter_only = instruments._replace(observer_bandwidth=0.0)

@@ -43,11 +43,12 @@ NO_ERRORS = SystematicErrors()
 
 
 class Trajectory(NamedTuple):
-    """Motion of a brake and its sensitivities."""
+    """Motion of a brake, samples of it by undisturbed sensors, and their sensitivities."""
 
     states: Floats  # Angle [rad] and velocity [rad/s] at the n + 1 instants around the n periods, shape (n + 1, 2)
+    samples: Floats  # Samples y_1..y_n: angle [rad] and velocity [rad/s], shape (n, 2)
     sensitivities: Floats
-    """Of the samples y_1..y_n to the parameters, shape (n, parameters, 2): of the angle [rad] and the velocity [rad/s].
+    """Of the samples to the parameters, shape (n, parameters, 2): of the angle [rad] and the velocity [rad/s].
 
     Relative for the brake's parameters, θ_i ∂y/∂θ_i at its own θ (eq. 4.17); per unit for those in ``UNITS``.
     """
@@ -70,8 +71,7 @@ def simulate(
     chosen, s = no_sensitivity(params)
     x = rest()
     x[:2] = x0
-    shown = show(*trajectory(march, mechanics, p, held(_finite(currents), t_s), chosen, x, s), chosen)
-    return Trajectory(shown.states, shown.sensitivities)
+    return show(*trajectory(march, mechanics, p, held(_finite(currents), t_s), chosen, x, s), chosen)
 
 
 class Input(NamedTuple):
@@ -114,14 +114,6 @@ def trajectory(
     return states, sensitivities
 
 
-class Shown(NamedTuple):
-    """Samples of undisturbed sensors along a motion."""
-
-    states: Floats  # True angle [rad] and velocity [rad/s] at all n + 1 instants, shape (n + 1, 2)
-    samples: Floats  # Angle [rad] and velocity [rad/s] at the ends of the n periods, shape (n, 2)
-    sensitivities: Floats  # Of the samples, shape (n, m, 2), as in :class:`Trajectory`
-
-
 def show(
     x: Floats,
     s: Floats,
@@ -129,7 +121,7 @@ def show(
     errors: SystematicErrors = NO_ERRORS,
     late: Floats | None = None,
     t_s: float = 0.0,
-) -> Shown:
+) -> Trajectory:
     """Samples along the states ``x`` of n + 1 instants, with their sensitivities ``s`` to the unknowns ``chosen``.
 
     The states are those of commands that act late by ``errors.delay``, if that is not negative: commands that act
@@ -150,7 +142,7 @@ def show(
     sensitivities[:, :, 1] *= 1.0 + errors.velocity_gain
     sensitivities[:, chosen == VELOCITY_GAIN, 1] += samples[:, 1:]
     samples[:, 1] *= 1.0 + errors.velocity_gain
-    return Shown(states, samples, sensitivities)
+    return Trajectory(states, samples, sensitivities)
 
 
 def later(rows: Floats, delay: int) -> Floats:

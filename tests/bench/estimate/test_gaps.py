@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from emb_bench.analysis.held_out import held_out
+from emb_bench.analysis.held_out import held_out, refit
 from emb_bench.analysis.model_choice import choose_model, fit_from
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.least_squares import regression
-from emb_bench.estimate.methods import refit
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.experiment import Experiment
@@ -62,9 +61,11 @@ def test_sensitivities_to_what_is_unknown_in_gaps_are_finite_differences(
     for j in range(len(held)):
         step = np.zeros(len(held))
         step[j] = 1e-4
-        up, down = (problem.filled(held + side * step).predict(z, 0).shown for side in (1.0, -1.0))
+        up, down = (problem.filled(held + side * step).predict(z, 0).samples for side in (1.0, -1.0))
         expected = ((up - down) / 2e-4)[counts]
-        assert shown.gaps[counts, j] == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
+        assert shown.sensitivities[counts, len(names) + j] == pytest.approx(
+            expected, rel=1e-5, abs=1e-6 * np.abs(expected).max()
+        )
 
 
 def test_information_is_what_is_left_when_the_gaps_are_unknowns_beside_the_parameters(bench: Bench) -> None:
@@ -73,7 +74,7 @@ def test_information_is_what_is_left_when_the_gaps_are_unknowns_beside_the_param
     z = problem.nominal()
     weights = problem.weights(z)
     said, low_high = problem.predict(z, 0), bench.limits.angle
-    columns = np.concatenate([said.sensitivities, said.gaps], axis=1) * weights[0][:, None]
+    columns = said.sensitivities * weights[0][:, None]
     joint = np.einsum("njo,nko->jk", columns, columns)
     widths = [bench.limits.current] * 3 + [low_high[1] - low_high[0], bench.limits.velocity] * 2
     joint += np.diag([0.0] * 4 + [1.0 / width**2 for width in widths])
@@ -183,7 +184,7 @@ def test_a_late_sample_after_a_gap_shows_the_brake_going_on_as_it_went_through_i
     breaks = problem.breaks(0)
     placed = problem.filled(np.concatenate([whole.currents[list(SINGLE)], said.states[breaks + 1].ravel()]))
     counts = problem.weights(z)[0][:, 0] > 0.0
-    difference = np.abs(placed.predict(z, 0).shown - said.shown)[counts] / [bench.noise.angle, bench.noise.velocity]
+    difference = np.abs(placed.predict(z, 0).samples - said.samples)[counts] / [bench.noise.angle, bench.noise.velocity]
     assert difference.max() < 0.1
 
 
