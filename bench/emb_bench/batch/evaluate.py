@@ -123,7 +123,7 @@ def _beginning(experiment: Experiment) -> str | None:
 
 
 def _of_the_information(e: Evaluation) -> dict[str, Any]:
-    physical, weighted = e.fisher("physical"), e.fisher("weighted").criteria()
+    physical = e.fisher("physical")
     own, bounds = physical.criteria(), physical.cramer_rao()
     identified = {finding.name: finding.identified for finding in e.verdict().findings}
     said = {e.log.missing, *e.experiment.missing}
@@ -135,9 +135,6 @@ def _of_the_information(e: Evaluation) -> dict[str, Any]:
         "log_det": own.log_det,
         "lambda_min": own.lambda_min,
         "trace_inverse": own.trace_inverse,
-        "weighted_log_det": weighted.log_det,
-        "weighted_lambda_min": weighted.lambda_min,
-        "weighted_trace_inverse": weighted.trace_inverse,
         "parameters": tuple(
             Parameter(name, identified=identified.get(name), cramer_rao=bounds[name], true=_true(e.log.truth, name))
             for name in e.question.names

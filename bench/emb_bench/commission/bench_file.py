@@ -11,6 +11,7 @@ from typing import Any
 
 import tomlkit
 
+from emb_bench.brake.parameters import SI
 from emb_bench.commission.records import CurrentCheck, Findings, Identification
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.config.plants import SHORTEST_LAG
@@ -159,7 +160,7 @@ def contradiction(sheet: Bench, one: Identification, names: Sequence[str]) -> st
     values = []
     for name in names:
         (low, high), (lowest, highest) = one.intervals[name], _range(sheet, name)
-        values.append(f"{name} is {low:.5g} to {high:.5g} {one.units[name]} (data sheet {lowest:.5g} to {highest:.5g})")
+        values.append(f"{name} is {low:.5g} to {high:.5g} {SI[name]} (data sheet {lowest:.5g} to {highest:.5g})")
     return (
         f"by the estimate {' and '.join(values)}: widen {', '.join(names)} in [ranges.{sheet.shield.ranges}] of the "
         "data sheet's bench file and begin again in another folder"

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from emb_bench.brake.parameters import SI
 from emb_bench.commission import examination
 from emb_bench.commission.bench_file import WRITTEN, found_text, measured_ranges, working_text
 from emb_bench.commission.records import Findings, Identification, Step
@@ -66,7 +67,7 @@ class Commissioned:
         one = self.identified
         fits = "the residual tests accept it" if one.fits else f"NO model explains the experiments{one.reasons()}"
         lines = [f"done: {len(self.logs)} steps, {self.runs} new runs; model {one.model}: {fits}"]
-        lines += [f"  {name:<4} {low:.5g} to {high:.5g} {one.units[name]}" for name, (low, high) in self.ranges.items()]
+        lines += [f"  {name:<4} {low:.5g} to {high:.5g} {SI[name]}" for name, (low, high) in self.ranges.items()]
         return "\n".join([*lines, f"  bench file {self.bench}: a comment behind each measured number gives its source"])
 
 

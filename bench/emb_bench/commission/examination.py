@@ -13,7 +13,7 @@ from scipy import optimize, stats
 
 from emb_bench.analysis.model_choice import fit_from
 from emb_bench.analysis.model_growth import grow_model
-from emb_bench.brake.parameters import FEATURES, SI
+from emb_bench.brake.parameters import FEATURES
 from emb_bench.commission.records import CurrentCheck, FirstMove, Identification, Rest
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Instruments, Mechanics, Plant
@@ -122,7 +122,6 @@ def identify(logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identific
     lag = _interval(first, "current_lag")
     return Identification(
         values={name: float(getattr(first.theta, name)) for name in PARAMETER_NAMES},
-        units={name: SI[name] for name in PARAMETER_NAMES},
         intervals={name: _interval(first, name) for name in PARAMETER_NAMES},
         model=best.plant.name,
         fits=best.validation.fits and first.validation.fits,  # an offset explains a wrong model of a small motion

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from emb_bench.brake.parameters import SI
 from emb_runtime.config.bench import Noise
 
 
@@ -81,7 +82,6 @@ class Identification:
     """Parameters from the experiments so far."""
 
     values: Mapping[str, float]  # [SI]
-    units: Mapping[str, str]  # Of the values, by name
     intervals: Mapping[str, tuple[float, float]]  # 95 %, allowing for systematic errors that are not excluded
     model: str  # Plant of the best model, with what was added to it
     fits: bool  # The residuals do not contradict the model
@@ -106,7 +106,7 @@ class Identification:
     def _within(self, name: str) -> str:
         value, (low, high) = self.values[name], self.intervals[name]
         aside = max(high - value, value - low) / abs(value)
-        return f"{name} {value:.5g} {self.units[name]} ± {100.0 * aside:.2g} %"
+        return f"{name} {value:.5g} {SI[name]} ± {100.0 * aside:.2g} %"
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import onnx
 
+from emb_bench.brake.parameters import SI
 from emb_bench.commission import examination
 from emb_bench.commission.bench_file import contradiction, measured_ranges, not_inside, outside
 from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Rest, Step, Window
@@ -253,7 +254,7 @@ def _judge_last(last: Identification, sheet: Bench, found: Findings) -> Findings
         got = last.intervals[name]
         _require(
             not last.fits or (got[1] >= low and got[0] <= high),
-            f"by the run with the bench file that was found {name} is {got[0]:.4g} to {got[1]:.4g} {last.units[name]}, "
+            f"by the run with the bench file that was found {name} is {got[0]:.4g} to {got[1]:.4g} {SI[name]}, "
             f"in the file {low:.4g} to {high:.4g}: the brake is not the one of the steps before, or changes",
         )
     return found

@@ -129,7 +129,6 @@ def test_rows_say_what_fim_says_of_the_log_alone(folder: Path, said: Said, repla
             assert row[name] == its["samples"][name]
         for name in ("log_det", "lambda_min", "trace_inverse"):
             assert finite(row[name]) == its["physical"][name]
-            assert finite(row[f"weighted_{name}"]) == its["weighted"][name]
         told = {finding["name"]: finding["identified"] for finding in its["physical"]["findings"]}
         assert {name: finite(row[f"{name}_cramer_rao"]) for name in told} == its["physical"]["cramer_rao"]
         assert (row["nominal_angle_sigmas"], row["nominal_velocity_sigmas"], row["nominal_fits"]) == (

@@ -191,7 +191,6 @@ def row(number: int, value: float, *, fits: bool = True, half: float = 0.0) -> R
         fits=fits,
         model="exact",
         log_det=70.0,
-        weighted_log_det=40.0,
         parameters=(estimate,),
     )
 

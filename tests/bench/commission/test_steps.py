@@ -62,7 +62,6 @@ def identification(sheet: Bench, share: float = 0.01, **changed: object) -> Iden
     values = {name: getattr(sheet.brake, name) for name in PARAMETER_NAMES}
     one = Identification(
         values=values,
-        units=dict(zip(PARAMETER_NAMES, ("N·m/A", "N/rad", "N·m", "N·m·s/rad"), strict=True)),
         intervals={name: (value * (1 - share), value * (1 + share)) for name, value in values.items()},
         model="exact",
         fits=True,
