@@ -136,6 +136,11 @@ def chance(p_value: float) -> str:
     return "< 10⁻⁶" if p_value < 1e-6 else plain(p_value, 2)
 
 
+def p_value(value: float) -> str:
+    """A p value behind its letter."""
+    return "p < 1e-6" if value < 1e-6 else f"p = {value:.2g}"
+
+
 def seconds(value: float) -> str:
     """A time in the unit that suits it."""
     if not math.isfinite(value):

@@ -28,7 +28,7 @@ from emb_bench.estimate.method import method_of
 from emb_bench.estimate.output_error import SAME
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import DONE, STARTS, End, EstimationProblem, Suspect, Unknown, with_systematic
-from emb_bench.experiment.evaluation import default_model, other_sample_time
+from emb_bench.experiment.evaluation import check_sample_time, default_model
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.figures import for_notebook
@@ -250,8 +250,7 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
         LogError: a log lacks what an estimate needs.
     """
     for log in logs:
-        if (its := other_sample_time(log, bench)) is not None:
-            raise UsageError(f"{log.path}: expected a sample time of {bench.timing.sample_time:g} s, got {its:g} s")
+        check_sample_time(log, bench)
     if (wanted.grow or wanted.model == EVERY) and wanted.method != "oem":
         option = "--grow" if wanted.grow else f"--model {EVERY}"
         raise UsageError(f"{option} compares models by output error: expected --method oem, got {wanted.method}")

@@ -15,7 +15,7 @@ from emb_bench.batch.row import NONE, Options, Parameter, Row, Source, failed, i
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import EstimationProblem, with_systematic
-from emb_bench.experiment.evaluation import Evaluation, Question, default_model, evaluate, other_sample_time
+from emb_bench.experiment.evaluation import Evaluation, Question, check_sample_time, default_model, evaluate
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.info import cycle_summary
@@ -51,9 +51,7 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
     yield _of_the_run(log)
     require_driven(log)
     bench = log.bench if options.bench_text is None else parse_bench(options.bench_text, "--bench", analysis=True)
-    if (its := other_sample_time(log, bench)) is not None:
-        ours = bench.timing.sample_time
-        raise UsageError(f"{source.path}: expected a sample time of {ours:g} s, got {its:g} s")
+    check_sample_time(log, bench)
     plant = bench.plant(options.model or default_model(log)[0])
     prior = None if options.prior is None else bench.range_set(options.prior)
     question = Question(options.params, options.nuisances, prior)

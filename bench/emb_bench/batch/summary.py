@@ -13,8 +13,8 @@ from emb_bench.analysis.several_runs import Constancy, constancy
 from emb_bench.batch.row import NONE, Options, Parameter, Row, is_relative, unit_of
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE, NORMAL_95
-from emb_bench.numbers import NOTHING, plain, spread
-from emb_bench.report.sentences import INTERVALS, p_value
+from emb_bench.numbers import NOTHING, p_value, plain, spread
+from emb_bench.report.sentences import INTERVALS
 from emb_bench.report.text import Table, listed, wrapped
 
 SHOWN = 3  # Most logs of a kind that are named without ``-v``

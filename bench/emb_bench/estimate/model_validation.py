@@ -31,8 +31,9 @@ from scipy import special
 from emb_bench.brake.motion import Floats
 from emb_bench.config.machine import Machine
 from emb_bench.estimate.prediction import Marginal, Problem, by_record
-from emb_bench.estimate.records import Independence, ModelValidation, Whiteness, chance
+from emb_bench.estimate.records import Independence, ModelValidation, Whiteness
 from emb_bench.estimate.suspects import Shown, Simulated, explained, score, shown_as
+from emb_bench.numbers import p_value
 
 Bools = NDArray[np.bool_]
 
@@ -160,7 +161,7 @@ def _judged(m: ModelValidation, disturbance: Disturbance | None, machine: Machin
     for name in depends:
         test = m.independence[name]
         alarms.append(
-            f"the residuals of the {name} depend on the current: F = {test.statistic:.3g}, {chance(test.p_value)}, "
+            f"the residuals of the {name} depend on the current: F = {test.statistic:.3g}, {p_value(test.p_value)}, "
             f"largest correlation {test.correlation:+.2f} with the current {test.lag} periods earlier"
         )
     if suspected:
@@ -169,12 +170,12 @@ def _judged(m: ModelValidation, disturbance: Disturbance | None, machine: Machin
     elif m.together is not None and "scores" in alarming:
         alarms.append(
             "the model lacks several effects together (chi2 "
-            f"{m.together.statistic:.4g} of {m.together.rank}, {chance(m.together.p_value)})"
+            f"{m.together.statistic:.4g} of {m.together.rank}, {p_value(m.together.p_value)})"
         )
     if disturbance is not None and disturbance.p_value < share:
         notes.append(
             f"the brake is disturbed by more than the sensors' noise: {disturbance.said} (likelihood ratio "
-            f"{disturbance.ratio:.4g}, {chance(disturbance.p_value)}); the intervals and the recommended run "
+            f"{disturbance.ratio:.4g}, {p_value(disturbance.p_value)}); the intervals and the recommended run "
             "allow for it"
         )
     if m.ratio < m.expected[0]:
@@ -184,7 +185,7 @@ def _judged(m: ModelValidation, disturbance: Disturbance | None, machine: Machin
         )
     if coloured:
         tested = "; ".join(
-            f"{white.statistic:.4g} at {white.lags} lags, {chance(white.p_value)}"
+            f"{white.statistic:.4g} at {white.lags} lags, {p_value(white.p_value)}"
             for white in (m.whiteness[name] for name in coloured)
         )
         said = f"the residuals of the {' and '.join(coloured)} are correlated in time (Ljung-Box {tested})"

@@ -35,11 +35,6 @@ DONE = "DONE"  # Exit reason of a run that came to its planned end
 NORMAL_95 = estimate.NORMAL_95  # Standard deviations that 95 % of a Gaussian lie within
 
 
-def chance(p_value: float) -> str:
-    """A p value as text; below 1e-6 only this bound."""
-    return "p < 1e-6" if p_value < 1e-6 else f"p = {p_value:.2g}"
-
-
 class Unknown(NamedTuple):
     """One number to be estimated."""
 

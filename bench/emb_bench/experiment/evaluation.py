@@ -296,15 +296,14 @@ def default_model(log: RunLog) -> tuple[str, str]:
     return DEFAULT_PLANT, "the log does not say what moved"
 
 
-def other_sample_time(log: RunLog, bench: Bench) -> float | None:
-    """The sample time that the log's own bench file states, if it is not this bench's [s].
+def check_sample_time(log: RunLog, bench: Bench) -> None:
+    """Refuse a log whose own bench file states another sample time than a bench.
 
     A log without a readable bench file is taken to be on this bench's grid.
     """
     with suppress(LogError):
-        if (its := log.bench.timing.sample_time) != bench.timing.sample_time:
-            return its
-    return None
+        if (its := log.bench.timing.sample_time) != (ours := bench.timing.sample_time):
+            raise UsageError(f"{log.path}: expected a sample time of {ours:g} s, as in the bench file, got {its:g} s")
 
 
 def bench_for(log: RunLog, path: str | Path | None) -> Bench:
@@ -312,6 +311,5 @@ def bench_for(log: RunLog, path: str | Path | None) -> Bench:
     if path is None:
         return log.bench
     bench = load_bench(path, analysis=True)
-    if (its := other_sample_time(log, bench)) is not None:
-        raise UsageError(f"{path}: expected the sample time of the log, {its:g} s, got {bench.timing.sample_time:g} s")
+    check_sample_time(log, bench)
     return bench

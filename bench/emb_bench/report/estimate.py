@@ -14,7 +14,7 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import METHODS
 from emb_bench.estimate.suspects import explained
 from emb_bench.information.identifiability import schur_complement
-from emb_bench.numbers import signed
+from emb_bench.numbers import p_value, signed
 from emb_bench.report import sentences as say
 from emb_bench.report import tables
 from emb_bench.report.text import Table, facts, listed, wrapped
@@ -113,7 +113,7 @@ def _evidence(study: Study) -> Iterator[str]:
         *(("record", said) for said in measured),
         ("method", f"{METHODS[e.method]}, model {e.plant.name} ({study.model_reason})"),
         ("prior", say.prior(e)),
-        ("chi2/n", f"{expected} ({say.p_value(m.chi2_p)})"),
+        ("chi2/n", f"{expected} ({p_value(m.chi2_p)})"),
     )
     yield from listed("NOTE: ", () if study.biased else m.notes)
     yield ""

@@ -179,7 +179,7 @@ def environment() -> Environment:
         "plain": numbers.plain,
         "signed": numbers.signed,
         "seconds": numbers.seconds,
-        "p_value": sentences.p_value,
+        "p_value": numbers.p_value,
         "data_uri": _data_uri,
         "capitalize_first": lambda words: words[:1].upper() + words[1:],
     }

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from emb_bench.brake.parameters import UNITS
 from emb_bench.information.identifiability import combination
-from emb_bench.numbers import amount, between, in_samples, percent, plain, spread
+from emb_bench.numbers import amount, between, in_samples, p_value, percent, plain, spread
 
 if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.conclusion import Conclusion
@@ -38,11 +38,6 @@ TERMS = {
     "trades off": "the data determine two parameters well only together: their errors compensate",
 }
 """Terms of the results, each explained in a line."""
-
-
-def p_value(value: float) -> str:
-    """A p value behind its letter."""
-    return "p < 1e-6" if value < 1e-6 else f"p = {value:.2g}"
 
 
 def deviation(value: float, name: str, digits: int = 3) -> str:

@@ -243,7 +243,7 @@ def test_a_log_of_another_sample_time_than_the_bench_fails_with_what_is_known_of
     other = bench.text.replace("sample_time = 1.0e-3", "sample_time = 2.0e-3")
     path = folder / "monday/a.mcap"
     row = evaluate_one(Source(str(path), str(folder), "monday/a.mcap", "monday"), Options(bench_text=other))
-    assert row.error == f"{path}: expected a sample time of 0.002 s, got 0.001 s"
+    assert row.error == f"{path}: expected a sample time of 0.002 s, as in the bench file, got 0.001 s"
     assert (row.exit_reason, row.log_det, row.parameters) == ("DONE", None, ())
 
 
