@@ -273,9 +273,4 @@ def sandwich(information: Floats, jacobian: Floats, errors: Floats, lengths: Seq
             cross = g[lag:].T @ g[:-lag]
             meat += (1.0 - lag / (reach + 1.0)) * (cross + cross.T)
     meat += jacobian[used:].T @ jacobian[used:]
-    spectrum = Spectrum(information)
-    inverse = spectrum.inverse()
-    inverse[spectrum.lost, spectrum.lost] = 0.0
-    result: Floats = inverse @ meat @ inverse
-    result[spectrum.lost, spectrum.lost] = math.inf
-    return result
+    return Spectrum(information).sandwich(meat)

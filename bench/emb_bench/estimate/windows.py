@@ -458,13 +458,8 @@ def by_windows(information: Floats, scores: Floats, follows: Sequence[bool]) -> 
     where the one before it ends. The diagonal is inf for unknowns that the windows do not identify.
     """
     m, p = scores.shape
-    meat = scatter(scores, follows)
-    spectrum = Spectrum(information)
-    inverse = spectrum.inverse()
-    inverse[spectrum.lost, spectrum.lost] = 0.0
-    result: Floats = inverse @ meat @ inverse * (m / max(m - p, 1))
-    result[spectrum.lost, spectrum.lost] = math.inf
-    return result
+    covariance: Floats = Spectrum(information).sandwich(scatter(scores, follows)) * (m / max(m - p, 1))
+    return covariance
 
 
 def scatter(scores: Floats, follows: Sequence[bool]) -> Floats:

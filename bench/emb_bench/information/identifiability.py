@@ -79,6 +79,14 @@ class Spectrum:
         inverse[self.lost, self.lost] = math.inf
         return inverse
 
+    def sandwich(self, scatter: Floats) -> Floats:
+        """M⁻¹ S M⁻¹ with the ``scatter`` S of scores; inf on the diagonal of each unidentified parameter."""
+        inverse = self.inverse()
+        inverse[self.lost, self.lost] = 0.0
+        result: Floats = inverse @ scatter @ inverse
+        result[self.lost, self.lost] = math.inf
+        return result
+
     def flat_directions(self) -> list[Floats]:
         """Unit vectors along which M is zero: of the parameters without information, then of combinations."""
         alone = np.eye(len(self.matrix))[self.dead]
