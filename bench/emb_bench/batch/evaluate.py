@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.batch.row import NONE, Options, Parameter, Row, Source, failed, is_relative, one_line, printable
+from emb_bench.batch.row import NONE, Options, Parameter, Row, Source, failed, one_line, printable
+from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import EstimationProblem, with_systematic
@@ -152,7 +153,7 @@ def _of_the_estimate(e: Estimate, evaluation: Evaluation, truth: BrakeParameters
         name, factor = e.unknowns[i].name, e.shown[i].factor  # the columns of all rows are in SI units
         value, low, high, noise = (shown / factor for shown in (said.value, *said.interval, said.repeatability))
         true = _true(truth, name)
-        scale = deviation * (abs(value) if is_relative(name) else 1.0)
+        scale = deviation * (abs(value) if PARAMETERS[name].relative else 1.0)
         error = None if true is None or not 0.0 < scale < math.inf else (value - true) / scale
         parameters.append(
             Parameter(name, said.identified, bounds[name], value, low, high, deviation, between, noise, true, error)

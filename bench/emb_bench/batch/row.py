@@ -74,11 +74,6 @@ class Parameter:
     true: float | None = column("what was simulated", "SI")
     error_sigmas: float | None = column("estimate less what was simulated, in its standard deviation", "1")
 
-    @property
-    def relative(self) -> bool:
-        """Returns True if deviations are relative to the value."""
-        return is_relative(self.name)
-
 
 @dataclass(frozen=True)
 class Row:
@@ -127,15 +122,10 @@ class Row:
     parameters: tuple[Parameter, ...] = ()  # In the order of the question; one column for each field of each
 
 
-def is_relative(name: str) -> bool:
-    """Returns True if deviations of a parameter are relative to its value."""
-    return name not in UNITS
-
-
 def unit_of(name: str, unit: str) -> str:
     """Unit of a column of :class:`Parameter`, for the parameter of this name."""
     if unit == RELATIVE:
-        return "1" if is_relative(name) else UNITS[name]
+        return UNITS.get(name, "1")
     return SI[name] if unit == "SI" else unit
 
 

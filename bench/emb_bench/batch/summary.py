@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from emb_bench.analysis.several_runs import Constancy, constancy
-from emb_bench.batch.row import NONE, Options, Parameter, Row, is_relative, unit_of
+from emb_bench.batch.row import NONE, Options, Parameter, Row, unit_of
+from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.numbers import NOTHING, p_value, plain, spread
@@ -127,7 +128,7 @@ def _parameter(rows: Sequence[Row], name: str) -> ParameterSummary:
         unit=unit_of(name, "SI"),
         identified=sum(bool(p.identified) for p in found),
         cramer_rao=float(np.median(bounds)) if bounds else None,
-        relative=is_relative(name),
+        relative=PARAMETERS[name].relative,
         estimate=_estimates(_usable(rows, name)),
     )
 
@@ -167,7 +168,7 @@ def _constancy(used: Sequence[Parameter]) -> Constancy:
 
 def _deviations(used: Sequence[Parameter]) -> list[float]:
     """Standard deviations in SI units; shares are of one number, so that what came out small weighs no more."""
-    scale = abs(float(np.median([p.estimate or 0.0 for p in used]))) if used[0].relative else 1.0
+    scale = abs(float(np.median([p.estimate or 0.0 for p in used]))) if PARAMETERS[used[0].name].relative else 1.0
     return [scale * (p.between_runs or 0.0) for p in used]
 
 
