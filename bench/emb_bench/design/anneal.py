@@ -3,8 +3,8 @@
 A polish keeps the samples at which a brake moves forwards and those at which it moves backwards, and ends on a corner
 of what that pattern allows. The optima of E are full of short hops during a slow creep, and each set of hops is a local
 optimum of its own. Here the pattern itself varies: blocks of speeds are shifted, replaced, moved, and hops are added,
-and the currents follow by dead beat. A variation that is worse is taken as well, at first (Kirkpatrick, Gelatt and
-Vecchi, Science 220, 1983), and one at a time is looked at: of several the best would mostly be one of those that change
+and the currents follow by dead beat. A worse variation is accepted with a falling probability (Kirkpatrick, Gelatt and
+Vecchi, Science 220, 1983). Variations are judged one by one: the best of several would mostly be one that changes
 nothing. Only the periods from the first change on are simulated again.
 """
 
@@ -22,19 +22,17 @@ from emb_bench.design.kernel import Task, excess, inform
 from emb_bench.design.problem import Problem
 from emb_bench.information.symmetric import Floats, packed_size, phi
 
-VARIATIONS = 28  # For each sample of a design, that one annealing simulates
-TEMPERATURE = 2e-4  # Loss of φ that is taken at the start, on average; it falls to zero as a parabola
+VARIATIONS = 28  # Variations that one annealing simulates for each sample of a design
+TEMPERATURE = 2e-4  # Mean loss of φ that is accepted at the start; it falls to zero as a parabola
 SOFTNESS = 0.03
-"""Of a criterion at the start, by which E's kinks are rounded; it falls to zero in the warmer half. Where the two
+"""Softness of the criterion at the start, which rounds E's kinks; it falls to zero in the warmer half. Where the two
 smallest eigenvalues are equal, as in all good designs for E, hardly a variation makes both larger at once."""
 PRICE = 0.3  # Share of the price of leaving the box that a variation pays: the polish brings it back in
-HOPELESS = 0.05
-"""Loss by that price beyond which a variation is dropped before its information is computed: none brings as much."""
+HOPELESS = 0.05  # Loss by that price beyond which a variation is dropped before its information is computed
 TWICE = 0.4  # Share of the variations that are two changes
 AT_TURNS = 0.4  # Share of the changes that begin near a turn
-STRAY = 0.05
-"""Way beyond home [rad] to which the speeds of a variation may lead; one that leads further is drawn anew, up to"""
-DRAWS = 4  # times in all, before anything is simulated: it would be worth nothing
+STRAY = 0.05  # Way beyond home to which the speeds of a variation may lead [rad]; one that leads further is drawn anew
+DRAWS = 4  # Most times that a variation is drawn
 CORRECTIONS = 8  # Simulations of a period at most that find the current for a speed; the Euler brake needs none
 HIT = 1e-3  # Distance from a speed that counts as having reached it [rad/s]
 

@@ -31,32 +31,31 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of what it would like to have for plots
     import cma
 
-JOURNEYS = (3, 4, 5)  # Of a coarse design; the searches take turns
-MOST_JOURNEYS = 9  # That a table grows to
-SHORTEST = 0.003  # Least length of a journey, in the unit in which the largest is 1
-DRAWN = 400  # Tables drawn at random, of which the best starts a search
+JOURNEYS = (3, 4, 5)  # Journeys of a coarse design; the searches take turns
+MOST_JOURNEYS = 9  # Most journeys of a grown table
+SHORTEST = 0.003  # Shortest journey, as a share of the longest one
+DRAWN = 400  # Tables drawn at random, of which the best one starts a search
 FIRST = 4000  # Coarse designs that one search simulates
-WIDE = 0.2  # Standard deviation of the genes, −1..1, with which it begins
-POPULATION = 24  # Of CMA-ES
-WAVES = 3  # Of coarse searches: those of one wave pay for being nearer to what earlier waves have found than
-NEAR = 0.3  # in the logarithm of the information on any combination of parameters, at most a price of
-NEARNESS = 0.1  # of φ. Tables that go on are apart by half of that distance.
-GROWING = 8  # Best tables that begin to grow, fewer by one each time
-GROWTHS = 4  # Times that a table grows, each by the best of
-CANDIDATES = 60  # journeys drawn at random, and a search of
-MORE = 3000  # coarse designs, that begins with a standard deviation of
-NARROW = 0.05  # of the genes
-LINES = 4  # Tables that go on as designs, fewer by one after each round until one is left, of which the better one of
-LAST = 2  # annealings goes on, so that two processors have work; and
-ROUNDS = 20  # rounds at most
-GAIN = 3e-4  # Of φ, in
-PATIENCE = 4  # rounds, at which the search has come to its end
+WIDE = 0.2  # Initial standard deviation of the genes, −1..1
+POPULATION = 24  # Population of CMA-ES
+WAVES = 3  # Batches of coarse searches, each of which keeps away from what the earlier ones found
+NEAR = 0.3  # Distance (:func:`distances`) below which two tables count as near; those that go on are half of it apart
+NEARNESS = 0.1  # Largest price of being near to an earlier table, in the unit of φ
+GROWING = 8  # Tables that begin to grow; one fewer in each round
+GROWTHS = 4  # Rounds in which tables grow
+CANDIDATES = 60  # Random journeys of which the best one is added to a table
+MORE = 3000  # Coarse designs that the search of a grown table simulates
+NARROW = 0.05  # Initial standard deviation of the genes in that search
+LINES = 4  # Designs that are annealed; one fewer in each round, down to one
+LAST = 2  # Annealings of the last design in each round, so that two processors have work
+ROUNDS = 20  # Most rounds of annealing
+PATIENCE = 4  # Rounds over which the gain is judged
+GAIN = 3e-4  # Gain of φ over these rounds below which the search ends
 SOFT = 0.05  # Share of the price of leaving the box that a coarse design pays: the polish brings it back in
-LONG = Settings(steps=80, tolerance=5e-5, cuts=4)
-"""Of the polish of every line at first, and of the best one at the end,"""
-AGAIN = Settings(steps=6, tolerance=0.0, cuts=2)  # after each annealing, and
-SHORT = Settings(steps=20, tolerance=1e-3, cuts=1)  # of one that is polished again inside tighter limits
-REPAIRS = 3  # Times that limits are drawn tighter because a brake left them between samples
+LONG = Settings(steps=80, tolerance=5e-5, cuts=4)  # Polish of every design at first, and of the best one at the end
+AGAIN = Settings(steps=6, tolerance=0.0, cuts=2)  # Polish after each annealing
+SHORT = Settings(steps=20, tolerance=1e-3, cuts=1)  # Polish of a finished design inside tighter limits
+REPAIRS = 3  # Most times that limits are tightened because a brake left them between samples
 
 
 @dataclass(frozen=True, eq=False)
