@@ -118,7 +118,7 @@ def grow_with_errors(
 ) -> ModelGrowth:
     """Growth as of :func:`grow_model`, and where no model fits so, with the bench's systematic errors estimated too.
 
-    With them a record tells features apart less well; without them, where there are some, no feature explains it.
+    With them features are harder to tell apart; without them, where there are some, no feature explains the record.
     """
     found = grow_model(bench, plant, records, asked, starts=starts, seed=seed)
     along = with_systematic(asked, bench, plant)

@@ -153,7 +153,7 @@ def _rows(e: Estimate, problem: Problem, z: Floats) -> Floats:
         rows = problem.jacobian(z, weights)[1]
     shared = [i for i, unknown in enumerate(problem.unknowns) if unknown.record is None]
     counts = np.ones(len(rows), dtype=bool)
-    known = len(problem.known(z)[0])
+    known = len(problem.prior_residuals(z)[0])
     counts[len(rows) - known :] = ~np.any(rows[len(rows) - known :, shared] != 0.0, axis=1)
     return rows[counts]
 

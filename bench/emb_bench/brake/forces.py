@@ -118,7 +118,7 @@ def travel(m: Mechanics, x1: float, w: float) -> float:
 
 
 def clamping_force(m: Mechanics, p: BrakeParameters, x1: float, w: float) -> float:
-    """Clamping force of a brake in contact, whose travel is 0 or more; the caller knows the side [N]."""
+    """Clamping force of a brake in contact, whose travel is 0 or more [N]."""
     x = travel(m, x1, w)
     return p.k_1 * x * (1.0 + x * (m.quadratic + x * m.cubic)) * (1.0 + m.hysteresis * w)
 

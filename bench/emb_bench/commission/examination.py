@@ -29,7 +29,7 @@ from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.errors import LogError
 from emb_runtime.records import RunType
 
-MOST_JITTER = 1e-4  # Jitter that is believed, at most [s]
+MOST_JITTER = 1e-4  # Largest jitter that is accepted [s]
 CERTAIN = 4.0  # Standard errors from which on a jitter is taken for one
 LONGEST = 2  # Samples by which measurements may come late, at most, that are looked for
 FEWEST = 300  # Samples at rest, at least, that a noise is known by

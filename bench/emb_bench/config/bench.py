@@ -61,8 +61,8 @@ class Budgets:
 class Systematic:
     """Systematic errors that a bench cannot exclude by itself: ``[systematic]``.
 
-    Standard deviations of Gaussian priors with mean zero, or with what the plant itself says. What a record tells
-    better than its prior, as most records do, follows from the record. 0 excludes an error: the bench knows better.
+    Standard deviations of Gaussian priors with mean zero, or with what the plant itself says. Most
+    records determine an error better than its prior. 0 excludes an error.
     """
 
     offset: NotNegative = 0.05  # Reading of the encoder at the true origin [rad]

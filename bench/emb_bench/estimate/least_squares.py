@@ -49,7 +49,7 @@ class RecursiveLeastSquares(Method):
         plant = problem.plant
         if plant.mechanics.solver == EXACT and not is_plain(plant.mechanics):
             raise UsageError(
-                f"plant '{plant.name}': recursive least squares knows the thesis's torques only, which are linear in "
+                f"plant '{plant.name}': recursive least squares has the thesis's torques only, which are linear in "
                 "the parameters; another method takes this model"
             )
         parts = [regression(problem, record) for record in problem.records]
@@ -63,19 +63,19 @@ class RecursiveLeastSquares(Method):
             )
         z = recursion(rows[counts], errors[counts], *beginning(problem))
         low, high = problem.bounds
-        belief_mean, belief = problem.belief
+        prior_mean, inverse = problem.prior
         if (z < low).any() or (z > high).any():
-            stacked = np.concatenate([rows, np.diag(belief)]), np.concatenate([errors, belief * belief_mean])
+            stacked = np.concatenate([rows, np.diag(inverse)]), np.concatenate([errors, inverse * prior_mean])
             z = np.clip(lsq_linear(*stacked, bounds=(low, high)).x, low, high)
         left = errors - rows @ z
         relative = rows * z
-        prior = np.diag((belief * z) ** 2)
+        prior = np.diag((inverse * z) ** 2)
         information = relative.T @ relative + prior
         paired = np.stack([relative, np.zeros_like(relative)], axis=1).reshape(-1, len(z))
-        known = (belief_mean - z) * belief
+        known = (prior_mean - z) * inverse
         spread = sandwich(
             information,
-            np.concatenate([paired, np.diag(belief * z)]),
+            np.concatenate([paired, np.diag(inverse * z)]),
             np.concatenate([np.stack([left, np.zeros_like(left)], axis=1).ravel(), known]),
             [len(part) for part, _ in parts],
         )
@@ -133,7 +133,7 @@ def velocity_noise(problem: Problem) -> float:
 
 def beginning(problem: Problem) -> tuple[Floats, Floats]:
     """Mean and covariance of the parameters over nominal before the first period."""
-    mean, inverse = problem.belief
+    mean, inverse = problem.prior
     return mean, np.diag(np.where(inverse > 0.0, 1.0 / np.where(inverse > 0.0, inverse, 1.0), WIDE) ** 2)
 
 

@@ -1,4 +1,4 @@
-"""Does the model explain the record? To be answered before any number is believed.
+"""Model validation: tests of whether the model explains the record, before any number is used.
 
 With the bench's noise known, three questions have a distribution under the right model:
 

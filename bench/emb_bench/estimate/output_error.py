@@ -245,7 +245,7 @@ def finished(
     information = relative.T @ relative
     fields = {
         "information": information,
-        "prior": np.diag((problem.belief[1] * scale) ** 2) if problem.belief[1].any() else None,
+        "prior": np.diag((problem.prior[1] * scale) ** 2) if problem.prior[1].any() else None,
         "sandwich": sandwich(information, relative, found.residuals, [len(r) for r in residuals]),
         "validation": validation or examine(problem, z, weights, found),
         "ends": ends,

@@ -85,7 +85,7 @@ class Problem:
         return pairs[:, 0], pairs[:, 1]
 
     @cached_property
-    def belief(self) -> tuple[Floats, Floats]:
+    def prior(self) -> tuple[Floats, Floats]:
         """Mean of z before the records, and its inverse standard deviations: zero for what nothing was known of."""
         prior = self.asked.prior
         mean, inverse = np.ones(len(self.unknowns)), np.zeros(len(self.unknowns))
@@ -216,7 +216,7 @@ class Problem:
         """Periods at whose ends the brake is found again after a longer gap: those of the first sample that shows it.
 
         A place earlier would have to be found back through the period between, in which the brake may have come to
-        rest: then nothing tells how fast it was.
+        rest: then its velocity cannot be recovered.
         """
         seen = self.plant.instruments.measurement_delay == 0
         return np.minimum(self.records[record].gaps[1] + int(seen), len(self.records[record].currents) - 1)
@@ -327,7 +327,7 @@ class Problem:
             block[:, :, columns] = -shares.transpose(0, 2, 1) / factors[columns]
             residuals.append(errors.ravel())
             rows.append(block.reshape(-1, len(z)))
-        known, their_rows = self.known(z)
+        known, their_rows = self.prior_residuals(z)
         return np.concatenate([*residuals, known]), np.concatenate([*rows, their_rows])
 
     def rests(self) -> dict[int, list[int]]:
@@ -339,7 +339,7 @@ class Problem:
                 found[i] = touched
         return found
 
-    def known(self, z: Floats) -> tuple[Floats, Floats]:
+    def prior_residuals(self, z: Floats) -> tuple[Floats, Floats]:
         """Residuals of what is no sample, and their derivatives: each record's start if it is unknown, the prior."""
         residuals, rows = [], []
         for i, touched in self.rests().items():
@@ -350,10 +350,10 @@ class Problem:
             shown = sum(float(z[c]) for c in touched) + unseen
             residuals.append(np.array([(record.angle - shown) / record.slack]))
             rows.append(row)
-        mean, inverse = self.belief
-        believed = np.flatnonzero(inverse)
-        residuals.append((mean - z)[believed] * inverse[believed])
-        rows.append(-np.diag(inverse)[believed])
+        mean, inverse = self.prior
+        known = np.flatnonzero(inverse)
+        residuals.append((mean - z)[known] * inverse[known])
+        rows.append(-np.diag(inverse)[known])
         return np.concatenate(residuals), np.concatenate(rows)
 
 

@@ -39,7 +39,7 @@ DISTURBED = 10.0
 """Factor of what is known of drifts before a record in which something disturbs the brake: it may be a drift, which the
 random walk of a filter follows without an alarm."""
 
-ALIKE = 2.0  # Difference of two suspects' squared scores below which the record hardly tells them apart
+ALIKE = 2.0  # Difference of two suspects' squared scores below which they are hardly distinguished
 
 DRIFT_STEP = 1e-4  # Step of the secant of a drift
 
@@ -258,7 +258,7 @@ def score(
 
 
 def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
-    """Most suspicious first; of those that the record hardly tells apart, the one that comes first in ``EFFECTS``."""
+    """Most suspicious first; of those that are hardly distinguished, the one that comes first in ``EFFECTS``."""
 
     def rank(s: Suspect) -> tuple[float, float]:
         """Without the last digits, which differ between processors: two that act alike keep their order."""

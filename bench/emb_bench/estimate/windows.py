@@ -203,7 +203,7 @@ class Cut:
     def _settled(self, i: int, shared: Floats, start: Floats) -> tuple[Floats, Window]:
         """Start of one window after damped Gauss-Newton steps, none of which raises the squares.
 
-        Near rest a step may be far too long: what friction holds hardly tells its start.
+        Near rest a step may be far too long: the samples of a brake that friction holds hardly depend on its start.
         """
         window = self._linearised(i, shared, start)
         for _ in range(SETTLED):
@@ -270,7 +270,7 @@ def _chosen(problem: Problem, points: Sequence[Floats]) -> tuple[Problem, Floats
         apart = _apart(one, other)
         one, other = (other, one) if apart > 0.0 else (one, other)
         names = {HELD: "is held from its stamp to the next", LINEAR: "goes straight from its stamp to the next"}
-        chosen = f"the command {names[course_of(one.problem)]}, as far as the record tells ({abs(apart):.1f} sigma)"
+        chosen = f"the command {names[course_of(one.problem)]}, by the likelihood ({abs(apart):.1f} sigma)"
         said.append(chosen if abs(apart) > NORMAL_95 else f"{chosen}: the intervals cover the other course too")
         others = () if abs(apart) > NORMAL_95 else (other.shared - one.shared,)
     return one.problem, one.shared, others, tuple(said)

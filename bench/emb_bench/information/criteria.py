@@ -193,7 +193,7 @@ def distances(matrices: Floats, other: Floats) -> Floats:
     """Largest |log vᵀMv − log vᵀM'v| over all v, of each of some FIMs M, shape (count, p, p), and another one M'.
 
     It is the largest |log λ| of their generalised eigenvalues: 0.1 if of some combination of parameters, of whatever
-    unit, one knows a tenth more than the other.
+    unit, one has a tenth more information than the other.
     """
     values, vectors = np.linalg.eigh(other)
     root = vectors / np.sqrt(np.maximum(values, max(FLOOR * values[-1], 1e-300)))
