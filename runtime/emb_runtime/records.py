@@ -118,6 +118,11 @@ class CycleRecord(NamedTuple):
     decide_time_ns: int  # Time at which policy, clip and shield had answered and the frame was ready; 0 if it never was
     send_time_ns: int  # Time at which the command had been handed to the bus; 0 if none was
 
+    @property
+    def time_ns(self) -> int:
+        """Time of its record in the log, as all records have one: the arrival of the pair."""
+        return self.receive_time_ns
+
 
 CYCLE_UNITS = {
     "angle": "rad",

@@ -308,7 +308,7 @@ def test_a_missing_event_or_another_one_is_reported(recorded: Callable[..., Driv
         records[:] = [record for record in records if not is_active(record)]
 
     def change(records: list[Record]) -> None:
-        records[:] = [EventRecord(r.time_ns, "NODE_STOPPED", "") if is_active(r) else r for r in records]  # type: ignore[union-attr]
+        records[:] = [EventRecord(r.time_ns, "NODE_STOPPED", "") if is_active(r) else r for r in records]
 
     for alter in (remove, change):
         result = again(run, alter=alter)

@@ -153,8 +153,8 @@ SAFETY = Topic(
 CLOCK = Topic(
     "/clock",
     "emb.ClockSample",
-    (Field("monotonic_ns", "int64", "ns"), Field("wall_ns", "int64", "ns"), Field("drift_ns", "int64", "ns")),
-    {"description": "drift_ns: how far Unix time has moved against the epoch of this log since its start"},
+    (Field("monotonic_ns", "int64", "ns"), Field("wall_ns", "int64", "ns")),
+    {"description": "both clocks read at once: each message's time is monotonic, plus their difference at the start"},
 )
 ESTIMATE = "/estimate"  # Topic of an experiment, see :func:`estimate_topic`
 LEARNT = Topic(

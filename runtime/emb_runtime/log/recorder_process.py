@@ -80,13 +80,22 @@ class LogWriter:
             self._attach(begin, *attachment)
         for topic in mcap_schema.FIXED_TOPICS:
             self._register(topic)
-        self._estimate = mcap_schema.estimate_topic(header.estimates)
+        estimate = mcap_schema.estimate_topic(header.estimates)
         if header.estimates:
-            self._register(self._estimate)
+            self._register(estimate)
         if header.learns:
             self._register(mcap_schema.LEARNT)
         if header.drive_bus:
             self._register(mcap_schema.DRIVE)
+        names = [name for name, _ in header.estimates]
+        self._rows: dict[type[Record], tuple[mcap_schema.Topic, tuple[str, ...]]] = {
+            CycleRecord: (mcap_schema.CYCLE, CycleRecord._fields),
+            EventRecord: (mcap_schema.SAFETY, ("code", "text")),
+            ClockRecord: (mcap_schema.CLOCK, ClockRecord._fields),
+            EstimateRecord: (estimate, ("step", *names, *map(mcap_schema.deviation_of, names))),
+            LearntRecord: (mcap_schema.LEARNT, tuple(field.name for field in mcap_schema.LEARNT.fields)),
+        }
+        """Topic of each record but a frame's, and the names of its values there."""
         self._decoded = {
             message.name: mcap_schema.message_topic(
                 message.name, message.identifier, [_field(s) for s in message.signals]
@@ -101,23 +110,16 @@ class LogWriter:
 
     def write(self, record: Record, log_time: int) -> None:
         """Write one record of monotonic times, and what it decodes to, at a Unix time [ns]."""
-        match record:
-            case FrameRecord():
-                self._write_frame(record, log_time)
-            case CycleRecord():
-                self._add(mcap_schema.CYCLE, log_time, record.receive_time_ns, record._asdict())
-            case EstimateRecord(time_ns, step, numbers):
-                self._write_estimate(time_ns, step, numbers, log_time)
-            case LearntRecord(time_ns, step, numbers):
-                names = (field.name for field in mcap_schema.LEARNT.fields)
-                values = dict(zip(names, (step, *numbers), strict=True))
-                self._add(mcap_schema.LEARNT, log_time, time_ns, values)
-            case EventRecord(time_ns, code, text):
-                self._add(mcap_schema.SAFETY, log_time, time_ns, {"code": code, "text": text})
-            case ClockRecord(monotonic_ns, wall_ns):
-                drift = wall_ns - monotonic_ns - self._offset
-                values = {"monotonic_ns": monotonic_ns, "wall_ns": wall_ns, "drift_ns": drift}
-                self._add(mcap_schema.CLOCK, log_time, monotonic_ns, values)
+        if isinstance(record, FrameRecord):
+            self._write_frame(record, log_time)
+            return
+        topic, names = self._rows[type(record)]
+        values: tuple[Any, ...] = record
+        if isinstance(record, EventRecord):
+            values = record.code, record.text
+        elif isinstance(record, EstimateRecord | LearntRecord):
+            values = record.step, *record.numbers
+        self._add(topic, log_time, record.time_ns, dict(zip(names, values, strict=True)))
 
     def write_drive(self, frame: Frame, read_ns: int, log_time: int) -> None:
         """Write a frame of a mapped drive's bus, whose identifiers have another meaning."""
@@ -147,12 +149,6 @@ class LogWriter:
         if topic.name not in self._channels:  # of an optional message
             self._register(topic)
         self._add(topic, log_time, frame.time_ns, signals)
-
-    def _write_estimate(self, time_ns: int, step: int, numbers: tuple[float, ...], log_time: int) -> None:
-        half = len(numbers) // 2
-        each = [number for pair in zip(numbers[:half], numbers[half:], strict=True) for number in pair]
-        values = dict(zip((field.name for field in self._estimate.fields), (step, *each), strict=True))
-        self._add(self._estimate, log_time, time_ns, values)
 
     def _register(self, topic: mcap_schema.Topic) -> None:
         if topic.message not in self._schemas:
@@ -302,7 +298,7 @@ class Recording:
                 self.lost += 1
                 continue
             # Nothing is written before it happened; in simulated time, which stands still, that is all there is to it.
-            self._now = max(self._now, _time(record) + self._offset)
+            self._now = max(self._now, record.time_ns + self._offset)
             self._guarded(partial(self.writer.write, record, self._now))
         return True
 
@@ -315,18 +311,6 @@ class Recording:
         except OSError as err:
             self.error = f"writing failed: {err.strerror}"
             self.lost += 1
-
-
-def _time(record: Record) -> int:
-    match record:
-        case FrameRecord(frame, _):
-            return frame.time_ns
-        case CycleRecord():
-            return record.receive_time_ns
-        case ClockRecord(monotonic_ns, _):
-            return monotonic_ns
-        case _:
-            return record.time_ns
 
 
 def begin(ring: Ring, document: Mapping[str, Any]) -> Recording:

@@ -163,6 +163,11 @@ class FrameRecord(NamedTuple):
     frame: Frame
     read_ns: int = 0  # Time at which the loop had it, monotonic [ns]; 0 if more frames of the same read follow
 
+    @property
+    def time_ns(self) -> int:
+        """Time at which it was on the bus, monotonic [ns]."""
+        return self.frame.time_ns
+
 
 class EventRecord(NamedTuple):
     """Something that the safety chain did."""
@@ -181,6 +186,11 @@ class ClockRecord(NamedTuple):
 
     monotonic_ns: int
     wall_ns: int  # Unix time [ns]
+
+    @property
+    def time_ns(self) -> int:
+        """Time of the reading, monotonic [ns]."""
+        return self.monotonic_ns
 
 
 class EstimateRecord(NamedTuple):
