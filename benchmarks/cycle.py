@@ -51,7 +51,7 @@ from emb_runtime.system.clock import Clock, MonotonicClock
 
 LIMITS = {50.0: 60e-6, 99.9: 150e-6}  # Limits of the cycle's work [s], by quantile
 STEPS: dict[str, tuple[Any, str]] = {
-    "reading a frame (after the wait)": (SocketCan, "_frame"),
+    "reading a frame (after the wait)": (SocketCan, "_read"),
     "reception": (Reception, "take"),
     "estimator": (Estimator, "take"),
     "policy": (Policy, "act"),

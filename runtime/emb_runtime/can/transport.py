@@ -12,7 +12,7 @@ import select
 import socket
 import struct
 from collections.abc import Callable, Mapping
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Protocol
 
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
@@ -94,15 +94,6 @@ def _raw_socket() -> socket.socket:
 def _wait_readable(descriptor: int, timeout_s: float) -> bool:
     # select() and not poll(), whose timeout has a resolution of one millisecond: a whole sample time.
     return bool(select.select([descriptor], [], [], timeout_s)[0])
-
-
-class Datagram(NamedTuple):
-    """One frame as the kernel gives it."""
-
-    data: bytes
-    wall_ns: int  # Arrival, Unix time [ns]
-    dropped: int | None  # Frames dropped on this socket so far; None if none was just before this one
-    flags: int
 
 
 class SocketCan:
@@ -205,48 +196,41 @@ class SocketCan:
 
     def receive(self, deadline_ns: int) -> Frame | None:
         """See :meth:`Transport.receive`; the kernel reports that the interface has gone down once."""
-        datagram = self._read()
-        if datagram is None and deadline_ns > 0:
-            datagram = self._wait(deadline_ns)
-        return None if datagram is None else self._frame(datagram)
+        frame = self._read()
+        if frame is None and deadline_ns > 0:
+            frame = self._wait(deadline_ns)
+        return frame
 
     def close(self) -> None:
         """See :meth:`Transport.close`."""
         self._socket.close()
 
-    def _wait(self, deadline_ns: int) -> Datagram | None:
+    def _wait(self, deadline_ns: int) -> Frame | None:
         """Wait for a frame until a deadline [ns]."""
         while (now_ns := self._clock.now_ns()) < deadline_ns:
             if not self._wait_readable(self._descriptor, (deadline_ns - now_ns) * 1e-9):
                 return None
-            if (datagram := self._read()) is not None:
-                self._keep_offset(datagram, now_ns, deadline_ns)
-                return datagram
+            if (frame := self._read()) is not None:
+                return self._restamped(frame, now_ns, deadline_ns)
         return None
 
-    def _read(self) -> Datagram | None:
+    def _read(self) -> Frame | None:
         """The next frame that waits, if one does."""
         try:
-            data, control, flags, _ = self._socket.recvmsg(_LONGEST_FRAME, _CONTROL_BYTES, _MSG_DONTWAIT)
+            raw, control, flags, _ = self._socket.recvmsg(_LONGEST_FRAME, _CONTROL_BYTES, _MSG_DONTWAIT)
         except BlockingIOError:
             return None
         except OSError as err:
             raise self._loss(err.errno) from err
-        wall_ns, dropped = 0, None
+        if len(raw) != _CAN_FRAME.size:
+            raise BusError(f"{self.name}: expected {_CAN_FRAME.size} bytes per frame, got {len(raw)}; not a CAN socket")
+        wall_ns = 0
         for _level, kind, value in control:
             if kind == _SO_TIMESTAMPNS:
                 seconds, nanoseconds = _STAMP.unpack(value)
                 wall_ns = seconds * 1_000_000_000 + nanoseconds
             elif kind == _SO_RXQ_OVFL:
-                (dropped,) = _COUNT.unpack(value)
-        return Datagram(data, wall_ns, dropped, flags)
-
-    def _frame(self, datagram: Datagram) -> Frame:
-        raw, wall_ns, dropped, flags = datagram
-        if len(raw) != _CAN_FRAME.size:
-            raise BusError(f"{self.name}: expected {_CAN_FRAME.size} bytes per frame, got {len(raw)}; not a CAN socket")
-        if dropped is not None:
-            self._dropped = dropped
+                (self._dropped,) = _COUNT.unpack(value)
         identifier, length, data = _CAN_FRAME.unpack(raw)
         time_ns, own = wall_ns - self._wall_offset_ns, bool(flags & _MSG_CONFIRM)
         if identifier <= _SFF_MASK:  # nearly all of them
@@ -265,14 +249,16 @@ class SocketCan:
             dropped=self._dropped,
         )
 
-    def _keep_offset(self, datagram: Datagram, empty_ns: int, deadline_ns: int) -> None:
-        """Measure the wall clock's offset anew if it has stepped since, judged by a frame that came while we waited.
+    def _restamped(self, frame: Frame, empty_ns: int, deadline_ns: int) -> Frame:
+        """A frame that came while we waited, with the wall clock's offset measured anew if that has stepped since.
 
         The queue was empty just before, so the frame cannot be older than that, nor younger than the deadline.
         """
-        time_ns = datagram.wall_ns - self._wall_offset_ns
-        if not empty_ns - _STEP_SLACK_NS <= time_ns <= deadline_ns + _STEP_SLACK_NS:
-            self._wall_offset_ns = self._clock.wall_offset_ns()
+        if empty_ns - _STEP_SLACK_NS <= frame.time_ns <= deadline_ns + _STEP_SLACK_NS:
+            return frame
+        wall_ns = frame.time_ns + self._wall_offset_ns
+        self._wall_offset_ns = self._clock.wall_offset_ns()
+        return frame._replace(time_ns=wall_ns - self._wall_offset_ns)
 
     def _loss(self, code: int | None) -> BusError:
         """The error about a lost bus."""

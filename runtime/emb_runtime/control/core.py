@@ -74,20 +74,6 @@ class Proposal(NamedTuple):
     decision: Decision
 
 
-class Answer(NamedTuple):
-    """Part of a cycle record that is there only if a sample was answered."""
-
-    command_counter: int = NO_COUNTER
-    wanted: float = NAN
-    clipped: float = NAN
-    sent: float = NAN
-    decide_ns: int = 0
-    send_ns: int = 0
-
-
-NO_ANSWER: Final = Answer()
-
-
 @dataclass
 class Core:
     """Core of one run: an experiment, or the way home."""
@@ -262,8 +248,8 @@ class Core:
             self._answered = sample.counter
             self._sent_counter = counter
             self.counters.count_answer(decision.reasons, current)
-            answer = Answer(counter, wanted, decision.clipped, current, self._decide_ns, now_ns)
-            self._record(sample, step, decision.reasons, self._missed, answer)
+            currents = wanted, decision.clipped, current
+            self._record(sample, step, decision.reasons, self._missed, self._decide_ns, currents, counter, now_ns)
         self._end_cycle(sample, step)
 
     def timeout(self, now_ns: int) -> None:
@@ -592,8 +578,7 @@ class Core:
         self.counters.left += bool(reasons)
         if not reasons:  # else the node brakes because the loop decided so
             self._unobeyed.reject()
-        answer = Answer(decide_ns=decide_ns) if decide_ns else NO_ANSWER
-        self._record(sample, self._step_of(sample), reasons or Reason.MISSED, missed, answer)
+        self._record(sample, self._step_of(sample), reasons or Reason.MISSED, missed, decide_ns)
 
     def _end_cycle(self, sample: SensorSample, step: int) -> None:
         """Record what is known at a sample, and judge the motion so far."""
@@ -696,13 +681,22 @@ class Core:
             before = self._learner.known
             raise StopError(Fault.SET_CONTRADICTED, "" if before is None else f"until then {words(before)} of nominal")
 
-    def _record(self, sample: SensorSample, step: int, reasons: int, missed: int, answer: Answer = NO_ANSWER) -> None:
-        command_counter, wanted, clipped, sent, decide_ns, send_ns = answer
+    def _record(
+        self,
+        sample: SensorSample,
+        step: int,
+        reasons: int,
+        missed: int,
+        decide_ns: int = 0,
+        currents: tuple[float, float, float] = (NAN, NAN, NAN),
+        command_counter: int = NO_COUNTER,
+        send_ns: int = 0,
+    ) -> None:
+        """Record a cycle; ``currents`` are those of the policy, clipped, and sent [A]."""
         counter, angle, velocity, device_ns, receive_ns, applied, _, node_state = sample
         of_cycle = step, self.state, int(reasons), counter, command_counter, missed, node_state
-        values = angle, velocity, applied, wanted, clipped, sent
         times = device_ns, receive_ns, self._now_ns, decide_ns, send_ns
-        self.records.append(tuple.__new__(CycleRecord, of_cycle + values + times))
+        self.records.append(tuple.__new__(CycleRecord, (*of_cycle, angle, velocity, applied, *currents, *times)))
 
 
 def latest_answer_ns(bench: Bench) -> int:

@@ -6,12 +6,12 @@ import socket
 import struct
 from collections import deque
 from importlib import metadata
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import pytest
 
 from emb_runtime.can.interfaces import open_transport
-from emb_runtime.can.transport import Datagram, SocketCan, TransmitQueueFullError, Transport
+from emb_runtime.can.transport import SocketCan, TransmitQueueFullError, Transport
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import BusError, UsageError
 from emb_runtime.records import Frame
@@ -29,6 +29,15 @@ def raw(identifier: int, data: bytes) -> bytes:
 
 def failure(code: int) -> OSError:
     return OSError(code, os.strerror(code))
+
+
+class Datagram(NamedTuple):
+    """One frame as the kernel gives it."""
+
+    data: bytes
+    wall_ns: int
+    dropped: int | None
+    flags: int
 
 
 class FakeSocket:
