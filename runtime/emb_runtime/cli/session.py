@@ -240,8 +240,15 @@ def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dic
         The result as a document, and the pre-flight of what was heard.
     """
     recorder = start_recorder(plan, bus, RunType.LISTEN_ONLY, path, (), 0)
-    clock = bus.clock
+    clock, receive = bus.clock, paced_receive(bus, recorder)
     end = {"exit_reason": Fault.INTERNAL.name, "detail": "the listening ended before its time"}
+
+    def receive_and_record(deadline_ns: int) -> Frame | None:
+        frame = receive(deadline_ns)
+        if frame is not None:
+            recorder.push_frame(frame)
+        return frame
+
     try:
         push_clock(recorder, clock)
         machine = StateMachine(timeouts(plan.bench), recorder.push_event)
@@ -249,9 +256,10 @@ def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dic
         monitor = BusMonitor(
             plan.layout, plan.bench, lambda _, why: recorder.push_event(clock.now_ns(), "FRAME_REJECTED", why)
         )
+        period_ns, deadline_ns = plan.bench.timing.sample_time_ns, clock.now_ns() + round(plan.listen * 1e9)
         refused: RefusedError | None = None
         try:
-            _log_frames(plan, bus, recorder, monitor, machine, console.stop_requested)
+            listen(monitor, receive_and_record, clock, period_ns, deadline_ns, lambda *_: False, console.stop_requested)
         except BusError as err:
             refused = RefusedError(str(err), err.exit_code, fault=Fault.BUS_LOST)
         heard = monitor.statistics()
@@ -270,23 +278,3 @@ def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dic
     finally:
         log = recorder.finish(end)
     return listen_document(plan, bus.iface, heard, lines, refused, log), lines
-
-
-def _log_frames(
-    plan: Plan,
-    bus: Bus,
-    recorder: Recorder,
-    monitor: BusMonitor,
-    machine: StateMachine,
-    stop_requested: Callable[[], bool],
-) -> None:
-    """Take every frame until the time is over, or the operator has heard enough."""
-    receive, now_ns = paced_receive(bus, recorder), bus.clock.now_ns()
-    deadline_ns = now_ns + round(plan.listen * 1e9)
-    while now_ns < deadline_ns and not stop_requested():
-        frame = receive(min(deadline_ns, now_ns + 10 * plan.bench.timing.sample_time_ns))
-        now_ns = bus.clock.now_ns()
-        if frame is not None:
-            recorder.push_frame(frame)
-            if monitor.take(frame) is not None:
-                machine.handle_event(Event.PAIR, frame.time_ns)
