@@ -33,7 +33,6 @@ from benchmarks.bus.long_run import long_bench, write_both
 from benchmarks.bus.pair import local_bus, node_on_a_pair
 from emb_bench.logs.log import read_log
 from emb_bench.logs.timing import Floats, timing
-from emb_runtime.can.messages import Layout
 from emb_runtime.can.receiver import Reception
 from emb_runtime.can.transport import SocketCan, Transport
 from emb_runtime.cli import experiment, session
@@ -56,7 +55,7 @@ STEPS: dict[str, tuple[Any, str]] = {
     "estimator": (Estimator, "take"),
     "policy": (Policy, "act"),
     "clip, slew, shield": (core, "decide"),
-    "encoding": (Layout, "encode_command"),
+    "permission and encoding": (core.Core, "commit"),
     "guard and bus": (Guard, "send"),
     "  of it, the bus": (SocketCan, "send"),
     "recording": (Recorder, "push"),

@@ -436,12 +436,12 @@ def of_runs(checkout: Checkout) -> Mapping[str, Any]:
 CAN = """
 import json
 from emb_runtime.can.messages import StopReason, load_layout
-from emb_runtime.records import CurrentCommand, NodeState
+from emb_runtime.records import NodeState
 l, out = load_layout(), {}
 def add(name, frame): out[name] = f"{frame.identifier:03x} {frame.data.hex()}"
 for n, i in enumerate((0.0, 0.0002, -0.0002, 1.23456, -3.3333, 6.0, -6.0)):
-    add(f"command {i} {n}", l.encode_command(CurrentCommand(n * 2, 14 - n, i, True)))
-add("command disabled", l.encode_command(CurrentCommand(14, 0, 0.0, False)))
+    add(f"command {i} {n}", l.encode_command(n * 2, 14 - n, i, True))
+add("command disabled", l.encode_command(14, 0, 0.0, False))
 for n, a in enumerate((0.0, 2e-5, -2e-5, 74.565, -9.99999, 100.0, 159.9, -160.0)):
     add(f"angle {a} {n}", l.encode_angle(n, a, n * 987_654_321))
 for n, v in enumerate((0.0, 1e-4, -1e-4, 491.3035, -500.0, 799.9, -800.0)):

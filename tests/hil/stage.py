@@ -36,7 +36,7 @@ import emb_runtime.safety.watchdog_process  # its bytecode and what it imports a
 import simulated_drives
 from emb_bench.hil import link
 from emb_runtime.can.messages import load_layout
-from emb_runtime.records import CurrentCommand, Frame
+from emb_runtime.records import Frame
 from tests.drives import EXAMPLES
 from tests.hil import bus_faults
 from tests.hil.failing_policy import make_it_hang
@@ -246,7 +246,7 @@ class Stage:
                     else:
                         sample = int(data[2:4], 16) & 0x0F
                 time.sleep(0.0002)
-            foreign = LAYOUT.encode_command(CurrentCommand(counter % 15, sample, 3.0, enable=True))
+            foreign = LAYOUT.encode_command(counter % 15, sample, 3.0, True)
             self._send(foreign)
 
     def do_babble(self, action: dict[str, Any]) -> None:

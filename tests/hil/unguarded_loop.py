@@ -12,7 +12,6 @@ from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import BusError
-from emb_runtime.records import CurrentCommand
 from emb_runtime.safety.watchdog import WatchdogHandle
 from tests.hil.sniffer import open_socket, read, wait_until
 
@@ -28,7 +27,7 @@ def main() -> None:
 
     def send(counter: int) -> str:
         try:
-            transport.send(layout.encode_command(CurrentCommand(counter, 0, 1.0, enable=True)))
+            transport.send(layout.encode_command(counter, 0, 1.0, True))
         except BusError as err:
             return str(err)
         return ""

@@ -9,7 +9,7 @@ import pytest
 from emb_runtime.can.messages import Layout, StopReason
 from emb_runtime.can.receiver import BUS_OFF, Reception
 from emb_runtime.config.bench import Bench
-from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState
+from emb_runtime.records import Frame, NodeState, RunState
 from emb_runtime.safety.guard import Guard, GuardRejectedError
 
 KINDS = {
@@ -34,7 +34,7 @@ def every(kind: str, valid: dict[int, bytes]) -> Iterator[Frame]:
 @pytest.fixture(scope="module")
 def valid(layout: Layout) -> dict[int, bytes]:
     frames = [
-        layout.encode_command(CurrentCommand(0, 0, 1.0, True)),
+        layout.encode_command(0, 0, 1.0, True),
         layout.encode_angle(3, 0.0, 0),
         layout.encode_velocity(3, 0.0, 0.0, NodeState.IDLE, 15),
         layout.encode_status(3, NodeState.IDLE, StopReason.NONE, 0, 0),

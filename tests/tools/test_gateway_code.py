@@ -128,7 +128,7 @@ def test_the_gateway_obeys_what_the_host_sends_and_nothing_with_a_bit_that_is_wr
     draw, lines, expected = random.Random(2), list[str](), list[str]()
     for _ in range(CASES):
         taken = CurrentCommand(draw.randrange(15), draw.randrange(15), draw.randrange(-30_000, 30_001) * 2e-4, True)
-        frame = LAYOUT.encode_command(taken)
+        frame = LAYOUT.encode_command(*taken)
         lines.append(f"c {frame.data.hex()}")
         expected.append(f"{taken.counter} {taken.answers} {taken.current:.4f} 1")
         for _ in range(2):

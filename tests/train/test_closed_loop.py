@@ -20,7 +20,6 @@ from emb_bench.sim.simulated_brake import sent_current
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
-from emb_runtime.records import CurrentCommand
 from emb_runtime.safety.command_limits import LEFT
 from emb_runtime.safety.sensor_monitor import OBEYS, largest_current
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
@@ -66,7 +65,7 @@ def test_an_experiment_is_what_the_node_makes_of_the_same_commands(seed: int, de
         assert batch.y[0, 0] == pytest.approx(said.angle, abs=1e-3)  # the frame's resolution
         assert batch.y[0, 1] == pytest.approx(applied.velocity, abs=0.05)
         assert batch.experiments.applied[0] == pytest.approx(applied.applied_current, abs=1.01 * step)
-        node.receive(layout.encode_command(CurrentCommand(k % 15, said.counter, steps[k] * step, True)))
+        node.receive(layout.encode_command(k % 15, said.counter, steps[k] * step, True))
         batch.advance(np.array([steps[k] * step]))
         frames = node.tick()
         assert batch.x[0, 0] == pytest.approx(node.angle, abs=1e-9)

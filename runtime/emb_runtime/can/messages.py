@@ -132,8 +132,8 @@ _FIELDS: Mapping[str, tuple[type[Any], tuple[Field, ...]]] = {
 class Layout:
     """All messages of the bench with their encoders and decoders, and the DBC text that they come from.
 
-    An encoder takes the fields of its record, :meth:`encode_command` the record, and raises FrameError where a value
-    does not fit. A decoder raises FrameRejectedError for a frame that is not valid in all respects.
+    An encoder takes the fields of its record, and raises FrameError where a value does not fit. A decoder raises
+    FrameRejectedError for a frame that is not valid in all respects.
     """
 
     text: str
@@ -146,7 +146,7 @@ class Layout:
     charge: Message  # A node may send it
     gateway: Message | None  # A gateway sends it; None in a log of before
     device_time_period_ns: int  # Period after which the device time wraps [ns]
-    encode_command_fields: Callable[[int, int, float, bool], Frame]
+    encode_command: Callable[[int, int, float, bool], Frame]
     encode_angle: Callable[[int, float, int], Frame]
     encode_velocity: Callable[[int, float, float, NodeState, int], Frame]
     encode_status: Callable[[int, NodeState, StopReason, int, int], Frame]  # The version is the layout's
@@ -156,10 +156,6 @@ class Layout:
     decode_angle: Callable[[Frame], AngleFrame]
     decode_velocity: Callable[[Frame], VelocityFrame]
     decode_status: Callable[[Frame], StatusFrame]
-
-    def encode_command(self, command: CurrentCommand) -> Frame:
-        """The command frame; raises FrameError for a current that is not finite or beyond the DBC's range."""
-        return self.encode_command_fields(*command)
 
     @property
     def known(self) -> tuple[Message, ...]:
@@ -231,7 +227,7 @@ def _generate(text: str) -> Layout:
         charge=optional,
         gateway=gateway,
         device_time_period_ns=step_ns * (time.mask + 1),
-        encode_command_fields=command.encode,
+        encode_command=command.encode,
         encode_angle=angle.encode,
         encode_velocity=velocity.encode,
         encode_status=status.encode,

@@ -33,7 +33,7 @@ from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.learning.known import numbers
 from emb_runtime.learning.learner import Learner, words
 from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord, Record
-from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, Reason, RunState, SensorSample
+from emb_runtime.records import CycleRecord, Frame, NodeState, Reason, RunState, SensorSample
 from emb_runtime.safety.command_limits import CommandLimits, Decision, checked, decide
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS, Guard
 from emb_runtime.safety.motion_balance import REST_SAMPLES, MotionBalance, steady_motion
@@ -125,7 +125,7 @@ class Core:
         self._end: SensorSample | None = None  # the newest of those before the stop
         self._missed = 0  # periods without a valid pair just before it
         self._at_home = 0  # samples in a row at home, once the brake is to return
-        self._command: CurrentCommand | None = None  # the last one that was committed
+        self._counter = NO_COUNTER  # of the last command that was committed
         self._decide_ns = 0  # and when
         self._sent_counter: int | None = None  # counter of the command that answered the newest sample
         self._unobeyed = LeakyCount(bench.watch.stop_missed)  # periods in which the node obeyed no command
@@ -219,9 +219,8 @@ class Core:
         sample, step, _, decision = proposal
         self._decide_ns = now_ns
         if self._may_answer(sample, decision, now_ns):
-            answer = self.guard.next_counter, sample.counter, decision.current, True
-            self._command = tuple.__new__(CurrentCommand, answer)
-            return self.layout.encode_command(self._command)
+            self._counter = self.guard.next_counter
+            return self.layout.encode_command(self._counter, sample.counter, decision.current, True)
         self._remember(0.0)
         in_time = now_ns - sample.receive_time_ns <= self._latest_answer_ns
         left = decision.reasons & Reason.LEFT if in_time else Reason.NONE
@@ -241,15 +240,13 @@ class Core:
             self._remember(0.0)
             self._leave_unanswered(sample, self._missed, self._decide_ns)
         else:
-            assert self._command is not None
-            counter = self._command.counter
             current = round(decision.current / self._current_step) * self._current_step  # what is on the bus
             self._remember(current)
             self._answered = sample.counter
-            self._sent_counter = counter
+            self._sent_counter = self._counter
             self.counters.count_answer(decision.reasons, current)
             currents = wanted, decision.clipped, current
-            self._record(sample, step, decision.reasons, self._missed, self._decide_ns, currents, counter, now_ns)
+            self._record(sample, step, decision.reasons, self._missed, self._decide_ns, currents, self._counter, now_ns)
         self._end_cycle(sample, step)
 
     def timeout(self, now_ns: int) -> None:
@@ -276,7 +273,7 @@ class Core:
 
     def stop_frame(self) -> Frame:
         """Next stop frame."""
-        return self.layout.encode_command(CurrentCommand(self.guard.next_counter, self.newest_counter, 0.0, False))
+        return self.layout.encode_command(self.guard.next_counter, self.newest_counter, 0.0, False)
 
     def end(self, now_ns: int) -> None:
         """Judge how the node came to rest; the run is over."""

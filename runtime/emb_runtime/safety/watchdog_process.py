@@ -32,7 +32,7 @@ from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import parse_bench
 from emb_runtime.errors import EmbError
-from emb_runtime.records import CurrentCommand, Frame
+from emb_runtime.records import Frame
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat
 from emb_runtime.system import child_process, realtime
 from emb_runtime.system.clock import Clock
@@ -99,8 +99,7 @@ def stop_frames(layout: Layout) -> StopFrames:
     """Stop frames: all that the watchdog can send."""
     counters = range(COUNTER_MODULUS)
     return tuple(
-        tuple(layout.encode_command(CurrentCommand(counter, answers, 0.0, enable=False)) for answers in counters)
-        for counter in counters
+        tuple(layout.encode_command(counter, answers, 0.0, False) for answers in counters) for counter in counters
     )
 
 

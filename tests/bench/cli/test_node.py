@@ -14,7 +14,7 @@ from emb_bench.cli.node import main, run_node
 from emb_bench.sim.node import BrakeNode
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
-from emb_runtime.records import CurrentCommand, Frame
+from emb_runtime.records import Frame
 from emb_runtime.system.clock import MonotonicClock, SteppedClock
 
 MS = 1_000_000
@@ -97,7 +97,7 @@ def test_commands_that_came_meanwhile_are_heard_before_the_tick(bench: Bench, la
 
     def asked() -> bool:
         if node.samples == 1:
-            bus.inbox.append(layout.encode_command(CurrentCommand(0, 0, 2.0, True)))
+            bus.inbox.append(layout.encode_command(0, 0, 2.0, True))
         return next(stop)
 
     run_node(node, bus, clock, MS, None, asked)

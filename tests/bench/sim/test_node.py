@@ -16,7 +16,7 @@ from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.simulated_brake import gaussian_noise, parse_assignments, true_parameters
 from emb_runtime.can.messages import Layout, StopReason, load_layout
 from emb_runtime.errors import UsageError
-from emb_runtime.records import CurrentCommand, Frame, NodeState
+from emb_runtime.records import Frame, NodeState
 from tests.independent import DATABASE, read
 
 QUIET = lambda: (0.0, 0.0, 0.0)  # noqa: E731  a constant
@@ -37,7 +37,7 @@ class Bus:
 
     def command(self, current: float, enable: bool = True, answers: int | None = None) -> None:
         answers = self.answers if answers is None else answers
-        self.node.receive(self.layout.encode_command(CurrentCommand(self.counter, answers, current, enable)))
+        self.node.receive(self.layout.encode_command(self.counter, answers, current, enable))
         self.counter = (self.counter + 1) % 15
 
     def tick(self, periods: int = 1) -> None:
@@ -69,7 +69,7 @@ def test_a_node_that_sends_the_charge_differs_in_nothing_else(bench: Bench, layo
         total += applied * bench.timing.sample_time
         assert values["Charge"] == pytest.approx(total, abs=1e-7)
         for node in (plain, telling):
-            node.receive(layout.encode_command(CurrentCommand(k % 15, counter, 0.5, True)))
+            node.receive(layout.encode_command(k % 15, counter, 0.5, True))
     assert total > 0.015
 
 
@@ -100,7 +100,7 @@ def test_a_late_answer_is_refused_and_its_period_is_braked(bus: Bus) -> None:
 
 def test_a_frozen_counter_is_obeyed_once_and_never_again_however_often_the_brake_comes_to_rest(bus: Bus) -> None:
     for _ in range(500):
-        bus.node.receive(bus.layout.encode_command(CurrentCommand(5, bus.answers, 2.0, True)))
+        bus.node.receive(bus.layout.encode_command(5, bus.answers, 2.0, True))
         bus.tick()
     assert bus.node.state is NodeState.IDLE  # after the stop that followed the one command
     assert (bus.node.obeyed, bus.node.rejected) == (1, 499)
@@ -122,7 +122,7 @@ def test_a_disabled_command_with_a_current_stops_the_brake_and_is_counted(bus: B
 
 def test_a_damaged_command_is_not_obeyed(bus: Bus) -> None:
     for bit in range(40):
-        data = bytearray(bus.layout.encode_command(CurrentCommand(0, bus.answers, 6.0, True)).data)
+        data = bytearray(bus.layout.encode_command(0, bus.answers, 6.0, True).data)
         data[bit // 8] ^= 1 << bit % 8
         bus.node.receive(Frame(0x80, bytes(data)))
         bus.tick()

@@ -40,7 +40,7 @@ COMMAND = CurrentCommand(counter=3, answers=2, current=-5.5, enable=True)
 # Worked by hand from the DBC; the CRC byte from an independent library.
 GOLDEN = {
     # 0x23: answers 2, counter 3. −5.5 A / 0.2 mA = −27500 = 0x9494. Enable.
-    "EMB_Command": (0x080, "2c 23 9494 01", LAYOUT.encode_command(COMMAND)),
+    "EMB_Command": (0x080, "2c 23 9494 01", LAYOUT.encode_command(*COMMAND)),
     # 0x07: counter 7. 55.5 rad / 20 µrad = 2775000 = 0x2A57D8. 123456789 ns / 250 ns rounds to 493827 = 0x078903.
     "EMB_Angle": (0x100, "a2 07 d8572a 038907", LAYOUT.encode_angle(7, 55.5, 123_456_789)),
     # 0x1e: active, counter 14. −321.5 rad/s / 0.1 mrad/s = −3215000 = 0xCEF168. −1.234 A / 0.2 mA = −6170 = 0xFE7E6
@@ -185,7 +185,7 @@ def test_each_of_all_currents_that_16_bits_can_say_is_within_the_ceiling_or_reje
         decoded = LAYOUT.decode_command(frame)
         assert decoded == (3, 2, raw * 2e-4, True)
         assert abs(decoded.current) <= CEILING_CURRENT
-        assert LAYOUT.encode_command(decoded) == frame
+        assert LAYOUT.encode_command(*decoded) == frame
     assert believed == list(range(-30_000, 30_001))
 
 
@@ -371,7 +371,7 @@ def test_the_layout_reads_back_from_its_own_text_and_each_message_from_the_docum
     assert tuple(map(from_document, document)) == LAYOUT.known
     again = load_layout(LAYOUT.text)
     assert (again.known, again.text) == (LAYOUT.known, LAYOUT.text)
-    assert again.encode_command(COMMAND) == GOLDEN["EMB_Command"][2]
+    assert again.encode_command(*COMMAND) == GOLDEN["EMB_Command"][2]
 
 
 def test_the_bench_identity_is_the_start_of_its_hash() -> None:
@@ -460,7 +460,7 @@ def test_a_signal_that_cannot_carry_the_values_of_its_field_is_refused() -> None
 def test_the_enable_bit_is_read_as_it_was_written() -> None:
     for enable in (False, True):
         command = CurrentCommand(3, 4, 0.0, enable)
-        assert LAYOUT.decode_command(LAYOUT.encode_command(command)) == command
+        assert LAYOUT.decode_command(LAYOUT.encode_command(*command)) == command
 
 
 def test_the_current_within_a_limit_lies_on_a_step_of_the_signal() -> None:

@@ -10,7 +10,7 @@ from emb_runtime.can.codec import Fault
 from emb_runtime.can.messages import Layout, StopReason
 from emb_runtime.can.receiver import BUS_OFF, UNKNOWN, WITHOUT_DETAILS, Reception, Rejection, classify
 from emb_runtime.config.bench import Bench
-from emb_runtime.records import CurrentCommand, Frame, NodeState, SensorSample
+from emb_runtime.records import Frame, NodeState, SensorSample
 from tests.independent import protected
 
 MS = 1_000_000
@@ -152,7 +152,7 @@ def test_too_many_damaged_frames_of_any_message_are_too_many_and_good_ones_come_
 
 
 def test_whoever_else_uses_our_identifier_is_noticed_and_our_own_echo_is_not(bench: Bench, layout: Layout) -> None:
-    own = layout.encode_command(CurrentCommand(0, 0, 1.0, True))._replace(time_ns=7 * MS, own=True)
+    own = layout.encode_command(0, 0, 1.0, True)._replace(time_ns=7 * MS, own=True)
     for frame, foreign in [
         (own, False),
         (own._replace(own=False), True),  # the very bits, at the very time

@@ -21,7 +21,7 @@ from emb_runtime.drives.gateway import LISTEN, MOST_FRAMES, Gateway
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.drives.node import ARMED_PERIODS, LONGEST_STOP_PERIODS, READY_SAMPLES, DriveNode, Phase
 from emb_runtime.errors import BusError, SafetyStopError
-from emb_runtime.records import CurrentCommand, Frame, NodeState
+from emb_runtime.records import Frame, NodeState
 from emb_runtime.system import terminal
 from emb_runtime.system.clock import SteppedClock
 from tests.drives import EXAMPLES, late_bench
@@ -205,7 +205,7 @@ def answer(played: Played, current: float, answers: int = 0, enable: bool = True
     """An answer to the newest sample, or to another."""
     newest = next(f for f in reversed(played.host.sent) if f.identifier == LAYOUT.angle.identifier)
     counter = (LAYOUT.decode_angle(newest).counter + answers) % 15
-    frame = LAYOUT.encode_command(CurrentCommand(played.counter, counter, current, enable))
+    frame = LAYOUT.encode_command(played.counter, counter, current, enable)
     played.counter = (played.counter + 1) % 15
     return frame
 

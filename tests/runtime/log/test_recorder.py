@@ -25,7 +25,7 @@ from emb_runtime.errors import BusError, LogError
 from emb_runtime.log import recorder_process
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import Attachment, EventRecord, LogHeader, Ring, pack
-from emb_runtime.records import CurrentCommand, CycleRecord, Frame, NodeState, Reason, RunState
+from emb_runtime.records import CycleRecord, Frame, NodeState, Reason, RunState
 
 from tests.bench.processes import wait_until_gone  # isort: skip
 
@@ -84,7 +84,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         now = START + k * 1_000_000
         recorder.push_frame(LAYOUT.encode_angle(k % 15, 0.5, k * 1_000_000)._replace(time_ns=now, dropped=2))
         recorder.push_frame(LAYOUT.encode_velocity(k % 15, -3.5, 0.0, NodeState.IDLE, 15)._replace(time_ns=now))
-        command = LAYOUT.encode_command(CurrentCommand(k % 15, k % 15, 1.5, True))
+        command = LAYOUT.encode_command(k % 15, k % 15, 1.5, True)
         recorder.push_frame(command._replace(time_ns=now + 1000, own=True))
         recorder.push(cycle(k, now + 2000))
     recorder.push_frame(Frame(0x100, b"\x00damage", START + 30_000_000))

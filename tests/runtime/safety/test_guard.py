@@ -47,7 +47,7 @@ def guard(bench: Bench, layout: Layout, bus: Bus) -> Guard:
 
 
 def command(current: float = 1.0, counter: int = 0, enable: bool = True) -> Frame:
-    return load_layout().encode_command(CurrentCommand(counter, 0, current, enable))
+    return load_layout().encode_command(counter, 0, current, enable)
 
 
 def refused(guard: Guard, bus: Bus, frame: Frame, reason: str, state: RunState = ACTIVE, age_ns: int = 0) -> None:
@@ -105,8 +105,8 @@ def test_every_current_that_the_signal_can_hold_passes_exactly_if_it_is_within_t
 def test_no_bench_no_limit_and_no_dbc_reaches_beyond_the_ceiling_of_six_ampere(bench: Bench, bus: Bus) -> None:
     wide = load_layout(load_layout().text.replace("(0.0002,0) [-6|6]", "(0.0002,0) [-6.5|6.5]"))
     guard = Guard(wide, replace(bench, limits=replace(bench.limits, current=6.5)), bus.send, limit=6.5)
-    refused(guard, bus, wide.encode_command(CurrentCommand(0, 0, 6.0002, True)), "beyond 6 A")
-    guard.send(wide.encode_command(CurrentCommand(0, 0, 6.0, True)), ACTIVE, 100 * MS, 100 * MS)
+    refused(guard, bus, wide.encode_command(0, 0, 6.0002, True), "beyond 6 A")
+    guard.send(wide.encode_command(0, 0, 6.0, True), ACTIVE, 100 * MS, 100 * MS)
 
 
 @pytest.mark.parametrize("age_ns", [-MS - 1, 2 * MS + 1, 50 * MS])
@@ -153,7 +153,7 @@ def test_a_bus_that_fails_is_not_counted_as_passed_and_its_counter_is_spent(benc
 
 
 def answer(current: float, counter: int, answers: int) -> Frame:
-    return load_layout().encode_command(CurrentCommand(counter, answers, current, True))
+    return load_layout().encode_command(counter, answers, current, True)
 
 
 def slow(slew: float) -> Bench:

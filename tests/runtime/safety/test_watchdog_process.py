@@ -428,7 +428,7 @@ class Race:
         self.in_flight = self.enabled(5, self.newest)  # the next command
 
     def enabled(self, counter: int, answers: int) -> Frame:
-        return self.layout.encode_command(CurrentCommand(counter, answers, 1.0, enable=True))
+        return self.layout.encode_command(counter, answers, 1.0, True)
 
     def period(self) -> None:
         self.newest = self.layout.decode_angle(self.node.tick()[0]).counter
