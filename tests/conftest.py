@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from emb_bench.config.bench import Bench, load_bench
-from emb_bench.sim.transport import SimTransport, open_sim
+from emb_bench.sim.transport import SimTransport, SteppedClock, open_sim
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import CEILING_CURRENT
 from emb_runtime.config.bench import Bench as RuntimeBench
@@ -28,7 +28,6 @@ from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import Heartbeat, Unwatched
 from emb_runtime.safety.shield_design import make_law
-from emb_runtime.system.clock import SteppedClock
 
 # The same examples each time: a suite that passed passes again. New ones: --hypothesis-profile=searching.
 # How long an example takes says something of the machine, and nothing of the code.

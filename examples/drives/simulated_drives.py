@@ -25,13 +25,12 @@ from emb_bench.cli.node import PRIORITY, run_node
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Plant
 from emb_bench.sim.simulated_brake import Noise, SimulatedBrake, read_brake
-from emb_bench.sim.transport import LockstepBus
+from emb_bench.sim.transport import LockstepBus, SteppedClock
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.records import Frame
 from emb_runtime.system import realtime
-from emb_runtime.system.clock import SteppedClock
 
 TORQUE_CONSTANT = 0.0217  # Set up in the drives that command torques [N·m/A]
 WATCHDOG = 0.010  # Time-out that a user has set up [s]

@@ -12,7 +12,7 @@ from random import Random
 from typing import Any
 
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.transport import SimTransport, open_sim
+from emb_bench.sim.transport import SimTransport, SteppedClock, open_sim
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import load_bench
@@ -22,7 +22,6 @@ from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.records import Frame
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.state_machine import Fault
-from emb_runtime.system.clock import SteppedClock
 from tests.conftest import Journal, make_loop
 from tests.fuzz.model import ReceptionModel
 from tests.fuzz.stream import ANGLE, COMMAND, MS, STATUS, anything, chance, damaged

@@ -11,13 +11,12 @@ import pytest
 
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.transport import SimTransport, open_sim
+from emb_bench.sim.transport import SimTransport, SteppedClock, open_sim
 from emb_runtime.can.messages import load_layout
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import Bench
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.records import Frame
-from emb_runtime.system.clock import SteppedClock
 
 
 class Keyboard(Protocol):

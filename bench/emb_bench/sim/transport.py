@@ -15,7 +15,33 @@ from emb_bench.sim.simulated_brake import read_brake
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame
-from emb_runtime.system.clock import SteppedClock
+
+
+class SteppedClock:
+    """Simulated time: stands still until somebody moves it on."""
+
+    def __init__(self, start_ns: int = 0, wall_offset_ns: int = 0) -> None:
+        self._now_ns = start_ns
+        self._wall_offset_ns = wall_offset_ns
+
+    def now_ns(self) -> int:
+        """Simulated time [ns]."""
+        return self._now_ns
+
+    def wall_offset_ns(self) -> int:
+        """Offset from simulated to Unix time [ns]."""
+        return self._wall_offset_ns
+
+    def sleep_until(self, time_ns: int) -> int:
+        """Move time on to a later one [ns]; gives the time that it is then."""
+        self.advance_to(max(time_ns, self._now_ns))
+        return self._now_ns
+
+    def advance_to(self, time_ns: int) -> None:
+        """Move time on, never back."""
+        if time_ns < self._now_ns:
+            raise ValueError(f"time cannot go back: it is {self._now_ns} ns, asked for {time_ns} ns")
+        self._now_ns = time_ns
 
 
 class Device(Protocol):

@@ -12,10 +12,11 @@ import pytest
 
 from emb_bench.cli.node import main, run_node
 from emb_bench.sim.node import BrakeNode
+from emb_bench.sim.transport import SteppedClock
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame
-from emb_runtime.system.clock import MonotonicClock, SteppedClock
+from emb_runtime.system.clock import MonotonicClock
 
 MS = 1_000_000
 

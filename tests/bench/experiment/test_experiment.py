@@ -24,7 +24,7 @@ from emb_bench.experiment.from_log import (
     samples_before,
 )
 from emb_bench.logs.log import RunLog, read_log
-from emb_bench.sim.transport import SimTransport
+from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.receiver import Reception
@@ -32,7 +32,6 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError
 from emb_runtime.log.ring_buffer import FrameRecord
 from emb_runtime.records import CycleRecord, Frame, RunState, SensorSample
-from emb_runtime.system.clock import SteppedClock
 
 from tests.bench.hostile import HostileBus, drive, write_trace  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip

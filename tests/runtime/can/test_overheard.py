@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 import pytest
 
+from emb_bench.sim.transport import SteppedClock
 from emb_runtime.can.messages import Layout
 from emb_runtime.cli.bus_monitor import BusMonitor, listen
 from emb_runtime.cli.main import Operator
@@ -13,7 +14,6 @@ from emb_runtime.cli.options import parser, prepare
 from emb_runtime.cli.session import Bus, drop_backlog
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame
-from emb_runtime.system.clock import SteppedClock
 from emb_runtime.system.terminal import StopRequest
 from tests.runtime.operating import Keyboard
 

@@ -10,12 +10,13 @@ from typing import Any, NamedTuple, cast
 
 import pytest
 
+from emb_bench.sim.transport import SteppedClock
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.transport import SocketCan, TransmitQueueFullError, Transport
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.errors import BusError, UsageError
 from emb_runtime.records import Frame
-from emb_runtime.system.clock import Clock, MonotonicClock, SteppedClock
+from emb_runtime.system.clock import Clock, MonotonicClock
 
 WALL_NS = 1_700_000_000_000_000_000
 RCVBUFFORCE, ERR_FILTER = 33, 2  # from the kernel's headers

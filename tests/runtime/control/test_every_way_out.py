@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 import pytest
 
-from emb_bench.sim.transport import SimTransport
+from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.messages import Layout
 from emb_runtime.errors import BusError, FrameError, PolicyRefusedError, UsageError
 from emb_runtime.estimator.estimator import Estimator
@@ -18,7 +18,6 @@ from emb_runtime.safety.guard import Guard, GuardRejectedError
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat, Unwatched
 from emb_runtime.safety.sensor_monitor import SensorMonitor
 from emb_runtime.safety.state_machine import Fault
-from emb_runtime.system.clock import SteppedClock
 
 from tests.conftest import Simulate  # isort: skip
 

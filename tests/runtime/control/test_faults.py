@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from emb_bench.sim.transport import SimTransport
+from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import load_bench, parse_bench, shipped_bench_text
@@ -18,7 +18,6 @@ from emb_runtime.records import CurrentCommand, Frame, NodeState
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Unwatched
 from emb_runtime.safety.state_machine import FAULTS, Fault
-from emb_runtime.system.clock import SteppedClock
 
 from tests.conftest import SimRun, Simulate  # isort: skip
 from tests.independent import encoded, read

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from emb_bench.sim.transport import SteppedClock
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.control.actor import Actor
@@ -21,7 +22,6 @@ from emb_runtime.control.result import Outcome
 from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.records import Frame
 from emb_runtime.safety.state_machine import FAULTS, Fault
-from emb_runtime.system.clock import SteppedClock
 from tests.conftest import FunctionActor, Journal, make_loop
 from tests.lying.node import COMMAND, HONEST, PERIOD_NS, Lie, LyingNode
 

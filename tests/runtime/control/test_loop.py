@@ -9,13 +9,12 @@ from typing import Any
 
 import pytest
 
-from emb_bench.sim.transport import SimTransport
+from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.messages import Layout, StopReason
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame, NodeState, Reason
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Unwatched
 from emb_runtime.safety.state_machine import Fault
-from emb_runtime.system.clock import SteppedClock
 
 from tests.conftest import SimRun, Simulate  # isort: skip
 

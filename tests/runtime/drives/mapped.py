@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from emb_bench.config.bench import Bench, parse_bench
+from emb_bench.sim.transport import SteppedClock
 from emb_runtime.can.transport import Transport
 from emb_runtime.drives.lock_step import LockStepDrive
 from emb_runtime.drives.mapping import Mapping
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.records import Frame
-from emb_runtime.system.clock import SteppedClock
 from simulated_drives import WATCHDOG, SimDriveTransport, SimulatedDrive, open_sim_drive
 from tests.actors import constant_actor
 from tests.drives import EXAMPLES, late_bench

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from emb_bench.sim.transport import SteppedClock
 from emb_runtime.can.messages import StopReason, load_layout
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.cli import gateway as cli
@@ -23,7 +24,6 @@ from emb_runtime.drives.node import ARMED_PERIODS, LONGEST_STOP_PERIODS, READY_S
 from emb_runtime.errors import BusError, SafetyStopError
 from emb_runtime.records import Frame, NodeState
 from emb_runtime.system import terminal
-from emb_runtime.system.clock import SteppedClock
 from tests.drives import EXAMPLES, late_bench
 
 MS = 1_000_000

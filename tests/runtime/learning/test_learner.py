@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from emb_bench.brake.euler import step
-from emb_bench.sim.transport import SimTransport
+from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import BenchFileError
@@ -19,7 +19,6 @@ from emb_runtime.learning.law import fits
 from emb_runtime.learning.learner import Learner, ranges_of, words
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.safety.shield_design import make_law
-from emb_runtime.system.clock import SteppedClock
 
 from tests.conftest import SimRun, Simulate  # isort: skip
 

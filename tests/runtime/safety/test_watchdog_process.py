@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.sim.node import BrakeNode
+from emb_bench.sim.transport import SteppedClock
 from emb_runtime.can.messages import Layout, StopReason, load_layout
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import Bench
@@ -21,7 +22,6 @@ from emb_runtime.errors import BusError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 from emb_runtime.safety.heartbeat import Heartbeat
 from emb_runtime.safety.watchdog_process import STOP_TRIES, LoopStatus, SilenceMonitor, Watchdog, stop_frames
-from emb_runtime.system.clock import SteppedClock
 from tests.independent import DATABASE, protected
 
 MS = 1_000_000

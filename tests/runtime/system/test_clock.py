@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_runtime.system.clock import MonotonicClock, SteppedClock, TimeUnwrapper
+from emb_bench.sim.transport import SteppedClock
+from emb_runtime.system.clock import MonotonicClock, TimeUnwrapper
 
 PERIOD_NS = 4_194_304_000
 
