@@ -7,6 +7,7 @@ import select
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from importlib import metadata
 from pathlib import Path
 from textwrap import dedent
@@ -103,23 +104,20 @@ def _serve(args: argparse.Namespace) -> int:
         raise SafetyStopError("stopped by the operator before anything was sent")
     infos = mapping.messages.values()
     identifiers = None if any(info.extended for info in infos) else tuple(info.identifier for info in infos)
-    drive_bus, clock = open_transport(args.drive, bench, identifiers)
-    try:
+    with ExitStack() as stack:
+        drive_bus, clock = open_transport(args.drive, bench, identifiers)
+        stack.callback(drive_bus.close)
         node_bus, _ = open_transport(args.node, bench, (layout.command.identifier,))
+        stack.callback(node_bus.close)
+        gateway = Gateway(mapping, bench, drive_bus, node_bus, clock, wait_for(drive_bus, node_bus))
+        if not args.no_rt:
+            realtime.obtain(PRIORITY)
+        done = "listening" if args.listen else "armed"
         try:
-            gateway = Gateway(mapping, bench, drive_bus, node_bus, clock, wait_for(drive_bus, node_bus))
-            if not args.no_rt:
-                realtime.obtain(PRIORITY)
-            done = "listening" if args.listen else "armed"
-            try:
-                gateway.run(stop, lambda: mention(f"{mapping.name}: {done}, node on {args.node}"), arms=not args.listen)
-            finally:
-                counts = report(gateway.node)
-                show(as_json(counts) if args.json else "\n".join(f"{name}: {value}" for name, value in counts.items()))
+            gateway.run(stop, lambda: mention(f"{mapping.name}: {done}, node on {args.node}"), arms=not args.listen)
         finally:
-            node_bus.close()
-    finally:
-        drive_bus.close()
+            counts = report(gateway.node)
+            show(as_json(counts) if args.json else "\n".join(f"{name}: {value}" for name, value in counts.items()))
     if late := gateway.node.times.too_late:
         mention(f"emb-gateway: TOO LATE: {late}")
     return EXIT_CHECK_FAILED if late else EXIT_DONE

@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import hashlib
+import math
+from collections.abc import Iterator
 from collections.abc import Mapping as Dictionary
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -199,42 +201,8 @@ def require_fit(mapping: Mapping, bench: Bench) -> None:
             f"{mapping.name}: its SHA-256 with its DBC is {mapping.sha256}, the bench file was made for another "
             f"(can.mapping = {bench.can.mapping[:12]}…)"
         )
-    limits, command = bench.limits, mapping.command
-    amperes = sorted((command.low / command.factor, command.high / command.factor))
-    if not (amperes[0] <= -limits.current and limits.current <= amperes[1]):
-        raise MappingError(
-            f"{mapping.name}: can.signals.command.range: {amperes[0]:.4g} to {amperes[1]:.4g} A does not cover the "
-            f"bench's ±{limits.current:g} A"
-        )
-    step = command.field.step(command.high) / abs(command.factor)
-    if not step <= COARSEST_CURRENT:
-        raise MappingError(
-            f"{mapping.name}: can.signals.command: a step of {step:.3g} A is too coarse, expected at most "
-            f"{COARSEST_CURRENT:g} A"
-        )
-    _cover(mapping, mapping.angle, "angle", limits.angle, "rad")
-    _cover(mapping, mapping.velocity, "velocity", (-limits.velocity, limits.velocity), "rad/s")
-    if mapping.pair_within > LONGEST_PAIR_PERIODS * bench.timing.sample_time:
-        raise MappingError(
-            f"{mapping.name}: can.pair_within: expected at most half of the bench's sample time, got "
-            f"{mapping.pair_within:g} s"
-        )
-    if mapping.watchdog > bench.node.watchdog:
-        raise MappingError(
-            f"{mapping.name}: node.watchdog: {mapping.watchdog:g} s is longer than the bench's node.watchdog = "
-            f"{bench.node.watchdog:g} s"
-        )
-    if (worst := released_speed(bench, mapping.watchdog)) > mapping.end_stop_speed:
-        raise MappingError(
-            f"{mapping.name}: node.end_stop_speed: without host or cable the drive holds its current for "
-            f"{mapping.watchdog:g} s, then switches it off: the brake may reach {worst:.4g} rad/s, and bears "
-            f"{mapping.end_stop_speed:g} rad/s; narrow the bench's limits"
-        )
-    if (load := mapping.bus_load(bench.timing.sample_time)) > HIGHEST_BUS_LOAD:
-        raise MappingError(
-            f"{mapping.name}: can.bitrate: at {mapping.bitrate} bit/s its frames take {load:.0%} of its bus at worst, "
-            f"expected at most {HIGHEST_BUS_LOAD:.0%}"
-        )
+    for key, reason in _fit_problems(mapping, bench):
+        raise MappingError(f"{mapping.name}: {key}: {reason}")
     least = 1 if mapping.polled else 0
     low, high = bench.shield.frame_age
     if high < 1 or low != least:
@@ -244,12 +212,40 @@ def require_fit(mapping: Mapping, bench: Bench) -> None:
         )
 
 
-def _cover(mapping: Mapping, measured: Measured, name: str, wanted: tuple[float, float], unit: str) -> None:
-    if measured.wrap:
-        return  # its range is that of one turn
-    low, high = sorted(value * measured.factor + measured.offset for value in (measured.low, measured.high))
-    if not (low <= wanted[0] and wanted[1] <= high):
-        raise MappingError(
-            f"{mapping.name}: can.signals.{name}.range: {low:.4g} to {high:.4g} {unit} does not cover the bench's "
-            f"{wanted[0]:g} to {wanted[1]:g} {unit}"
+def _fit_problems(mapping: Mapping, bench: Bench) -> Iterator[tuple[str, str]]:
+    """Keys of a mapping that are not enough for a bench, or too long, and why."""
+    limits, command = bench.limits, mapping.command
+    amperes = command.low / command.factor, command.high / command.factor
+    for name, ends, wanted, unit in (
+        ("command", amperes, (-limits.current, limits.current), "A"),
+        ("angle", _si_range(mapping.angle), limits.angle, "rad"),
+        ("velocity", _si_range(mapping.velocity), (-limits.velocity, limits.velocity), "rad/s"),
+    ):
+        low, high = sorted(ends)
+        if not (low <= wanted[0] and wanted[1] <= high):
+            covered = f"{low:.4g} to {high:.4g} {unit} does not cover"
+            yield f"can.signals.{name}.range", f"{covered} the bench's {wanted[0]:g} to {wanted[1]:g} {unit}"
+    step = command.field.step(command.high) / abs(command.factor)
+    if not step <= COARSEST_CURRENT:
+        yield "can.signals.command", f"a step of {step:.3g} A is too coarse, expected at most {COARSEST_CURRENT:g} A"
+    if mapping.pair_within > LONGEST_PAIR_PERIODS * bench.timing.sample_time:
+        yield "can.pair_within", f"expected at most half of the bench's sample time, got {mapping.pair_within:g} s"
+    if mapping.watchdog > bench.node.watchdog:
+        longest = f"the bench's node.watchdog = {bench.node.watchdog:g} s"
+        yield "node.watchdog", f"{mapping.watchdog:g} s is longer than {longest}"
+    if (worst := released_speed(bench, mapping.watchdog)) > mapping.end_stop_speed:
+        yield (
+            "node.end_stop_speed",
+            f"without host or cable the drive holds its current for {mapping.watchdog:g} s, then switches it off: the "
+            f"brake may reach {worst:.4g} rad/s, and bears {mapping.end_stop_speed:g} rad/s; narrow the bench's limits",
         )
+    if (load := mapping.bus_load(bench.timing.sample_time)) > HIGHEST_BUS_LOAD:
+        taken = f"at {mapping.bitrate} bit/s its frames take {load:.0%} of its bus at worst"
+        yield "can.bitrate", f"{taken}, expected at most {HIGHEST_BUS_LOAD:.0%}"
+
+
+def _si_range(measured: Measured) -> tuple[float, float]:
+    """Values that a signal may have [SI units]; one that begins anew has all."""
+    if measured.wrap:
+        return -math.inf, math.inf
+    return measured.low * measured.factor + measured.offset, measured.high * measured.factor + measured.offset

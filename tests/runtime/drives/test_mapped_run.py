@@ -157,7 +157,7 @@ def test_the_age_of_answers_is_measured_and_one_beyond_the_declared_named(
 
 def test_a_mapping_that_does_not_fit_the_bench_is_refused_before_anything_is_sent(tmp_path: Path) -> None:
     for drive, old, new, bench_old, bench_new, reason in (
-        ("odrive", "range = [-0.1303, 0.1303]", "range = [-0.1, 0.1]", "", "", "does not cover the bench's ±6 A"),
+        ("odrive", "range = [-0.1303, 0.1303]", "range = [-0.1, 0.1]", "", "", "does not cover the bench's -6 to 6 A"),
         ("odrive", "range = [-2, 17]", "range = [-2, 15]", "", "", "does not cover the bench's -10 to 100 rad"),
         ("odrive", "range = [-90, 90]", "range = [-70, 70]", "", "", "does not cover the bench's -500 to 500 rad/s"),
         ("odrive", "pair_within = 0.0005", "pair_within = 0.0006", "", "", "at most half of the bench's sample time"),
