@@ -10,12 +10,11 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
-import msgspec
 from msgspec import Meta
 
 from emb_runtime.config.typed import MAX_TOML_BYTES, SMALLEST, FieldError, Positive, parse_toml, read
@@ -184,13 +183,12 @@ class Can:
     """SHA-256 of the mapping of a drive, and its DBC: no other one is taken then. Empty where the file names none."""
 
 
-class _Document(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A bench file as it stands."""
+@dataclass(frozen=True, kw_only=True)
+class _Tables:
+    """Tables of a bench file that are records as they stand."""
 
-    schema: Literal[1]
     name: str
     brake: BrakeParameters
-    ranges: dict[str, dict[ParameterName, tuple[Positive, Positive]]]
     limits: Limits
     noise: Noise
     timing: Timing
@@ -199,6 +197,14 @@ class _Document(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     guard: GuardLimits
     node: Node
     can: Can
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Document(_Tables):
+    """A bench file as it stands."""
+
+    schema: Literal[1]
+    ranges: dict[str, dict[ParameterName, tuple[Positive, Positive]]]
     estimator: Estimator | None = None
     budgets: Any = None
     plants: Any = None
@@ -206,22 +212,12 @@ class _Document(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     machine: Any = None
 
 
-@dataclass(frozen=True)
-class Bench:
+@dataclass(frozen=True, kw_only=True)
+class Bench(_Tables):
     """Everything that is known about one bench."""
 
-    name: str
-    brake: BrakeParameters
     ranges: Mapping[str, Ranges]
-    limits: Limits
-    noise: Noise
-    timing: Timing
-    shield: Shield
     prior: str  # Name of the set of ranges that the running estimate begins with; the shield's where none is named
-    watch: Watch
-    guard: GuardLimits
-    node: Node
-    can: Can
     text: str  # The file as it was read: it goes into the log, so that the log replays alone
     tables: Mapping[str, Any]  # Tables of ANALYSIS as they stand, which :mod:`emb_bench.config` reads
 
@@ -330,18 +326,9 @@ def checked_bench(document: Mapping[str, Any], text: str, source: str, *, driven
 
 def _checked(found: _Document, document: Mapping[str, Any], text: str, driven: bool) -> Bench:
     bench = Bench(
-        name=found.name,
-        brake=found.brake,
+        **{field.name: getattr(found, field.name) for field in fields(_Tables)},
         ranges={name: _ranges(name, table, found.brake) for name, table in found.ranges.items()},
-        limits=found.limits,
-        noise=found.noise,
-        timing=found.timing,
-        shield=found.shield,
         prior=found.shield.ranges if found.estimator is None else found.estimator.ranges,
-        watch=found.watch,
-        guard=found.guard,
-        node=found.node,
-        can=found.can,
         text=text,
         tables={key: document[key] for key in ANALYSIS if key in document},
     )
