@@ -150,7 +150,7 @@ def read_criteria(path: Path) -> Criteria:
         raise UsageError(f"{source}: {err.strerror}") from err
     except (ValueError, RecursionError) as err:
         raise UsageError(f"{source}: expected TOML: {err}") from err
-    found = read(_File, content, source, UsageError, smallest=1e-30).acceptance
+    found = read(_File, content, source, UsageError).acceptance
     return msgspec.structs.replace(found, source=path.name)
 
 

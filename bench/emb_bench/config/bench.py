@@ -14,7 +14,7 @@ import emb_runtime.config.bench as driven
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import BUILT_IN, Plant, read_plant
 from emb_runtime.config.bench import PARAMETER_NAMES, REMEDY, checked_bench, parse_document, read_bench_text
-from emb_runtime.config.typed import SMALLEST, NotNegative, parse_toml, read
+from emb_runtime.config.typed import NotNegative, parse_toml, read
 from emb_runtime.errors import BenchFileError, near
 
 AROUND = 3.0  # Factor around its nominal parameters within which searches for those of a machine begin
@@ -142,7 +142,7 @@ def with_tables(bench: driven.Bench, source: str) -> Bench:
     """
     if isinstance(bench, Bench):
         return bench
-    tables = read(_Tables, dict(bench.tables), source, BenchFileError, remedy=REMEDY, smallest=SMALLEST)
+    tables = read(_Tables, dict(bench.tables), source, BenchFileError, remedy=REMEDY)
     plants = dict(BUILT_IN)
     plants |= {name: read_plant(name, table, source) for name, table in tables.plants.items()}
     common = {f.name: getattr(bench, f.name) for f in fields(driven.Bench)}

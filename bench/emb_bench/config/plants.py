@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from msgspec import Meta
 
-from emb_runtime.config.typed import SMALLEST, key_text, read, shown
+from emb_runtime.config.typed import key_text, read, shown
 from emb_runtime.errors import BenchFileError, near
 
 Solver = Literal["euler", "exact"]
@@ -104,8 +104,8 @@ def read_plant(name: str, document: Mapping[str, Any], source: str) -> Plant:
     features["solver"] = SOLVERS.index(solver)
     others = {key: value for key, value in document.items() if key not in Mechanics._fields}
     place = ("plants", name)
-    mechanics = read(Mechanics, features, source, BenchFileError, at=place, smallest=SMALLEST)
-    instruments = read(Instruments, others, source, BenchFileError, at=place, smallest=SMALLEST)
+    mechanics = read(Mechanics, features, source, BenchFileError, at=place)
+    instruments = read(Instruments, others, source, BenchFileError, at=place)
     for key, reason in _contradictions(document):
         raise BenchFileError(f"{at}.{key}: {reason}")
     return Plant(name, mechanics, instruments)

@@ -255,4 +255,4 @@ def parse_map(text: str, source: str) -> RecordingMap:
         document = parse_toml(text)
     except ValueError as err:
         raise UsageError(f"{source}: {err}") from err
-    return typed.read(RecordingMap, document, source, UsageError, smallest=1e-30)
+    return typed.read(RecordingMap, document, source, UsageError)

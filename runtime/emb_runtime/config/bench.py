@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from msgspec import Meta
 
-from emb_runtime.config.typed import MAX_TOML_BYTES, SMALLEST, FieldError, Positive, parse_toml, read
+from emb_runtime.config.typed import MAX_TOML_BYTES, FieldError, Positive, parse_toml, read
 from emb_runtime.errors import BenchFileError, near
 from emb_runtime.system.input_file import read_text
 
@@ -317,7 +317,7 @@ def checked_bench(document: Mapping[str, Any], text: str, source: str, *, driven
 
     A machine that is not ``driven`` is only analysed: the ceilings do not hold, and there may be no spring.
     """
-    found = read(_Document, document, source, BenchFileError, remedy=REMEDY, smallest=SMALLEST)
+    found = read(_Document, document, source, BenchFileError, remedy=REMEDY)
     try:
         return _checked(found, document, text, driven)
     except FieldError as err:

@@ -20,7 +20,7 @@ from msgspec import inspect
 from emb_runtime.errors import EmbError, near
 
 Record = TypeVar("Record")
-SMALLEST = 1e-30  # No quantity of a brake is smaller, or larger than its inverse; beyond it arithmetic overflows
+SMALLEST = 1e-30  # No number but 0 is smaller, or larger than its inverse; beyond it arithmetic overflows
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
@@ -55,7 +55,6 @@ def read(
     at: Keys = (),
     remedy: str = "add it",
     longest_text: int = 200,
-    smallest: float = 0.0,
 ) -> Record:
     """Convert a document into a record.
 
@@ -67,13 +66,12 @@ def read(
         at: place of the value in the document, where it is part of one.
         remedy: advice where a key is missing.
         longest_text: most characters of a text; all are printable, and none is empty.
-        smallest: smallest magnitude of a number other than 0; its inverse is the largest.
 
     Raises:
         EmbError: of the given kind: a key is missing or unknown, or a value has another type or is out of bounds.
     """
     keys: Keys = ()
-    reader = _Reader(longest_text, smallest)
+    reader = _Reader(longest_text)
     try:
         record = reader.convert(document, kind, ())
         if not reader.missing:
@@ -130,9 +128,8 @@ def _fields(kind: type[Any]) -> dict[str, tuple[Any, bool]] | None:
 class _Reader:
     """Converts tables and lists part by part; msgspec converts each value in them."""
 
-    def __init__(self, longest_text: int, smallest: float) -> None:
+    def __init__(self, longest_text: int) -> None:
         self._longest_text = longest_text
-        self._smallest = smallest
         self.missing: list[tuple[Keys, Any]] = []  # Required keys that are not there; then no record is made
 
     def convert(self, value: Any, kind: Any, keys: Keys) -> Any:
@@ -187,7 +184,7 @@ class _Reader:
                 wanted = f"expected a printable text of 1 to {self._longest_text} characters"
                 raise _RefusedError(keys, f"{wanted}, got {shown(value)}")
         elif isinstance(value, int | float) and not isinstance(value, bool) and _is_number(inspect.type_info(kind)):
-            _refuse_size(value, self._smallest, keys)
+            _refuse_size(value, keys)
 
 
 def _takes(kind: Any, value: object) -> bool:
@@ -220,15 +217,15 @@ def _is_number(kind: inspect.Type) -> bool:
     return isinstance(kind, inspect.FloatType | inspect.IntType)
 
 
-def _refuse_size(value: float, smallest: float, keys: Keys) -> None:
+def _refuse_size(value: float, keys: Keys) -> None:
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
         raise _RefusedError(keys, "expected a finite number")
-    if number and smallest and not smallest <= abs(number) <= 1.0 / smallest:
-        wanted = f"expected 0 or a size from {smallest:g} to {1.0 / smallest:g}"
+    if number and not SMALLEST <= abs(number) <= 1.0 / SMALLEST:
+        wanted = f"expected 0 or a size from {SMALLEST:g} to {1.0 / SMALLEST:g}"
         raise _RefusedError(keys, f"{wanted}, got {number:g}")
 
 
