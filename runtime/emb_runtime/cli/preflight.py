@@ -17,13 +17,13 @@ from typing import Any
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.cli.bus_monitor import BusStatistics, planned_load
 from emb_runtime.cli.options import Plan, Stage
+from emb_runtime.config.bench import HIGHEST_BUS_LOAD
 from emb_runtime.control.start_conditions import StartConditions
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_SAFETY_STOP, BenchFileError, EmbError, UsageError
 from emb_runtime.safety.end_stop import released_speed
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.system.compiled_core import Core
 
-HIGHEST_BUS_LOAD = 0.8  # Beyond it, at worst-case bit stuffing, frames wait for each other
 RATE_TOLERANCE = 0.01
 """Largest relative deviation of the node's sample time from the bench's. The shield reckons with the bench's."""
 MOST_MISSING = 0.1  # Share of the pairs that may be missing before --read-only calls the bus unfit

@@ -31,6 +31,7 @@ CEILING_NODE_WATCHDOG = 0.5  # s
 CEILING_HEARTBEAT = 0.5  # s
 CEILINGS = CEILING_CURRENT, CEILING_ANGLE, CEILING_VELOCITY
 OLDEST_FRAME = 5  # samples
+HIGHEST_BUS_LOAD = 0.8  # Beyond it, at worst-case bit stuffing, frames wait for each other
 FAR = 1e9  # of a machine that is never driven, in SI units
 SHORTEST_SAMPLE = 1e-4  # s
 

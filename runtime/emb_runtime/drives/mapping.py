@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from emb_runtime.can.codec import worst_bits
-from emb_runtime.config.bench import Bench
+from emb_runtime.config.bench import HIGHEST_BUS_LOAD, Bench
 from emb_runtime.drives.signals import Field, Protection
 from emb_runtime.errors import BenchFileError, UsageError
 from emb_runtime.safety.end_stop import released_speed
@@ -184,7 +184,6 @@ def mapping_hash(text: str, dbc_text: str) -> str:
     return hashlib.sha256(f"{text}\0{dbc_text}".encode()).hexdigest()
 
 
-HIGHEST_BUS_LOAD = 0.8  # Beyond it, at worst-case bit stuffing, frames wait for each other
 COARSEST_CURRENT = 0.1  # Coarsest step of a command [A]
 LONGEST_PAIR_PERIODS = 0.5  # Longest ``can.pair_within``, in periods: later frames are of the next sample
 

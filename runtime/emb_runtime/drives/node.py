@@ -285,13 +285,10 @@ class DriveNode:
             self._give_up("angle and velocity contradict each other: with them no brake can be stopped")
 
     def _watch_limits(self, sample: DriveSample) -> None:
-        low, high = self._bench.limits.angle
-        outside = not low <= sample.angle <= high or not abs(sample.velocity) <= self._bench.limits.velocity
-        noise = self._bench.noise
-        margin = self._bench.shield.noise_sigmas
-        far = not low - margin * noise.angle <= sample.angle <= high + margin * noise.angle
-        far = far or not abs(sample.velocity) <= self._bench.limits.velocity + margin * noise.velocity
-        if self.phase is Phase.ACTIVE and outside and far:
+        noise, sigmas, (low, high) = self._bench.noise, self._bench.shield.noise_sigmas, self._bench.limits.angle
+        outside = not low - sigmas * noise.angle <= sample.angle <= high + sigmas * noise.angle
+        outside = outside or not abs(sample.velocity) <= self._bench.limits.velocity + sigmas * noise.velocity
+        if self.phase is Phase.ACTIVE and outside:
             self._latch(StopReason.LIMIT)
         if self.phase is Phase.STOPPING:
             self._watch_rest(sample)
