@@ -191,14 +191,8 @@ def facts(outcome: Outcome) -> dict[str, Any]:
 
 def log_facts(log: RecorderResult) -> dict[str, Any]:
     """Facts of a log for a document."""
-    return {
-        "log": str(log.path),
-        "log_messages": log.messages,
-        "log_bytes": log.bytes,
-        "log_dropped": log.dropped,
-        "log_complete": log.complete,
-        "log_error": log.error,
-    }
+    values = {f"log_{name}": value for name, value in log._asdict().items()}
+    return {"log": str(values.pop("log_path")), **values}
 
 
 def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
