@@ -87,12 +87,12 @@ class LogWriter:
             self._register(mcap_schema.LEARNT)
         if header.drive_bus:
             self._register(mcap_schema.DRIVE)
-        names = [name for name, _ in header.estimates]
+        names = [field.name for field in estimate.fields]
         self._rows: dict[type[Record], tuple[mcap_schema.Topic, tuple[str, ...]]] = {
             CycleRecord: (mcap_schema.CYCLE, CycleRecord._fields),
             EventRecord: (mcap_schema.SAFETY, ("code", "text")),
             ClockRecord: (mcap_schema.CLOCK, ClockRecord._fields),
-            EstimateRecord: (estimate, ("step", *names, *map(mcap_schema.deviation_of, names))),
+            EstimateRecord: (estimate, (names[0], *names[1::2], *names[2::2])),  # the values, then their deviations
             LearntRecord: (mcap_schema.LEARNT, tuple(field.name for field in mcap_schema.LEARNT.fields)),
         }
         """Topic of each record but a frame's, and the names of its values there."""
