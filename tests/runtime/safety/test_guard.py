@@ -17,7 +17,7 @@ import emb_runtime
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import EXIT_SAFETY_STOP, BusError
-from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState, SensorSample
+from emb_runtime.records import Frame, NodeState, RunState, SensorSample
 from emb_runtime.safety.guard import Guard, GuardRejectedError
 from emb_runtime.safety.heartbeat import Unwatched
 from emb_runtime.safety.state_machine import Fault, StopError
