@@ -43,7 +43,7 @@ from benchmarks.independent_simulator import Brake, Floats, Losses, brake_of, si
 from emb_bench.analysis.conclusion import noise_deviations
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Plant
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.records import NORMAL_95, EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES

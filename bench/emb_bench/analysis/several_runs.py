@@ -61,7 +61,7 @@ def apart(e: Estimate) -> tuple[Differing, ...]:
     """
     if len(e.records) < 2 or e.validation.fits:
         return ()
-    from emb_bench.estimate.method import method_of
+    from emb_bench.estimate.methods import method_of
 
     alone = [method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit([record]) for record in e.records]
     if not all(one.validation.fits for one in alone):

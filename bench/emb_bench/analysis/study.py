@@ -24,7 +24,7 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY, Plant
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.intervals import union
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import SAME
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import DONE, STARTS, End, EstimationProblem, Suspect, Unknown, with_systematic

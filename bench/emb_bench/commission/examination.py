@@ -18,7 +18,7 @@ from emb_bench.commission.records import CurrentCheck, FirstMove, Identification
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Instruments, Mechanics, Plant
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import NORMAL_95, EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Booleans, Experiment, Floats
