@@ -23,9 +23,8 @@ from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.estimate.windows import predict_windows
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.experiment.from_log import read_experiment
-from emb_bench.logs.log import read_log
-from emb_bench.recordings.run_file import import_recording
+from emb_bench.experiment.from_log import Recording
+from emb_bench.recordings.recording import open_recording
 
 Floats = NDArray[np.float64]
 
@@ -100,10 +99,12 @@ def main() -> None:
         print("not measured: the recording is no part of the project, give its path")
         return
     with tempfile.TemporaryDirectory() as folder:
-        whole = _record(arguments.recording, Path(folder) / "first.mcap")
-        other = None if arguments.other is None else _record(arguments.other, Path(folder) / "other.mcap")
-        bench = read_log(Path(folder) / "first.mcap").bench
+        opened = _opened(arguments.recording, Path(folder))
+        others = None if arguments.other is None else _opened(arguments.other, Path(folder))
+    bench = opened.bench
     plant = bench.plant("recorded")
+    whole = opened.experiment.seen_by(plant)
+    other = None if others is None else others.experiment.seen_by(plant)
     begun = time.process_time()
     e = method_of("windows")(bench, plant, ASKED, starts=2).fit([whole])
     fits = "fits" if e.validation.fits else "DOES NOT FIT"
@@ -140,11 +141,9 @@ def _ours(mass: float, viscous: float, coulomb: float, offset: float) -> Floats:
     return np.array([mass * TRAVEL**2, viscous * TRAVEL**2, coulomb * TRAVEL, -offset * TRAVEL])
 
 
-def _record(path: Path, log: Path) -> Experiment:
-    (log.parent / "map.toml").write_text(MAP)
-    import_recording(path, log.parent / "map.toml", log)
-    read = read_log(log)
-    return read_experiment(read, name=log.stem).seen_by(read.bench.plant("recorded"))
+def _opened(path: Path, folder: Path) -> Recording:
+    (folder / "map.toml").write_text(MAP)
+    return open_recording(path, folder / "map.toml")
 
 
 def _part(record: Experiment, begin: int, end: int) -> Experiment:

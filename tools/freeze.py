@@ -50,7 +50,6 @@ COMMANDS = {
     "info": ["emb-replay", "info"],
     "timing": ["emb-replay", "timing"],
     "rerun": ["emb-replay", "rerun"],
-    "import": ["emb-replay", "import"],
     "design": ["emb-design"],
     "export": ["emb-export"],
     "train": ["emb-train"],
@@ -61,6 +60,10 @@ CYCLES, FRAMES = "/cycle", ["/can/rx", "/can/tx"]
 RENAMED: dict[str, str] = {}
 """Keys of JSON documents: the new name, and the frozen one."""
 GONE: dict[str, str] = {
+    "logs/emps*": "a recording of others is read by fim, estimate and report: no log is made of it",
+    "info/emps*": "a recording of others is no log",
+    "timing/emps*": "a recording of others is no log",
+    "rerun/emps*": "a recording of others is no log",
     "estimate/*/held_out*": "each of several records is predicted from the others; no other is",
     "report/*/held_out*": "each of several records is predicted from the others; no other is",
     "design/*/coarse_optima*": "of a search the designs that keep the limits are told, not where each began",
@@ -296,7 +299,7 @@ def logs(checkout: Checkout, emps: Path) -> dict[str, Any]:
     rewrite(clean, checkout.folder / "damaged.mcap", damaged=True)
     rewrite(clean, checkout.folder / "lossy.mcap", lost=23)
     if emps.is_file():
-        said["emps"] = checkout.says("import", str(emps), "--map", "emps_map.toml", "-o", "emps.mcap", "--json")
+        shutil.copy(emps, checkout.folder / "emps.mat")
     return said
 
 
@@ -375,7 +378,9 @@ def _written(out: BinaryIO, records: list[Any]) -> list[int]:
 
 
 def paths(checkout: Checkout, name: str) -> list[str]:
-    """The files of one of ALL that are there."""
+    """The files of one of ALL that are there; a recording of others with its map."""
+    if name == "emps":
+        return ["emps.mat", "--map", "emps_map.toml"] if (checkout.folder / "emps.mat").is_file() else []
     wanted = [f"{n}.mcap" for n in (SEVERAL if name == "several" else (name,))]
     return [n for n in wanted if (checkout.folder / n).is_file()]
 

@@ -218,11 +218,12 @@ def fisher_information(
     prior: str | None = None,
     theta: str | Path | Mapping[str, float] | None = None,
     bench: str | Path | None = None,
+    map: str | Path | None = None,  # noqa: A002  # as the option is called
 ) -> Evaluation:
     """Fisher information of a run: how precisely its parameters can be known at best.
 
     Args:
-        run: MCAP file of emb-run.
+        run: MCAP file of emb-run; with a map, a recording of others.
         model: plant of the bench to evaluate with (default: the one that was simulated; exact where the log does not
             say).
         params: parameters to evaluate; all others are taken as known (default: the four of the brake).
@@ -232,6 +233,7 @@ def fisher_information(
             simulated brake, 'name=value,...', or the JSON of an estimate or report (default: log, and
             nominal where it has no estimate).
         bench: bench file (default: the one in the log).
+        map: map file of a recording of others: which column of it is what, and what is known of the machine.
 
     Returns:
         The evaluation: ``fisher("physical")`` and ``fisher("weighted")``, the fit of the model, and warnings.
@@ -245,7 +247,7 @@ def fisher_information(
     from emb_bench.experiment.theta import read_theta
 
     Question(*_unknowns(params, nuisance, None))  # a wrong name needs no log to be refused
-    log = _driven(run)
+    log = _driven(run, map)
     its = bench_for(log, bench)
     question = Question(*_unknowns(params, nuisance, its), None if prior is None else its.range_set(prior))
     plant = its.plant(model or default_model(log)[0])
@@ -269,11 +271,12 @@ def estimate(
     profile: bool = False,
     last: str | Path | None = None,
     bench: str | Path | None = None,
+    map: str | Path | None = None,  # noqa: A002  # as the option is called
 ) -> Study:
     """Parameters of a brake from its runs, with total and repeatability, and whether the model explains them.
 
     Args:
-        runs: MCAP files of emb-run, of one brake, which are taken together.
+        runs: MCAP files of emb-run, of one brake, which are taken together; with a map, recordings of others.
         params: parameters to estimate (default: the four of the brake; what the map of a recording guesses).
         nuisance: further unknowns to estimate (default: none, or what the map of a recording says).
         method: see above (default: oem; windows for a recording).
@@ -289,6 +292,7 @@ def estimate(
         profile: likelihood profiles of all parameters (default: of those that are identified badly).
         last: JSON of an earlier estimate or report, to say what has changed since.
         bench: bench file (default: the one in the first log).
+        map: map file of recordings of others: which column of them is what, and what is known of the machine.
 
     Returns:
         The study; ``study.estimate.theta`` has the values, ``study.conclusions`` what is known of each parameter.
@@ -301,7 +305,7 @@ def estimate(
     options_of, before = _study_options(given), _last(last)
     from emb_bench.analysis.study import make_study
 
-    logs = [_driven(run) for run in _listed(runs)]
+    logs = [_driven(run, map) for run in _listed(runs)]
     if not logs:
         raise UsageError("expected at least one run")
     its = logs[0].bench if bench is None else load_bench(bench, analysis=True)
@@ -321,7 +325,8 @@ def report(
     """One page about runs of one brake, to hand over, and a JSON file beside it.
 
     Args:
-        runs: MCAP files of emb-run, of one brake. What cannot be used is named on the page and left out.
+        runs: MCAP files of emb-run, of one brake; with a map, recordings of others. What cannot be used is named on
+            the page and left out.
         output: page to write, .html or .htm.
         acceptance: TOML file with an [acceptance] table: tolerances, drift, budgets; each is passed, failed, or not
             decided.
@@ -341,7 +346,7 @@ def report(
     bound = inspect.signature(estimate).bind(runs, **options | {"profile": True})
     bound.apply_defaults()
     given = bound.arguments
-    files = [*_listed(runs), given["last"], acceptance]
+    files = [*_listed(runs), given["last"], given["map"], acceptance]
     _check_page(page, beside, [entry.path if isinstance(entry, RunLog) else Path(entry) for entry in files if entry])
     require_place("--junit", None if junit is None else Path(junit), (".xml",))
     if junit is not None and acceptance is None:
@@ -359,7 +364,7 @@ def report(
     criteria = None if acceptance is None else test.read_criteria(Path(acceptance))
     say_if_compiling()
     with replacing(page) as new_page, replacing(beside) as new_numbers:
-        logs, left_out = _usable(_listed(runs))
+        logs, left_out = _usable(_listed(runs), given["map"])
         _say(f"estimates from {', '.join(log.path.name for log in logs)}, and writes {page.name}")
         own = next((log for log in logs if "bench.toml" in log.attachments), logs[-1])
         its = own.bench if given["bench"] is None else load_bench(given["bench"], analysis=True)
@@ -488,12 +493,19 @@ def _say(text: str) -> None:
         mention(f"{text} ...")
 
 
-def _opened(run: Source) -> RunLog:
-    return run if isinstance(run, RunLog) else read_log(run)
+def _opened(run: Source, map_path: str | Path | None = None) -> RunLog:
+    """The log of a run; with a map, a recording of others."""
+    if isinstance(run, RunLog):
+        return run
+    if map_path is None:
+        return read_log(run)
+    from emb_bench.recordings.recording import open_recording
+
+    return open_recording(Path(run), Path(map_path))
 
 
-def _driven(run: Source) -> RunLog:
-    log = _opened(run)
+def _driven(run: Source, map_path: str | Path | None) -> RunLog:
+    log = _opened(run, map_path)
     require_driven(log)
     return log
 
@@ -596,7 +608,7 @@ def _check_page(page: Path, beside: Path, inputs: Sequence[Path]) -> None:
                 raise UsageError(f"--output {page}: would write over {path}, which is read: choose another name")
 
 
-def _usable(runs: Sequence[Source]) -> tuple[list[RunLog], list[tuple[Path, str]]]:
+def _usable(runs: Sequence[Source], map_path: str | Path | None) -> tuple[list[RunLog], list[tuple[Path, str]]]:
     """The logs that can be read, and why the others cannot.
 
     Raises:
@@ -606,7 +618,7 @@ def _usable(runs: Sequence[Source]) -> tuple[list[RunLog], list[tuple[Path, str]
     logs, left_out = [], []
     for run in runs:
         try:
-            logs.append(_opened(run))
+            logs.append(_opened(run, map_path))
         except LogError as err:
             if len(runs) == 1:
                 raise

@@ -388,8 +388,6 @@ def add_arguments(p: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Runs a log's loop again; returns the exit code."""
     log = read_log(args.log)
-    if log.imported:
-        raise UsageError(f"{args.log}: a recording of others has no loop to run again")
     if recorded_run(log).purpose == "homing":
         again = rerun(log, Still(), log.bench.limits.current)
         carried: dict[str, str] = {}

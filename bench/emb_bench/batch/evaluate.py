@@ -74,9 +74,8 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
 def _of_the_run(log: RunLog) -> dict[str, Any]:
     found, policy = cycle_summary(log), log.run.get("policy_sha256")
     cycles, largest = found.cycles, found.largest
-    driven = None if log.imported else cycles  # no loop of ours made a recording of others
     return {
-        "start_time": None if log.imported else log.span[0],
+        "start_time": log.span[0],
         "exit_reason": printable(log.exit_reason),
         "complete": log.complete,
         "missing": printable(log.missing),
@@ -85,10 +84,10 @@ def _of_the_run(log: RunLog) -> dict[str, Any]:
         "angle_max": largest and largest.angle_max,
         "speed_max": largest and largest.speed,
         "current_max": largest and largest.current,
-        "limited": driven and driven.limited,
-        "returning": driven and driven.returning,
-        "clipped": driven and driven.clipped,
-        "missed": driven and driven.missed_periods,
+        "limited": cycles.limited,
+        "returning": cycles.returning,
+        "clipped": cycles.clipped,
+        "missed": cycles.missed_periods,
     }
 
 

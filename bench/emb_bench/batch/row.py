@@ -86,7 +86,7 @@ class Row:
     sha256: str | None = column("SHA-256 of the file")
     beginning: str | None = column("SHA-256 of the first samples of the experiment, which no two runs have in common")
     copy_of: str | None = column("log of the same run that counts in its place; null if this one counts")
-    start_time: int | None = column("first message, Unix time; none of an imported recording", "ns")
+    start_time: int | None = column("first message, Unix time", "ns")
     exit_reason: str | None = column("why the run ended")
     complete: bool | None = column("neither the log nor the experiment lacks anything")
     missing: str | None = column("what is missing, in words; empty if nothing is")

@@ -27,6 +27,7 @@ METAVARS = {
     "output": "FILE",
     "junit": "FILE",
     "ray": "ADDRESS",
+    "map": "FILE",
 }
 """Words of ``--help`` for the values of options; without, those of the type."""
 LISTS = ("runs", "paths")  # Arguments that may be given several times

@@ -261,7 +261,6 @@ COMMANDS: Mapping[str, tuple[Command | str, Collection[int]]] = {
         _command(api.export, _export, "The frames on the bus go to BLF, ASC and others by can_logconvert RUN FILE.\n"),
         OF_A_LOG,
     ),
-    "import": ("emb_bench.recordings.run_file", (EXIT_DONE, EXIT_USAGE, EXIT_INTERRUPTED)),
     "live": ("emb_bench.cli.live", (EXIT_DONE, EXIT_USAGE, EXIT_LOG)),
 }
 """Commands and their exit codes, in the order of ``--help``.

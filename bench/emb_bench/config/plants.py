@@ -74,7 +74,7 @@ class Plant:
 
 DEFAULT_PLANT = "exact"  # Plant where none is named: it sticks at rest, as a real brake does
 THESIS_PLANT = "euler"  # The thesis's plant; that of logs and trainings of versions that knew no other
-IMPORTED_PLANT = "recorded"  # Name of the machine in the bench file of a recording that was imported
+RECORDED_PLANT = "recorded"  # Name of the machine in the bench file of a recording of others
 BUILT_IN = {
     THESIS_PLANT: Plant(THESIS_PLANT, Mechanics(solver=EULER), Instruments()),
     DEFAULT_PLANT: Plant(DEFAULT_PLANT, Mechanics(solver=EXACT), Instruments()),

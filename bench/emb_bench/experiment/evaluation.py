@@ -12,7 +12,7 @@ import numpy as np
 
 from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.config.bench import Bench, load_bench
-from emb_bench.config.plants import DEFAULT_PLANT, IMPORTED_PLANT, THESIS_PLANT, Plant
+from emb_bench.config.plants import DEFAULT_PLANT, RECORDED_PLANT, THESIS_PLANT, Plant
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.fisher import Fisher, Kind, information_over_time, uniform_prior, weights_along
 from emb_bench.information.identifiability import Identifiability
@@ -291,8 +291,8 @@ def default_model(log: RunLog) -> tuple[str, str]:
         return log.true_plant, "it was simulated"
     if log.truth is not None:
         return THESIS_PLANT, "it was simulated, by a version that knew no other"
-    if log.imported:
-        return IMPORTED_PLANT, "the recording was imported"
+    if log.is_recording:
+        return RECORDED_PLANT, "it is a recording of others"
     return DEFAULT_PLANT, "the log does not say what moved"
 
 

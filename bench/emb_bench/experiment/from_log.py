@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,12 +46,23 @@ _RECENT = COUNTER_MODULUS  # Of the node's messages before a control cycle, thos
 _DELAYS = range(LONGEST_DELAY + 1)  # Samples by which commands may act late
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Recording(RunLog):
+    """A recording that others made, in place of the log of a run: it has no messages but its experiment."""
+
+    experiment: Experiment
+    is_recording = True
+    exit_reason = "DONE"
+
+
 def read_experiment(log: RunLog, bench: Bench | None = None, name: str = "") -> Experiment:
     """The experiment in a log; ``bench`` is used where the log carries no bench file.
 
     Raises:
         LogError: the log has no experiment, or none of which a whole period is left, or contradicts itself.
     """
+    if isinstance(log, Recording):
+        return replace(log.experiment, name=name or log.path.name)
     bench = log.bench if "bench.toml" in log.attachments or bench is None else bench
     planned = _planned(log, bench)
     samples = samples_on_grid(log, bench, planned)
@@ -79,7 +91,7 @@ def read_experiment(log: RunLog, bench: Bench | None = None, name: str = "") -> 
         planned=planned,
         braked=int((counted & (samples.obeyed[1:] == NO_COUNTER)).sum()),
         command_delay=delay,
-        missing=(*log.lacks, *_missing(periods, _due(log, periods, planned), lost, told, wrong[delay])),
+        missing=_missing(periods, _due(log, periods, planned), lost, told, wrong[delay]),
         notes=_notes(log, delay, within),
     )
 
@@ -157,8 +169,6 @@ def _start(log: RunLog, bench: Bench, samples: Samples) -> tuple[float, float, f
 
     A resting brake has rested since the node was idle: its samples are averaged.
     """
-    if log.imported:  # nothing is known before the first sample
-        return float(samples.angle[0]), float(samples.velocity[0]), 0.0
     before: list[SensorSample] = samples_before(log, bench, REST_SAMPLES)
     resting = [sample for sample in before if sample.node_state == NodeState.IDLE] or before
     if not resting:
@@ -202,7 +212,7 @@ def _notes(log: RunLog, late: int, within: float) -> tuple[str, ...]:
     )
 
 
-def _missing(count: int, planned: int, lost: int, told: int, disagreements: int) -> list[str]:
+def _missing(count: int, planned: int, lost: int, told: int, disagreements: int) -> tuple[str, ...]:
     missing = []
     if count < planned:
         missing.append(f"the experiment ends after {count} of {planned} samples")
@@ -213,7 +223,7 @@ def _missing(count: int, planned: int, lost: int, told: int, disagreements: int)
         )
     if disagreements:
         missing.append(f"in {disagreements} periods the node reports another current than the command says")
-    return missing
+    return tuple(missing)
 
 
 class Samples(NamedTuple):
@@ -264,7 +274,7 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[tuple[In
     """Step and content of the samples in the control cycles, some at a time; errors as for :func:`samples_on_grid`."""
     layout, period_ns = log.layout, bench.timing.sample_time_ns
     log.require("/cycle", CycleRecord._fields)
-    apart_ns = 0 if log.imported else fresh_ns(layout.velocity)
+    apart_ns = fresh_ns(layout.velocity)
     reports = _Reports(log, layout.velocity.name, "CommandCounter", UNKNOWN, apart_ns)
     charges = _Reports(log, CHARGE, "Charge", math.nan, apart_ns)
     active = last = 0
@@ -290,8 +300,7 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[tuple[In
             origin_ns = cycles["device_time_ns"][:1] - steps[:1] * period_ns
         since_ns = cycles["device_time_ns"] - origin_ns
         answered = cycles["command_counter"] != NO_COUNTER
-        measured = np.isfinite(cycles["angle"]) if log.imported else _measured(cycles, layout)
-        on_time = measured & (np.rint(since_ns / period_ns) == steps)
+        on_time = _measured(cycles, layout) & (np.rint(since_ns / period_ns) == steps)
         samples = (
             cycles["angle"],
             cycles["velocity"],
@@ -306,7 +315,7 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[tuple[In
     if not active:
         why = log.missing or f"it never became active ({log.exit_reason})"
         raise LogError(f"{log.path}: no experiment in this log: {why}")
-    if not reports.found and not log.imported:
+    if not reports.found:
         raise LogError(f"{log.path}: the frames of the experiment are missing: what acted is not known")
 
 

@@ -13,7 +13,6 @@ from emb_bench.experiment.theta import read_theta
 from emb_bench.logs.log import RunLog
 from emb_bench.output import replacing
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.errors import UsageError
 
 STEPS = 10  # Of the simulation, per sample time
 
@@ -57,8 +56,6 @@ def mjcf(bench: Bench, brake: BrakeParameters) -> str:
 
 def write_mjcf(log: RunLog, theta: str, path: Path) -> str:
     """Write the brake of a log; says which parameters it has, of :func:`emb_bench.experiment.theta.read_theta`."""
-    if log.bench.machine is not None:
-        raise UsageError(f"{log.path}: expected the log of a brake, got a recording of another machine")
     name, brake, _ = read_theta(theta, log, log.bench)
     text = mjcf(log.bench, brake)
     with replacing(path) as beside:

@@ -73,8 +73,7 @@ def info_document(log: RunLog) -> dict[str, Any]:
         "learnt": last_learnt(log),
         "drive_lacks": log.drive_lacks,
         "largest": found.largest and asdict(found.largest),
-        "sensor_to_command": {} if log.imported else found.sensor_to_command,
-        "lacks": list(log.lacks),
+        "sensor_to_command": found.sensor_to_command,
     }
     return {
         "log": str(log.path),

@@ -6,7 +6,6 @@ tables, or of a long log in batches. Chunks are kept if they are few, and else r
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections import Counter
@@ -14,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -48,9 +47,6 @@ Table = Mapping[str, NDArray[Any]]
 
 REPAIR = "emb.repair"
 """Metadata of a log that ``emb-replay repair`` made: what is ``missing``, and ``source_sha256`` of the damaged one."""
-
-IMPORT = "emb.import"
-"""Metadata of a log that ``emb-replay import`` made: the recording's ``file`` and ``sha256``, and what it ``lacks``."""
 
 KEPT = 16 << 20  # Unpacked chunks are kept in memory if all of them take no more than this [bytes]
 BATCH = 4 << 20  # Unpacked bytes that are decoded at a time
@@ -143,6 +139,7 @@ class _Tables(Mapping[str, Table]):
 class RunLog:
     """The content of one log. A message that cannot be decoded is refused when it is requested."""
 
+    is_recording: ClassVar[bool] = False  # True if others made it, and the file is no log
     path: Path
     complete: bool  # The file was closed properly, every checksum is right, and no record was dropped
     missing: str  # Description of the missing parts of an incomplete log; empty if it is complete
@@ -234,20 +231,6 @@ class RunLog:
     def run(self) -> Mapping[str, str]:
         """The run's identity."""
         return self.metadata.get("emb.run", {})
-
-    @property
-    def imported(self) -> bool:
-        """Returns True if ``emb-replay import`` made this log of a recording that was not ours."""
-        return IMPORT in self.metadata
-
-    @property
-    def lacks(self) -> tuple[str, ...]:
-        """Descriptions of the parts that an imported recording lacks beside a log of ours; empty for a log of ours."""
-        try:
-            found = json.loads(self.metadata.get(IMPORT, {}).get("lacks", "[]"))
-        except ValueError:
-            return ("what it lacks is not readable",)
-        return tuple(terminal.one_line(str(lack)) for lack in found) if isinstance(found, list) else ()
 
     @property
     def drive_lacks(self) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Samples of foreign files (CSV, Parquet, MATLAB, MDF) on a grid, in our units, and what a recording lacks.
+"""Columns of foreign files (CSV, Parquet, MATLAB, MDF) as an experiment in our units, and what it lacks.
 
 Each library is imported when it is needed.
 """
@@ -10,7 +10,6 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from emb_bench.config.machine import FORCE, LENGTH, SPEED
 from emb_bench.config.plants import Instruments
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.recordings.map_file import MEASURED_UNITS, TIMED, RecordingMap, Signal, Source
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_runtime.errors import EmbError, UsageError
@@ -171,24 +171,17 @@ LONGEST = 1_000_000  # Most periods of a recording
 Integers = NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class Recorded:
-    """A recording in our units: samples y_0..y_n, lost ones left out, and the current of each period before one."""
+class Found(NamedTuple):
+    """A recording in our units."""
 
+    experiment: Experiment
     sample_time: float  # [s]
-    step: Integers  # Periods since the first sample, ascending, shape (m,)
-    time: Floats  # Since the first sample, by the recording's own stamps [s], shape (m,)
-    angle: Floats  # [rad], shape (m,)
-    velocity: Floats  # [rad/s], shape (m,)
-    applied: Floats  # Current in the period before each sample [A], shape (m,)
-    commanded: Floats  # Current commanded from each sample on [A], shape (m,); NaN where that is not known
     noise: tuple[float, float]  # Standard deviations of angle [rad] and velocity [rad/s]
     bandwidth: float  # Of the observer that made the velocity [rad/s]; 0 if it was measured
-    lacks: tuple[str, ...]  # Descriptions of the parts of a log of ours that the recording does not have
 
 
-def recorded(columns: Mapping[str, Column], wanted: RecordingMap, kind: str, source: str) -> Recorded:
-    """Columns, by their names, on a grid; messages call the file ``source``."""
+def experiment_of(columns: Mapping[str, Column], wanted: RecordingMap, kind: str, source: str) -> Found:
+    """Columns, by their names, as an experiment; messages call the file ``source``."""
     given, timing = wanted.signals.given, wanted.timing
     clock = columns[timing.column].values * wanted.time_unit if timing.column else None
     signals = {name: _signal(columns, signal, name, wanted, clock, source) for name, signal in given.items()}
@@ -198,43 +191,48 @@ def recorded(columns: Mapping[str, Column], wanted: RecordingMap, kind: str, sou
         raise UsageError(
             f"{source}: expected a sample time from 0.0001 to 0.1 s, got {t_s:g} s: see [timing] in the map"
         )
-    origin = times[0]
-    step, index = _on_grid(times - origin, t_s)
+    step, index = _on_grid(times - times[0], t_s)
     if len(step) < FEWEST or step[-1] > LONGEST:
         raise UsageError(
-            f"{source}: expected {FEWEST} to {LONGEST} samples, got {len(step)} over {times[-1] - origin:g} s: see "
+            f"{source}: expected {FEWEST} to {LONGEST} samples, got {len(step)} over {times[-1] - times[0]:g} s: see "
             "[timing] in the map"
         )
-    angle = angles[index]
+    grid = times[0] + np.arange(step[-1] + 1) * t_s
+    angle, late = np.full(len(grid), np.nan), np.zeros(len(grid))
+    angle[step], late[step] = angles[index], times[index] - grid[step]
     bandwidth = 0.0 if "velocity" in signals else min(max(SLOWEST, 0.5 / t_s), FASTEST)
     angle_noise = given["angle"].noise * _factor("angle", given["angle"], wanted)
     if bandwidth:
-        velocity = _derived(step, angle, t_s, bandwidth)
+        velocity = _derived(step, angles[index], t_s, bandwidth)
         velocity_noise = observer_noise(bandwidth, t_s, angle_noise)
     else:
-        velocity = _nearest(*signals["velocity"], origin + step * t_s, t_s)
+        velocity = _nearest(*signals["velocity"], grid, t_s)
         velocity_noise = given["velocity"].noise * _factor("velocity", given["velocity"], wanted)
-    held = "command" not in given or given["command"].between != "linear"
-    applied, commanded = _currents(signals, origin, step, t_s, held)
-    known = np.isfinite(velocity) & np.isfinite(applied)
-    if int(known.sum()) < FEWEST:
-        raise UsageError(f"{source}: velocity and current cover {int(known.sum())} samples, expected at least {FEWEST}")
-    first = int(np.argmax(known))
-    chosen = np.flatnonzero(known)
-    step = step - step[first]
-    time = times[index] - times[index][first]
-    return Recorded(
-        sample_time=t_s,
-        step=step[chosen],
-        time=time[chosen],
-        angle=angle[chosen],
-        velocity=velocity[chosen],
-        applied=applied[chosen],
-        commanded=commanded[chosen],
-        noise=(angle_noise, velocity_noise),
-        bandwidth=bandwidth,
-        lacks=_lacks(wanted, kind, bandwidth, int(step[chosen][-1]) + 1 - len(chosen)),
+    applied = _applied(signals, grid, t_s, held="command" not in given or given["command"].between != "linear")
+    received = np.isfinite(angle) & np.isfinite(velocity) & np.isfinite(applied)
+    if int(received.sum()) < FEWEST:
+        raise UsageError(
+            f"{source}: velocity and current cover {int(received.sum())} samples, expected at least {FEWEST}"
+        )
+    whole = slice(int(np.argmax(received)), int(np.flatnonzero(received)[-1]) + 1)
+    samples = np.where(received[:, None], np.stack([angle, velocity], axis=1), np.nan)[whole]
+    received, late, currents = received[whole], late[whole] - late[whole.start], applied[whole][1:]
+    first = float(samples[0, 0]), float(samples[0, 1])
+    experiment = Experiment(
+        name=Path(source).name,
+        currents=currents,
+        samples=samples[1:],
+        angle=first[0],
+        velocity=first[1],
+        slack=0.0,  # nothing is known before the first sample
+        from_origin=first == (0.0, 0.0),
+        late=late[1:],
+        assumed=None if received.all() else np.where(received[1:], np.nan, currents),
+        first=first,
+        planned=len(currents),
+        missing=_lacks(wanted, kind, bandwidth, int((~received).sum())),
     )
+    return Found(experiment, t_s, (angle_noise, velocity_noise), bandwidth)
 
 
 def _factor(name: str, signal: Signal, wanted: RecordingMap) -> float:
@@ -286,19 +284,13 @@ def _nearest(times: Floats, values: Floats, wanted: Floats, t_s: float) -> Float
     return result
 
 
-def _currents(
-    signals: Mapping[str, tuple[Floats, Floats]], origin: float, step: Integers, t_s: float, held: bool
-) -> tuple[Floats, Floats]:
-    """Current of the period before each sample, and what was commanded from it on [A]."""
-    at = np.asarray(origin + step * t_s, dtype=np.float64)
-    commanded = np.full(len(step), np.nan)
-    if "command" in signals:
-        commanded = _means(*signals["command"], at, at + t_s, held)
-    if "current" in signals:
-        times, values = signals["current"]
-        covered = (at - t_s >= times[0] - 0.5 * t_s) & (at <= times[-1] + 0.5 * t_s)
-        return np.where(covered, _means(times, values, at - t_s, at, False), np.nan), commanded
-    return _means(*signals["command"], at - t_s, at, held), commanded
+def _applied(signals: Mapping[str, tuple[Floats, Floats]], at: Floats, t_s: float, held: bool) -> Floats:
+    """Current of the period before each time [A]; NaN where the current that was measured does not cover it."""
+    if "current" not in signals:
+        return _means(*signals["command"], at - t_s, at, held)
+    times, values = signals["current"]
+    covered = (at - t_s >= times[0] - 0.5 * t_s) & (at <= times[-1] + 0.5 * t_s)
+    return np.where(covered, _means(times, values, at - t_s, at, held=False), np.nan)
 
 
 def _means(times: Floats, values: Floats, begin: Floats, end: Floats, held: bool) -> Floats:
@@ -322,14 +314,12 @@ def _means(times: Floats, values: Floats, begin: Floats, end: Floats, held: bool
 
 
 def _derived(step: Integers, angle: Floats, t_s: float, bandwidth: float) -> Floats:
-    """Velocity that a tracking observer makes of the angles; through lost ones it goes on along a line [rad/s]."""
+    """Velocity at each step that a tracking observer makes of angles; between them it goes along a line [rad/s]."""
     memory = np.zeros(MEMORY)
     settle(Instruments(), memory, float(angle[0]))
     instruments = Instruments(observer_bandwidth=bandwidth)
     every = np.interp(np.arange(step[-1] + 1), step, angle)
-    velocity = np.array([observe(instruments, memory, t_s, y1) for y1 in every.tolist()])
-    result: Floats = velocity[step]
-    return result
+    return np.array([observe(instruments, memory, t_s, y1) for y1 in every.tolist()])
 
 
 def _lacks(wanted: RecordingMap, kind: str, bandwidth: float, lost: int) -> tuple[str, ...]:

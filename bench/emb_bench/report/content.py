@@ -67,10 +67,10 @@ class Run:
     def cycles(self) -> ActiveCycles | None:
         """Cycles of the control loop; None if the log has none, as a recording of others."""
         try:
-            cycles = None if self.log.imported else ActiveCycles(self)
+            cycles = ActiveCycles(self)
         except LogError:
             return None
-        return cycles if cycles is not None and len(cycles.time) else None
+        return cycles if len(cycles.time) else None
 
     @cached_property
     def after(self) -> StopSamples | None:
@@ -100,7 +100,7 @@ class Run:
     @property
     def source(self) -> str:
         """Brake that was driven: a simulated one, or the bench on its interface; or a recording of others."""
-        if self.log.imported:
+        if self.log.is_recording:
             return "recording of another machine"
         return "simulated brake" if self.simulated else f"bench on {self.log.run.get('iface', 'an unknown interface')}"
 
@@ -108,7 +108,7 @@ class Run:
     def began(self) -> str:
         """Begin of the run in UTC, by the clock of the computer that recorded it; empty if the log has none."""
         first, _ = self.log.span
-        if self.log.imported or not 0 < first < 2**62:
+        if not 0 < first < 2**62:
             return ""
         return datetime.fromtimestamp(first // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 

@@ -82,7 +82,7 @@ def excitation(run: Run, cycles: ActiveCycles) -> Panel:
 
 
 def applied(run: Run, experiment: Experiment) -> Panel:
-    """Command or current that drove the machine of an imported recording, in its own unit."""
+    """Command or current that drove the machine of a recording of others, in its own unit."""
     shown = command(run.bench.machine)
 
     def draw(axes: Any) -> None:

@@ -133,7 +133,7 @@ def _over_time(e: Evaluation) -> Table:
 
 def _heading(e: Evaluation) -> list[str]:
     x, late, machine = e.experiment, e.experiment.command_delay, e.bench.machine
-    run = "recording" if e.log.imported else e.log.exit_reason
+    run = "recording" if e.log.is_recording else e.log.exit_reason
     run += f", {x.periods} of {x.planned} periods, {x.measured.sum()} samples"
     run += f", {x.braked} braked by the node" if x.braked else ""
     run += f"; commands acted {in_samples(late)} late" if late else ""

@@ -112,7 +112,7 @@ def _identity(run: Run) -> dict[str, str]:
         "policy SHA-256": entries.get("policy_sha256", ""),
         "log SHA-256": run.log_sha256,
     }
-    if run.log.imported:
+    if run.log.is_recording:
         del found["conditions"]
     return {key: value[:LONGEST] or "not recorded" for key, value in (found | _drive(run)).items()}
 
@@ -132,7 +132,7 @@ def _drive(run: Run) -> dict[str, str]:
 def intervals(run: Run) -> Table | None:
     """Intervals of the loop; None if no sample was answered, or there was none."""
     t = run.timing
-    if t is None or not len(t.response) or run.log.imported:
+    if t is None or not len(t.response):
         return None
     rows = []
     for key, words in INTERVALS.items():
@@ -146,7 +146,7 @@ def intervals(run: Run) -> Table | None:
 
 def safety(run: Run) -> Safety | None:
     """Events and the worst that a loss of all commands would do; None of a recording of others."""
-    if run.log.imported:
+    if run.log.is_recording:
         return None
     events = run.log.events
     active = [event.time_ns for event in events if event.code == "ACTIVE"]
@@ -234,7 +234,7 @@ def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
         "simulated": run.simulated,
         "why_not_estimated": run.why_not,
         "sha256": run.log_sha256,
-        "info": info_document(run.log),
+        "info": None if run.log.is_recording else info_document(run.log),
         "timing": None if run.timing is None else timing.document(run.timing),
     }
     x, alone = run.experiment, run.alone

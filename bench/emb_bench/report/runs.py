@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from emb_bench.config.bench import COUNTED, QUANTILE_NAMES
-from emb_bench.logs.log import IMPORT, RunLog
+from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import INTERVALS, BudgetCheck, Timing, document, judge, quantiles, timing
 from emb_bench.numbers import NOTHING, around, percent, plain, seconds
 from emb_bench.report.text import Table, facts, listed, wrapped
-from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE, LogError
+from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE
 from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.system.terminal import one_line
 
@@ -20,15 +20,15 @@ UNITS = ((1.0, "s"), (1e3, "ms"), (1e6, "µs"))  # Of times, with their factors
 def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
     """A :func:`emb_bench.logs.info.info_document` for a person; with ``verbose`` all metadata and events."""
     d = _lines(d)
-    learnt, imported = d.get("learnt", {}), IMPORT in d["metadata"]
+    learnt = d.get("learnt", {})
     lines = listed("WARNING: ", [d["missing"]])
     lines += wrapped(
         f"{d['log']}: {d['exit_reason']}{_why(d['metadata'].get('emb.end', {}))}, {d['duration']:.3f} s, log "
         f"{'complete' if d['complete'] else 'NOT complete'}"
     )
     lines += facts(
-        *(_recording(d) if imported else _loop(d["cycles"])),
-        ("largest", _largest(d.get("largest")) + (", in coordinates of the motor" if imported else "")),
+        *_loop(d["cycles"]),
+        ("largest", _largest(d.get("largest"))),
         *(("drive lacks", f"{name}: {lost}") for name, lost in d.get("drive_lacks", {}).items()),
         ("response", _delays(d)),
     )
@@ -45,11 +45,6 @@ def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
     for name, record in d["metadata"].items():
         lines += _listed(name, record)
     return "\n".join([*lines, "", "events", *(f"  {event['code']:24} {event['text']}" for event in d["events"])])
-
-
-def _recording(d: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Samples of an imported recording, and the signals that it lacks."""
-    return [("samples", f"{d['cycles']['active']}, of a recording"), *(("lacks", lack) for lack in d.get("lacks", ()))]
 
 
 def _delays(d: Mapping[str, Any]) -> str:
@@ -127,8 +122,6 @@ class RunTiming(NamedTuple):
 
 def run_timing(log: RunLog) -> RunTiming:
     """Timing of a run beside the budgets of its own bench."""
-    if log.imported:
-        raise LogError(f"{log.path}: an imported recording has no loop, so no timing")
     t = timing(log)
     budgets = log.bench.budgets
     if t.simulated:

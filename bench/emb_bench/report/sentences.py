@@ -307,7 +307,7 @@ def warnings(e: Evaluation) -> list[str]:
         )
     if e.fit.fits:
         return found
-    if e.log.imported:
+    if e.log.is_recording:
         why = (
             "they are guesses of the map: pass --theta with an estimate"
             if e.theta_name == "nominal"

@@ -13,8 +13,8 @@ from emb_bench.estimate.records import EstimationProblem
 from emb_bench.estimate.windows import Cut, by_windows, predict_windows
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.recordings.map_file import parse_map
-from emb_bench.recordings.readers import Column, recorded
-from emb_bench.recordings.run_file import bench_of
+from emb_bench.recordings.readers import Column, experiment_of
+from emb_bench.recordings.recording import bench_of
 from emb_runtime.errors import UsageError
 from tests.bench.linear_machine import MAP, TRAVEL, Machine, Recording, record
 
@@ -26,10 +26,8 @@ def made(found: Recording, text: str = MAP) -> tuple[Bench, Experiment]:
     """Bench and record of a recording, without a file between."""
     wanted = parse_map(text, "map")
     columns = {name: Column(c, None) for name, c in zip(("t", "x", "F"), found, strict=True)}
-    ours = recorded(columns, wanted, "csv", "r.csv")
-    bench = parse_bench(bench_of(ours, wanted), "made", analysis=True)
-    samples = np.stack([ours.angle, ours.velocity], axis=1)[1:]
-    return bench, Experiment("r", ours.applied[1:], samples, float(ours.angle[0]), float(ours.velocity[0]), 0.0, False)
+    ours = experiment_of(columns, wanted, "csv", "r.csv")
+    return parse_bench(bench_of(ours, wanted), "made", analysis=True), ours.experiment
 
 
 def fitted(found: Recording, asked: EstimationProblem = ASKED, text: str = MAP) -> Estimate:

@@ -1,4 +1,4 @@
-"""The log of a recording of a machine that is no brake."""
+"""A recording of a machine that is no brake."""
 
 from __future__ import annotations
 
@@ -6,19 +6,16 @@ import math
 
 import pytest
 
-from emb_bench.cli.replay import main
 from tests.bench.linear_machine import MAP, STEP, Machine, record
 
 
 @pytest.fixture(scope="package")
-def run(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A recording in millimetres and kilonewtons as a log."""
+def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
+    """A recording in millimetres and kilonewtons, and its map, as arguments."""
     folder = tmp_path_factory.mktemp("others")
     found = record(Machine(), 2.0)
     rows = zip(found.time.tolist(), (1e3 * found.position).tolist(), (1e-3 * found.force).tolist(), strict=True)
     (folder / "r.csv").write_text("t,x,F\n" + "".join(f"{t!r},{x!r},{f!r}\n" for t, x, f in rows))
     text = MAP.replace('"m"', '"mm"').replace('"N"', '"kN"').replace("window = 0.5", "window = 0.1")
     (folder / "map.toml").write_text(text.replace(f"noise = {STEP / math.sqrt(12.0)}", "noise = 1.4e-5"))
-    out = str(folder / "run.mcap")
-    assert main(["import", str(folder / "r.csv"), "--map", str(folder / "map.toml"), "-o", out]) == 0
-    return out
+    return str(folder / "r.csv"), "--map", str(folder / "map.toml")

@@ -26,11 +26,11 @@ IN_VOLTS = (
 
 
 @pytest.fixture(scope="module")
-def repeated(run: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def repeated(recording: tuple[str, ...], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The document of an estimate that is compared with the same one before."""
     last = tmp_path_factory.mktemp("repeated") / "last.json"
-    last.write_text(printed("estimate", run, "--starts", "1", "--json"))
-    found: dict[str, Any] = json.loads(printed("estimate", run, "--starts", "1", "--json", "--last", str(last)))
+    last.write_text(printed("estimate", *recording, "--starts", "1", "--json"))
+    found: dict[str, Any] = json.loads(printed("estimate", *recording, "--starts", "1", "--json", "--last", str(last)))
     return found
 
 
@@ -66,8 +66,8 @@ def test_an_estimate_is_compared_with_an_earlier_one_in_the_same_units(repeated:
     assert drifts["mass"]["now"] == pytest.approx(95.0, rel=0.02)
 
 
-def test_information_is_told_by_the_names_of_the_machine(run: str) -> None:
-    said = printed("fim", run)
+def test_information_is_told_by_the_names_of_the_machine(recording: tuple[str, ...]) -> None:
+    said = printed("fim", *recording)
     assert "F_c = 14 N, F_v = 300 N·s/m, mass = 70 kg" in " ".join(said.split())
     assert " kN" in next(line for line in said.splitlines() if line.startswith("  force_offset"))
     assert "T_c" not in said

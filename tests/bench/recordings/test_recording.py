@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +7,9 @@ import pytest
 
 from emb_bench.cli.replay import main
 from emb_bench.config.bench import load_bench
-from emb_bench.experiment.from_log import read_experiment
-from emb_bench.logs.log import read_log
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.from_log import Recording as Opened
+from emb_bench.recordings.recording import open_recording
 from emb_runtime.errors import BenchFileError
 from tests.bench.linear_machine import MAP, T_S, TRAVEL, Machine, Recording, record
 
@@ -23,38 +23,31 @@ def csv(path: Path, found: Recording, delimiter: str = ",") -> Path:
     return path
 
 
-def imported(folder: Path, source: Path, text: str = MAP) -> Path:
+def opened(folder: Path, source: Path, text: str = MAP) -> Opened:
     (folder / "map.toml").write_text(text)
-    out = folder / "run.mcap"
-    assert main(["import", str(source), "--map", str(folder / "map.toml"), "-o", str(out)]) == 0
-    return out
+    return open_recording(source, folder / "map.toml")
 
 
 def refused(folder: Path, source: Path, text: str, capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line with which an import is refused; it leaves no file."""
+    """The one line with which a recording is refused."""
     (folder / "map.toml").write_text(text)
-    out = folder / "refused.mcap"
-    assert main(["import", str(source), "--map", str(folder / "map.toml"), "-o", str(out)]) == 2
-    assert not out.exists()
+    assert main(["fim", str(source), "--map", str(folder / "map.toml")]) == 2
     said = capsys.readouterr().err.strip()
     assert "\n" not in said
     return said
 
 
-def check(path: Path, found: Recording = RECORDING) -> None:
-    """The log has the recording's samples, in coordinates of the motor."""
-    log = read_log(path)
-    assert log.complete
-    experiment = read_experiment(log)
+def check(experiment: Experiment, found: Recording = RECORDING) -> None:
+    """The experiment has the recording's samples, in coordinates of the motor."""
     np.testing.assert_allclose(experiment.all_samples[:, 0], found.position / TRAVEL, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(experiment.currents, found.force[:-1] * TRAVEL, rtol=1e-9, atol=1e-9)
     assert experiment.measured.sum() == len(found.time) - 1
 
 
-def test_a_csv_file_becomes_a_log_with_its_samples_and_the_machine(tmp_path: Path) -> None:
-    path = imported(tmp_path, csv(tmp_path / "r.csv", RECORDING))
-    check(path)
-    bench = read_log(path).bench
+def test_a_csv_file_becomes_an_experiment_with_its_samples_and_the_machine(tmp_path: Path) -> None:
+    found = opened(tmp_path, csv(tmp_path / "r.csv", RECORDING))
+    check(found.experiment)
+    bench = found.bench
     assert bench.machine is not None
     assert bench.machine.unknown == ("T_c", "f_v", "J")
     assert bench.brake.k_1 == 0.0
@@ -63,14 +56,9 @@ def test_a_csv_file_becomes_a_log_with_its_samples_and_the_machine(tmp_path: Pat
     assert bench.brake.f_v == pytest.approx(300.0 * TRAVEL**2)
 
 
-def test_what_a_recording_lacks_is_said_by_the_import_and_by_whoever_reads_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = imported(tmp_path, csv(tmp_path / "r.csv", RECORDING))
-    said = capsys.readouterr().out
-    experiment = read_experiment(read_log(path))
+def test_what_a_recording_lacks_is_said_of_its_experiment(tmp_path: Path) -> None:
+    experiment = opened(tmp_path, csv(tmp_path / "r.csv", RECORDING)).experiment
     for lack in ("no counters", "no velocity", "no measured current"):
-        assert lack in said
         assert any(lack in line for line in experiment.missing)
 
 
@@ -110,7 +98,7 @@ def test_signals_with_times_of_their_own_are_paired_by_these(tmp_path: Path) -> 
         for name, (values, stamps) in columns.items():
             file.append(asammdf.Signal(values, stamps, name=name))
         file.save(tmp_path / "drive.mf4")
-    experiment = read_experiment(read_log(imported(tmp_path, tmp_path / "drive.mf4", TURNING)))
+    experiment = opened(tmp_path, tmp_path / "drive.mf4", TURNING).experiment
     np.testing.assert_allclose(experiment.all_samples, 2.0 * np.pi * np.stack([turns, -turns], axis=1), atol=1e-9)
     np.testing.assert_allclose(experiment.currents, torques[:-1], atol=1e-9)
     # The samples came up to 2 ms late; their own stamps say so.
@@ -120,7 +108,7 @@ def test_signals_with_times_of_their_own_are_paired_by_these(tmp_path: Path) -> 
 
 def test_a_linear_command_is_the_mean_of_what_lies_between_its_stamps(tmp_path: Path) -> None:
     text = MAP.replace('unit = "N"', 'unit = "N"\nbetween = "linear"')
-    experiment = read_experiment(read_log(imported(tmp_path, csv(tmp_path / "r.csv", RECORDING), text)))
+    experiment = opened(tmp_path, csv(tmp_path / "r.csv", RECORDING), text).experiment
     force = RECORDING.force
     np.testing.assert_allclose(experiment.currents, 0.5 * (force[:-1] + force[1:]) * TRAVEL, rtol=1e-9, atol=1e-9)
 
@@ -129,7 +117,7 @@ def test_lost_and_shifted_samples_stay_where_their_times_are(tmp_path: Path) -> 
     kept = np.ones(len(RECORDING.time), np.bool_)
     kept[[50, 51, 90]] = False
     found = Recording(*(column[kept] for column in RECORDING))
-    experiment = read_experiment(read_log(imported(tmp_path, csv(tmp_path / "r.csv", found))))
+    experiment = opened(tmp_path, csv(tmp_path / "r.csv", found)).experiment
     assert experiment.periods == len(RECORDING.time) - 1
     lost = np.flatnonzero(~experiment.measured) + 1
     assert lost.tolist() == [50, 51, 90]
@@ -175,7 +163,7 @@ def test_k_m_and_inertia_without_a_known_load_are_only_a_ratio(
     said = refused(tmp_path, csv(tmp_path / "r.csv", RECORDING), text, capsys)
     assert "scale together" in said
     held = text.replace("mass = 70.0\n", "") + "[machine.known]\nmass = 95.0\n"
-    assert read_log(imported(tmp_path, tmp_path / "r.csv", held)).bench.machine.unknown == ("k_m", "T_c", "f_v")  # type: ignore[union-attr]
+    assert opened(tmp_path, tmp_path / "r.csv", held).bench.machine.unknown == ("k_m", "T_c", "f_v")  # type: ignore[union-attr]
 
 
 FILES_REFUSED = (
@@ -194,8 +182,8 @@ def test_a_file_that_is_none_is_refused_in_one_line(tmp_path: Path, capsys: pyte
 
 
 def test_nothing_is_driven_or_designed_with_the_machine_of_a_recording(tmp_path: Path) -> None:
-    path = imported(tmp_path, csv(tmp_path / "r.csv", RECORDING))
-    (tmp_path / "bench.toml").write_bytes(read_log(path).attachments["bench.toml"])
+    found = opened(tmp_path, csv(tmp_path / "r.csv", RECORDING))
+    (tmp_path / "bench.toml").write_bytes(found.attachments["bench.toml"])
     with pytest.raises(BenchFileError, match=r"machine: .* nothing is driven"):
         load_bench(tmp_path / "bench.toml")
     assert load_bench(tmp_path / "bench.toml", analysis=True).machine is not None
@@ -204,19 +192,8 @@ def test_nothing_is_driven_or_designed_with_the_machine_of_a_recording(tmp_path:
 def test_the_map_in_the_documentation_is_whole(tmp_path: Path) -> None:
     page = (Path(__file__).parents[3] / "docs/howto/recordings-of-others.md").read_text(encoding="utf-8")
     text = page.partition("```toml\n")[2].partition("```")[0]
-    path = imported(tmp_path, csv(tmp_path / "r.csv", RECORDING), text)
-    check(path)
-    machine = read_log(path).bench.machine
+    found = opened(tmp_path, csv(tmp_path / "r.csv", RECORDING), text)
+    check(found.experiment)
+    machine = found.bench.machine
     assert machine is not None
     assert machine.unknown == ("T_c", "f_v", "J")
-
-
-def test_the_document_of_an_import_is_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = csv(tmp_path / "r.csv", RECORDING)
-    (tmp_path / "map.toml").write_text(MAP)
-    out = tmp_path / "run.mcap"
-    assert main(["import", str(source), "--map", str(tmp_path / "map.toml"), "-o", str(out), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert (document["samples"], document["periods"], document["sample_time"]) == (401, 400, T_S)
-    assert main(["info", str(out)]) == 0
-    assert main(["import", str(source), "--map", str(tmp_path / "map.toml"), "-o", str(out)]) == 2  # never overwritten

@@ -1,0 +1,76 @@
+"""A recording of others, opened by its map file: its experiment, and a bench file of the machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import tomlkit
+
+from emb_bench.config.bench import Systematic, parse_bench
+from emb_bench.config.plants import RECORDED_PLANT
+from emb_bench.experiment.from_log import Recording
+from emb_bench.recordings.map_file import RecordingMap, read_map
+from emb_bench.recordings.readers import Found, experiment_of, read_columns
+
+
+def open_recording(path: Path, map_path: Path) -> Recording:
+    """Open a recording by its map.
+
+    Raises:
+        UsageError: a file cannot be read, the map does not fit the recording, or a library is missing.
+    """
+    wanted, map_text = read_map(map_path)
+    kind, timing = wanted.kind_of(path), wanted.timing
+    names = [signal.column for signal in wanted.signals.given.values()] + ([timing.column] if timing.column else [])
+    found = experiment_of(read_columns(path, kind, wanted.file, names), wanted, kind, str(path))
+    text = bench_of(found, wanted)
+    parse_bench(text, f"{map_path}: the bench file made of it", analysis=True)
+    return Recording(
+        path=path,
+        complete=True,
+        missing="",
+        metadata={"emb.run": {"bench_name": wanted.name}},
+        attachments={"bench.toml": text.encode(), "map.toml": map_text.encode()},
+        size=path.stat().st_size,
+        span=(0, 0),
+        chunks=(),
+        topics={},
+        experiment=found.experiment,
+    )
+
+
+def bench_of(found: Found, wanted: RecordingMap) -> str:
+    """Text of the bench file of a machine for analysis, from its map and its samples."""
+    machine = wanted.machine
+    samples = found.experiment.all_samples
+    low, high = float(np.nanmin(samples[:, 0])), float(np.nanmax(samples[:, 0]))
+    speed, current = float(np.nanmax(np.abs(samples[:, 1]))), float(np.abs(found.experiment.currents).max())
+    slack = 0.5 * (high - low) + 1.0
+    brake = {"J": 1.0, "gamma": 1.0, "k_m": 1.0, "k_1": 0.0, "T_c": 1.0, "f_v": 1.0} | machine.parameters
+    plant = {name: 0.0 for name in machine.unknown if name not in brake}
+    document = {
+        "schema": 1,
+        "name": wanted.name,
+        "machine": {
+            "unknown": [*machine.unknown],
+            "nuisances": [*machine.nuisances],
+            "between": wanted.between,
+            **({"window": machine.window} if machine.window else {}),
+            **({"travel": machine.travel} if machine.travel else {}),
+            "units": wanted.shown,
+        },
+        "brake": brake,
+        "limits": {
+            "current": 2.0 * current + 1e-6,
+            "angle": [min(low - slack, -1.0), max(high + slack, 1.0)],
+            "velocity": 3.0 * speed + 1.0,
+        },
+        "noise": {"angle": found.noise[0], "velocity": found.noise[1]},
+        "timing": {"sample_time": found.sample_time, "horizon": found.experiment.periods},
+        "systematic": dict.fromkeys(Systematic.__dataclass_fields__, 0.0),  # what a map can say of a bench is exact
+        "plants": {
+            RECORDED_PLANT: plant | ({"observer_bandwidth": found.bandwidth} if found.bandwidth else {}),
+        },
+    }
+    return f"# A machine for the analysis of recordings: nothing is driven with it.\n{tomlkit.dumps(document)}"
