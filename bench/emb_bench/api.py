@@ -41,11 +41,13 @@ if TYPE_CHECKING:  # scipy, numba, matplotlib and pyarrow come with the extra [b
     from emb_bench.batch.summary import Campaign
     from emb_bench.design.report import Report
     from emb_bench.experiment.evaluation import Evaluation
+    from emb_bench.export.repair import Repaired
     from emb_bench.report.content import Content
+    from emb_bench.rerun import Rerun
 
 __all__ = [
-    *("Run", "campaign", "design", "draw", "estimate", "export", "fisher_information", "open_run", "report"),
-    *("simulate", "topic"),
+    *("Run", "campaign", "design", "draw", "estimate", "export", "fisher_information", "open_run", "repair"),
+    *("report", "rerun", "simulate", "topic"),
 ]
 
 Source = RunLog | str | Path
@@ -207,6 +209,44 @@ def export(
     from emb_bench.export.export import write
 
     return write(_opened(run), Path(output), topic, _text_of(theta))
+
+
+def repair(run: str | Path, output: str | Path) -> Repaired | None:
+    """Write what is left of a cut or damaged log as a finished one that viewers open.
+
+    Args:
+        run: MCAP file of emb-run.
+        output: log to write.
+
+    Returns:
+        What is missing, and the number of messages that were saved; None if the log is whole and nothing was written.
+
+    Raises:
+        UsageError: a file cannot be read or written.
+        LogError: not one message is left.
+    """
+    from emb_bench.export import repair as mending
+
+    return mending.repair(Path(run), Path(output))
+
+
+def rerun(run: Source) -> Rerun:
+    """Run the loop again from the log of a run: does it decide the same?
+
+    Args:
+        run: MCAP file of emb-run.
+
+    Returns:
+        The differences, and how much was compared.
+
+    Raises:
+        UsageError: the run only listened.
+        LogError: the log does not begin with its run, or carries no policy.
+        PolicyError: the policy in the log is refused.
+    """
+    from emb_bench.rerun import rerun_as_recorded
+
+    return rerun_as_recorded(_opened(run))
 
 
 def fisher_information(

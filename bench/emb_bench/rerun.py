@@ -7,19 +7,17 @@ record is one, it is given to the core. A stop frame names the newest sample, an
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import msgspec
 
 from emb_bench.logs.estimates import by_step, learnt_by_step
-from emb_bench.logs.log import RunLog, read_log, require_driven
+from emb_bench.logs.log import RunLog, require_driven
 from emb_runtime.can.e2e import COUNTER_MODULUS
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import CEILING_CURRENT
@@ -29,7 +27,7 @@ from emb_runtime.control.loop import detail_of, fault_of
 from emb_runtime.control.result import Outcome
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.drives.mapping import mapping_hash
-from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, BusError, FrameError, LogError, UsageError
+from emb_runtime.errors import BusError, FrameError, LogError, UsageError
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder_process import DIED
 from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord
@@ -38,7 +36,6 @@ from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import STOP_FRAMES
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import FAULTS, Fault
-from emb_runtime.system.terminal import as_json, show
 
 Item = FrameRecord | CycleRecord | EventRecord
 
@@ -339,17 +336,7 @@ def _words(item: Item) -> str:
 if TYPE_CHECKING:
     from emb_runtime.policy.policy import Policy
 
-SHOWN = 10  # Most differences that are printed; JSON has all
-
-HELP = "run the loop again from the log: does it decide the same?"
-DESCRIPTION = """\
-Run the control loop again with the policy, bench file and DBC of the log, and compare. Bus and clock give the frames
-and times that the log recorded. Each decision (policy, clip, shield, sent current, its reason), each sent frame, each
-safety event and the outcome must be the same, numbers to the last bit. A cut log is compared up to its end.
-
-Rounding may differ with another ONNX Runtime, numpy, Python or processor. If a decision differs, the versions of the
-log are printed too.
-"""
+SHOWN = 10  # Differences that are printed, unless all are asked for
 
 
 class Recorded(msgspec.Struct, frozen=True):
@@ -364,6 +351,7 @@ class Recorded(msgspec.Struct, frozen=True):
 class Rerun:
     """Result of running a log's loop again."""
 
+    log: RunLog
     decisions: int  # Cycle records compared
     frames: int  # Sent frames compared
     events: int  # Safety events compared
@@ -379,15 +367,8 @@ class Rerun:
         return not self.differences
 
 
-def add_arguments(p: argparse.ArgumentParser) -> None:
-    """Adds the command's options."""
-    p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
-    p.add_argument("--json", action="store_true", help="print JSON, with every difference")
-
-
-def run(args: argparse.Namespace) -> int:
-    """Runs a log's loop again; returns the exit code."""
-    log = read_log(args.log)
+def rerun_as_recorded(log: RunLog) -> Rerun:
+    """Run the loop of a log again with the policy that it carries, and compare what it carries with its hashes."""
     if recorded_run(log).purpose == "homing":
         again = rerun(log, Still(), log.bench.limits.current)
         carried: dict[str, str] = {}
@@ -395,9 +376,7 @@ def run(args: argparse.Namespace) -> int:
         policy = carried_policy(log)
         again = rerun(log, policy, policy.contract.limits.current, _stop_condition(log))
         carried = {"policy_sha256": policy.sha256}
-    again = replace(again, differences=(*_identity(log, carried), *again.differences))
-    show(as_json(document(log, again)) if args.json else text(log, again))
-    return EXIT_DONE if again.reproduced else EXIT_CHECK_FAILED
+    return replace(again, differences=(*_identity(log, carried), *again.differences))
 
 
 def carried_policy(log: RunLog) -> Policy:
@@ -428,6 +407,7 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
     playback.play(core)
     outcome = core.outcome() if core.state is RunState.OVER and playback.at_end else None
     return Rerun(
+        log=log,
         decisions=playback.decisions,
         frames=playback.frames,
         events=playback.events,
@@ -485,8 +465,9 @@ def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
     ]
 
 
-def document(log: RunLog, again: Rerun) -> dict[str, Any]:
+def document(again: Rerun) -> dict[str, Any]:
     """The result as plain data."""
+    log = again.log
     return {
         "log": str(log.path),
         "complete": log.complete,
@@ -502,8 +483,9 @@ def document(log: RunLog, again: Rerun) -> dict[str, Any]:
     }
 
 
-def text(log: RunLog, again: Rerun) -> str:
-    """Result as text."""
+def text(again: Rerun, *, verbose: bool = False) -> str:
+    """Result as text; with ``verbose`` every difference."""
+    log, shown = again.log, len(again.differences) if verbose else SHOWN
     lines = [f"WARNING: {log.missing}"] if log.missing else []
     counts = f"{again.decisions} decisions, {again.frames} sent frames, {again.events} events"
     if again.reproduced:
@@ -518,11 +500,11 @@ def text(log: RunLog, again: Rerun) -> str:
         lines.append("outcome      none: the log ends before the run does, and was followed up to there")
     else:
         lines.append("outcome      none: the loop went another way than the log, the last difference says where")
-    for difference in again.differences[:SHOWN]:
+    for difference in again.differences[:shown]:
         where = "" if difference.step is None else f"step {difference.step}, "
         lines.append(f"  {where}{difference.what}: recorded {difference.recorded}, came {difference.came}")
-    if len(again.differences) > SHOWN:
-        lines.append(f"  and {len(again.differences) - SHOWN} more (--json has all)")
+    if len(again.differences) > shown:
+        lines.append(f"  and {len(again.differences) - shown} more (-v shows all)")
     if not again.reproduced:
         names = ("tool", "python", "numpy", "onnxruntime")
         made = ", ".join(f"{name} {log.run[name]}" for name in names if name in log.run)

@@ -367,7 +367,7 @@ def test_the_first_differences_are_printed_and_the_exit_code_says_so(
     lines = replay.text(*arguments, code=1).splitlines()
     assert lines[0] == "NOT reproduced: 151 differences in 151 decisions, 153 sent frames, 5 events"
     assert lines[2] == "  step 0, policy_current: recorded 2.5, came 2.0"
-    assert lines[-2] == "  and 141 more (--json has all)"
+    assert lines[-2] == "  and 141 more (-v shows all)"
     assert len(replay.document(*arguments, code=1)["differences"]) == 151
 
 

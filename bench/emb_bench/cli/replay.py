@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib import metadata
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from emb_bench import api
 from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.cli import live
 from emb_bench.cli.options import add, add_output_options, answer, given, summary
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import read_log
@@ -113,6 +113,26 @@ def _campaign(args: argparse.Namespace) -> int:
     return EXIT_CHECK_FAILED if found.failed else EXIT_DONE
 
 
+def _rerun(args: argparse.Namespace) -> int:
+    again = api.rerun(args.run)
+    from emb_bench.rerun import document, text
+
+    answer(args, lambda: document(again), lambda verbose: text(again, verbose=verbose))
+    return EXIT_DONE if again.reproduced else EXIT_CHECK_FAILED
+
+
+def _repair(args: argparse.Namespace) -> int:
+    found = api.repair(**given(args, api.repair))
+    missing, kept = ((), None) if found is None else found
+    written = None if found is None else str(args.output)
+    document = {"log": str(args.run), "written": written, "missing": "; ".join(missing), "messages": kept}
+    said = f"{args.run}: the log is whole: nothing to repair, and nothing was written"
+    if found is not None:
+        said = "\n".join([f"{args.output}: {kept} messages saved", *(f"missing  {what}" for what in missing)])
+    answer(args, lambda: document, lambda _: said)
+    return EXIT_DONE
+
+
 def info(run: Path) -> dict[str, Any]:
     """Summary of a run: end, counts, largest values, completeness.
 
@@ -196,7 +216,7 @@ OF_A_LOG = (EXIT_DONE, EXIT_USAGE, EXIT_LOG, EXIT_INTERRUPTED)
 CHECKED = (*OF_A_LOG, EXIT_CHECK_FAILED)
 
 MISFIT = "a run was stopped, the model does not fit, does not predict a log, or a parameter is not identified"
-COMMANDS: Mapping[str, tuple[Command | str, Collection[int]]] = {
+COMMANDS: Mapping[str, tuple[Command, Collection[int]]] = {
     "fim": (
         _command(
             api.fisher_information,
@@ -255,26 +275,36 @@ COMMANDS: Mapping[str, tuple[Command | str, Collection[int]]] = {
         ),
         CHECKED,
     ),
-    "rerun": ("emb_bench.rerun", (*CHECKED, EXIT_POLICY_REFUSED)),
-    "repair": ("emb_bench.export.repair", OF_A_LOG),
+    "rerun": (
+        _command(
+            api.rerun,
+            _rerun,
+            "The control loop runs again with the policy, bench file and DBC of the log. Bus and clock\n"
+            "give the frames and times that the log recorded. Each decision (policy, clip, shield, sent\n"
+            "current, its reason), each sent frame, each safety event and the outcome must be the same,\n"
+            "numbers to the last bit. A cut log is compared up to its end. Rounding may differ with\n"
+            "another ONNX Runtime, numpy, Python or processor. If a decision differs, the versions of\n"
+            "the log are printed too.\n",
+        ),
+        (*CHECKED, EXIT_POLICY_REFUSED),
+    ),
+    "repair": (
+        _command(
+            api.repair,
+            _repair,
+            "The new file has a summary, indexes and checksums. Topics, schemas, times, sequence\n"
+            "numbers, attachments and metadata stay as they were. The file says in itself what is\n"
+            "missing, so that nothing takes it for a complete log.\n",
+        ),
+        OF_A_LOG,
+    ),
     "export": (
         _command(api.export, _export, "The frames on the bus go to BLF, ASC and others by can_logconvert RUN FILE.\n"),
         OF_A_LOG,
     ),
-    "live": ("emb_bench.cli.live", (EXIT_DONE, EXIT_USAGE, EXIT_LOG)),
+    "live": (Command(live.HELP, live.DESCRIPTION, live.add_arguments, live.run), (EXIT_DONE, EXIT_USAGE, EXIT_LOG)),
 }
-"""Commands and their exit codes, in the order of ``--help``.
-
-A text is a module with ``HELP``, ``DESCRIPTION``, ``add_arguments`` and ``run``, which is imported where it is needed.
-"""
-
-
-def _found(name: str) -> Command:
-    command = COMMANDS[name][0]
-    if isinstance(command, Command):
-        return command
-    module = importlib.import_module(command)
-    return Command(module.HELP, module.DESCRIPTION, module.add_arguments, module.run)
+"""Commands and their exit codes, in the order of ``--help``."""
 
 
 CUT = "\nA cut log (kill -9, full disk) is read as far as it goes, and the missing part is named.\n"
@@ -287,7 +317,7 @@ def epilog(codes: Collection[int]) -> str:
 
 
 def parser(only: str | None = None) -> argparse.ArgumentParser:
-    """The command line, of one command where it is known: the others' imports would take longer than many of them."""
+    """The command line, of one command where it is known."""
     p = Parser(
         prog="emb-replay",
         description="Evaluate logs of emb-run.",
@@ -297,12 +327,12 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
     p.add_argument("--version", action="version", version=f"emb-replay {metadata.version('emb-excite')}")
     commands = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS if only is None else (only,):
-        found = _found(name)
+        found, codes = COMMANDS[name]
         command = commands.add_parser(
             name,
             help=found.help,
             description=found.description,
-            epilog=epilog(COMMANDS[name][1]),
+            epilog=epilog(codes),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         found.add_arguments(command)

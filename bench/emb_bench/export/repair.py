@@ -1,8 +1,7 @@
-"""``emb-replay repair``: the rest of a cut or damaged log as a finished file that any viewer opens."""
+"""The rest of a cut or damaged log as a finished file that any viewer opens."""
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import os
 from collections import Counter
@@ -16,51 +15,19 @@ from mcap.writer import CompressionType, Writer
 from emb_bench.logs.log import REPAIR
 from emb_bench.logs.mcap_file import McapFile
 from emb_bench.output import replacing
-from emb_runtime.errors import EXIT_DONE, LogError, UsageError
+from emb_runtime.errors import LogError, UsageError
 from emb_runtime.log.recorder_process import CHUNK
 from emb_runtime.system.input_file import open_regular
-from emb_runtime.system.terminal import as_json, show
-
-HELP = "a cut or damaged log as a finished file that viewers open"
-DESCRIPTION = """\
-Write what can be saved of a log that was cut (kill -9, full disk, lost power) or damaged as a finished MCAP file, with
-summary, indexes and checksums. Topics, schemas, times, sequence numbers, attachments and metadata stay as they were.
-The new file says in itself what is missing, so that nothing takes it for a complete log. A log that is whole is left
-alone, and nothing is written.
-"""
 
 
-def add_arguments(p: argparse.ArgumentParser) -> None:
-    """Adds the command's options."""
-    p.add_argument("log", type=Path, metavar="LOG", help="MCAP file of emb-run")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="log to write")
-    p.add_argument("--json", action="store_true", help="print JSON")
-
-
-def run(args: argparse.Namespace) -> int:
-    """Repair a log; returns the exit code."""
-    found = repair(args.log, args.output)
-    if args.json:
-        written = None if found is None else str(args.output)
-        missing, kept = ("", None) if found is None else ("; ".join(found.missing), found.kept)
-        show(as_json({"log": str(args.log), "written": written, "missing": missing, "messages": kept}))
-    elif found is None:
-        show(f"{args.log}: the log is whole, there is nothing to repair, and nothing was written")
-    else:
-        show(
-            "\n".join([*(f"missing  {what}" for what in found.missing), f"{args.output}: {found.kept} messages saved"])
-        )
-    return EXIT_DONE
-
-
-class Found(NamedTuple):
-    """Content of a damaged log."""
+class Repaired(NamedTuple):
+    """Content of a damaged log that was written anew."""
 
     missing: tuple[str, ...]  # Descriptions of the missing parts
     kept: int  # Messages that are saved
 
 
-def repair(source: Path, target: Path) -> Found | None:
+def repair(source: Path, target: Path) -> Repaired | None:
     """Write what is left of a log as a finished one, in two passes, chunk by chunk.
 
     Returns None if the log is whole, and nothing was written.
@@ -89,7 +56,7 @@ def repair(source: Path, target: Path) -> Found | None:
                 _write(McapFile(source, file, size), whole, described, note, output)
     except OSError as err:
         raise UsageError(f"{source}: cannot read the log: {err.strerror}") from err
-    return Found(tuple(whole.missing), kept)
+    return Repaired(tuple(whole.missing), kept)
 
 
 def _write(
