@@ -1,7 +1,7 @@
 """A log of a run: finished, cut by ``kill -9``, or damaged. All that is left is read; what is missing is named.
 
 The messages are decoded with the descriptors that the file itself carries, when they are requested: as whole
-tables, or of a long log in batches. Chunks are kept if they are few, and else read again.
+tables, or of a long log in batches; the chunks are read again each time.
 """
 
 from __future__ import annotations
@@ -48,7 +48,6 @@ Table = Mapping[str, NDArray[Any]]
 REPAIR = "emb.repair"
 """Metadata of a log that ``emb-replay repair`` made: what is ``missing``, and ``source_sha256`` of the damaged one."""
 
-KEPT = 16 << 20  # Unpacked chunks are kept in memory if all of them take no more than this [bytes]
 BATCH = 4 << 20  # Unpacked bytes that are decoded at a time
 SMALL_TABLE = 64 << 20  # Size of a table that any log may have [bytes]
 TABLE = 16  # Times the size of the file by which it may be larger; the cycles of a log take about the size of its file
@@ -81,40 +80,34 @@ class _Topic(NamedTuple):
     units: str  # SI units by field, as JSON
 
 
+class _Place(NamedTuple):
+    """Place of a chunk's record in the file."""
+
+    at: int  # [bytes]
+    length: int  # [bytes]
+    messages: int  # Number of them in the chunk
+
+
+@dataclass(frozen=True)
 class _Chunks:
-    """The chunks of a log, kept if all of them are small, and else read again."""
+    """The chunks of a log that are whole, read from the file each time: a long log takes more than the memory."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._unpacked = 0  # size of all of them [bytes]
-        self._kept: list[Chunk] = []
-        self._places: list[tuple[int, int, int]] = []  # offset and length in the file, and count of messages
-
-    def add(self, at: int, length: int, chunk: Chunk) -> None:
-        """Take the next chunk."""
-        self._unpacked += len(chunk.data)
-        self._places.append((at, length, len(chunk.at)))
-        if self._unpacked <= KEPT:
-            self._kept.append(chunk)
-        else:
-            self._kept.clear()
+    path: Path
+    places: Sequence[_Place]
 
     def __iter__(self) -> Iterator[Chunk]:
-        if self._unpacked <= KEPT:
-            yield from self._kept
-            return
         try:
-            with open_regular(self._path) as file:
-                for at, length, messages in self._places:
+            with open_regular(self.path) as file:
+                for at, length, messages in self.places:
                     file.seek(at)
                     chunk = unpack_chunk(file.read(length))
                     if len(chunk.at) != messages:
                         raise ValueError("other messages than before")
                     yield chunk
         except OSError as err:
-            raise UsageError(f"{self._path}: cannot read the log: {err.strerror}") from err
+            raise UsageError(f"{self.path}: cannot read the log: {err.strerror}") from err
         except DAMAGE as err:
-            raise LogError(f"{self._path}: the log has changed while it was read: {message_of(err)}") from err
+            raise LogError(f"{self.path}: the log has changed while it was read: {message_of(err)}") from err
 
 
 class _Tables(Mapping[str, Table]):
@@ -316,7 +309,7 @@ class RunLog:
                 rows.append((order, Frame(identifier, data, time_ns, extended, remote, error, own, dropped)))
         return tuple(frame for _, frame in sorted(rows))
 
-    @property
+    @cached_property
     def events(self) -> tuple[Event, ...]:
         """The safety events."""
         rows = self.rows("/safety", "publish_time", "code", "text")
@@ -376,13 +369,13 @@ def read_log(path: str | Path) -> RunLog:
         UsageError: it cannot be read.
     """
     path = Path(path)
-    chunks, counts, spans = _Chunks(path), Counter[int](), list[tuple[int, int]]()
+    places, counts, spans = list[_Place](), Counter[int](), list[tuple[int, int]]()
     try:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             contents = McapFile(path, file, size)
             for at, length, chunk in contents.chunks():
-                chunks.add(at, length, chunk)
+                places.append(_Place(at, length, len(chunk.at)))
                 if len(chunk.at):
                     counts += Counter(dict(enumerate(np.bincount(chunk.headers["channel"]).tolist())))
                     spans.append((int(chunk.headers["publish"].min()), int(chunk.headers["publish"].max())))
@@ -401,7 +394,7 @@ def read_log(path: str | Path) -> RunLog:
         attachments={name: attachment.data for name, attachment in contents.attachments.items()},
         size=size,
         span=(min(first for first, _ in spans), max(last for _, last in spans)),
-        chunks=chunks,
+        chunks=_Chunks(path, places),
         topics=topics,
     )
 
