@@ -465,13 +465,14 @@ def of_can(checkout: Checkout) -> Mapping[str, Any]:
 
 
 def each(command: str, *arguments: str) -> Section:
-    """A command that takes one log."""
+    """A command that takes one log; ``fim`` takes a recording of others, too."""
+    left_out = ("several",) if command == "fim" else ("several", "emps")
 
     def section(checkout: Checkout) -> Mapping[str, Any]:
         return {
-            name: checkout.says(command, paths(checkout, name)[0], "--json", *arguments, *model(command, name))
+            name: checkout.says(command, *paths(checkout, name), "--json", *arguments, *model(command, name))
             for name in ALL
-            if name != "several" and paths(checkout, name)
+            if name not in left_out and paths(checkout, name)
         }
 
     return section
