@@ -61,6 +61,7 @@ RENAMED: dict[str, str] = {}
 """Keys of JSON documents: the new name, and the frozen one."""
 GONE: dict[str, str] = {
     "logs/emps*": "a recording of others is read by fim, estimate and report: no log is made of it",
+    "estimate/emps windows/says/records/emps.mcap": "a record has the name of its file, which is the recording's own",
     "info/emps*": "a recording of others is no log",
     "timing/emps*": "a recording of others is no log",
     "rerun/emps*": "a recording of others is no log",
