@@ -150,7 +150,7 @@ figures: $(VENV)/.dev
 	$(BIN)/python -m tools.figures
 
 study-reproduce: $(VENV)/.dev
-	$(BIN)/python -m studies.thesis trainings --out build/trainings
+	$(BIN)/python -m studies.thesis trainings --output build/trainings
 
 proof: $(VENV)/.dev
 	$(BIN)/python -m tools.proof

@@ -181,7 +181,7 @@ def main() -> None:
     p.add_argument("--drives", nargs="+", default=("odrive",), choices=kinds, help="of those mapped")
     p.add_argument("--outside", action="store_true", help="brakes of which one parameter is outside of the data sheet")
     p.add_argument("--keep", type=Path, help="folder for the logs; without, they are deleted")
-    p.add_argument("--out", type=Path, help="a line of JSON for each brake")
+    p.add_argument("-o", "--output", type=Path, help="a line of JSON for each brake")
     args = p.parse_args()
     setattr(transport, "BrakeNode", recorded(BrakeNode))  # noqa: B010  mypy would refuse the plain assignment
     setattr(simulated_drives, "DRIVES", {name: recorded(kind) for name, kind in simulated_drives.DRIVES.items()})  # noqa: B010
@@ -194,8 +194,8 @@ def main() -> None:
             drive = args.drives[number // len(PLANTS) % len(args.drives)]
             row = commissioned(number, folder, drive, lambda _: None, is_outside=args.outside)
             rows.append(row)
-            if args.out:
-                with args.out.open("a") as file:
+            if args.output:
+                with args.output.open("a") as file:
                     file.write(json.dumps(row) + "\n")
             if args.outside:
                 verdict = f"{row['outside']} {'refused' if row['refused'] else 'MISSED'}"

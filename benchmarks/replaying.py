@@ -81,7 +81,7 @@ def long_logs(folder: Path, minutes: float) -> bool:
         samples = round(length * 60.0 / sample_time)
         bench.write_text(text.replace(line, f"horizon     = {samples} "))
         with contextlib.redirect_stdout(io.StringIO()):
-            assert emb_export(["square:period=0.05,amplitude=1", "--bench", str(bench), "--out", str(policy)]) == 0
+            assert emb_export(["square:period=0.05,amplitude=1", "--bench", str(bench), "--output", str(policy)]) == 0
         path = simulated(folder, f"{length:g}", "--bench", str(bench), "--policy", str(policy))
         size, messages = path.stat().st_size / 2**20, 0
         found.append({})

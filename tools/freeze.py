@@ -271,7 +271,7 @@ def files(checkout: Checkout, policies: bool = True) -> None:
     (checkout.folder / "emps_map.toml").write_text(EMPS_MAP, encoding="utf-8")
     if not policies:
         return
-    require(checkout.type("export", REFERENCE, "--bench", "late.toml", "--out", "late.onnx"))
+    require(checkout.type("export", REFERENCE, "--bench", "late.toml", "--output", "late.onnx"))
     for name, later in (("nan", "nan"), ("beyond", "1e9")):
         program = (
             "import sys, pathlib, json; from tests.actors import constant_actor; "

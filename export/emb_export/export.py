@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
         help="a tuned reference, one of those below or the reference.json of emb-train reference; a sequence: "
         "step:amplitude=1.5, chirp:f1=20, ..., or the .csv file of emb-design; or a directory that emb-train wrote",
     )
-    p.add_argument("--out", type=Path, metavar="FILE", help="the ONNX file (default: DIR/actor.onnx)")
+    p.add_argument("-o", "--output", type=Path, metavar="FILE", help="the ONNX file (default: DIR/actor.onnx)")
     p.add_argument(
         "--bench",
         type=Path,
@@ -68,12 +68,12 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _export(arguments: argparse.Namespace) -> str:
-    source, path = Path(arguments.source), arguments.out
+    source, path = Path(arguments.source), arguments.output
     is_training = source.is_dir()
     if is_training and arguments.bench:
         raise UsageError("--bench: a training's actor is for the bench that it was trained on; leave it out")
     if path is None and not is_training:
-        raise UsageError(f"{source} is no folder of a training: name the file to write, as in --out actor.onnx")
+        raise UsageError(f"{source} is no folder of a training: name the file to write, as in --output actor.onnx")
     if is_training:
         from emb_export.network import network_file
 

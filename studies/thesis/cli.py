@@ -54,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("figure", nargs="*", help="some of those below, 'analysis' (the default) or 'trainings'")
     p.add_argument("--json", action="store_true", help="print JSON")
     p.add_argument(
-        "--out", type=Path, metavar="DIR", default=Path("trainings"), help="trainings (default: %(default)s)"
+        "-o", "--output", type=Path, metavar="DIR", default=Path("trainings"), help="trainings (default: %(default)s)"
     )
     p.add_argument("--steps", type=int, metavar="N", help="most steps of a training (default: as its preset has)")
     p.add_argument("--seeds", type=int, metavar="N", default=SEEDS, help="trainings of one kind (default: %(default)s)")
@@ -92,7 +92,7 @@ def _run(args: argparse.Namespace) -> str:
         from studies.thesis.trainings import Trainings
 
         seeds = range(args.seed, args.seed + args.seeds)
-        trainings = Trainings(args.out, bench, seeds, args.steps, lambda what: mention(f"{PROGRAM}: {what}"))
+        trainings = Trainings(args.output, bench, seeds, args.steps, lambda what: mention(f"{PROGRAM}: {what}"))
         facts += [fact for name in trained for fact in agent_facts(name, trainings)]
     if args.json:
         return json.dumps([fact.document() for fact in facts], indent=1, allow_nan=False)

@@ -124,7 +124,7 @@ class Trainings:
             run_training(folder, config, self._bench)
         trained = load_training(folder)
         if (trained.training, trained.bench.identity_hash) != (config, self._bench.identity_hash):
-            raise UsageError(f"{folder}: holds another training, of other steps or bench: choose another --out")
+            raise UsageError(f"{folder}: holds another training, of other steps or bench: choose another --output")
         try:
             records = [json.loads(line) for line in (folder / METRICS).read_text(encoding="utf-8").splitlines()]
             returns = [(r["mean_return"] * max(r["ended"], 1), r["violations"]) for r in records]

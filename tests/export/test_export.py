@@ -51,7 +51,7 @@ def _tiny() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("training")
-    arguments = ["ppo", "single-viscous", "--out", str(folder / "run"), "--seed", "5"]
+    arguments = ["ppo", "single-viscous", "--output", str(folder / "run"), "--seed", "5"]
     assert train_main([*arguments, "--bench", str(short_bench(folder))]) == 0
     return folder / "run"
 
@@ -59,7 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def exported(run: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     path = tmp_path_factory.mktemp("exported") / "actor.onnx"
-    assert main([str(run), "--out", str(path)]) == 0
+    assert main([str(run), "--output", str(path)]) == 0
     assert [p.name for p in path.parent.iterdir()] == ["actor.onnx"]
     return path.read_bytes()
 
@@ -190,7 +190,7 @@ def test_a_file_that_computes_something_else_is_not_written(monkeypatch: pytest.
 
 def test_a_sequence_is_exported_as_a_policy_that_gives_it(tmp_path: Path) -> None:
     path, estimator = tmp_path / "ramp.onnx", Estimator(BENCH)
-    assert main(["ramp:amplitude=-5", "--out", str(path)]) == 0
+    assert main(["ramp:amplitude=-5", "--output", str(path)]) == 0
     policy, wanted = load_policy(path, BENCH), excitation("ramp", BENCH, amplitude=-5.0).currents
     assert wanted is not None
     found = [policy.act(17.0, -3.0, float(k), estimator) for k in range(len(wanted))]
@@ -206,7 +206,7 @@ def test_a_design_is_exported_as_a_policy(tmp_path: Path) -> None:
     current = np.linspace(-6.0, 6.0, BENCH.timing.horizon + 1)
     metadata = json.dumps({"identity_hash": BENCH.identity_hash, "criterion": "D"})
     design.write_text("\n".join([f"# {metadata}", "current", *map(str, current.tolist())]))
-    assert main([str(design), "--out", str(path)]) == 0
+    assert main([str(design), "--output", str(path)]) == 0
     policy = load_policy(path, BENCH)
     found = [policy.act(0.0, 0.0, float(k), Estimator(BENCH)) for k in range(BENCH.timing.horizon)]
     assert found == pytest.approx(current[:-1], abs=1e-5 * BENCH.limits.current)
@@ -218,7 +218,7 @@ def test_a_design_is_exported_as_a_policy(tmp_path: Path) -> None:
 def test_each_graph_stands_alone_in_a_version_that_the_runtimes_oldest_library_reads(
     exported: bytes, tmp_path: Path
 ) -> None:
-    assert main(["step", "--out", str(tmp_path / "step.onnx")]) == 0
+    assert main(["step", "--output", str(tmp_path / "step.onnx")]) == 0
     for data in (exported, reference_file("four-d-exact-quadratic", BENCH), (tmp_path / "step.onnx").read_bytes()):
         model = onnx.load_from_string(data)
         onnx.checker.check_model(model, full_check=True)
@@ -235,7 +235,7 @@ def test_ctrl_c_is_no_traceback_and_leaves_nothing(tmp_path: Path, monkeypatch: 
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Path, "replace", interrupt)
-    monkeypatch.setattr(sys, "argv", ["emb-export", "step", "--out", str(tmp_path / "y.onnx")])
+    monkeypatch.setattr(sys, "argv", ["emb-export", "step", "--output", str(tmp_path / "y.onnx")])
     assert emb_export() == 130
     assert not list(tmp_path.iterdir())
 
@@ -244,14 +244,16 @@ def test_a_file_is_for_the_limits_and_the_sample_time_of_the_bench_that_is_named
     bench, path = tmp_path / "my.toml", tmp_path / "x.onnx"
     bench.write_text(shipped_bench_text().replace("velocity = 500.0", "velocity = 400.0"))
     for source in ("ramp:amplitude=-3", "four-d-exact-quadratic"):
-        assert main([source, "--bench", str(bench), "--out", str(path)]) == 0
+        assert main([source, "--bench", str(bench), "--output", str(path)]) == 0
         load_policy(path, load_bench(bench))
         for other in (BENCH, dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, sample_time=2e-3))):
             with pytest.raises(PolicyRefusedError):
                 load_policy(path, other)
     bench.write_text(shipped_bench_text().replace('envelope      = "braking"', 'envelope      = "coasting"'))
     path.unlink()
-    assert main(["ramp:amplitude=-5", "--bench", str(bench), "--out", str(path)]) == 2  # no shield can be made for it
+    assert (
+        main(["ramp:amplitude=-5", "--bench", str(bench), "--output", str(path)]) == 2
+    )  # no shield can be made for it
     assert not path.exists()
 
 
@@ -270,6 +272,6 @@ def test_a_reference_and_a_sequence_are_exported_without_torch(tmp_path: Path) -
             "            raise ModuleNotFoundError(name=name)\n"
             "sys.meta_path.insert(0, NoTorch())\n"
             "from emb_export.export import main\n"
-            f"sys.exit(main([{source!r}, '--out', {str(tmp_path / 'x.onnx')!r}]))"
+            f"sys.exit(main([{source!r}, '--output', {str(tmp_path / 'x.onnx')!r}]))"
         )
         assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0

@@ -30,14 +30,14 @@ def test_whatever_is_told_no_plant_takes_the_same(bench: Bench) -> None:
     defaults = [
         open_sim("", bench)[0].truth["plant"],
         read_brake(node.parser().parse_args(["--iface", "vcan0"]).brake, bench, "").plant.name,
-        train.parser().parse_args(["reference", "four-d", "--out", "a"]).plant,
+        train.parser().parse_args(["reference", "four-d", "--output", "a"]).plant,
         *(inspect.signature(call).parameters["plant"].default for call in (api.simulate, Batch)),
         *(inspect.signature(call).parameters["model"].default for call in (api.design, make_problem)),
         *(task.plant for task in TASKS.values()),
     ]
     assert set(defaults) == {DEFAULT_PLANT}
     assert bench.plant(DEFAULT_PLANT).mechanics.solver == EXACT
-    assert f"(default {DEFAULT_PLANT})" in options.EPILOG
+    assert f"(default: {DEFAULT_PLANT})" in options.EPILOG
 
 
 @pytest.mark.parametrize("told", [True, False], ids=["simulated", "over a bus"])

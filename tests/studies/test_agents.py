@@ -48,7 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("trainings")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(trainings, "load_preset", small)
-        assert main(["trainings", "--seeds", "2", "--json", "--out", str(folder)]) == 0
+        assert main(["trainings", "--seeds", "2", "--json", "--output", str(folder)]) == 0
     return folder
 
 
@@ -76,13 +76,13 @@ def test_every_target_has_statements_of_its_own_trainings_which_are_made_once(
     once = ("adaptive", "d-optimal-1", "d-optimal-2", "fixed", "random")
     names = [f"thesis-{n}-{s}" for n in both for s in (0, 1)] + [f"thesis-{n}-0" for n in once]
     assert sorted(path.name for path in folder.iterdir()) == sorted(names)
-    assert main(["fig-5.2", "fig-4.2", "--out", str(folder)]) == 0
+    assert main(["fig-5.2", "fig-4.2", "--output", str(folder)]) == 0
     assert capsys.readouterr().out.count("fig-") == 2
 
 
 def test_a_wrong_option_is_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in (["fig-1.1"], ["--seeds", "0"], ["--steps", "-5"], ["--seed", "-1"]):
-        refused(lambda: main([*arguments, "--out", str(tmp_path / "new")]), capsys)  # noqa: B023  # called at once
+        refused(lambda: main([*arguments, "--output", str(tmp_path / "new")]), capsys)  # noqa: B023  # called at once
     assert not (tmp_path / "new").exists()
 
 
@@ -90,12 +90,12 @@ def test_a_wrong_option_is_refused_in_a_line(tmp_path: Path, capsys: pytest.Capt
 def test_trainings_that_do_not_belong_to_a_target_are_refused_in_a_line(
     folder: Path, made: Trainings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    refused(lambda: main(["fig-5.2", "--steps", "300", "--out", str(folder)]), capsys)  # of other trainings
+    refused(lambda: main(["fig-5.2", "--steps", "300", "--output", str(folder)]), capsys)  # of other trainings
     for content in ("junk\n", '{"steps": 1}\n', "\xff", ""):
         shutil.rmtree(tmp_path / "thesis-fixed-0", ignore_errors=True)
         copy = shutil.copytree(folder / "thesis-fixed-0", tmp_path / "thesis-fixed-0")
         (copy / METRICS).write_bytes(content.encode("latin-1"))
-        refused(lambda: main(["fig-5.3", "--out", str(tmp_path)]), capsys)
+        refused(lambda: main(["fig-5.3", "--output", str(tmp_path)]), capsys)
 
 
 @pytest.mark.slow
@@ -103,7 +103,7 @@ def test_a_cut_training_makes_a_rehearsal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(trainings, "load_preset", small)
-    assert main(["fig-5.2", "--steps", "300", "--out", str(tmp_path)]) == 0
+    assert main(["fig-5.2", "--steps", "300", "--output", str(tmp_path)]) == 0
     assert "no verdict of a training counts" in capsys.readouterr().out
 
 

@@ -17,5 +17,5 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         make_tiny(patch)
         bench = short_bench(folder)
-        assert main(["ppo", "single-viscous", "--bench", str(bench), "--out", str(folder / "run")]) == 0
+        assert main(["ppo", "single-viscous", "--bench", str(bench), "--output", str(folder / "run")]) == 0
     return folder / "run"

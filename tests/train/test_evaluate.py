@@ -171,7 +171,7 @@ def test_the_optimum_of_a_plant_is_that_of_its_mechanics() -> None:
 
 
 def test_table_and_document_say_the_same(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(finished, "--criterion", "weighted", "--json", "--out", tmp_path / "out") == 0
+    assert run(finished, "--criterion", "weighted", "--json", "--output", tmp_path / "out") == 0
     said = capsys.readouterr().out
     assert said == (tmp_path / "out" / "evaluation.json").read_text()
     plant = json.loads(said)["plants"]["euler"]

@@ -184,7 +184,7 @@ def test_every_packaged_reference_is_made_by_a_command_that_exists_and_keeps_wha
         assert (asked.task, asked.form, asked.plant, asked.gain) == (kept.task, kept.form, kept.plant, kept.gain), name
         assert (tuple(asked.command_delay), asked.seed) == (kept.command_delay, kept.seed)
         assert kept.draws == asked.steps * BATCH
-        assert asked.out.name == name
+        assert asked.output.name == name
 
 
 def test_a_kept_delay_that_is_none_is_refused() -> None:

@@ -66,7 +66,7 @@ def test_a_training_writes_all_that_its_result_depends_on_and_keeps_the_best_act
 def test_the_same_seed_gives_the_same_files(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_tiny(monkeypatch)
     bench, other = finished.parent / "short.toml", tmp_path / "run"
-    assert main(["ppo", "single-viscous", "--bench", str(bench), "--out", str(other)]) == 0
+    assert main(["ppo", "single-viscous", "--bench", str(bench), "--output", str(other)]) == 0
     for name in FILES:
         assert (other / name).read_bytes() == (finished / name).read_bytes(), name
 
@@ -90,7 +90,7 @@ def test_ctrl_c_and_divergence_leave_the_best_actor_so_far(
     bench = finished.parent / "short.toml"
     for code in (EXIT_INTERRUPTED, 1):
         calls, stop, folder = 0, code == EXIT_INTERRUPTED, tmp_path / str(code)
-        assert main(["ppo", "single-viscous", "--bench", str(bench), "--out", str(folder)]) == code
+        assert main(["ppo", "single-viscous", "--bench", str(bench), "--output", str(folder)]) == code
         scores = [m["score"] for m in metrics_of(folder)]
         assert scores == [m["score"] for m in metrics_of(finished)][:2]
         assert load_training(folder).score == max(scores)
@@ -117,7 +117,7 @@ def test_a_reference_is_searched_for_and_a_ctrl_c_keeps_what_was_found(
     for module, value in (("BATCH", 4), ("JUDGED", 4)):
         monkeypatch.setattr(f"emb_train.evolve.{module}", value)
     command = ["reference", "viscous", "--bench", str(short_bench(tmp_path)), "--steps", "3", "--seed", "7"]
-    assert main([*command, "--out", str(tmp_path / "whole")]) == 0
+    assert main([*command, "--output", str(tmp_path / "whole")]) == 0
     assert sorted(p.name for p in (tmp_path / "whole").iterdir()) == ["bench.toml", "metrics.jsonl", "reference.json"]
     kept = stored(str(tmp_path / "whole" / "reference.json"))
     assert (kept.task, kept.form, kept.seed, kept.command.split()[:3]) == (
@@ -127,8 +127,8 @@ def test_a_reference_is_searched_for_and_a_ctrl_c_keeps_what_was_found(
     assert f"{kept.score:.6g}" in capsys.readouterr().out
     blind, found = tmp_path / "blind", tmp_path / "found"
     command[1], options = "four-d", ["--command-delay", "1", "2", "--gain", "0.3"]
-    assert main([*command, "--form", "blind", "--begin=1,-1,0,0.3,0.6", *options, "--out", str(blind)]) == 0
-    assert main([*command, "--start", str(blind / "reference.json"), *options, "--out", str(found)]) == 0
+    assert main([*command, "--form", "blind", "--begin=1,-1,0,0.3,0.6", *options, "--output", str(blind)]) == 0
+    assert main([*command, "--start", str(blind / "reference.json"), *options, "--output", str(found)]) == 0
     assert not stored(str(blind / "reference.json")).array()[:, 1:].any()
     assert Task.of(stored(str(found / "reference.json"))).conditions.command_delay == (1, 2)
     done = Progress._asdict
@@ -139,7 +139,7 @@ def test_a_reference_is_searched_for_and_a_ctrl_c_keeps_what_was_found(
         return done(step)
 
     monkeypatch.setattr(Progress, "_asdict", pressed)
-    assert main([*command, "--out", str(tmp_path / "part")]) == EXIT_INTERRUPTED
+    assert main([*command, "--output", str(tmp_path / "part")]) == EXIT_INTERRUPTED
     begun = stored(str(tmp_path / "part" / "reference.json"))
     assert np.isfinite(begun.array()).all()
 
@@ -177,7 +177,7 @@ def test_ctrl_c_in_the_imports_and_a_missing_extra_are_no_traceback(tmp_path: Pa
     code = (
         "import sys; sys.modules['torch'] = None\n"
         "from emb_train.cli import main\n"
-        f"sys.exit(main(['ppo', 'single-viscous', '--out', {str(tmp_path / 'run')!r}]))"
+        f"sys.exit(main(['ppo', 'single-viscous', '--output', {str(tmp_path / 'run')!r}]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr.count("\n")) == (EXIT_USAGE, 1)
@@ -190,7 +190,7 @@ def test_a_bench_that_does_not_fit_the_training_is_refused_and_nothing_is_made(
     text = short_bench(tmp_path).read_text()
     for old, new in (('"envelope"', '"pm50"'), (f"= {HORIZON}", "= 120")):
         (tmp_path / "other.toml").write_text(text.replace(old, new, 1))
-        command = ["ppo", "single-viscous", "--out", str(tmp_path / "x"), "--bench", str(tmp_path / "other.toml")]
+        command = ["ppo", "single-viscous", "--output", str(tmp_path / "x"), "--bench", str(tmp_path / "other.toml")]
         assert refused(lambda: main(command), capsys), new  # noqa: B023  # called at once
         assert not (tmp_path / "x").exists()
 

@@ -34,8 +34,8 @@ FORMS = ("blind", "quadratic")
 REFERENCE, BENCH, METRICS = "reference.json", "bench.toml", "metrics.jsonl"  # Files of a folder of results
 EPILOG = """\
 examples:
-  emb-train reference four-d --out mine && emb-export mine/reference.json --out mine/actor.onnx
-  emb-train ppo single-viscous --out run && emb-export run
+  emb-train reference four-d --output mine && emb-export mine/reference.json --output mine/actor.onnx
+  emb-train ppo single-viscous --output run && emb-export run
   emb-train evaluate mine/actor.onnx four-d-exact-blind --plant exact
 
 Ctrl-C ends a command and keeps the best result so far.
@@ -118,7 +118,7 @@ def _add_common(p: argparse.ArgumentParser, seed: str) -> None:
 
 def _add_reference(p: argparse.ArgumentParser) -> None:
     p.add_argument("task", metavar="TASK", choices=TASKS, help="what the reference is for: one of those below")
-    p.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the results")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="new folder for the results")
     p.add_argument(
         "--form",
         choices=FORMS,
@@ -146,7 +146,7 @@ def _add_reference(p: argparse.ArgumentParser) -> None:
 
 def _add_ppo(p: argparse.ArgumentParser) -> None:
     p.add_argument("preset", metavar="PRESET", help="what to learn: one of those below")
-    p.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the results")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="new folder for the results")
     p.add_argument(
         "--steps",
         type=_at_least(1),
@@ -182,7 +182,9 @@ def _add_evaluate(p: argparse.ArgumentParser) -> None:
         help="search the optimum for the first N brakes, which takes minutes (default: %(default)s)",
     )
     p.add_argument("--json", action="store_true", help="print JSON, with the values of every draw")
-    p.add_argument("--out", type=Path, metavar="DIR", help="also write evaluation.txt and evaluation.json there")
+    p.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="also write evaluation.txt and evaluation.json there"
+    )
     _add_late(p)
     _add_common(p, "seed of brakes and noise, which no training uses")
 
@@ -260,7 +262,7 @@ def reference(arguments: argparse.Namespace) -> int:
     task = replace(TASKS[arguments.task], plant=arguments.plant, command_delay=(least, most))
     begin, blind = _beginning(arguments, task), arguments.form == "blind"
     task.trials(bench, task.draws(bench, 0, 1))  # what cannot be is refused before there is a folder
-    folder = arguments.out
+    folder = arguments.output
     make_empty_folder(folder)
     (folder / BENCH).write_text(bench.text, encoding="utf-8")
     with (folder / METRICS).open("a", encoding="utf-8") as metrics, progress(task.name, arguments.steps) as advance:
@@ -318,7 +320,7 @@ def ppo(arguments: argparse.Namespace) -> int:
     from emb_train.ppo import Metrics
     from emb_train.training import ACTOR, begin_training, load_preset, run_training
 
-    bench, folder = load_bench(arguments.bench), arguments.out
+    bench, folder = load_bench(arguments.bench), arguments.output
     changes = {"total_steps": arguments.steps, "plant": arguments.plant, "seed": arguments.seed}
     training = load_preset(arguments.preset, **{k: v for k, v in changes.items() if v is not None})
     conditions = msgspec.structs.replace(training.conditions, command_delay=tuple(arguments.command_delay))
@@ -352,14 +354,14 @@ def evaluate(arguments: argparse.Namespace) -> int:
     from emb_train.evaluate import document, evaluate, text
 
     bench, settings, subjects = prepare(arguments)
-    if arguments.out is not None:
-        make_empty_folder(arguments.out)
+    if arguments.output is not None:
+        make_empty_folder(arguments.output)
     with Console(stderr=True).status("") as status:
         results = evaluate(bench, settings, subjects, status.update)
     table, record = text(settings, results), as_json(document(settings, results))
-    if arguments.out is not None:
-        (arguments.out / "evaluation.txt").write_text(table + "\n", encoding="utf-8")
-        (arguments.out / "evaluation.json").write_text(record + "\n", encoding="utf-8")
+    if arguments.output is not None:
+        (arguments.output / "evaluation.txt").write_text(table + "\n", encoding="utf-8")
+        (arguments.output / "evaluation.json").write_text(record + "\n", encoding="utf-8")
     show(record if arguments.json else table)
     return EXIT_DONE if len(results) == len(settings.plants) else EXIT_INTERRUPTED
 
