@@ -104,10 +104,13 @@ def test_what_does_not_fit_is_refused_with_its_place_what_was_expected_and_what_
         assert refusal(document).startswith(message), document
 
 
-def test_bounds_of_a_whole_document_and_the_remedy_are_given_by_the_caller() -> None:
+def test_a_number_other_than_0_has_a_size_with_which_arithmetic_does_not_overflow() -> None:
     assert refusal({"gear": {"ratio": 1e-31}}).startswith("gear.ratio: expected 0 or a size from 1e-30")
     assert refusal({"gear": SPUR, "load": -1e31}).startswith("load: expected 0 or a size")
     assert read(Machine, {"gear": SPUR, "load": 0}, "f", UsageError).load == 0.0
+
+
+def test_the_longest_text_and_the_remedy_are_given_by_the_caller() -> None:
     assert refusal({"gear": SPUR, "name": "abcd"}, longest_text=3).startswith(
         "name: expected a printable text of 1 to 3"
     )

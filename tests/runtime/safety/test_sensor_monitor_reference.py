@@ -462,6 +462,9 @@ def test_the_thresholds_of_the_shipped_bench_are_those_that_the_page_states() ->
     limits = sensor_thresholds(BENCH, SHIPPED)
     stated = round(limits.travel, 2), limits.offset, round(limits.motion, 1), round(limits.first_current, 2)
     assert stated == (0.12, 0.5, 16.5, 2.15)
+    held = SHIPPED.friction_low / SHIPPED.spring_high
+    missing = SHIPPED.change * SHIPPED.sample_time  # A T²/4 of one lost sample, T two periods
+    assert (round(held, 1), round(held / 2.0, 1), round(missing, 3)) == (7.9, 4.0, 0.065)
     assert sensor_thresholds(BENCH, SHIPPED._replace(current=1.0)).first_current == 1.0
 
 
