@@ -231,7 +231,7 @@ def repair(run: str | Path, output: str | Path) -> Repaired | None:
 
 
 def rerun(run: Source) -> Rerun:
-    """Run the loop again from the log of a run: does it decide the same?
+    """Run the loop again from the log of a run, and compare what it decides.
 
     Args:
         run: MCAP file of emb-run.

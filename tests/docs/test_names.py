@@ -36,3 +36,9 @@ def test_what_a_page_names_exists() -> None:
         missing += [(page, name) for name in names if not exists(name)]
         missing += [(page, name) for name in files if not any(path.endswith(f"/{name}") for path in FILES)]
     assert missing == []
+
+
+def test_the_first_page_lists_every_other_one() -> None:
+    docs = ROOT / "docs"
+    listed = re.findall(r"\]\(([\w/.-]+\.md)\)", (docs / "index.md").read_text(encoding="utf-8"))
+    assert {str(page.relative_to(docs)) for page in docs.rglob("*.md")} - {"index.md", *listed} == set()

@@ -90,7 +90,7 @@ class Row:
     exit_reason: str | None = column("why the run ended")
     complete: bool | None = column("neither the log nor the experiment lacks anything")
     missing: str | None = column("what is missing, in words; empty if nothing is")
-    warnings: tuple[str, ...] | None = column("what else to know before believing a number")
+    warnings: tuple[str, ...] | None = column("what else to know before a number is used")
     planned: int | None = column("periods that the run was to have", "samples")
     periods: int | None = column("periods of the experiment that are in the log", "samples")
     measured: int | None = column("periods whose sample was received", "samples")

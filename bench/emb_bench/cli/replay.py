@@ -294,7 +294,7 @@ COMMANDS: Mapping[str, tuple[Command, Collection[int]]] = {
             _repair,
             "The new file has a summary, indexes and checksums. Topics, schemas, times, sequence\n"
             "numbers, attachments and metadata stay as they were. The file says in itself what is\n"
-            "missing, so that nothing takes it for a complete log.\n",
+            "missing, so that nothing takes it for a complete log. Of a whole log nothing is written.\n",
         ),
         OF_A_LOG,
     ),

@@ -67,7 +67,7 @@ def _half(half: float, size: float) -> str:
     """Half an interval: in percent of a size, or as it is where the size is 0."""
     if not math.isfinite(half):
         return NOTHING
-    return spread(half / abs(size), True, 2) if size and math.isfinite(half) else plain(half, 2)
+    return spread(half / abs(size), True, 2) if size else plain(half, 2)
 
 
 def _errors(study: Study) -> list[list[str]]:
