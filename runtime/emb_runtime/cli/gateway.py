@@ -141,7 +141,7 @@ def _description(mapping: Mapping, bench: str, identity: int, speed: float, seri
         dedent(f"""\
         {mapping.name}{f", number {serial}" if serial else ""}, mapping {mapping.sha256}
         bench {bench}, identity {identity:#06x}
-        time-out {mapping.watchdog:g} s; host or cable lost at the worst moment, and let go: below {speed:.4g} rad/s,
+        time-out {mapping.watchdog:g} s; host or cable lost at the worst moment: below {speed:.4g} rad/s,
         the brake bears {mapping.end_stop_speed:g} rad/s; what the drive lacks, accepted by the mapping file:
         """)
         + lost

@@ -102,9 +102,9 @@ class Gateway:
         if self._node_lost is not None:
             return self._node_lost
         if self.node.failure:
-            return SafetyStopError(f"the drive was let go: {self.node.failure}")
+            return SafetyStopError(f"the drive was disarmed: {self.node.failure}")
         if stopped:
-            return SafetyStopError(f"the drive was let go after a stop, reason {self.node.stop_reason.name}")
+            return SafetyStopError(f"the drive was disarmed after a stop, reason {self.node.stop_reason.name}")
         return None
 
     def _release_problem(self) -> str:

@@ -51,7 +51,7 @@ class LockStepDrive:
         # With its first sample the node judges what came before.
         self.receive(clock.now_ns() + round(LONGEST_SILENCE * 1e9))
         if self.node.failure:
-            raise BusError(f"{name}: the drive was let go: {self.node.failure}")
+            raise BusError(f"{name}: the drive was disarmed: {self.node.failure}")
 
     def send(self, frame: Frame) -> None:
         """See :meth:`Transport.send`."""
