@@ -267,7 +267,7 @@ def _decompressed(packed: memoryview, compression: str, size: int) -> bytes:
 def _split(packed: bytes) -> Chunk:
     """Part a chunk into records."""
     at, others, places, described = 0, 0, list[int](), list[mcap.Schema | mcap.Channel]()
-    while at < len(packed):
+    while at + RECORD.size <= len(packed):
         opcode, length = RECORD.unpack_from(packed, at)
         if opcode == _MESSAGE:
             places.append(at)

@@ -172,6 +172,7 @@ def test_a_malformed_record_is_left_out_and_the_rest_is_right(path: Path, whole:
         chunk(b"", compression=b"lz4"),
         chunk(b"\x05" + struct.pack("<Q", 10) + bytes(10)),
         chunk(b"\x05" + struct.pack("<Q", 2**63) + bytes(30)),
+        chunk(b"\x40" + struct.pack("<Q", 0) + b"\x40\x00"),
         chunk(b"\x04" + struct.pack("<Q", 2) + b"\x00\x01"),
         record(5, bytes(40)),
         record(0x40, b"x"),
