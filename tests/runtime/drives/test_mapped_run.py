@@ -160,6 +160,7 @@ def test_a_mapping_that_does_not_fit_the_bench_is_refused_before_anything_is_sen
         ("odrive", "range = [-0.1303, 0.1303]", "range = [-0.1, 0.1]", "", "", "does not cover the bench's -6 to 6 A"),
         ("odrive", "range = [-2, 17]", "range = [-2, 15]", "", "", "does not cover the bench's -10 to 100 rad"),
         ("odrive", "range = [-90, 90]", "range = [-70, 70]", "", "", "does not cover the bench's -500 to 500 rad/s"),
+        ("mit", "0.1953, range = [-1.18", "0.05, range = [-1.18", "", "", "a step of 0.176 A is too coarse"),
         ("odrive", "pair_within = 0.0005", "pair_within = 0.0006", "", "", "at most half of the bench's sample time"),
         ("odrive", "speed = 1800", "speed = 1700", "", "", "may reach 1711 rad/s, and bears 1700 rad/s; narrow"),
         ("odrive", "", "", "watchdog         = 0.010", "watchdog = 0.008", "longer than the bench's node.watchdog"),
