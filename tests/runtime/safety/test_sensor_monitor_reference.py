@@ -417,12 +417,13 @@ def test_numbers_count_up_to_a_million(place: int, sign: float) -> None:
         begin(memory, 0.0, 0.0)
         angle, velocity, command, reported = numbers
         verdict = judge(SHIPPED, SILENT, memory, 1e-3, angle, velocity, True, command, reported)
-        assert (verdict == CONTRADICTING) == (size > 1e6)
+        assert (verdict == CONTRADICTING) == (not size <= 1e6)
         return memory
 
     begun = [0.0] * MEMORY
     begin(begun, 0.0, 0.0)
-    assert memory_of(math.nextafter(1e6, math.inf)) == begun
+    for none in (math.nextafter(1e6, math.inf), math.inf, math.nan):
+        assert memory_of(none) == begun
     assert memory_of(1e6) != begun
 
 
