@@ -32,10 +32,10 @@ LONGEST_WAIT_NS = 10_000_000  # Time between two looks at the operator's end [ns
 DESCRIPTION = """\
 Translate between a drive with a protocol of its own, on one bus, and emb-run with emb.dbc, on another bus.
 
-The gateway first tests that the drive's own time-out switches the current off. Then it arms the drive by the sequence
-of the mapping file. The drive stays armed until the gateway ends; without a run it gets 0 A. The gateway is a node: it
-brakes by itself if no command comes. A second guard checks each frame to the drive. After a stop that emb-run did not
-request, the gateway disarms the drive and ends.
+The gateway first tests that the drive's own time-out switches the current off, if the drive reports its state. Then it
+arms the drive by the sequence of the mapping file. The drive stays armed until the gateway ends; without a run it gets
+0 A. The gateway is a node: it brakes by itself if no command comes. A second guard checks each frame to the drive.
+After a stop that emb-run did not request, the gateway disarms the drive and ends.
 """
 EPILOG = """\
 exit codes:
