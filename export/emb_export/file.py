@@ -20,6 +20,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Ranges
 from emb_runtime.errors import UsageError
 from emb_runtime.policy.contract import (
     CONTRACT_KEY,
+    MAX_VECTORS,
     MIN_VECTORS,
     SAMPLE,
     Contract,
@@ -81,7 +82,8 @@ def policy_file(
         onnx.checker.check_model(model, full_check=True)
         return bytes(model.SerializeToString(deterministic=True))
 
-    load_policy(with_vectors(np.arange(len(seen))), bench)
+    for chosen in np.array_split(np.arange(len(seen)), -(-len(seen) // MAX_VECTORS)):
+        load_policy(with_vectors(chosen), bench)
     return with_vectors(np.linspace(0, len(seen) - 1, MIN_VECTORS).astype(int))
 
 

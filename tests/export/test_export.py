@@ -22,12 +22,12 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_bench.excitation import excitation
 from emb_export import emb_export
 from emb_export.export import main
-from emb_export.file import reference_file
+from emb_export.file import reference_file, sequence_file
 from emb_export.network import network_file, observations
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, Contract, read_contract
+from emb_runtime.policy.contract import CONTRACT_KEY, MAX_VECTORS, MIN_VECTORS, Contract, read_contract
 from emb_runtime.policy.policy import load_policy
 from emb_train.cli import main as train_main
 from emb_train.ppo import DeployedActor
@@ -199,6 +199,14 @@ def test_a_sequence_is_exported_as_a_policy_that_gives_it(tmp_path: Path) -> Non
     assert policy.act(0.0, 0.0, 1e9, estimator) == found[-1]
     assert policy.contract.provenance["sequence"] == "ramp:amplitude=-5.0,start=0.0"
     assert policy.contract.ranges == {}
+
+
+def test_a_sequence_longer_than_a_contract_has_vectors_is_compared_whole() -> None:
+    bench = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=MAX_VECTORS + 10))
+    wanted = np.linspace(-6.0, 6.0, bench.timing.horizon)
+    policy = load_policy(sequence_file(wanted, "ramp", bench), bench)
+    found = [policy.act(0.0, 0.0, float(k), Estimator(bench)) for k in range(0, len(wanted), 100)]
+    assert found == pytest.approx(wanted[::100], abs=1e-5 * bench.limits.current)
 
 
 def test_a_design_is_exported_as_a_policy(tmp_path: Path) -> None:

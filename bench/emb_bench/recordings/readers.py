@@ -68,7 +68,7 @@ def _errors_in_one_line(path: Path, kind: str, library: str) -> Iterator[None]:
     except EmbError:
         raise
     except ImportError as err:
-        raise UsageError(f"{path}: reading {kind} needs {library}: pip install 'emb-excite[import]'") from err
+        raise UsageError(f"{path}: reading {kind} needs {library}: pip install 'emb-excite[mdf]'") from err
     except Exception as err:  # every library has errors of its own, and some raise whatever they meet
         _let_go(err)
         said = " ".join(str(err).split())[:120] or type(err).__name__

@@ -143,6 +143,7 @@ def test_the_charge_tells_what_acted_before_a_single_lost_sample_and_nothing_els
     lose, silent = Lose(*losses), Lose(*losses)
     run = simulate(square, options="f_v=4e-5,charge=1", on_receive=lose)
     log, experiment = recorded(tmp_path, run)
+    topics, charges = log.topics, log.signals("EMB_Charge")["Charge"]
     without = simulate(square, options="f_v=4e-5", on_receive=silent)
     assert [f.data for f in run.sent] == [f.data for f in without.sent]
     decided = [[(c.step, c.state, c.reasons, c.sent_current) for c in r.journal.cycles] for r in (run, without)]
@@ -156,9 +157,9 @@ def test_the_charge_tells_what_acted_before_a_single_lost_sample_and_nothing_els
     assert "of 3 periods the charge tells it" in experiment.missing[0]
     assert assumed.reported.tolist() == assumed.measured.tolist() == experiment.measured.tolist()
     assert "charge" not in assumed.missing[0]
-    assert "/emb/EMB_Charge" in log.topics
+    assert "/emb/EMB_Charge" in topics
     assert "/emb/EMB_Charge" not in older.topics
-    assert len(log.signals("EMB_Charge")["Charge"]) > 500
+    assert len(charges) > 500
 
 
 def test_a_charge_that_cannot_be_is_not_believed(bench: Bench, layout: Layout) -> None:
