@@ -61,9 +61,9 @@ class ModelEvaluator:
     """Evaluates one model along an experiment, piece by piece.
 
     A measurement delay of the model shifts what a sample measures: the first ones show the brake before the experiment
-    and carry no information. The jitter of the clock makes the standard deviations larger where the brake is fast;
-    an observer is run along the plant's own angle. Its noise is coloured, so that its mean square scatters more than
-    that of white noise.
+    and inform of the encoder's offset and of the start alone. The jitter of the clock makes the standard deviations
+    larger where the brake is fast; an observer is run along the plant's own angle. Its noise is coloured, so that its
+    mean square scatters more than that of white noise.
 
     Systematic ``errors`` count in the information and in the fit. The physical information before the first sample is
     ``start``, shape (p, p); the information is kept after the ``instants`` of the ``periods``, in ascending order.
