@@ -82,7 +82,8 @@ def policy_file(
         onnx.checker.check_model(model, full_check=True)
         return bytes(model.SerializeToString(deterministic=True))
 
-    for chosen in np.array_split(np.arange(len(seen)), -(-len(seen) // MAX_VECTORS)):
+    every = np.resize(np.arange(len(seen)), max(len(seen), MIN_VECTORS))  # a short one again, up to the least number
+    for chosen in np.array_split(every, -(-len(every) // MAX_VECTORS)):
         load_policy(with_vectors(chosen), bench)
     return with_vectors(np.linspace(0, len(seen) - 1, MIN_VECTORS).astype(int))
 

@@ -201,12 +201,13 @@ def test_a_sequence_is_exported_as_a_policy_that_gives_it(tmp_path: Path) -> Non
     assert policy.contract.ranges == {}
 
 
-def test_a_sequence_longer_than_a_contract_has_vectors_is_compared_whole() -> None:
-    bench = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=MAX_VECTORS + 10))
+@pytest.mark.parametrize("horizon", [MIN_VECTORS - 12, MAX_VECTORS + 10])
+def test_a_sequence_shorter_or_longer_than_a_contract_has_vectors_is_compared_whole(horizon: int) -> None:
+    bench = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=horizon))
     wanted = np.linspace(-6.0, 6.0, bench.timing.horizon)
     policy = load_policy(sequence_file(wanted, "ramp", bench), bench)
-    found = [policy.act(0.0, 0.0, float(k), Estimator(bench)) for k in range(0, len(wanted), 100)]
-    assert found == pytest.approx(wanted[::100], abs=1e-5 * bench.limits.current)
+    found = [policy.act(0.0, 0.0, float(k), Estimator(bench)) for k in range(0, len(wanted), 10)]
+    assert found == pytest.approx(wanted[::10], abs=1e-5 * bench.limits.current)
 
 
 def test_a_design_is_exported_as_a_policy(tmp_path: Path) -> None:
