@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.logs.mcap_file import (
     DAMAGE,
+    HEADER,
     Chunk,
     Column,
     McapFile,
@@ -86,24 +87,29 @@ class _Place(NamedTuple):
     at: int  # [bytes]
     length: int  # [bytes]
     messages: int  # Number of them in the chunk
+    channels: frozenset[int]  # Of these messages
 
 
 @dataclass(frozen=True)
-class _Chunks:
+class Chunks:
     """The chunks of a log that are whole, read from the file each time: a long log takes more than the memory."""
 
     path: Path
     places: Sequence[_Place]
 
-    def __iter__(self) -> Iterator[Chunk]:
+    def of(self, channels: Set[int]) -> Iterator[tuple[int, Chunk]]:
+        """Those with a message of some channels, each behind the number of messages before it in the log."""
+        before = 0
         try:
             with open_regular(self.path) as file:
-                for at, length, messages in self.places:
-                    file.seek(at)
-                    chunk = unpack_chunk(file.read(length))
-                    if len(chunk.at) != messages:
-                        raise ValueError("other messages than before")
-                    yield chunk
+                for place in self.places:
+                    if not channels.isdisjoint(place.channels):
+                        file.seek(place.at)
+                        chunk = unpack_chunk(file.read(place.length))
+                        if len(chunk.at) != place.messages:
+                            raise ValueError("other messages than before")
+                        yield before, chunk
+                    before += place.messages
         except OSError as err:
             raise UsageError(f"{self.path}: cannot read the log: {err.strerror}") from err
         except DAMAGE as err:
@@ -140,7 +146,7 @@ class RunLog:
     attachments: Mapping[str, bytes]  # Attached files by name
     size: int  # Of the file [bytes]
     span: tuple[int, int]  # First and last publish time of the messages [Unix ns]
-    chunks: Iterable[Chunk] = field(repr=False)  # Those of the file that are whole
+    chunks: Chunks = field(repr=False)  # Those of the file that are whole
     topics: Mapping[str, _Topic] = field(repr=False)  # The topics that can be decoded, by name
 
     def __repr__(self) -> str:
@@ -167,29 +173,33 @@ class RunLog:
 
         Topics and fields, ``wanted`` by topic, that the log does not have are left out.
         """
-        held, size, order = list[Chunk](), 0, 0
-        for chunk in self.chunks:
-            held.append(chunk)
+        held, size, some = list[tuple[int, Chunk]](), 0, False
+        for before, chunk in self.chunks.of({self.topics[topic].channel for topic in wanted if topic in self.topics}):
+            held.append((before, chunk))
             size += len(chunk.data)
             if size >= BATCH:
-                yield self._decoded(held, order, wanted)
-                order += sum(len(own.at) for own in held)
-                held, size = [], 0
-        if held or not order:
-            yield self._decoded(held, order, wanted)
+                yield self._decoded(held, wanted)
+                held, size, some = [], 0, True
+        if held or not some:
+            yield self._decoded(held, wanted)
 
-    def _decoded(self, chunks: Sequence[Chunk], order: int, wanted: Mapping[str, Sequence[str]]) -> dict[str, Table]:
-        """Some fields of the messages in chunks, the first of which has this place among all messages of the log."""
+    def _decoded(self, held: Sequence[tuple[int, Chunk]], wanted: Mapping[str, Sequence[str]]) -> dict[str, Table]:
+        """Some fields of the messages in chunks, each behind the number of messages before it."""
         found = dict[str, Table]()
         for topic, names in wanted.items():
             if topic not in self.topics:
                 continue
             channel, _, factory, _ = self.topics[topic]
-            index = np.concatenate([chunk.headers["channel"] == channel for chunk in chunks])
-            times = [np.concatenate([chunk.headers[name] for chunk in chunks])[index] for name in ("publish", "log")]
+            headers, orders = [np.empty(0, HEADER)], [np.empty(0, np.int64)]
+            for before, chunk in held:
+                own = np.flatnonzero(chunk.headers["channel"] == channel)
+                headers.append(chunk.headers[own])
+                orders.append(before + own)
+            times = np.concatenate(headers)
             try:
-                fields = columns(factory, [data for chunk in chunks for data in chunk.payloads(channel)], names)
-                found[topic] = _times(*times) | {"order": np.flatnonzero(index) + order} | fields
+                fields = columns(factory, [data for _, chunk in held for data in chunk.payloads(channel)], names)
+                order = np.concatenate(orders)
+                found[topic] = _times(times["publish"], times["log"]) | {"order": order} | fields
             except UNREADABLE as err:
                 raise LogError(f"{self.path}: the messages of {topic} are not readable: {message_of(err)}") from err
         return found
@@ -375,7 +385,7 @@ def read_log(path: str | Path) -> RunLog:
             size = os.fstat(file.fileno()).st_size
             contents = McapFile(path, file, size)
             for at, length, chunk in contents.chunks():
-                places.append(_Place(at, length, len(chunk.at)))
+                places.append(_Place(at, length, len(chunk.at), frozenset(chunk.headers["channel"].tolist())))
                 if len(chunk.at):
                     counts += Counter(dict(enumerate(np.bincount(chunk.headers["channel"]).tolist())))
                     spans.append((int(chunk.headers["publish"].min()), int(chunk.headers["publish"].max())))
@@ -394,7 +404,7 @@ def read_log(path: str | Path) -> RunLog:
         attachments={name: attachment.data for name, attachment in contents.attachments.items()},
         size=size,
         span=(min(first for first, _ in spans), max(last for _, last in spans)),
-        chunks=_Chunks(path, places),
+        chunks=Chunks(path, places),
         topics=topics,
     )
 

@@ -10,6 +10,7 @@ import tomlkit
 from emb_bench.config.bench import Systematic, parse_bench
 from emb_bench.config.plants import RECORDED_PLANT
 from emb_bench.experiment.from_log import Recording
+from emb_bench.logs.log import Chunks
 from emb_bench.recordings.map_file import RecordingMap, read_map
 from emb_bench.recordings.readers import Found, experiment_of, read_columns
 
@@ -34,7 +35,7 @@ def open_recording(path: Path, map_path: Path) -> Recording:
         attachments={"bench.toml": text.encode(), "map.toml": map_text.encode()},
         size=path.stat().st_size,
         span=(0, 0),
-        chunks=(),
+        chunks=Chunks(path, ()),
         topics={},
         experiment=found.experiment,
     )
