@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator
 from typing import Any
 
 from emb_bench.logs.log import RunLog
@@ -28,20 +26,19 @@ def quantities(log: RunLog) -> tuple[Quantity, ...]:
 
 def by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
     """All estimates by their step: values, then standard deviations, in the order of :func:`quantities`."""
-    return {step: tuple(numbers) for step, *numbers in _rows(log)}
+    return {step: tuple(numbers) for step, *numbers in log.rows(ESTIMATE, "step", *_columns(log))}
 
 
 def last_estimate(log: RunLog) -> dict[str, dict[str, Any]]:
     """The estimate at the end: value, standard deviation and unit by name; empty if there was none."""
     if any(event.code == LOST for event in log.events):
         return {}
-    last = deque(_rows(log), maxlen=1)
-    return by_name(quantities(log), last[0][1:] if last else ())
+    return by_name(quantities(log), log.last(ESTIMATE, *_columns(log)))
 
 
-def _rows(log: RunLog) -> Iterator[tuple[Any, ...]]:
+def _columns(log: RunLog) -> list[str]:
     names = [quantity.name for quantity in quantities(log)]
-    return log.rows(ESTIMATE, "step", *names, *map(deviation_of, names))
+    return [*names, *map(deviation_of, names)]
 
 
 _STEP, *_LEARNT = (field.name for field in LEARNT.fields)
@@ -55,5 +52,5 @@ def learnt_by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
 def last_learnt(log: RunLog) -> dict[str, list[float]]:
     """The last learnt set, by parameter: its least and greatest value, relative to nominal; empty if there is none."""
     names = [name.removesuffix("_low") for name in _LEARNT[:8:2]]
-    last = deque(log.rows(LEARNT.name, *_LEARNT), maxlen=1)
-    return {name: [*numbers[2 * i : 2 * i + 2]] for numbers in last for i, name in enumerate(names)}
+    numbers = log.last(LEARNT.name, *_LEARNT)
+    return {name: [*numbers[2 * i : 2 * i + 2]] for i, name in enumerate(names) if numbers}

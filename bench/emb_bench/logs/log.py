@@ -10,7 +10,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -212,6 +212,16 @@ class RunLog:
             self.require(topic, [name for name in names if name not in TIMES])
         for part in self.batches({topic: names}):
             yield from zip(*(part[topic][name].tolist() for name in names), strict=True)
+
+    def last(self, topic: str, *names: str) -> tuple[Any, ...]:
+        """Some columns of the last message of a topic, read without those before it; empty if there is none."""
+        if topic not in self.topics:
+            return ()
+        channel = self.topics[topic].channel
+        own = [place for place in self.chunks.places if channel in place.channels]
+        held = [*replace(self.chunks, places=own[-1:]).of({channel})]
+        table = self._decoded(held, {topic: names})[topic]
+        return next(zip(*(table[name][-1:].tolist() for name in names), strict=True), ())
 
     def describe(self, topic: str) -> tuple[Column, ...]:
         """The columns of a topic: two times, then every field."""
