@@ -6,6 +6,7 @@ prints as ``| claim | limit | value |`` take the place of its rows, with the com
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import subprocess
@@ -52,4 +53,8 @@ def replaced(page: str, command: str, found: list[str], commit: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "texts", nargs="*", metavar="TEXT", help="commands that have one of these in them (default: all)"
+    )
+    sys.exit(main(parser.parse_args().texts))

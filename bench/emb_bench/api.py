@@ -538,6 +538,10 @@ def _opened(run: Source, map_path: str | Path | None = None) -> RunLog:
     if isinstance(run, RunLog):
         return run
     if map_path is None:
+        from emb_bench.recordings.map_file import KINDS
+
+        if Path(run).suffix.lower() in (ending for endings in KINDS.values() for ending in endings):
+            raise UsageError(f"{run}: a recording of others needs its map file: --map FILE")
         return read_log(run)
     from emb_bench.recordings.recording import open_recording
 

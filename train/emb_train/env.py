@@ -177,7 +177,7 @@ class EmbExcitationVectorEnv(gymnasium.vector.VectorEnv[Observations, Observatio
         listed = set(options) == {"brakes"} and isinstance(brakes, list) and len(brakes) == self.num_envs
         if listed and brakes is not None and all(isinstance(brake, BrakeParameters) for brake in brakes):
             return list(brakes)
-        raise UsageError(f"reset knows the option 'brakes' with {self.num_envs} BrakeParameters, got {options!r}")
+        raise UsageError(f"reset: expected the option 'brakes' with {self.num_envs} BrakeParameters, got {options!r}")
 
 
 class EmbExcitationEnv(gymnasium.Env[Observations, Observations]):

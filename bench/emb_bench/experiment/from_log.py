@@ -205,10 +205,10 @@ def _notes(log: RunLog, late: int, within: float) -> tuple[str, ...]:
     if log.drive_files is None:
         return ()
     if log.drive is None:
-        return ("the drive's mapping is not readable: what acted is taken to be what the drive told",)
+        return ("the drive's mapping is not readable: what acted is taken to be what the drive reported",)
     return (
         f"what acted is taken to be the command as its bus carried it, {in_samples(late)} late, where what the drive "
-        f"told lies within {within:.3g} A of it, and elsewhere what the drive told",
+        f"reported lies within {within:.3g} A of it, and elsewhere what the drive reported",
     )
 
 
@@ -219,7 +219,7 @@ def _missing(count: int, planned: int, lost: int, told: int, disagreements: int)
     if lost:
         missing.append(
             f"{lost} samples were lost: they count for no information, and what acted in the periods before them was "
-            "not reported" + (f"; of {told} periods the charge tells it" if told else "")
+            "not reported" + (f"; the charge gives it for {told} periods" if told else "")
         )
     if disagreements:
         missing.append(f"in {disagreements} periods the node reports another current than the command says")

@@ -154,7 +154,7 @@ def test_the_charge_tells_what_acted_before_a_single_lost_sample_and_nothing_els
     acted = dict(zip(lost.tolist(), lose.applied[-len(lost) :], strict=True))
     assert len(told) == 3
     assert experiment.currents[told] == pytest.approx([acted[k] for k in told.tolist()], abs=1e-7)
-    assert "of 3 periods the charge tells it" in experiment.missing[0]
+    assert "the charge gives it for 3 periods" in experiment.missing[0]
     assert assumed.reported.tolist() == assumed.measured.tolist() == experiment.measured.tolist()
     assert "charge" not in assumed.missing[0]
     assert "/emb/EMB_Charge" in topics

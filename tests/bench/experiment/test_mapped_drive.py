@@ -83,4 +83,6 @@ def test_of_a_mapping_that_is_not_readable_what_was_told_acted(tmp_path: Path, m
     damaged = replace(log, attachments={**log.attachments, "drive.toml": b"schema = "})
     experiment = read_experiment(damaged)
     assert experiment.currents.tolist() == log.cycles["applied_current"][1 : experiment.periods + 1].tolist()
-    assert experiment.notes == ("the drive's mapping is not readable: what acted is taken to be what the drive told",)
+    assert experiment.notes == (
+        "the drive's mapping is not readable: what acted is taken to be what the drive reported",
+    )
