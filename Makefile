@@ -1,5 +1,5 @@
 # make demo   one simulated experiment with the shipped actor, its report as a page, and its Fisher information
-# make test   style, types, and the tests: no root, no kernel, nothing outside .venv (6 minutes on two processors)
+# make test   style, types, and the tests: no root, no kernel, nothing outside .venv (4 minutes on two processors)
 # make hil    the programs as shipped on a real vcan0, with faults; needs user-mode-linux, gcc, libc6-dev, iproute2
 # make night  what takes longer: slow tests, every fault, searches, fuzzing, all mutants
 # make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
