@@ -79,6 +79,7 @@ STAMPED = "what a lock-step gateway sends has its time, and its frames count"
 EXPLAINED: dict[str, str] = {
     "estimate/*/says/misfit/notes": JOINED,
     "estimate/*/says/misfit/alarms": JOINED,
+    "demo/run/numbers/24": "kB of the log: /clock has no drift_ns",
     "logs/mapped/*": STAMPED,
     "info/mapped/says/messages//*": STAMPED,
     "info/mapped/says/duration": "the arming of a lock-step drive takes one sample more",
