@@ -33,7 +33,7 @@ REASONS = {
     Reason.LIMITED: "kept inside the limits by the shield",
     Reason.RETURNING: "the shield returns home",
     Reason.MISSED: "no sample in time, nothing sent",
-    Reason.LEFT: "needed current beyond slew or limit: the node brakes",
+    Reason.LEFT: "the needed current is beyond slew or limit: the node brakes",
 }
 """Reasons for which the sent current differs from the one that the policy requested, in words."""
 

@@ -21,7 +21,7 @@ def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
         (d["value_is"], f"{d['value']:.7g}; {_verdict(own)}"),
         ("criterion", f"{d['criterion']} of {', '.join(d['params'])}"),
         ("brake", brake),
-        ("bounds", ", ".join(f"{name} {deviation(bound, name)}" for name, bound in bounds.items())),
+        ("least sigma", ", ".join(f"{name} {deviation(bound, name)}" for name, bound in bounds.items())),
         ("optima", f"{optima} ({d['starts']} starts, seed {d['seed']})"),
         ("currents", written or "not written: use -o design.csv"),
     )

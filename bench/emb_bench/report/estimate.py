@@ -82,7 +82,7 @@ def _limits(study: Study) -> Iterator[str]:
         if (suspect := e.left_open_by(i)) is not None and e.open()[i] > e.cramer_rao()[i]:
             by.setdefault(say.limit(suspect, e), []).append(e.labels[i])
     if by:
-        yield "limited by  " + ", ".join(f"{name} ({', '.join(labels)})" for name, labels in by.items())
+        yield "limited by  " + "; ".join(f"{name} ({', '.join(labels)})" for name, labels in by.items())
     if tested := e.validation.suspects:
         hints = [f"{s.name} {signed(s.sigmas, '+.1f')}" for s in tested if abs(s.sigmas) >= NOTICED and s.p_value < 0.5]
         if not hints:

@@ -28,7 +28,7 @@ def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
     )
     lines += facts(
         *_loop(d["cycles"]),
-        ("largest", _largest(d.get("largest"))),
+        ("extremes", _largest(d.get("largest"))),
         *(("drive lacks", f"{name}: {lost}") for name, lost in d.get("drive_lacks", {}).items()),
         ("response", _delays(d)),
     )

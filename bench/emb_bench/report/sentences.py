@@ -101,7 +101,7 @@ ONLY_ALONE = (
 def stopped(stop: Stop) -> str:
     """That a run did not come to its planned end, and why."""
     after = f" after {stop.periods} of {stop.planned} samples" if stop.planned else ""
-    return f"STOPPED: {stop.log}{after}: {': '.join(filter(None, (stop.reason, stop.detail)))}"
+    return f"STOPPED: {stop.log}{after} ({stop.reason}){f': {stop.detail}' if stop.detail else ''}"
 
 
 def outside(study: Study) -> list[str]:
@@ -274,7 +274,7 @@ def remedies(study: Study) -> list[str]:
             f"or correct the largest effect in the residuals: {shown_as(study.suspects[0], e.bench.machine).name}"
         )
     if e.method == "oem":
-        found.append("if no model explains the record, something may disturb the brake: --method pem")
+        found.append("if no model explains the record, allow for a disturbance: --method pem")
     return found
 
 
@@ -309,16 +309,19 @@ def warnings(e: Evaluation) -> list[str]:
         return found
     if e.log.is_recording:
         why = (
-            "they are guesses of the map: pass --theta with an estimate"
+            "theta is a guess of the map: pass --theta with an estimate"
             if e.theta_name == "nominal"
             else "the model does not include what disturbed the machine"
         )
     elif e.log.missing or e.experiment.missing:
-        why = "the losses hide whether they are this brake's"
+        why = "what is missing hides whether theta is right"
     else:
         why = "pass --theta or --model"
     worst = max(e.fit.angle, e.fit.velocity)
-    return [*found, f"model '{e.plant.name}' at {e.theta_name} parameters does not fit (rms {worst:.3g} sigma): {why}"]
+    return [
+        *found,
+        f"model '{e.plant.name}' with theta of '{e.theta_name}' does not fit (rms {worst:.3g} sigma): {why}",
+    ]
 
 
 def notes(e: Evaluation) -> list[str]:

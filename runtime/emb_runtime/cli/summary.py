@@ -268,8 +268,8 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
         ended = "NOT RECORDED" if s["result"] == LOG_INCOMPLETE else "STOPPED"
         lines = [f"{ended}{where} ({s['result']}): {why}", f"  → {s['advice']}"]
     lines += [
-        f"  OUTSIDE    {name} = {value:.4g} is at or beyond the border of ranges.{ranges} ({low:.4g} to {high:.4g}): "
-        "the limits were not guaranteed; find the cause, or widen the range"
+        f"  OUTSIDE    {name} = {value:.4g} {s['estimate'][name]['unit']} is at or beyond a border of ranges.{ranges} "
+        f"({low:.4g} to {high:.4g}): the limits were not guaranteed; find the cause, or widen the range"
         for name, (value, low, high, ranges) in s["outside"].items()
     ]
     lines += [f"  way home   {name} the experiment: {brief(way)}" for name, way in s["homing"].items()]
@@ -353,7 +353,7 @@ def _brake(s: Mapping[str, Any]) -> list[str]:
 def _counts(s: Mapping[str, Any]) -> list[str]:
     return [
         f"  commands   {s['answered']} sent, {s['confirmed']} frames seen on the bus, {s['limited']} limited by the "
-        f"shield, {s['returning']} returning home, {s['clipped']} clipped, {s['not_obeyed']} late",
+        f"shield, {s['returning']} returning home, {s['clipped']} clipped, {s['not_obeyed']} not obeyed",
         f"  samples    {s['pairs']} pairs, {s['unanswered']} without a command (send buffer full: {s['not_taken']}, "
         f"braked by the node: {s['left']}), {s['missed']} periods missed, {s['rejected']} frames rejected, "
         f"{s['dropped']} dropped by the kernel",
