@@ -126,7 +126,7 @@ def rewritten(
     library: str = "emb-excite/0.1.0",
 ) -> None:
     """Write a log anew with the plain MCAP library: other fields, values or times, or the whole of it again."""
-    topics = {topic.name: topic for topic in mcap_schema.FIXED_TOPICS}
+    topics = {topic.name: topic for topic in (*mcap_schema.FIXED_TOPICS, mcap_schema.LEARNT)}
     with path.open("rb") as file:
         reader = NonSeekingReader(file, validate_crcs=True)
         rows = list(reader.iter_messages())

@@ -206,22 +206,24 @@ class RunLog:
 
     def rows(self, topic: str, *names: str) -> Iterator[tuple[Any, ...]]:
         """Some columns of a topic, message by message; nothing if the log does not have it."""
-        if topic not in self.topics:
-            return
-        if topic in _OURS:
-            self.require(topic, [name for name in names if name not in TIMES])
-        for part in self.batches({topic: names}):
+        for part in self.batches({topic: names}) if self._has(topic, names) else ():
             yield from zip(*(part[topic][name].tolist() for name in names), strict=True)
 
     def last(self, topic: str, *names: str) -> tuple[Any, ...]:
         """Some columns of the last message of a topic, read without those before it; empty if there is none."""
-        if topic not in self.topics:
+        if not self._has(topic, names):
             return ()
         channel = self.topics[topic].channel
         own = [place for place in self.chunks.places if channel in place.channels]
         held = [*replace(self.chunks, places=own[-1:]).of({channel})]
         table = self._decoded(held, {topic: names})[topic]
         return next(zip(*(table[name][-1:].tolist() for name in names), strict=True), ())
+
+    def _has(self, topic: str, names: Sequence[str]) -> bool:
+        """Returns True if the log has a topic; raises LogError if one of ours lacks some of these fields."""
+        if topic in self.topics and topic in _OURS:
+            self.require(topic, [name for name in names if name not in TIMES])
+        return topic in self.topics
 
     def describe(self, topic: str) -> tuple[Column, ...]:
         """The columns of a topic: two times, then every field."""

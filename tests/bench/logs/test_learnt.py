@@ -12,8 +12,10 @@ from emb_bench.logs.estimates import last_learnt, learnt_by_step
 from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
-from emb_runtime.errors import BenchFileError
+from emb_runtime.errors import BenchFileError, LogError
+from emb_runtime.log.mcap_schema import LEARNT
 from tests.bench.conftest import Log, Replay
+from tests.bench.damaged import rewritten, without
 
 
 @pytest.fixture
@@ -66,6 +68,13 @@ def test_a_report_shows_the_set_that_is_left(learnt_log: Path, tmp_path: Path, r
     low, high = last_learnt(read_log(learnt_log))["k_m"]
     assert f"<dt>k_m</dt><dd>{low:.4f} to {high:.4f} of nominal</dd>" in text
     assert "model error 5.0 rad/s²" in text
+
+
+def test_a_log_without_a_bound_that_was_learnt_is_refused(learnt_log: Path) -> None:
+    rewritten(learnt_log, without(LEARNT.name, "k_m_low"))
+    for asked in (learnt_by_step, last_learnt):
+        with pytest.raises(LogError, match="expected k_m_low"):
+            asked(read_log(learnt_log))
 
 
 def test_a_log_of_a_shield_that_learns_nothing_has_no_such_topic(log: Log, replay: Replay) -> None:
