@@ -13,11 +13,10 @@ from emb_bench.live.serve import HOST, PORT, Server
 from emb_runtime.errors import EXIT_DONE, LogError, UsageError
 from emb_runtime.system.terminal import mention
 
-HELP = "show runs while they go on: on a page in the browser, or in Foxglove"
+HELP = "show runs while they go on, on a page in the browser"
 DESCRIPTION = """\
-Show the logs that appear in a folder while they are written: on a page in the browser, and in Foxglove and Lichtblick
-over the Foxglove WebSocket protocol (open the address as a connection, with the layout of the documentation). The
-command only reads files and does not affect a run. Ctrl-C ends it. emb-run --live shows one run.
+Show the logs that appear in a folder on a page in the browser, while they are written. The command only reads files and
+does not affect a run. Ctrl-C ends it. emb-run --live shows one run.
 """
 
 
@@ -51,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         mention(str(err))
 
     try:
-        mention(f"shows {'the log' if one else 'new logs in'} {args.place}: {server.addresses}; Ctrl-C ends it")
+        mention(f"shows {'the log' if one else 'new logs in'} {args.place}: {server.address}; Ctrl-C ends it")
         follow(logs, server, wait, complain, once=one)
     except KeyboardInterrupt:
         pass

@@ -9,15 +9,21 @@ from __future__ import annotations
 import json
 import math
 from collections import deque
+from collections.abc import Iterator
 from importlib import resources
 from typing import Any
 
-from emb_bench.live.follow import RUNNING, SHIELD, Decoder, intervals
-from emb_bench.logs.mcap_file import Chunk
-from emb_runtime.log.mcap_schema import ESTIMATE, SAFETY
+from mcap import records as mcap
 
-SUBPROTOCOL = "emb-excite.page"
-KEPT = 600  # Chunks that a page which comes later gets; a chunk has 0.1 s
+from emb_bench.logs.mcap_file import Chunk, message_class
+from emb_runtime.estimator.estimate import NORMAL_95
+from emb_runtime.log.mcap_schema import CYCLE, ESTIMATE, SAFETY, deviation_of
+from emb_runtime.records import Reason, RunState
+
+KEPT = 600  # Chunks that a browser which comes later gets; a chunk has 0.1 s
+TOPICS = (CYCLE.name, ESTIMATE, SAFETY.name)
+RUNNING = (RunState.ACTIVE, RunState.HOMING)
+SHIELD = Reason.LIMITED | Reason.RETURNING | Reason.LEFT
 
 
 def html() -> str:
@@ -39,26 +45,47 @@ class Page:
     def begin(self) -> str:
         """Another log begins."""
         self._sent: deque[str] = deque(maxlen=KEPT)
-        self._decoder = Decoder()
+        self._schemas: dict[int, mcap.Schema] = {}
+        self._classes: dict[int, tuple[str, Any]] = {}
+        self._units: dict[str, str] = {}  # Of the estimated parameters
         self._start_ns = -1
         return self.so_far[0]
 
     def add(self, chunk: Chunk) -> str:
-        """Samples, estimates and transitions of a chunk; times in seconds since the experiment began."""
+        """Samples, estimates and transitions of a chunk; times in seconds since the experiment began.
+
+        Raises:
+            TypeError, KeyError, ValueError, AttributeError, google.protobuf.message.DecodeError: it is damaged.
+        """
         said: dict[str, Any] = {"cycles": [], "estimates": [], "events": []}
-        for topic, message in self._decoder.messages(chunk):
+        for topic, message in self._messages(chunk):
             if topic == SAFETY.name:
                 said["events"].append(f"{message.code} {message.text}")
             elif topic == ESTIMATE:
-                rows = [(name, _number(value), _number(half)) for name, value, half in intervals(message)]
+                rows = [(name, _number(value), _number(half)) for name, value, half in _intervals(message)]
                 said["estimates"].append({"step": message.step, "rows": rows})
             elif message.state in RUNNING:
                 said["cycles"].append(self._cycle(message))
-        return self._keep({**said, "units": self._decoder.units})
+        return self._keep({**said, "units": self._units})
 
     def end(self, reason: str) -> str:
         """The log is whole: the run's exit reason."""
         return self._keep({"result": reason})
+
+    def _messages(self, chunk: Chunk) -> Iterator[tuple[str, Any]]:
+        """Topic and content of each message in a chunk that the page shows."""
+        for record in chunk.described:
+            if isinstance(record, mcap.Schema):
+                self._schemas[record.id] = record
+            elif record.topic in TOPICS and record.schema_id in self._schemas:
+                schema = self._schemas[record.schema_id]
+                self._classes[record.id] = (record.topic, message_class(schema.name, schema.data))
+                if record.topic == ESTIMATE:
+                    self._units = dict(json.loads(record.metadata.get("units", "{}")))
+        for message in chunk.messages():
+            if message.channel_id in self._classes:
+                topic, factory = self._classes[message.channel_id]
+                yield topic, factory.FromString(message.data)
 
     def _cycle(self, c: Any) -> dict[str, float | None]:
         if self._start_ns < 0:
@@ -77,6 +104,14 @@ class Page:
     def _keep(self, said: dict[str, Any]) -> str:
         self._sent.append(json.dumps(said))
         return self._sent[-1]
+
+
+def _intervals(estimate: Any) -> Iterator[tuple[str, float, float]]:
+    """Name, value and half of the 95 % interval of each parameter in an estimate."""
+    names = [field.name for field in estimate.DESCRIPTOR.fields]
+    for name in names:
+        if deviation_of(name) in names:
+            yield name, getattr(estimate, name), NORMAL_95 * getattr(estimate, deviation_of(name))
 
 
 def _number(value: float) -> float | None:
