@@ -71,6 +71,7 @@ GONE: dict[str, str] = {
     "design/*/of": "a design is for all of its parameters",
     "estimate/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
     "report/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
+    "estimate/*/growth*": "estimate --grow is no more: score tests name the missing effect, --model all compares",
     "info/*/says/messages//log": "an internal error's place is in its event's detail",
 }
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, and why."""

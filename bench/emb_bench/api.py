@@ -302,7 +302,6 @@ def estimate(
     nuisance: Names | None = None,
     method: Literal["oem", "pem", "rls", "windows"] | None = None,
     model: str | None = None,
-    grow: bool = False,
     systematic: Literal["bench", "none"] = "bench",
     prior: str | None = None,
     window: float = 0.0,
@@ -322,7 +321,6 @@ def estimate(
         method: see above (default: oem; windows for a recording).
         model: plant of the bench to estimate with, or 'all': each is fitted, and the best is used (default: the one
             that was simulated; exact where a log does not say).
-        grow: begin with the model, or exact, and add the features that the logs ask for.
         systematic: 'bench' also estimates sensor offsets, gain and delay, with priors from [systematic] of the bench
             file; 'none' assumes ideal sensors (default: bench).
         prior: name of ranges in the bench file in which the parameters are known to lie (default: none).
@@ -623,7 +621,6 @@ def _study_options(given: Mapping[str, Any]) -> Callable[[Bench], StudyOptions]:
             given["starts"],
             given["seed"],
             given["profile"],
-            given["grow"],
             given["systematic"] == "bench",
         )
 

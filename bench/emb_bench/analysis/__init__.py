@@ -1,1 +1,1 @@
-"""Verdict on estimates: model validation, uncertainty, drift, and the recommended experiment."""
+"""Verdict on estimates: uncertainty, several runs and models, drift, acceptance."""

@@ -18,13 +18,15 @@ import numpy as np
 
 from emb_bench.analysis.drift import Drift
 from emb_bench.analysis.profile import Profile
-from emb_bench.analysis.recommendation import PRECISE
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.intervals import interval as with_profile
 from emb_bench.estimate.records import NORMAL_95, Unknown
 from emb_bench.information.identifiability import GROSS, Finding, Spectrum
 from emb_runtime.config.bench import PARAMETER_NAMES
+
+PRECISE = 0.01
+"""Deviation, as a share of the value or of a gross error, above which a trade-off with another parameter is named."""
 
 
 class Standing(StrEnum):

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from emb_bench.analysis.model_choice import Candidate, ModelChoice, candidate, fit_from, ranked
+from emb_bench.analysis.model_choice import Candidate, candidate, fit_from, ranked
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EXACT, Plant
@@ -42,48 +42,17 @@ POLISHED = 6  # Searches around the minimum of a model that was accepted,
 AROUND = 0.03  # from values that differ by this share
 
 
-@dataclass(frozen=True)
-class Trial:
-    """An addition that was tried."""
-
-    name: str  # Key of ``ADDITIONS``
-    sigmas: float  # Score before it was added, in standard deviations; NaN where it was taken out
-    bic: float  # Change of BIC by it
-    held_out: float  # Change of the logarithm of the density of what was held out
-    accepted: bool
-
-
-@dataclass(frozen=True)
-class Round:
-    """One round: the model that it began with, and what was tried."""
-
-    model: str
-    ratio: float  # χ²/n of the model
-    trials: tuple[Trial, ...]  # Most wanted first; empty if the residuals want nothing
-    removed: tuple[str, ...] = ()  # Earlier additions that became needless
-
-
-@dataclass(frozen=True, eq=False)
-class ModelGrowth:
-    """The path from a simple plant to the model that the records ask for."""
-
-    rounds: tuple[Round, ...]
-    added: tuple[str, ...]  # Keys of ``ADDITIONS`` in the final model
-    choice: ModelChoice  # The final model and all others that were tried and accepted by what was held out
-
-
 def grow_model(
     bench: Bench, plant: Plant, records: Sequence[Experiment], asked: EstimationProblem, *, starts: int, seed: int
-) -> ModelGrowth:
-    """Adds features to a plant until the records ask for nothing more."""
+) -> Estimate:
+    """Adds features to a plant until the records ask for nothing more; the estimate's plant is named after them."""
     if plant.mechanics.solver != EXACT:
         raise UsageError(f"plant '{plant.name}': expected one that is solved exactly: others have no features to add")
     first = method_of("oem")(bench, plant, asked, starts=starts, seed=seed).fit(records)
     now = _judged(plant, first, ())
     added: tuple[str, ...] = ()
     seen: dict[tuple[str, ...], Candidate] = {(): now}
-    path: list[tuple[str, ...]] = [()]
-    rounds: list[Round] = []
+    path = [added]
     while True:
         scores = wanted(now.estimate, added)
         tried = [name for name in scores if abs(scores[name]) >= WANTED and _possible(plant, asked, (*added, name))]
@@ -93,45 +62,17 @@ def grow_model(
                 seen[key] = _fitted(plant, asked, now.estimate, key)
         found = [(name, seen[_key((*added, name))]) for name in tried]
         better = [(name, c) for name, c in found if c.bic < now.bic and c.held_out >= now.held_out]
-        best = min(better, key=lambda pair: pair[1].bic, default=None)
-        trials = tuple(
-            Trial(name, scores[name], c.bic - now.bic, c.held_out - now.held_out, best is not None and name == best[0])
-            for name, c in found
-        )
-        rounds.append(Round(now.name, now.estimate.validation.ratio, trials))
-        if best is None:
+        if not better:
             break
-        added = _key((*added, best[0]))
-        now = seen[added] = _polished(plant, asked, best[1], added, seed)
-        now, kept = _pruned(plant, asked, now, added, seen, best[0])
-        rounds[-1] = replace(rounds[-1], removed=tuple(name for name in added if name not in kept))
-        added = kept
+        newest, best = min(better, key=lambda pair: pair[1].bic)
+        added = _key((*added, newest))
+        now = seen[added] = _polished(plant, asked, best, added, seed)
+        now, added = _pruned(plant, asked, now, added, seen, newest)
         if added in path:
             break
         path.append(added)
-    vetoed = {id(c) for c in seen.values() if c.bic < now.bic and c is not now}
-    return ModelGrowth(tuple(rounds), added, ranked([c for c in seen.values() if id(c) not in vetoed]))
-
-
-def grow_with_errors(
-    bench: Bench, plant: Plant, records: Sequence[Experiment], asked: EstimationProblem, *, starts: int, seed: int
-) -> ModelGrowth:
-    """Growth as of :func:`grow_model`, and where no model fits so, with the bench's systematic errors estimated too.
-
-    With them features are harder to tell apart; without them, where there are some, no feature explains the record.
-    """
-    found = grow_model(bench, plant, records, asked, starts=starts, seed=seed)
-    along = with_systematic(asked, bench, plant)
-    if found.choice.best.fits or not along.systematic:
-        return found
-    again = grow_model(bench, plant, records, along, starts=starts, seed=seed)
-    return min(found, again, key=_misfit)
-
-
-def _misfit(growth: ModelGrowth) -> tuple[bool, float]:
-    """Order of models: those that fit first, then by the size of the residuals."""
-    found = growth.choice.best.estimate.validation
-    return not found.fits, found.ratio
+    # Of those that have less BIC what was held out is predicted worse.
+    return ranked([c for c in seen.values() if c.bic >= now.bic or c is now]).best.estimate
 
 
 def wanted(e: Estimate, added: Sequence[str] = ()) -> dict[str, float]:

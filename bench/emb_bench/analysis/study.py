@@ -1,4 +1,4 @@
-"""Study of logs: estimate, model validation, conclusions, recommended experiment and drift."""
+"""Study of logs: estimate, model validation, conclusions and drift."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ import numpy as np
 from emb_bench.analysis.conclusion import Conclusion, conclude
 from emb_bench.analysis.drift import Drift, Earlier, drifts
 from emb_bench.analysis.held_out import HeldOut, leave_one_out
-from emb_bench.analysis.model_choice import ModelChoice, choose_model, fit_from
-from emb_bench.analysis.model_growth import ModelGrowth, grow_model, grow_with_errors
+from emb_bench.analysis.model_choice import ModelChoice, choose_model
 from emb_bench.analysis.profile import Profile, profiles
-from emb_bench.analysis.recommendation import Recommendation, advise
 from emb_bench.analysis.several_runs import Differing, apart
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY, Plant
@@ -26,7 +24,6 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.intervals import union
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import SAME
-from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import DONE, STARTS, End, EstimationProblem, Suspect, Unknown, with_systematic
 from emb_bench.experiment.evaluation import check_sample_time, default_model
 from emb_bench.experiment.experiment import Experiment
@@ -81,7 +78,6 @@ class StudyOptions:
     seed: int = 0  # Seed of the starting points of searches
     profiles: bool = False
     """True for profiles of all shared unknowns, False for only those whose verdict may depend on one."""
-    grow: bool = False  # True to add the features that the logs ask for to the model
     systematic: bool = True  # True to estimate the bench's systematic errors along
 
     def problem(self, bench: Bench, plant: Plant) -> EstimationProblem:
@@ -104,13 +100,10 @@ class Study:
     profiles: tuple[Profile, ...]
     """Profiles of the unknowns that the records share: all, or those whose verdict may depend on one."""
     left_out: tuple[HeldOut, ...]  # Prediction of each record from the others; empty for a single record
-    advice: tuple[Recommendation, ...]
-    """Recommended runs, best first; empty if all parameters are identified well, or no run would help."""
     drifts: tuple[Drift, ...]
     conclusions: tuple[Conclusion, ...]
     stopped: tuple[Stop, ...]  # Ends of the runs that were stopped
     choice: ModelChoice | None = None  # Models that were compared; None if one was given
-    growth: ModelGrowth | None = None  # The path to the model; None if it was not grown
     apart: tuple[Differing, ...] = ()  # Parameters in which logs differ that each fit alone; empty if they fit together
 
     def __repr__(self) -> str:
@@ -251,11 +244,8 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
     """
     for log in logs:
         check_sample_time(log, bench)
-    if (wanted.grow or wanted.model == EVERY) and wanted.method != "oem":
-        option = "--grow" if wanted.grow else f"--model {EVERY}"
-        raise UsageError(f"{option} compares models by output error: expected --method oem, got {wanted.method}")
-    if wanted.grow and wanted.model == EVERY:
-        raise UsageError(f"--grow begins with one model: expected the name of a plant, not --model {EVERY}")
+    if wanted.model == EVERY and wanted.method != "oem":
+        raise UsageError(f"--model {EVERY} compares models by output error: expected --method oem, got {wanted.method}")
     plant, why = begun_with(bench, logs, wanted)
     names = file_names([log.path for log in logs])
     experiments: list[Experiment] = []
@@ -276,13 +266,8 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
         return [own.seen_by(plant) for own in experiments]
 
     _check_different(records_of(plant))
-    choice = growth = None
-    if wanted.grow:
-        growing = grow_with_errors if wanted.systematic else grow_model
-        growth = growing(bench, plant, records_of(plant), wanted.asked, starts=wanted.starts, seed=wanted.seed)
-        choice = growth.choice
-        plant, why = choice.best.estimate.plant, f"grown: {choice.best.name}"
-    elif wanted.model == EVERY:
+    choice = None
+    if wanted.model == EVERY:
         choice = choose_model(
             bench,
             list(bench.plants.values()),
@@ -294,13 +279,14 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
         plant, why = choice.best.estimate.plant, f"the best of {len(choice.candidates)}"
         if choice.same:
             why += f"; {', '.join(choice.same)} left out: one of them, with the encoder's offset estimated too"
-    records = records_of(plant)
-    e = _answer(wanted, bench, plant, records, choice)
-    # The likelihood of a whole recording is none of windows, and no run can be planned with what is never driven.
+        e = choice.best.estimate
+    else:
+        asked = wanted.problem(bench, plant)
+        e = method_of(wanted.method)(bench, plant, asked, starts=wanted.starts, seed=wanted.seed).fit(records_of(plant))
+    # The likelihood of a whole recording is none of windows.
     found = profiles(e, of_all=wanted.profiles) if wanted.method != "windows" else ()
-    advice = advise(e) if bench.machine is None else ()
     changes = () if last is None else drifts(e, last)
-    left_out = leave_one_out(e) if len(records) > 1 else ()
+    left_out = leave_one_out(e) if len(logs) > 1 else ()
     return Study(
         estimate=e,
         logs=tuple(log.path for log in logs),
@@ -310,7 +296,6 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
         truth=_truth(logs),
         profiles=found,
         left_out=left_out,
-        advice=advice,
         drifts=changes,
         conclusions=covering(
             conclude(e, found, changes, predicts=all(h.fits for h in left_out)),
@@ -319,7 +304,6 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
         ),
         stopped=tuple(stops),
         choice=choice,
-        growth=growth,
         apart=apart(e) if wanted.method == "oem" else (),
     )
 
@@ -328,24 +312,8 @@ def begun_with(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions) -> tu
     """The plant that a study of logs begins with, and the reason for it."""
     if wanted.model is not None:
         return bench.plant(DEFAULT_PLANT if wanted.model == EVERY else wanted.model), "asked for"
-    name, why = (DEFAULT_PLANT, "to begin with") if wanted.grow else _model(logs)
+    name, why = _model(logs)
     return bench.plant(name), why
-
-
-def _answer(
-    wanted: StudyOptions, bench: Bench, plant: Plant, records: Sequence[Experiment], choice: ModelChoice | None
-) -> Estimate:
-    """Estimate with the errors that the bench cannot exclude, where that is wanted.
-
-    A model that was grown without them is fitted once more, with them.
-    """
-    asked = wanted.asked if choice is None else choice.best.estimate.asked
-    if wanted.systematic:
-        asked = with_systematic(asked, bench, plant)
-    if choice is None:
-        return method_of(wanted.method)(bench, plant, asked, starts=wanted.starts, seed=wanted.seed).fit(records)
-    e = choice.best.estimate
-    return e if asked == e.asked else fit_from(Problem(bench, plant, asked, e.records), e).finished()
 
 
 def covering(

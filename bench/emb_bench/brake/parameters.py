@@ -35,7 +35,7 @@ class Parameter(NamedTuple):
     remedy: str = ""  # What to do if the score test finds it
     step: float = 0.0  # Of the score test's secant; 0 where the brake has a sensitivity
     positive: bool = False  # It cannot be negative
-    addition: str = ""  # What a growing model calls it; rows of one name are added together
+    addition: str = ""  # What a model that grows calls it; rows of one name are added together
 
 
 _HELD = "estimate it as well: --params"

@@ -216,7 +216,7 @@ def _grown(e: Estimate, prior: Ranges) -> Estimate:
     """Estimate by the model with what its residuals ask for, the jitter of the sampling among it."""
     for _ in range(ROUNDS):
         bench = _beginning_at({name: float(getattr(e.theta, name)) for name in PARAMETER_NAMES}, e.bench, prior)
-        e = grow_model(bench, e.plant, e.records, e.asked, starts=1, seed=0).choice.best.estimate
+        e = grow_model(bench, e.plant, e.records, e.asked, starts=1, seed=0)
         jitter = _jitter(e)
         if e.validation.fits or not 0.0 < jitter <= MOST_JITTER:
             return e

@@ -175,8 +175,7 @@ def _judged(m: ModelValidation, disturbance: Disturbance | None, machine: Machin
     if disturbance is not None and disturbance.p_value < share:
         notes.append(
             f"the brake is disturbed by more than the sensors' noise: {disturbance.said} (likelihood ratio "
-            f"{disturbance.ratio:.4g}, {p_value(disturbance.p_value)}); the intervals and the recommended run "
-            "allow for it"
+            f"{disturbance.ratio:.4g}, {p_value(disturbance.p_value)}); the intervals allow for it"
         )
     if m.ratio < m.expected[0]:
         notes.append(

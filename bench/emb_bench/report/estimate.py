@@ -93,9 +93,7 @@ def _limits(study: Study) -> Iterator[str]:
 
 def _next(study: Study) -> list[str]:
     """The next step, or several to choose from."""
-    found = [*say.remedies(study), *(say.recommendation(r) for r in study.advice[:1])]
-    if study.stopped:
-        found = ["find the cause of the stop before the next run"]
+    found = ["find the cause of the stop before the next run"] if study.stopped else say.remedies(study)
     found = found or [f"emb-replay report {say.logs_of(study)} -o report.html   (-v shows the evidence)"]
     return listed("next: ", found) if len(found) == 1 else ["next", *listed("  - ", found)]
 
@@ -119,7 +117,7 @@ def _evidence(study: Study) -> Iterator[str]:
     yield ""
     correlation, pairs = tables.correlation(e)
     found: list[Table | None] = [
-        *(tables.growth_path(study), tables.models(study), tables.errors(study), tables.budget(study)),
+        *(tables.models(study), tables.errors(study), tables.budget(study)),
         *(tables.residual_tests(study), tables.suspects(e), tables.systematic(e), tables.predicted(study)),
         correlation,
     ]
@@ -129,7 +127,6 @@ def _evidence(study: Study) -> Iterator[str]:
     yield from listed("", say.directions(e.verdict()))
     profiles = (p.scaled(e.factor(p.label)) for p in study.profiles)
     yield from listed("", (f"profile of {p.label}: {say.profile(p, e)}" for p in profiles))
-    yield from listed("also: ", map(say.recommendation, study.advice[1:]))
 
 
 def document(study: Study) -> dict[str, Any]:
@@ -169,7 +166,6 @@ def document(study: Study) -> dict[str, Any]:
         ],
         "models_left_out": choice.same if choice is not None else (),
         "not_told_apart": [c.name for c in choice.left_over] if choice and len(choice.left_over) > 1 else None,
-        "growth": study.growth.rounds if study.growth is not None else (),
         "correlation": {
             "names": [e.labels[i] for i in wanted],
             "matrix": e.correlation()[np.ix_(wanted, wanted)],
@@ -198,7 +194,7 @@ def document(study: Study) -> dict[str, Any]:
         "conclusions",
         "drifts",
     )
-    found |= _fields(study, *of_study, "left_out", "apart", "advice")
+    found |= _fields(study, *of_study, "left_out", "apart")
     document: dict[str, Any] = to_json(found | _fields(e, "caveats", "process_noise", "load_noise", "theta"))
     return document
 

@@ -16,7 +16,6 @@ if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.held_out import HeldOut
     from emb_bench.analysis.model_choice import Candidate
     from emb_bench.analysis.profile import OpenSide, Profile
-    from emb_bench.analysis.recommendation import Recommendation
     from emb_bench.analysis.study import Stop, Study
     from emb_bench.estimate.estimate import Estimate
     from emb_bench.estimate.records import Contribution
@@ -239,10 +238,7 @@ def pairs(found: Sequence[str]) -> str:
 # ---- what to do next ----
 
 
-def recommendation(r: Recommendation) -> str:
-    """A run that would help, and what it would bring."""
-    brings = ", ".join(f"{n} from {deviation(r.before[n], n, 2)} to {deviation(r.after[n], n, 2)}" for n in r.wanting)
-    return f"one more run of {r.excitation} would bring {brings} (standard deviation{'s' * (len(r.wanting) > 1)})"
+MORE = "run emb-run, whose actor excites all four parameters, and estimate from both logs"
 
 
 def logs_of(study: Study) -> str:
@@ -253,7 +249,7 @@ def logs_of(study: Study) -> str:
 
 
 def remedies(study: Study) -> list[str]:
-    """Remedies for a model that does not fit or predict; empty where nothing is wrong."""
+    """Remedies for a model that does not fit or predict, and for parameters that are not identified."""
     from emb_bench.estimate.suspects import shown_as
 
     e, again = study.estimate, f"emb-replay estimate {logs_of(study)}"
@@ -264,9 +260,9 @@ def remedies(study: Study) -> list[str]:
     if study.apart:
         return [f"estimate from each log alone: emb-replay campaign {logs_of(study)} -o rows.csv"]
     if study.model_fits:
-        return []
+        return [] if study.identified or e.bench.machine is not None else [MORE]
     if e.bench.machine is None:
-        found = [f"find a model that explains the record: {again} --model all, or --grow"]
+        found = [f"find a model that explains the record: {again} --model all"]
     else:
         found = ["use the intervals: they come from the scatter of the windows, and do not need a right model"]
     if study.suspects:

@@ -110,26 +110,6 @@ def models(study: Study) -> Table | None:
     return Table(title, header, rows, words=(0, 1))
 
 
-def growth_path(study: Study) -> Table | None:
-    """Features that the records asked for, round by round."""
-    if study.growth is None:
-        return None
-    rows = []
-    for one in study.growth.rounds:
-        for i, trial in enumerate(one.trials or (None,)):
-            begin = [one.model, plain(one.ratio)] if i == 0 else ["", ""]
-            if trial is None:
-                rows.append([*begin, "nothing", NOTHING, NOTHING, NOTHING, NOTHING])
-                continue
-            said = "added" if trial.accepted else "no"
-            if trial.accepted and one.removed:
-                said += ", without " + ", ".join(one.removed)
-            cells = [f"{value:+.1f}" for value in (trial.sigmas, trial.bic, trial.held_out)]
-            rows.append([*begin, trial.name, *cells, said])
-    header = ["model", "chi2/n", "the residuals ask for", "sigma", "BIC", "held-out", "added"]
-    return Table("Growth of the model; changes of BIC and of the held-out log density", header, rows, words=(0, 2, 6))
-
-
 def budget(study: Study) -> Table:
     """Contributions to the uncertainty of each parameter."""
     e, rows = study.estimate, []
@@ -200,7 +180,7 @@ def suspects(e: Estimate) -> Table | None:
 def checks(study: Study) -> list[Table | None]:
     """Tables behind the verdict on the model."""
     e = study.estimate
-    return [residual_tests(study), suspects(e), systematic(e), predicted(study), models(study), growth_path(study)]
+    return [residual_tests(study), suspects(e), systematic(e), predicted(study), models(study)]
 
 
 def predicted(study: Study) -> Table | None:

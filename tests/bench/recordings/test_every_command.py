@@ -22,7 +22,6 @@ WORKS: dict[str, tuple[str, ...]] = {
 LACKS: dict[str, tuple[tuple[str, ...], str]] = {
     "estimate --method rls": (("estimate", "--method", "rls"), "another method does"),
     "estimate --model all": (("estimate", "--model", "all"), "expected --method oem"),
-    "estimate --grow": (("estimate", "--grow"), "expected --method oem"),
     "estimate --params k_1": (("estimate", "--params", "k_1"), "zero in this bench"),
 }
 
