@@ -8,6 +8,7 @@ from importlib import metadata
 from pathlib import Path
 
 from emb_bench.config.bench import load_bench
+from emb_runtime.can.interfaces import open_transport
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import Parser, as_json, complain, mention, show
 
@@ -76,6 +77,8 @@ def main(argv: list[str] | None = None) -> int:
         each = options(args)
         if "--confirm" in each and (sys.stdin is None or not sys.stdin.isatty()):
             raise UsageError("--confirm: expected a terminal on standard input; --yes runs without asking")
+        if args.iface.partition(":")[0] == "sim":
+            open_transport(args.iface, sheet)[0].close()  # a wrong option is refused before the first step
         try:
             args.folder.mkdir(parents=True, exist_ok=True)
             result = Commissioning(args.folder, sheet, args.iface, each, emb_run, mention).run()

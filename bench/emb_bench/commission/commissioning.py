@@ -14,14 +14,13 @@ from typing import Any
 from emb_bench.brake.parameters import SI
 from emb_bench.commission import examination
 from emb_bench.commission.bench_file import WRITTEN, found_text, measured_ranges, working_text
-from emb_bench.commission.records import Findings, Identification, Step
-from emb_bench.commission.steps import EXPERIMENTS, FULL, RECENT, STEPS, policy_file, suspected
+from emb_bench.commission.records import Findings, Identification
+from emb_bench.commission.steps import EXPERIMENTS, FULL, RECENT, STEPS, Step, policy_file, suspected
 from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_bench.documents import to_json
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.config.typed import parse_toml
-from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, SafetyStopError, UsageError
+from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError, SafetyStopError, UsageError
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system import terminal
 
@@ -34,7 +33,7 @@ Run = Callable[[Sequence[str]], Mapping[str, Any]]
 """A run of ``emb-run --json`` with these arguments; the document that it prints."""
 
 
-class StepFailedError(SafetyStopError):
+class StepFailedError(EmbError):
     """A step was not completed; the command ends with the exit code of its run."""
 
     def __init__(self, message: str, exit_code: int) -> None:
@@ -93,49 +92,45 @@ class Commissioning:
         self._runs = 0
 
     def run(self) -> Commissioned:
-        """All steps that are not done yet."""
-        work = self._bench(WORKING, working_text(self._sheet))
-        found = Findings()
+        """All steps that are not done yet.
+
+        Raises:
+            UsageError: the folder is another brake's, or a file cannot be written.
+            StepFailedError: a run was not completed.
+            SafetyStopError: a step contradicts the data sheet.
+            BenchFileError: no shield covers the data sheet, or a parameter lies outside of it.
+        """
+        path, found = self._bench_file(WORKING, working_text(self._sheet)), Findings()
         for name, row in STEPS.items():
-            bench = self._found_bench(found) if name == FULL else work
-            log = self._completed(name) or self._run(row.make(name, bench, found), bench, found)
-            finding = row.examine(log, self._experiments(), self._sheet, found)
+            experiments = [self._logs[name] for name in EXPERIMENTS if name in self._logs]
+            if name == FULL:
+                used = " and ".join(log.name for log in experiments[-RECENT:])
+                path = self._bench_file(FOUND, found_text(self._sheet, found, used))
+            log = next(filter(examination.is_completed, self._attempts(name)[:-1]), None)
+            if log is None:
+                bench = load_bench(path)
+                log = self._run(name, row.make(bench, found), path, bench, found)
+            finding = row.examine(log, experiments, self._sheet, found)
             found = row.judge(finding, self._sheet, found)
             self._logs[name] = log
             self._say(f"  found: {finding or 'no fault'}")
         assert found.identified is not None
         ranges = measured_ranges(self._sheet, found.identified)
-        return Commissioned(self._folder / FOUND, ranges, found, tuple(self._logs.values()), self._runs)
+        return Commissioned(path, ranges, found, tuple(self._logs.values()), self._runs)
 
-    # --- files ------------------------------------------------------------------------------------------------------
-
-    def _bench(self, name: str, text: str) -> Bench:
-        """The bench file of that name, written if it is not there yet."""
+    def _bench_file(self, name: str, text: str) -> Path:
+        """Write a bench file, unless logs rest on another bench of that name, or somebody else wrote it."""
         path = self._folder / name
         if path.exists():
             there = load_bench(path)
-            if parse_toml(there.text) == parse_toml(text):
-                return there
             is_another = there.identity_hash != parse_bench(text, name).identity_hash
             if is_another and (any(self._folder.glob("*.mcap")) or WRITTEN not in there.text):
                 raise UsageError(
                     f"{path}: another bench than this data sheet's or these logs', which rest on it; go on with the "
                     "data sheet that it was made from, or take another folder for this one"
                 )
-        try:
-            path.write_text(text, encoding="utf-8")
-        except OSError as err:
-            raise UsageError(f"{path}: cannot write the bench file: {err.strerror}") from err
-        return load_bench(path)
-
-    def _found_bench(self, found: Findings) -> Bench:
-        used = " and ".join(path.name for path in self._experiments()[-RECENT:])
-        logs = {"rest": self._logs["1-listen"].name, "current": self._logs["3-current"].name, "experiments": used}
-        return self._bench(FOUND, found_text(self._sheet, found, logs))
-
-    def _experiments(self) -> list[Path]:
-        """Logs of the experiments with the data sheet's ranges so far."""
-        return [self._logs[name] for name in EXPERIMENTS if name in self._logs]
+        path.write_text(text, encoding="utf-8")
+        return path
 
     def _attempts(self, name: str) -> list[Path]:
         """Logs of a step that are there, and last the one that its next run makes."""
@@ -144,30 +139,23 @@ class Commissioning:
             paths.append(self._folder / f"{name}-attempt{len(paths) + 1}.mcap")
         return paths
 
-    def _completed(self, name: str) -> Path | None:
-        return next((path for path in self._attempts(name)[:-1] if examination.ended(path) == "DONE"), None)
-
-    # --- runs -------------------------------------------------------------------------------------------------------
-
-    def _run(self, step: Step, bench: Bench, found: Findings) -> Path:
-        self._say(f"{step.name}: {step.purpose}\n  uses {step.rests_on}")
-        path = self._folder / (FOUND if step.name == FULL else WORKING)
+    def _run(self, name: str, step: Step, path: Path, bench: Bench, found: Findings) -> Path:
+        self._say(f"{name}: {step.purpose}")
         if bench.identity_hash != self._identity:
             self._identity = bench.identity_hash
-            identity = bench_identity(bench.identity_hash)
-            self._say(f"  set up the node for {path}, bench identity {identity:#06x}")
-        policy, log = self._folder / f"{step.name}.onnx", self._attempts(step.name)[-1]
+            self._say(f"  set up the node for {path}, bench identity {bench_identity(bench.identity_hash):#06x}")
+        policy, log = self._folder / f"{name}.onnx", self._attempts(name)[-1]
         policy.write_bytes(policy_file(step, bench))
         arguments = ["--iface", simulated(self._iface, self._sheet, self._runs), "--bench", str(path)]
         arguments += ["--policy", str(policy), "--log", str(log), "--duration", repr(step.duration)]
         self._runs += 1
         document = self._make_run([*arguments, *self._options, *step.stage, "--json"])
-        if document["exit_code"] == EXIT_DONE and examination.ended(log) == "DONE":
+        if document["exit_code"] == EXIT_DONE and examination.is_completed(log):
             return log
         why, is_outside = _failure(document)
         advice = f"see {log}, and begin again in the same folder once the cause is removed"
         raise StepFailedError(
-            f"step {step.name} was not completed: {why}; {suspected(self._sheet, found) if is_outside else advice}",
+            f"step {name} was not completed: {why}; {suspected(self._sheet, found) if is_outside else advice}",
             document["exit_code"] or EXIT_SAFETY_STOP,
         )
 

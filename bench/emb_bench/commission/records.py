@@ -1,4 +1,4 @@
-"""Records of a commissioning: a step, and what its log shows."""
+"""Records of a commissioning: what the logs of its steps show."""
 
 from __future__ import annotations
 
@@ -8,32 +8,7 @@ from dataclasses import dataclass
 from emb_bench.brake.parameters import SI
 from emb_runtime.config.bench import Noise
 
-
-@dataclass(frozen=True)
-class Window:
-    """Window of a step: outside of it no current flows that drives the brake farther out."""
-
-    lowest: float  # Angle [rad]
-    highest: float  # Angle [rad]
-    speed: float  # [rad/s]
-
-
-@dataclass(frozen=True)
-class Step:
-    """One guarded run: what is done, within which limits, and what these rest on."""
-
-    name: str  # Name of its files
-    purpose: str  # Description of what is done, for the operator
-    rests_on: str  # Origin of the numbers that its limits come from
-    duration: float  # [s]
-    window: Window
-    stage: tuple[str, ...] = ()  # Options of ``emb-run`` for what may be sent; none: currents up to the limit
-    currents: tuple[float, ...] = (0.0,)  # Wanted current by sample [A]; after the last one it stays
-
-    @property
-    def limit(self) -> float:
-        """Largest current that may leave [A]."""
-        return max(map(abs, self.currents))
+UNEXPLAINED = 9.0  # Mean square of the residuals, in variances of the noise at rest, from which on nothing is explained
 
 
 @dataclass(frozen=True)
@@ -42,12 +17,11 @@ class Rest:
 
     noise: Noise  # Standard deviations
     period: float  # Of the samples by the node's clock [s]
-    jitter: float  # Standard deviation of the samples about their grid, by the node's clock [s]
 
     def __str__(self) -> str:
         return (
             f"noise {self.noise.angle:.3g} rad and {self.noise.velocity:.3g} rad/s, a sample each "
-            f"{1e3 * self.period:.6g} ms, jitter {1e6 * self.jitter:.3f} us"
+            f"{1e3 * self.period:.6g} ms"
         )
 
 
@@ -56,13 +30,12 @@ class CurrentCheck:
     """Reported against commanded current."""
 
     delay: int  # Samples by which commands act late, by the node's reports
+    latest: int  # The same, at most: of a drive that does not report which command it obeyed, a sample more
     scale: float  # Reported current over commanded one
-    error: float  # Standard deviation of the rest [A]
     moved: float  # Farthest from the angle at the start [rad]
-    uncertain: int = 0  # Samples by which commands may act later, of a drive that does not report which one it obeyed
 
     def __str__(self) -> str:
-        return f"commands {self.delay} samples late, current times {self.scale:.4f}, error {self.error:.2g} A"
+        return f"commands {self.delay} samples late, current times {self.scale:.4f}"
 
 
 @dataclass(frozen=True)
@@ -90,10 +63,13 @@ class Identification:
     measurement_delay: int  # [samples]
     current_lag: tuple[float, float]  # Interval of the current loop's time constant [s]; zeros where none is needed
     features: Mapping[str, float]  # Features beyond eq. 3.12-3.14 that the model needed, by name [SI]
-    jitter: float  # Standard deviation of the instants of sampling, by residuals that grow with the speed [s]
-    noise: Noise  # Standard deviations of the residuals of slow motion, without jitter
-    contact: tuple[float, float]  # Interval of the encoder's reading at the origin [rad]
+    noise: Noise  # Standard deviations of the residuals of slow motion
     objections: tuple[str, ...] = ()  # Alarms of the tests on the residuals, and what would explain them
+
+    @property
+    def is_unexplained(self) -> bool:
+        """True if the residuals are so large that no number of the model means anything."""
+        return not self.fits and self.ratio > UNEXPLAINED
 
     def __str__(self) -> str:
         fits = "" if self.fits else f", which does not fit yet{self.reasons()}"

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import onnx
+from onnx import numpy_helper
 
-from emb_bench.brake.parameters import SI
 from emb_bench.commission import examination
 from emb_bench.commission.bench_file import contradiction, measured_ranges, not_inside, outside
-from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Rest, Step, Window
+from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Rest
 from emb_bench.config.bench import Bench
 from emb_runtime.errors import BenchFileError, SafetyStopError
 from emb_runtime.policy.contract import CONTRACT_KEY, MIN_VECTORS, SAMPLE, Contract, PolicyLimits, Vector
@@ -39,22 +40,26 @@ SHARES = ((1.0, 0.12), (-1.0, 0.12), (0.7, 0.1), (-0.7, 0.1), (1.0, 0.08), (0.5,
 """Currents of an experiment, out and back, as shares of its limit, and the share of its samples for each."""
 
 
-class Experiment(NamedTuple):
-    """Limits of an experiment with the data sheet's ranges."""
+class Window(NamedTuple):
+    """Window of a step: outside of it no current flows that drives the brake farther out."""
 
-    words: str
-    multiple: float  # Current in multiples of that of the free stroke
-    speed: float  # [rad/s]
-    stroke: float  # Share of the free stroke, on the side away from the pads
+    lowest: float  # Angle [rad]
     highest: float  # Angle [rad]
+    speed: float  # [rad/s]
 
 
-EXPERIMENTS = {
-    "5-free-stroke": Experiment("the free stroke and the contact", 1.0, 30.0, 0.4, 5.0),
-    "6-small": Experiment("a small experiment", 2.0, 80.0, 0.6, 12.0),
-    "7-medium": Experiment("a medium experiment", 3.5, 200.0, 0.7, 30.0),
-    "8-large": Experiment("a large experiment", math.inf, 400.0, 0.7, math.inf),
-}
+EVERYWHERE = Window(-math.inf, math.inf, math.inf)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One guarded run: what is done, and within which limits."""
+
+    purpose: str  # Description of what is done, for the operator
+    duration: float  # [s]
+    stage: tuple[str, ...]  # Options of ``emb-run`` for what may be sent
+    window: Window = EVERYWHERE
+    currents: tuple[float, ...] = (0.0,)  # Wanted current by sample [A]; after the last one it stays
 
 
 def break_away(bench: Bench) -> tuple[float, float]:
@@ -66,80 +71,70 @@ def break_away(bench: Bench) -> tuple[float, float]:
 # --- the steps ------------------------------------------------------------------------------------------------------
 
 
-def _listen(name: str, work: Bench, _: Findings) -> Step:
-    return Step(name, "listen, send nothing", "no earlier step", LISTENING, _everywhere(work), ("--read-only",))
+def _listen(_work: Bench, _: Findings) -> Step:
+    return Step("listen, send nothing", LISTENING, ("--read-only",))
 
 
-def _chain(name: str, work: Bench, _: Findings) -> Step:
-    return Step(name, "the whole chain with 0 A", "noise and clock of step 1", SHORT, _everywhere(work), ("--zero",))
+def _chain(_work: Bench, _: Findings) -> Step:
+    return Step("the whole chain with 0 A", SHORT, ("--zero",))
 
 
-def _current(name: str, work: Bench, _: Findings) -> Step:
+def _current(work: Bench, _: Findings) -> Step:
     amplitude = BELOW * break_away(work)[0]
     return Step(
-        name,
         f"sign, scale and latency of the current with {1e3 * amplitude:.0f} mA, which moves no brake of the data sheet",
-        "the data sheet's least friction and strongest motor",
         SHORT,
-        Window(-work.shield.home_angle, work.shield.home_angle, work.shield.home_velocity),
         ("--limit", repr(amplitude)),  # no way home with a current whose sign and scale are not known yet
+        Window(-work.shield.home_angle, work.shield.home_angle, work.shield.home_velocity),
         4 * tuple(amplitude * sign for sign in SIGNS for _ in range(5)),
     )
 
 
-def _first_move(name: str, work: Bench, _: Findings) -> Step:
+def _first_move(work: Bench, _: Findings) -> Step:
     most = min(FIRST_MOVE * break_away(work)[1], work.limits.current)
     fifth = work.timing.horizon // 5
     ramp = [most * (k + 1) / fifth for k in range(fifth)]
     return Step(
-        name,
         f"a current that rises to {most:.2f} A at most until the brake moves, in either direction",
-        "the data sheet's greatest friction and weakest motor; sign and scale of the current",
         work.timing.duration,
-        Window(-1.0, 1.0, 10.0),
         ("--limit", repr(most), "--home"),
+        Window(-1.0, 1.0, 10.0),
         (*ramp, *[0.0] * (fifth // 5), *[-value for value in ramp], 0.0),
     )
 
 
-def _experiment(name: str, work: Bench, found: Findings) -> Step:
-    row, move, one = EXPERIMENTS[name], found.first_move, found.identified
-    assert move is not None
-    limit = min(row.multiple * (MOVES * max(move.up, move.down)), work.limits.current)
-    window = Window(row.stroke * work.limits.angle[0], min(row.highest, REACH * work.limits.angle[1]), row.speed)
-    return _excited(
-        name,
-        f"{row.words}: {limit:.2f} A, {window.lowest:.1f} to {window.highest:.1f} rad, {window.speed:g} rad/s",
-        "the currents of the first move" if one is None else f"the estimate so far (model {one.model})",
-        work,
-        window,
-        limit,
-    )
+def _experiment(
+    words: str, multiple: float, speed: float, stroke: float, highest: float, work: Bench, found: Findings
+) -> Step:
+    """An experiment with the data sheet's ranges.
+
+    Args:
+        words: what it is, for the operator.
+        multiple: current, in multiples of that of the free stroke.
+        speed: largest [rad/s].
+        stroke: share of the free stroke, on the side away from the pads.
+        highest: angle [rad].
+        work: the bench of the steps.
+        found: with the currents of the first move.
+    """
+    assert found.first_move is not None
+    limit = min(multiple * MOVES * max(found.first_move.up, found.first_move.down), work.limits.current)
+    window = Window(stroke * work.limits.angle[0], min(highest, REACH * work.limits.angle[1]), speed)
+    return _excited(words, work, window, limit)
 
 
-def _full(name: str, bench: Bench, _: Findings) -> Step:
+def _full(bench: Bench, _: Findings) -> Step:
     limits = bench.limits
     window = Window(0.7 * limits.angle[0], REACH * limits.angle[1], FULL_SPEED * limits.velocity)
-    return _excited(
-        name,
-        f"an experiment with the new bench file: {limits.current:g} A, up to {window.highest:.0f} rad and "
-        f"{window.speed:.0f} rad/s",
-        "all results",
-        bench,
-        window,
-        limits.current,
-    )
+    return _excited("an experiment with the new bench file", bench, window, limits.current)
 
 
-def _everywhere(bench: Bench) -> Window:
-    return Window(*bench.limits.angle, bench.limits.velocity)
-
-
-def _excited(name: str, purpose: str, rests_on: str, bench: Bench, window: Window, limit: float) -> Step:
+def _excited(words: str, bench: Bench, window: Window, limit: float) -> Step:
     """Currents out and back, as :data:`SHARES` has them."""
     timing = bench.timing
     currents = (*(limit * share for share, part in SHARES for _ in range(round(part * timing.horizon))), 0.0)
-    return Step(name, purpose, rests_on, timing.duration, window, ("--limit", repr(limit), "--home"), currents)
+    purpose = f"{words}: {limit:.2f} A, {window.lowest:.1f} to {window.highest:.1f} rad, {window.speed:g} rad/s"
+    return Step(purpose, timing.duration, ("--limit", repr(limit), "--home"), window, currents)
 
 
 # --- comparison with the data sheet: comparisons are this way round for NaN ------------------------------------------
@@ -165,10 +160,8 @@ def _require(condition: bool, message: str) -> None:
 
 
 def _judge_rest(rest: Rest, sheet: Bench, found: Findings) -> Findings:
-    for name, got, most, unit in (
-        ("angle", rest.noise.angle, sheet.noise.angle, "rad"),
-        ("velocity", rest.noise.velocity, sheet.noise.velocity, "rad/s"),
-    ):
+    for name, unit in (("angle", "rad"), ("velocity", "rad/s")):
+        got, most = getattr(rest.noise, name), getattr(sheet.noise, name)
         _require(
             got <= NOISE_EXCESS * most,
             f"the {name} scatters by {got:.3g} {unit} at rest, the data sheet's bench file has {most:.3g}, and the "
@@ -191,12 +184,14 @@ def _judge_current(check: CurrentCheck, sheet: Bench, found: Findings) -> Findin
         f"the brake moved by {check.moved:.3g} rad under a current that moves no brake of the data sheet: friction is "
         f"lower or the motor stronger (T_c and k_m in [ranges.{sheet.shield.ranges}]), or something else turns it",
     )
-    _require(
-        check.delay <= sheet.shield.frame_age[1],
-        f"commands act {check.delay} samples late, and the data sheet's bench file allows for "
-        f"{sheet.shield.frame_age[1]}: correct shield.frame_age {AGAIN}",
-    )
+    _require_early(check.delay, f"commands act {check.delay} samples late", sheet)
     return replace(found, current=check)
+
+
+def _require_early(late: int, words: str, sheet: Bench) -> None:
+    allowed = sheet.shield.frame_age[1]
+    allows = f"the data sheet's bench file allows for {allowed}: correct shield.frame_age"
+    _require(late <= allowed, f"{words}, and {allows} {AGAIN}")
 
 
 def _judge_first_move(move: FirstMove, sheet: Bench, found: Findings) -> Findings:
@@ -214,13 +209,7 @@ def _judge_first_move(move: FirstMove, sheet: Bench, found: Findings) -> Finding
 
 
 def _judge_experiment(one: Identification, sheet: Bench, found: Findings) -> Findings:
-    _judge_ranges(one, sheet, is_first=found.identified is None)
-    _judge_delays(one, sheet)
-    return replace(found, identified=one)
-
-
-def _judge_ranges(one: Identification, sheet: Bench, *, is_first: bool) -> None:
-    """Refuse an estimate outside of the data sheet's ranges.
+    """Compare an estimate with the data sheet.
 
     The first estimate of a model that only almost fits does not count: a single small experiment does not tell features
     of the friction apart. Of such a model, another constant may be wrong too.
@@ -228,23 +217,17 @@ def _judge_ranges(one: Identification, sheet: Bench, *, is_first: bool) -> None:
     names = outside(sheet, one)
     if names and one.fits:
         raise BenchFileError(contradiction(sheet, one, names))
-    if names and not is_first and one.ratio <= NEARLY:
+    if names and found.identified is not None and one.ratio <= NEARLY:
         raise SafetyStopError("; or ".join((contradiction(sheet, one, names), *one.objections)))
-
-
-def _judge_delays(one: Identification, sheet: Bench) -> None:
-    late, allowed = one.command_delay + one.measurement_delay, sheet.shield.frame_age[1]
+    late = one.command_delay + one.measurement_delay
+    delays = f"{one.command_delay} of the command, {one.measurement_delay} of the measurement"
+    _require_early(late, f"answers act {late} samples late ({delays})", sheet)
     _require(
-        late <= allowed,
-        f"answers act {late} samples late ({one.command_delay} of the command, {one.measurement_delay} of the "
-        f"measurement), and the data sheet's bench file allows for {allowed}: correct shield.frame_age {AGAIN}",
-    )
-    slowest = (1.0 + LAG_ERROR) * sheet.shield.current_lag
-    _require(
-        not (one.fits and one.current_lag[0] > slowest),
+        not (one.fits and one.current_lag[0] > (1.0 + LAG_ERROR) * sheet.shield.current_lag),
         f"the current lags by {one.current_lag[0]:.3g} s at least, and the data sheet's bench file allows for "
         f"{sheet.shield.current_lag:g} s: correct shield.current_lag {AGAIN}",
     )
+    return replace(found, identified=one)
 
 
 def _judge_last(last: Identification, sheet: Bench, found: Findings) -> Findings:
@@ -254,7 +237,7 @@ def _judge_last(last: Identification, sheet: Bench, found: Findings) -> Findings
         got = last.intervals[name]
         _require(
             not last.fits or (got[1] >= low and got[0] <= high),
-            f"by the run with the bench file that was found {name} is {got[0]:.4g} to {got[1]:.4g} {SI[name]}, "
+            f"by the run with the bench file that was found {name} is {got[0]:.4g} to {got[1]:.4g}, "
             f"in the file {low:.4g} to {high:.4g}: the brake is not the one of the steps before, or changes",
         )
     return found
@@ -270,7 +253,7 @@ class Row(NamedTuple):
     raises SafetyStopError or BenchFileError where it contradicts the data sheet, so that nothing more may be done.
     """
 
-    make: Callable[[str, Bench, Findings], Step]
+    make: Callable[[Bench, Findings], Step]
     examine: Callable[[Path, Sequence[Path], Bench, Findings], Any]
     judge: Callable[[Any, Bench, Findings], Findings]
 
@@ -285,13 +268,19 @@ def _moved(log: Path, _before: Sequence[Path], _sheet: Bench, found: Findings) -
     return examination.first_move(log, found.rest.noise)
 
 
+EXPERIMENTS = {
+    "5-free-stroke": partial(_experiment, "the free stroke and the contact", 1.0, 30.0, 0.4, 5.0),
+    "6-small": partial(_experiment, "a small experiment", 2.0, 80.0, 0.6, 12.0),
+    "7-medium": partial(_experiment, "a medium experiment", 3.5, 200.0, 0.7, 30.0),
+    "8-large": partial(_experiment, "a large experiment", math.inf, 400.0, 0.7, math.inf),
+}
 FULL = "9-full"
 STEPS: Mapping[str, Row] = {
-    "1-listen": Row(_listen, lambda log, *_: examination.at_rest(log), _judge_rest),
+    "1-listen": Row(_listen, lambda log, _, sheet, _found: examination.at_rest(log, sheet), _judge_rest),
     "2-zero": Row(_chain, lambda *_: None, lambda _finding, _sheet, found: found),
     "3-current": Row(_current, lambda log, *_: examination.current(log), _judge_current),
     "4-first-move": Row(_first_move, _moved, _judge_first_move),
-    **dict.fromkeys(EXPERIMENTS, Row(_experiment, _identified, _judge_experiment)),
+    **{name: Row(make, _identified, _judge_experiment) for name, make in EXPERIMENTS.items()},
     FULL: Row(_full, lambda log, _, *rest: _identified(log, (), *rest), _judge_last),
 }
 """The steps in their order."""
@@ -302,15 +291,7 @@ STEPS: Mapping[str, Row] = {
 
 GRAPH = """
 <ir_version: 10, opset_import: ["" : 20]>
-commissioning (float[1, 3] inputs) => (float[1, 1] outputs)
-<
-  float[1] lowest = {{{lowest}}}, float[1] highest = {{{highest}}}, float[1] fastest = {{{speed}}},
-  float[1] slowest = {{-{speed}}}, float[1] least = {{{least}}}, float[1] most = {{{most}}}, float[1] zero = {{0}},
-  float[1] rate = {{{rate}}},
-  float[{count}] currents = {{{currents}}},
-  int64[1] first = {{0}}, int64[1] second = {{1}}, int64[1] third = {{2}}, int64 begin = {{0}}, int64 last = {{{last}}}
->
-{{
+commissioning (float[1, 3] inputs) => (float[1, 1] outputs) {
   angle = Gather <axis = 1> (inputs, first)
   velocity = Gather <axis = 1> (inputs, second)
   time = Gather <axis = 1> (inputs, third)
@@ -320,52 +301,41 @@ commissioning (float[1, 3] inputs) => (float[1, 1] outputs)
   place = Clip (number, begin, last)
   wanted = Gather <axis = 0> (currents, place)
   above = Greater (angle, highest)
-  fast_up = Greater (velocity, fastest)
+  fast_up = Greater (velocity, speed)
   no_more_up = Or (above, fast_up)
   upper = Where (no_more_up, zero, most)
   below = Less (angle, lowest)
+  slowest = Neg (speed)
   fast_down = Less (velocity, slowest)
   no_more_down = Or (below, fast_down)
+  least = Neg (most)
   lower = Where (no_more_down, zero, least)
   raised = Max (wanted, lower)
   outputs = Min (raised, upper)
-}}
+}
 """
 """The current of the step, cut to zero on the side that leads out of the window."""
 
 
 def policy_file(step: Step, bench: Bench) -> bytes:
     """The policy of a step, for a bench: its current, but none that drives the brake farther out of the window."""
-    currents = np.asarray(step.currents, np.float32)
-    limit, window = bench.limits.current, step.window
-    text = GRAPH.format(
-        lowest=window.lowest,
-        highest=window.highest,
-        speed=window.speed,
-        rate=1.0 / bench.timing.sample_time,
-        least=-limit,
-        most=limit,
-        count=len(currents),
-        currents=_numbers(currents.tolist()),
-        last=len(currents) - 1,
-    )
-    model = onnx.parser.parse_model(text)
-    model.metadata_props.add(key=CONTRACT_KEY, value=_contract(currents.tolist(), step, bench).to_json())
-    return model.SerializeToString()
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return ", ".join(f"{value:.9g}" for value in values)  # nine digits tell single precision exactly
-
-
-def _contract(currents: list[float], step: Step, bench: Bench) -> Contract:
-    places = [k * (len(currents) - 1) // (MIN_VECTORS - 1) for k in range(MIN_VECTORS)]
-    return Contract(
+    currents, rate = np.asarray(step.currents, np.float32), 1.0 / bench.timing.sample_time
+    numbers = {**step.window._asdict(), "rate": rate, "zero": 0.0, "most": bench.limits.current}
+    constants = {name: np.array([value], np.float32) for name, value in numbers.items()}
+    constants |= {"first": np.array([0]), "second": np.array([1]), "third": np.array([2])}
+    constants |= {"begin": np.array(0), "last": np.array(len(currents) - 1), "currents": currents}
+    model = onnx.parser.parse_model(GRAPH)
+    model.graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in constants.items())
+    places = np.linspace(0, len(currents) - 1, MIN_VECTORS).astype(int)
+    contract = Contract(
         kind="current",
         inputs=SAMPLE,
         limits=PolicyLimits(bench.limits.current, bench.limits.angle, bench.limits.velocity),
         sample_time=bench.timing.sample_time,
         horizon=bench.timing.horizon,
-        vectors=tuple(Vector((0.0, 0.0, k * bench.timing.sample_time), (currents[k],)) for k in places),
-        provenance={"commissioning": step.name},
+        vectors=tuple(Vector((0.0, 0.0, float(k / rate)), (float(currents[k]),)) for k in places),
+        provenance={"commissioning": step.purpose},
     )
+    model.metadata_props.add(key=CONTRACT_KEY, value=contract.to_json())
+    data: bytes = model.SerializeToString()
+    return data

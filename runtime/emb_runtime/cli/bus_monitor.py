@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from emb_runtime.drives.mapping import Mapping as DriveMapping
 
 ENOUGH_PAIRS = 200  # Sensor pairs from which a standard deviation is known to within a twentieth
-RECENT_PAIRS = 1000  # Pairs that the scatter is taken from
+RECENT_PAIRS = 4000  # Pairs that the scatter is taken from
 CREEP_SIGMAS = 5.0  # Standard errors from which a slope is reported
 OTHERS_BITS = worst_bits(8)  # Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier
 

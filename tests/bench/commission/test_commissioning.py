@@ -160,7 +160,7 @@ def test_a_mapped_drive_is_commissioned_up_to_its_first_move(tmp_path: Path) -> 
         on_a_drive(tmp_path, up_to("5-free-stroke")).run()
     assert examination.first_move(tmp_path / "4-first-move.mcap", NOISE).scale == pytest.approx(1.0, abs=0.05)
     check = examination.current(tmp_path / "3-current.mcap")
-    assert (check.delay, check.uncertain) == (1, 0)
+    assert (check.delay, check.latest) == (1, 1)
     assert check.scale == pytest.approx(1.0, abs=1e-3)
 
 
@@ -178,7 +178,7 @@ def test_a_polled_drive_is_listened_to_as_any_other(tmp_path: Path) -> None:
     with pytest.raises(EnoughError):
         on_a_drive(tmp_path, up_to("3-current"), drive="mit", frame_age="[1, 3]").run()
     assert read_log(tmp_path / "1-listen.mcap").run["stage"] == "read-only"
-    assert examination.at_rest(tmp_path / "1-listen.mcap").period == pytest.approx(1e-3, rel=1e-6)
+    assert examination.at_rest(tmp_path / "1-listen.mcap", sheet()).period == pytest.approx(1e-3, rel=1e-6)
 
 
 def test_a_run_that_was_not_completed_is_done_again_under_another_name(tmp_path: Path) -> None:

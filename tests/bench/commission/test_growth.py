@@ -55,7 +55,7 @@ def test_a_single_experiment_grows_no_model(bench: Bench, tmp_path: Path, simula
 def test_a_plain_brake_stays_plain(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
     plain = identified(bench, logs_of(tmp_path, simulate, "exact"))
     assert plain.fits
-    assert (plain.model, plain.features, plain.jitter) == ("exact", {}, 0.0)
+    assert (plain.model, plain.features) == ("exact", {})
     low, high = plain.intervals["k_m"]
     assert high - low < bench.systematic.inertia * plain.values["k_m"]  # the shield shares the error of J
     assert holds_the_truth(bench, plain)
@@ -70,15 +70,4 @@ def test_features_that_do_not_explain_larger_experiments_are_added_to(
     found = identified(bench, logs_of(tmp_path, simulate, "cubic"), before)
     assert found.fits
     assert {"quadratic", "cubic"} <= set(found.features)
-    assert holds_the_truth(bench, found)
-
-
-@pytest.mark.slow
-def test_a_jitter_of_the_sampling_is_found_where_the_residuals_grow_with_the_speed(
-    bench: Bench, tmp_path: Path, simulate: Simulate
-) -> None:
-    found = identified(bench, logs_of(tmp_path, simulate, "jitter"))
-    assert found.fits
-    assert not found.features
-    assert found.jitter == pytest.approx(bench.plant("jitter").instruments.clock_jitter, rel=0.2)
     assert holds_the_truth(bench, found)
