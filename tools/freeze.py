@@ -57,7 +57,7 @@ COMMANDS = {
 """Console scripts. One that is renamed is renamed here; the frozen data stay."""
 CYCLES, FRAMES = "/cycle", ["/can/rx", "/can/tx"]
 """Topics of a log."""
-RENAMED: dict[str, str] = {}
+RENAMED: dict[str, str] = {"stopped": "ended"}
 """Keys of JSON documents: the new name, and the frozen one."""
 GONE: dict[str, str] = {
     "logs/emps*": "a recording of others is read by fim, estimate and report: no log is made of it",
@@ -72,6 +72,8 @@ GONE: dict[str, str] = {
     "estimate/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
     "report/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
     "estimate/*/growth*": "estimate --grow is no more: score tests name the missing effect, --model all compares",
+    "rerun/*/says/frames": "a cycle record has the current and the counter of its command: the frame is made of them",
+    "rerun/*/says/home": "a rerun ends where the run stops: nothing is decided on after that",
     "info/*/says/messages//log": "an internal error's place is in its event's detail",
 }
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, and why."""
@@ -80,6 +82,8 @@ STAMPED = "what a lock-step gateway sends has its time, and its frames count"
 EXPLAINED: dict[str, str] = {
     "estimate/*/says/misfit/notes": JOINED,
     "estimate/*/says/misfit/alarms": JOINED,
+    "rerun/*/says/events": "those after the stop are not compared",
+    "rerun/*/says/differences*": "sent frames are not compared",
     "demo/run/numbers/24": "kB of the log: /clock has no drift_ns",
     "logs/mapped/*": STAMPED,
     "info/mapped/says/messages//*": STAMPED,

@@ -281,7 +281,7 @@ COMMANDS: Mapping[str, tuple[Command, Collection[int]]] = {
             _rerun,
             "The control loop runs again with the policy, bench file and DBC of the log. Bus and clock\n"
             "give the frames and times that the log recorded. Each decision (policy, clip, shield, sent\n"
-            "current, its reason), each sent frame, each safety event and the outcome must be the same,\n"
+            "current, its reason), each estimate and each safety event up to the stop must be the same,\n"
             "numbers to the last bit. A cut log is compared up to its end. Rounding may differ with\n"
             "another ONNX Runtime, numpy, Python or processor. If a decision differs, the versions of\n"
             "the log are printed too.\n",
