@@ -4,9 +4,9 @@ A coarse design is a table of few journeys (:func:`emb_bench.design.kernel.explo
 The CMA evolution strategy: a tutorial, arXiv:1604.00772). Most searches end at the same optimum, and what a table is
 worth says little of what it will be worth when it is polished. So a search pays for nearness to what earlier ones have
 found, and those that go on differ: two designs are near each other if they know the same of each combination of
-parameters. Tables grow: a journey more takes some time from another one, and the search goes on. Then each is polished,
-annealed (:mod:`emb_bench.design.anneal`) and polished a little, again and again: fewer and fewer of them, in the end
-the best one twice at a time, until it gains no more. It is polished to its end then.
+parameters. Then each is polished, annealed (:mod:`emb_bench.design.anneal`) and polished a little, again and again:
+fewer and fewer of them, in the end the best one twice at a time, until it gains no more. Then it is polished to its
+end.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ with warnings.catch_warnings():
     import cma
 
 JOURNEYS = (3, 4, 5)  # Journeys of a coarse design; the searches take turns
-MOST_JOURNEYS = 9  # Most journeys of a grown table
 SHORTEST = 0.003  # Shortest journey, as a share of the longest one
 DRAWN = 400  # Tables drawn at random, of which the best one starts a search
 FIRST = 4000  # Coarse designs that one search simulates
@@ -41,11 +40,6 @@ POPULATION = 24  # Population of CMA-ES
 WAVES = 3  # Batches of coarse searches, each of which keeps away from what the earlier ones found
 NEAR = 0.3  # Distance (:func:`distances`) below which two tables count as near; those that go on are half of it apart
 NEARNESS = 0.1  # Largest price of being near to an earlier table, in the unit of φ
-GROWING = 8  # Tables that begin to grow; one fewer in each round
-GROWTHS = 4  # Rounds in which tables grow
-CANDIDATES = 60  # Random journeys of which the best one is added to a table
-MORE = 3000  # Coarse designs that the search of a grown table simulates
-NARROW = 0.05  # Initial standard deviation of the genes in that search
 LINES = 4  # Designs that are annealed; one fewer in each round, down to one
 LAST = 2  # Annealings of the last design in each round, so that two processors have work
 ROUNDS = 20  # Most rounds of annealing
@@ -80,16 +74,13 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
 
     ``starts`` are coarse searches, ``workers`` threads, 0 for one per processor, ``warm`` currents to begin with too.
     """
-    seeds = np.random.SeedSequence(seed).spawn(starts + GROWING)
+    seeds = np.random.SeedSequence(seed).spawn(starts + LINES)
     draws = [np.random.default_rng(s) for s in seeds[starts:]]
     tables: list[Table] = []
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
         for wave in np.array_split(np.arange(starts), WAVES):
             found = list(tables)
             tables += pool.map(lambda i, f=found: coarse(problem, JOURNEYS[i % len(JOURNEYS)], seeds[i], f), wave)
-        for growth in range(GROWTHS):
-            tables = _diverse(tables, GROWING - growth)
-            tables = list(pool.map(lambda table, rng: grown(problem, table, rng), tables, draws))
         begun = [problem.design(table.currents) for table in _diverse(tables, LINES)]
         begun += [problem.design(u) for u in warm]
         lines = sorted(pool.map(lambda d: _better(d, polish(problem, d.currents, LONG)), begun), key=_rank)[::-1]
@@ -165,34 +156,6 @@ def coarse(problem: Problem, journeys: int, seed: np.random.SeedSequence, far: S
     near = rng.random((DRAWN, 2 * journeys)) < 0.5  # optima wait near contact, and creep
     drawn[:, : 2 * journeys] *= np.where(near, 0.4, 1.0)
     return evolved(problem, drawn[np.argmin(_cost(problem, drawn, far))], WIDE, FIRST, rng, far=far)
-
-
-def grown(problem: Problem, table: Table, rng: np.random.Generator) -> Table:
-    """The table, or a better one with one journey more."""
-    if len(table.genes) >= 3 * MOST_JOURNEYS:
-        return table
-    candidates = np.array([_with_another(table.genes, rng) for _ in range(CANDIDATES)])
-    begin = candidates[np.argmin(_cost(problem, candidates))]
-    return max(table, evolved(problem, begin, NARROW, MORE, rng), key=lambda t: t.value)
-
-
-def _with_another(genes: Floats, rng: np.random.Generator) -> Floats:
-    """Genes with a journey inserted that takes some time from one of the others."""
-    angles, speeds, lengths = genes.reshape(3, -1)
-    giver = rng.choice(len(lengths), p=lengths / lengths.sum())
-    share = rng.random() * lengths[giver]
-    lengths = np.where(np.arange(len(lengths)) == giver, lengths - share, lengths)
-    near = 0.4 if rng.random() < 0.7 else 1.0
-    angle, speed = near * rng.uniform(-1.0, 1.0, 2)
-    kind = rng.random()
-    if kind < 0.5:  # the same place, another direction
-        angle = angles[giver]
-    if kind < 0.25:
-        speed = -speeds[giver]
-    to = giver + rng.integers(2) if rng.random() < 0.5 else rng.integers(len(lengths) + 1)
-    lengths = np.insert(lengths, to, share)
-    lengths = np.maximum(lengths / lengths.max(), SHORTEST)
-    return np.concatenate([np.insert(angles, to, angle), np.insert(speeds, to, speed), lengths])
 
 
 def evolved(
