@@ -185,10 +185,11 @@ def main() -> None:
         )
         print(f"{'':12}{low} below {LIMITS[name]}; cpu s median {statistics.median(cpu):.1f}, most {max(cpu):.1f}")
         walls, missed = [line.wall for line in of], ", **not met**" if low else ""
+        middle, least = statistics.median(shares), min(shares)
         print(
             f"| designs of {len(of)} held-out {model} brakes, {name}: below {LIMITS[name]} of the best known; "
-            f"median, least; wall clock, median and most | 0; –; 60 s | {low}{missed}; {statistics.median(shares):.4f}, "
-            f"{min(shares):.4f}; {statistics.median(walls):.1f}, {max(walls):.1f} s |"
+            f"median, least; wall clock, median and most | 0; –; 60 s | {low}{missed}; "
+            f"{middle:.4f}, {least:.4f}; {statistics.median(walls):.1f}, {max(walls):.1f} s |"
         )
 
 

@@ -28,7 +28,6 @@ from emb_bench.recordings.recording import open_recording
 
 Floats = NDArray[np.float64]
 
-TRAVEL = 3.978873577e-4  # m/rad
 T_S = 1e-3
 MAP = f"""\
 schema = 1
@@ -50,7 +49,6 @@ unit = "N"
 scale = 35.1506519  # N per volt of the controller's output
 
 [machine]
-travel = {TRAVEL}
 nuisances = ["current_offset"]
 
 [machine.guess]
@@ -67,14 +65,8 @@ def of_machine(e: Estimate) -> dict[str, tuple[float, float]]:
     low, high = e.intervals().T
     pairs = zip(e.values.tolist(), (0.5 * (high - low)).tolist(), strict=True)
     values = dict(zip((u.name for u in e.unknowns), pairs, strict=True))
-    found = {"M": _times(values["J"], TRAVEL**-2)}
-    found |= {"F_v": _times(values["f_v"], TRAVEL**-2), "F_c": _times(values["T_c"], 1.0 / TRAVEL)}
     value, half = values["current_offset"]  # ours drives the machine, the published one opposes the command
-    return found | {"offset": (-value / TRAVEL, half / TRAVEL)}
-
-
-def _times(pair: tuple[float, float], factor: float) -> tuple[float, float]:
-    return pair[0] * factor, pair[1] * factor
+    return {"M": values["J"], "F_v": values["f_v"], "F_c": values["T_c"], "offset": (-value, half)}
 
 
 def least_squares(position: Floats, force: Floats) -> Floats:
@@ -120,8 +112,8 @@ def main() -> None:
     else:
         first, held = whole, other
         print("held back: the other recording, predicted in windows of 0.5 s from the first")
-    position = np.concatenate([[first.angle], first.samples[:, 0]]) * TRAVEL
-    scipy = least_squares(position, np.append(first.currents, first.currents[-1]) / TRAVEL)
+    position = np.concatenate([[first.angle], first.samples[:, 0]])
+    scipy = least_squares(position, np.append(first.currents, first.currents[-1]))
     own = method_of("windows")(bench, plant, ASKED, starts=2).fit([first])
     for name, asked, values in (
         ("ours", own.asked, own.values),
@@ -131,14 +123,14 @@ def main() -> None:
         errors = []
         for between in ("held", "linear"):
             problem = make_problem(bench, plant, [held], replace(asked, window=0.5, between=between))
-            errors.append(f"{between} {1e6 * predict_windows(problem, values)[0] * TRAVEL:.1f} um")
+            errors.append(f"{between} {1e6 * predict_windows(problem, values)[0]:.1f} um")
         chosen = f", estimated as {asked.between} in windows of {asked.window:g} s" if asked.between else ""
         print(f"  {name:12} root mean square with the command {', '.join(errors)}{chosen}")
 
 
 def _ours(mass: float, viscous: float, coulomb: float, offset: float) -> Floats:
     """Unknowns in coordinates of the motor; the published offset opposes the command, ours adds to it."""
-    return np.array([mass * TRAVEL**2, viscous * TRAVEL**2, coulomb * TRAVEL, -offset * TRAVEL])
+    return np.array([mass, viscous, coulomb, -offset])
 
 
 def _opened(path: Path, folder: Path) -> Recording:

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-TRAVEL = 4e-4  # Metres per radian of the motor
 T_S = 1e-3
 STEP = 5e-8  # Of the encoder [m]
 
@@ -92,7 +91,6 @@ column = "F"
 unit = "N"
 
 [machine]
-travel = {TRAVEL}
 window = 0.5
 nuisances = ["current_offset"]
 

@@ -101,10 +101,10 @@ def conclude(
         found.append(
             Conclusion(
                 label=label,
-                value=value * shown.factor,
+                value=value,
                 unit=shown.unit,
-                interval=(interval[0] * shown.factor, interval[1] * shown.factor),
-                repeatability=NORMAL_95 * own * shown.factor * scale,
+                interval=interval,
+                repeatability=NORMAL_95 * own * scale,
                 of_interest=of_interest,
                 standing=Standing.NOT_IDENTIFIED if why_not else certain,
                 why_not=why_not,

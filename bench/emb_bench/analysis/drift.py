@@ -128,9 +128,9 @@ def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
     deviations = now.between_runs()
     found = []
     for i in common:
-        name, relative, (_, unit, factor) = now.labels[i], now.unknowns[i].relative, now.shown[i]
-        value = float(now.values[i]) * factor
-        deviation = float(deviations[i]) * (abs(value) if relative else factor)
+        name, relative, unit = now.labels[i], now.unknowns[i].relative, now.shown[i].unit
+        value = float(now.values[i])
+        deviation = float(deviations[i]) * (abs(value) if relative else 1.0)
         before, deviation_before = then[name].value, then[name].absolute
         both, change = math.hypot(deviation_before, deviation), value - before
         size = abs(before) if relative else 1.0

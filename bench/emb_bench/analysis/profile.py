@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -68,21 +68,6 @@ class Profile:
     minimum: float  # Value with the least χ², SI units
     fell: float  # Fall of χ² below that of the estimate, which is then a local minimum only; 0 if none
     open_sides: tuple[OpenSide, ...]
-
-    def scaled(self, factor: float) -> Profile:
-        """Profile in another unit."""
-
-        def both(pair: tuple[float, float]) -> tuple[float, float]:
-            return pair[0] * factor, pair[1] * factor
-
-        return replace(
-            self,
-            values=self.values * factor,
-            interval=both(self.interval),
-            fisher=both(self.fisher),
-            minimum=self.minimum * factor,
-            open_sides=tuple(replace(side, at=side.at * factor) for side in self.open_sides),
-        )
 
     @property
     def agrees(self) -> bool:

@@ -75,6 +75,5 @@ def apart(e: Estimate) -> tuple[Differing, ...]:
             continue
         p_value = constancy(values, deviations).p_value
         if p_value < APART / len(e.asked.params):
-            shown = quantity(e.bench.machine, name)
-            found.append(Differing(shown.name, tuple(value * shown.factor for value in values), p_value))
+            found.append(Differing(quantity(e.bench.machine, name).name, tuple(values), p_value))
     return tuple(sorted(found, key=lambda one: one.p_value))

@@ -149,8 +149,8 @@ def _of_the_estimate(e: Estimate, evaluation: Evaluation, truth: BrakeParameters
     deviations = [(float(e.deviations()[i]), float(e.between_runs()[i])) for i in e.wanted()]
     conclusions = conclude(e, profiles(e, of_all=False), ())
     for i, said, (deviation, between) in zip(e.wanted(), conclusions, deviations, strict=True):
-        name, factor = e.unknowns[i].name, e.shown[i].factor  # the columns of all rows are in SI units
-        value, low, high, noise = (shown / factor for shown in (said.value, *said.interval, said.repeatability))
+        name = e.unknowns[i].name
+        value, low, high, noise = said.value, *said.interval, said.repeatability
         true = _true(truth, name)
         scale = deviation * (abs(value) if PARAMETERS[name].relative else 1.0)
         error = None if true is None or not 0.0 < scale < math.inf else (value - true) / scale

@@ -169,10 +169,6 @@ class Estimate:
         """Names and units in which the unknowns are shown, in their order."""
         return tuple(quantity(self.bench.machine, unknown.name) for unknown in self.unknowns)
 
-    def factor(self, label: str) -> float:
-        """Factor from SI units to those in which the unknown of a label is shown."""
-        return self.shown[self.labels.index(label)].factor
-
     def label(self, unknown: Unknown) -> str:
         """Label of an unknown."""
         name = quantity(self.bench.machine, unknown.name).name

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
-from emb_bench.brake.parameters import command, quantity
+from emb_bench.brake.parameters import quantity
 from emb_bench.config.bench import Bench
-from emb_bench.config.machine import CURRENT
+from emb_bench.config.machine import LOADS
 from emb_bench.config.plants import Plant
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.prediction import Problem, make_problem
@@ -67,6 +67,7 @@ def _scale(e: Estimate) -> tuple[str, ...]:
         if not known:
             return (f"k_m, {others} scale together: without a known load only their ratios are in the recording",)
         return (f"k_m{f', {others}' if others else ''} are as right as what was given as known: {known}",)
-    if machine.command in CURRENT:
+    if machine.command not in LOADS:
         return (f"{others}: only their ratios to k_m are in the recording, and k_m was given",)
-    return (f"{others} are as right as the scale of the commanded {command(machine).name}: only ratios do without it",)
+    commanded = quantity(machine, "current").name
+    return (f"{others} are as right as the scale of the commanded {commanded}: only ratios do without it",)

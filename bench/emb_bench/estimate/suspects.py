@@ -311,21 +311,21 @@ def _size(name: str, prior: float, length: float, score: float) -> float:
 def shown_as(s: Suspect | Contribution, machine: Machine | None) -> Quantity:
     """Name and unit of an effect as they are shown; no unit for what is relative."""
     if s.name == ANGLE_SCALE:
-        return Quantity("angle scale", "", 1.0)
+        return Quantity("angle scale", "")
     if s.name in DRIFTS:
         parameter = s.name.removesuffix("_drift")
-        return Quantity(f"{quantity(machine, parameter).name}_drift", "", 1.0)
+        return Quantity(f"{quantity(machine, parameter).name}_drift", "")
     row = EFFECTS[s.name]
-    found = quantity(machine, s.name) if s.name in SI else Quantity(s.name, row.unit, 1.0)
+    found = quantity(machine, s.name) if s.name in SI else Quantity(s.name, row.unit)
     a_share = row.unit == "1" or (s.name in SI and row.relative and row.step == 0.0)
-    return found._replace(unit="", factor=1.0) if a_share else found
+    return found._replace(unit="") if a_share else found
 
 
 def explained(s: Suspect, machine: Machine | None = None) -> str:
     """A suspect in words that lead to the remedy; ``machine`` is that of a bench that has no brake."""
-    effect, (_, unit, factor) = EFFECTS[s.name], shown_as(s, machine)
+    effect, unit = EFFECTS[s.name], shown_as(s, machine).unit
     share = 100.0 * s.value
-    amount = f"{s.value * factor:.2g} {unit}" if unit else f"{share:.0f} %" if abs(share) >= 99.5 else f"{share:.2g} %"
+    amount = f"{s.value:.2g} {unit}" if unit else f"{share:.0f} %" if abs(share) >= 99.5 else f"{share:.2g} %"
     said = effect.effect
     for parameter in PARAMETER_NAMES:
         said = said.replace(parameter, quantity(machine, parameter).name)

@@ -96,8 +96,8 @@ def _from_file(path: str, log: RunLog, bench: Bench) -> tuple[dict[str, float], 
         wanted = "expected the JSON of 'emb-replay estimate --json' or of a report"
         raise UsageError(f"{path}: {wanted}: {err}") from err
     names = PARAMETER_NAMES if bench.machine is None else (*PARAMETER_NAMES, "J")
-    shown = {name: quantity(bench.machine, name) for name in names}
-    values = {n: _number(found.parameters[q.name]) / q.factor for n, q in shown.items() if q.name in found.parameters}
+    shown = {name: quantity(bench.machine, name).name for name in names}
+    values = {name: _number(found.parameters[own]) for name, own in shown.items() if own in found.parameters}
     if not values:
         raise UsageError(f"{path}: expected an estimate of some of {', '.join(names)}, and it has none of them")
     return values, _errors(found, path, log, bench)

@@ -199,11 +199,9 @@ class Identifiability:
         """Findings by the names and in the units of a machine."""
         findings = []
         for finding in self.findings:
-            name, unit, factor = quantity(machine, finding.name)
-            own = replace(finding, name=name, traded_with=renamed(finding.traded_with, machine))
-            if finding.unit:
-                own = replace(own, deviation=finding.deviation * factor, unit=unit)
-            findings.append(own)
+            name, unit = quantity(machine, finding.name)
+            traded = renamed(finding.traded_with, machine)
+            findings.append(replace(finding, name=name, traded_with=traded, unit=unit if finding.unit else ""))
         directions = tuple(
             replace(direction, shares=renamed(direction.shares, machine)) for direction in self.directions
         )

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from emb_bench.brake.parameters import LINEAR, UNITS, in_motor_coordinates
-from emb_bench.config.machine import ANGLE, ANGULAR_SPEED, CURRENT, FORCE, LENGTH, PARAMETERS, SPEED, TIME, TORQUE
+from emb_bench.brake.parameters import LINEAR, UNITS
+from emb_bench.config.machine import COMMANDS, LOADS, PARAMETERS
 from emb_runtime.config import typed
 from emb_runtime.config.typed import MAX_TOML_BYTES, FieldError, parse_toml
 from emb_runtime.errors import UsageError
@@ -24,13 +24,9 @@ KINDS: Mapping[str, tuple[str, ...]] = {
 }
 """Kinds of files, and the endings by which they are known."""
 TIMED = "mdf"  # Kind of files whose values have times
-MEASURED_UNITS: Mapping[str, Mapping[str, float]] = {
-    "angle": {**ANGLE, **LENGTH},
-    "velocity": {**ANGULAR_SPEED, **SPEED},
-    "command": {**CURRENT, **TORQUE, **FORCE},
-    "current": CURRENT,
-}
-"""Signals, and the units that each can have."""
+TIME: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # Seconds in each
+ALONG: Mapping[str, str] = {"angle": "m", "velocity": "m/s", "command": "N"}  # Units of a linear machine alone
+AROUND: Mapping[str, str] = {"angle": "rad", "velocity": "rad/s", "command": "Nm"}  # Units of one that turns alone
 
 Positive = Annotated[float, Meta(gt=0.0, description="a positive number")]
 
@@ -40,7 +36,7 @@ class Signal(msgspec.Struct, frozen=True, kw_only=True):
 
     column: str
     unit: str
-    scale: Positive = 1.0  # Factor to ``unit``
+    scale: Positive = 1.0  # Factor from the column to ``unit``
     sign: Literal[-1, 1] = 1
     offset: float = 0.0  # Reading of the column at zero, before the factor
     noise: Positive = 0.0  # Standard deviation in ``unit``; 0 if it is not given
@@ -59,10 +55,18 @@ class Signals(msgspec.Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         """Check units and noise, and that what acted is known."""
+        linear = self.angle.unit == ALONG["angle"]
+        units = ALONG if linear else AROUND
+        known = {
+            "angle": (AROUND["angle"], ALONG["angle"]),
+            "velocity": (units["velocity"],),
+            "command": tuple(unit for unit in COMMANDS if unit not in LOADS or unit == units["command"]),
+            "current": ("A",),
+        }
         for name, signal in self.given.items():
-            if signal.unit not in MEASURED_UNITS[name]:
-                known = ", ".join(MEASURED_UNITS[name])
-                raise FieldError(f"{name}.unit", f"expected one of {known}, got {typed.shown(signal.unit)}")
+            if signal.unit not in known[name]:
+                expected = f"expected one of {', '.join(known[name])}, and scale as the factor to it"
+                raise FieldError(f"{name}.unit", f"{expected}; got {typed.shown(signal.unit)}")
             if name in ("angle", "velocity") and not signal.noise:
                 raise FieldError(f"{name}.noise", "missing: standard deviation of the sensor, or its step over 3.5")
         if self.command is None and self.current is None:
@@ -71,7 +75,8 @@ class Signals(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def given(self) -> dict[str, Signal]:
         """The signals that there are, by name."""
-        return {name: signal for name in MEASURED_UNITS if (signal := getattr(self, name)) is not None}
+        names = ("angle", "velocity", "command", "current")
+        return {name: signal for name in names if (signal := getattr(self, name)) is not None}
 
 
 class Source(msgspec.Struct, frozen=True, kw_only=True):
@@ -95,10 +100,10 @@ class Timing(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Parameters(msgspec.Struct, frozen=True, kw_only=True):
-    """Parameters, each in coordinates of the motor or as those of a linear machine; 0 where it is not given."""
+    """Parameters, of a linear machine by names of its own; 0 where it is not given."""
 
     J: Positive = 0.0  # [kg·m²]
-    k_m: Positive = 0.0  # [N·m/A]
+    k_m: Positive = 0.0  # [N·m/A], [N/A] of a linear machine
     k_1: Positive = 0.0  # [N·m/rad] times ``gamma``
     gamma: Positive = 0.0
     T_c: Positive = 0.0  # [N·m]
@@ -107,17 +112,16 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True):
     F_c: Positive = 0.0  # [N]
     F_v: Positive = 0.0  # [N·s/m]
 
-    def of_the_motor(self, travel: float) -> dict[str, float]:
-        """The given ones in coordinates of the motor, of which a radian is ``travel`` metres."""
+    @property
+    def given(self) -> dict[str, float]:
+        """The given ones, by their place in the equations."""
         found = dict[str, float]()
         for key, value in msgspec.structs.asdict(self).items():
             ours = LINEAR.get(key, key)
-            if value and key in LINEAR and not travel:
-                raise FieldError(key, "needs [machine] travel, in m per rad of the motor")
             if value and ours in found:
                 raise FieldError(key, f"{ours} is given twice: as {ours} and as {key}")
             if value:
-                found[ours] = value * (in_motor_coordinates(ours, travel) if key in LINEAR else 1.0)
+                found[ours] = value
         return found
 
 
@@ -126,19 +130,17 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True):
 
     guess: Parameters
     known: Parameters = Parameters()
-    travel: Positive = 0.0  # Metres per radian of a linear machine; 0 for one that turns
     window: Annotated[float, Meta(ge=1e-3, le=3600.0)] = 0.0  # [s]; 0: the recording chooses
     nuisances: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check that the parameters make a machine."""
-        known, guess, every = (self._of_the_motor(name) for name in ("known", "guess", ""))
+        known, guess, every = self.known.given, self.guess.given, self.parameters
         if twice := sorted({*known} & {*guess}):
             raise FieldError("guess", f"{', '.join(twice)}: known already: expected each once")
-        for name, linear in (("J", "mass"), ("T_c", "F_c"), ("f_v", "F_v")):
+        for linear, name in LINEAR.items():
             if name not in every:
-                other = f", or {linear}" if self.travel else ""
-                raise FieldError("guess", f"{name} is missing{other}: known, or a first guess")
+                raise FieldError("guess", f"{name} is missing, or {linear} of a linear machine: known, or a guess")
         if ("k_1" in every) != ("gamma" in every):
             raise FieldError("known", "k_1 and gamma go together: a spring needs both, a machine without one neither")
         if "gamma" in guess:
@@ -153,25 +155,15 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True):
                 "guess", "k_m, J and all loads scale together: without one that is known only ratios can be told"
             )
 
-    def _of_the_motor(self, name: str) -> dict[str, float]:
-        if not name:
-            return self._of_the_motor("known") | self._of_the_motor("guess")
-        parameters: Parameters = getattr(self, name)
-        try:
-            return parameters.of_the_motor(self.travel)
-        except FieldError as err:
-            raise FieldError(f"{name}.{err.key}", str(err)) from err
-
     @property
     def parameters(self) -> dict[str, float]:
-        """Known and guessed values in coordinates of the motor, SI units."""
-        return self._of_the_motor("")
+        """Known and guessed values, SI units."""
+        return self.known.given | self.guess.given
 
     @property
     def unknown(self) -> tuple[str, ...]:
         """Parameters to be estimated."""
-        guess = self._of_the_motor("guess")
-        return tuple(name for name in PARAMETERS if name in guess)
+        return tuple(name for name in PARAMETERS if name in self.guess.given)
 
 
 class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):
@@ -186,22 +178,11 @@ class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         """Check what the signals need of the machine."""
-        machine = self.machine
-        for name, signal in self.signals.given.items():
-            if signal.unit in (*LENGTH, *SPEED, *FORCE) and not machine.travel:
-                raise FieldError(
-                    f"signals.{name}.unit", f"{signal.unit} needs [machine] travel, in m per rad of the motor"
-                )
-        unit, has_k_m = self.command_unit, "k_m" in machine.parameters
-        if unit in (*TORQUE, *FORCE) and (has_k_m or self.signals.current is not None):
-            raise FieldError(
-                "signals.command.unit", f"a command in {unit} has no k_m and no current: its k_m is 1 N·m per A"
-            )
-        if unit in CURRENT and not has_k_m:
-            raise FieldError(
-                "signals.command.unit",
-                f"a command in {unit} needs [machine] k_m, known or guessed, in N·m per {unit}",
-            )
+        unit, has_k_m = self.command_unit, "k_m" in self.machine.parameters
+        if unit in LOADS and (has_k_m or self.signals.current is not None):
+            raise FieldError("signals.command.unit", f"a command in {unit} has no k_m and no current: its k_m is 1")
+        if unit not in LOADS and not has_k_m:
+            raise FieldError("signals.command.unit", f"a command in {unit} needs [machine] k_m, known or guessed")
 
     @property
     def command_unit(self) -> str:
@@ -213,11 +194,6 @@ class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):
         """``open`` where the recording is to choose the course of a command between its stamps, else ``held``."""
         command = self.signals.command
         return "open" if self.signals.current is None and command is not None and command.between == "open" else "held"
-
-    @property
-    def shown(self) -> dict[str, str]:
-        """Units in which results are shown: those of the recording."""
-        return {"angle": self.signals.angle.unit, "command": self.command_unit}
 
     @property
     def time_unit(self) -> float:

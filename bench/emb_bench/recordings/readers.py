@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.config.machine import FORCE, LENGTH, SPEED
 from emb_bench.config.plants import Instruments
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.recordings.map_file import MEASURED_UNITS, TIMED, RecordingMap, Signal, Source
+from emb_bench.recordings.map_file import TIMED, RecordingMap, Signal, Source
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.input_file import open_regular
@@ -184,7 +183,7 @@ def experiment_of(columns: Mapping[str, Column], wanted: RecordingMap, kind: str
     """Columns, by their names, as an experiment; messages call the file ``source``."""
     given, timing = wanted.signals.given, wanted.timing
     clock = columns[timing.column].values * wanted.time_unit if timing.column else None
-    signals = {name: _signal(columns, signal, name, wanted, clock, source) for name, signal in given.items()}
+    signals = {name: _signal(columns, signal, wanted, clock, source) for name, signal in given.items()}
     times, angles = signals["angle"]
     t_s = timing.sample_time or float(np.median(np.diff(times)))
     if not 1e-4 <= t_s <= 0.1:
@@ -201,13 +200,13 @@ def experiment_of(columns: Mapping[str, Column], wanted: RecordingMap, kind: str
     angle, late = np.full(len(grid), np.nan), np.zeros(len(grid))
     angle[step], late[step] = angles[index], times[index] - grid[step]
     bandwidth = 0.0 if "velocity" in signals else min(max(SLOWEST, 0.5 / t_s), FASTEST)
-    angle_noise = given["angle"].noise * _factor("angle", given["angle"], wanted)
+    angle_noise = given["angle"].noise
     if bandwidth:
         velocity = _derived(step, angles[index], t_s, bandwidth)
         velocity_noise = observer_noise(bandwidth, t_s, angle_noise)
     else:
         velocity = _nearest(*signals["velocity"], grid, t_s)
-        velocity_noise = given["velocity"].noise * _factor("velocity", given["velocity"], wanted)
+        velocity_noise = given["velocity"].noise
     applied = _applied(signals, grid, t_s, held="command" not in given or given["command"].between != "linear")
     received = np.isfinite(angle) & np.isfinite(velocity) & np.isfinite(applied)
     if int(received.sum()) < FEWEST:
@@ -235,25 +234,16 @@ def experiment_of(columns: Mapping[str, Column], wanted: RecordingMap, kind: str
     return Found(experiment, t_s, (angle_noise, velocity_noise), bandwidth)
 
 
-def _factor(name: str, signal: Signal, wanted: RecordingMap) -> float:
-    """Factor from the unit of a signal to ours."""
-    factor = MEASURED_UNITS[name][signal.unit]
-    if signal.unit in (*LENGTH, *SPEED):
-        factor /= wanted.machine.travel
-    return factor * wanted.machine.travel if signal.unit in FORCE else factor
-
-
 def _signal(
     columns: Mapping[str, Column],
     signal: Signal,
-    name: str,
     wanted: RecordingMap,
     clock: Floats | None,
     source: str,
 ) -> tuple[Floats, Floats]:
     """Times [s] and values in our units of what was recorded of a signal."""
     column = columns[signal.column]
-    values = (column.values - signal.offset) * signal.scale * signal.sign * _factor(name, signal, wanted)
+    values = (column.values - signal.offset) * signal.scale * signal.sign
     rows = np.asarray(np.arange(len(values)) * wanted.timing.sample_time, dtype=np.float64) if clock is None else clock
     time: Floats = rows if column.time is None else column.time
     if len(time) != len(values):

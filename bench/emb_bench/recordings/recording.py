@@ -58,8 +58,8 @@ def bench_of(found: Found, wanted: RecordingMap) -> str:
             "nuisances": [*machine.nuisances],
             "between": wanted.between,
             **({"window": machine.window} if machine.window else {}),
-            **({"travel": machine.travel} if machine.travel else {}),
-            "units": wanted.shown,
+            "angle": wanted.signals.angle.unit,
+            "command": wanted.command_unit,
         },
         "brake": brake,
         "limits": {

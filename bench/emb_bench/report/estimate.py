@@ -125,8 +125,7 @@ def _evidence(study: Study) -> Iterator[str]:
         yield from [] if table is None else table.text("  ")
     yield from listed("NOTE: ", [say.pairs(pairs) if pairs else "", say.once(study)])
     yield from listed("", say.directions(e.verdict()))
-    profiles = (p.scaled(e.factor(p.label)) for p in study.profiles)
-    yield from listed("", (f"profile of {p.label}: {say.profile(p, e)}" for p in profiles))
+    yield from listed("", (f"profile of {p.label}: {say.profile(p, e)}" for p in study.profiles))
 
 
 def document(study: Study) -> dict[str, Any]:
@@ -174,8 +173,7 @@ def document(study: Study) -> dict[str, Any]:
         "directions": e.verdict().directions,
         "left_to_prior": e.verdict().left_to_prior,
         "profiles": [
-            _fields(p, "label", "values", "rise", "shape") | {"interval_95": p.interval}
-            for p in (own.scaled(e.factor(own.label)) for own in study.profiles)
+            _fields(p, "label", "values", "rise", "shape") | {"interval_95": p.interval} for p in study.profiles
         ],
         "starts": [
             _fields(end, "cost", "converged", "evaluations")
@@ -204,9 +202,8 @@ def _fields(record: object, *names: str) -> dict[str, Any]:
 
 
 def _shown(e: Estimate, z: Floats) -> dict[str, float]:
-    """Values of the unknowns by label, in the units that they are shown in."""
-    values = (z * e.problem.units).tolist()
-    return {label: value * shown.factor for label, value, shown in zip(e.labels, values, e.shown, strict=True)}
+    """Values of the unknowns by label."""
+    return dict(zip(e.labels, (z * e.problem.units).tolist(), strict=True))
 
 
 def _systematic(e: Estimate) -> dict[str, Any]:
@@ -224,15 +221,14 @@ def _parameters(study: Study) -> dict[str, dict[str, Any]]:
     columns = (e.deviations(), e.cramer_rao(), e.robust(), e.open())
     for i, c in zip(e.wanted(), study.conclusions, strict=True):
         unknown = e.unknowns[i]
-        factor = 1.0 if unknown.relative else e.shown[i].factor
-        used, bound, robust, model = (factor * column[i] for column in columns)
+        used, bound, robust, model = (column[i] for column in columns)
         suspect = e.left_open_by(i)
         found[c.label] = {
             **_fields(c, "value", "unit", "repeatability", "identified", "why_not"),
             "interval_95": c.interval,
             "deviation": used,
             "deviation_relative": unknown.relative,
-            "deviation_between_runs": factor * e.between_runs()[i],
+            "deviation_between_runs": e.between_runs()[i],
             "cramer_rao": bound,
             "sandwich": robust,
             "left_open": model,

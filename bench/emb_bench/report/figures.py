@@ -10,7 +10,7 @@ import numpy as np
 
 from emb_bench.analysis.profile import LEVEL, Profile
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.parameters import angle, command, velocity
+from emb_bench.brake.parameters import quantity
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.model_validation import OUTPUTS
 from emb_bench.experiment.experiment import Experiment
@@ -83,11 +83,11 @@ def excitation(run: Run, cycles: ActiveCycles) -> Panel:
 
 def applied(run: Run, experiment: Experiment) -> Panel:
     """Command or current that drove the machine of a recording of others, in its own unit."""
-    shown = command(run.bench.machine)
+    shown = quantity(run.bench.machine, "current")
 
     def draw(axes: Any) -> None:
         axis = axes[0, 0]
-        values = shown.factor * np.append(experiment.currents, np.nan)
+        values = np.append(experiment.currents, np.nan)
         axis.axhline(0.0, **FAINT)
         axis.step(1e3 * run.bench.timing.sample_time * np.arange(len(values)), values, where="post", color=COLOURS[0])
         axis.set_ylabel(f"{shown.name} [{shown.unit}]")
@@ -153,9 +153,7 @@ def motion(run: Run) -> list[Panel]:
     else:
         measured = run.experiment.all_samples
         time = period * np.arange(len(measured), dtype=np.float64)
-    units = (angle(run.bench.machine), velocity(run.bench.machine))
-    factors = np.array([unit.factor for unit in units])
-    measured = measured * factors
+    units = [quantity(run.bench.machine, name) for name in OUTPUTS]
     driven = run.bench.machine is None
     borders = (limits.angle, (-limits.velocity, limits.velocity)) if driven else ((0.0, 0.0), (0.0, 0.0))
     last = max(float(time.max(initial=0.0)), period, 0.0 if after is None else after.end)
@@ -170,7 +168,7 @@ def motion(run: Run) -> list[Panel]:
             axis.plot(1e3 * time, measured[:, i], ".", color=COLOURS[4], markersize=3.5, label="measured")
             seen = measured[np.isfinite(measured[:, i]), i]
             if run.predicted is not None:
-                shown = factors[i] * run.predicted[:, i]
+                shown = run.predicted[:, i]
                 at = 1e3 * period * np.arange(1, len(shown) + 1)
                 axis.plot(at, shown, color=COLOURS[1], label="predicted", linewidth=1)
             if after is not None and cycles is not None:
@@ -224,7 +222,7 @@ _POWERS = (-2, 5)  # of ten, beyond which the axis has a common one: its numbers
 def axis_unit(e: Estimate, i: int) -> tuple[float, str]:
     """Factor and unit for distances of an unknown from its estimate: of its value in ppm or percent, or in its unit."""
     if not e.unknowns[i].relative:
-        return e.shown[i].factor, e.shown[i].unit
+        return 1.0, e.shown[i].unit
     factor, unit = (1e6, "ppm") if 3.0 * float(e.deviations()[i]) < SMALL else (100.0, "%")
     return factor / float(e.scale[i]), unit
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.brake.parameters import PARAMETERS, quantity
-from emb_bench.config.machine import CURRENT
+from emb_bench.config.machine import LOADS
 from emb_bench.documents import to_json
 from emb_bench.experiment.evaluation import KINDS, Evaluation, Question, default_model, evenly
 from emb_bench.information.criteria import criteria_series
@@ -141,9 +141,9 @@ def _heading(e: Evaluation) -> list[str]:
         theta = ", ".join(f"{name} = {getattr(e.theta, name):.4g} {PARAMETERS[name].unit}" for name in PARAMETER_NAMES)
     else:
         values = e.theta._asdict()
-        names = [n for n in (*PARAMETER_NAMES, "J") if values[n] and (n != "k_m" or machine.command in CURRENT)]
+        names = [n for n in (*PARAMETER_NAMES, "J") if values[n] and (n != "k_m" or machine.command not in LOADS)]
         known = ((quantity(machine, name), values[name]) for name in names)
-        theta = ", ".join(f"{shown.name} = {value * shown.factor:.4g} {shown.unit}" for shown, value in known)
+        theta = ", ".join(f"{shown.name} = {value:.4g} {shown.unit}" for shown, value in known)
     return facts(
         ("log", f"{e.log.path}: {run}"),
         ("theta", f"{e.theta_name}: {theta}"),

@@ -116,7 +116,7 @@ def budget(study: Study) -> Table:
     bound, other, every = e.cramer_rao(), e.open(OF_THE_BENCH), e.open()
     columns = (bound, np.sqrt(np.maximum(every**2 - other**2, 0.0)), other, e.robust())
     for i, c in zip(e.wanted(), study.conclusions, strict=True):
-        factor = NORMAL_95 * e.shown[i].factor * float(e.scale[i])
+        factor = NORMAL_95 * float(e.scale[i])
         jointly, shared, effects, residuals = (factor * float(column[i]) for column in columns)
         systematic = math.sqrt(max(jointly**2 - c.repeatability**2, 0.0)) if math.isfinite(jointly) else math.inf
         systematic = systematic if systematic > SMALL * jointly else 0.0  # what is left is rounding
@@ -170,8 +170,8 @@ def suspects(e: Estimate) -> Table | None:
     """Effects that the model may lack."""
     rows = []
     for s in e.validation.suspects:
-        name, unit, factor = shown_as(s, e.bench.machine)
-        suggested = f"{plain(s.value * factor)} {unit}" if unit else share(s.value, 3)
+        name, unit = shown_as(s, e.bench.machine)
+        suggested = f"{plain(s.value)} {unit}" if unit else share(s.value, 3)
         rows.append([name, suggested, signed(s.sigmas, "+.1f"), chance(s.p_value)])
     title = "Score tests for effects that the model lacks: first-order amount; one-sided p if the effect is positive"
     return Table(title, ["effect", "amount", "sigma", "p"], rows) if rows else None

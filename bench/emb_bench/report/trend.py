@@ -65,10 +65,10 @@ def _trend(studies: Sequence[Study], label: str) -> Trend:
 
 
 def _half(study: Study, label: str) -> float:
-    """Half of the 95 % interval without the errors that all runs share, in the unit that is shown."""
+    """Half of the 95 % interval without the errors that all runs share."""
     e = study.estimate
     i = e.labels.index(label)
-    return NORMAL_95 * float(e.between_runs()[i] * e.scale[i]) * e.shown[i].factor
+    return NORMAL_95 * float(e.between_runs()[i] * e.scale[i])
 
 
 def _conclusion(study: Study, label: str) -> Conclusion:

@@ -16,7 +16,7 @@ from emb_bench.recordings.map_file import parse_map
 from emb_bench.recordings.readers import Column, experiment_of
 from emb_bench.recordings.recording import bench_of
 from emb_runtime.errors import UsageError
-from tests.bench.linear_machine import MAP, TRAVEL, Machine, Recording, record
+from tests.bench.linear_machine import MAP, Machine, Recording, record
 
 BY_DIRECTION = Machine(forward=160.0, backward=240.0)
 ASKED = EstimationProblem(("T_c", "f_v", "J"), ("current_offset",))
@@ -37,12 +37,8 @@ def fitted(found: Recording, asked: EstimationProblem = ASKED, text: str = MAP) 
 
 def of_machine(e: Estimate) -> dict[str, tuple[float, float]]:
     """Values and half-widths of the 95 % intervals in SI units of the linear machine."""
-    factors = {"J": TRAVEL**-2, "f_v": TRAVEL**-2, "T_c": 1.0 / TRAVEL, "current_offset": 1.0 / TRAVEL}
-    found = {}
-    for u, value, (low, high) in zip(e.unknowns, e.values.tolist(), e.intervals().tolist(), strict=True):
-        factor = factors.get(u.name, 1.0)
-        found[u.name] = value * factor, 0.5 * (high - low) * factor
-    return found
+    found = zip(e.unknowns, e.values.tolist(), e.intervals().tolist(), strict=True)
+    return {u.name: (value, 0.5 * (high - low)) for u, value, (low, high) in found}
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +76,7 @@ def test_what_is_estimated_from_one_recording_predicts_another(plain: Estimate) 
     problem = make_problem(bench, plain.plant, [data], ASKED)
     error, _, _ = predict_windows(problem, plain.values)
     wrong, _, _ = predict_windows(problem, plain.values * 1.2)
-    assert error * TRAVEL < 2e-6
+    assert error < 2e-6
     assert wrong > 5.0 * error
 
 
@@ -93,13 +89,13 @@ def test_a_window_that_begins_at_rest_is_predicted_from_a_start_that_does_not_di
         "r", data.currents[begin:end], data.samples[begin:end], angle, velocity, 0.0, False, before=before
     )
     problem = make_problem(bench, bench.plant("recorded"), [part], ASKED)
-    true = {"T_c": 20.0 * TRAVEL, "f_v": 200.0 * TRAVEL**2, "J": 95.0 * TRAVEL**2, "current_offset": -3.0 * TRAVEL}
+    true = {"T_c": 20.0, "f_v": 200.0, "J": 95.0, "current_offset": -3.0}
     values = np.array([true[u.name] for u in problem.unknowns])
     error, chi2, _ = predict_windows(problem, values)
     cut = Cut(problem, values / problem.units)
     seen = cut.linearised(cut.begun)
     assert chi2 <= seen[0].cost
-    assert error * TRAVEL < 150e-6
+    assert error < 150e-6
 
 
 def test_eliminating_the_starts_gives_the_information_of_all_unknowns_together() -> None:

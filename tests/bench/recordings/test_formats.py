@@ -11,7 +11,7 @@ import pytest
 
 from emb_bench.recordings.recording import open_recording
 from emb_runtime.errors import UsageError
-from tests.bench.linear_machine import MAP, TRAVEL, Machine, record
+from tests.bench.linear_machine import MAP, Machine, record
 
 RECORDING = record(Machine(), 0.3)
 COLUMNS = {"t": RECORDING.time, "x": RECORDING.position, "F": RECORDING.force}
@@ -78,8 +78,8 @@ def test_what_a_library_writes_is_read_back(written: dict[str, bytes], tmp_path:
         experiment = open_recording(*put(tmp_path, name, written[name])).experiment
         assert experiment.periods == len(RECORDING.time) - 1
         assert experiment.measured.all()
-        np.testing.assert_allclose(experiment.all_samples[:, 0] * TRAVEL, RECORDING.position, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(experiment.currents / TRAVEL, RECORDING.force[:-1], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(experiment.all_samples[:, 0], RECORDING.position, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(experiment.currents, RECORDING.force[:-1], rtol=1e-6, atol=1e-6)
         assert experiment.late is not None
         np.testing.assert_allclose(experiment.late, 0.0, atol=1e-9)
 

@@ -11,7 +11,7 @@ from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import Recording as Opened
 from emb_bench.recordings.recording import open_recording
 from emb_runtime.errors import BenchFileError
-from tests.bench.linear_machine import MAP, T_S, TRAVEL, Machine, Recording, record
+from tests.bench.linear_machine import MAP, T_S, Machine, Recording, record
 
 RECORDING = record(Machine(), 0.4)
 
@@ -38,9 +38,9 @@ def refused(folder: Path, source: Path, text: str, capsys: pytest.CaptureFixture
 
 
 def check(experiment: Experiment, found: Recording = RECORDING) -> None:
-    """The experiment has the recording's samples, in coordinates of the motor."""
-    np.testing.assert_allclose(experiment.all_samples[:, 0], found.position / TRAVEL, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(experiment.currents, found.force[:-1] * TRAVEL, rtol=1e-9, atol=1e-9)
+    """The experiment has the recording's samples."""
+    np.testing.assert_allclose(experiment.all_samples[:, 0], found.position, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(experiment.currents, found.force[:-1], rtol=1e-9, atol=1e-9)
     assert experiment.measured.sum() == len(found.time) - 1
 
 
@@ -51,9 +51,9 @@ def test_a_csv_file_becomes_an_experiment_with_its_samples_and_the_machine(tmp_p
     assert bench.machine is not None
     assert bench.machine.unknown == ("T_c", "f_v", "J")
     assert bench.brake.k_1 == 0.0
-    assert pytest.approx(70.0 * TRAVEL**2) == bench.brake.J
-    assert bench.brake.T_c == pytest.approx(14.0 * TRAVEL)
-    assert bench.brake.f_v == pytest.approx(300.0 * TRAVEL**2)
+    assert bench.brake.J == 70.0
+    assert bench.brake.T_c == 14.0
+    assert bench.brake.f_v == 300.0
 
 
 def test_what_a_recording_lacks_is_said_of_its_experiment(tmp_path: Path) -> None:
@@ -69,12 +69,14 @@ name = "a drive that turns"
 sample_time = 0.01
 [signals.angle]
 column = "position"
-unit = "rev"
-noise = 0.0001
+unit = "rad"
+scale = 6.283185307179586
+noise = 0.0006
 [signals.velocity]
 column = "speed"
-unit = "rpm"
-noise = 0.1
+unit = "rad/s"
+scale = 0.10471975511965977
+noise = 0.01
 sign = -1
 [signals.command]
 column = "torque"
@@ -110,7 +112,7 @@ def test_a_linear_command_is_the_mean_of_what_lies_between_its_stamps(tmp_path: 
     text = MAP.replace('unit = "N"', 'unit = "N"\nbetween = "linear"')
     experiment = opened(tmp_path, csv(tmp_path / "r.csv", RECORDING), text).experiment
     force = RECORDING.force
-    np.testing.assert_allclose(experiment.currents, 0.5 * (force[:-1] + force[1:]) * TRAVEL, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(experiment.currents, 0.5 * (force[:-1] + force[1:]), rtol=1e-9, atol=1e-9)
 
 
 def test_lost_and_shifted_samples_stay_where_their_times_are(tmp_path: Path) -> None:
@@ -121,7 +123,7 @@ def test_lost_and_shifted_samples_stay_where_their_times_are(tmp_path: Path) -> 
     assert experiment.periods == len(RECORDING.time) - 1
     lost = np.flatnonzero(~experiment.measured) + 1
     assert lost.tolist() == [50, 51, 90]
-    np.testing.assert_allclose(experiment.all_samples[kept, 0], found.position / TRAVEL)
+    np.testing.assert_allclose(experiment.all_samples[kept, 0], found.position)
     assert any("3 samples" in line for line in experiment.missing)
 
 
@@ -129,7 +131,7 @@ MAPS_REFUSED = (
     ('unit = "m"', 'unit = "inch"', "signals.angle.unit: expected one of rad"),
     ('unit = "m"', 'units = "m"', "signals.angle.units: unknown key"),
     ('unit = "m"', "", "signals.angle.unit: missing"),
-    (f"travel = {TRAVEL}\n", "", "travel"),
+    ('unit = "N"', 'unit = "Nm"', "signals.command.unit: expected one of A, V, 1, N,"),
     ('column = "x"', 'column = "y"', "no column is called 'y'; it has: t, x, F"),
     ('unit = "N"', 'unit = "A"', "needs [machine] k_m"),
     ('unit = "N"', 'unit = "A"\nsign = 0', "signals.command.sign: expected one of -1, 1, got 0"),
