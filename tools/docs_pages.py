@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import re
 import sys
 import tomllib
@@ -186,17 +187,23 @@ def messages_tables() -> str:
 
 def topics_tables() -> str:
     """A table of fields for each topic of a log that the bench's DBC does not describe."""
-    from emb_runtime.log import mcap_schema
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto
 
-    topics = {t.name: t for t in vars(mcap_schema).values() if isinstance(t, mcap_schema.Topic)}
+    from emb_runtime.log import topics
+
     lines = []
-    for topic in topics.values():
-        lines += [f"### {topic.name}\n", f"Message `{topic.message}`. {topic.notes.get('description', '')}\n"]
+    for topic, message in topics.TOPICS.items():
+        if topic.startswith("/emb/"):
+            continue
+        notes = topics.metadata(message)
+        units = json.loads(notes.get("units", "{}"))
+        lines += [f"### {topic}\n", f"Message `emb.{message}`. {notes.get('description', '')}\n"]
         lines += ["| field | type | unit | meaning |", "|---|---|---|---|"]
-        for field in topic.fields:
-            choices = ", ".join(f"{value} {name}" for name, value in (field.choices or {}).items())
-            meaning = "; ".join(filter(None, (topic.notes.get(field.name, ""), choices)))
-            lines.append(f"| `{field.name}` | {field.type} | {field.unit} | {meaning} |")
+        for field in topics.message_class(message).DESCRIPTOR.fields:
+            kind = FieldDescriptorProto.Type.Name(field.type).removeprefix("TYPE_").lower()
+            choices = [f"{value.number} {value.name}" for value in field.enum_type.values] if field.enum_type else []
+            meaning = "; ".join(filter(None, (notes.get(field.name, ""), ", ".join(choices))))
+            lines.append(f"| `{field.name}` | {kind} | {units.get(field.name, '')} | {meaning} |")
         lines.append("")
     return "\n".join(lines)
 

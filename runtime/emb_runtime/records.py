@@ -95,8 +95,7 @@ class CycleRecord(NamedTuple):
 
     Times are monotonic nanoseconds. A value that does not exist in a cycle (a policy output in a missed one) is NaN.
 
-    The record in the ring buffer, the log's topic ``/cycle`` and its columns follow from these fields and
-    :data:`CYCLE_UNITS`; the core fills them in ``_record``.
+    The log's topic ``/cycle`` has these fields, see ``emb.proto``; the core fills them in ``_record``.
     """
 
     step: int  # Sample index since the experiment began; −1 before
@@ -122,14 +121,3 @@ class CycleRecord(NamedTuple):
     def time_ns(self) -> int:
         """Time of its record in the log, as all records have one: the arrival of the pair."""
         return self.receive_time_ns
-
-
-CYCLE_UNITS = {
-    "angle": "rad",
-    "velocity": "rad/s",
-    "applied_current": "A",
-    "policy_current": "A",
-    "clipped_current": "A",
-    "sent_current": "A",
-}
-"""Unit of every field of :class:`CycleRecord` that is no whole number, "" for none; whole ones in ``_ns`` are in ns."""

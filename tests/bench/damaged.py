@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorSet
 from mcap.reader import NonSeekingReader
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
@@ -22,9 +23,9 @@ from emb_bench.logs.log import RunLog, read_log
 from emb_bench.logs.mcap_file import MAGIC, message_class
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EmbError, LogError
-from emb_runtime.log import mcap_schema
-from emb_runtime.log.mcap_schema import Field, Topic
 
+Change = Callable[[str, DescriptorProto], None]
+"""Changes the message of a topic."""
 CHUNK, ATTACHMENT, METADATA, DATA_END, FOOTER = 6, 9, 12, 15, 2
 
 
@@ -117,7 +118,7 @@ def spliced(path: Path, extra: bytes, opcode: int = CHUNK) -> None:
 
 def rewritten(
     path: Path,
-    change: Callable[[Topic], Topic] = lambda topic: topic,
+    change: Change = lambda _topic, _message: None,
     *,
     values: Callable[[str, int, dict[str, Any]], dict[str, Any]] = lambda _topic, _n, row: row,
     stamps: Callable[[str, int, int], int] = lambda _topic, _n, time_ns: time_ns,
@@ -126,7 +127,6 @@ def rewritten(
     library: str = "emb-excite/0.1.0",
 ) -> None:
     """Write a log anew with the plain MCAP library: other fields, values or times, or the whole of it again."""
-    topics = {topic.name: topic for topic in (*mcap_schema.FIXED_TOPICS, mcap_schema.LEARNT)}
     with path.open("rb") as file:
         reader = NonSeekingReader(file, validate_crcs=True)
         rows = list(reader.iter_messages())
@@ -146,42 +146,47 @@ def rewritten(
         for described, channel, message in rows * runs:
             assert described is not None
             name, payload = channel.topic, message.data
-            ours = change(topics[name]) if name in topics else None
-            if ours is None:
-                data, title = described.data, described.name
-            else:
-                data, title = ours.descriptor.SerializeToString(), ours.message
+            files = FileDescriptorSet.FromString(described.data)
+            change(name, next(m for m in files.file[0].message_type if described.name == f"emb.{m.name}"))
+            data = files.SerializeToString()
             if name not in channels:
-                number = writer.register_schema(title, SchemaEncoding.Protobuf, data)
+                number = writer.register_schema(described.name, SchemaEncoding.Protobuf, data)
                 channels[name] = writer.register_channel(name, MessageEncoding.Protobuf, number)
             n = counts[name] = counts.get(name, -1) + 1
-            if ours is not None:
-                old = message_class(described.name, described.data).FromString(payload)
-                row = {f.name: getattr(old, f.name) for f in old.DESCRIPTOR.fields if f.type != f.TYPE_MESSAGE}
-                row = values(name, n, row)
-                fields = {f.name: f for f in ours.fields}
-                payload = ours.factory(**{k: v for k, v in row.items() if k in fields}).SerializeToString()
+            old = message_class(described.name, described.data).FromString(payload)
+            row = values(name, n, {f.name: getattr(old, f.name) for f in old.DESCRIPTOR.fields})
+            new = message_class(described.name, data)
+            payload = new(**{k: v for k, v in row.items() if k in new.DESCRIPTOR.fields_by_name}).SerializeToString()
             publish = stamps(name, n, message.publish_time)
             writer.add_message(channels[name], message.log_time, payload, publish, message.sequence)
         writer.finish()  # type: ignore[no-untyped-call]
 
 
-def without(topic: str, *names: str) -> Callable[[Topic], Topic]:
-    def change(t: Topic) -> Topic:
-        kept = tuple(f for f in t.fields if f.name not in names)
-        return Topic(t.name, t.message, kept, t.notes) if t.name == topic else t
+def without(topic: str, *names: str) -> Change:
+    def change(name: str, message: DescriptorProto) -> None:
+        if name == topic:
+            _set_fields(message, [field for field in message.field if field.name not in names])
 
     return change
 
 
-def with_field(topic: str, name: str, kind: str) -> Callable[[Topic], Topic]:
+def with_field(topic: str, name: str, kind: str) -> Change:
     """A field more, or one of another kind."""
 
-    def change(t: Topic) -> Topic:
-        if t.name != topic:
-            return t
-        fields = tuple(Field(name, kind) if f.name == name else f for f in t.fields)
-        more = () if any(f.name == name for f in t.fields) else (Field(name, kind),)
-        return Topic(t.name, t.message, (*fields, *more), t.notes)
+    def change(of: str, message: DescriptorProto) -> None:
+        if of == topic:
+            number = next((field.number for field in message.field if field.name == name), 99)
+            field = FieldDescriptorProto(name=name, number=number, label=FieldDescriptorProto.LABEL_OPTIONAL)
+            field.type = FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}")
+            _set_fields(message, [*(field for field in message.field if field.name != name), field])
 
     return change
+
+
+def _set_fields(message: DescriptorProto, fields: Sequence[FieldDescriptorProto]) -> None:
+    """Replace the fields, without presence: each has a oneof for it."""
+    kept = DescriptorProto(name=message.name, field=fields)
+    for field in kept.field:
+        field.ClearField("proto3_optional")
+        field.ClearField("oneof_index")
+    message.CopyFrom(kept)

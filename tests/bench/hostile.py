@@ -20,7 +20,6 @@ from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.log.ring_buffer import (
     Attachment,
     EventRecord,
-    LearntRecord,
     LogHeader,
     Record,
 )
@@ -56,9 +55,8 @@ def write_trace(
         dbc=layout.text,
         messages=layout.known,
         metadata={"emb.run": {"steps": str(steps), "purpose": "experiment", "limit": "6.0", **identity}},
-        estimates=estimated(bench),
         attachments=files,
-        learns=any(isinstance(record, LearntRecord) for record in records),
+        topics=["/estimate"] if estimated(bench) else [],
     )
     with path.open("wb") as file:
         writer = LogWriter(file, header)

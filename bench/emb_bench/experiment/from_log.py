@@ -354,10 +354,7 @@ class _Reports:
         self._signal, self._unknown, self._apart_ns = signal, unknown, apart_ns
         self.found = False  # There was a report for any of the cycles
         if self.topic in log.topics:
-            log.require(self.topic, self.columns[:1])
-            log.require(
-                self.topic, self.columns[1:], "a real number" if isinstance(unknown, float) else "a whole number"
-            )
+            log.require(self.topic, self.columns)
         self._recent = dict.fromkeys((*self.columns, "order", "publish_time"), np.empty(0, np.int64))
 
     def of_the_cycles(self, part: dict[str, Table]) -> NDArray[Any]:

@@ -16,12 +16,11 @@ from typing import Any
 from mcap import records as mcap
 
 from emb_bench.logs.mcap_file import Chunk, message_class
-from emb_runtime.estimator.estimate import NORMAL_95
-from emb_runtime.log.mcap_schema import CYCLE, ESTIMATE, SAFETY, deviation_of
+from emb_runtime.estimator.estimate import NORMAL_95, UNITS
 from emb_runtime.records import Reason, RunState
 
 KEPT = 600  # Chunks that a browser which comes later gets; a chunk has 0.1 s
-TOPICS = (CYCLE.name, ESTIMATE, SAFETY.name)
+TOPICS = ("/cycle", "/estimate", "/safety")
 RUNNING = (RunState.ACTIVE, RunState.HOMING)
 SHIELD = Reason.LIMITED | Reason.RETURNING | Reason.LEFT
 
@@ -47,7 +46,6 @@ class Page:
         self._sent: deque[str] = deque(maxlen=KEPT)
         self._schemas: dict[int, mcap.Schema] = {}
         self._classes: dict[int, tuple[str, Any]] = {}
-        self._units: dict[str, str] = {}  # Of the estimated parameters
         self._start_ns = -1
         return self.so_far[0]
 
@@ -59,14 +57,14 @@ class Page:
         """
         said: dict[str, Any] = {"cycles": [], "estimates": [], "events": []}
         for topic, message in self._messages(chunk):
-            if topic == SAFETY.name:
+            if topic == "/safety":
                 said["events"].append(f"{message.code} {message.text}")
-            elif topic == ESTIMATE:
+            elif topic == "/estimate":
                 rows = [(name, _number(value), _number(half)) for name, value, half in _intervals(message)]
                 said["estimates"].append({"step": message.step, "rows": rows})
             elif message.state in RUNNING:
                 said["cycles"].append(self._cycle(message))
-        return self._keep({**said, "units": self._units})
+        return self._keep({**said, "units": UNITS})
 
     def end(self, reason: str) -> str:
         """The log is whole: the run's exit reason."""
@@ -80,8 +78,6 @@ class Page:
             elif record.topic in TOPICS and record.schema_id in self._schemas:
                 schema = self._schemas[record.schema_id]
                 self._classes[record.id] = (record.topic, message_class(schema.name, schema.data))
-                if record.topic == ESTIMATE:
-                    self._units = dict(json.loads(record.metadata.get("units", "{}")))
         for message in chunk.messages():
             if message.channel_id in self._classes:
                 topic, factory = self._classes[message.channel_id]
@@ -107,11 +103,10 @@ class Page:
 
 
 def _intervals(estimate: Any) -> Iterator[tuple[str, float, float]]:
-    """Name, value and half of the 95 % interval of each parameter in an estimate."""
-    names = [field.name for field in estimate.DESCRIPTOR.fields]
-    for name in names:
-        if deviation_of(name) in names:
-            yield name, getattr(estimate, name), NORMAL_95 * getattr(estimate, deviation_of(name))
+    """Name, value and half of the 95 % interval of each estimated parameter."""
+    for name in UNITS:
+        if (deviation := getattr(estimate, f"{name}_deviation")) > 0.0:
+            yield name, getattr(estimate, name), NORMAL_95 * deviation
 
 
 def _number(value: float) -> float | None:

@@ -21,11 +21,11 @@ from mcap import records as mcap
 from emb_bench.logs.log import reported_missing
 from emb_bench.logs.mcap_file import McapFile
 from emb_runtime.errors import LogError, UsageError
-from emb_runtime.log.mcap_schema import CAN_RX, CAN_TX
 from emb_runtime.log.recorder_process import RUN
+from emb_runtime.log.topics import message_class
 from emb_runtime.system.input_file import open_regular
 
-_FRAME, _FRAMES = CAN_RX.factory, (CAN_RX.name, CAN_TX.name)
+_FRAME, _FRAMES = message_class("CanFrame"), ("/can/rx", "/can/tx")
 _SECOND = 10**9  # [ns]
 
 
@@ -53,7 +53,7 @@ class McapReader(MessageReader):
         """Messages; ``timestamp`` is Unix time [s], ``is_rx`` is False for what was sent."""
         log, lost = self._mcap(), 0
         for _, _, chunk in log.chunks():
-            received = {number: c.topic == CAN_RX.name for number, c in log.channels.items() if c.topic in _FRAMES}
+            received = {number: c.topic == "/can/rx" for number, c in log.channels.items() if c.topic in _FRAMES}
             bus = _bus(log.metadata.get(RUN, {}).get("iface"))
             for message in chunk.messages():
                 if message.channel_id in received:

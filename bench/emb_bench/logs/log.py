@@ -37,8 +37,8 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.drives.mapping import PROPERTIES, MappingError
 from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.drives.mapping_file import parse_mapping
-from emb_runtime.errors import BenchFileError, FrameError, LogError, UsageError, near
-from emb_runtime.log.mcap_schema import FIXED_TOPICS, LEARNT
+from emb_runtime.errors import BenchFileError, LogError, UsageError, near
+from emb_runtime.log import topics
 from emb_runtime.records import CycleRecord, Frame, RunType
 from emb_runtime.system import terminal
 from emb_runtime.system.input_file import open_regular
@@ -59,7 +59,6 @@ TIMES = ("publish_time", "log_time", "order")  # Columns that every topic has be
 TIME = Column("time", "float64", "s")  # Since the first message of the log; all topics have the same zero
 UNIX_TIME = Column("unix_time", "int64", "ns")
 
-_OURS = {topic.name: topic for topic in (*FIXED_TOPICS, LEARNT)}
 UNREADABLE = (DecodeError, TypeError, KeyError, AttributeError, RecursionError, *DAMAGE)
 """Exceptions of descriptors and messages that are damaged, or mean something else."""
 
@@ -221,7 +220,7 @@ class RunLog:
 
     def _has(self, topic: str, names: Sequence[str]) -> bool:
         """Returns True if the log has a topic; raises LogError if one of ours lacks some of these fields."""
-        if topic in self.topics and topic in _OURS:
+        if topic in self.topics and topic in topics.TOPICS:
             self.require(topic, [name for name in names if name not in TIMES])
         return topic in self.topics
 
@@ -292,16 +291,13 @@ class RunLog:
         self.require("/cycle", CycleRecord._fields)
         return self.tables["/cycle"]
 
-    def require(self, topic: str, fields: Sequence[str], kind: str = "a whole number") -> None:
-        """Refuse a log in which one of our topics is missing, or some of its fields are or mean something else.
-
-        Of the topic of a DBC message the fields have to be of the ``kind`` that is named.
-        """
+    def require(self, topic: str, fields: Sequence[str]) -> None:
+        """Refuse a log in which one of our topics is missing, or some of its fields are or mean something else."""
         what = {"/cycle": "the control cycles"}.get(topic, f"the messages of {topic}")
         if topic not in self.topics:
             raise LogError(f"{self.path}: {what} are missing{': ' + self.missing if self.missing else ''}")
         theirs = _kinds(self.topics[topic].factory)
-        ours = _kinds(_OURS[topic].factory) if topic in _OURS else dict.fromkeys(fields, kind)
+        ours = _kinds(topics.message_class(topics.TOPICS[topic]))
         lost = [f"{name} ({ours[name]})" for name in fields if theirs.get(name) != ours[name]]
         if lost:
             raise LogError(f"{self.path}: {what} have other fields: expected {', '.join(lost)} too")
@@ -347,11 +343,11 @@ class RunLog:
 
     @cached_property
     def layout(self) -> Layout:
-        """The CAN layout of the run."""
-        try:
-            return _layout(self._text("emb.dbc"))
-        except FrameError as err:
-            raise LogError(f"{self.path}: the DBC inside the log is refused: {err}") from err
+        """The CAN layout of the run; LogError if the log's messages are not those of this version."""
+        layout = load_layout()
+        if _definitions(self._text("emb.dbc")) != _definitions(layout.text):
+            raise LogError(f"{self.path}: its DBC is not that of this version: read it with the version that wrote it")
+        return layout
 
     @property
     def truth(self) -> BrakeParameters | None:
@@ -482,7 +478,6 @@ def _bench(text: str) -> Bench:
     return parse_bench(text, "bench.toml", analysis=True)
 
 
-@lru_cache(maxsize=8)
-def _layout(text: str) -> Layout:
-    """Many logs have one layout."""
-    return load_layout(text)
+def _definitions(dbc: str) -> list[str]:
+    """Lines of a DBC without its comments."""
+    return [line for line in dbc.splitlines() if not line.startswith("CM_")]

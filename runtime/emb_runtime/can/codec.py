@@ -1,4 +1,4 @@
-"""Messages as a DBC describes them: plain little-endian signals, end-to-end protected; and a decoder by that table.
+"""Messages of ``emb.dbc``: plain little-endian signals, end-to-end protected; and a decoder by that table.
 
 The loop uses functions that are generated from it (:mod:`emb_runtime.can.generated`); the guard, the log and whoever
 explains a rejection decode by the table. What does not fit raises: nothing is masked or clipped into shape.
@@ -6,9 +6,8 @@ explains a rejection decode by the table. What does not fit raises: nothing is m
 
 from __future__ import annotations
 
-import math
 import sys
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
@@ -22,8 +21,6 @@ from emb_runtime.records import Frame
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
-    from cantools.database.can import Message as DbcMessage
-    from cantools.database.can import Signal as DbcSignal
 
 
 Number = int | float  # An int where it is whole
@@ -56,19 +53,12 @@ class Signal:
     unit: str
     minimum: Number  # Least value in ``unit``; beyond it nothing is sent and nothing believed
     maximum: Number
-    choices: Mapping[int, str]  # Names of the values, empty where they are numbers
-    factor: Number  # Step in ``unit``; an int where the values are whole numbers
-    offset: Number
+    factor: Number  # Step in ``unit``; 1 where the values are whole numbers
     shift: int  # Bits below it in the payload as one little-endian word
     mask: int  # Bit mask of the signal's width
     sign: int  # Its sign bit; 0 if unsigned
     raw_minimum: int
     raw_maximum: int
-
-    @property
-    def is_plain(self) -> bool:
-        """Its values are whole numbers, and each of them."""
-        return self.factor == 1 and isinstance(self.offset, int)
 
     def raw(self, word: int) -> int:
         """The whole number that stands for it in the payload word."""
@@ -114,7 +104,7 @@ class Message:
         values: dict[str, Number] = {}
         for signal in self.signals:
             raw = signal.raw(word)
-            value = values[signal.name] = raw * signal.factor + signal.offset
+            value = values[signal.name] = raw * signal.factor
             if not signal.raw_minimum <= raw <= signal.raw_maximum:
                 raise self._rejected(Fault.RANGE, f"{signal.name}: expected {signal.range_text}, got {value:g}")
         return values
@@ -125,7 +115,7 @@ class Message:
             signal = self.signal(name)
             if not signal.minimum <= value <= signal.maximum:  # this way round, NaN is refused
                 return FrameError(f"{self.name}.{name}: expected {signal.range_text}, got {value!r}")
-            if signal.is_plain and int(value) != value:
+            if signal.factor == 1 and int(value) != value:
                 return FrameError(f"{self.name}.{name}: expected a whole number, got {value!r}")
         raise ValueError(f"{self.name}: a frame can carry {values}")
 
@@ -144,11 +134,7 @@ class Message:
 
 def from_document(found: Mapping[str, Any]) -> Message:
     """A message of its fields as JSON has them; by hand, since a compiled record does not tell the types of its own."""
-    signals = (
-        Signal(**{**signal, "choices": {int(value): name for value, name in signal["choices"].items()}})
-        for signal in found["signals"]
-    )
-    return Message(**{**found, "signals": tuple(signals)})
+    return Message(**{**found, "signals": tuple(Signal(**signal) for signal in found["signals"])})
 
 
 def worst_bits(length: int, *, extended: bool = False) -> int:
@@ -192,77 +178,35 @@ def parse(text: str) -> Database:
     return database
 
 
-def generate(database: Database, name: str, expected: Set[str]) -> Message:
-    """The description of one message of a DBC, whose signals are ``CRC`` and those expected.
-
-    The DBC may place all but the counter anywhere.
-
-    Raises:
-        FrameError: there is no such message, or not as this protocol needs it.
-    """
-    try:
-        source = database.get_message_by_name(name)
-    except KeyError:
-        raise FrameError(f"DBC: no message {name}; this file is not a layout of this bench") from None
-    found = {s.name: _generate_signal(name, s) for s in source.signals}
-    if found.keys() != {"CRC", *expected}:
-        raise FrameError(f"DBC: {name}: expected the signals CRC, {', '.join(sorted(expected))}")
-    signals = tuple(sorted(found.values(), key=lambda signal: signal.shift))
-    if source.is_extended_frame or source.is_fd or source.length > 8:
-        raise FrameError(f"DBC: {name}: expected a classical frame with an 11-bit identifier")
-    header = [(s.name, s.shift, s.mask) for s in signals[:2]]
-    if header != [("CRC", 0, 0xFF), ("Counter", 8, 0x0F)]:
-        raise FrameError(f"DBC: {name}: expected CRC in byte 0 and Counter in the low half of byte 1")
-    covered = sum(s.mask << s.shift for s in signals)
-    data_id = _attribute(source, "DataId")
+def describe(source: Any) -> Message:
+    """The description of a message of ``emb.dbc``, of cantools'."""
+    signals = tuple(map(_describe_signal, sorted(source.signals, key=lambda signal: signal.start)))
+    data_id = int(source.dbc.attributes["DataId"].value)
     return Message(
-        name=name,
+        name=source.name,
         identifier=source.frame_id,
         length=source.length,
         data_id=data_id,
-        cycle_time=_attribute(source, "GenMsgCycleTime") * 1e-3,
+        cycle_time=source.cycle_time * 1e-3,
         signals=signals,
-        reserved=((1 << 8 * source.length) - 1) & ~covered,
+        reserved=((1 << 8 * source.length) - 1) & ~sum(s.mask << s.shift for s in signals),
         crc_start=e2e.profile1_start(data_id),
     )
 
 
-def _attribute(message: DbcMessage, name: str) -> int:
-    attributes = message.dbc.attributes if message.dbc else {}
-    if name not in attributes or not 0 < int(attributes[name].value) <= 0xFFFF:
-        raise FrameError(f"DBC: {message.name}: expected the attribute {name}, a whole number from 1 to 65535")
-    return int(attributes[name].value)
-
-
-def _generate_signal(message: str, source: DbcSignal) -> Signal:
-    where = f"DBC: {message}.{source.name}"
-    if source.byte_order != "little_endian" or source.is_float or source.is_multiplexer or source.multiplexer_ids:
-        raise FrameError(f"{where}: expected a plain little-endian integer signal")
-    sign = 1 << (source.length - 1) if source.is_signed else 0
-    mask = (1 << source.length) - 1
-    factor, offset = _number(source.scale), _number(source.offset)
-    if factor <= 0 or source.minimum is None or source.maximum is None:
-        raise FrameError(f"{where}: expected a positive step and a range [minimum|maximum]")
-    if not all(map(math.isfinite, (factor, offset, source.minimum, source.maximum))):
-        raise FrameError(f"{where}: expected finite numbers")
-    # The range is meant to lie on steps; the slack absorbs the decimal fractions' rounding, never a whole step.
-    raw_minimum = math.ceil((source.minimum - offset) / factor - 1e-6)
-    raw_maximum = math.floor((source.maximum - offset) / factor + 1e-6)
-    if raw_minimum < -sign or raw_maximum > mask - sign:
-        raise FrameError(f"{where}: its range does not fit its {source.length} bits")
+def _describe_signal(source: Any) -> Signal:
+    factor, minimum, maximum = map(_number, (source.scale, source.minimum, source.maximum))
     return Signal(
         name=source.name,
         unit=source.unit or "",
-        minimum=_number(source.minimum),
-        maximum=_number(source.maximum),
-        choices={int(k): str(v) for k, v in (source.choices or {}).items()},
+        minimum=minimum,
+        maximum=maximum,
         factor=factor,
-        offset=offset,
         shift=source.start,
-        mask=mask,
-        sign=sign,
-        raw_minimum=raw_minimum,
-        raw_maximum=raw_maximum,
+        mask=(1 << source.length) - 1,
+        sign=1 << (source.length - 1) if source.is_signed else 0,
+        raw_minimum=round(minimum / factor),
+        raw_maximum=round(maximum / factor),
     )
 
 

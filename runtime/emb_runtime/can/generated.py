@@ -1,7 +1,7 @@
 """Encoder and decoder of a message as Python functions that are generated from its description in the DBC.
 
-Each is one expression per signal on the payload as one little-endian word; of a DBC only finite numbers get into the
-text. What does not fit is told by :meth:`emb_runtime.can.codec.Message.refusal` and ``decode``, which go by the table.
+Each is one expression per signal on the payload as one little-endian word. What does not fit is told by
+:meth:`emb_runtime.can.codec.Message.refusal` and ``decode``, which go by the table.
 """
 
 from __future__ import annotations
@@ -44,9 +44,6 @@ def generate_codec(message: Message, record: type[Any], fields: tuple[Field, ...
         fields: of the record, in order: every signal but the CRC, once.
     """
     coded = [_Coded(message.signal(field.signal), field, f"v{at}") for at, field in enumerate(fields)]
-    for c in coded:
-        if problem := c.field_problem():
-            raise FrameError(f"DBC: {message.name}.{c.signal.name}: {problem}")
     known: dict[str, Any] = {
         "T": CRC_TABLE,
         "Frame": Frame,
@@ -73,28 +70,17 @@ class _Coded(NamedTuple):
         factor = self.signal.factor
         return factor if self.field.scale == 1 else round(factor * self.field.scale)
 
-    def field_problem(self) -> str:
-        """Reason why the signal cannot carry what its field says; "" if it can."""
-        low, high = self.signal.raw_minimum, self.signal.raw_maximum
-        choices, fixed = self.field.choices, self.field.fixed
-        unscaled = (self.signal.factor, self.signal.offset) == (1, 0)
-        if choices and not (unscaled and (low, high) == (0, len(choices) - 1)):
-            return f"expected the whole numbers from 0 to {len(choices) - 1}"
-        if fixed is not None and not (unscaled and low <= fixed <= high):
-            return f"expected whole numbers with {fixed} among them"
-        return ""
-
     def check(self) -> str:
         """True for a value that can be encoded; NaN is refused by the order of the comparisons."""
         low, high = self.signal.minimum, self.signal.maximum
         if self.field.wraps or self.field.fixed is not None:
             return ""
         bounds = f"{low!r} <= {self.name}" + ("" if self.field.saturates else f" <= {high!r}")
-        return f"{bounds} and int({self.name}) == {self.name}" if self.signal.is_plain else bounds
+        return f"{bounds} and int({self.name}) == {self.name}" if self.signal.factor == 1 else bounds
 
     def encoded(self) -> str:
         """The raw value of the value."""
-        value, step, zero = self.name, self.step, self.signal.offset
+        value, step = self.name, self.step
         if self.field.fixed is not None:
             return str(self.field.fixed)
         if self.field.wraps:
@@ -102,8 +88,7 @@ class _Coded(NamedTuple):
             return f"{whole} & {self.signal.mask}"
         if self.field.saturates:
             value = f"min({value}, {self.signal.maximum!r})"
-        value = f"({value} - {zero!r})" if zero else value
-        return f"int({value})" if self.signal.is_plain else f"round({value} / {step!r})"
+        return f"int({value})" if self.signal.factor == 1 else f"round({value} / {step!r})"
 
     def raw(self) -> str:
         """The raw value in the word."""
@@ -113,11 +98,9 @@ class _Coded(NamedTuple):
 
     def decoded(self) -> str:
         """The value of the raw value."""
-        value, step, zero = self.name, self.step, self.signal.offset
         if self.field.choices:
-            return f"choices_{value}[{value}]"
-        value = value if step == 1 else f"{value} * {step!r}"
-        return f"{value} + {zero!r}" if zero else value
+            return f"choices_{self.name}[{self.name}]"
+        return self.name if self.step == 1 else f"{self.name} * {self.step!r}"
 
 
 def _encoder(message: Message, coded: list[_Coded]) -> str:

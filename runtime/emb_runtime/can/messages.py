@@ -14,13 +14,12 @@ from functools import cache
 from importlib import resources
 from typing import Any, Final, NamedTuple
 
-from emb_runtime.can.codec import Message, generate, parse
+from emb_runtime.can.codec import Message, describe, parse
 from emb_runtime.can.generated import Field, generate_codec
-from emb_runtime.errors import FrameError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 
-CHARGE: Final = "EMB_Charge"  # Name of the message that a node need not send
-GATEWAY: Final = "EMB_Gateway"  # Name of a message that the layouts of logs before it do not have
+CHARGE: Final = "EMB_Charge"
+GATEWAY: Final = "EMB_Gateway"  # Names of the messages that a node need not send
 OPTIONAL_VERSION: Final = 1  # Version of each of the two
 
 
@@ -125,12 +124,12 @@ _FIELDS: Mapping[str, tuple[type[Any], tuple[Field, ...]]] = {
         ),
     ),
 }
-"""Record of each message, and the signal of each of its fields; a DBC that has others is not ours."""
+"""Record of each message, and the signal of each of its fields: all but the CRC."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """All messages of the bench with their encoders and decoders, and the DBC text that they come from.
+    """All messages of ``emb.dbc`` with their encoders and decoders, and its text.
 
     An encoder takes the fields of its record, and raises FrameError where a value does not fit. A decoder raises
     FrameRejectedError for a frame that is not valid in all respects.
@@ -144,7 +143,7 @@ class Layout:
     velocity: Message
     status: Message
     charge: Message  # A node may send it
-    gateway: Message | None  # A gateway sends it; None in a log of before
+    gateway: Message  # A gateway sends it
     device_time_period_ns: int  # Period after which the device time wraps [ns]
     encode_command: Callable[[int, int, float, bool], Frame]
     encode_angle: Callable[[int, float, int], Frame]
@@ -160,8 +159,7 @@ class Layout:
     @property
     def known(self) -> tuple[Message, ...]:
         """All messages, those included that need not be sent."""
-        required = (*self.messages.values(), self.charge)
-        return required if self.gateway is None else (*required, self.gateway)
+        return (*self.messages.values(), self.charge, self.gateway)
 
     def current_within(self, limit: float) -> float:
         """The largest current that a command can carry and that is not beyond a limit [A]."""
@@ -178,44 +176,17 @@ def bench_identity(identity_hash: str) -> int:
     return int(identity_hash[:4], 16)
 
 
-def load_layout(dbc_text: str | None = None) -> Layout:
-    """Generate the codec from the text of a DBC file; without one, from the shipped ``emb.dbc``.
-
-    Raises:
-        FrameError: the text is not a DBC, or not one of this protocol: the message names the entry and the reason.
-    """
-    if dbc_text is None:
-        return _shipped_layout()
-    try:
-        return _generate(dbc_text)
-    except ArithmeticError as err:  # of a number of 400 digits, or a step of 1e-310
-        raise FrameError(f"DBC: expected numbers that can be calculated with: {err}") from err
-
-
 @cache
-def _shipped_layout() -> Layout:
-    return _generate(resources.files("emb_runtime.can").joinpath("emb.dbc").read_text(encoding="utf-8"))
-
-
-def _generate(text: str) -> Layout:
-    database = parse(text)
-    there = {message.name for message in database.messages}
-    names = [name for name in _FIELDS if name != GATEWAY or name in there]
-    messages = {name: generate(database, name, {field.signal for field in _FIELDS[name][1]}) for name in names}
-    time = messages["EMB_Angle"].signal("DeviceTime")
-    step_ns = round(time.factor * 1e9)
-    if step_ns < 1 or not math.isclose(step_ns * 1e-9, time.factor, rel_tol=1e-9):
-        raise FrameError(f"DBC: EMB_Angle.DeviceTime: expected a step of whole nanoseconds, got {time.factor:g} s")
-    _check_choices(messages["EMB_Velocity"], "NodeState", NodeState)
-    _check_choices(messages["EMB_Status"], "NodeState", NodeState)
-    _check_choices(messages["EMB_Status"], "StopReason", StopReason)
-    attributes = database.dbc.attributes if database.dbc else {}
-    if "EmbProtocolVersion" not in attributes:
-        raise FrameError("DBC: expected the attribute EmbProtocolVersion; this file is not a layout of this bench")
-    version = int(attributes["EmbProtocolVersion"].value)
+def load_layout() -> Layout:
+    """Generate the codec from ``emb.dbc``."""
+    text = resources.files("emb_runtime.can").joinpath("emb.dbc").read_text(encoding="utf-8")
+    database: Any = parse(text)
+    version = int(database.dbc.attributes["EmbProtocolVersion"].value)
+    messages = {name: describe(database.get_message_by_name(name)) for name in _FIELDS}
     codecs = {name: generate_codec(message, *_fields(name, version)) for name, message in messages.items()}
-    command, angle, velocity, status, charge = list(codecs.values())[:5]
-    optional, gateway = messages.pop(CHARGE), messages.pop(GATEWAY, None)
+    command, angle, velocity, status, charge, gateway = codecs.values()
+    optional = messages.pop(CHARGE), messages.pop(GATEWAY)
+    time = messages["EMB_Angle"].signal("DeviceTime")
     return Layout(
         text=text,
         protocol_version=version,
@@ -224,15 +195,15 @@ def _generate(text: str) -> Layout:
         angle=messages["EMB_Angle"],
         velocity=messages["EMB_Velocity"],
         status=messages["EMB_Status"],
-        charge=optional,
-        gateway=gateway,
-        device_time_period_ns=step_ns * (time.mask + 1),
+        charge=optional[0],
+        gateway=optional[1],
+        device_time_period_ns=round(time.factor * 1e9) * (time.mask + 1),
         encode_command=command.encode,
         encode_angle=angle.encode,
         encode_velocity=velocity.encode,
         encode_status=status.encode,
         encode_charge=charge.encode,
-        encode_gateway=codecs[GATEWAY].encode if gateway else _no_gateway,
+        encode_gateway=gateway.encode,
         decode_command=command.decode,
         decode_angle=angle.decode,
         decode_velocity=velocity.decode,
@@ -243,15 +214,3 @@ def _generate(text: str) -> Layout:
 def _fields(name: str, version: int) -> tuple[type[Any], tuple[Field, ...]]:
     record, fields = _FIELDS[name]
     return record, tuple(replace(f, fixed=version) if f.signal == "ProtocolVersion" else f for f in fields)
-
-
-def _no_gateway(*_: object) -> Frame:
-    raise FrameError(f"DBC: no message {GATEWAY}: expected a layout that has it")
-
-
-def _check_choices(message: Message, name: str, enum: type[IntEnum]) -> None:
-    """Refuse a value table that says something else than the enum its values are decoded to."""
-    signal = message.signal(name)
-    expected = {int(member): member.name.lower() for member in enum}
-    if signal.choices != expected or (signal.raw_minimum, signal.raw_maximum) != (min(expected), max(expected)):
-        raise FrameError(f"DBC: {message.name}.{name}: expected the values {expected}, got {signal.choices}")

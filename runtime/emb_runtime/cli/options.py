@@ -381,7 +381,7 @@ def _stop_condition(args: argparse.Namespace, bench: Bench) -> StopCondition | N
     estimates = estimated(bench)
     if args.stop_when is not None:
         return parse_stop_condition(args.stop_when, estimates)
-    goal = ",".join(f"{quantity.name}={QUICK_GOAL}" for quantity in estimates)
+    goal = ",".join(f"{name}={QUICK_GOAL}" for name in estimates)
     return parse_stop_condition(goal, estimates) if args.quick else None
 
 

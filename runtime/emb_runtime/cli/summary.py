@@ -31,7 +31,7 @@ from emb_runtime.safety.watchdog import WatchdogResult
 from emb_runtime.system import compiled_core
 from emb_runtime.system.clock import Clock
 
-ESTIMATE_RATE = 25_000  # Log rate of each parameter that is estimated [bytes per second]
+ESTIMATE_RATE = 100_000  # Log rate of the estimates [bytes per second]
 LEARNT_RATE = 150_000  # Log rate of what the shield learns [bytes per second]
 LOG_RATE = 500_000  # Log rate of a run at 1 kHz, with room to spare: measured are 250 to 310 kB [bytes per second]
 
@@ -99,7 +99,7 @@ def header(
         | {f"bus_{name}": value for name, value in transport.obtained.items()},
     }
     attachments = [Attachment("bench.toml", "application/toml", bench.text.encode())]
-    estimates: Sequence[estimate.Quantity] = ()
+    topics: list[str] = []
     if run_type is RunType.EXPERIMENT:
         assert policy is not None
         records["emb.run"] |= {
@@ -109,7 +109,7 @@ def header(
         }
         if plan.stop_condition is not None:
             records["emb.run"]["stop_when"] = plan.stop_condition.text
-        estimates = estimated(bench)
+        topics = ["/estimate"] if estimated(bench) else []
         attachments.append(Attachment("policy.onnx", "application/octet-stream", policy.data))
     if lines:
         records["emb.preflight"] = {
@@ -135,8 +135,7 @@ def header(
         messages=plan.layout.known,
         metadata=records,
         attachments=tuple(attachments),
-        estimates=estimates,
-        learns=learns,
+        topics=[*topics, "/learnt"] if learns else topics,
         drive_bus=plan.drive.bus if plan.drive is not None else "",
     )
 
@@ -147,7 +146,7 @@ def log_bytes(plan: Plan, duration: float) -> int:
     rate = LOG_RATE + LEARNT_RATE * plan.bench.shield.learn
     if plan.policy is not None:
         carried += len(plan.policy.data)
-        rate += ESTIMATE_RATE * len(estimated(plan.bench))
+        rate += ESTIMATE_RATE
     return carried + round(rate * duration * 1e-3 / plan.bench.timing.sample_time)
 
 
@@ -216,7 +215,7 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         "duration_s": outcome.duration_ns * 1e-9,
         **facts(outcome),
         "learnt": {} if outcome.learnt is None else ranges_of(outcome.learnt),
-        "estimate": estimate.by_name(estimated(plan.bench), outcome.estimate),
+        "estimate": estimate.by_name(outcome.estimate),
         "outside": beyond,
         "goal_s": outcome.goal_ns * 1e-9 if outcome.goal_reached else None,
         "end_angle": outcome.end_angle,
@@ -236,13 +235,13 @@ def outside(bench: Bench, numbers: Sequence[float]) -> dict[str, tuple[float, fl
 
     The estimator does not go beyond the ranges itself.
     """
-    name, quantities = bench.shield.ranges, estimated(bench)
+    name = bench.shield.ranges
     ranges = bench.range_set(name)
     found = {}
-    for quantity, value in zip(quantities, numbers[: len(quantities)], strict=False):
-        low, high = getattr(ranges.low, quantity.name), getattr(ranges.high, quantity.name)
+    for parameter, found_value in estimate.by_name(numbers).items():
+        value, low, high = found_value["value"], getattr(ranges.low, parameter), getattr(ranges.high, parameter)
         if not low * (1.0 + BORDER) < value < high * (1.0 - BORDER):
-            found[quantity.name] = (value, low, high, name)
+            found[parameter] = (value, low, high, name)
     return found
 
 

@@ -29,7 +29,7 @@ from emb_runtime.control.result import Outcome, RunCounters
 from emb_runtime.control.start_conditions import READY_PAIRS, Bounds, StartConditions
 from emb_runtime.control.stop_condition import REACHED, StopCondition
 from emb_runtime.estimator.estimate import LOST
-from emb_runtime.estimator.estimator import Estimator
+from emb_runtime.estimator.estimator import Estimator, estimated
 from emb_runtime.learning.known import numbers
 from emb_runtime.learning.learner import Learner, words
 from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord, Record
@@ -137,7 +137,7 @@ class Core:
         self._answered: int | None = None  # counter of the sample that the newest of them answered
         self._permitted = True
         self._estimate: tuple[float, ...] = ()  # the latest
-        self._estimates = not self.homing and bool(self._estimator.estimate)  # there is one, and it was finite so far
+        self._estimates = not self.homing and bool(estimated(bench))  # there is an estimate, and it was finite so far
         self._condition_met = False
         self._met_ns = 0  # from the first sample to that at which it was met, device time
         self._silent: SensorSample | None = None  # the newest one before arming

@@ -78,7 +78,7 @@ class Outcome:
     rejections: Mapping[str, Mapping[str, int]]  # Number of rejections by message name and reason; only what happened
     bus_errors: Mapping[str, int]  # Number of the CAN controller's reports by error; only what happened
     estimate: tuple[float, ...] = ()
-    """The actor's last estimate: values, then their standard deviations; empty if it estimates nothing."""
+    """Last :attr:`~emb_runtime.estimator.estimator.Estimator.estimate`; empty if there was none."""
     model_fits: bool = True  # The estimator's model explains the measurements
     unexplained: float = math.nan
     """Velocity that no one brake explains, see :mod:`emb_runtime.safety.motion_balance`; NaN of a run that was not

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from emb_runtime.errors import UsageError, near
-from emb_runtime.estimator.estimate import Quantity
+from emb_runtime.estimator.estimate import UNITS
 
+NAMES, COUNT = tuple(UNITS), len(UNITS)
 REACHED = "KNOWN_ENOUGH"  # Code of the event that says so in the log
 
 
@@ -16,26 +17,22 @@ class StopCondition:
     """Standard deviations, each as a part of its value, that the estimate has to fall below."""
 
     text: str  # Text as :func:`parse_stop_condition` reads it
-    names: tuple[str, ...]  # Names of all parameters that are estimated, in their order
-    parts: tuple[tuple[int, float], ...]  # Indices among them, and the bound of each relative deviation; 0.01 is 1 %
+    parts: tuple[tuple[int, float], ...]  # Indices of parameters, and the bound of each relative deviation; 0.01 is 1 %
 
     def reached(self, estimate: Sequence[float]) -> bool:
-        """Returns True if all deviations, which follow the values, are below their bounds. One of zero is an error."""
-        count = len(self.names)
-        return all(0.0 < estimate[count + at] < part * abs(estimate[at]) for at, part in self.parts)
+        """Returns True if all deviations are below their bounds. One of zero is an error."""
+        return all(0.0 < estimate[COUNT + at] < part * abs(estimate[at]) for at, part in self.parts)
 
     def describe(self, estimate: Sequence[float]) -> str:
         """Deviations and their bounds in words, of a condition that is met."""
-        count = len(self.names)
         return ", ".join(
-            f"{self.names[at]} to {100.0 * estimate[count + at] / abs(estimate[at]):.3g} % of {100.0 * part:.3g} %"
+            f"{NAMES[at]} to {100.0 * estimate[COUNT + at] / abs(estimate[at]):.3g} % of {100.0 * part:.3g} %"
             for at, part in self.parts
         )
 
 
-def parse_stop_condition(text: str, estimates: Sequence[Quantity]) -> StopCondition:
-    """Read a stop condition such as ``k_1=1%,f_v=5%`` on what is estimated."""
-    names = tuple(quantity.name for quantity in estimates)
+def parse_stop_condition(text: str, names: Sequence[str]) -> StopCondition:
+    """Read a stop condition such as ``k_1=1%,f_v=5%`` on the parameters that are estimated."""
     if not names:
         raise UsageError("--stop-when: the bench's [estimator] leaves no parameter open: leave it out")
     parts: dict[int, float] = {}
@@ -44,10 +41,10 @@ def parse_stop_condition(text: str, estimates: Sequence[Quantity]) -> StopCondit
         if (name := name.strip()) not in names:
             expected = f"--stop-when: expected one of {', '.join(names)}, which are estimated"
             raise UsageError(f"{expected}, got '{name}'{near(name, names)}")
-        if names.index(name) in parts:
+        if NAMES.index(name) in parts:
             raise UsageError(f"--stop-when: {name} is named twice")
-        parts[names.index(name)] = _part(name, percent.strip())
-    return StopCondition(text, names, tuple(parts.items()))
+        parts[NAMES.index(name)] = _part(name, percent.strip())
+    return StopCondition(text, tuple(parts.items()))
 
 
 def _part(name: str, percent: str) -> float:

@@ -4,33 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 LOST = "ESTIMATE_LOST"  # Code of the event after which a run has no estimate: it was not finite
 NORMAL_95 = 1.959963984540054  # Standard deviations that 95 % of a Gaussian lie within
 
 
-class Quantity(NamedTuple):
-    """A signal with its unit."""
-
-    name: str
-    unit: str
+UNITS = {"k_m": "N·m/A", "k_1": "N/rad", "T_c": "N·m", "f_v": "N·m·s/rad"}  # Of the parameters
 
 
-def by_name(quantities: Sequence[Quantity], numbers: Sequence[float]) -> dict[str, dict[str, Any]]:
-    """Value, standard deviation, 95 % interval and unit of each quantity, by values that their deviations follow."""
-    if not numbers:
-        return {}
-    count = len(quantities)
-    both = zip(quantities, numbers[:count], numbers[count:], strict=True)
+def by_name(numbers: Sequence[float]) -> dict[str, dict[str, Any]]:
+    """Value, standard deviation, 95 % interval and unit of each parameter that is estimated.
+
+    The ``numbers`` are those of :attr:`emb_runtime.estimator.estimator.Estimator.estimate`.
+    """
     return {
-        q.name: {
+        name: {
             "value": value,
             "deviation": deviation,
             "interval_95": [value - NORMAL_95 * deviation, value + NORMAL_95 * deviation],
-            "unit": q.unit,
+            "unit": UNITS[name],
         }
-        for q, value, deviation in both
+        for name, value, deviation in zip(UNITS, numbers[:4], numbers[4:], strict=False)
+        if deviation > 0.0
     }
 
 

@@ -5,17 +5,13 @@ from __future__ import annotations
 import math
 
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
-from emb_runtime.estimator.estimate import Quantity
 from emb_runtime.estimator.kalman import Four, State, believed, deviations, fits, follow, make_model, start
 
-UNITS = {"k_m": "N·m/A", "k_1": "N/rad", "T_c": "N·m", "f_v": "N·m·s/rad"}  # Of the parameters
 
-
-def estimated(bench: Bench) -> tuple[Quantity, ...]:
-    """Parameters that are estimated on a bench: those that its prior leaves open."""
+def estimated(bench: Bench) -> tuple[str, ...]:
+    """Names of the parameters that are estimated on a bench: those that its prior leaves open."""
     ranges = bench.range_set(bench.prior)
-    names = (name for name in PARAMETER_NAMES if getattr(ranges.low, name) < getattr(ranges.high, name))
-    return tuple(Quantity(name, UNITS[name]) for name in names)
+    return tuple(name for name in PARAMETER_NAMES if getattr(ranges.low, name) < getattr(ranges.high, name))
 
 
 class Estimator:
@@ -25,8 +21,6 @@ class Estimator:
         """Make the model, and begin."""
         ranges = bench.range_set(bench.prior)
         self.model = make_model(bench, ranges, sticks=bench.shield.model != "euler")
-        varied = [PARAMETER_NAMES.index(quantity.name) for quantity in estimated(bench)]
-        self._varied = [*varied, *(len(PARAMETER_NAMES) + i for i in varied)]  # Indices in :attr:`parameters`
         self.state: State = start(self.model)
 
     def begin(self) -> None:
@@ -50,7 +44,7 @@ class Estimator:
 
     @property
     def parameters(self) -> tuple[float, ...]:
-        """k_m, k_1, T_c and f_v in SI units, then their standard deviations."""
+        """k_m, k_1, T_c and f_v in SI units, then their standard deviations: 0 of one that the prior does not open."""
         return self.in_si(self.relative) + self.in_si(deviations(self.model, self.state))
 
     @property
@@ -60,7 +54,6 @@ class Estimator:
 
     @property
     def estimate(self) -> tuple[float, ...]:
-        """Values of :func:`estimated`, then their standard deviations, in SI units; empty if one is not finite."""
+        """The :attr:`parameters`; empty if one is not finite."""
         numbers = self.parameters
-        chosen = tuple(numbers[i] for i in self._varied)
-        return chosen if all(map(math.isfinite, chosen)) else ()
+        return numbers if all(map(math.isfinite, numbers)) else ()

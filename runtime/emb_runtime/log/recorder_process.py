@@ -26,12 +26,12 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from msgspec import convert
 
-from emb_runtime.can.codec import FrameRejectedError, Signal, from_document
-from emb_runtime.can.messages import CHARGE
+from emb_runtime.can.codec import FrameRejectedError, from_document
 from emb_runtime.can.transport import SocketCan
 from emb_runtime.errors import BusError, EmbError, LogError
-from emb_runtime.log import mcap_schema
+from emb_runtime.log import topics
 from emb_runtime.log.ring_buffer import (
+    KINDS,
     ClockRecord,
     EstimateRecord,
     EventRecord,
@@ -42,7 +42,7 @@ from emb_runtime.log.ring_buffer import (
     Ring,
     unpack,
 )
-from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.records import Frame
 from emb_runtime.system import child_process
 from emb_runtime.system.clock import MonotonicClock
 from emb_runtime.system.realtime import step_back
@@ -55,6 +55,7 @@ BATCH = 128  # Records between two looks at the clock
 
 RUN = "emb.run"
 END = "emb.end"  # Names of the metadata records with the run's identity and with its outcome
+OPTIONAL = {"/estimate", "/learnt", "/drive/rx", "/emb/EMB_Charge"}  # Topics that not every log has
 DIED = "the runtime process died"  # Exit reason in a log whose runtime ended without saying why
 
 
@@ -69,6 +70,7 @@ class LogWriter:
         self._mcap.start(profile="", library=f"{tool} mcap-python/{mcap.__version__}")
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
+        self._topics = {kind.record: kind.topic for kind in KINDS}
         self._sequences: dict[int, int] = {}
         self.messages = 0  # Messages written
         self.undecoded = 0  # Frames that are no valid frame of ours: they are in the log as they were on the bus only
@@ -78,32 +80,9 @@ class LogWriter:
         self._attach(begin, "emb.dbc", "text/plain", header.dbc.encode())
         for attachment in header.attachments:
             self._attach(begin, *attachment)
-        for topic in mcap_schema.FIXED_TOPICS:
-            self._register(topic)
-        estimate = mcap_schema.estimate_topic(header.estimates)
-        if header.estimates:
-            self._register(estimate)
-        if header.learns:
-            self._register(mcap_schema.LEARNT)
-        if header.drive_bus:
-            self._register(mcap_schema.DRIVE)
-        names = [field.name for field in estimate.fields]
-        self._rows: dict[type[Record], tuple[mcap_schema.Topic, tuple[str, ...]]] = {
-            CycleRecord: (mcap_schema.CYCLE, CycleRecord._fields),
-            EventRecord: (mcap_schema.SAFETY, ("code", "text")),
-            ClockRecord: (mcap_schema.CLOCK, ClockRecord._fields),
-            EstimateRecord: (estimate, (names[0], *names[1::2], *names[2::2])),  # the values, then their deviations
-            LearntRecord: (mcap_schema.LEARNT, tuple(field.name for field in mcap_schema.LEARNT.fields)),
-        }
-        """Topic of each record but a frame's, and the names of its values there."""
-        self._decoded = {
-            message.name: mcap_schema.message_topic(
-                message.name, message.identifier, [_field(s) for s in message.signals]
-            )
-            for message in self._messages.values()
-        }
-        for name in self._decoded.keys() - {CHARGE}:
-            self._register(self._decoded[name])
+        for topic in topics.TOPICS:
+            if topic not in OPTIONAL or topic in header.topics:
+                self._register(topic)
         # A chunk needs a message to be written, and whoever reads a cut file needs this chunk.
         self.write(ClockRecord(header.start_ns, begin), begin)
         self.flush()
@@ -113,17 +92,18 @@ class LogWriter:
         if isinstance(record, FrameRecord):
             self._write_frame(record, log_time)
             return
-        topic, names = self._rows[type(record)]
         values: tuple[Any, ...] = record
         if isinstance(record, EventRecord):
             values = record.code, record.text
         elif isinstance(record, EstimateRecord | LearntRecord):
             values = record.step, *record.numbers
+        topic = self._topics[type(record)]
+        names = topics.message_class(topics.TOPICS[topic]).DESCRIPTOR.fields_by_name
         self._add(topic, log_time, record.time_ns, dict(zip(names, values, strict=True)))
 
     def write_drive(self, frame: Frame, read_ns: int, log_time: int) -> None:
         """Write a frame of a mapped drive's bus, whose identifiers have another meaning."""
-        self._add(mcap_schema.DRIVE, log_time, frame.time_ns, _frame_values(frame, read_ns))
+        self._add("/drive/rx", log_time, frame.time_ns, _frame_values(frame, read_ns))
 
     def flush(self) -> None:
         """Hand everything written so far to the operating system."""
@@ -137,34 +117,33 @@ class LogWriter:
 
     def _write_frame(self, record: FrameRecord, log_time: int) -> None:
         frame, read_ns = record
-        topic = mcap_schema.CAN_TX if frame.own else mcap_schema.CAN_RX
-        self._add(topic, log_time, frame.time_ns, _frame_values(frame, read_ns))
+        self._add("/can/tx" if frame.own else "/can/rx", log_time, frame.time_ns, _frame_values(frame, read_ns))
         try:
             message = self._messages[frame.identifier]
             signals = message.decode(frame)
         except (KeyError, FrameRejectedError):
             self.undecoded += 1
             return
-        topic = self._decoded[message.name]
-        if topic.name not in self._channels:  # of an optional message
-            self._register(topic)
-        self._add(topic, log_time, frame.time_ns, signals)
+        self._add(f"/emb/{message.name}", log_time, frame.time_ns, signals)
 
-    def _register(self, topic: mcap_schema.Topic) -> None:
-        if topic.message not in self._schemas:
-            data = topic.descriptor.SerializeToString()
-            self._schemas[topic.message] = self._mcap.register_schema(topic.message, SchemaEncoding.Protobuf, data)
-        self._channels[topic.name] = self._mcap.register_channel(
-            topic.name, MessageEncoding.Protobuf, self._schemas[topic.message], topic.metadata
+    def _register(self, topic: str) -> None:
+        message = topics.TOPICS[topic]
+        if message not in self._schemas:
+            data = topics.schema(message)
+            self._schemas[message] = self._mcap.register_schema(f"emb.{message}", SchemaEncoding.Protobuf, data)
+        self._channels[topic] = self._mcap.register_channel(
+            topic, MessageEncoding.Protobuf, self._schemas[message], topics.metadata(message)
         )
 
     def _attach(self, when: int, name: str, media_type: str, data: bytes) -> None:
         self._mcap.add_attachment(create_time=when, log_time=when, name=name, media_type=media_type, data=data)
 
-    def _add(self, topic: mcap_schema.Topic, log_time: int, time_ns: int, values: Mapping[str, Any]) -> None:
-        channel = self._channels[topic.name]
+    def _add(self, topic: str, log_time: int, time_ns: int, values: Mapping[str, Any]) -> None:
+        if topic not in self._channels:
+            self._register(topic)
+        channel = self._channels[topic]
         self._sequences[channel] = sequence = self._sequences.get(channel, 0) + 1
-        data = topic.factory(**values).SerializeToString()
+        data = topics.message_class(topics.TOPICS[topic])(**values).SerializeToString()
         self._mcap.add_message(channel, log_time, data, time_ns + self._offset, sequence)
         self.messages += 1
 
@@ -180,14 +159,6 @@ def _frame_values(frame: Frame, read_ns: int) -> dict[str, Any]:
         "dropped": frame.dropped,
         "read_time_ns": read_ns,
     }
-
-
-def _field(signal: Signal) -> mcap_schema.Field:
-    """The protobuf field of a signal: an enum if the DBC names all its values, else what its numbers need."""
-    if signal.choices and set(range(signal.raw_minimum, signal.raw_maximum + 1)) <= set(signal.choices):
-        names = {label.upper(): value for value, label in signal.choices.items()}
-        return mcap_schema.Field(signal.name, "enum", signal.unit, names)
-    return mcap_schema.Field(signal.name, "int64" if isinstance(signal.factor, int) else "double", signal.unit)
 
 
 class Recording:

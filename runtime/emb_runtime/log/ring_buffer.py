@@ -5,8 +5,8 @@ it, in the shared memory, so that both sides can read the count. Python promises
 processes on every processor, so each slot carries a checksum seeded with its index: a slot whose parts are not all
 visible yet reads as not written yet, and is read again later. A torn record can therefore not come out.
 
-The second half of the module is what travels: the header of the log, and the records, each as MessagePack after a type
-byte.
+The second half of the module is what travels: the header of the log, and the records of :data:`KINDS`, each as
+MessagePack after a type byte.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, cast
 
 from msgspec import msgpack
 
@@ -152,8 +152,7 @@ class LogHeader:
     metadata: Mapping[str, Mapping[str, str]]  # Metadata records by name; ``emb.run`` has the run's identity
     messages: tuple[Message, ...] = ()  # Of that DBC: these are decoded
     attachments: Sequence[Attachment] = ()  # Further files: ``policy.onnx``, ``bench.toml``
-    estimates: Sequence[tuple[str, str]] = ()  # Names and units of what is estimated
-    learns: bool = False  # The shield learns which brakes are possible
+    topics: Sequence[str] = ()  # Topics that not every log has, and this one will have
     drive_bus: str = ""  # Bus of a mapped drive, whose frames the recorder reads by itself; "" for none
 
 
@@ -194,11 +193,11 @@ class ClockRecord(NamedTuple):
 
 
 class EstimateRecord(NamedTuple):
-    """Estimate of the actor at a sample."""
+    """Running estimate at a sample."""
 
     time_ns: int  # Arrival time of the sample, monotonic [ns]
     step: int
-    numbers: tuple[float, ...]  # Values, then their standard deviations
+    numbers: tuple[float, ...]  # See :attr:`emb_runtime.estimator.estimator.Estimator.estimate`
 
 
 class LearntRecord(NamedTuple):
@@ -211,20 +210,36 @@ class LearntRecord(NamedTuple):
 
 Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | EstimateRecord | LearntRecord
 
-RECORDS: Final = (FrameRecord, CycleRecord, EventRecord, ClockRecord, EstimateRecord, LearntRecord)
-"""Types of the records; a type's place is its type byte in the ring."""
-KINDS: Final = {record: kind for kind, record in enumerate(RECORDS)}
+
+class Kind(NamedTuple):
+    """A kind of record: in the ring its MessagePack, in the log a message of a topic."""
+
+    record: type[Any]
+    topic: str
+    message: str  # Of ``emb.proto``, whose fields are those of the record but its ``time_ns``
+
+
+KINDS: Final = (
+    Kind(FrameRecord, "/can/rx", "CanFrame"),  # One that was sent goes to /can/tx
+    Kind(CycleRecord, "/cycle", "Cycle"),
+    Kind(EventRecord, "/safety", "SafetyEvent"),
+    Kind(ClockRecord, "/clock", "ClockSample"),
+    Kind(EstimateRecord, "/estimate", "Estimate"),
+    Kind(LearntRecord, "/learnt", "Learnt"),
+)
+"""A kind's place is its type byte in the ring."""
+_PLACES: Final = {kind.record: place for place, kind in enumerate(KINDS)}
 
 _MAX_CODE: Final = 40  # Bytes of an event's code
 _MAX_EVENT_TEXT: Final = MAX_PAYLOAD - _MAX_CODE - 16
 
 _ENCODER: Final = msgpack.Encoder(enc_hook=lambda number: number.item())  # of numpy
-_DECODERS: Final = tuple(msgpack.Decoder(record) for record in RECORDS)
+_DECODERS: Final = tuple(msgpack.Decoder(kind.record) for kind in KINDS)
 
 
 def pack(record: Record) -> tuple[int, bytes]:
     """Type byte and payload of a record: MessagePack of its fields. Texts beyond the slot are cut."""
-    kind = KINDS[type(record)]
+    kind = _PLACES[type(record)]
     if isinstance(record, EventRecord):
         record = record.clipped()
     return kind, _ENCODER.encode(record)

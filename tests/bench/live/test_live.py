@@ -31,8 +31,7 @@ from emb_bench.logs.log import read_log
 from emb_bench.logs.mcap_file import Chunk
 from emb_runtime.cli import main as emb_run
 from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, LogError
-from emb_runtime.estimator.estimate import LOST
-from emb_runtime.estimator.estimator import UNITS
+from emb_runtime.estimator.estimate import LOST, UNITS
 from tests.bench.damaged import rewritten, without
 
 SECONDS = 20.0

@@ -5,24 +5,39 @@ from typing import Any
 
 import numpy as np
 import pytest
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
 from google.protobuf.message import DecodeError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_bench.logs.mcap_file import columns
-from emb_runtime.log.mcap_schema import Field, Topic
+from emb_bench.logs.mcap_file import columns, message_class
 
-ALL = Topic(
-    "/all",
-    "test.All",
-    (
-        *(Field("real", "double"), Field("whole", "int64"), Field("natural", "uint64"), Field("small", "uint32")),
-        *(Field("flag", "bool"), Field("text", "string"), Field("data", "bytes")),
-        Field("kind", "enum", "", {"A": 0, "B": 1}),
-        *(Field(f"far{n}", "int64") for n in range(8)),
-    ),
-    {},
-)
+KINDS = {
+    "real": "double",
+    "whole": "int64",
+    "natural": "uint64",
+    "small": "uint32",
+    "flag": "bool",
+    "text": "string",
+    "data": "bytes",
+    "kind": "enum",
+    **{f"far{n}": "int64" for n in range(8)},
+}
+
+
+def all_kinds() -> Any:
+    """The class of a message with a field of each kind."""
+    file = FileDescriptorProto(name="all.proto", package="test", syntax="proto3")
+    message, enum = file.message_type.add(name="All"), file.enum_type.add(name="Kind")
+    enum.value.add(name="A", number=0)
+    enum.value.add(name="B", number=1)
+    for number, (name, kind) in enumerate(KINDS.items(), 1):
+        of = FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}")
+        message.field.add(name=name, number=number, type=of, type_name=".test.Kind" if kind == "enum" else None)
+    return message_class("test.All", FileDescriptorSet(file=[file]).SerializeToString())
+
+
+ALL = all_kinds()
 VALUES: dict[str, st.SearchStrategy[Any]] = {
     "real": st.floats(),
     "whole": st.integers(-(2**63), 2**63 - 1),
@@ -44,7 +59,7 @@ TYPES = {"real": np.float64, "flag": np.bool_, "text": np.object_, "data": np.ob
 def test_columns_hold_what_was_written_and_zero_where_nothing_was(
     messages: list[dict[str, Any]], wanted: set[str]
 ) -> None:
-    found = columns(ALL.factory, [ALL.factory(**message).SerializeToString() for message in messages], wanted)
+    found = columns(ALL, [ALL(**message).SerializeToString() for message in messages], wanted)
     assert set(found) == wanted
     for name, column in found.items():
         assert column.dtype == TYPES.get(name, np.int64)
@@ -56,10 +71,10 @@ def test_columns_hold_what_was_written_and_zero_where_nothing_was(
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=4))
 def test_any_bytes_are_columns_of_one_row_each_or_refused(payloads: list[bytes]) -> None:
     with suppress(DecodeError, OverflowError):
-        found = columns(ALL.factory, payloads, VALUES)
+        found = columns(ALL, payloads, VALUES)
         assert {column.shape for column in found.values()} == {(len(payloads),)}
 
 
 def test_a_number_beyond_63_bits_is_refused() -> None:
     with pytest.raises(OverflowError):
-        columns(ALL.factory, [ALL.factory(natural=2**63).SerializeToString()], {"natural"})
+        columns(ALL, [ALL(natural=2**63).SerializeToString()], {"natural"})

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emb_bench.logs.estimates import by_step, last_estimate, quantities
+from emb_bench.logs.estimates import by_step, last_estimate
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.rerun import Rerun, rerun
@@ -19,12 +19,11 @@ from emb_runtime.control.stop_condition import parse_stop_condition
 from emb_runtime.errors import LogError
 from emb_runtime.estimator.estimate import LOST
 from emb_runtime.estimator.estimator import estimated
-from emb_runtime.log import mcap_schema
-from emb_runtime.log.mcap_schema import Field, Topic
 from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, Record
 
 from tests.bench.conftest import Replay  # isort: skip
 from tests.actors import constant_actor
+from tests.bench.damaged import rewritten, with_field, without
 from tests.bench.hostile import write_trace
 from tests.conftest import FunctionActor, Journal, SimRun, Simulate
 
@@ -75,11 +74,8 @@ def estimates(records: list[Record]) -> list[int]:
     return [n for n, record in enumerate(records) if isinstance(record, EstimateRecord)]
 
 
-def test_all_of_them_are_read_with_their_names_and_units(
-    write: Write, driven: tuple[SimRun, list[Record]], bench: Bench
-) -> None:
+def test_all_of_them_are_read_with_their_names_and_units(write: Write, driven: tuple[SimRun, list[Record]]) -> None:
     log, records = read_log(write()), [r for r in driven[1] if isinstance(r, EstimateRecord)]
-    assert quantities(log) == estimated(bench)
     assert by_step(log) == {record.step: record.numbers for record in records}
     said = last_estimate(log)
     assert list(said) == ["k_m", "k_1", "T_c", "f_v"]
@@ -130,26 +126,13 @@ def test_without_its_goal_the_run_goes_another_way(write: Write) -> None:
     assert not result.reproduced
 
 
-STEP, VALUE, DEVIATION = Field("step", "int64"), Field("x", "double"), Field("x_deviation", "double")
-OTHERS = Field("y", "double"), Field("y_deviation", "double")
-
-
-def test_a_topic_with_other_fields_is_refused_in_one_line(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    for fields in (
-        (STEP, DEVIATION, VALUE, *OTHERS),
-        (STEP, VALUE, OTHERS[0], DEVIATION, OTHERS[1]),
-        (STEP._replace(type="double"), VALUE, DEVIATION, *OTHERS),
-        (STEP._replace(name="k"), VALUE, DEVIATION, *OTHERS),
-        (STEP, VALUE, DEVIATION, OTHERS[0], Field("z_deviation", "double")),
-    ):
-        four = (*fields, *(Field(name, "double") for name in ("v", "v_deviation", "w", "w_deviation")))
-        topic = Topic(mcap_schema.ESTIMATE, "emb.Estimate", four, {})
-        with monkeypatch.context() as patch:
-            patch.setattr(mcap_schema, "estimate_topic", lambda _, topic=topic: topic)
-            path = write()
-        readers: tuple[Callable[[RunLog], object], ...] = (by_step, last_estimate, info_document)
+def test_a_topic_with_other_fields_is_refused_in_one_line(write: Write) -> None:
+    readers: tuple[Callable[[RunLog], object], ...] = (by_step, last_estimate, info_document)
+    for change in (without("/estimate", "T_c"), with_field("/estimate", "T_c", "string")):
+        path = write()
+        rewritten(path, change, values=lambda _t, _n, row: {**row, "T_c": "1"} if "T_c" in row else row)
         for read in readers:
-            with pytest.raises(LogError, match="/estimate: expected a step, and values with a deviation") as caught:
+            with pytest.raises(LogError, match="/estimate have other fields: expected ") as caught:
                 read(read_log(path))
             assert "\n" not in str(caught.value)
 
@@ -160,6 +143,6 @@ def test_a_log_without_estimates_has_no_such_topic(
     journal = Journal()
     run = simulate(steps=20, journal=journal, on_bench=(closed := replace(bench, prior="nominal")))
     log = read_log(write_trace(tmp_path / "run.mcap", journal.records, closed, layout, run.outcome, steps=20))
-    assert mcap_schema.ESTIMATE not in log.topics
-    assert (quantities(log), by_step(log), last_estimate(log)) == ((), {}, {})
+    assert "/estimate" not in log.topics
+    assert (by_step(log), last_estimate(log)) == ({}, {})
     assert "estimate" not in info_document(log)

@@ -13,7 +13,6 @@ from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import BenchFileError, LogError
-from emb_runtime.log.mcap_schema import LEARNT
 from tests.bench.conftest import Log, Replay
 from tests.bench.damaged import rewritten, without
 
@@ -71,7 +70,7 @@ def test_a_report_shows_the_set_that_is_left(learnt_log: Path, tmp_path: Path, r
 
 
 def test_a_log_without_a_bound_that_was_learnt_is_refused(learnt_log: Path) -> None:
-    rewritten(learnt_log, without(LEARNT.name, "k_m_low"))
+    rewritten(learnt_log, without("/learnt", "k_m_low"))
     for asked in (learnt_by_step, last_learnt):
         with pytest.raises(LogError, match="expected k_m_low"):
             asked(read_log(learnt_log))

@@ -59,6 +59,9 @@ def test_a_log_replays_alone(path: Path, run: SimRun) -> None:
     assert log.bench.brake == log.truth._replace(f_v=log.bench.brake.f_v)
     assert log.layout.text == load_layout().text
     assert read_log(write_log(path, run, metadata={})).truth is None
+    commented = load_layout().text.replace('CM_ "Electro', 'CM_ "An electro')
+    assert commented != load_layout().text
+    assert read_log(write_log(path, run, dbc=commented)).layout is load_layout()
 
 
 def test_decoded_signals_are_those_of_the_frames(path: Path, run: SimRun) -> None:
@@ -183,6 +186,7 @@ def test_what_a_log_should_carry_and_does_not_is_said(tmp_path: Path, run: SimRu
         ({"attachments": [Attachment("bench.toml", "", b"xx")]}, "bench", "not valid TOML"),
         ({"attachments": [Attachment("bench.toml", "", b"\xff")]}, "bench", "not UTF-8"),
         ({"metadata": {"emb.truth": {"f_v": "1"}}}, "truth", "true parameters"),
+        ({"dbc": load_layout().text.replace("[-6|6]", "[-5|5]")}, "layout", "its DBC is not that of this version"),
         ({"metadata": {"emb.truth": nan}}, "truth", "not positive"),
     )
     for changes, part, reason in rows:

@@ -19,7 +19,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.control.core import HOME_PAIRS
 from emb_runtime.control.stop_condition import REACHED, parse_stop_condition
 from emb_runtime.errors import UsageError
-from emb_runtime.estimator.estimate import LOST, Quantity
+from emb_runtime.estimator.estimate import LOST
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.records import Reason
 from emb_runtime.safety.state_machine import Fault
@@ -29,7 +29,7 @@ from tests.runtime.operating import EmbRun
 
 BENCH = load_bench()
 BOX = BENCH.range_set(BENCH.shield.ranges)
-TWO = (Quantity("k_1", "N/rad"), Quantity("f_v", "N·m·s/rad"))
+TWO = ("k_1", "f_v")
 
 
 class At:
@@ -88,14 +88,18 @@ def test_an_estimate_that_is_not_finite_any_more_is_none_and_said_once(simulate:
 
 def test_a_condition_is_reached_when_each_deviation_is_below_its_part_of_the_value() -> None:
     condition = parse_stop_condition(" k_1 = 1%, f_v=50 % ", TWO)
-    assert condition.parts == ((0, 0.01), (1, 0.5))
-    assert condition.reached((-2.0, 1.0, 0.0199, 0.49))
-    assert not condition.reached((-2.0, 1.0, 0.0201, 0.49))
-    assert not condition.reached((-2.0, 1.0, 0.0199, 0.51))
-    assert not condition.reached((0.0, 1.0, 0.0, 0.1))
-    assert not condition.reached((-2.0, 1.0, 0.0, 0.49)), "what is certain was not measured"
-    assert condition.describe((-2.0, 1.0, 0.019, 0.4)) == "k_1 to 0.95 % of 1 %, f_v to 40 % of 50 %"
-    assert parse_stop_condition("f_v=5%", TWO).reached((1.0, 1.0, 1e9, 0.04))
+    assert condition.parts == ((1, 0.01), (3, 0.5))
+
+    def numbers(k_1: float, f_v: float, k_1_deviation: float, f_v_deviation: float) -> tuple[float, ...]:
+        return 1.0, k_1, 1.0, f_v, 9.0, k_1_deviation, 9.0, f_v_deviation
+
+    assert condition.reached(numbers(-2.0, 1.0, 0.0199, 0.49))
+    assert not condition.reached(numbers(-2.0, 1.0, 0.0201, 0.49))
+    assert not condition.reached(numbers(-2.0, 1.0, 0.0199, 0.51))
+    assert not condition.reached(numbers(0.0, 1.0, 0.0, 0.1))
+    assert not condition.reached(numbers(-2.0, 1.0, 0.0, 0.49)), "what is certain was not measured"
+    assert condition.describe(numbers(-2.0, 1.0, 0.019, 0.4)) == "k_1 to 0.95 % of 1 %, f_v to 40 % of 50 %"
+    assert parse_stop_condition("f_v=5%", TWO).reached(numbers(1.0, 1.0, 1e9, 0.04))
 
 
 def test_what_is_no_condition_is_refused_in_one_line() -> None:
@@ -175,7 +179,7 @@ def test_a_run_is_logged_with_its_estimates_and_decides_the_same_again(
     assert summary["estimate"]["k_m"]["value"] == pytest.approx(BENCH.brake.k_m, rel=1e-2)
     log = steady.log()
     table = log.tables["/estimate"]
-    assert [*table][3:6] == ["step", "k_m", "k_m_deviation"]
+    assert [*table][3:9] == ["step", "k_m", "k_1", "T_c", "f_v", "k_m_deviation"]
     assert table["step"].tolist() == list(range(500))
     assert table["publish_time"].tolist() == log.cycles["publish_time"][:500].tolist()
     assert (np.diff(table["k_m_deviation"]) < 1e-4 * BENCH.brake.k_m).all()

@@ -196,7 +196,8 @@ def test_units_travel_in_the_channel_metadata(log: Path) -> None:
     channels = {c.topic: c.metadata for c in summary(log)[0].channels.values()}
     assert json.loads(channels["/cycle"]["units"])["sent_current"] == "A"
     assert json.loads(channels["/emb/EMB_Velocity"]["units"]) == {"Velocity": "rad/s", "AppliedCurrent": "A"}
-    assert channels["/emb/EMB_Angle"]["can_id"] == "0x100"
+    assert channels["/can/rx"]["dropped"] == "frames that the kernel has dropped on this socket so far"
+    assert channels["/clock"]["description"].startswith("Both clocks read at once: ")
 
 
 def test_metadata_and_attachments_make_the_file_replay_alone(log: Path) -> None:

@@ -1,0 +1,57 @@
+"""The topics of a log and their messages, which ``emb.proto`` describes, for the recorder and for readers."""
+
+from __future__ import annotations
+
+import json
+import re
+from functools import cache
+from importlib import resources
+from typing import Any, Final
+
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+from emb_runtime.log.ring_buffer import KINDS
+
+_COMPILED: Final = resources.files("emb_runtime.log").joinpath("emb.binpb").read_bytes()
+_FILE: Final = descriptor_pb2.FileDescriptorSet.FromString(_COMPILED).file[0]
+_POOL: Final = descriptor_pool.DescriptorPool()
+_POOL.Add(_FILE)
+
+TOPICS: Final = {
+    **{kind.topic: kind.message for kind in KINDS},
+    "/can/tx": "CanFrame",
+    "/drive/rx": "CanFrame",
+    **{f"/emb/{message.name}": message.name for message in _FILE.message_type if message.name.startswith("EMB_")},
+}
+"""Message of each topic."""
+
+
+@cache
+def message_class(message: str) -> Any:
+    """The class of a message."""
+    return message_factory.GetMessageClass(_POOL.FindMessageTypeByName(f"emb.{message}"))
+
+
+def schema(message: str) -> bytes:
+    """A message and the enumerations, as a reader without our code needs them: a serialised FileDescriptorSet."""
+    file = descriptor_pb2.FileDescriptorProto(name=f"emb/{message}.proto", package="emb", syntax="proto3")
+    file.message_type.extend(m for m in _FILE.message_type if m.name == message or m.enum_type)
+    return descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+
+
+@cache
+def metadata(message: str) -> dict[str, str]:
+    """Metadata of a channel: the message's description, units of its fields as JSON, and the meaning of each field."""
+    place = [found.name for found in _FILE.message_type].index(message)
+    notes, units = {}, {}
+    for found in _FILE.source_code_info.location:
+        match [*found.path]:
+            case [4, at] if at == place:
+                notes["description"] = found.leading_comments.strip()
+            case [4, at, 2, field] if at == place and found.trailing_comments:
+                name, text = _FILE.message_type[place].field[field].name, found.trailing_comments.strip()
+                if unit := re.match(r"\[(.+?)\]", text):
+                    units[name] = unit[1]
+                notes[name] = text[unit.end() :].strip() if unit else text
+    notes["units"] = json.dumps(units, ensure_ascii=False) if units else ""
+    return {key: text for key, text in notes.items() if text}
