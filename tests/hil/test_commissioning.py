@@ -97,7 +97,7 @@ def test_each_scene_ends_as_it_should_and_the_last_one_with_a_bench_file(played:
     assert "done: 9 steps, 1 new runs" in played["finished"]["out"]
     assert "another bench file" in played["mapped"]["out"]
     assert "done: 9 steps, 1 new runs" in played["mapped_finished"]["out"]
-    assert played["gateway"]["drive_time_out"].startswith("let go within 0.01")
+    assert played["gateway"]["drive_time_out"].startswith("disarmed within 0.01")
     for name in SCENES:
         assert "Traceback" not in played[name]["out"]
 

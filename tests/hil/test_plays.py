@@ -183,7 +183,7 @@ def test_a_drive_behind_the_gateway_answers_every_sample_and_its_frames_are_in_t
         logged = read_log(it.log).tables["/drive/rx"]["id"].tolist()
         assert logged.count(commands) >= 500, name  # of the gateway, beside what the drive sends
         assert logged.count(samples) >= 500, name
-    assert gateway(played("mapped_odrive"))["drive_time_out"].startswith("let go within 0.01")
+    assert gateway(played("mapped_odrive"))["drive_time_out"].startswith("disarmed within 0.01")
 
 
 @pytest.mark.slow

@@ -152,7 +152,7 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True):
                 raise FieldError(f"nuisances[{i}]", f"expected one of {', '.join(UNITS)}, got {typed.shown(name)}")
         if {"J", "k_m"} <= {*guess} and not {"T_c", "f_v", "k_1"} & {*known}:
             raise FieldError(
-                "guess", "k_m, J and all loads scale together: without one that is known only ratios can be told"
+                "guess", "k_m, J and all loads scale together: without a known one only their ratios can be estimated"
             )
 
     @property

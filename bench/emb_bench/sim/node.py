@@ -1,4 +1,4 @@
-"""The brake as a CAN node: it owns the current, obeys what is fresh, valid and enabled, and stops by itself.
+"""The brake as a CAN node: it drives the motor, obeys what is fresh, valid and enabled, and stops by itself.
 
 Pure logic: frames and ticks go in, frames come out; no clock and no socket. ``emb-node`` drives it in real time, the
 ``sim`` transport in lock-step.

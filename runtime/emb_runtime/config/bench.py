@@ -167,7 +167,7 @@ class GuardLimits:
 
 @dataclass(frozen=True)
 class Node:
-    """Safe stop and time-outs of the node that owns the current."""
+    """Safe stop and time-outs of the node that drives the motor."""
 
     watchdog: Positive  # Time without a fresh, valid, enabled command until the safe stop latches [s]
     stop: Literal["damped", "freewheel"]

@@ -34,7 +34,7 @@ class Arming:
     def time_out(self) -> str:
         """Proof of the drive's own time-out, in words."""
         if self._proof is not None and self._proof.done:
-            return f"let go within {self._proof.seen_ns * 1e-9:.3f} s without a command"
+            return f"disarmed within {self._proof.seen_ns * 1e-9:.3f} s without a command"
         if self._mapping.state is None:
             return "not provable: the drive does not report whether it is armed"
         return "not proved yet"

@@ -164,7 +164,7 @@ def test_the_drive_proves_its_time_out_before_it_is_armed_and_then_gets_0_a(play
     assert state_of([f for _ in range(3) for f in played.period()]) is NodeState.FAULT
     assert played.drive.sent == []
     played.arm()
-    assert played.node.arming.time_out.startswith("let go within 0.0")
+    assert played.node.arming.time_out.startswith("disarmed within 0.0")
     assert played.asked_states == [CLOSED_LOOP, CLOSED_LOOP]
     left = len(played.torques)
     for _ in range(20):
@@ -507,7 +507,7 @@ def test_the_command_asks_serves_and_ends_with_its_counts(
         assert "hold_on_loss: " in err
         assert bool(played.drive.sent) == (code != 3)  # who said no
         if code != 3:
-            assert json.loads(out)["drive_time_out"].startswith("let go within 0.0")
+            assert json.loads(out)["drive_time_out"].startswith("disarmed within 0.0")
             assert ("TOO LATE: an answer acted 1.20 periods" in err) == (code == 1)
 
 

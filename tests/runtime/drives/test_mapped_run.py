@@ -117,7 +117,7 @@ def test_with_zero_only_0_a_leaves_and_the_time_out_was_proved_whenever_the_hear
         bus.shift = shift
         assert emb_run.document("--duration", "0.05", "--zero")["result"] == "done"
         assert {frame.data for frame in bus.sent if frame.identifier == 0x00E} == {bytes(4)}
-        assert bus.transport.node.arming.time_out == "let go within 0.013 s without a command"
+        assert bus.transport.node.arming.time_out == "disarmed within 0.013 s without a command"
         within_limits(bus)
 
 
