@@ -145,7 +145,7 @@ def test_the_age_of_answers_is_measured_and_one_beyond_the_declared_named(
         assert bus.transport.node.times.largest_age_ns * 1e-6 == pytest.approx(age_ms, abs=0.005)
         assert not bus.transport.node.times.too_late
         says_its_state = name == "odrive"
-        assert bus.transport.node.arming.time_out.startswith("let go" if says_its_state else "not provable")
+        assert bus.transport.node.arming.time_out.startswith("disarmed" if says_its_state else "not provable")
     (folder := tmp_path / "slow").mkdir()
     bus, emb_run = runner("odrive", folder, capsys, monkeypatch)
     bus.edit("[can]", "[can]\nbitrate = 520000")
