@@ -129,8 +129,7 @@ def simulate(
     if quick:
         arguments.append("--quick")
     plan = prepare(parser().parse_args(arguments))
-    unattended = Console(stop_requested=lambda: False, show=lambda *_: None, may_arm=lambda _: True)
-    experiment(plan, Path(log), unattended)
+    experiment(plan, Path(log), Console())
     return open_run(log)
 
 

@@ -7,7 +7,7 @@ import statistics
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from emb_runtime.can.codec import worst_bits
 from emb_runtime.can.messages import Layout, StatusFrame
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 ENOUGH_PAIRS = 200  # Sensor pairs from which a standard deviation is known to within a twentieth
 RECENT_PAIRS = 4000  # Pairs that the scatter is taken from
-CREEP_SIGMAS = 5.0  # Standard errors from which a slope is reported
 OTHERS_BITS = worst_bits(8)  # Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier
 
 
@@ -49,10 +48,10 @@ class BusStatistics:
     pairs: int  # Valid pairs
     missing: int  # Pairs that did not come, by the node's own clock
     period: float  # Median time between samples by the node's own clock [s]; NaN with fewer than two
-    angle_scatter: float
-    """Standard deviation of the newest angles while the node was idle, about a line; NaN for fewer than three [rad]."""
-    velocity_scatter: float  # Standard deviation of the newest velocities while the node was idle, about a line [rad/s]
-    creep: float  # Slope of that line through the angles, 0 where it is none that the noise could not give [rad/s]
+    angle_scatter: (
+        float  # Standard deviation of the newest angles while the node was idle; NaN for fewer than two [rad]
+    )
+    velocity_scatter: float  # The same of the velocities [rad/s]
     load: float
     """Share of the bus that all frames took, with every stuff bit that there can be; of a mapped drive's its own."""
     pairing_problem: str = ""  # :attr:`~emb_runtime.can.receiver.Reception.pairing_problem`
@@ -73,7 +72,7 @@ class BusMonitor:
         self._others = 0
         self._first_ns = self._last_ns = 0
         self._periods_ns: deque[int] = deque(maxlen=RECENT_PAIRS)
-        self._at_rest: deque[tuple[float, float, float]] = deque(maxlen=RECENT_PAIRS)
+        self._at_rest: deque[tuple[float, float]] = deque(maxlen=RECENT_PAIRS)
         self._missing = 0
         self.pairs = 0  # Valid pairs so far
         self.sample: SensorSample | None = None  # The newest one
@@ -107,8 +106,7 @@ class BusMonitor:
         """Statistics so far."""
         reception, duration = self._reception, (self._last_ns - self._first_ns) * 1e-9
         bits = sum(self._bits[name] * count for name, count in self._frames.items()) + OTHERS_BITS * self._others
-        times, angles, velocities = zip(*self._at_rest, strict=True) if self._at_rest else ((), (), ())
-        angle, velocity = _about_a_line(times, angles), _about_a_line(times, velocities)
+        angles, velocities = zip(*self._at_rest, strict=True) if self._at_rest else ((), ())
         return BusStatistics(
             duration=duration,
             frames=dict(self._frames),
@@ -128,9 +126,8 @@ class BusMonitor:
             pairs=self.pairs,
             missing=self._missing,
             period=statistics.median(self._periods_ns) * 1e-9 if self._periods_ns else float("nan"),
-            angle_scatter=angle.scatter,
-            velocity_scatter=velocity.scatter,
-            creep=angle.slope if abs(angle.slope) > CREEP_SIGMAS * angle.slope_error else 0.0,
+            angle_scatter=statistics.stdev(angles) if len(angles) > 1 else math.nan,
+            velocity_scatter=statistics.stdev(velocities) if len(velocities) > 1 else math.nan,
             pairing_problem=reception.pairing_problem,
             load=bits / duration / self._bitrate if duration > 0.0 else 0.0,
         )
@@ -139,7 +136,7 @@ class BusMonitor:
         before, self.sample = self.sample, sample
         self.pairs += 1
         if sample.node_state is NodeState.IDLE:
-            self._at_rest.append((sample.device_time_ns * 1e-9, sample.angle, sample.velocity))
+            self._at_rest.append((sample.angle, sample.velocity))
         else:
             self._at_rest.clear()
         if before is not None:
@@ -186,20 +183,3 @@ def listen(
             monitor.take_old(frame)
         elif (sample := monitor.take(frame)) is not None:
             ready = ready + 1 if enough(sample, now_ns) else 0
-
-
-class _Line(NamedTuple):
-    """Values over time as a straight line and what they scatter about it."""
-
-    slope: float
-    slope_error: float
-    scatter: float
-
-
-def _about_a_line(times: tuple[float, ...], values: tuple[float, ...]) -> _Line:
-    if len(times) < 3:
-        return _Line(math.nan, math.nan, math.nan)
-    line = statistics.linear_regression(times, values)
-    rest = [value - line.intercept - line.slope * time for time, value in zip(times, values, strict=True)]
-    scatter = math.sqrt(math.fsum(r * r for r in rest) / (len(rest) - 2))
-    return _Line(line.slope, scatter / (statistics.pstdev(times) * math.sqrt(len(times))), scatter)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -24,23 +23,19 @@ from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 from emb_runtime.system.terminal import ARM_QUESTION, StopRequest, as_json, complain, confirmed, mention, show
 
 LISTEN_NS = 50_000_000  # Time between two looks at the keyboard [ns]
-VIEWERS = "emb_runtime.viewers"  # Entry-point group of the modules that show a run: ``live``, and its ``report``
+VIEWERS = "emb_runtime.viewers"  # Entry-point group of the module that shows a run
 VIEWER_TIMEOUT = 10.0  # Longest wait for the process to be ready [s]
 
 
-class Operator:
+class Operator(Console):
     """Operator: sees the pre-flight, and is asked once before anything is armed."""
 
     def __init__(self, plan: Plan, stop_requested: StopRequest) -> None:
         self._plan = plan
-        self._stop_requested = stop_requested
+        self.stop_requested = stop_requested
         self._seen = self._agreed = False
 
-    def console(self) -> Console:
-        """Operator's end, for a run."""
-        return Console(self._stop_requested, self._show, self._may_arm)
-
-    def _show(self, lines: tuple[CheckResult, ...], bus: Bus) -> None:
+    def show(self, lines: tuple[CheckResult, ...], bus: Bus) -> None:
         """Show the checks that are not ok, below the stage: it says what they are of. All where they are agreed to."""
         whole = not self._seen and (self._plan.verbose or self._asks(bus))
         shown = [line for line in lines if whole or line.verdict is not Verdict.OK]
@@ -53,7 +48,8 @@ class Operator:
             mention(f"pre-flight: {len(lines)} checks, all ok (-v shows them)")
         self._seen = True
 
-    def _may_arm(self, bus: Bus) -> bool:
+    def may_arm(self, bus: Bus) -> bool:
+        """Ask, once for the experiment and its ways home."""
         if not self._agreed:
             self._agreed = not self._asks(bus) or self._ask(bus)
         return self._agreed
@@ -72,7 +68,7 @@ class Operator:
                 if frame is not None:
                     bus.pass_over(frame, self._plan.layout)
 
-        return confirmed(ARM_QUESTION, self._stop_requested, wait)
+        return confirmed(ARM_QUESTION, self.stop_requested, wait)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -82,7 +78,7 @@ def main(argv: list[str] | None = None) -> int:
         if args.write_bench is not None:
             return _write_bench(args.write_bench)
         plan = prepare(args)
-        console = Operator(plan, StopRequest()).console()
+        console = Operator(plan, StopRequest())
         try:
             with log_folder(plan.log), shown(plan):
                 if plan.stage is Stage.READ_ONLY:
@@ -125,32 +121,10 @@ def shown(plan: Plan) -> Iterator[None]:
 
 
 def _experiment(plan: Plan, console: Console) -> int:
-    reporter = None if plan.report is None else _reporter(plan.report)
     document, exit_code = experiment(plan, log_path(plan.log), console)
     text = as_json(document) if plan.json else summary.text(document, plan.verbose)
     show(text.partition("\n")[0] if plan.quiet else text)
-    if reporter is not None and document["log"] is not None:
-        reported = _report(reporter, document["log"], plan)
-        return exit_code or reported
     return exit_code
-
-
-def _reporter(page: Path) -> str:
-    """Module whose command ``report`` writes a page; asked for before the run."""
-    entries = list(metadata.entry_points(group=VIEWERS, name="report"))
-    if not entries:
-        raise UsageError("--report: nothing is installed that writes a page; emb_bench does: emb-excite[bench]")
-    if page.suffix not in (".html", ".htm"):
-        raise UsageError(f"--report {page}: expected a name that ends in .html or .htm")
-    if not page.absolute().parent.is_dir():
-        raise UsageError(f"--report: {page.absolute().parent} is no folder")
-    return entries[0].value
-
-
-def _report(module: str, log: str, plan: Plan) -> int:
-    """Have a process without the real-time settings of this one estimate, and write the page; its exit code."""
-    command = [sys.executable, "-P", "-m", module, "report", log, "--output", str(plan.report)]
-    return subprocess.run(command, stdout=sys.stderr if plan.json else None, check=False).returncode
 
 
 def _read(plan: Plan, console: Console) -> int:

@@ -206,8 +206,6 @@ def _noise(f: Findings) -> CheckResult:
     good = heard.angle_scatter <= SCATTER_TOLERANCE * noise.angle
     good = good and heard.velocity_scatter <= SCATTER_TOLERANCE * noise.velocity
     found = f"{heard.angle_scatter:.2g} rad and {heard.velocity_scatter:.2g} rad/s"
-    if heard.creep:
-        found += f", about a line: the brake is not at rest but creeps at {heard.creep:.2g} rad/s"
     return _line("noise at rest", found, expected, good)
 
 

@@ -61,13 +61,17 @@ class Bus:
             self.overheard.setdefault((frame.error, frame.identifier), frame)
 
 
-@dataclass(frozen=True)
 class Console:
-    """The operator's end."""
+    """The operator's end; of itself nobody's, who sees nothing, agrees, and wants no end."""
 
-    stop_requested: Callable[[], bool]  # Returns True if an end is wanted
-    show: Callable[[tuple[CheckResult, ...], Bus], None]  # Shows the pre-flight
-    may_arm: Callable[[Bus], bool]  # Returns True if anything may be armed
+    stop_requested: Callable[[], bool] = staticmethod(lambda: False)  # Returns True if an end is wanted
+
+    def show(self, lines: tuple[CheckResult, ...], bus: Bus) -> None:
+        """Show the pre-flight."""
+
+    def may_arm(self, bus: Bus) -> bool:
+        """Returns True if anything may be armed."""
+        return True
 
 
 def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Console) -> RunResult:

@@ -78,7 +78,7 @@ def test_what_comes_while_the_operator_is_asked_is_kept_for_the_run(
     plan = prepare(parser().parse_args(["--confirm"]))
     waiting, bus = bus_of(*ORDINARY, FOREIGN, BUS_OFF, *ORDINARY)
     waiting.typed = keyboard
-    assert Operator(plan, StopRequest()).console().may_arm(bus)
+    assert Operator(plan, StopRequest()).may_arm(bus)
     assert drop_backlog(bus, layout) == (FOREIGN, BUS_OFF)
 
 
