@@ -31,7 +31,16 @@ UNIQUE = re.compile(
 )
 """Hashes, numbers of reports, dates and the version."""
 RELATIVE, ABSOLUTE = 0.02, 1e-9
-SHORT = {"fim": 14, "estimate-good": 16, "estimate-aborted": 16, "info": 14, "timing": 14, "campaign": 16, "design": 14}
+SHORT = {
+    "fim": 14,
+    "estimate-good": 16,
+    "estimate-misfit": 16,
+    "estimate-aborted": 16,
+    "info": 14,
+    "timing": 14,
+    "campaign": 16,
+    "design": 14,
+}
 """Pages without ``-v``: as wide as a terminal, and at most so many lines."""
 HOUR = 3_600_000_000_000  # [ns]
 

@@ -29,7 +29,7 @@ from emb_bench.experiment.evaluation import check_sample_time, default_model
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.figures import for_notebook
-from emb_bench.logs.log import RunLog
+from emb_bench.logs.log import RunLog, end_detail
 from emb_bench.numbers import amount
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
@@ -353,7 +353,7 @@ def stop_of(log: RunLog, experiment: Experiment | None, name: str) -> Stop | Non
     periods, planned = (0, 0) if experiment is None else (experiment.periods, experiment.planned)
     fault = FAULTS[Fault[reason]] if reason in Fault.__members__ else None
     cause, advice = ("", "") if fault is None else (fault.cause, fault.advice)
-    return Stop(name, reason, log.end.get("detail", ""), periods, planned, cause, advice)
+    return Stop(name, reason, end_detail(log.end), periods, planned, cause, advice)
 
 
 def _read(log: RunLog, bench: Bench, name: str) -> tuple[Experiment, list[str]]:

@@ -192,7 +192,7 @@ def text(c: Campaign, *, verbose: bool = False) -> str:
         lines += wrapped("NOTE: the runs are of different models: use --model, or name the logs of one")
     lines += ["", *parameter_table(c).lines()]
     if c.method != NONE:
-        lines += wrapped("Medians of all runs. " + INTERVALS, 0)
+        lines += wrapped(f"Mean weighted by information, scatter over the stated one, else medians. {INTERVALS}", 0)
     return "\n".join([*lines, *listed("", _agreement(c))])
 
 
@@ -218,7 +218,9 @@ def _notes(c: Campaign) -> Iterator[str]:
 def parameter_table(c: Campaign) -> Table:
     """Table of the parameters, over all runs."""
     estimated = c.method != NONE
-    header = ["parameter", "identified"] + (["mean", "total", "repeatability", "chi2/n"] if estimated else ["bound"])
+    header = ["parameter", "identified"] + (
+        ["weighted mean", "total", "repeatability", "scatter"] if estimated else ["bound"]
+    )
     rows = []
     for name, p in c.parameters.items():
         row = [f"{name} [{p.unit}]", f"{p.identified} of {c.evaluated}"]
@@ -231,7 +233,7 @@ def parameter_table(c: Campaign) -> Table:
             continue
         mean, size = p.estimate.constancy, p.estimate.median if p.relative else 0.0
         row += [f"{mean.mean:.7g}", *(_share(half, size) for half in (p.estimate.total, p.estimate.repeatability))]
-        rows.append([*row, f"{mean.scatter**2:.3g}" if mean.runs > 1 else NOTHING])
+        rows.append([*row, f"{mean.scatter:.3g}" if mean.runs > 1 else NOTHING])
     return Table("", header, rows)
 
 

@@ -423,6 +423,13 @@ def require_driven(log: RunLog) -> None:
         raise UsageError(f"{log.path}: nothing was driven in this log, its run only listened (--read-only)")
 
 
+def end_detail(end: Mapping[str, str]) -> str:
+    """What a run's end says beside its reason: the loop's detail, and the node's stop reason if it stopped."""
+    node = end.get("node_stop_reason", "NONE")
+    stopped = "" if node in ("NONE", "NEVER_COMMANDED") else f"stop reason of the node: {node}"
+    return "; ".join(filter(None, (end.get("detail", ""), stopped)))
+
+
 def reported_missing(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
     """Descriptions of the parts that a log itself reports as missing."""
     reported = []

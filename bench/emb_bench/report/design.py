@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from emb_bench.report.sentences import deviation
+from emb_bench.brake.parameters import UNITS
+from emb_bench.numbers import spread
 from emb_bench.report.text import Table, facts
+from emb_runtime.estimator.estimate import NORMAL_95
 
 if TYPE_CHECKING:  # a search for designs takes a second to import
     from emb_bench.design.report import Check, Report
@@ -21,11 +23,17 @@ def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
         (d["value_is"], f"{d['value']:.7g}; {_verdict(own)}"),
         ("criterion", f"{d['criterion']} of {', '.join(d['params'])}"),
         ("brake", brake),
-        ("least sigma", ", ".join(f"{name} {deviation(bound, name)}" for name, bound in bounds.items())),
+        ("± 95 %", ", ".join(f"{name} {_half(bound, name)}" for name, bound in bounds.items())),
         ("optima", f"{optima} ({d['starts']} starts, seed {d['seed']})"),
         ("currents", written or "not written: use -o design.csv"),
     )
     return "\n".join([*lines, *(["", *_checks(report).lines()] if verbose else [])])
+
+
+def _half(deviation: float, name: str) -> str:
+    """Half of the best possible 95 % interval: in percent, or in the unit of an unknown that has no scale."""
+    unit = UNITS.get(name, "").removesuffix("1")  # of a share
+    return f"{spread(NORMAL_95 * deviation, name not in UNITS)} {unit}".rstrip()
 
 
 def _verdict(check: Check) -> str:

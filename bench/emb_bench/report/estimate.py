@@ -27,20 +27,16 @@ def text(study: Study, *, verbose: bool = False) -> str:
     lines = [*stops(study), *listed("", say.outside(study)), *listed("WARNING: ", study.warnings)]
     if study.aborted and not verbose:
         return "\n".join([*lines, "next: find the cause before the next run   (-v shows values until the stop)"])
-    lines = [
-        *lines,
-        *wrapped(say.headline(study)),
-        *listed("  - ", _against(study)),
-        *listed("NOTE: ", _notes(study)),
-        "",
-        *tables.parameters(study, brief=True).lines(),
-        *listed("  - ", _remarks(study)),
-        *wrapped(say.INTERVALS, 0),
-        "",
-        *listed("", _limits(study)),
-        *_next(study),
-    ]
-    return "\n".join([*lines, *(_evidence(study) if verbose else ())])
+    against = list(_against(study))
+    lines += wrapped(say.headline(study))
+    lines += listed("  - ", against if verbose else against[-1:])  # the last one names the effect, if any explains it
+    lines += listed("NOTE: ", _notes(study))
+    lines += ["", *tables.parameters(study, brief=True).lines()]
+    if study.holds or verbose:
+        lines += [*listed("  - ", _remarks(study)), *wrapped(say.INTERVALS, 0), "", *listed("", _limits(study))]
+    else:
+        lines += ["± 95 % (k=2), without the error of the model", ""]
+    return "\n".join([*lines, *_next(study), *(_evidence(study) if verbose else ())])
 
 
 def stops(study: Study) -> Iterator[str]:

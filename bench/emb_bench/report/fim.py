@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.brake.parameters import PARAMETERS, quantity
+from emb_bench.brake.parameters import quantity
 from emb_bench.config.machine import LOADS
 from emb_bench.documents import to_json
 from emb_bench.experiment.evaluation import KINDS, Evaluation, Question, default_model, evenly
@@ -73,9 +73,8 @@ def document(e: Evaluation) -> dict[str, Any]:
 def text(e: Evaluation, *, verbose: bool = False) -> str:
     """The best possible intervals; what is missing comes before any number. With ``verbose`` the criteria over time."""
     doubts, lines = [*listed("WARNING: ", say.warnings(e)), *listed("NOTE: ", say.notes(e))], _heading(e)
-    sizes = f"angle {e.fit.angle:.3g}, velocity {e.fit.velocity:.3g} sigma"
-    fit = f"rms residuals: {sizes} (at most {e.fit.expected:.2f} if it fits)"
-    lines += [*facts(("model", f"{e.plant.name} ({_why(e)}); {fit}")), *_unknowns(e.question)]
+    fit = f"rms: angle {e.fit.angle:.3g}, velocity {e.fit.velocity:.3g} sigma (at most {e.fit.expected:.2f} if it fits)"
+    lines += [*facts(("model", f"{e.plant.name} ({_why(e)})"), ("residuals", fit)), *_unknowns(e.question)]
     if not e.fisher("weighted").matrix.any():  # which has no prior
         return "\n".join([*doubts, "no information: the record does not depend on any of these parameters", *lines])
     verdict = e.verdict().shown(e.bench.machine)
@@ -84,7 +83,6 @@ def text(e: Evaluation, *, verbose: bool = False) -> str:
     rows = [[f.name, _half(f), say.finding(f)] for f in verdict.findings]
     head += [*(row.rstrip() for row in Table("", ("", "", ""), rows, words=(0, 2)).lines("  ")[1:])]
     head += listed("  ", say.directions(verdict))
-    head += wrapped("emb-replay estimate also fits systematic errors: its repeatability is larger", 0)
     final = e.fisher("physical").criteria().shown(e.bench.machine)
     shown = f"log det {final.log_det:.6g}, smallest eigenvalue {final.lambda_min:.4g}, condition {final.condition:.4g}"
     lines = [*head, "", *lines, *facts(("information", shown))]
@@ -138,7 +136,7 @@ def _heading(e: Evaluation) -> list[str]:
     run += f", {x.braked} braked by the node" if x.braked else ""
     run += f"; commands acted {in_samples(late)} late" if late else ""
     if machine is None:
-        theta = ", ".join(f"{name} = {getattr(e.theta, name):.4g} {PARAMETERS[name].unit}" for name in PARAMETER_NAMES)
+        theta = ", ".join(f"{name} {getattr(e.theta, name):.4g}" for name in PARAMETER_NAMES) + " (SI)"
     else:
         values = e.theta._asdict()
         names = [n for n in (*PARAMETER_NAMES, "J") if values[n] and (n != "k_m" or machine.command not in LOADS)]

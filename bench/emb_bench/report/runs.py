@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from emb_bench.config.bench import COUNTED, QUANTILE_NAMES
-from emb_bench.logs.log import RunLog
+from emb_bench.logs.log import RunLog, end_detail
 from emb_bench.logs.timing import INTERVALS, BudgetCheck, Timing, document, judge, quantiles, timing
 from emb_bench.numbers import NOTHING, around, percent, plain, seconds
 from emb_bench.report.text import Table, facts, listed, wrapped
@@ -95,13 +95,8 @@ def _listed(title: str, entries: Mapping[str, str]) -> list[str]:
 
 
 def _why(end: Mapping[str, str]) -> str:
-    """Reasons of the loop and of the node."""
-    said = [end.get("detail", ""), f"stop reason of the node: {end['node_stop_reason']}" if _stopped(end) else ""]
-    return f" ({'; '.join(filter(None, said))})" if any(said) else ""
-
-
-def _stopped(end: Mapping[str, str]) -> bool:
-    return end.get("node_stop_reason", "NONE") not in ("NONE", "NEVER_COMMANDED")
+    said = end_detail(end)
+    return f" ({said})" if said else ""
 
 
 class RunTiming(NamedTuple):

@@ -39,13 +39,6 @@ TERMS = {
 """Terms of the results, each explained in a line."""
 
 
-def deviation(value: float, name: str, digits: int = 3) -> str:
-    """A standard deviation of an unknown: in percent, or in its unit if it has no scale."""
-    found = spread(value, name not in UNITS, digits)
-    unit = UNITS.get(name, "").removesuffix("1")  # of a share
-    return f"{found} {unit}" if unit and found[0].isdigit() else found
-
-
 # ---- the verdict on a study ----
 
 
@@ -59,8 +52,8 @@ def headline(study: Study) -> str:
         )
     if not study.model_fits:
         return (
-            f"THE MODEL '{name}' DOES NOT FIT: the best values follow, but their intervals do not include the error "
-            "of the model."
+            f"THE MODEL '{name}' DOES NOT FIT (chi2/n {e.validation.ratio:.3g}, at most "
+            f"{e.validation.expected[1]:.3f} expected): the intervals do not include its error."
         )
     if not study.predicts:
         return f"THE MODEL '{name}' DOES NOT PREDICT other records: the values hold only for their own records."
@@ -250,8 +243,6 @@ def logs_of(study: Study) -> str:
 
 def remedies(study: Study) -> list[str]:
     """Remedies for a model that does not fit or predict, and for parameters that are not identified."""
-    from emb_bench.estimate.suspects import shown_as
-
     e, again = study.estimate, f"emb-replay estimate {logs_of(study)}"
     if study.biased:
         return [f"use another method: {again} --method oem"]
@@ -265,12 +256,8 @@ def remedies(study: Study) -> list[str]:
         found = [f"find a model that explains the record: {again} --model all"]
     else:
         found = ["use the intervals: they come from the scatter of the windows, and do not need a right model"]
-    if study.suspects:
-        found.append(
-            f"or correct the largest effect in the residuals: {shown_as(study.suspects[0], e.bench.machine).name}"
-        )
     if e.method == "oem":
-        found.append("if no model explains the record, allow for a disturbance: --method pem")
+        found.append("if none does, allow for a disturbance: --method pem")
     return found
 
 

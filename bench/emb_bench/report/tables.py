@@ -42,6 +42,9 @@ def parameters(study: Study, *, brief: bool = False) -> Table:
     """Values with total and repeatability, and whether each is identified."""
     e = study.estimate
     header = ["" if brief else "parameter", "value ± total", "total", "repeatability", "identified"]
+    if not study.holds:
+        header.remove("repeatability")  # of a wrong model it means nothing
+    words = (0, len(header) - 1)
     header += [] if brief else ["from nominal"]
     header += ["simulated", "error in sigma"] if study.truth is not None and not brief else []
     yes = Cell("yes", "good") if study.holds else Cell("biased" if study.biased else "(yes)", "care")
@@ -51,7 +54,7 @@ def parameters(study: Study, *, brief: bool = False) -> Table:
         size = c.value if unknown.relative else 0.0
         row: list[str] = [c.label, amount(c.value, c.interval, c.unit)]
         row += [_half(0.5 * (c.interval[1] - c.interval[0]), size)]
-        row += [_half(c.repeatability, size) if study.holds else NOTHING]
+        row += [_half(c.repeatability, size)] if study.holds else []
         row.append(yes if c.identified else Cell("NO", "bad"))
         if not brief:
             nominal = getattr(e.bench.brake, unknown.name, None)
@@ -60,7 +63,7 @@ def parameters(study: Study, *, brief: bool = False) -> Table:
         rows.append(row)
     if study.truth is not None and not brief:
         rows = [[*row, *true] for row, true in zip(rows, _errors(study), strict=True)]
-    return Table("Estimates; ± is half of the 95 % interval (k=2)", header, rows, words=(0, 4))
+    return Table("Estimates; ± is half of the 95 % interval (k=2)", header, rows, words=words)
 
 
 def _half(half: float, size: float) -> str:
