@@ -32,7 +32,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.config.machine import Machine
 from emb_bench.estimate.prediction import Marginal, Problem, by_record
 from emb_bench.estimate.records import Independence, ModelValidation, Whiteness
-from emb_bench.estimate.suspects import Shown, Simulated, explained, score, shown_as
+from emb_bench.estimate.suspects import Shown, Simulated, explained, score
 from emb_bench.numbers import p_value
 
 Bools = NDArray[np.bool_]
@@ -165,8 +165,7 @@ def _judged(m: ModelValidation, disturbance: Disturbance | None, machine: Machin
             f"largest correlation {test.correlation:+.2f} with the current {test.lag} periods earlier"
         )
     if suspected:
-        others = ", ".join(shown_as(s, machine).name for s in suspected[1:4])
-        alarms.append(explained(suspected[0], machine) + (f"; less likely: {others}" if others else ""))
+        alarms.append(explained(suspected[0], machine))
     elif m.together is not None and "scores" in alarming:
         alarms.append(
             "the model lacks several effects together (chi2 "

@@ -253,7 +253,7 @@ def remedies(study: Study) -> list[str]:
     if study.model_fits:
         return [] if study.identified or e.bench.machine is not None else [MORE]
     if e.bench.machine is None:
-        found = [f"find a model that explains the record: {again} --model all"]
+        found = [f"find a model that explains it: {again} --model all"]
     else:
         found = ["use the intervals: they come from the scatter of the windows, and do not need a right model"]
     if e.method == "oem":
