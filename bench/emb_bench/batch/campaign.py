@@ -6,7 +6,7 @@ Logs are shared out to processes or to Ray: one that dies, or takes too long, co
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path, PurePath
@@ -23,7 +23,6 @@ from emb_runtime.records import HOMING_LOG, LISTEN_ONLY_LOG
 
 SUFFIX = ".mcap"
 PASSED_OVER = (HOMING_LOG + SUFFIX, LISTEN_ONLY_LOG + SUFFIX)  # Logs of emb-run that hold no experiment
-Evaluate = Callable[[Source], Row]  # A function that another process can import; a ``functools.partial`` of one as well
 
 
 def run_campaign(
@@ -46,15 +45,15 @@ def run_campaign(
     sources, evaluate = find(paths), partial(evaluate_one, options=options)
     with replacing(output) as beside:
         if ray is None:
-            numbered = in_processes(evaluate, sources, jobs or os.cpu_count() or 1, time_limit)
+            numbered = shared_out(evaluate, sources, jobs or os.cpu_count() or 1, time_limit)
         else:
-            numbered = on_ray(evaluate, sources, jobs, time_limit, ray)
-        rows = mark_copies(_in_order(len(sources), numbered))
+            numbered = shared_out_on_ray(evaluate, sources, jobs, time_limit, ray)
+        rows = mark_copies(in_order(sources, numbered))
         write_rows(beside, output.suffix, rows, options)
     return summarise(rows, options, str(output))
 
 
-def _in_order(count: int, numbered: Generator[tuple[int, Row], None, None]) -> list[Row]:
+def in_order(sources: Sequence[Source], numbered: Generator[tuple[int, Row | Lost], None, None]) -> list[Row]:
     """All rows in the order of the logs; shows how many there are, and says at once what failed."""
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -62,13 +61,15 @@ def _in_order(count: int, numbered: Generator[tuple[int, Row], None, None]) -> l
     columns = (MofNCompleteColumn(), TextColumn("logs"), TimeRemainingColumn(), TextColumn("left"))
     console, rows = Console(stderr=True, markup=False, highlight=False, emoji=False), dict[int, Row]()
     with closing(numbered), Progress(*columns, console=console, disable=not console.is_terminal) as shown:
-        task = shown.add_task("", total=count)  # processes end with the generator, whatever happens
-        for number, row in numbered:
+        task = shown.add_task("", total=len(sources))  # processes end with the generator, whatever happens
+        for number, found in numbered:
+            source = sources[number]
+            row = failed(source, f"{source.path}: {found.why}") if isinstance(found, Lost) else found
             rows[number] = row
             shown.advance(task)
-            if row.error is not None:
-                console.print(f"FAILED {row.error}", soft_wrap=True)
-    return [rows[number] for number in range(count)]
+            if row["error"] is not None:
+                console.print(f"FAILED {row['error']}", soft_wrap=True)
+    return [rows[number] for number in range(len(sources))]
 
 
 def find(paths: Sequence[Path]) -> list[Source]:
@@ -121,26 +122,3 @@ def _source(root: Path, path: Path, trouble: str) -> Source:
     if not trouble and path.exists() and not path.is_file():
         trouble = "expected a file, and it is none"  # opening a pipe would wait for ever
     return Source(str(path), str(root), relative.as_posix(), relative.parent.as_posix(), trouble)
-
-
-def in_processes(
-    evaluate: Evaluate, sources: Sequence[Source], jobs: int, time_limit: float
-) -> Generator[tuple[int, Row], None, None]:
-    """Each log's number and row, as they come, evaluated in processes of this machine."""
-    return _rows(sources, shared_out(evaluate, sources, jobs, time_limit))
-
-
-def on_ray(
-    evaluate: Evaluate, sources: Sequence[Source], jobs: int | None, time_limit: float, address: str
-) -> Generator[tuple[int, Row], None, None]:
-    """Each log's number and row, as they come, evaluated on Ray, whose machines have the logs at the same paths."""
-    return _rows(sources, shared_out_on_ray(evaluate, sources, jobs, time_limit, address))
-
-
-def _rows(
-    sources: Sequence[Source], numbered: Generator[tuple[int, Row | Lost], None, None]
-) -> Generator[tuple[int, Row], None, None]:
-    with closing(numbered):
-        for number, row in numbered:
-            path = sources[number].path
-            yield number, failed(sources[number], f"{path}: {row.why}") if isinstance(row, Lost) else row

@@ -6,12 +6,11 @@ import hashlib
 import math
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from emb_bench.batch.row import NONE, Options, Parameter, Row, Source, failed, one_line, printable
+from emb_bench.batch.row import NONE, Options, Row, Source, failed, one_line, printable
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.estimate import Estimate
@@ -34,15 +33,15 @@ def evaluate_one(source: Source, options: Options) -> Row:
     row = failed(source, "")
     try:
         for found in _steps(source, options):
-            row = replace(row, **found)
+            row |= found
     except EmbError as err:
-        return replace(row, error=one_line(str(err)))
+        return row | {"error": one_line(str(err))}
     except Exception as err:  # no log may cost the others theirs, and a fault of ours is reported like one of the log
-        return replace(row, error=one_line(f"{source.path}: {type(err).__name__}: {err}"))
-    return replace(row, error=None)
+        return row | {"error": one_line(f"{source.path}: {type(err).__name__}: {err}")}
+    return row | {"error": None}
 
 
-def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
+def _steps(source: Source, options: Options) -> Iterator[Row]:
     """Fields of the row, as far as one gets."""
     if source.trouble:
         raise UsageError(f"{source.path}: {source.trouble}")
@@ -68,10 +67,10 @@ def _steps(source: Source, options: Options) -> Iterator[dict[str, Any]]:
 
     asked = with_systematic(EstimationProblem(options.params, options.nuisances, prior), bench, plant)
     method = method_of(options.method)(bench, plant, asked, starts=options.starts, seed=options.seed)
-    yield _of_the_estimate(method.fit([experiment.seen_by(plant)]), evaluation, log.truth)
+    yield _of_the_estimate(method.fit([experiment.seen_by(plant)]), log.truth)
 
 
-def _of_the_run(log: RunLog) -> dict[str, Any]:
+def _of_the_run(log: RunLog) -> Row:
     found, policy = cycle_summary(log), log.run.get("policy_sha256")
     cycles, largest = found.cycles, found.largest
     return {
@@ -91,7 +90,7 @@ def _of_the_run(log: RunLog) -> dict[str, Any]:
     }
 
 
-def _of_the_experiment(log: RunLog, experiment: Experiment, bench: Bench) -> dict[str, Any]:
+def _of_the_experiment(log: RunLog, experiment: Experiment, bench: Bench) -> Row:
     missing = [log.missing] if log.missing else []
     missing += experiment.missing
     (low, high), speed = bench.limits.angle, bench.limits.velocity
@@ -120,12 +119,12 @@ def _beginning(experiment: Experiment) -> str | None:
     return hashlib.sha256(samples.tobytes()).hexdigest()
 
 
-def _of_the_information(e: Evaluation) -> dict[str, Any]:
+def _of_the_information(e: Evaluation) -> Row:
     physical = e.fisher("physical")
     own, bounds = physical.criteria(), physical.cramer_rao()
     identified = {finding.name: finding.identified for finding in e.verdict().findings}
     said = {e.log.missing, *e.experiment.missing}
-    return {
+    found: Row = {
         "warnings": tuple(printable(warning) for warning in warnings(e) if warning not in said),
         "nominal_fits": e.fit.fits,
         "nominal_angle_sigmas": e.fit.angle,
@@ -133,38 +132,50 @@ def _of_the_information(e: Evaluation) -> dict[str, Any]:
         "log_det": own.log_det,
         "lambda_min": own.lambda_min,
         "trace_inverse": own.trace_inverse,
-        "parameters": tuple(
-            Parameter(name, identified=identified.get(name), cramer_rao=bounds[name], true=_true(e.log.truth, name))
-            for name in e.question.names
-        ),
     }
+    for name in e.question.names:
+        true = _true(e.log.truth, name)
+        found |= _of(name, identified=identified.get(name), cramer_rao=bounds[name], true=true)
+    return found
 
 
-def _of_the_estimate(e: Estimate, evaluation: Evaluation, truth: BrakeParameters | None) -> dict[str, Any]:
+def _of(name: str, **values: Any) -> Row:
+    """Columns of a parameter."""
+    return {f"{name}_{key}": value for key, value in values.items()}
+
+
+def _of_the_estimate(e: Estimate, truth: BrakeParameters | None) -> Row:
     from emb_bench.analysis.conclusion import conclude
     from emb_bench.analysis.profile import profiles
 
-    bounds = evaluation.fisher("physical").cramer_rao()
-    parameters = []
-    deviations = [(float(e.deviations()[i]), float(e.between_runs()[i])) for i in e.wanted()]
     conclusions = conclude(e, profiles(e, of_all=False), ())
-    for i, said, (deviation, between) in zip(e.wanted(), conclusions, deviations, strict=True):
-        name = e.unknowns[i].name
-        value, low, high, noise = said.value, *said.interval, said.repeatability
-        true = _true(truth, name)
-        scale = deviation * (abs(value) if PARAMETERS[name].relative else 1.0)
-        error = None if true is None or not 0.0 < scale < math.inf else (value - true) / scale
-        parameters.append(
-            Parameter(name, said.identified, bounds[name], value, low, high, deviation, between, noise, true, error)
-        )
-    return {
+    found: Row = {
         "fits": e.validation.fits,
         "chi2_per_freedom": e.validation.ratio,
         "alarms": e.validation.alarms,
         "caveats": e.caveats,
         "outside": tuple(said.label for said in conclusions if said.outside is not None),
-        "parameters": tuple(parameters),
     }
+    deviations, between = e.deviations(), e.between_runs()
+    for i, said in zip(e.wanted(), conclusions, strict=True):
+        name = e.unknowns[i].name
+        value, low, high, noise = said.value, *said.interval, said.repeatability
+        true = _true(truth, name)
+        deviation = float(deviations[i])
+        scale = deviation * (abs(value) if PARAMETERS[name].relative else 1.0)
+        error = None if true is None or not 0.0 < scale < math.inf else (value - true) / scale
+        found |= _of(
+            name,
+            identified=said.identified,
+            estimate=value,
+            low=low,
+            high=high,
+            deviation=deviation,
+            between_runs=float(between[i]),
+            repeatability=noise,
+            error_sigmas=error,
+        )
+    return found
 
 
 def _true(truth: BrakeParameters | None, name: str) -> float | None:

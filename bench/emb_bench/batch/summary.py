@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.analysis.several_runs import Constancy, constancy
-from emb_bench.batch.row import NONE, Options, Parameter, Row, unit_of
+from emb_bench.batch.row import NONE, Options, Row, unit_of
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE, NORMAL_95
@@ -19,6 +19,7 @@ from emb_bench.report.sentences import INTERVALS
 from emb_bench.report.text import Table, listed, wrapped
 
 SHOWN = 3  # Most logs of a kind that are named without ``-v``
+OF_AN_ESTIMATE = ("estimate", "low", "high", "between_runs", "repeatability", "error_sigmas")
 
 
 @dataclass(frozen=True)
@@ -68,23 +69,23 @@ class Campaign:
 
 def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
     """Summary of a campaign; numbers may be infinite."""
-    good = [row for row in rows if row.error is None]
-    counted = [row for row in good if row.copy_of is None]
-    starts = [row.start_time for row in good if row.start_time is not None]
+    good = [row for row in rows if row["error"] is None]
+    counted = [row for row in good if row.get("copy_of") is None]
+    starts = [row["start_time"] for row in good if row.get("start_time") is not None]
     return Campaign(
         result=result,
         logs=len(rows),
         evaluated=len(good),
-        failed=tuple(row for row in rows if row.error is not None),
-        copies=tuple(row for row in good if row.copy_of is not None),
-        stopped=tuple(row for row in counted if row.exit_reason not in (None, DONE)),
-        incomplete=sum(not row.complete for row in good),
-        misfit=tuple(row for row in good if not _fits(row)),
-        outside=tuple(row for row in counted if row.outside),
-        violating=sum(bool(row.violations) for row in good),
+        failed=tuple(row for row in rows if row["error"] is not None),
+        copies=tuple(row for row in good if row.get("copy_of") is not None),
+        stopped=tuple(row for row in counted if row.get("exit_reason") not in (None, DONE)),
+        incomplete=sum(not row.get("complete") for row in good),
+        misfit=tuple(row for row in good if not row.get("fits", row.get("nominal_fits"))),
+        outside=tuple(row for row in counted if row.get("outside")),
+        violating=sum(bool(row.get("violations")) for row in good),
         start_time=(min(starts), max(starts)) if starts else None,
         method=options.method,
-        models=tuple(sorted({row.model for row in good if row.model is not None})),
+        models=tuple(sorted({row["model"] for row in good if row.get("model") is not None})),
         parameters={name: _parameter(counted, name) for name in options.names},
     )
 
@@ -94,7 +95,7 @@ def document(c: Campaign) -> dict[str, Any]:
     found: dict[str, Any] = to_json(replace(c, failed=(), copies=(), stopped=(), misfit=(), outside=()))
     told = ("root", "log", "error", "copy_of", "exit_reason", "model", "outside")
     for name in ("failed", "copies", "stopped", "misfit", "outside"):
-        found[name] = [{key: getattr(row, key) for key in told} for row in getattr(c, name)]
+        found[name] = [{key: row.get(key) for key in told} for row in getattr(c, name)]
     return found
 
 
@@ -104,72 +105,50 @@ def mark_copies(rows: Sequence[Row]) -> list[Row]:
     The first counts among equals.
     """
     best: dict[str, Row] = {}
-    for row in rows:
-        if row.error is None and row.beginning is not None:
-            held = best.get(row.beginning)
-            if held is None or (bool(row.complete), row.measured or 0) > (bool(held.complete), held.measured or 0):
-                best[row.beginning] = row
-    return [
-        replace(row, copy_of=best[row.beginning].log)
-        if row.error is None and row.beginning is not None and best[row.beginning] is not row
-        else row
-        for row in rows
-    ]
-
-
-def _fits(row: Row) -> bool:
-    return bool(row.nominal_fits if row.fits is None else row.fits)
+    told = [row for row in rows if row["error"] is None and row.get("beginning") is not None]
+    for row in told:
+        held = best.setdefault(row["beginning"], row)
+        if (row["complete"], row["measured"]) > (held["complete"], held["measured"]):
+            best[row["beginning"]] = row
+    copies = {id(row): best[row["beginning"]]["log"] for row in told if best[row["beginning"]] is not row}
+    return [row | {"copy_of": copies.get(id(row))} for row in rows]
 
 
 def _parameter(rows: Sequence[Row], name: str) -> ParameterSummary:
-    found = [p for row in rows for p in row.parameters if p.name == name]
-    bounds = [p.cramer_rao for p in found if p.cramer_rao is not None]
+    bounds = [row[key] for row in rows if row.get(key := f"{name}_cramer_rao") is not None]
     return ParameterSummary(
         unit=unit_of(name, "SI"),
-        identified=sum(bool(p.identified) for p in found),
+        identified=sum(bool(row.get(f"{name}_identified")) for row in rows),
         cramer_rao=float(np.median(bounds)) if bounds else None,
         relative=PARAMETERS[name].relative,
-        estimate=_estimates(_usable(rows, name)),
+        estimate=_estimates([row for row in rows if _is_usable(row, name)], name),
     )
 
 
-def _estimates(used: Sequence[Parameter]) -> ParameterEstimates | None:
+def _is_usable(row: Row, name: str) -> bool:
+    """True if the estimate has a valid deviation: the model explains the record, which identifies the parameter."""
+    deviation = row.get(f"{name}_between_runs")
+    return bool(row.get("fits") and row[f"{name}_identified"]) and deviation is not None and 0.0 < deviation < math.inf
+
+
+def _estimates(used: Sequence[Row], name: str) -> ParameterEstimates | None:
     if not used:
         return None
-    values = np.array([p.estimate for p in used], dtype=np.float64)
+    found = {key: np.array([row.get(f"{name}_{key}") for row in used], np.float64) for key in OF_AN_ESTIMATE}
+    values, errors = found["estimate"], found["error_sigmas"][np.isfinite(found["error_sigmas"])]
     low, high = np.quantile(values, [0.158655, 0.841345])
-    errors = np.array([p.error_sigmas for p in used if p.error_sigmas is not None])
+    # Shares are of one number, so that what came out small weighs no more.
+    scale = abs(float(np.median(values))) if PARAMETERS[name].relative else 1.0
     return ParameterEstimates(
         runs=len(used),
         median=float(np.median(values)),
         spread=0.5 * float(high - low),
-        total=float(np.median([0.5 * ((p.high or 0.0) - (p.low or 0.0)) for p in used])),
-        repeatability=float(np.median([p.repeatability or 0.0 for p in used])),
-        constancy=_constancy(used),
+        total=float(np.median(0.5 * (found["high"] - found["low"]))),
+        repeatability=float(np.median(found["repeatability"])),
+        constancy=constancy(values.tolist(), (scale * found["between_runs"]).tolist()),
         rms_error_sigmas=float(np.sqrt(np.mean(errors**2))) if len(errors) else None,
         covered=float(np.mean(np.abs(errors) <= NORMAL_95)) if len(errors) else None,
     )
-
-
-def _usable(rows: Sequence[Row], name: str) -> list[Parameter]:
-    """Estimates with valid deviations: the model explains the record, and the record identifies the parameter."""
-    return [
-        p
-        for row in rows
-        if row.fits
-        for p in row.parameters
-        if p.name == name and p.identified and p.between_runs is not None and 0.0 < p.between_runs < math.inf
-    ]
-
-
-def _constancy(used: Sequence[Parameter]) -> Constancy:
-    return constancy([p.estimate or 0.0 for p in used], _deviations(used))
-
-
-def _deviations(used: Sequence[Parameter]) -> list[float]:
-    """Standard deviations in SI units; shares are of one number, so that what came out small weighs no more."""
-    scale = abs(float(np.median([p.estimate or 0.0 for p in used]))) if PARAMETERS[used[0].name].relative else 1.0
-    return [scale * (p.between_runs or 0.0) for p in used]
 
 
 def text(c: Campaign, *, verbose: bool = False) -> str:
@@ -177,7 +156,7 @@ def text(c: Campaign, *, verbose: bool = False) -> str:
     most = None if verbose else SHOWN
     lines = []
     if c.failed:
-        lines += [f"{len(c.failed)} of {c.logs} logs FAILED", *listed("  ", (str(r.error) for r in c.failed[:most]))]
+        lines += [f"{len(c.failed)} of {c.logs} logs FAILED", *listed("  ", (row["error"] for row in c.failed[:most]))]
     if not c.evaluated:
         return "\n".join(lines)
     lines += wrapped(
@@ -185,7 +164,7 @@ def text(c: Campaign, *, verbose: bool = False) -> str:
         f"{len(c.copies)} copies, {c.violating} beyond a limit of the bench, {len(c.misfit)} not explained by the "
         f"model ({', '.join(c.models)})"
     )
-    outside = ((row.log, ", ".join(row.outside or ())) for row in c.outside[:most])
+    outside = ((row["log"], ", ".join(row["outside"])) for row in c.outside[:most])
     lines += listed("OUTSIDE: ", (f"{log}: {names}: the limits were not guaranteed" for log, names in outside))
     lines += listed("NOTE: ", _notes(c) if verbose else ())
     if len(c.models) > 1:
@@ -209,10 +188,10 @@ def _agreement(c: Campaign) -> Iterator[str]:
 
 
 def _notes(c: Campaign) -> Iterator[str]:
-    yield from (f"{row.log} is a copy of {row.copy_of}: the run counts once" for row in c.copies)
+    yield from (f"{row['log']} is a copy of {row['copy_of']}: the run counts once" for row in c.copies)
     unused = "" if c.method == NONE else ", and it is not in the means"
-    yield from (f"{row.log}: the model '{row.model}' does not fit{unused}" for row in c.misfit)
-    yield from (f"{row.log} was stopped ({row.exit_reason}) and counts where it identifies" for row in c.stopped)
+    yield from (f"{row['log']}: the model '{row['model']}' does not fit{unused}" for row in c.misfit)
+    yield from (f"{row['log']} was stopped ({row['exit_reason']}) and counts where it identifies" for row in c.stopped)
 
 
 def parameter_table(c: Campaign) -> Table:

@@ -120,7 +120,8 @@ def test_estimate_report_and_campaign_agree_on_what_is_identified(
         )
         row = evaluate_one(Source(str(one.path), "", one.path.name, "."), Options(starts=2))
         identified = [c.identified for c in plain.conclusions]
-        assert identified == [c.identified for c in profiled.conclusions] == [p.identified for p in row.parameters]
+        assert identified == [c.identified for c in profiled.conclusions]
+        assert identified == [row[f"{c.label}_identified"] for c in plain.conclusions]
         verdicts.append(identified)
     assert all(verdicts[0])
     assert not all(verdicts[1])

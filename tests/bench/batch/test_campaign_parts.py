@@ -17,7 +17,7 @@ from pyarrow import parquet
 
 from emb_bench.analysis.several_runs import constancy
 from emb_bench.batch.campaign import find
-from emb_bench.batch.row import Options, Parameter, Row, Source, failed, write_rows
+from emb_bench.batch.row import Options, Row, Source, failed, write_rows
 from emb_bench.batch.summary import Campaign, mark_copies, summarise, text
 from emb_bench.output import replacing
 from emb_runtime.errors import UsageError
@@ -77,8 +77,8 @@ def test_a_name_that_is_no_text_can_still_be_written(tmp_path: Path) -> None:
     Path(os.fsdecode(os.fsencode(tmp_path) + b"/run\xff.mcap")).touch()
     (log,) = find([tmp_path])
     row = failed(log, f"{log.path}:\nempty")
-    assert row.log == "run\\udcff.mcap"
-    assert row.error == f"{tmp_path}/run\\udcff.mcap: empty"
+    assert row["log"] == "run\\udcff.mcap"
+    assert row["error"] == f"{tmp_path}/run\\udcff.mcap: empty"
 
 
 def test_a_folder_that_cannot_be_listed_is_in_the_list(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,16 +149,16 @@ def test_a_missing_library_is_named_with_what_to_install(
 
 def test_a_run_counts_once_and_the_whole_log_or_the_one_that_holds_most_of_it_is_the_one() -> None:
     def row(log: str, beginning: str | None, measured: int, error: str | None = None, complete: bool = True) -> Row:
-        return Row(".", ".", log, error, beginning=beginning, measured=measured, complete=complete)
+        return {"log": log, "error": error, "beginning": beginning, "measured": measured, "complete": complete}
 
     rows = [row("a", "x", 60), row("b", "x", 500), row("c", "x", 500), row("d", "y", 9), row("e", None, 3)]
     rows += [row("f", None, 3), row("g", "x", 900, "it failed"), row("damaged", "x", 600, complete=False)]
-    assert [r.copy_of for r in mark_copies(rows)] == ["b", None, "b", None, None, None, None, "b"]
+    assert [r["copy_of"] for r in mark_copies(rows)] == ["b", None, "b", None, None, None, None, "b"]
 
 
 def test_the_rows_are_a_csv_file_where_the_name_says_so(tmp_path: Path) -> None:
     cut = failed(Source("logs/a.mcap", "logs", "a.mcap", "."), "cut")
-    rows = [cut, Row("logs", ".", "b.mcap", warnings=("one", "two"))]
+    rows = [cut, {"log": "b.mcap", "error": None, "warnings": ("one", "two")}]
     path = tmp_path / "rows"
     write_rows(path, ".csv", rows, Options())
     with path.open(newline="", encoding="utf-8") as file:
@@ -179,20 +179,25 @@ OPTIONS = Options(params=("k_m",))
 
 
 def row(number: int, value: float, *, fits: bool = True, half: float = 0.0) -> Row:
-    low, high = value * (1.0 - half), value * (1.0 + half)
-    estimate = Parameter("k_m", True, DEVIATION, value, low, high, DEVIATION, DEVIATION)
-    return Row(
-        "root",
-        "day",
-        f"{number}.mcap",
-        start_time=FIRST + number * HOUR,
-        exit_reason="DONE",
-        complete=True,
-        fits=fits,
-        model="exact",
-        log_det=70.0,
-        parameters=(estimate,),
-    )
+    of_k_m = {
+        "identified": True,
+        "cramer_rao": DEVIATION,
+        "estimate": value,
+        "low": value * (1.0 - half),
+        "high": value * (1.0 + half),
+        "deviation": DEVIATION,
+        "between_runs": DEVIATION,
+    }
+    return {
+        "log": f"{number}.mcap",
+        "error": None,
+        "start_time": FIRST + number * HOUR,
+        "exit_reason": "DONE",
+        "complete": True,
+        "fits": fits,
+        "model": "exact",
+        **{f"k_m_{key}": entry for key, entry in of_k_m.items()},
+    }
 
 
 def campaign(values: list[float], wrong: int | None = None) -> Campaign:
@@ -203,7 +208,7 @@ def campaign(values: list[float], wrong: int | None = None) -> Campaign:
 def test_a_misfit_is_named_and_has_no_part_in_the_mean() -> None:
     values = [2.98e-2, 2.99e-2, 3.1e-2, 5e-2]
     found = summarise([row(n, value, fits=n < 3, half=0.1) for n, value in enumerate(values)], OPTIONS, "r.parquet")
-    assert [row.log for row in found.misfit] == ["3.mcap"]
+    assert [row["log"] for row in found.misfit] == ["3.mcap"]
     estimate = found.parameters["k_m"].estimate
     assert estimate is not None
     assert (estimate.runs, estimate.constancy.constant) == (3, False)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from emb_bench import ONE_THREAD
-from emb_bench.batch.campaign import in_processes
+from emb_bench.batch.campaign import in_order
 from emb_bench.batch.row import Row, Source
 from emb_bench.parallel import Lost, shared_out
 
@@ -33,27 +33,27 @@ def dying(log: Source) -> Row:
         os._exit(int(log.log[4:]))
     if log.log == "hang":
         signal.pause()
-    return Row(log.root, log.campaign, log.log, exit_reason=" ".join(os.environ[name] for name in sorted(ONE_THREAD)))
+    return {"log": log.log, "error": None, "exit_reason": " ".join(os.environ[name] for name in sorted(ONE_THREAD))}
 
 
 def test_a_log_that_ends_its_process_costs_no_other_log() -> None:
     names = ["a", "SIGKILL", "b", "SIGSEGV-1", "exit3", "hang", "c"]
-    found = dict(in_processes(dying, [source(name) for name in names], jobs=2, time_limit=3.0))
-    assert sorted(found) == list(range(len(names)))
-    errors = {names[number]: row.error for number, row in found.items() if row.error is not None}
+    sources = [source(name) for name in names]
+    found = in_order(sources, shared_out(dying, sources, jobs=2, time_limit=3.0))
+    errors = {row["log"]: row["error"] for row in found if row["error"] is not None}
     assert errors == {
         "SIGKILL": "/logs/SIGKILL: the process that evaluated it was ended by SIGKILL",
         "SIGSEGV-1": "/logs/SIGSEGV-1: the process that evaluated it was ended by SIGSEGV",
         "exit3": "/logs/exit3: the process that evaluated it ended with exit code 3",
         "hang": "/logs/hang: not evaluated within 3 s",
     }
-    assert all(found[number].log == name for number, name in enumerate(names))
-    assert found[0].exit_reason == "1 1 1 1 1"
+    assert [row["log"] for row in found] == names
+    assert found[0]["exit_reason"] == "1 1 1 1 1"
 
 
 def test_the_environment_is_as_it_was_and_no_process_stays() -> None:
     before, children = dict(os.environ), multiprocessing.active_children()
-    rows = in_processes(dying, [source(name) for name in "abc"], jobs=2, time_limit=WAIT)
+    rows = shared_out(dying, [source(name) for name in "abc"], jobs=2, time_limit=WAIT)
     next(rows)
     rows.close()
     assert dict(os.environ) == before
