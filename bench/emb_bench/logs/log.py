@@ -424,7 +424,7 @@ def require_driven(log: RunLog) -> None:
 
 
 def end_detail(end: Mapping[str, str]) -> str:
-    """What a run's end says beside its reason: the loop's detail, and the node's stop reason if it stopped."""
+    """Detail of a run's end beside its reason: that of the loop, and the stop reason of a node that stopped."""
     node = end.get("node_stop_reason", "NONE")
     stopped = "" if node in ("NONE", "NEVER_COMMANDED") else f"stop reason of the node: {node}"
     return "; ".join(filter(None, (end.get("detail", ""), stopped)))
