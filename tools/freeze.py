@@ -80,7 +80,16 @@ GONE: dict[str, str] = {
 JOINED = "one note says that the residuals of both signals are correlated in time"
 STAMPED = "what a lock-step gateway sends has its time, and its frames count"
 OTHER_SEARCH = "the search of designs has no growth of tables: other local optima; E of four became better by a third"
+GRID = "the grid of a profile has its steps in the logarithm: other points of the same curve"
+LOGARITHM = "what windows of another length, or a flat prior, change is that of the logarithm"
 EXPLAINED: dict[str, str] = {
+    "*/says/profiles/*/values*": GRID,
+    "*/says/profiles/*/rise*": GRID,
+    "*/says/estimate/profiles/*/values*": GRID,
+    "*/says/estimate/profiles/*/rise*": GRID,
+    "estimate/clean windows/says/parameters/*/sandwich": LOGARITHM,
+    "estimate/clean pem/says/information/0/0": LOGARITHM,
+    "estimate/several oem/says/misfit/suspects/contact/*": "0.06 of a thousandth of it is beside the logs' own offsets",
     "estimate/*/says/misfit/notes": JOINED,
     "estimate/*/says/misfit/alarms": JOINED,
     "rerun/*/says/events": "those after the stop are not compared",

@@ -171,7 +171,7 @@ class Fit(NamedTuple):
 
     @property
     def z(self) -> Floats:
-        """The unknowns, scaled as in ``problem``."""
+        """The unknowns, in the coordinates of ``problem``."""
         return self.end.z
 
     @property
@@ -217,7 +217,7 @@ def fit_from(problem: Problem, near: Estimate | Fit, *, follow: bool = False) ->
 
     With ``follow`` a filter leads there, which follows the measured brake and has few local minima.
     """
-    values = (near.z * near.problem.units).tolist()
+    values = near.problem.values(near.z).tolist()
     start = problem.started(dict(zip(near.problem.unknowns, values, strict=True)))
     if follow:
         start = released(problem, start).z
@@ -291,6 +291,5 @@ def held_out_score(e: Estimate, deviance: float) -> float:
 
 def _volume(problem: Problem, z: Floats) -> float:
     """Logarithm of the determinant of the information, 1 for what nothing is known of."""
-    scale = problem.scale(z)
-    rows = problem.jacobian(z, problem.weights(z))[1] * scale
+    rows = problem.jacobian(z, problem.weights(z))[1]
     return float(np.linalg.slogdet(rows.T @ rows + np.eye(len(z)))[1])

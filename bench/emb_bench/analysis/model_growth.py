@@ -129,7 +129,8 @@ def _polished(plant: Plant, asked: EstimationProblem, found: Candidate, names: S
     """The model searched once more from around its minimum, in case that is a local one."""
     e, rng = found.estimate, np.random.default_rng(seed)
     problem = _problem(plant, asked, e, names)
-    near = [replace(e, z=e.z * (1.0 + AROUND * rng.standard_normal(len(e.z)))) for _ in range(POLISHED)]
+    around = [e.values * (1.0 + AROUND * rng.standard_normal(len(e.z))) for _ in range(POLISHED)]
+    near = [replace(e, z=e.problem.coordinates(values)) for values in around]
     fits = [fit_from(problem, e, follow=True), *(fit_from(problem, start) for start in near)]
     best = min(fits, key=lambda fit: fit.end.cost)
     return _judged(plant, best.finished(), names) if best.end.cost < e.ends[0].cost - 1e-3 else found

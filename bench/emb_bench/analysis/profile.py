@@ -11,7 +11,7 @@ method.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -37,7 +37,6 @@ SEARCHES = 60  # Most searches on one side
 BETTER = 0.01  # Fall of χ² below its minimum that is more than the search's own error
 MINIMA = 3  # Most minima that a profile moves on to
 CLIFF = 1e-9  # Share of the way to the border that the grid is not narrowed below: the rise jumps there
-NEAR = 1e-6  # Share of what is searched within which an unknown is at its border
 AGREES = 0.1  # Largest relative difference of two half-widths that count as equal
 DOUBTFUL = 0.05
 """Deviation, as a share of the value or of a gross error, above which a parabola is not trusted without a profile."""
@@ -78,7 +77,7 @@ class Profile:
 
 
 class _Point(NamedTuple):
-    """Point of a profile: the scaled unknowns, and the rise of χ² there."""
+    """Point of a profile: the unknowns, and the rise of χ² there."""
 
     z: Floats
     rise: float
@@ -129,24 +128,27 @@ def profile(e: Estimate, label: str) -> Profile:
         sides = _sides(e, problem, weights, i, end)
     below, above = sides
     points = [*below.points[:0:-1], *above.points]
-    unit = float(problem.units[i])
-    interval = (_crossing(below, i, -math.inf) * unit, _crossing(above, i, math.inf) * unit)
+
+    def value(z: Floats) -> float:
+        return float(problem.values(z)[i])
+
+    interval = (_crossing(below, value, -math.inf), _crossing(above, value, math.inf))
     shape = {
         (True, True): "closed",
         (False, True): "open below",
         (True, False): "open above",
         (False, False): "flat",
     }[below.closed, above.closed]
-    minimum = float(end.z[i]) * unit
+    minimum = value(end.z)
     half = NORMAL_95 * float(e.cramer_rao()[i] * e.scale[i])
     open_sides = tuple(
-        OpenSide(above, last.rise, float(last.z[i]) * unit, last.rise >= LEVEL)
+        OpenSide(above, last.rise, value(last.z), last.rise >= LEVEL)
         for above, side in zip((False, True), sides, strict=True)
         if not side.closed and (last := side.points[-1])
     )
     return Profile(
         label=label,
-        values=np.array([point.z[i] for point in points]) * unit,
+        values=np.array([value(point.z) for point in points]),
         rise=np.array([point.rise for point in points]),
         interval=interval,
         shape=shape,
@@ -159,7 +161,7 @@ def profile(e: Estimate, label: str) -> Profile:
 
 def _sides(e: Estimate, problem: Problem, weights: Sequence[Floats], i: int, minimum: End) -> tuple[_Side, _Side]:
     z, cost = minimum.z, minimum.cost
-    deviation = float(e.cramer_rao()[i] * problem.scale(z)[i])
+    deviation = float(e.cramer_rao()[i])
     low, high = (float(border[i]) for border in problem.bounds)
     below = _walk(problem, weights, i, z, cost, low, min(STEP * deviation, SHARE * (z[i] - low)))
     above = _walk(problem, weights, i, z, cost, high, min(STEP * deviation, SHARE * (high - z[i])))
@@ -210,17 +212,16 @@ def _walk(
 
 def _at_border(problem: Problem, z: Floats, i: int) -> NDArray[np.bool_]:
     """Mask of the unknowns other than ``i`` that are at a border of the search, shape (p,)."""
-    low, high = problem.bounds
-    result: NDArray[np.bool_] = np.minimum(z - low, high - z) <= NEAR * (high - low)
+    result = problem.at_border(z)
     result[i] = False
     return result
 
 
-def _crossing(side: _Side, i: int, otherwise: float) -> float:
-    """Scaled value where the rise reaches ``LEVEL``, interpolated linearly in its root; else ``otherwise``."""
+def _crossing(side: _Side, value: Callable[[Floats], float], otherwise: float) -> float:
+    """Value where the rise reaches ``LEVEL``, interpolated linearly in its root; else ``otherwise``."""
     if not side.closed:
         return otherwise
     inner, outer = side.points[-2:]
     low, high = math.sqrt(max(inner.rise, 0.0)), math.sqrt(outer.rise)
     share = (math.sqrt(LEVEL) - low) / (high - low)
-    return float(inner.z[i] + share * (outer.z[i] - inner.z[i]))
+    return value(inner.z) + share * (value(outer.z) - value(inner.z))

@@ -9,11 +9,8 @@ A machine that is no brake has names and units of its own: a linear servo has a 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
 
 from emb_bench.config.machine import COMMANDS, LOADS, Machine
 
@@ -235,11 +232,6 @@ FEATURES = tuple(name for name, row in PARAMETERS.items() if row.start)
 """Features of a brake beyond the thesis's equations."""
 OF_A_RECORD = tuple(name for name, row in PARAMETERS.items() if row.of_a_record)
 """Unknowns that each record has for itself: its start, and the homing of its encoder."""
-
-
-def scale(names: Iterable[str], values: Iterable[float]) -> NDArray[np.float64]:
-    """Factors from relative changes to those of the values: the value where a parameter is relative, else 1."""
-    return np.array([value if PARAMETERS[name].relative else 1.0 for name, value in zip(names, values, strict=True)])
 
 
 LINEAR: Mapping[str, str] = {"mass": "J", "F_c": "T_c", "F_v": "f_v"}

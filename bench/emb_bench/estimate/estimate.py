@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.parameters import Quantity, quantity, scale
+from emb_bench.brake.parameters import Quantity, quantity
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
 from emb_bench.estimate.intervals import deviations, unnoticed
@@ -26,7 +26,6 @@ from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
 from emb_runtime.config.bench import BrakeParameters
 
-NEAR_BOUND = 1e-6  # Share of what is searched within which an unknown is at its border
 OF_THE_BENCH = ("J", ANGLE_SCALE)  # Effects that all runs on one bench share
 
 
@@ -35,7 +34,7 @@ class Estimate:
     """Parameters from records."""
 
     problem: Problem  # Its plant has the features that were estimated
-    z: Floats  # The unknowns, scaled as in ``problem``
+    z: Floats  # The unknowns, in the coordinates of ``problem``
     information: Floats  # Physical FIM at the estimate, prior included, relative parameters
     prior: Floats | None  # The prior's part of it
     sandwich: Floats
@@ -84,15 +83,12 @@ class Estimate:
     @property
     def values(self) -> Floats:
         """The unknowns in SI units."""
-        result: Floats = self.z * self.problem.units
-        return result
+        return self.problem.values(self.z)
 
     @property
     def at_bound(self) -> tuple[str, ...]:
         """Labels of the unknowns that ended at the border of what is searched."""
-        low, high = self.problem.bounds
-        near = np.minimum(self.z - low, high - self.z) <= NEAR_BOUND * (high - low)
-        return tuple(label for label, at in zip(self.labels, near, strict=True) if at)
+        return tuple(label for label, at in zip(self.labels, self.problem.at_border(self.z), strict=True) if at)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -102,7 +98,7 @@ class Estimate:
     @property
     def scale(self) -> Floats:
         """Factors from relative deviations, or those in an unknown's unit, to SI units."""
-        return np.abs(scale([unknown.name for unknown in self.unknowns], self.values.tolist()))
+        return self.problem.scale(self.z)
 
     def cramer_rao(self) -> Floats:
         """Least standard deviations by the physical FIM: relative or in the unknown's unit, inf if not identified."""

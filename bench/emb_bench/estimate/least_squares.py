@@ -61,21 +61,23 @@ class RecursiveLeastSquares(Method):
                 f"recursive least squares: the brake surely moves in {used} periods, too few for "
                 f"{len(problem.unknowns)} unknowns: excite it more"
             )
-        z = recursion(rows[counts], errors[counts], *beginning(problem))
-        low, high = problem.bounds
+        values = recursion(rows[counts], errors[counts], *beginning(problem))
+        low, high = map(problem.values, problem.bounds)
         prior_mean, inverse = problem.prior
-        if (z < low).any() or (z > high).any():
-            stacked = np.concatenate([rows, np.diag(inverse)]), np.concatenate([errors, inverse * prior_mean])
-            z = np.clip(lsq_linear(*stacked, bounds=(low, high)).x, low, high)
-        left = errors - rows @ z
-        relative = rows * z
-        prior = np.diag((inverse * z) ** 2)
+        if (values < low).any() or (values > high).any():
+            unit = problem.values(problem.nominal())
+            stacked = np.concatenate([rows, np.diag(inverse)]) * unit, np.concatenate([errors, inverse * prior_mean])
+            values = np.clip(lsq_linear(*stacked, bounds=(low / unit, high / unit)).x * unit, low, high)
+        z = problem.coordinates(values)
+        left = errors - rows @ values
+        relative = rows * values
+        prior = np.diag((inverse * values) ** 2)
         information = relative.T @ relative + prior
         paired = np.stack([relative, np.zeros_like(relative)], axis=1).reshape(-1, len(z))
-        known = (prior_mean - z) * inverse
+        known = (prior_mean - values) * inverse
         spread = sandwich(
             information,
-            np.concatenate([paired, np.diag(inverse * z)]),
+            np.concatenate([paired, np.diag(inverse * values)]),
             np.concatenate([np.stack([left, np.zeros_like(left)], axis=1).ravel(), known]),
             [len(part) for part, _ in parts],
         )
@@ -84,7 +86,7 @@ class RecursiveLeastSquares(Method):
             problem,
             z,
             problem.weights(z),
-            (End(z, cost, np.ones(len(z)), True, used),),
+            (End(z, cost, problem.nominal(), True, used),),
             information=information,
             sandwich=spread,
             method="rls",
@@ -96,9 +98,8 @@ def regression(problem: Problem, record: Experiment) -> tuple[Floats, Floats]:
     """A record's equations of motion, each over the deviation that the noise of the velocities gives it.
 
     Returns:
-        Regressors, shape (periods, unknowns), of parameters over nominal, and what they make up, shape (periods,). Zero
-        for a period that does not count. The first one, which begins at a start that was not sampled, is not among
-        them.
+        Regressors, shape (periods, unknowns), of the parameters, and what they make up, shape (periods,). Zero for a
+        period that does not count. The first one, which begins at a start that was not sampled, is not among them.
     """
     p, t_s = problem.bench.brake, problem.bench.timing.sample_time
     delay, offset = problem.plant.instruments.measurement_delay, problem.plant.instruments.encoder_offset
@@ -108,12 +109,13 @@ def regression(problem: Problem, record: Experiment) -> tuple[Floats, Floats]:
     noise = velocity_noise(problem)
     sign = np.sign(mean[:, 1])
     impulses = {
-        "k_m": p.k_m * record.currents[1 : len(seen)] * t_s,
-        "k_1": -p.gamma * p.k_1 * np.maximum(mean[:, 0] - offset, 0.0) * t_s,
-        "T_c": -p.T_c * sign * t_s,
-        "f_v": -p.f_v * mean[:, 1] * t_s,
+        "k_m": record.currents[1 : len(seen)] * t_s,
+        "k_1": -p.gamma * np.maximum(mean[:, 0] - offset, 0.0) * t_s,
+        "T_c": -sign * t_s,
+        "f_v": -mean[:, 1] * t_s,
     }
-    whole = p.J * (ended[:, 1] - begun[:, 1]) - sum(v for n, v in impulses.items() if n not in problem.asked.names)
+    known = sum(getattr(p, n) * v for n, v in impulses.items() if n not in problem.asked.names)
+    whole = p.J * (ended[:, 1] - begun[:, 1]) - known
     rows = np.stack([impulses[name] for name in problem.asked.names], axis=1)
     reported = True if record.assumed is None else np.isnan(record.assumed[1 : len(seen)])
     with np.errstate(invalid="ignore"):  # a lost sample compares as not sure
@@ -132,9 +134,11 @@ def velocity_noise(problem: Problem) -> float:
 
 
 def beginning(problem: Problem) -> tuple[Floats, Floats]:
-    """Mean and covariance of the parameters over nominal before the first period."""
+    """Mean and covariance of the parameters before the first period."""
     mean, inverse = problem.prior
-    return mean, np.diag(np.where(inverse > 0.0, 1.0 / np.where(inverse > 0.0, inverse, 1.0), WIDE) ** 2)
+    nominal, known = problem.values(problem.nominal()), inverse > 0.0
+    deviation = np.where(known, 1.0 / np.where(known, inverse, 1.0), WIDE * nominal)
+    return np.where(known, mean, nominal), np.diag(deviation**2)
 
 
 def recursion(rows: Floats, errors: Floats, z: Floats, covariance: Floats) -> Floats:

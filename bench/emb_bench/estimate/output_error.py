@@ -212,12 +212,12 @@ def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
     ranges = problem.asked.prior or bench.range_set(bench.shield.ranges)
     rng, points = np.random.default_rng(seed), [first]
     for _ in range(starts - 1):
-        drawn, point = rng.random(len(first)), first.copy()
+        drawn, point = rng.random(len(first)), problem.values(first)
         for i, unknown in enumerate(problem.unknowns):
             low, high = getattr(ranges.low, unknown.name, 0.0), getattr(ranges.high, unknown.name, 0.0)
             if low < high:
-                point[i] = (low + drawn[i] * (high - low)) / problem.units[i]
-        points.append(np.clip(point, *problem.bounds))
+                point[i] = low + drawn[i] * (high - low)
+        points.append(np.clip(problem.coordinates(point), *problem.bounds))
     return points
 
 
@@ -240,13 +240,11 @@ def finished(
     The residuals ``found`` at ``z`` are those of the simulation, if no others are given; ``more`` are further fields.
     """
     found = found or problem.marginal(z, weights)
-    residuals, scale = by_record(found.residuals, weights), problem.scale(z)
-    relative = found.jacobian * scale
-    information = relative.T @ relative
+    residuals, information = by_record(found.residuals, weights), found.jacobian.T @ found.jacobian
     fields = {
         "information": information,
-        "prior": np.diag((problem.prior[1] * scale) ** 2) if problem.prior[1].any() else None,
-        "sandwich": sandwich(information, relative, found.residuals, [len(r) for r in residuals]),
+        "prior": np.diag((problem.prior[1] * problem.scale(z)) ** 2) if problem.prior[1].any() else None,
+        "sandwich": sandwich(information, found.jacobian, found.residuals, [len(r) for r in residuals]),
         "validation": validation or examine(problem, z, weights, found),
         "ends": ends,
         "caveats": of_losses(problem),

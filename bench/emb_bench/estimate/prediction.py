@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,16 +12,18 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
-from emb_bench.brake.parameters import COMMAND, FEATURES, PARAMETERS, scale
+from emb_bench.brake.parameters import COMMAND, FEATURES, PARAMETERS
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Mechanics, Plant
 from emb_bench.estimate.records import EstimationProblem, Unknown, check_model, searched
-from emb_bench.experiment.experiment import Experiment
-from emb_bench.information.fisher import uniform_prior, weights_along
+from emb_bench.experiment.experiment import Booleans, Experiment
+from emb_bench.information.fisher import weights_along
 from emb_bench.sim.open_loop import Input, SystematicErrors, Trajectory, later, march, show, trajectory
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError, UsageError
+
+NEAR_BOUND = 1e-6  # Share of what is searched within which an unknown is at its border
 
 
 class Marginal(NamedTuple):
@@ -55,7 +58,8 @@ class Opening(NamedTuple):
 class Problem:
     """Records, a model and what is unknown.
 
-    The unknowns travel as a vector z: brake parameters over their nominal values, the others in their units.
+    A search moves a vector z: the logarithm of each relative unknown, the others in their units. Derivatives to z are
+    then the sensitivities themselves, θ ∂y/∂θ = ∂y/∂ln θ, and what is positive stays so.
     """
 
     bench: Bench
@@ -69,32 +73,41 @@ class Problem:
         return self.asked.unknowns(len(self.records))
 
     @cached_property
-    def units(self) -> Floats:
-        """Factors from z to SI units."""
-        nominal = {name: row.start for name, row in PARAMETERS.items()} | self.bench.brake._asdict()
-        return scale([u.name for u in self.unknowns], [nominal[u.name] for u in self.unknowns])
+    def _logarithmic(self) -> Booleans:
+        return np.array([unknown.relative for unknown in self.unknowns], np.bool_)
+
+    def values(self, z: Floats) -> Floats:
+        """The unknowns in SI units."""
+        return np.exp(z, out=z.copy(), where=self._logarithmic)
+
+    def coordinates(self, values: Floats) -> Floats:
+        """The z of unknowns in SI units."""
+        return np.log(values, out=values.copy(), where=self._logarithmic)
 
     def scale(self, z: Floats) -> Floats:
-        """Factors from relative changes of the unknowns, or those in their units, to changes of z."""
-        return scale([u.name for u in self.unknowns], z.tolist())
+        """Changes of the unknowns in SI units with z."""
+        return np.where(self._logarithmic, self.values(z), 1.0)
 
     @cached_property
     def bounds(self) -> tuple[Floats, Floats]:
         """Lowest and highest z."""
-        pairs = np.array([searched(self.bench, u) for u in self.unknowns]) / self.units[:, None]
-        return pairs[:, 0], pairs[:, 1]
+        low, high = np.array([searched(self.bench, u) for u in self.unknowns]).T
+        return self.coordinates(low), self.coordinates(high)
+
+    def at_border(self, z: Floats) -> Booleans:
+        """Mask of the unknowns that are at a border of the search."""
+        value, low, high = self.values(z), *map(self.values, self.bounds)
+        return np.minimum(value - low, high - value) <= NEAR_BOUND * (high - low)
 
     @cached_property
     def prior(self) -> tuple[Floats, Floats]:
-        """Mean of z before the records, and its inverse standard deviations: zero for what nothing was known of."""
+        """Means of the unknowns before the records, and inverse deviations: zero for what nothing was known of."""
         prior = self.asked.prior
-        mean, inverse = np.ones(len(self.unknowns)), np.zeros(len(self.unknowns))
+        mean, inverse = np.zeros(len(self.unknowns)), np.zeros(len(self.unknowns))
         if prior is not None:
-            precision = np.sqrt(np.diag(uniform_prior(prior, self.asked.varied, self.bench.brake)))
-            for name, value in zip(self.asked.varied, precision.tolist(), strict=True):
-                i = self.unknowns.index(Unknown(name))
-                mean[i] = 0.5 * (getattr(prior.low, name) + getattr(prior.high, name)) / self.units[i]
-                inverse[i] = value
+            for name in self.asked.varied:
+                i, low, high = self.unknowns.index(Unknown(name)), getattr(prior.low, name), getattr(prior.high, name)
+                mean[i], inverse[i] = 0.5 * (low + high), math.sqrt(12.0) / (high - low)
         for i, unknown in enumerate(self.unknowns):
             if unknown.name in self.asked.systematic:
                 mean[i] = self.plant.instruments.encoder_offset if unknown.name == "offset" else 0.0
@@ -106,36 +119,31 @@ class Problem:
         offset = self.plant.instruments.encoder_offset
         free = "offset" in self.asked.names
         along = "offset" in self.asked.systematic
-        z = np.ones(len(self.unknowns))
+        of_all = self.plant.mechanics._asdict() | self.bench.brake._asdict()
+        values = np.zeros(len(self.unknowns))
         for i, unknown in enumerate(self.unknowns):
-            if unknown.name in FEATURES:
-                own, row = getattr(self.plant.mechanics, unknown.name), PARAMETERS[unknown.name]
-                z[i] = own / row.start if own > row.low else 1.0
-                continue
             if unknown.record is None:
-                z[i] = z[i] if unknown.relative else getattr(self.plant.mechanics, unknown.name, 0.0)
+                own, row = of_all.get(unknown.name, 0.0), PARAMETERS[unknown.name]
+                values[i] = row.start if unknown.name in FEATURES and own <= row.low else own
                 continue
             record = self.records[unknown.record]
             x1, x2 = record.start(record.angle if free else offset)
             known = {"x1_0": 0.0 if free else x1, "x2_0": x2, "offset": offset if along else record.angle}
-            z[i] = known[unknown.name]
-        low, high = self.bounds
-        return np.clip(z, low, high)
+            values[i] = known[unknown.name]
+        return np.clip(self.coordinates(values), *self.bounds)
 
     def started(self, known: Mapping[Unknown, float]) -> Floats:
         """The z to begin with where some unknowns are known [SI units]."""
-        z = self.nominal()
-        for i, unknown in enumerate(self.unknowns):
-            z[i] = known[unknown] / self.units[i] if unknown in known else z[i]
-        result: Floats = np.clip(z, *self.bounds)
-        return result
+        values = self.values(self.nominal()).tolist()
+        begun = [known.get(unknown, value) for unknown, value in zip(self.unknowns, values, strict=True)]
+        return np.clip(self.coordinates(np.array(begun)), *self.bounds)
 
     def theta(self, z: Floats) -> BrakeParameters:
-        """Parameters of the brake for a vector of scaled unknowns."""
+        """Parameters of the brake."""
         return self.bench.brake._replace(**self._named(z, BrakeParameters._fields))
 
     def _named(self, z: Floats, names: Container[str]) -> dict[str, Any]:
-        pairs = zip(self.unknowns, (z * self.units).tolist(), strict=True)
+        pairs = zip(self.unknowns, self.values(z).tolist(), strict=True)
         return {unknown.name: value for unknown, value in pairs if unknown.name in names}
 
     def mechanics(self, z: Floats) -> Mechanics:
@@ -318,13 +326,13 @@ class Problem:
         """All residuals in one row, and their derivatives to z, as :meth:`jacobian`.
 
         The ``parts`` are of each record the errors of its samples in standard deviations, shape (n, 2), and what each
-        of its unknowns adds to what is shown, in the same unit, relative for parameters, shape (n, own, 2).
+        of its unknowns adds to what is shown, in the same unit, shape (n, own, 2).
         """
-        residuals, rows, factors = [], [], self.scale(z)
+        residuals, rows = [], []
         for i, (errors, shares) in enumerate(parts):
             columns = self.columns(i)
             block = np.zeros((*errors.shape, len(z)))
-            block[:, :, columns] = -shares.transpose(0, 2, 1) / factors[columns]
+            block[:, :, columns] = -shares.transpose(0, 2, 1)
             residuals.append(errors.ravel())
             rows.append(block.reshape(-1, len(z)))
         known, their_rows = self.prior_residuals(z)
@@ -352,8 +360,8 @@ class Problem:
             rows.append(row)
         mean, inverse = self.prior
         known = np.flatnonzero(inverse)
-        residuals.append((mean - z)[known] * inverse[known])
-        rows.append(-np.diag(inverse)[known])
+        residuals.append((mean - self.values(z))[known] * inverse[known])
+        rows.append(-np.diag(inverse * self.scale(z))[known])
         return np.concatenate(residuals), np.concatenate(rows)
 
 

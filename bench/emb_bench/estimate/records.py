@@ -150,7 +150,7 @@ def check_model(plant: Plant, names: Sequence[str]) -> None:
 class End:
     """End of a local search, and its start."""
 
-    z: Floats  # The unknowns, scaled as in :class:`~emb_bench.estimate.prediction.Problem`
+    z: Floats  # The unknowns, in the coordinates of :class:`~emb_bench.estimate.prediction.Problem`
     cost: float
     """Weighted sum of squares, prior included; under a disturbance, minus twice the logarithm of the likelihood."""
     start: Floats  # Start, in the form of ``z``

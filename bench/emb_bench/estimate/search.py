@@ -19,6 +19,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from emb_bench.brake.motion import Floats
+from emb_bench.brake.parameters import FEATURES, PARAMETERS
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End
@@ -39,25 +40,34 @@ def minimise(
     """One local search for the least sum of squares within the bounds.
 
     What follows the unknowns of the problem in ``start`` is searched along without bounds, and is in the end too.
-    ``residuals`` gives those of a z with their derivatives.
+    ``residuals`` gives those of a z with their derivatives. Features are moved by their values, for none at all is
+    infinitely far in a logarithm.
     """
+    added = np.zeros(len(start) - len(problem.unknowns))
+    linear = np.append([u.name in FEATURES for u in problem.unknowns], added).astype(np.bool_)
+    unit = np.append(problem.coordinates(np.array([PARAMETERS[u.name].start or 1.0 for u in problem.unknowns])), added)
     known: dict[bytes, tuple[Floats, Floats]] = {}
-    low, high = problem.bounds
-    free = np.full(len(start) - len(low), math.inf)
+    low, high = (np.append(z, added + side) for z, side in zip(problem.bounds, (-math.inf, math.inf), strict=True))
 
-    def both(z: Floats) -> tuple[Floats, Floats]:
-        key = z.tobytes()
+    def moved(z: Floats) -> Floats:
+        return np.exp(z - unit, out=z.copy(), where=linear)
+
+    def of(x: Floats) -> Floats:
+        return np.add(np.log(x, out=x.copy(), where=linear), unit, out=x.copy(), where=linear)
+
+    def both(x: Floats) -> tuple[Floats, Floats]:
+        key = x.tobytes()
         if key not in known:
             known.clear()  # the derivatives are evaluated at the newest point only
-            errors, derivatives = residuals(z)
-            known[key] = np.clip(errors, -HUGE, HUGE), derivatives
+            errors, derivatives = residuals(of(x))
+            known[key] = np.clip(errors, -HUGE, HUGE), derivatives / np.where(linear, x, 1.0)
         return known[key]
 
     found = least_squares(
-        lambda z: both(z)[0],
-        start,
-        lambda z: both(z)[1],
-        bounds=(np.append(low, -free), np.append(high, free)),
+        lambda x: both(x)[0],
+        np.clip(moved(start), moved(low), moved(high)),
+        lambda x: both(x)[1],
+        bounds=(moved(low), moved(high)),
         method="trf",
         x_scale="jac",
         ftol=1e-10,
@@ -65,7 +75,7 @@ def minimise(
         gtol=1e-12,
         max_nfev=evaluations,
     )
-    return End(found.x, 2.0 * float(found.cost), start, found.status > 0, int(found.nfev))
+    return End(of(found.x), 2.0 * float(found.cost), start, found.status > 0, int(found.nfev))
 
 
 def strong(problem: Problem) -> float:

@@ -225,7 +225,6 @@ def score(
         every = {name: column for name, column in every.items() if name not in OF_THE_SPRING}
     pseudo = np.linalg.pinv(jacobian / _lengths(jacobian)) / _lengths(jacobian)[:, None]
     priors = _priors(problem, DISTURBED if disturbed else 1.0)
-    scale = np.abs(problem.scale(z))
     found, beside_all, budget = [], [], []
     untested = {ANGLE_SCALE: _angle_scaled(problem, z, shown)} if ANGLE_SCALE in priors else {}
     for name, column in (every | untested).items():
@@ -238,7 +237,7 @@ def score(
         if name in priors:
             # What drifts is fitted as it is in the middle of a run, and meant from the begin to the end.
             ends = np.array([0.5 if f"{u.name}_drift" == name else 0.0 for u in problem.unknowns])
-            bias = (np.abs(pseudo @ whole) / scale + ends) * _size(name, priors[name], length, float(beside @ errors))
+            bias = (np.abs(pseudo @ whole) + ends) * _size(name, priors[name], length, float(beside @ errors))
             budget.append(Contribution(name, tuple(bias.tolist())))
         if length == 0.0 or name in untested:
             continue

@@ -87,7 +87,7 @@ class Windows(Method):
 
 
 class Point(NamedTuple):
-    """Values of all unknowns, scaled as in :class:`Problem`."""
+    """Values of all unknowns, in the coordinates of :class:`Problem`."""
 
     shared: Floats  # Shape (p,)
     starts: Floats  # Angle and velocity at the start of each window, shape (m, 2)
@@ -188,7 +188,7 @@ class Cut:
         window, root, z = self.windows[i], self.weights[i], np.append(shared, start)
         said, counts = window.predict(z, 0), root.ravel() > 0.0
         errors = (np.nan_to_num(window.records[0].samples - said.samples) * root).ravel()[counts]
-        rows = (said.sensitivities * root[:, None]).transpose(0, 2, 1).reshape(-1, len(z))[counts] / window.scale(z)
+        rows = (said.sensitivities * root[:, None]).transpose(0, 2, 1).reshape(-1, len(z))[counts]
         own = rows[:, -len(START) :]
         lengths = np.linalg.norm(own, axis=0)
         unit = np.where(lengths > 0.0, lengths, 1.0)
@@ -237,9 +237,8 @@ class _Candidate(NamedTuple):
     """An estimate with windows of one length and one course of the command, by one step of Gauss and Newton."""
 
     problem: Problem
-    shared: Floats  # Scaled as in :class:`Problem`, shape (p,)
-    covariance: Floats  # From the scatter of the windows, relative, shape (p, p)
-    scale: Floats  # From relative to scaled values, shape (p,)
+    shared: Floats  # Shape (p,)
+    covariance: Floats  # From the scatter of the windows, shape (p, p)
     costs: Floats  # Of each window, shape (m,)
     follows: list[bool]
 
@@ -293,20 +292,20 @@ def _candidate(problem: Problem, shared: Floats) -> _Candidate:
     """Estimate that windows lead to from shared unknowns that are near."""
     cut = Cut(problem, shared)
     _, windows = cut.settled(cut.begun)
-    information, scores, scale = _sums(problem, shared, windows)
+    information, scores = _sums(windows)
     spectrum = Spectrum(information)
-    step = np.where(spectrum.lost, 0.0, np.linalg.pinv(information, hermitian=True) @ scores.sum(axis=0)) * scale
+    step = np.where(spectrum.lost, 0.0, np.linalg.pinv(information, hermitian=True) @ scores.sum(axis=0))
     parts = [(errors - columns @ step, columns) for errors, columns in (window.projected() for window in windows)]
     costs = np.array([float(errors @ errors) for errors, _ in parts])
-    left = np.array([columns.T @ errors for errors, columns in parts]) * scale
-    return _Candidate(problem, shared + step, by_windows(information, left, cut.follows), scale, costs, cut.follows)
+    left = np.array([columns.T @ errors for errors, columns in parts])
+    return _Candidate(problem, shared + step, by_windows(information, left, cut.follows), costs, cut.follows)
 
 
 def _uncertainty(found: Sequence[_Candidate], i: int) -> float:
     """Logarithm of the determinant of a candidate's covariance, with what another length moves it by."""
     steps = round(math.log2(OTHER))
     other = found[i + steps if i + steps < len(found) else max(i - steps, 0)]
-    moved = (other.shared - found[i].shared) / found[i].scale
+    moved = other.shared - found[i].shared
     sign, value = np.linalg.slogdet(found[i].covariance + np.outer(moved, moved))
     return float(value) if sign > 0.0 and math.isfinite(value) else math.inf
 
@@ -338,7 +337,7 @@ def predict_windows(problem: Problem, values: Floats) -> tuple[float, float, int
     Returns:
         Root mean square of the angle's error [rad], χ² of the samples, and its degrees of freedom.
     """
-    cut = Cut(problem, values / problem.units)
+    cut = Cut(problem, problem.coordinates(values))
     at = cut.restarted(cut.settled(cut.begun)[0])
     squares, samples, chi2, freedom = 0.0, 0, 0.0, 0
     for _, found, root in cut.residuals(at):
@@ -350,20 +349,17 @@ def predict_windows(problem: Problem, values: Floats) -> tuple[float, float, int
     return math.sqrt(squares / samples), chi2, freedom
 
 
-def _sums(problem: Problem, shared: Floats, windows: Sequence[Window]) -> tuple[Floats, Floats, Floats]:
-    """Information of relative parameters, the score of each window, and the factors to scaled values."""
-    p = len(problem.unknowns)
-    scale = problem.scale(shared)
+def _sums(windows: Sequence[Window]) -> tuple[Floats, Floats]:
+    """Information of the shared unknowns, and the score of each window."""
     parts = [window.projected() for window in windows]
-    information = sum((columns.T @ columns for _, columns in parts), np.zeros((p, p))) * np.outer(scale, scale)
-    return information, np.array([columns.T @ errors for errors, columns in parts]) * scale, scale
+    information = np.sum([columns.T @ columns for _, columns in parts], axis=0)
+    return information, np.array([columns.T @ errors for errors, columns in parts])
 
 
 def _finished(cut: Cut, at: Point, ends: tuple[End, ...], moved: Sequence[Floats], said: tuple[str, ...]) -> Estimate:
     """Estimate of what the windows share, with its information, covariance and validation."""
     problem = cut.problem
-    information, scores, scale = _sums(problem, at.shared, cut.linearised(at))
-    changes = [change / scale for change in moved]
+    information, scores = _sums(cut.linearised(at))
     covariance = by_windows(information, scores, cut.follows)
     residuals = tuple(np.full(record.samples.shape, np.nan) for record in problem.records)
     for (number, begin, end), errors, root in cut.residuals(at):
@@ -373,7 +369,7 @@ def _finished(cut: Cut, at: Point, ends: tuple[End, ...], moved: Sequence[Floats
         at.shared,
         information=information,
         prior=None,
-        sandwich=covariance + sum((np.outer(c, c) for c in changes), np.zeros_like(covariance)),
+        sandwich=covariance + sum((np.outer(c, c) for c in moved), np.zeros_like(covariance)),
         validation=_validated(cut, at),
         ends=ends,
         residuals=residuals,

@@ -199,7 +199,7 @@ def _fields(record: object, *names: str) -> dict[str, Any]:
 
 def _shown(e: Estimate, z: Floats) -> dict[str, float]:
     """Values of the unknowns by label."""
-    return dict(zip(e.labels, (z * e.problem.units).tolist(), strict=True))
+    return dict(zip(e.labels, e.problem.values(z).tolist(), strict=True))
 
 
 def _systematic(e: Estimate) -> dict[str, Any]:

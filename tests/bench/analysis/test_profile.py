@@ -51,7 +51,7 @@ def test_the_rise_is_that_of_a_search_over_the_other_parameter(bench: Bench) -> 
     e = estimated(bench, [data], "T_c", "f_v")
     found = profile(e, "T_c")
     problem = Problem(e.bench, e.plant, e.asked, e.records)
-    z = e.values / problem.units
+    z = e.z
     weights = problem.weights(z)
 
     def chi2(t_c: float, f_v: float) -> float:
@@ -59,8 +59,8 @@ def test_the_rise_is_that_of_a_search_over_the_other_parameter(bench: Bench) -> 
         return float(errors @ errors)
 
     least = chi2(*z)
-    for value, rise in zip(found.values[::3] / problem.units[0], found.rise[::3], strict=True):
-        width = 20.0 * e.cramer_rao()[1] * z[1]
+    for value, rise in zip(np.log(found.values[::3]), found.rise[::3], strict=True):
+        width = 20.0 * e.cramer_rao()[1]
         best = minimize_scalar(
             lambda f_v, t=value: chi2(t, f_v), bounds=(z[1] - width, z[1] + width), options={"xatol": 1e-9}
         )

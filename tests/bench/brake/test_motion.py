@@ -11,7 +11,7 @@ from emb_bench.brake.exact import advance_exact
 from emb_bench.brake.extended import advance_extended
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, no_sensitivity, rest
 from emb_bench.brake.parameters import FEATURES as NAMED
-from emb_bench.brake.parameters import PARAMETERS, scale
+from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import EULER, EXACT, Mechanics
 
@@ -80,7 +80,3 @@ def test_each_feature_of_the_mechanics_has_a_row_with_what_its_readers_take() ->
         assert bool(row.effect) == bool(row.remedy), name
         assert row.step == 0.0 or name in NAMED, name
         assert row.gross > 0.0, name
-
-
-def test_the_scale_is_the_value_of_a_relative_parameter_and_one_of_an_absolute_one() -> None:
-    assert_array_equal(scale(["k_m", "delay", "play"], [0.02, 0.3, 0.5]), [0.02, 1.0, 0.5])

@@ -64,7 +64,8 @@ def test_derivatives_are_finite_differences_of_the_residuals(
     data = record(bench, model, currents_of(bench, "multisine")[:150], x0=(0.3, 20.0))
     asked = EstimationProblem(names, systematic=dict.fromkeys({*SYSTEMATIC} & {*names}, 0.1))
     problem = Problem(bench, model, asked, (data,))
-    z = problem.nominal() * 1.03 + np.array([(AWAY | {"delay": delay}).get(u.name, 0.0) for u in problem.unknowns])
+    away = np.array([(AWAY | {"delay": delay}).get(u.name, 0.0) for u in problem.unknowns])
+    z = problem.coordinates(1.03 * problem.values(problem.nominal())) + away
     weights = problem.weights(z)
     check_derivatives(lambda z: problem.jacobian(z, weights)[0], z, problem.jacobian(z, weights)[1])
 

@@ -52,7 +52,7 @@ def test_sensitivities_to_what_is_unknown_in_gaps_are_finite_differences(
     model, names = bench.plant(plant), ("k_m",) if late is None else ("k_m", "delay")
     data = lossy(record(bench, model, currents_of(bench, "chirp")), EVERY)
     problem = problem_of(bench, names, data, plant=plant)
-    z = np.array([1.0] if late is None else [1.0, late])
+    z = problem.coordinates(np.array([bench.brake.k_m] if late is None else [bench.brake.k_m, late]))
     weights = problem.weights(z)
     first = problem.marginal(z, weights)
     held = problem.in_gaps()
@@ -192,7 +192,8 @@ def test_of_late_samples_those_that_show_the_inside_of_a_gap_do_not_count(bench:
     plant = bench.plant("late")
     delay = plant.instruments.measurement_delay
     data = lossy(record(bench, plant, currents_of(bench, "chirp")), list(range(100, 110)))
-    counts = Problem(bench, plant, EstimationProblem(), (data,)).weights(np.ones(4))[0][:, 0] > 0.0
+    problem = Problem(bench, plant, EstimationProblem(), (data,))
+    counts = problem.weights(problem.nominal())[0][:, 0] > 0.0
     assert delay == 1
     assert np.flatnonzero(~counts).tolist() == list(range(100, 110))
     shorter = lossy(data, [])

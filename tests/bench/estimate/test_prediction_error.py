@@ -64,7 +64,8 @@ def test_without_disturbance_and_with_a_known_start_innovations_are_output_error
     samples[[3, 50, 51]] = np.nan
     stamps = 1e-5 * np.random.default_rng(0).standard_normal(500)
     problem = problem_of(bench, names, replace(data, samples=samples, late=stamps), plant=plant)
-    z = problem.nominal() * 1.02 + np.array([0.0 if n == "delay" else AWAY.get(n, 0.0) for n in names])
+    away = np.array([0.0 if n == "delay" else AWAY.get(n, 0.0) for n in names])
+    z = problem.coordinates(1.02 * problem.values(problem.nominal())) + away
     weights = problem.weights(z)
     errors, jacobian = problem.jacobian(z, weights)
     gains = (found := Filter(problem, 0.0)).gains(z, weights)
@@ -78,14 +79,15 @@ def test_without_disturbance_and_with_a_known_start_innovations_are_output_error
 def test_commands_that_act_early_do_so_in_the_filter_as_in_the_simulation(bench: Bench) -> None:
     data = known_start(record(bench, bench.plant("exact"), currents_of(bench, "chirp")))
     problem = problem_of(bench, ("k_m", "delay"), data)
-    z = np.array([1.01, -0.05])
+    k_m = math.log(1.01 * bench.brake.k_m)
+    z = np.array([k_m, -0.05])
     weights, found = problem.weights(z), Filter(problem, 0.0)
     errors, _ = problem.jacobian(z, weights)
     assert found.jacobian(z, weights, found.gains(z, weights))[0] == pytest.approx(errors, rel=1e-9, abs=1e-9)
     walking = Filter(problem, WALK)
     gains = walking.gains(z, weights)
-    late = walking.jacobian(np.array([1.01, 0.05]), weights, gains)[0]
-    none, derivatives = walking.jacobian(np.array([1.01, 0.0]), weights, gains)
+    late = walking.jacobian(np.array([k_m, 0.05]), weights, gains)[0]
+    none, derivatives = walking.jacobian(np.array([k_m, 0.0]), weights, gains)
     early, _ = walking.jacobian(z, weights, gains)
     assert early == pytest.approx(none - 0.05 * derivatives[:, 1], rel=1e-9, abs=1e-9)
     assert np.linalg.norm(late - none + early - none) < 0.05 * np.linalg.norm(late - none)
@@ -98,7 +100,7 @@ def test_derivatives_are_those_of_the_innovations_with_the_gains_held(
 ) -> None:
     data = record(bench, bench.plant(plant), currents_of(bench, "chirp")[:200], x0=(0.3, 20.0))
     problem = problem_of(bench, names, data, plant=plant)
-    z = problem.nominal() * 1.03 + np.array([AWAY.get(n, 0.0) for n in names])
+    z = problem.coordinates(1.03 * problem.values(problem.nominal())) + np.array([AWAY.get(n, 0.0) for n in names])
     weights, found = problem.weights(z), Filter(problem, 3.0, load)
     gains = found.gains(z, weights)
     assert np.any(gains[0][:, :, :2])
@@ -256,7 +258,7 @@ def test_a_start_that_was_seen_but_is_not_certain_is_one_that_the_samples_may_co
         Problem(bench, plant, EstimationProblem(), (data,)),
         Problem(bench, plant, EstimationProblem(nuisances=("x1_0",)), (data,)),
     )
-    z = converge(Filter(blind, 0.0), np.ones(4)).z
+    z = converge(Filter(blind, 0.0), blind.nominal()).z
     free = search(asked, asked.nominal(), asked.weights(asked.nominal())).z
     assert z == pytest.approx(free[:4], rel=1e-5)
 
@@ -264,11 +266,12 @@ def test_a_start_that_was_seen_but_is_not_certain_is_one_that_the_samples_may_co
 def test_a_trial_step_at_which_the_filter_diverges_is_one_that_is_not_taken(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), currents_of(bench, "chirp"))
     problem = problem_of(bench, PARAMETER_NAMES, data)
+    start = problem.nominal()
 
     def diverging(z: Floats) -> tuple[Floats, Floats]:
-        far = 1e200 if z[0] > 1.2 else 1.0
-        return far * (z - 1.5), far * np.eye(len(z))
+        far = 1e200 if z[0] > start[0] + 0.2 else 1.0
+        return far * (z - start - 0.5), far * np.eye(len(z))
 
-    end = minimise(problem, np.ones(4), diverging)
-    assert end.z[0] <= 1.2
+    end = minimise(problem, start, diverging)
+    assert end.z[0] <= start[0] + 0.2
     assert math.isfinite(end.cost)
