@@ -43,11 +43,12 @@ if TYPE_CHECKING:  # scipy, numba, matplotlib and pyarrow come with the extra [b
     from emb_bench.experiment.evaluation import Evaluation
     from emb_bench.export.repair import Repaired
     from emb_bench.report.content import Content
+    from emb_bench.report.runs import RunTiming
     from emb_bench.rerun import Rerun
 
 __all__ = [
-    *("Run", "campaign", "design", "draw", "estimate", "export", "fisher_information", "open_run", "repair"),
-    *("report", "rerun", "simulate", "topic"),
+    *("Run", "campaign", "design", "draw", "estimate", "export", "fisher_information", "info", "open_run"),
+    *("repair", "report", "rerun", "simulate", "timing", "topic"),
 ]
 
 Source = RunLog | str | Path
@@ -192,6 +193,8 @@ def export(
 ) -> str:
     """A part of a run for another tool: a picture, one topic as a table with units, or the brake as a MuJoCo model.
 
+    The frames on the bus go to BLF, ASC and others by can_logconvert RUN FILE.
+
     Args:
         run: MCAP file of emb-run.
         output: file to write: a picture (.png, .svg, .pdf), a table (.csv, .parquet) or a model (.xml) by its ending.
@@ -213,6 +216,10 @@ def export(
 def repair(run: str | Path, output: str | Path) -> Repaired | None:
     """Write what is left of a cut or damaged log as a finished one that viewers open.
 
+    The new file has a summary, indexes and checksums. Topics, schemas, times, sequence numbers, attachments and
+    metadata stay as they were. The file says in itself what is missing, so that nothing takes it for a complete log. Of
+    a whole log nothing is written.
+
     Args:
         run: MCAP file of emb-run.
         output: log to write.
@@ -232,6 +239,12 @@ def repair(run: str | Path, output: str | Path) -> Repaired | None:
 def rerun(run: Source) -> Rerun:
     """Run the loop again from the log of a run, and compare what it decides.
 
+    The control loop runs again with the policy, bench file and DBC of the log. Bus and clock give the frames and times
+    that the log recorded. Each decision (policy, clip, shield, sent current, its reason), each estimate and each safety
+    event up to the stop must be the same, numbers to the last bit. A cut log is compared up to its end. Rounding may
+    differ with another ONNX Runtime, numpy, Python or processor. If a decision differs, the versions of the log are
+    printed too.
+
     Args:
         run: MCAP file of emb-run.
 
@@ -248,6 +261,40 @@ def rerun(run: Source) -> Rerun:
     return rerun_as_recorded(_opened(run))
 
 
+def info(run: Source) -> dict[str, Any]:
+    """Summary of a run: end, counts, largest values, completeness.
+
+    Args:
+        run: MCAP file of emb-run.
+
+    Raises:
+        UsageError: the file cannot be read.
+        LogError: it is not a log, or too damaged.
+    """
+    from emb_bench.logs.info import info_document
+
+    return info_document(_opened(run))
+
+
+def timing(runs: Source | Sequence[Source]) -> list[RunTiming]:
+    """Timing of runs, judged by the budgets of their bench.
+
+    How long each part of a control cycle took, by the time stamps in the log: sample to sample, sample to loop,
+    decision, sending, sensor to command, and the time left before the answer would have been late. The times are
+    compared with [budgets] of the bench file in the log. Simulated time is not judged.
+
+    Args:
+        runs: MCAP files of emb-run.
+
+    Raises:
+        UsageError: a file cannot be read.
+        LogError: a log has no control cycles.
+    """
+    from emb_bench.report.runs import run_timing
+
+    return [run_timing(_opened(run)) for run in _listed(runs)]
+
+
 def fisher_information(
     run: Source,
     *,
@@ -260,6 +307,10 @@ def fisher_information(
     map: str | Path | None = None,  # noqa: A002  # as the option is called
 ) -> Evaluation:
     """Fisher information of a run: how precisely its parameters can be known at best.
+
+    Intervals are the Cramer-Rao bound for sensors with noise and without systematic errors: no method can do better.
+    emb-replay estimate also estimates the systematic errors of the bench file, so its repeatability is larger. -v adds
+    the criteria over time, and the information as the thesis weights it.
 
     Args:
         run: MCAP file of emb-run; with a map, a recording of others.
@@ -313,6 +364,9 @@ def estimate(
 ) -> Study:
     """Parameters of a brake from its runs, with total and repeatability, and whether the model explains them.
 
+    The verdict on the model comes first, then each parameter, the largest part of its uncertainty, and the next step.
+    Of several logs, each is also predicted from the others.
+
     Args:
         runs: MCAP files of emb-run, of one brake, which are taken together; with a map, recordings of others.
         params: parameters to estimate (default: the four of the brake; what the map of a recording guesses).
@@ -356,10 +410,12 @@ def report(
     output: str | Path,
     *,
     acceptance: str | Path | None = None,
-    junit: str | Path | None = None,
     **options: Any,
 ) -> Content:
     """One page about runs of one brake, to hand over, and a JSON file beside it.
+
+    The verdict comes first, then the evidence. The page is one file for screen and paper. A log that cannot be used is
+    named and left out. A run without an experiment is reported without an estimate.
 
     Args:
         runs: MCAP files of emb-run, of one brake; with a map, recordings of others. What cannot be used is named on
@@ -367,7 +423,6 @@ def report(
         output: page to write, .html or .htm.
         acceptance: TOML file with an [acceptance] table: tolerances, drift, budgets; each is passed, failed, or not
             decided.
-        junit: XML file to write with the results of the acceptance criteria as test cases.
         options: of :func:`estimate`; ``profile`` is on.
 
     Returns:
@@ -385,9 +440,6 @@ def report(
     given = bound.arguments
     files = [*_listed(runs), given["last"], given["map"], acceptance]
     _check_page(page, beside, [entry.path if isinstance(entry, RunLog) else Path(entry) for entry in files if entry])
-    require_place("--junit", None if junit is None else Path(junit), (".xml",))
-    if junit is not None and acceptance is None:
-        raise UsageError("--junit: expected it with --acceptance")
     options_of = _study_options(given)
     try:
         import matplotlib  # noqa: F401
@@ -409,9 +461,6 @@ def report(
         content = gather(its, logs, left_out, options_of(its), made_by, last=before, criteria=criteria)
         new_numbers.write_text(as_json(document(content)) + "\n", encoding="utf-8")
         new_page.write_text(report_page(content), encoding="utf-8")
-        if junit is not None and content.acceptance is not None:
-            with replacing(Path(junit)) as new_cases:
-                new_cases.write_text(test.junit(content.acceptance), encoding="utf-8")
     return content
 
 
@@ -432,6 +481,10 @@ def campaign(
     ray: str | None = None,
 ) -> Campaign:
     """Many logs in parallel: one row each in a Parquet or CSV file, and what they say together.
+
+    A row has the identity of the run, its Fisher information at the bench's nominal brake, and an estimate of the
+    parameters. A log that cannot be evaluated becomes a row with the reason. The rows do not depend on the number of
+    processes or machines. On a Ray cluster all machines need emb-excite and the logs at the same paths.
 
     Args:
         paths: logs, or folders to search for *.mcap.
@@ -476,8 +529,8 @@ def campaign(
 
 
 def design(
-    criterion: Literal["D", "A", "E"] = "D",
     *,
+    criterion: Literal["D", "A", "E"] = "D",
     params: Names = PARAMETER_NAMES,
     theta: str | Path | Mapping[str, float] | None = None,
     model: str = DEFAULT_PLANT,

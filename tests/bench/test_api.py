@@ -73,7 +73,14 @@ def test_a_design_is_that_of_emb_design(tmp_path: Path, capsys: pytest.CaptureFi
     options += ["--bench", str(short), "--model", "euler", "--no-return-home", "--json"]
     found = printed(capsys, design.main(options))
     report = api.design(
-        "A", params=("k_m", "T_c"), theta={"f_v": 3e-5}, starts=1, seed=3, bench=short, model="euler", return_home=False
+        criterion="A",
+        params=("k_m", "T_c"),
+        theta={"f_v": 3e-5},
+        starts=1,
+        seed=3,
+        bench=short,
+        model="euler",
+        return_home=False,
     )
     assert json.loads(report.json()) == found
 

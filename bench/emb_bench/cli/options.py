@@ -1,8 +1,8 @@
 """Options of a command from the function behind it: names, types and defaults by its signature, help by its docstring.
 
-An argument without a default stands by itself, one with a default is an option ``--name``. An option that is not typed
-is not passed on, so that each default stands in the signature only. Every command that answers has the same options
-for the form of its answer.
+An argument that may be given by keyword only is an option ``--name``, another one stands by itself. An option that is
+not typed is not passed on, so that each default stands in the signature only. Every command that answers has the same
+options for the form of its answer.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import argparse
 import inspect
 import re
 import sys
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -25,18 +26,25 @@ METAVARS = {
     "acceptance": "FILE",
     "plot": "FILE",
     "output": "FILE",
-    "junit": "FILE",
     "ray": "ADDRESS",
     "map": "FILE",
+    "place": "DIR|LOG",
 }
 """Words of ``--help`` for the values of options; without, those of the type."""
 LISTS = ("runs", "paths")  # Arguments that may be given several times
+HELP_WIDTH = 92  # Columns of a description
 
 
 def summary(function: Function) -> str:
     """First sentence of a function's docstring, as a line of ``--help``."""
     text = inspect.getdoc(function) or ""
     return text.partition("\n\n")[0].replace("\n", " ").rstrip(".")
+
+
+def description(function: Function) -> str:
+    """Text of a function's docstring before its arguments, as paragraphs of ``--help``."""
+    text = (inspect.getdoc(function) or "").partition("Args:\n")[0]
+    return "\n".join(textwrap.fill(part, HELP_WIDTH) for part in text.strip().split("\n\n")) + "\n"
 
 
 def add(p: argparse.ArgumentParser, function: Function, leave_out: Sequence[str] = ()) -> None:
@@ -58,15 +66,16 @@ def given(args: argparse.Namespace, function: Function, leave_out: Sequence[str]
 def _flags(name: str, parameter: inspect.Parameter) -> list[str]:
     if name == "output":
         return ["-o", "--output"]
-    if parameter.default is parameter.empty:
+    if parameter.kind is not parameter.KEYWORD_ONLY:
         return [name]
     return [f"--{'no-' if parameter.default is True else ''}{name.replace('_', '-')}"]
 
 
 def _form(name: str, parameter: inspect.Parameter, kind: Any) -> dict[str, Any]:
     """Keywords of ``add_argument`` for one argument."""
-    option = parameter.default is not parameter.empty
-    form: dict[str, Any] = {"default": argparse.SUPPRESS, "dest": name} if option else {}
+    option = parameter.kind is parameter.KEYWORD_ONLY
+    form: dict[str, Any] = {"default": argparse.SUPPRESS}
+    form |= {"dest": name} if option else {} if parameter.default is parameter.empty else {"nargs": "?"}
     if name == "output":
         return {"required": True, "type": Path, "metavar": "FILE"}
     if isinstance(parameter.default, bool):

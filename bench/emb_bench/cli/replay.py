@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
+from contextlib import nullcontext
 from importlib import metadata
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from emb_bench import api
 from emb_bench.brake.parameters import PARAMETERS
-from emb_bench.cli import live
-from emb_bench.cli.options import add, add_output_options, answer, given, summary
-from emb_bench.logs.info import info_document
-from emb_bench.logs.log import read_log
+from emb_bench.cli.live import live
+from emb_bench.cli.options import add, add_output_options, answer, description, given, summary
 from emb_bench.output import reported_if_interrupted
 from emb_bench.report import fim, runs
-from emb_bench.report.runs import RunTiming, run_timing
 from emb_bench.report.text import show
 from emb_runtime.errors import (
     EXIT_CANNOT_TELL,
@@ -133,32 +130,14 @@ def _repair(args: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def info(run: Path) -> dict[str, Any]:
-    """Summary of a run: end, counts, largest values, completeness.
-
-    Args:
-        run: MCAP file of emb-run.
-    """
-    return info_document(read_log(run))
-
-
 def _info(args: argparse.Namespace) -> int:
-    document = info(args.run)
+    document = api.info(args.run)
     answer(args, lambda: document, lambda verbose: runs.info(document, verbose=verbose))
     return EXIT_DONE
 
 
-def timing(runs: Sequence[Path]) -> list[RunTiming]:
-    """Timing of runs, judged by the budgets of their bench.
-
-    Args:
-        runs: MCAP files of emb-run.
-    """
-    return [run_timing(read_log(path)) for path in runs]
-
-
 def _timing(args: argparse.Namespace) -> int:
-    found = timing(**given(args, timing))
+    found = api.timing(args.runs)
     answer(
         args,
         lambda: {"logs": [runs.timing_document(entry) for entry in found]},
@@ -168,37 +147,22 @@ def _timing(args: argparse.Namespace) -> int:
     return next(code for code in (EXIT_CHECK_FAILED, EXIT_USAGE, EXIT_DONE) if code in codes)
 
 
+def _live(args: argparse.Namespace) -> int:
+    live(**given(args, live))
+    return EXIT_DONE
+
+
 # ---- the commands ----
 
 
 class Command(NamedTuple):
     """One command."""
 
-    help: str
-    description: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
+    function: Callable[..., Any]  # Its signature and docstring are the command's options and help
     run: Callable[[argparse.Namespace], int]  # Gives the exit code
-
-
-def _command(
-    function: Callable[..., Any], run: Callable[[argparse.Namespace], int], text: str = "", strict: str = ""
-) -> Command:
-    """A command whose options and help are a function's; ``strict`` is the help of ``--strict``, if it has that."""
-
-    def add_arguments(p: argparse.ArgumentParser) -> None:
-        add(p, function)
-        if function is api.report:
-            add(p, api.estimate, leave_out=("runs", "profile"))
-        else:
-            add_output_options(p)
-        if strict:
-            p.add_argument("--strict", action="store_true", help=strict)
-
-    def reported(args: argparse.Namespace) -> int:
-        with reported_if_interrupted(f"emb-replay {args.command}"):
-            return run(args)
-
-    return Command(summary(function), f"{summary(function)}.\n{text}", add_arguments, reported)
+    codes: Collection[int]
+    more: str = ""  # Help below what the docstring says
+    strict: str = ""  # Help of ``--strict``, if the command has it
 
 
 MEANINGS: Mapping[int, str] = {
@@ -216,95 +180,33 @@ OF_A_LOG = (EXIT_DONE, EXIT_USAGE, EXIT_LOG, EXIT_INTERRUPTED)
 CHECKED = (*OF_A_LOG, EXIT_CHECK_FAILED)
 
 MISFIT = "a run was stopped, the model does not fit, does not predict a log, or a parameter is not identified"
-COMMANDS: Mapping[str, tuple[Command, Collection[int]]] = {
-    "fim": (
-        _command(
-            api.fisher_information,
-            _fim,
-            "Intervals are the Cramer-Rao bound for sensors with noise and without systematic errors: no\n"
-            "method can do better. emb-replay estimate also estimates the systematic errors of the\n"
-            "bench file, so its repeatability is larger. -v adds the criteria over time, and the\n"
-            "information as the thesis weights it.\n",
-        ),
-        OF_A_LOG,
-    ),
-    "estimate": (
-        _command(
-            api.estimate,
-            _estimate,
-            "The verdict on the model comes first, then each parameter, the largest part of its\n"
-            "uncertainty, and the next step. Of several logs, each is also predicted from the others.\n"
-            f"{METHODS}\nunknowns for --nuisance, besides the parameters:\n"
-            + "".join(f"  {name:17} {row.about}\n" for name, row in PARAMETERS.items() if row.about),
-            strict=f"exit with 1 if {MISFIT}; else with {EXIT_OUTSIDE} if the brake is outside the shield's ranges",
-        ),
+COMMANDS: Mapping[str, Command] = {
+    "fim": Command(api.fisher_information, _fim, OF_A_LOG),
+    "estimate": Command(
+        api.estimate,
+        _estimate,
         (*CHECKED, EXIT_OUTSIDE),
+        f"{METHODS}\nunknowns for --nuisance, besides the parameters:\n"
+        + "".join(f"  {name:17} {row.about}\n" for name, row in PARAMETERS.items() if row.about),
+        strict=f"exit with 1 if {MISFIT}; else with {EXIT_OUTSIDE} if the brake is outside the shield's ranges",
     ),
-    "report": (
-        _command(
-            api.report,
-            _report,
-            "The verdict comes first, then the evidence. The page is one file for screen and paper. A\n"
-            "log that cannot be used is named and left out. A run without an experiment is reported\n"
-            f"without an estimate.\n{UNKNOWNS}",
-            strict=f"exit with {EXIT_CHECK_FAILED} if a criterion failed, else {EXIT_CANNOT_TELL} if one is not "
-            f"decided; without --acceptance as emb-replay estimate does",
-        ),
+    "report": Command(
+        api.report,
+        _report,
         (*CHECKED, EXIT_CANNOT_TELL, EXIT_OUTSIDE),
+        UNKNOWNS,
+        strict=f"exit with {EXIT_CHECK_FAILED} if a criterion failed, else {EXIT_CANNOT_TELL} if one is not "
+        f"decided; without --acceptance as emb-replay estimate does",
     ),
-    "campaign": (
-        _command(
-            api.campaign,
-            _campaign,
-            "A row has the identity of the run, its Fisher information at the bench's nominal brake,\n"
-            "and an estimate of the parameters. A log that cannot be evaluated becomes a row with the\n"
-            "reason. The rows do not depend on the number of processes or machines. On a Ray cluster\n"
-            f"all machines need emb-excite and the logs at the same paths.\n{UNKNOWNS}",
-        ),
-        CHECKED,
-    ),
-    "info": (_command(info, _info), OF_A_LOG),
-    "timing": (
-        _command(
-            timing,
-            _timing,
-            "How long each part of a control cycle took, by the time stamps in the log: sample to\n"
-            "sample, sample to loop, decision, sending, sensor to command, and the time left before\n"
-            "the answer would have been late. The times are compared with [budgets] of the bench file\n"
-            "in the log. Simulated time is not judged.\n",
-        ),
-        CHECKED,
-    ),
-    "rerun": (
-        _command(
-            api.rerun,
-            _rerun,
-            "The control loop runs again with the policy, bench file and DBC of the log. Bus and clock\n"
-            "give the frames and times that the log recorded. Each decision (policy, clip, shield, sent\n"
-            "current, its reason), each estimate and each safety event up to the stop must be the same,\n"
-            "numbers to the last bit. A cut log is compared up to its end. Rounding may differ with\n"
-            "another ONNX Runtime, numpy, Python or processor. If a decision differs, the versions of\n"
-            "the log are printed too.\n",
-        ),
-        (*CHECKED, EXIT_POLICY_REFUSED),
-    ),
-    "repair": (
-        _command(
-            api.repair,
-            _repair,
-            "The new file has a summary, indexes and checksums. Topics, schemas, times, sequence\n"
-            "numbers, attachments and metadata stay as they were. The file says in itself what is\n"
-            "missing, so that nothing takes it for a complete log. Of a whole log nothing is written.\n",
-        ),
-        OF_A_LOG,
-    ),
-    "export": (
-        _command(api.export, _export, "The frames on the bus go to BLF, ASC and others by can_logconvert RUN FILE.\n"),
-        OF_A_LOG,
-    ),
-    "live": (Command(live.HELP, live.DESCRIPTION, live.add_arguments, live.run), (EXIT_DONE, EXIT_USAGE, EXIT_LOG)),
+    "campaign": Command(api.campaign, _campaign, CHECKED, UNKNOWNS),
+    "info": Command(api.info, _info, OF_A_LOG),
+    "timing": Command(api.timing, _timing, CHECKED),
+    "rerun": Command(api.rerun, _rerun, (*CHECKED, EXIT_POLICY_REFUSED)),
+    "repair": Command(api.repair, _repair, OF_A_LOG),
+    "export": Command(api.export, _export, OF_A_LOG),
+    "live": Command(live, _live, (EXIT_DONE, EXIT_USAGE, EXIT_LOG)),
 }
-"""Commands and their exit codes, in the order of ``--help``."""
+"""Commands in the order of ``--help``."""
 
 
 CUT = "\nA cut log (kill -9, full disk) is read as far as it goes, and the missing part is named.\n"
@@ -327,15 +229,21 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
     p.add_argument("--version", action="version", version=f"emb-replay {metadata.version('emb-excite')}")
     commands = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS if only is None else (only,):
-        found, codes = COMMANDS[name]
+        _, _, codes, more, strict = found = COMMANDS[name]
         command = commands.add_parser(
             name,
-            help=found.help,
-            description=found.description,
+            help=summary(found.function),
+            description=f"{description(found.function)}\n{more}",
             epilog=epilog(codes),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        found.add_arguments(command)
+        add(command, found.function)
+        if name == "report":
+            add(command, api.estimate, leave_out=("runs", "profile"))
+        elif name != "live":
+            add_output_options(command)
+        if strict:
+            command.add_argument("--strict", action="store_true", help=strict)
         command.set_defaults(start=found.run)
     return p
 
@@ -345,7 +253,8 @@ def main(argv: list[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     try:
         args = parser(argv[0] if argv and argv[0] in COMMANDS else None).parse_args(argv)
-        return int(args.start(args))
+        with nullcontext() if args.command == "live" else reported_if_interrupted(f"emb-replay {args.command}"):
+            return int(args.start(args))
     except EmbError as err:
         return complain("emb-replay", err)
 

@@ -185,7 +185,6 @@ def document(study: Study) -> dict[str, Any]:
         "model_fits",
         "predicts",
         "identified",
-        "conclusions",
         "drifts",
     )
     found |= _fields(study, *of_study, "left_out", "apart")
@@ -220,7 +219,7 @@ def _parameters(study: Study) -> dict[str, dict[str, Any]]:
         used, bound, robust, model = (column[i] for column in columns)
         suspect = e.left_open_by(i)
         found[c.label] = {
-            **_fields(c, "value", "unit", "repeatability", "identified", "why_not"),
+            **_fields(c, "value", "unit", "repeatability", "identified", "standing", "why_not", "arbitrary", "outside"),
             "interval_95": c.interval,
             "deviation": used,
             "deviation_relative": unknown.relative,

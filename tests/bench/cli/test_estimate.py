@@ -128,12 +128,12 @@ def test_strict_fails_where_the_model_does_not_fit_or_something_is_not_identifie
 def test_profiles_come_when_asked_for(path: Path, replay: Replay) -> None:
     got = replay.document(path, "--profile", "--starts", "1")
     assert [(p["label"], p["shape"]) for p in got["profiles"]] == [(name, "closed") for name in PARAMETER_NAMES]
-    for conclusion, profile in zip(got["conclusions"], got["profiles"], strict=True):
-        (low, high), (first, last) = conclusion["interval"], profile["interval_95"]
+    for found, profile in zip(got["parameters"].values(), got["profiles"], strict=True):
+        (low, high), (first, last) = found["interval_95"], profile["interval_95"]
         assert low <= first < last <= high  # it allows for suspects that were not noticed, too
     ideal = replay.document(path, "--profile", "--starts", "1", "--systematic", "none")
-    for conclusion, profile in zip(ideal["conclusions"], ideal["profiles"], strict=True):
-        assert conclusion["interval"] == profile["interval_95"]
+    for found, profile in zip(ideal["parameters"].values(), ideal["profiles"], strict=True):
+        assert found["interval_95"] == profile["interval_95"]
 
 
 def test_without_scipy_and_numba_the_other_commands_work_and_this_one_says_what_to_install(path: Path) -> None:

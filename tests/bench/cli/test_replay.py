@@ -286,12 +286,12 @@ def test_the_information_is_that_at_the_controllers_estimate_where_the_log_has_o
 
 
 def test_the_help_of_a_command_has_its_own_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
-    for name, (_, codes) in COMMANDS.items():
+    for name, command in COMMANDS.items():
         with pytest.raises(SystemExit) as left:
             main([name, "--help"])
         assert left.value.code == 0
         end = capsys.readouterr().out.partition("exit codes:\n")[2].partition("\n\n")[0]
-        assert [int(line.split()[0]) for line in end.splitlines()] == sorted(codes)
+        assert [int(line.split()[0]) for line in end.splitlines()] == sorted(command.codes)
 
 
 def test_a_reader_who_leaves_early_is_no_error(path: Path) -> None:

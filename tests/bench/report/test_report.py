@@ -271,8 +271,10 @@ def test_a_brake_outside_of_the_shield_s_ranges_is_said_everywhere(
     path = write_log(folder / "stiff.mcap", simulate(square, options=f"plant=exact,k_1={1.5 * ranges.high.k_1}"))
     text = replay.text("estimate", path, "--starts", "1", "--strict", code=EXIT_OUTSIDE)
     assert text.startswith("OUTSIDE: k_1")
-    (c,) = (c for c in replay.document("estimate", path, "--starts", "1")["conclusions"] if c["outside"])
-    assert (c["label"], c["outside"]) == ("k_1", [ranges.low.k_1, ranges.high.k_1])
+    found = replay.document("estimate", path, "--starts", "1")["parameters"]
+    assert {name: c["outside"] for name, c in found.items() if c["outside"]} == {
+        "k_1": [ranges.low.k_1, ranges.high.k_1]
+    }
     made = make(folder / "stiff.html", path, "--starts", "1", "--strict", code=EXIT_OUTSIDE)
     assert any(line.startswith("OUTSIDE: k_1") for line in made.reader.texts[:4])
     row = evaluate_one(Source(str(path), "", path.name, "."), Options(starts=1))
