@@ -28,7 +28,7 @@ from emb_runtime.records import Frame, RunType, SensorSample
 from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import Unwatched
-from emb_runtime.safety.state_machine import Event, Fault, StateMachine, timeouts
+from emb_runtime.safety.state_machine import Event, Fault, StateMachine
 from emb_runtime.safety.watchdog import WatchdogHandle
 from emb_runtime.system import compiled_core, realtime
 from emb_runtime.system.clock import Clock
@@ -255,7 +255,7 @@ def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dic
 
     try:
         push_clock(recorder, clock)
-        machine = StateMachine(timeouts(plan.bench), recorder.push_event)
+        machine = StateMachine(plan.bench, recorder.push_event)
         machine.handle_event(Event.PREPARED, clock.now_ns())
         monitor = BusMonitor(
             plan.layout, plan.bench, lambda _, why: recorder.push_event(clock.now_ns(), "FRAME_REJECTED", why)

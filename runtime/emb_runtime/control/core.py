@@ -41,7 +41,7 @@ from emb_runtime.safety.sensor_monitor import SensorMonitor
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import ShieldLaw
-from emb_runtime.safety.state_machine import Event, Fault, StateMachine, StopError, may_enable, timeouts
+from emb_runtime.safety.state_machine import Event, Fault, StateMachine, StopError, may_enable
 
 HOME_PAIRS: Final = 50  # Valid pairs in a row, at home, that end a way home
 UNSTEADY: Final = "its samples come earlier and earlier by its own clock: they had piled up, or that clock is fast"
@@ -94,7 +94,7 @@ class Core:
         bench = self.bench
         self.records: list[Record] = []
         self.counters = RunCounters()
-        self._machine = StateMachine(timeouts(bench), self.note)
+        self._machine = StateMachine(bench, self.note)
         self._reception = Reception(self.layout, bench, self._on_rejected)
         self._period_ns = bench.timing.sample_time_ns
         self._latest_answer_ns = latest_answer_ns(bench)

@@ -68,15 +68,6 @@ class Fault(IntEnum):
     PERMISSION_LOST = 105
 
 
-class Timeouts(NamedTuple):
-    """Times that the state machine counts in."""
-
-    period_ns: int
-    start_ns: int  # Time for a node to show itself
-    soft_missed: int  # Periods in a row without a valid pair that are reported
-    stop_missed: int  # Periods in a row without a valid pair that stop the run
-
-
 class Run(NamedTuple):
     """State of a run."""
 
@@ -85,12 +76,6 @@ class Run(NamedTuple):
     heard_ns: int = 0  # Arrival of the last valid pair; 0 before the first [ns]
     late: bool = False  # The soft limit of missed periods has been reached since then
     fault: Fault | None = None  # The first one that latched
-
-
-def timeouts(bench: Bench) -> Timeouts:
-    """Timeouts of a bench."""
-    watch = bench.watch
-    return Timeouts(bench.timing.sample_time_ns, round(watch.start_timeout * 1e9), watch.soft_missed, watch.stop_missed)
 
 
 _NEXT: Final[dict[tuple[RunState, Event], RunState]] = {
@@ -110,7 +95,7 @@ _ENABLING: Final = (RunState.ACTIVE, RunState.HOMING)
 _SENDING: Final = (*_ENABLING, RunState.STOPPING)
 
 
-def step(times: Timeouts, run: Run, event: Event | Fault, now_ns: int) -> Run:
+def step(bench: Bench, run: Run, event: Event | Fault, now_ns: int) -> Run:
     """State of a run after an event at a monotonic time [ns].
 
     Raises:
@@ -121,16 +106,17 @@ def step(times: Timeouts, run: Run, event: Event | Fault, now_ns: int) -> Run:
     if isinstance(event, Fault):
         return _faulted(run, event, now_ns)
     if event is Event.TIME:
-        return _waited(times, run, now_ns)
+        return _waited(bench, run, now_ns)
     try:
         return run._replace(state=_NEXT[run.state, event], since_ns=now_ns)
     except KeyError:
         raise ValueError(f"{event.name} cannot happen in {run.state.name}") from None
 
 
-def missed(times: Timeouts, run: Run, now_ns: int) -> int:
+def missed(bench: Bench, run: Run, now_ns: int) -> int:
     """Sampling periods in a row that have passed without a valid pair; one counts when it is half a period overdue."""
-    return max(0, (2 * (now_ns - run.heard_ns) - times.period_ns) // (2 * times.period_ns))
+    period_ns = bench.timing.sample_time_ns
+    return max(0, (2 * (now_ns - run.heard_ns) - period_ns) // (2 * period_ns))
 
 
 def _faulted(run: Run, fault: Fault, now_ns: int) -> Run:
@@ -144,14 +130,14 @@ def _faulted(run: Run, fault: Fault, now_ns: int) -> Run:
     return run._replace(state=RunState.OVER if nothing_sent else RunState.STOPPING, since_ns=now_ns, fault=first)
 
 
-def _waited(times: Timeouts, run: Run, now_ns: int) -> Run:
-    if run.state is RunState.SILENT and now_ns - run.since_ns >= times.start_ns:
+def _waited(bench: Bench, run: Run, now_ns: int) -> Run:
+    if run.state is RunState.SILENT and now_ns - run.since_ns >= round(bench.watch.start_timeout * 1e9):
         return _faulted(run, Fault.NODE_NOT_READY if run.heard_ns else Fault.NO_NODE, now_ns)
     if run.state in _WATCHED:
-        silent = missed(times, run, now_ns)
-        if silent >= times.stop_missed:
+        silent = missed(bench, run, now_ns)
+        if silent >= bench.watch.stop_missed:
             return _faulted(run, Fault.SENSOR_LOST, now_ns)
-        return run._replace(late=run.late or silent >= times.soft_missed)
+        return run._replace(late=run.late or silent >= bench.watch.soft_missed)
     return run
 
 
@@ -303,18 +289,18 @@ FAULTS: dict[Fault, FaultInfo] = {
 class StateMachine:
     """A run's state, moved on by events; each change and each fault is recorded: time [ns], code and text."""
 
-    def __init__(self, times: Timeouts, push_event: Callable[[int, str, str], object]) -> None:
-        self._times = times
+    def __init__(self, bench: Bench, push_event: Callable[[int, str, str], object]) -> None:
+        self._bench = bench
         self._push_event = push_event
         self.run = Run()
 
     def handle_event(self, event: Event, now_ns: int) -> None:
         """Take an event; raises StopError if the run has failed by it: whoever catches the error latches the fault."""
-        before, after = self.run, step(self._times, self.run, event, now_ns)
+        before, after = self.run, step(self._bench, self.run, event, now_ns)
         if after.fault is not None and before.fault is None:
             raise StopError(after.fault, self._detail(before, now_ns))
         if after.late and not before.late:
-            self.note(Fault.SENSOR_LATE, f"{missed(self._times, before, now_ns)} so far", now_ns)
+            self.note(Fault.SENSOR_LATE, f"{missed(self._bench, before, now_ns)} so far", now_ns)
         self.run = after
         self.note_change(before, event, now_ns)
 
@@ -327,7 +313,7 @@ class StateMachine:
 
     def latch(self, fault: Fault, now_ns: int) -> None:
         """Take a fault that latches, and record nothing: the stop comes before the record."""
-        self.run = step(self._times, self.run, fault, now_ns)
+        self.run = step(self._bench, self.run, fault, now_ns)
 
     def note(self, fault: Fault, detail: str, now_ns: int) -> None:
         """Record a fault; a soft one changes nothing else."""
@@ -341,5 +327,5 @@ class StateMachine:
 
     def _detail(self, run: Run, now_ns: int) -> str:
         if run.state is RunState.SILENT:
-            return f"within {self._times.start_ns * 1e-9:g} s"
-        return f"{missed(self._times, run, now_ns)} periods without a valid pair"
+            return f"within {self._bench.watch.start_timeout:g} s"
+        return f"{missed(self._bench, run, now_ns)} periods without a valid pair"

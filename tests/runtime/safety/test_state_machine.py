@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_runtime.config.bench import Bench
+from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_BUS, EXIT_DONE, EXIT_SAFETY_STOP, EXIT_UNEXPLAINED
 from emb_runtime.records import RunState
 from emb_runtime.safety.state_machine import (
@@ -20,16 +20,14 @@ from emb_runtime.safety.state_machine import (
     Run,
     StateMachine,
     StopError,
-    Timeouts,
     may_enable,
     may_send,
     missed,
     step,
-    timeouts,
 )
 
 MS = 1_000_000
-TIMES = Timeouts(period_ns=MS, start_ns=5_000 * MS, soft_missed=5, stop_missed=20)
+BENCH = load_bench()  # A period of 1 ms, 5 s to begin, 5 and 20 missed periods
 LATCHED = [fault for fault, info in FAULTS.items() if info.latched]
 SOFT = [fault for fault, info in FAULTS.items() if not info.latched]
 
@@ -53,9 +51,9 @@ def test_every_transition_is_the_one_in_the_picture(row: str) -> None:
     for event, target in zip([*Event, Fault.INTERRUPTED, Fault.BUS_ERRORS], targets, strict=True):
         if target == "-":
             with pytest.raises(ValueError, match=f"{event.name} cannot happen in {name}"):
-                step(TIMES, run, event, 101 * MS)
+                step(BENCH, run, event, 101 * MS)
             continue
-        after = step(TIMES, run, event, 101 * MS)
+        after = step(BENCH, run, event, 101 * MS)
         assert after.state is (run.state if target == "=" else RunState[target])
         assert after.since_ns == (100 * MS if target == "=" else 101 * MS)
 
@@ -64,16 +62,18 @@ def test_a_run_begins_in_init_at_time_0_unheard_and_without_a_fault() -> None:
     assert Run() == (RunState.INIT, 0, 0, False, None)
 
 
-def test_a_time_in_seconds_is_rounded_to_nanoseconds(bench: Bench) -> None:
+def test_a_time_in_seconds_is_rounded_to_nanoseconds() -> None:
     assert 2.01 * 1e9 < 2_010_000_000
-    assert timeouts(replace(bench, watch=replace(bench.watch, start_timeout=2.01))).start_ns == 2_010_000_000
+    bench = replace(BENCH, watch=replace(BENCH.watch, start_timeout=2.01))
+    for now_ns, fault in ((2_009_999_999, None), (2_010_000_000, Fault.NO_NODE)):
+        assert step(bench, Run(RunState.SILENT), Event.TIME, now_ns).fault is fault
 
 
 @pytest.mark.parametrize("state", [s for s in RunState if s is not RunState.SILENT])
 def test_the_time_to_show_itself_counts_while_the_run_waits_for_the_node_only(state: RunState) -> None:
     now_ns = 100_000 * MS
     run = Run(state, since_ns=0, heard_ns=now_ns)
-    assert step(TIMES, run, Event.TIME, now_ns) == run
+    assert step(BENCH, run, Event.TIME, now_ns) == run
 
 
 def test_an_error_that_stops_a_run_carries_its_fault_and_the_detail() -> None:
@@ -85,8 +85,8 @@ def test_an_error_that_stops_a_run_carries_its_fault_and_the_detail() -> None:
 @pytest.mark.parametrize("heard_ns", [0, 7 * MS])
 def test_a_node_that_does_not_show_itself_in_time_ends_the_run_before_anything_has_left(heard_ns: int) -> None:
     run = Run(RunState.SILENT, since_ns=3, heard_ns=heard_ns)
-    assert step(TIMES, run, Event.TIME, 2 + 5_000 * MS) == run
-    over = step(TIMES, run, Event.TIME, 3 + 5_000 * MS)
+    assert step(BENCH, run, Event.TIME, 2 + 5_000 * MS) == run
+    over = step(BENCH, run, Event.TIME, 3 + 5_000 * MS)
     assert over.state is RunState.OVER
     assert over.fault is (Fault.NODE_NOT_READY if heard_ns else Fault.NO_NODE)
 
@@ -95,31 +95,32 @@ def test_a_node_that_does_not_show_itself_in_time_ends_the_run_before_anything_h
 def test_missed_periods_are_told_at_the_soft_limit_and_stop_the_run_at_the_other(state: RunState) -> None:
     run = Run(state, since_ns=0, heard_ns=100 * MS)
     soft, stop = 105 * MS + MS // 2, 120 * MS + MS // 2
-    assert step(TIMES, run, Event.TIME, soft - 1) == run
-    late = step(TIMES, run, Event.TIME, soft)
+    assert step(BENCH, run, Event.TIME, soft - 1) == run
+    late = step(BENCH, run, Event.TIME, soft)
     assert late == run._replace(late=True)
-    assert step(TIMES, late, Event.TIME, stop - 1) == late
-    ended = step(TIMES, late, Event.TIME, stop)
+    assert step(BENCH, late, Event.TIME, stop - 1) == late
+    ended = step(BENCH, late, Event.TIME, stop)
     assert (ended.state, ended.fault, ended.since_ns) == (RunState.STOPPING, Fault.SENSOR_LOST, stop)
 
 
 def test_a_pair_and_nothing_else_forgives_what_was_missed_before_it() -> None:
     late = Run(RunState.ACTIVE, heard_ns=100 * MS, late=True)
-    assert step(TIMES, late, Event.TIME, 100 * MS) == late
-    assert step(TIMES, late, Event.PAIR, 117 * MS) == Run(RunState.ACTIVE, heard_ns=117 * MS)
+    assert step(BENCH, late, Event.TIME, 100 * MS) == late
+    assert step(BENCH, late, Event.PAIR, 117 * MS) == Run(RunState.ACTIVE, heard_ns=117 * MS)
 
 
 def test_time_stops_nothing_while_the_run_stops() -> None:
     run = Run(RunState.STOPPING, since_ns=0, heard_ns=0, fault=Fault.SENSOR_LOST)
-    assert step(TIMES, run, Event.TIME, 10**12) == run
+    assert step(BENCH, run, Event.TIME, 10**12) == run
 
 
 @given(st.integers(0, 10**7), st.integers(1, 10**9))
 def test_a_period_is_missed_when_it_is_half_a_period_overdue(n: int, period_ns: int) -> None:
-    times, run = TIMES._replace(period_ns=2 * period_ns), Run(RunState.ACTIVE, heard_ns=17)
+    bench = replace(BENCH, timing=replace(BENCH.timing, sample_time=2e-9 * period_ns))
+    run = Run(RunState.ACTIVE, heard_ns=17)
     overdue_ns = 17 + n * 2 * period_ns + period_ns
-    assert missed(times, run, overdue_ns) == n
-    assert missed(times, run, overdue_ns - 1) == max(0, n - 1)
+    assert missed(bench, run, overdue_ns) == n
+    assert missed(bench, run, overdue_ns - 1) == max(0, n - 1)
 
 
 @given(st.lists(st.tuples(st.sampled_from([*Event, *Fault]), st.integers(0, 10**10)), max_size=60))
@@ -130,7 +131,7 @@ def test_whatever_happens_a_fault_stays_and_only_stopping_follows_what_may_have_
     for event, waited_ns in events:
         now_ns += waited_ns
         try:
-            after = step(TIMES, run, event, now_ns)
+            after = step(BENCH, run, event, now_ns)
         except ValueError:
             continue
         assert run.fault is None or after.fault is run.fault
@@ -146,10 +147,6 @@ def test_whatever_happens_a_fault_stays_and_only_stopping_follows_what_may_have_
 def test_nothing_leaves_before_the_experiment_and_no_current_after_it() -> None:
     assert [s for s in RunState if may_send(s)] == [RunState.ACTIVE, RunState.STOPPING, RunState.HOMING]
     assert [s for s in RunState if may_enable(s)] == [RunState.ACTIVE, RunState.HOMING]
-
-
-def test_the_times_are_those_of_the_bench(bench: Bench) -> None:
-    assert timeouts(bench) == TIMES
 
 
 def test_every_fault_tells_cause_advice_and_exit_code() -> None:
@@ -187,7 +184,7 @@ def events() -> list[tuple[int, str, str]]:
 @pytest.fixture
 def machine(events: list[tuple[int, str, str]]) -> StateMachine:
     """A state machine that waits for the node since 1 ms."""
-    machine = StateMachine(TIMES, lambda *event: events.append(event))
+    machine = StateMachine(BENCH, lambda *event: events.append(event))
     machine.handle_event(Event.PREPARED, MS)
     return machine
 
