@@ -60,10 +60,6 @@ class Signal:
     raw_minimum: int
     raw_maximum: int
 
-    def raw(self, word: int) -> int:
-        """The whole number that stands for it in the payload word."""
-        return ((word >> self.shift & self.mask) ^ self.sign) - self.sign
-
     @property
     def range_text(self) -> str:
         """The range for a message."""
@@ -103,7 +99,7 @@ class Message:
             raise self._rejected(Fault.RESERVED, f"{data.hex(' ')}; does its sender speak another protocol version?")
         values: dict[str, Number] = {}
         for signal in self.signals:
-            raw = signal.raw(word)
+            raw = (word >> signal.shift & signal.mask ^ signal.sign) - signal.sign
             value = values[signal.name] = raw * signal.factor
             if not signal.raw_minimum <= raw <= signal.raw_maximum:
                 raise self._rejected(Fault.RANGE, f"{signal.name}: expected {signal.range_text}, got {value:g}")

@@ -24,6 +24,7 @@ from emb_runtime.control.loop import Loop
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
+from emb_runtime.log.ring_buffer import ClockRecord, EventRecord, FrameRecord
 from emb_runtime.records import Frame, RunType, SensorSample
 from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.safety.guard import Guard
@@ -209,7 +210,7 @@ def start_recorder(
 def push_clock(recorder: Recorder, clock: Clock) -> None:
     """Record a reading of the clocks."""
     now_ns = clock.now_ns()
-    recorder.push_clock(now_ns, now_ns + clock.wall_offset_ns())
+    recorder.push(ClockRecord(now_ns, now_ns + clock.wall_offset_ns()))
 
 
 def _watch(plan: Plan, bus: Bus, stack: ExitStack) -> WatchdogHandle | None:
@@ -250,15 +251,17 @@ def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dic
     def receive_and_record(deadline_ns: int) -> Frame | None:
         frame = receive(deadline_ns)
         if frame is not None:
-            recorder.push_frame(frame)
+            recorder.push(FrameRecord(frame))
         return frame
 
     try:
         push_clock(recorder, clock)
-        machine = StateMachine(plan.bench, recorder.push_event)
+        machine = StateMachine(plan.bench, lambda *event: recorder.push(EventRecord(*event)))
         machine.handle_event(Event.PREPARED, clock.now_ns())
         monitor = BusMonitor(
-            plan.layout, plan.bench, lambda _, why: recorder.push_event(clock.now_ns(), "FRAME_REJECTED", why)
+            plan.layout,
+            plan.bench,
+            lambda _, why: recorder.push(EventRecord(clock.now_ns(), "FRAME_REJECTED", why)),
         )
         period_ns, deadline_ns = plan.bench.timing.sample_time_ns, clock.now_ns() + round(plan.listen * 1e9)
         refused: RefusedError | None = None

@@ -17,15 +17,11 @@ from msgspec import to_builtins
 
 from emb_runtime.errors import LogError
 from emb_runtime.log.ring_buffer import (
-    ClockRecord,
-    EventRecord,
-    FrameRecord,
     LogHeader,
     Record,
     Ring,
     pack,
 )
-from emb_runtime.records import Frame
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 
 START_TIMEOUT: Final = 30.0  # Longest wait for the recorder process to have the file on disk [s]
@@ -117,18 +113,6 @@ class Recorder:
     def push(self, record: Record) -> None:
         """Record anything; never waits."""
         self._ring.push(*pack(record))
-
-    def push_frame(self, frame: Frame) -> None:
-        """Record a frame that was on the bus."""
-        self.push(FrameRecord(frame))
-
-    def push_event(self, time_ns: int, code: str, text: str) -> None:
-        """Record what the safety chain did at a monotonic time [ns]: a stable name, and words, cut to 192 bytes."""
-        self.push(EventRecord(time_ns, code, text))
-
-    def push_clock(self, monotonic_ns: int, wall_ns: int) -> None:
-        """Record one reading of the monotonic and of the Unix clock; once a second is plenty."""
-        self.push(ClockRecord(monotonic_ns, wall_ns))
 
     def finish(self, trailer: Mapping[str, str], timeout: float = FINISH_TIMEOUT) -> RecorderResult:
         """Have the rest written and the file closed; ends the process in any case. A failure is in the result.

@@ -17,7 +17,7 @@ from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import load_layout
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.log.recorder import Recorder
-from emb_runtime.log.ring_buffer import Attachment, LogHeader
+from emb_runtime.log.ring_buffer import Attachment, EventRecord, LogHeader
 from emb_runtime.records import CycleRecord
 
 from tests.bench.damaged import rewritten  # isort: skip
@@ -151,7 +151,7 @@ def test_dropped_records_make_a_log_incomplete(tmp_path: Path) -> None:
     recorder = Recorder.start(tmp_path / "run.mcap", LogHeader(0, 0, True, load_layout().text, {}), slots=4)
     os.kill(recorder.pid, signal.SIGSTOP)
     for k in range(9):
-        recorder.push_event(k, "X", "")
+        recorder.push(EventRecord(k, "X", ""))
     os.kill(recorder.pid, signal.SIGCONT)
     recorder.finish({"exit_reason": "DONE"})
     log = read_log(tmp_path / "run.mcap")
@@ -163,7 +163,7 @@ def test_a_log_whose_recorder_was_killed_is_read_up_to_the_last_flush(tmp_path: 
     path = tmp_path / "run.mcap"
     recorder = Recorder.start(path, LogHeader(0, 0, True, load_layout().text, {"emb.run": {"iface": "x"}}))
     for k in range(200):
-        recorder.push_event(k, "X", str(k))
+        recorder.push(EventRecord(k, "X", str(k)))
     deadline = time.monotonic() + 60
     while not read_log(path).events:  # a part of the flush may be there before the rest
         assert time.monotonic() < deadline

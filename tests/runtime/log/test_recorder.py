@@ -24,7 +24,7 @@ from emb_runtime.can.messages import load_layout
 from emb_runtime.errors import BusError, LogError
 from emb_runtime.log import recorder_process
 from emb_runtime.log.recorder import Recorder
-from emb_runtime.log.ring_buffer import Attachment, EventRecord, LogHeader, Ring, pack
+from emb_runtime.log.ring_buffer import Attachment, ClockRecord, EventRecord, FrameRecord, LogHeader, Ring, pack
 from emb_runtime.records import CycleRecord, Frame, NodeState, Reason, RunState
 
 from tests.bench.processes import wait_until_gone  # isort: skip
@@ -82,16 +82,16 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recorder = Recorder.start(path, HEADER)
     for k in range(20):
         now = START + k * 1_000_000
-        recorder.push_frame(LAYOUT.encode_angle(k % 15, 0.5, k * 1_000_000)._replace(time_ns=now, dropped=2))
-        recorder.push_frame(LAYOUT.encode_velocity(k % 15, -3.5, 0.0, NodeState.IDLE, 15)._replace(time_ns=now))
+        recorder.push(FrameRecord(LAYOUT.encode_angle(k % 15, 0.5, k * 1_000_000)._replace(time_ns=now, dropped=2)))
+        recorder.push(FrameRecord(LAYOUT.encode_velocity(k % 15, -3.5, 0.0, NodeState.IDLE, 15)._replace(time_ns=now)))
         command = LAYOUT.encode_command(k % 15, k % 15, 1.5, True)
-        recorder.push_frame(command._replace(time_ns=now + 1000, own=True))
+        recorder.push(FrameRecord(command._replace(time_ns=now + 1000, own=True)))
         recorder.push(cycle(k, now + 2000))
-    recorder.push_frame(Frame(0x100, b"\x00damage", START + 30_000_000))
-    recorder.push_frame(Frame(0x20, b"", START + 31_000_000, error=True))
+    recorder.push(FrameRecord(Frame(0x100, b"\x00damage", START + 30_000_000)))
+    recorder.push(FrameRecord(Frame(0x20, b"", START + 31_000_000, error=True)))
     recorder.push(cycle(20, START + 32_000_000, policy_current=math.nan, state=RunState.STOPPING))
-    recorder.push_event(START + 33_000_000, "SENSOR_LATE", "5 periods ohne Δ")
-    recorder.push_clock(START + 35_000_000, WALL + START + 35_000_000 + 7)
+    recorder.push(EventRecord(START + 33_000_000, "SENSOR_LATE", "5 periods ohne Δ"))
+    recorder.push(ClockRecord(START + 35_000_000, WALL + START + 35_000_000 + 7))
     result = recorder.finish({"exit_reason": "done"})
     assert (result.complete, result.error, result.dropped, result.bytes) == (True, "", 0, path.stat().st_size)
     assert result.messages == sum(summary(path)[0].statistics.channel_message_counts.values())
@@ -223,7 +223,7 @@ def test_in_real_time_logged_is_when_it_was_written_on_the_same_epoch(tmp_path: 
     start = time.monotonic_ns()
     recorder = Recorder.start(tmp_path / "a.mcap", LogHeader(start, offset, False, LAYOUT.text, {}))
     for _ in range(10):
-        recorder.push_event(time.monotonic_ns(), "X", "")
+        recorder.push(EventRecord(time.monotonic_ns(), "X", ""))
         time.sleep(0.002)
     recorder.finish({})
     end = time.monotonic_ns()
@@ -240,7 +240,7 @@ def test_the_first_chunk_is_on_disk_before_the_run_begins_and_what_is_recorded_f
             records.extend(type(record).__name__ for record in StreamReader(file).records)
     assert {"Metadata", "Attachment", "Schema", "Channel", "Message"} <= set(records)
     before = path.stat().st_size
-    recorder.push_event(START, "X", "")
+    recorder.push(EventRecord(START, "X", ""))
     deadline = time.monotonic() + 20
     while path.stat().st_size == before:
         assert time.monotonic() < deadline
@@ -252,7 +252,7 @@ def test_a_ring_that_overflows_is_counted_and_told(tmp_path: Path) -> None:
     recorder = Recorder.start(tmp_path / "run.mcap", HEADER, slots=8)
     os.kill(recorder.pid, signal.SIGSTOP)
     for _ in range(11):
-        recorder.push_event(START, "X", "")
+        recorder.push(EventRecord(START, "X", ""))
     assert recorder.dropped == 3
     os.kill(recorder.pid, signal.SIGCONT)
     result = recorder.finish({})
@@ -311,7 +311,7 @@ def test_a_full_disk_does_not_disturb_the_run_and_is_told_at_its_end(tmp_path: P
     size = recorder.path.stat().st_size
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (size + 1000, size + 1000))
     for k in range(3000):
-        recorder.push_event(START + k, "X", f"{k}: {os.urandom(40).hex()}")
+        recorder.push(EventRecord(START + k, "X", f"{k}: {os.urandom(40).hex()}"))
     result = recorder.finish({"exit_reason": "done"})
     assert not result.complete
     assert result.error.startswith("writing failed: ")
@@ -322,7 +322,7 @@ def test_a_recorder_that_is_killed_does_not_disturb_the_run_and_is_told_at_its_e
     recorder = Recorder.start(tmp_path / "run.mcap", HEADER, slots=8)
     os.kill(recorder.pid, signal.SIGKILL)
     for _ in range(10):
-        recorder.push_event(START, "X", "")
+        recorder.push(EventRecord(START, "X", ""))
     result = recorder.finish({"exit_reason": "done"})
     assert (result.complete, result.messages) == (False, 0)
     assert result.error == "the recorder process died (signal 9)"
@@ -333,12 +333,12 @@ RUNTIME = """
 import os, sys, time
 from emb_runtime.can.messages import load_layout
 from emb_runtime.log.recorder import Recorder
-from emb_runtime.log.ring_buffer import LogHeader
+from emb_runtime.log.ring_buffer import EventRecord, LogHeader
 recorder = Recorder.start(sys.argv[1], LogHeader(0, 0, True, load_layout().text, {"emb.run": {"iface": "x"}}))
 if "fork" in sys.argv and os.fork() == 0:
     time.sleep(60)  # a sibling that holds every inherited pipe open
 for k in range(500):
-    recorder.push_event(k, "X", str(k))
+    recorder.push(EventRecord(k, "X", str(k)))
 print(recorder.pid, flush=True)
 time.sleep(60)
 """
@@ -365,7 +365,7 @@ def test_the_recorder_leaves_signals_to_the_runtime(tmp_path: Path) -> None:
     recorder = Recorder.start(tmp_path / "run.mcap", HEADER)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         os.kill(recorder.pid, number)
-    recorder.push_event(START, "X", "")
+    recorder.push(EventRecord(START, "X", ""))
     result = recorder.finish({"exit_reason": "stopped by the operator"})
     assert result.complete
     assert len(decode(result.path)["/safety"]) == 1
