@@ -16,6 +16,12 @@ _COMPILED: Final = resources.files("emb_runtime.log").joinpath("emb.binpb").read
 _FILE: Final = descriptor_pb2.FileDescriptorSet.FromString(_COMPILED).file[0]
 _POOL: Final = descriptor_pool.DescriptorPool()
 _POOL.Add(_FILE)
+_COMMENTS: Final = {
+    tuple(place.path): (place.leading_comments + place.trailing_comments).strip()
+    for place in _FILE.source_code_info.location
+    if place.leading_comments or place.trailing_comments
+}
+"""Comments by the place of what they describe: of message i (4, i), of its field j (4, i, 2, j)."""
 
 TOPICS: Final = {
     **{kind.topic: kind.message for kind in KINDS},
@@ -42,16 +48,13 @@ def schema(message: str) -> bytes:
 @cache
 def metadata(message: str) -> dict[str, str]:
     """Metadata of a channel: the message's description, units of its fields as JSON, and the meaning of each field."""
-    place = [found.name for found in _FILE.message_type].index(message)
-    notes, units = {}, {}
-    for found in _FILE.source_code_info.location:
-        match [*found.path]:
-            case [4, at] if at == place:
-                notes["description"] = found.leading_comments.strip()
-            case [4, at, 2, field] if at == place and found.trailing_comments:
-                name, text = _FILE.message_type[place].field[field].name, found.trailing_comments.strip()
-                if unit := re.match(r"\[(.+?)\]", text):
-                    units[name] = unit[1]
-                notes[name] = text[unit.end() :].strip() if unit else text
+    i = [found.name for found in _FILE.message_type].index(message)
+    notes, units = {"description": _COMMENTS.get((4, i), "")}, {}
+    for j, field in enumerate(_FILE.message_type[i].field):
+        text = _COMMENTS.get((4, i, 2, j), "")
+        if unit := re.match(r"\[(.+?)\] ?", text):
+            units[field.name] = unit[1]
+            text = text.removeprefix(unit[0])
+        notes[field.name] = text
     notes["units"] = json.dumps(units, ensure_ascii=False) if units else ""
     return {key: text for key, text in notes.items() if text}
