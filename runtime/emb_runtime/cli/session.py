@@ -25,11 +25,11 @@ from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import ClockRecord, EventRecord, FrameRecord
-from emb_runtime.records import Frame, RunType, SensorSample
+from emb_runtime.records import Frame, RunState, RunType, SensorSample
 from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import Unwatched
-from emb_runtime.safety.state_machine import Event, Fault, StateMachine
+from emb_runtime.safety.state_machine import Fault
 from emb_runtime.safety.watchdog import WatchdogHandle
 from emb_runtime.system import compiled_core, realtime
 from emb_runtime.system.clock import Clock
@@ -256,8 +256,7 @@ def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dic
 
     try:
         push_clock(recorder, clock)
-        machine = StateMachine(plan.bench, lambda *event: recorder.push(EventRecord(*event)))
-        machine.handle_event(Event.PREPARED, clock.now_ns())
+        recorder.push(EventRecord(clock.now_ns(), RunState.SILENT.name, "listening"))
         monitor = BusMonitor(
             plan.layout,
             plan.bench,
@@ -277,7 +276,7 @@ def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dic
         except RefusedError as err:
             refused = err
         if refused is not None and refused.fault is not None:
-            machine.fail(refused.fault, str(refused), clock.now_ns())
+            recorder.push(EventRecord(clock.now_ns(), refused.fault.name, str(refused)))
         push_clock(recorder, clock)
         reason = "DONE" if refused is None else "REFUSED" if refused.fault is None else refused.fault.name
         end = {"exit_reason": reason, "detail": str(refused or ""), "heard": as_json(heard_document(heard))}

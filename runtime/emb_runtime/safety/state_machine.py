@@ -304,13 +304,6 @@ class StateMachine:
         self.run = after
         self.note_change(before, event, now_ns)
 
-    def fail(self, fault: Fault, detail: str, now_ns: int) -> None:
-        """Take a fault that latches, and record it."""
-        before = self.run
-        self.latch(fault, now_ns)
-        self.note(fault, detail, now_ns)
-        self.note_change(before, fault, now_ns)
-
     def latch(self, fault: Fault, now_ns: int) -> None:
         """Take a fault that latches, and record nothing: the stop comes before the record."""
         self.run = step(self._bench, self.run, fault, now_ns)

@@ -69,7 +69,7 @@ def test_read_only_of_a_node_that_is_not_ready_ends_with_its_fault(emb_run: EmbR
     said = emb_run.text("--read-only", code=3)
     assert said.startswith("a run could NOT begin (NODE_NOT_READY): pre-flight, node state: at 2")
     log = emb_run.log()
-    assert [event.code for event in log.events] == ["SILENT", "NODE_NOT_READY", "OVER"]
+    assert [event.code for event in log.events] == ["SILENT", "NODE_NOT_READY"]
     assert sim.sent == []
 
 

@@ -239,7 +239,8 @@ def test_the_first_fault_that_latches_is_the_run_s_and_it_is_recorded_when_it_is
     assert (machine.run.state, events[3:]) == (RunState.STOPPING, [])
     machine.note(Fault.INTERRUPTED, "", 3 * MS)
     machine.note_change(before, Fault.INTERRUPTED, 3 * MS)
-    machine.fail(Fault.BUS_LOST, "vcan0", 4 * MS)
+    machine.latch(Fault.BUS_LOST, 4 * MS)
+    machine.note(Fault.BUS_LOST, "vcan0", 4 * MS)
     machine.handle_event(Event.STOPPED, 5 * MS)
     assert events[3:] == [
         (3 * MS, "INTERRUPTED", FAULTS[Fault.INTERRUPTED].cause),
@@ -248,15 +249,3 @@ def test_the_first_fault_that_latches_is_the_run_s_and_it_is_recorded_when_it_is
         (5 * MS, "OVER", "after STOPPED"),
     ]
     assert machine.run == Run(RunState.OVER, 5 * MS, 2 * MS, False, Fault.INTERRUPTED)
-
-
-def test_a_fault_that_fails_a_run_is_recorded_with_the_change_of_its_state(
-    machine: StateMachine, events: list[tuple[int, str, str]]
-) -> None:
-    begun(machine)
-    machine.fail(Fault.BUS_LOST, "vcan0", 3 * MS)
-    assert events[3:] == [
-        (3 * MS, "BUS_LOST", f"{FAULTS[Fault.BUS_LOST].cause}: vcan0"),
-        (3 * MS, "STOPPING", "after BUS_LOST"),
-    ]
-    assert (machine.run.state, machine.run.fault) == (RunState.STOPPING, Fault.BUS_LOST)
