@@ -48,9 +48,7 @@ class BusStatistics:
     pairs: int  # Valid pairs
     missing: int  # Pairs that did not come, by the node's own clock
     period: float  # Median time between samples by the node's own clock [s]; NaN with fewer than two
-    angle_scatter: (
-        float  # Standard deviation of the newest angles while the node was idle; NaN for fewer than two [rad]
-    )
+    angle_scatter: float  # Standard deviation of an idle node's newest angles; NaN for fewer than two [rad]
     velocity_scatter: float  # The same of the velocities [rad/s]
     load: float
     """Share of the bus that all frames took, with every stuff bit that there can be; of a mapped drive's its own."""
