@@ -193,6 +193,7 @@ def test_what_the_file_s_range_reaches_to_leaves_and_what_is_beyond_it_does_not(
         it = Guarded()
         assert it.guard.command(by_hand(current), current) == current
         assert it.bus == [by_hand(current)]
+        assert (it.guard.passed, it.guard.rejected) == (1, 0)
     for current in (-5.125, 4.625, 100.0):
         Guarded().refuses(by_hand(current), current, f"its bytes say {current:g}, the file allows -5 to 4.5")
 
