@@ -1,8 +1,7 @@
 """Work shared out to processes of this machine or to Ray.
 
-Each process has one piece of work at a time: one that dies, out of memory or in a fault of compiled code, costs its own
-piece and no other. ``concurrent.futures`` calls all pieces in flight broken then, and finishes them before it answers a
-Ctrl-C. A process whose parent has died reads the end of its pipe and ends as well.
+A process that dies, out of memory or in a fault of compiled code, costs its own piece of work and no other:
+``concurrent.futures`` calls all pieces in flight broken then, pebble does not.
 """
 
 from __future__ import annotations
@@ -14,13 +13,11 @@ import os
 import shutil
 import signal
 import socket
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from multiprocessing import connection, resource_tracker
-from multiprocessing.connection import Connection
+from concurrent.futures import Future, as_completed
+from contextlib import contextmanager
 from typing import Any, NamedTuple, TypeVar
 
 from emb_bench import ONE_THREAD
@@ -47,101 +44,46 @@ def shared_out(
 ) -> Generator[tuple[int, Result | Lost], None, None]:
     """Each piece's number and result, as they come, with at most ``jobs`` processes at work.
 
-    The work raises nothing and returns something; it is a function that another process can import, or a
-    ``functools.partial`` of one. A process that takes longer than the limit [s] is ended. Closed or interrupted, all
-    are ended at once.
+    The work raises nothing; it is a function that another process can import, or a ``functools.partial`` of one. A
+    process that takes longer than the limit [s] is ended. Closed or interrupted, all are ended at once.
     """
-    waiting, busy = iter(enumerate(pieces)), dict[Any, tuple[_Worker, int]]()
+    from pebble import ProcessPool
 
-    def give_next(worker: _Worker | None) -> None:
-        if (piece := next(waiting, None)) is not None:
-            worker = worker or _Worker(work)
-            busy[worker.pipe] = worker, piece[0]
-            worker.give(piece[1])
-        elif worker is not None:
-            worker.end()
+    limit = None if math.isinf(time_limit) else time_limit
+    numbers: dict[Future[Any], int] = {}
+    pool: Any = ProcessPool(min(jobs, len(pieces)) or 1, context=_SPAWN)  # its types do not say all
+    try:
+        with _one_thread():
+            for number, piece in enumerate(pieces):
+                numbers[pool.schedule(work, args=[piece], timeout=limit)] = number
+            for future in as_completed(numbers):
+                yield numbers[future], _result(future, time_limit)
+    finally:
+        pool.stop()
+        pool.join()
+
+
+def _result(future: Future[Any], time_limit: float) -> Any:
+    from pebble import ProcessExpired
 
     try:
-        for _ in range(jobs):
-            give_next(None)
-        while busy:
-            left = min(worker.begun for worker, _ in busy.values()) + time_limit - time.monotonic()
-            ready = connection.wait(list(busy), None if math.isinf(left) else max(left, 0.0))
-            for pipe, (worker, number) in [*busy.items()]:
-                result: Any = None
-                if pipe in ready:
-                    result = worker.take()
-                elif time.monotonic() >= worker.begun + time_limit:
-                    result = Lost(f"not evaluated within {time_limit:g} s")
-                if result is not None:
-                    del busy[pipe]
-                    if isinstance(result, Lost):
-                        worker.end()
-                    give_next(None if isinstance(result, Lost) else worker)
-                    yield number, result
-    finally:
-        for worker, _ in busy.values():
-            worker.end()
-
-
-class _Worker:
-    """A process that works on one piece at a time."""
-
-    def __init__(self, work: Callable[[Any], Any]) -> None:
-        self.pipe, theirs = _SPAWN.Pipe()
-        self.begun = math.inf  # Monotonic time since which it works on its piece [s]
-        self._process = _SPAWN.Process(target=_work, args=(theirs, work), daemon=True)
-        if sys.platform != "win32":
-            resource_tracker.ensure_running()  # started along with the first process, it would end the waiting
-        with _start_settings():
-            self._process.start()
-        theirs.close()
-
-    def give(self, piece: Any) -> None:
-        self.begun = math.inf
-        with suppress(OSError):  # a process that has ended is noticed when the result is taken
-            self.pipe.send(piece)
-
-    def take(self) -> Any:
-        """The result that has arrived, or None where the work on it begins; :class:`Lost` if the process has ended."""
-        try:
-            result = self.pipe.recv()
-        except (EOFError, OSError):
-            self._process.join()
-            code = self._process.exitcode or 0
-            how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-            return Lost(f"the process that evaluated it {how}")
-        if result is None:
-            self.begun = time.monotonic()
-        return result
-
-    def end(self) -> None:
-        """End the process, whatever it does."""
-        self._process.kill()
-        self._process.join()
-        self.pipe.close()
-
-
-def _work(pipe: Connection, work: Callable[[Any], Any]) -> None:
-    """Main function of a process: works on each piece it receives, until its pipe is closed."""
-    with suppress(EOFError, OSError):
-        while True:
-            piece = pipe.recv()
-            pipe.send(None)  # it begins
-            pipe.send(work(piece))
+        return future.result()
+    except TimeoutError:
+        return Lost(f"not evaluated within {time_limit:g} s")
+    except ProcessExpired as err:
+        code = err.exitcode or 0
+        how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        return Lost(f"the process that evaluated it {how}")
 
 
 @contextmanager
-def _start_settings() -> Iterator[None]:
-    """Start processes inside with one thread for each library, and without SIGINT, which is for the command alone."""
+def _one_thread() -> Iterator[None]:
+    """Give processes that start inside one thread for each library."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]) if hasattr(signal, "pthread_sigmask") else None
     try:
         yield
     finally:
-        if mask is not None:  # it is not on Windows
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for name, value in before.items():
             os.environ.pop(name)
             if value is not None:
