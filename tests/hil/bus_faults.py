@@ -17,7 +17,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from emb_bench.hil.link import CREATE, REPLACE, attribute, request
+from tests.hil.link import CREATE, REPLACE, attribute, request
 
 _RTM_NEWROUTE, _RTM_DELROUTE, _RTM_NEWQDISC, _RTM_DELQDISC = 24, 25, 36, 37
 

@@ -21,7 +21,7 @@ def hil() -> Hil:
         command: Sequence[str], timeout: float = 60.0, options: Sequence[str] = ()
     ) -> subprocess.CompletedProcess[str]:
         result = subprocess.run(
-            [*EMB_HIL, *options, "--timeout", str(timeout), "--", *command],
+            ["timeout", str(timeout), *EMB_HIL, *options, "--", *command],
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,

@@ -260,7 +260,7 @@ def perform(plays: Iterable[Play], folder: Path, kernel: Sequence[str] = SLOWLY)
     (folder / "giant.onnx").write_bytes(constant_actor(load_bench(), 3.0, 1e9))
     plan = folder / "plan.json"
     plan.write_text(json.dumps([play.plan(folder) for play in plays]))
-    hil = [sys.executable, "-m", "emb_bench.hil.cli", *kernel, "--timeout", "3000", "--"]
+    hil = ["timeout", "3000", sys.executable, "-m", "emb_bench.hil.cli", *kernel, "--"]
     command = [*hil, sys.executable, "-m", "tests.hil.stage", str(plan), str(folder)]
     done = subprocess.run(
         command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(EXAMPLES), "EMB_CORE": "python"},

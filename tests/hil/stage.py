@@ -34,11 +34,10 @@ import emb_runtime.cli.gateway
 import emb_runtime.cli.main
 import emb_runtime.safety.watchdog_process  # its bytecode and what it imports are then in the page cache
 import simulated_drives
-from emb_bench.hil import link
 from emb_runtime.can.messages import load_layout
 from emb_runtime.records import Frame
 from tests.drives import EXAMPLES
-from tests.hil import bus_faults
+from tests.hil import bus_faults, link
 from tests.hil.failing_policy import make_it_hang
 from tests.hil.sniffer import FRAME, open_socket, read, wait_until
 

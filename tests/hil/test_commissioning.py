@@ -67,7 +67,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"name": "mapped_finished", "node": None, "gateway": gateways[1], "run": mapped},
     ]
     (folder / "scenes.json").write_text(json.dumps(scenes))
-    emb_hil = [sys.executable, "-m", "emb_bench.hil.cli", *SLOWLY, "--timeout", "1000"]
+    emb_hil = ["timeout", "1000", sys.executable, "-m", "emb_bench.hil.cli", *SLOWLY]
     driver = [sys.executable, "-m", "tests.hil.terminal", str(folder / "scenes.json"), str(folder)]
     command = [*emb_hil, "--", "env", f"PYTHONPATH={ROOT}:{EXAMPLES}", *driver]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)

@@ -202,7 +202,7 @@ def test_a_mapped_drive_is_let_go_when_its_host_dies_and_gets_no_current_with_ze
 
 @pytest.fixture(scope="module")
 def unguarded() -> dict[str, Any]:
-    hil = [sys.executable, "-m", "emb_bench.hil.cli", *SLOWLY, "--timeout", "300", "--"]
+    hil = ["timeout", "300", sys.executable, "-m", "emb_bench.hil.cli", *SLOWLY, "--"]
     command = [*hil, sys.executable, "-m", "tests.hil.unguarded_loop"]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-3000:]

@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import argparse
+import fcntl
 import os
 import signal
+import socket
+import struct
 import sys
 from collections.abc import Sequence
 
-from emb_bench.hil import link, uml
+from emb_bench.hil import uml
 from emb_bench.hil.guest import INTERFACE, not_started
-from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
-from emb_bench.hil.uml import KernelCommand, state_directory
+from emb_bench.hil.uml import KernelCommand, state_directory, supervise
 from emb_runtime.errors import EXIT_BUS, EXIT_USAGE, BusError, EmbError, UsageError
 from emb_runtime.system.terminal import Parser, complain, mention
 
-_USAGE = "emb-hil [--host | --uml] [--root] [--slow N] [--timeout S] [--memory MB] -- COMMAND..."
+_USAGE = "emb-hil [--host | --uml] [--root] [--slow N] [--memory MB] -- COMMAND..."
 _EPILOG = f"""\
 If vcan0 exists and is up, the command runs on this kernel. Otherwise it runs in a User-Mode Linux kernel, with your
 files, working directory, environment and user; /proc, /sys, /dev, /run and /dev/shm are those of that kernel. Standard
 input is empty. Ctrl-C and SIGTERM reach the command; a second one kills it.
 
 exit status: that of the command (128 + n if signal n ended it, 126 or 127 if it could not be started);
-{EXIT_TIMEOUT} time limit reached, {EXIT_BUS} no vcan0 or the kernel died, {EXIT_USAGE} wrong usage."""
+{EXIT_BUS} no vcan0 or the kernel died, {EXIT_USAGE} wrong usage."""
 
-_LIMITED = ("timeout", "--kill-after=10")
 _MAKE = f"`sudo ip link add dev {INTERFACE} type vcan && sudo ip link set {INTERFACE} up`"
+
+_SIOCGIFFLAGS, _IFF_UP = 0x8913, 1
 
 SLOWEST = 1000
 """Largest ``--slow``. Far beyond it, a program that waits for a time without sleeping would seem to hang."""
@@ -46,14 +49,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--slow", type=int, default=1, metavar="N",
                         help="--uml with a clock N times slower, so that delays of this computer count N times "
                         "less; idle time is skipped (default 1: real time)")  # fmt: skip
-    parser.add_argument("--timeout", type=float, metavar="S", help="end the command after S seconds, start-up included")
     parser.add_argument("--memory", type=int, default=2048, metavar="MB", help="memory of the kernel (default 2048)")
     return parser
 
 
 def _run(options: argparse.Namespace, command: list[str]) -> int:
-    if not options.uml and link.is_up(INTERFACE):
-        return _become(command if options.timeout is None else [*_LIMITED, f"{options.timeout:g}", *command])
+    if not options.uml and _is_up(INTERFACE):
+        return _become(command)
     if options.host:
         raise BusError(f"{INTERFACE} does not exist here, or is down: {_MAKE}")
     with uml.own_processor(), state_directory() as state:
@@ -61,7 +63,16 @@ def _run(options: argparse.Namespace, command: list[str]) -> int:
         def start() -> KernelCommand:
             return KernelCommand(command, state, options.memory, options.slow, options.root)
 
-        return supervise(start, options.timeout)
+        return supervise(start)
+
+
+def _is_up(name: str) -> bool:
+    """Returns True if an interface of this process's network namespace exists and is up: netdevice(7)."""
+    if all(name != known for _, known in socket.if_nameindex()):
+        return False
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        answer = fcntl.ioctl(sock, _SIOCGIFFLAGS, struct.pack("=16sH22x", name.encode(), 0))
+    return bool(struct.unpack_from("=H", answer, 16)[0] & _IFF_UP)
 
 
 def _become(command: list[str]) -> int:
@@ -88,8 +99,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(given[:mark])
     command = given[mark + 1 :]
     try:
-        if not (options.timeout is None or options.timeout > 0) or options.memory < 128:
-            raise UsageError("--timeout must be above 0 s and --memory at least 128 MB")
+        if options.memory < 128:
+            raise UsageError("--memory must be at least 128 MB")
         if not 1 <= options.slow <= SLOWEST:
             raise UsageError(f"--slow: expected 1 to {SLOWEST}, got {options.slow}")
         if options.slow > 1 and options.host:

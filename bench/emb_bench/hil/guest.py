@@ -1,8 +1,7 @@
 """The first process inside the User-Mode Linux kernel: makes the interfaces, runs the command, switches the kernel off.
 
-Runs without site-packages (standard library and :mod:`emb_bench.hil.link` only). Mounts and modules go through
-libc, because a minimal Debian has neither insmod nor halt. What it prints is kernel console text, never the
-command's output.
+Runs without site-packages. Mounts and modules go through libc, because a minimal Debian has neither insmod nor halt.
+What it prints is kernel console text, never the command's output.
 """
 
 from __future__ import annotations
@@ -19,8 +18,6 @@ import traceback
 from pathlib import Path
 from types import FrameType
 from typing import Any
-
-from emb_bench.hil import link
 
 INTERFACE, SECOND_INTERFACE = "vcan0", "vcan1"
 #: In the order of their dependencies, each with its parameters.
@@ -84,9 +81,14 @@ def _load_modules() -> None:
 
 
 def _make_interfaces() -> None:
-    link.set_up("lo")
     for name in (INTERFACE, SECOND_INTERFACE):
-        link.add(name)
+        _ip("add", "dev", name, "type", "vcan")
+    for name in ("lo", INTERFACE, SECOND_INTERFACE):
+        _ip("set", name, "up")
+
+
+def _ip(*words: str) -> None:
+    subprocess.run(["/sbin/ip", "link", *words], check=True)
 
 
 def _raise_soft_interrupts() -> None:

@@ -10,6 +10,7 @@ import contextlib
 import fcntl
 import hashlib
 import json
+import math
 import os
 import shlex
 import shutil
@@ -20,13 +21,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import IO, Any
 
-from emb_bench.hil.guest import JOB_FILE, RUNNING, SIGNAL_FILE
-from emb_bench.hil.supervise import ParentDeathWatch
+from emb_bench.hil.guest import JOB_FILE, RUNNING, SIGNAL_FILE, SIGNALS
 from emb_runtime.cli.summary import SLOW_MARK
 from emb_runtime.errors import BusError
 
@@ -154,6 +155,9 @@ def memory_directory(bytes_needed: int) -> Path:
 _CONSOLE_LINES = 40
 _BOOT_LIMIT = 60.0  # Time until the command must run [s]
 _GRACE = 10.0  # Time from a signal until the command is killed [s]
+_POLL = 0.02  # Time between two looks at it [s]
+# Standard input ends without a line when emb-hil dies, by kill -9 too.
+_DEATH_WATCH = 'read -r _ || { kill -s KILL -- "-$1"; rm -rf -- "$2"; }'
 _INIT = """#!/bin/sh
 export PYTHONPATH={path} PYTHONDONTWRITEBYTECODE=1 LD_LIBRARY_PATH={libraries}
 exec {python} -S -s -m emb_bench.hil.guest {state}
@@ -181,7 +185,7 @@ def state_directory() -> Iterator[Path]:
 
 
 class KernelCommand:
-    """The command inside the kernel; a :class:`~emb_bench.hil.supervise.Child`.
+    """The command inside the kernel.
 
     Args:
         command: with its arguments.
@@ -211,7 +215,13 @@ class KernelCommand:
                 start_new_session=True,
             )  # fmt: skip
         _put_first(self._process.pid)
-        self._watch = ParentDeathWatch(self._process.pid, str(state))
+        self._watch = subprocess.Popen(
+            ["/bin/sh", "-c", _DEATH_WATCH, "emb-hil", str(self._process.pid), str(state)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
         self._boot_until = time.monotonic() + _BOOT_LIMIT
 
     def _write_job(self, command: list[str], as_root: bool, extra_env: Mapping[str, str]) -> None:
@@ -300,11 +310,43 @@ class KernelCommand:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-        self._watch.release()
+        self._watch.communicate(b"done\n")
         with contextlib.suppress(BrokenPipeError):
             self._pump()
         for _, stream in self._streams:
             stream.close()
+
+
+def supervise(start: Callable[[], KernelCommand]) -> int:
+    """Start a command and wait for it; its exit status, or 128 + n if it was killed after signal n.
+
+    The first signal is handed on with the command's grace to end in, a second one kills.
+    """
+    asked: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        asked.append(number)
+
+    previous = {number: signal.signal(number, note) for number in SIGNALS}
+    kill_at, handed_on = math.inf, 0
+    command: KernelCommand | None = None
+    try:
+        command = start()
+        while (status := command.poll()) is None:
+            now = time.monotonic()
+            if len(asked) > handed_on:
+                kill_at = now if handed_on else now + command.grace
+                handed_on = len(asked)
+                command.signal(asked[-1])
+            if now >= kill_at:
+                return 128 + asked[-1]
+            time.sleep(_POLL)
+        return status
+    finally:
+        if command is not None:
+            command.kill()
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def _put_first(group: int) -> None:

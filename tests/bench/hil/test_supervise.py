@@ -1,4 +1,4 @@
-"""emb-hil: its time limit ends a command and says so, and each kernel has a processor of its own where that goes."""
+"""emb-hil: Ctrl-C while a kernel is made ready, and a processor of its own for each kernel, where that goes."""
 
 from __future__ import annotations
 
@@ -11,38 +11,6 @@ import pytest
 
 from emb_bench.hil import uml
 from emb_bench.hil.cli import main
-from emb_bench.hil.supervise import EXIT_TIMEOUT, supervise
-
-
-class Patient:
-    """A command that ends when it is told to, or by itself after some looks."""
-
-    grace = 5.0
-
-    def __init__(self, looks: int) -> None:
-        self.looks = looks
-        self.signals: list[int] = []
-
-    def poll(self) -> int | None:
-        self.looks -= 1
-        return 0 if self.signals or self.looks < 0 else None
-
-    def signal(self, number: int) -> None:
-        self.signals.append(number)
-
-    def kill(self) -> None:
-        pass
-
-
-def test_a_command_that_is_ended_by_its_time_limit_is_told_of_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert supervise(lambda: Patient(looks=2), timeout_s=600.0) == 0
-    assert capsys.readouterr() == ("", "")
-    child = Patient(looks=10**9)
-    assert supervise(lambda: child, timeout_s=1e-3) == EXIT_TIMEOUT == 124
-    assert child.signals == [signal.SIGTERM]
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err == "emb-hil: the time limit of 0.001 s is over, the command ends; exit code 124\n"
 
 
 def test_ctrl_c_while_a_kernel_is_made_ready_ends_it_and_leaves_nothing(
