@@ -82,6 +82,7 @@ STAMPED = "what a lock-step gateway sends has its time, and its frames count"
 OTHER_SEARCH = "the search of designs has no growth of tables: other local optima; E of four became better by a third"
 GRID = "the grid of a profile has its steps in the logarithm: other points of the same curve"
 LOGARITHM = "what windows of another length, or a flat prior, change is that of the logarithm"
+METRES = "a linear machine is stated in metres and newtons, not in radians of a motor"
 EXPLAINED: dict[str, str] = {
     "*/says/profiles/*/values*": GRID,
     "*/says/profiles/*/rise*": GRID,
@@ -98,6 +99,9 @@ EXPLAINED: dict[str, str] = {
     "design/*/says/local_optima/*": OTHER_SEARCH,
     "design/*/says/checks/*": OTHER_SEARCH,
     "design/E of four/says/*": OTHER_SEARCH,
+    "fim/emps/says/*": METRES,
+    "report/emps/says/runs/*": METRES,
+    "estimate/emps windows/says/information/*": METRES,
     "logs/mapped/*": STAMPED,
     "info/mapped/says/messages//*": STAMPED,
     "info/mapped/says/duration": "the arming of a lock-step drive takes one sample more",

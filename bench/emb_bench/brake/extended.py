@@ -18,10 +18,11 @@ Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems, 2004, cha
 A brake that starts at rest exactly where contact begins counts as one that makes contact: w's derivative to ``contact``
 and ``x1_0`` is that of a brake that starts just outside.
 
-Accuracy: the velocity's local error is below 1e-8 rad/s by the lower order of the pair. Over 500 ms of random currents
-the states were within 5e-9 rad and 1e-7 rad/s of those with a tolerance of 1e-12, far below the sensors' 1e-3 rad and
-1 rad/s; sensitivities within 3e-7 of their largest value, and within 1e-4 for a Stribeck exponent that is not a whole
-number, for then the curve is not smooth at rest. Without features all agrees with the exact brake to 1e-9.
+Accuracy: the velocity's local error is below ``tolerance``, 1e-8 rad/s, by the lower order of the pair. Over 500 ms of
+random currents the states were within 5e-9 rad and 1e-7 rad/s of those with a tolerance of 1e-12, far below the
+sensors' 1e-3 rad and 1 rad/s; sensitivities within 3e-7 of their largest value, and within 1e-4 for a Stribeck
+exponent that is not a whole number, for then the curve is not smooth at rest. Without features all agrees with the
+exact brake to 1e-9.
 """
 
 from __future__ import annotations
@@ -58,7 +59,6 @@ from emb_bench.brake.runge_kutta import (
 from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
 
-TOLERANCE = 1e-8  # Local error of the velocity per step [rad/s]
 ROUNDING = 1e-13
 """Local error per step as a share of the velocity: keeps the steps of an extremely fast brake above rounding."""
 SHORTEST = 1e-9  # Step that is taken whatever its error [s]
@@ -195,11 +195,11 @@ def _begin(
 def _try(m: Mechanics, p: BrakeParameters, a: Slide, before: float, h: float) -> tuple[Step, float, float]:
     """A step of at most ``h`` that is accurate enough, its length, and one for the next step [s]."""
     found = step(m, p, a, before, h)
-    allowed = TOLERANCE + ROUNDING * abs(found.x2)
+    allowed = m.tolerance + ROUNDING * abs(found.x2)
     while found.error > allowed and h > SHORTEST:
         h *= max(0.1, 0.9 * (allowed / found.error) ** 0.2)
         found = step(m, p, a, before, h)
-        allowed = TOLERANCE + ROUNDING * abs(found.x2)
+        allowed = m.tolerance + ROUNDING * abs(found.x2)
     return found, h, h * min(5.0, 0.9 * (allowed / max(found.error, 1e-30)) ** 0.2)
 
 

@@ -48,6 +48,8 @@ class Mechanics(NamedTuple):
     current_lag: Annotated[float, Meta(ge=SHORTEST_LAG, le=0.1)] = 0.0  # Time constant of the current [s]; 0: none
     play: Annotated[float, Meta(ge=0, le=10)] = 0.0
     """Travel of the motor after a turn until the clamp, and with it the clamping force, follows it [rad]."""
+    tolerance: Annotated[float, Meta(gt=0, le=1e-8)] = 1e-8
+    """Local error of the velocity per step, where features are integrated [rad/s], [m/s] of a linear machine."""
 
 
 class Instruments(NamedTuple):
@@ -113,7 +115,7 @@ def read_plant(name: str, document: Mapping[str, Any], source: str) -> Plant:
 
 def _contradictions(given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Keys that do not go with others, and why."""
-    features = sorted({*given} & {*Mechanics._fields} - {"solver"})
+    features = sorted({*given} & {*Mechanics._fields} - {"solver", "tolerance"})
     for key in features:
         if (solver := given.get("solver", "exact")) != "exact":
             yield key, f'goes with solver = "exact", not with "{solver}"'

@@ -14,6 +14,8 @@ from emb_bench.logs.log import Chunks
 from emb_bench.recordings.map_file import RecordingMap, read_map
 from emb_bench.recordings.readers import Found, experiment_of, read_columns
 
+ACCURACY = 4e-11  # Local error of the velocity, as a share of the largest one: that of a brake at 250 rad/s
+
 
 def open_recording(path: Path, map_path: Path) -> Recording:
     """Open a recording by its map.
@@ -49,7 +51,7 @@ def bench_of(found: Found, wanted: RecordingMap) -> str:
     speed, current = float(np.nanmax(np.abs(samples[:, 1]))), float(np.abs(found.experiment.currents).max())
     slack = 0.5 * (high - low) + 1.0
     brake = {"J": 1.0, "gamma": 1.0, "k_m": 1.0, "k_1": 0.0, "T_c": 1.0, "f_v": 1.0} | machine.parameters
-    plant = {name: 0.0 for name in machine.unknown if name not in brake}
+    plant = {name: 0.0 for name in machine.unknown if name not in brake} | {"tolerance": min(1e-8, ACCURACY * speed)}
     document = {
         "schema": 1,
         "name": wanted.name,

@@ -70,7 +70,7 @@ def test_at_the_start_only_the_initial_state_is_sensitive_to_itself() -> None:
 
 
 def test_each_feature_of_the_mechanics_has_a_row_with_what_its_readers_take() -> None:
-    shaping = {"solver", "stribeck_exponent", "hysteresis_travel"}  # say how, not how much
+    shaping = {"solver", "stribeck_exponent", "hysteresis_travel", "tolerance"}  # say how, not how much
     assert set(Mechanics._fields) - shaping - set(PARAMETERS) == set()
     assert set(NAMED) < set(Mechanics._fields)
     for name, row in PARAMETERS.items():

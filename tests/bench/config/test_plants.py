@@ -32,7 +32,7 @@ def test_the_shipped_bench_has_a_plant_for_every_feature(bench: Bench) -> None:
         if value != ideal[key]
     }
     # 2 and 1 rad are both the default and the sources' values.
-    assert changed == set(ideal) - {"stribeck_exponent", "hysteresis_travel"}
+    assert changed == set(ideal) - {"stribeck_exponent", "hysteresis_travel", "tolerance"}
     assert all(name == plant.name for name, plant in bench.plants.items())
 
 
