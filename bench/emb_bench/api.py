@@ -590,7 +590,7 @@ def _opened(run: Source, map_path: str | Path | None = None) -> RunLog:
     if map_path is None:
         from emb_bench.recordings.map_file import KINDS
 
-        if Path(run).suffix.lower() in (ending for endings in KINDS.values() for ending in endings):
+        if Path(run).suffix.lower() in KINDS:
             raise UsageError(f"{run}: a recording of others needs its map file: --map FILE")
         return read_log(run)
     from emb_bench.recordings.recording import open_recording

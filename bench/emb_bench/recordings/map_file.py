@@ -16,13 +16,11 @@ from emb_runtime.config.typed import MAX_TOML_BYTES, FieldError, parse_toml
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
 
-KINDS: Mapping[str, tuple[str, ...]] = {
-    "csv": (".csv", ".txt", ".tsv"),
-    "parquet": (".parquet",),
-    "matlab": (".mat",),
-    "mdf": (".mf4", ".mdf", ".dat"),
-}
-"""Kinds of files, and the endings by which they are known."""
+KINDS: Mapping[str, str] = {
+    ".csv": "csv", ".txt": "csv", ".tsv": "csv", ".parquet": "parquet", ".mat": "matlab",
+    ".mf4": "mdf", ".mdf": "mdf", ".dat": "mdf",
+}  # fmt: skip
+"""Kinds of files by their endings."""
 TIMED = "mdf"  # Kind of files whose values have times
 TIME: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # Seconds in each
 ALONG: Mapping[str, str] = {"angle": "m", "velocity": "m/s", "command": "N"}  # Units of a linear machine alone
@@ -82,9 +80,9 @@ class Signals(msgspec.Struct, frozen=True, kw_only=True):
 class Source(msgspec.Struct, frozen=True, kw_only=True):
     """The file of a recording."""
 
-    kind: Annotated[Literal["", "csv", "parquet", "matlab", "mdf"], Meta(description=f"one of {', '.join(KINDS)}")] = (
-        ""  # By its ending if it is not given
-    )
+    kind: Annotated[
+        Literal["", "csv", "parquet", "matlab", "mdf"], Meta(description="one of csv, parquet, matlab, mdf")
+    ] = ""  # By its ending if it is not given
     delimiter: Literal[",", ";", " ", "|", "tab"] = ","  # Between columns of a CSV file
     decimal: Literal[".", ","] = "."  # Decimal mark in a CSV file
     skip: Annotated[int, Meta(ge=0, le=1000)] = 0  # Lines of a CSV file after its head that are no numbers
@@ -201,12 +199,10 @@ class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):
         return TIME[self.timing.unit]
 
     def kind_of(self, recording: Path) -> str:
-        """Kind of a recording's file, a key of ``KINDS``."""
-        by_ending = (kind for kind, endings in KINDS.items() if recording.suffix.lower() in endings)
-        kind = str(self.file.kind) or next(by_ending, "")
+        """Kind of a recording's file."""
+        kind = self.file.kind or KINDS.get(recording.suffix.lower(), "")
         if not kind:
-            endings = ", ".join(ending for some in KINDS.values() for ending in some)
-            raise UsageError(f"{recording}: expected a file that ends in {endings}, or [file] kind in the map")
+            raise UsageError(f"{recording}: expected a file that ends in {', '.join(KINDS)}, or [file] kind in the map")
         if kind == TIMED and self.timing.column:
             raise UsageError(f"[timing] column: a file of kind {kind} has times of its own: leave it out")
         if kind != TIMED and not self.timing.column and not self.timing.sample_time:

@@ -37,7 +37,7 @@ class Column(NamedTuple):
 
 
 def read_columns(path: Path, kind: str, source: Source, names: Sequence[str]) -> dict[str, Column]:
-    """Named columns of a file of a kind, a key of ``KINDS``; ``struct.field`` inside MATLAB structures."""
+    """Named columns of a file of a kind; ``struct.field`` inside MATLAB structures."""
     names = list(dict.fromkeys(names))
     readers: Mapping[str, tuple[str, str, Callable[[], Iterator[tuple[str, Any, Any]]]]] = {
         "csv": ("CSV", "pyarrow", lambda: _csv(path, source, names)),
