@@ -445,7 +445,7 @@ def report(
         import matplotlib  # noqa: F401
     except ImportError as err:
         raise UsageError("a report needs matplotlib: pip install 'emb-excite[bench]'") from err
-    from emb_bench.analysis import acceptance as test
+    from emb_bench.report import acceptance as test
     from emb_bench.report.content import gather
     from emb_bench.report.page import document, report_page
 

@@ -1,1 +1,1 @@
-"""Verdict on estimates: uncertainty, several runs and models, drift, acceptance."""
+"""Verdict on estimates: uncertainty, several runs and models, drift."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -67,14 +66,6 @@ class _Report(msgspec.Struct, frozen=True):
     estimate: Earlier | None = None
 
 
-class Doubt(StrEnum):
-    """Reason why a change may be one of the model instead of one of the brake."""
-
-    DID_NOT_FIT = "the model did not fit then"
-    DOES_NOT_FIT = "the model does not fit now"
-    OTHER_MODEL = "the model was another one then"
-
-
 @dataclass(frozen=True)
 class Drift:
     """One parameter now and then."""
@@ -92,8 +83,6 @@ class Drift:
     detectable: float
     """Smallest change that would count as a drift, relative or in the parameter's unit; inf where not comparable."""
     since: tuple[str, ...]  # Names of the records of the earlier estimate; empty if it names none
-    doubts: tuple[Doubt, ...]  # Reasons why the drift may be one of the model; empty if there is no drift
-    last_model: str  # Model of the earlier estimate
 
 
 def read_last(path: Path) -> Earlier:
@@ -124,7 +113,6 @@ def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
         )
     limit = float(special.ndtri(1.0 - 0.5 * LEVEL / len(common)))
     since = tuple(_printable(record.name) for record in last.records)
-    doubts, model = _doubts(now, last), _printable(last.model)
     deviations = now.between_runs()
     found = []
     for i in common:
@@ -150,27 +138,21 @@ def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
                 drifted=drifted,
                 detectable=limit * both / size,
                 since=since,
-                doubts=doubts if drifted else (),
-                last_model=model,
             )
         )
     return tuple(found)
 
 
-def comparable(now: Estimate, last: Earlier) -> str:
+def other_model(now: Estimate, last: Earlier) -> str:
     """Reasons why a change since an earlier estimate may be one of the model; empty if there is none."""
-    return "; ".join(_doubts(now, last))
+    reasons = {
+        "it did not fit then": not last.model_fits,
+        "it does not fit now": not now.validation.fits,
+        f"it was '{_printable(last.model)}' then": last.model != now.plant.name,
+    }
+    return " and ".join(reason for reason, holds in reasons.items() if holds)
 
 
 def _printable(text: str) -> str:
     """Text of another file, as it can stand in a line."""
     return "".join(c if c.isprintable() else "?" for c in text[-LONG:])
-
-
-def _doubts(now: Estimate, last: Earlier) -> tuple[Doubt, ...]:
-    reasons = {
-        Doubt.DID_NOT_FIT: not last.model_fits,
-        Doubt.DOES_NOT_FIT: not now.validation.fits,
-        Doubt.OTHER_MODEL: last.model != now.plant.name,
-    }
-    return tuple(doubt for doubt, holds in reasons.items() if holds)

@@ -42,16 +42,6 @@ DOUBTFUL = 0.05
 """Deviation, as a share of the value or of a gross error, above which a parabola is not trusted without a profile."""
 
 
-@dataclass(frozen=True)
-class OpenSide:
-    """A side on which the rise does not reach ``LEVEL`` for the unknown alone."""
-
-    above: bool  # True above the minimum, False below it
-    rise: float  # χ² above its minimum where the profile ends
-    at: float  # Value where it ends, SI units
-    by_other: bool  # True if another unknown met its border, False if this one did
-
-
 @dataclass(frozen=True, eq=False)
 class Profile:
     """Likelihood profile of one unknown: rise of χ² when it is held and the others are refitted."""
@@ -66,7 +56,6 @@ class Profile:
     """95 % by the Fisher information, around the profile's minimum; infinite where it identifies nothing."""
     minimum: float  # Value with the least χ², SI units
     fell: float  # Fall of χ² below that of the estimate, which is then a local minimum only; 0 if none
-    open_sides: tuple[OpenSide, ...]
 
     @property
     def agrees(self) -> bool:
@@ -141,11 +130,6 @@ def profile(e: Estimate, label: str) -> Profile:
     }[below.closed, above.closed]
     minimum = value(end.z)
     half = NORMAL_95 * float(e.cramer_rao()[i] * e.scale[i])
-    open_sides = tuple(
-        OpenSide(above, last.rise, value(last.z), last.rise >= LEVEL)
-        for above, side in zip((False, True), sides, strict=True)
-        if not side.closed and (last := side.points[-1])
-    )
     return Profile(
         label=label,
         values=np.array([value(point.z) for point in points]),
@@ -155,7 +139,6 @@ def profile(e: Estimate, label: str) -> Profile:
         fisher=(minimum - half, minimum + half),
         minimum=minimum,
         fell=first.cost - end.cost if end.cost < first.cost - BETTER else 0.0,
-        open_sides=open_sides,
     )
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.analysis.conclusion import Conclusion, conclude
-from emb_bench.analysis.drift import Drift, Earlier, drifts
+from emb_bench.analysis.drift import Drift, Earlier, drifts, other_model
 from emb_bench.analysis.held_out import HeldOut, leave_one_out
 from emb_bench.analysis.model_choice import ModelChoice, choose_model
 from emb_bench.analysis.profile import Profile, profiles
@@ -104,6 +104,7 @@ class Study:
     conclusions: tuple[Conclusion, ...]
     stopped: tuple[Stop, ...]  # Ends of the runs that were stopped
     choice: ModelChoice | None = None  # Models that were compared; None if one was given
+    other_model: str = ""  # Why a drift may be one of the model instead of one of the brake; empty if it is not
     apart: tuple[Differing, ...] = ()  # Parameters in which logs differ that each fit alone; empty if they fit together
 
     def __repr__(self) -> str:
@@ -304,6 +305,7 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
         ),
         stopped=tuple(stops),
         choice=choice,
+        other_model="" if last is None else other_model(e, last),
         apart=apart(e) if wanted.method == "oem" else (),
     )
 

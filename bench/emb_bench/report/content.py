@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.analysis.acceptance import Acceptance, Criteria, Result, RunFacts, judge
 from emb_bench.analysis.drift import Earlier
 from emb_bench.analysis.study import Stop, Study, StudyOptions, begun_with, make_study, stop_of
 from emb_bench.config.bench import Bench
@@ -25,6 +24,7 @@ from emb_bench.logs import timing
 from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import Timing
+from emb_bench.report.acceptance import Acceptance, Criteria, Result, RunFacts, judge
 from emb_runtime.errors import LogError
 from emb_runtime.records import Reason
 

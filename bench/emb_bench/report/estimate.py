@@ -56,7 +56,7 @@ def _against(study: Study) -> Iterator[str]:
 def _notes(study: Study) -> list[str]:
     """Qualifications of the values."""
     apart = [say.apart(study)] if study.apart else []
-    return [*study.notes, *apart, say.models(study), *study.estimate.caveats]
+    return [*study.notes, *apart, say.changed_model(study), say.models(study), *study.estimate.caveats]
 
 
 def _remarks(study: Study) -> Iterator[str]:

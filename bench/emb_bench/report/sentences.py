@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.drift import Drift
     from emb_bench.analysis.held_out import HeldOut
     from emb_bench.analysis.model_choice import Candidate
-    from emb_bench.analysis.profile import OpenSide, Profile
+    from emb_bench.analysis.profile import Profile
     from emb_bench.analysis.study import Stop, Study
     from emb_bench.estimate.estimate import Estimate
     from emb_bench.estimate.records import Contribution
@@ -115,6 +115,12 @@ def apart(study: Study) -> str:
     return f"each log fits alone, but not with the others: two brakes, or one that changed. By each log: {values}."
 
 
+def changed_model(study: Study) -> str:
+    """A warning where a drift may be one of the model instead of one of the brake; else empty."""
+    drifted = any(d.drifted for d in study.drifts)
+    return f"the changes may be the model's: {study.other_model}" if drifted and study.other_model else ""
+
+
 def models(study: Study) -> str:
     """Models that the records do not tell apart; empty if one is left."""
     found: Sequence[Candidate] = study.choice.left_over if study.choice is not None else ()
@@ -168,10 +174,8 @@ def drift(d: Drift) -> str:
 
     if not d.drifted:
         return f"no significant change since {since} (detection limit {size(d.detectable)})"
-    doubts = [f"the model was {d.last_model} then" if x.name == "OTHER_MODEL" else x.value for x in d.doubts]
-    perhaps = f", perhaps because {' and '.join(doubts)}" if doubts else ""
     way = "rose" if d.sigmas > 0 else "fell"
-    return f"{way} by {size(abs(d.relative_change))} ({abs(d.sigmas):.2g} sigma) since {since}{perhaps}"
+    return f"{way} by {size(abs(d.relative_change))} ({abs(d.sigmas):.2g} sigma) since {since}"
 
 
 def held_out(h: HeldOut) -> str:
@@ -194,7 +198,7 @@ def profile(p: Profile, e: Estimate) -> str:
         said = f"{between(low, high)}, as the Fisher information says"
     else:
         said = f"{between(low, high)}; the Fisher information says {between(*fisher)}"
-    found = [said, *(_open_side(side) for side in p.open_sides)]
+    found = [said]
     if e.method != "oem":
         found.append(f"of output error, whose minimum is at {plain(p.minimum, 6)}")
     if p.fell:
@@ -202,12 +206,6 @@ def profile(p: Profile, e: Estimate) -> str:
     if not e.validation.fits:
         found.append("too narrow, because the model does not fit")
     return "; ".join(found)
-
-
-def _open_side(side: OpenSide) -> str:
-    where = "another unknown reaches its bound" if side.by_other else "the search ends"
-    rise, way = side.rise if abs(side.rise) > 1e-6 else 0.0, "above" if side.above else "below"
-    return f"{way} the estimate chi2 rises by {rise:.2g} to {plain(side.at, 4)}, where {where}"
 
 
 def prior(e: Estimate) -> str:

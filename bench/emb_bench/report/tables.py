@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from emb_bench.analysis.acceptance import Acceptance, Result
 from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
@@ -14,6 +13,7 @@ from emb_bench.estimate.records import NORMAL_95
 from emb_bench.estimate.suspects import shown_as
 from emb_bench.information.identifiability import TRADED_OFF
 from emb_bench.numbers import NOTHING, SMALL, amount, around, chance, percent, plain, share, signed, spread
+from emb_bench.report.acceptance import Acceptance, Result
 from emb_bench.report.sentences import drift, limit
 from emb_bench.report.text import Cell, Table
 

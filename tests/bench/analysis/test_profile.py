@@ -42,7 +42,7 @@ def test_where_the_records_tell_a_parameter_well_its_profile_is_the_parabola_of_
     assert found.rise == pytest.approx(parabola, abs=0.05 * LEVEL)
     assert (np.diff(found.values) > 0.0).all()
     assert found.agrees
-    assert (found.fell, found.open_sides) == (0.0, ())
+    assert found.fell == 0.0
 
 
 def test_the_rise_is_that_of_a_search_over_the_other_parameter(bench: Bench) -> None:
@@ -74,7 +74,6 @@ def test_a_clamping_stiffness_of_a_brake_that_never_clamps_has_a_flat_profile(be
     assert np.abs(found.rise).max() < 1e-3
     nominal = bench.brake.k_1
     assert [found.values[0], found.values[-1]] == pytest.approx([nominal / 10.0, nominal * 10.0])
-    assert [side.above for side in found.open_sides] == [False, True]
 
 
 def test_a_brake_that_does_not_break_away_tells_its_friction_from_below_only(bench: Bench) -> None:
@@ -87,7 +86,6 @@ def test_a_brake_that_does_not_break_away_tells_its_friction_from_below_only(ben
     assert high == np.inf
     assert low == pytest.approx(bench.brake.k_m * current, rel=1e-3)
     assert low < bench.brake.k_m * current
-    assert [side.above for side in found.open_sides] == [True]
 
 
 def test_a_side_that_closes_only_because_another_unknown_meets_its_border_is_open(bench: Bench) -> None:
@@ -98,7 +96,6 @@ def test_a_side_that_closes_only_because_another_unknown_meets_its_border_is_ope
     found = profile(e, "k_m")
     assert found.rise.max() > LEVEL
     assert (found.shape, found.interval) == ("flat", (-np.inf, np.inf))
-    assert any(side.by_other for side in found.open_sides)
 
 
 def test_what_only_the_prior_tells_has_the_prior_s_interval(bench: Bench) -> None:

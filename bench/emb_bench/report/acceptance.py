@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from emb_bench.analysis.drift import Drift, Earlier, comparable
+from emb_bench.analysis.drift import Drift, Earlier
 from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import OF_A_RECORD, PARAMETERS, SI, UNITS
 from emb_bench.estimate.records import DONE, NORMAL_95
@@ -167,7 +167,7 @@ def judge(
         results.append(_model_fit(study, doubt))
     results += [_tolerated(name, one, study, doubt) for name, one in criteria.parameters.items()]
     drifts = {} if study is None else {drift.name: drift for drift in study.drifts}
-    earlier = "" if study is None or last is None else comparable(study.estimate, last)
+    earlier = f"the model: {study.other_model}" if study is not None and study.other_model else ""
     for name, most in criteria.drift.items():
         results.append(_drifted(name, most, drifts.get(name), doubt or earlier, given=last is not None))
     for run in runs:

@@ -10,13 +10,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from emb_bench.analysis.acceptance import Result, RunFacts, judge, read_criteria
 from emb_bench.analysis.drift import Earlier
 from emb_bench.analysis.study import Study, StudyOptions, make_study
 from emb_bench.cli.replay import main
 from emb_bench.config.bench import load_bench
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.logs.log import read_log
+from emb_bench.report.acceptance import Result, RunFacts, judge, read_criteria
 from emb_bench.report.estimate import document
 from emb_runtime.errors import UsageError
 
