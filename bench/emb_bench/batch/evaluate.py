@@ -20,7 +20,7 @@ from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog, read_log, require_driven
-from emb_bench.report.sentences import warnings
+from emb_bench.report.sentences import alarms, warnings
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.input_file import open_regular
@@ -152,7 +152,7 @@ def _of_the_estimate(e: Estimate, truth: BrakeParameters | None) -> Row:
     found: Row = {
         "fits": e.validation.fits,
         "chi2_per_freedom": e.validation.ratio,
-        "alarms": e.validation.alarms,
+        "alarms": alarms(e),
         "caveats": e.caveats,
         "outside": tuple(said.label for said in conclusions if said.outside is not None),
     }

@@ -24,6 +24,7 @@ from emb_bench.estimate.records import NORMAL_95, EstimationProblem, with_system
 from emb_bench.experiment.experiment import Booleans, Experiment, Floats
 from emb_bench.experiment.from_log import read_experiment, step_of
 from emb_bench.logs.log import read_log
+from emb_bench.report.sentences import alarms
 from emb_runtime.config.bench import PARAMETER_NAMES, Noise
 from emb_runtime.drives.mapping import Mapping as DriveMapping
 from emb_runtime.errors import LogError
@@ -141,7 +142,7 @@ def identify(logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identific
         current_lag=(max(0.0, lag[0]), max(0.0, lag[1])),
         features={name: value for name, value in values.items() if name in FEATURES and name != "current_lag"},
         noise=_residuals(e, bench.noise),
-        objections=e.validation.alarms or best.validation.alarms,
+        objections=tuple(alarms(e) or alarms(best)),
     )
 
 

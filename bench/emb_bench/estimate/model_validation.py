@@ -22,18 +22,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
 from emb_bench.brake.motion import Floats
-from emb_bench.config.machine import Machine
 from emb_bench.estimate.prediction import Marginal, Problem, by_record
-from emb_bench.estimate.records import Independence, ModelValidation, Whiteness
-from emb_bench.estimate.suspects import Shown, Simulated, explained, score
-from emb_bench.numbers import p_value
+from emb_bench.estimate.records import Disturbance, Independence, ModelValidation, Whiteness
+from emb_bench.estimate.suspects import Shown, Simulated, score
 
 Bools = NDArray[np.bool_]
 
@@ -43,28 +40,6 @@ LAGS = 10  # Periods back in which a current may still show in a residual
 NEIGHBOURS = 20  # Lags at which residuals are compared with each other
 
 _DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
-
-
-class Disturbance(NamedTuple):
-    """Disturbance that an estimator found in order to whiten the residuals."""
-
-    walk: float  # Standard deviation of the velocity's random walk [rad/s per √s]
-    load: float  # Standard deviation of the load's random walk, as a current [A per √s]
-    ratio: float  # Twice the logarithm of the likelihood ratio against none
-
-    @property
-    def said(self) -> str:
-        """Words for what was found."""
-        walks = (
-            (self.walk, f"its velocity does a random walk of {self.walk:.3g} rad/s per root of a second"),
-            (self.load, f"its load does a random walk, that of a current of {self.load:.3g} A per root of a second"),
-        )
-        return " and ".join(words for size, words in walks if size > 0.0)
-
-    @property
-    def p_value(self) -> float:
-        """Probability of such a ratio without a disturbance: half of the time it is zero then (Chernoff 1954)."""
-        return 0.5 * float(special.chdtrc(1, self.ratio)) if self.ratio > 0.0 else 1.0
 
 
 def examine(
@@ -110,7 +85,7 @@ def examine(
         independence,
         *score(problem, z, found, model, seen, chi2 / freedom, disturbed=disturbed),
     )
-    return _judged(tested, disturbance, problem.bench.machine)
+    return _judged(tested, disturbance)
 
 
 def _share(disturbance: Disturbance | None) -> float:
@@ -133,68 +108,27 @@ def significant(p_values: Mapping[str, float]) -> frozenset[str]:
     return frozenset(name for name, _ in ordered[:count])
 
 
-def _judged(m: ModelValidation, disturbance: Disturbance | None, machine: Machine | None) -> ModelValidation:
-    """Tests with their alarms, notes, and the suspects that an alarm is about."""
-    alarms, notes, whiteness = [], [], m.whiteness
+def _judged(m: ModelValidation, disturbance: Disturbance | None) -> ModelValidation:
+    """Tests with those that reject the model, and the suspects among them."""
     tests = {"size": m.chi2_p} | {f"current of {name}": test.p_value for name, test in m.independence.items()}
     tests |= {f"score of {suspect.name}": suspect.p_value for suspect in m.suspects}
     if m.together is not None:
         tests["scores"] = m.together.p_value
     if disturbance is not None:
-        tests |= {f"whiteness of {name}": test.p_value for name, test in whiteness.items()}
-    alarming = significant(tests)
-    share = _share(disturbance)
-    depends = [n for n in m.independence if f"current of {n}" in alarming]
-    coloured = [
+        tests |= {f"whiteness of {name}": test.p_value for name, test in m.whiteness.items()}
+    alarming, share = significant(tests), _share(disturbance)
+    coloured = (
         n
-        for n, test in whiteness.items()
-        if (test.p_value < share / len(whiteness) if disturbance is None else f"whiteness of {n}" in alarming)
-    ]
-    suspected = tuple(s for s in m.suspects if f"score of {s.name}" in alarming)
-    if "size" in alarming:
-        why = (
-            ""
-            if depends or coloured or suspected
-            else ", without any pattern: the noise may be larger than the bench says"
-        )
-        alarms.append(f"the residuals are too large: chi2/n {m.ratio:.4g}, at most {m.expected[1]:.3f} expected{why}")
-    for name in depends:
-        test = m.independence[name]
-        alarms.append(
-            f"the residuals of the {name} depend on the current: F = {test.statistic:.3g}, {p_value(test.p_value)}, "
-            f"largest correlation {test.correlation:+.2f} with the current {test.lag} periods earlier"
-        )
-    if suspected:
-        alarms.append(explained(suspected[0], machine))
-    elif m.together is not None and "scores" in alarming:
-        alarms.append(
-            "the model lacks several effects together (chi2 "
-            f"{m.together.statistic:.4g} of {m.together.rank}, {p_value(m.together.p_value)})"
-        )
-    if disturbance is not None and disturbance.p_value < share:
-        notes.append(
-            f"the brake is disturbed by more than the sensors' noise: {disturbance.said} (likelihood ratio "
-            f"{disturbance.ratio:.4g}, {p_value(disturbance.p_value)}); the intervals allow for it"
-        )
-    if m.ratio < m.expected[0]:
-        notes.append(
-            f"the residuals are smaller than the bench's noise: chi2/n {m.ratio:.4g}, at least {m.expected[0]:.3f} "
-            "expected: the noise in the bench file, and all uncertainties, are too large"
-        )
-    if coloured:
-        tested = "; ".join(
-            f"{white.statistic:.4g} at {white.lags} lags, {p_value(white.p_value)}"
-            for white in (m.whiteness[name] for name in coloured)
-        )
-        said = f"the residuals of the {' and '.join(coloured)} are correlated in time (Ljung-Box {tested})"
-        if disturbance is None:
-            notes.append(
-                f"{said}: if only the sensors are disturbed, the model may be right, but the standard deviations by "
-                "Fisher information are wrong"
-            )
-        else:
-            alarms.append(f"{said}: the disturbance of the brake or its sensors is not white, or the model is wrong")
-    return replace(m, suspected=suspected, alarms=tuple(alarms), notes=tuple(notes))
+        for n, test in m.whiteness.items()
+        if (test.p_value < share / len(m.whiteness) if disturbance is None else f"whiteness of {n}" in alarming)
+    )
+    return replace(
+        m,
+        alarming=alarming,
+        suspected=tuple(s for s in m.suspects if f"score of {s.name}" in alarming),
+        coloured=tuple(coloured),
+        disturbance=disturbance if disturbance is not None and disturbance.p_value < share else None,
+    )
 
 
 def taken(gaps: Floats, samples: int) -> int:

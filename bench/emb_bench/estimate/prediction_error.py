@@ -24,9 +24,10 @@ from emb_bench.brake.motion import Floats
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.innovations import Filter, Followed
 from emb_bench.estimate.method import Method
-from emb_bench.estimate.model_validation import Disturbance, examine
+from emb_bench.estimate.model_validation import examine
 from emb_bench.estimate.output_error import finished, of_losses, start_points
 from emb_bench.estimate.prediction import Marginal, Problem
+from emb_bench.estimate.records import Disturbance
 from emb_bench.estimate.search import converge, strong, strong_load
 
 POWERS = {"walk": range(2, -7, -1), "load": range(0, -5, -1)}

@@ -204,6 +204,21 @@ class Contribution:
     bias: tuple[float, ...]  # Root mean square of the bias of each unknown: relative, or in the unknown's unit
 
 
+class Disturbance(NamedTuple):
+    """Disturbance that an estimator found in order to whiten the residuals."""
+
+    walk: float  # Standard deviation of the velocity's random walk [rad/s per √s]
+    load: float  # Standard deviation of the load's random walk, as a current [A per √s]
+    ratio: float  # Twice the logarithm of the likelihood ratio against none
+
+    @property
+    def p_value(self) -> float:
+        """Probability of such a ratio without a disturbance: half of the time it is zero then (Chernoff 1954)."""
+        from scipy import special
+
+        return 0.5 * float(special.chdtrc(1, self.ratio)) if self.ratio > 0.0 else 1.0
+
+
 @dataclass(frozen=True)
 class ModelValidation:
     """Model validation: tests on the residuals of whether the model explains the records."""
@@ -218,8 +233,10 @@ class ModelValidation:
     budget: tuple[Contribution, ...]  # Effects that the total allows for
     together: JointScore | None  # None without a suspect
     suspected: tuple[Suspect, ...] = ()  # Those that an alarm is about
-    alarms: tuple[str, ...] = ()  # Reasons for which the model does not fit; empty if it may
-    notes: tuple[str, ...] = ()
+    alarming: frozenset[str] = frozenset()
+    """Tests that reject the model: ``size``, ``scores``, and ``current of``, ``whiteness of``, ``score of`` a name."""
+    coloured: tuple[str, ...] = ()  # Outputs whose residuals are correlated in time
+    disturbance: Disturbance | None = None  # A significant one, of a method that whitens the residuals
 
     @property
     def ratio(self) -> float:
@@ -228,5 +245,5 @@ class ModelValidation:
 
     @property
     def fits(self) -> bool:
-        """True if there is no alarm."""
-        return not self.alarms
+        """True if no test rejects the model."""
+        return not self.alarming

@@ -318,14 +318,3 @@ def shown_as(s: Suspect | Contribution, machine: Machine | None) -> Quantity:
     found = quantity(machine, s.name) if s.name in SI else Quantity(s.name, row.unit)
     a_share = row.unit == "1" or (s.name in SI and row.relative and row.step == 0.0)
     return found._replace(unit="") if a_share else found
-
-
-def explained(s: Suspect, machine: Machine | None = None) -> str:
-    """A suspect in words that lead to the remedy; ``machine`` is that of a bench that has no brake."""
-    effect, unit = EFFECTS[s.name], shown_as(s, machine).unit
-    share = 100.0 * s.value
-    amount = f"{s.value:.2g} {unit}" if unit else f"{share:.0f} %" if abs(share) >= 99.5 else f"{share:.2g} %"
-    said = effect.effect
-    for parameter in PARAMETER_NAMES:
-        said = said.replace(parameter, quantity(machine, parameter).name)
-    return f"{said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma); remedy: {effect.remedy}"

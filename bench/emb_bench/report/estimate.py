@@ -12,7 +12,6 @@ from emb_bench.brake.motion import Floats
 from emb_bench.documents import to_json
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import METHODS
-from emb_bench.estimate.suspects import explained
 from emb_bench.information.identifiability import schur_complement
 from emb_bench.numbers import p_value, signed
 from emb_bench.report import sentences as say
@@ -29,7 +28,7 @@ def text(study: Study, *, verbose: bool = False) -> str:
         return "\n".join([*lines, "next: find the cause before the next run   (-v shows values until the stop)"])
     against = list(_against(study))
     lines += wrapped(say.headline(study))
-    lines += listed("  - ", against if verbose else against[-1:])  # the last one names the effect, if any explains it
+    lines += listed("  - ", against if verbose or study.model_fits else against[:1])
     lines += listed("NOTE: ", _notes(study))
     lines += ["", *tables.parameters(study, brief=True).lines()]
     if study.holds or verbose:
@@ -49,7 +48,7 @@ def stops(study: Study) -> Iterator[str]:
 def _against(study: Study) -> Iterator[str]:
     """Reasons against the model."""
     if not study.biased:
-        yield from study.estimate.validation.alarms
+        yield from say.alarms(study.estimate)
     yield from (f"{h.name}: {say.held_out(h)}" for h in study.left_out if not h.fits)
 
 
@@ -109,7 +108,7 @@ def _evidence(study: Study) -> Iterator[str]:
         ("prior", say.prior(e)),
         ("chi2/n", f"{expected} ({p_value(m.chi2_p)})"),
     )
-    yield from listed("NOTE: ", () if study.biased else m.notes)
+    yield from listed("NOTE: ", () if study.biased else say.residual_notes(e))
     yield ""
     correlation, pairs = tables.correlation(e)
     found: list[Table | None] = [
@@ -141,12 +140,14 @@ def document(study: Study) -> dict[str, Any]:
         "systematic": _systematic(e),
         "prior": e.asked.prior.name if e.asked.prior else None,
         "misfit": {
-            **_fields(validation, "chi2", "freedom", "expected", "whiteness", "independence", "alarms", "notes"),
+            **_fields(validation, "chi2", "freedom", "expected", "whiteness", "independence"),
+            "alarms": say.alarms(e),
+            "notes": say.residual_notes(e),
             "chi2_per_freedom": validation.ratio,
             "p_value": validation.chi2_p,
             "suspects": [_fields(s, "name", "value", "sigmas", "p_value") for s in validation.suspects],
             "suspected": [
-                _fields(s, "name", "value", "sigmas", "p_value") | {"words": explained(s, e.bench.machine)}
+                _fields(s, "name", "value", "sigmas", "p_value") | {"words": say.explained(s, e.bench.machine)}
                 for s in validation.suspected
             ],
             "suspects_together": validation.together and _fields(validation.together, "statistic", "p_value"),

@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from emb_bench.brake.parameters import UNITS
+from emb_bench.brake.parameters import UNITS, quantity
 from emb_bench.information.identifiability import combination
 from emb_bench.numbers import amount, between, in_samples, p_value, percent, plain, spread
+from emb_runtime.config.bench import PARAMETER_NAMES
 
 if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.conclusion import Conclusion
@@ -17,8 +18,9 @@ if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.model_choice import Candidate
     from emb_bench.analysis.profile import Profile
     from emb_bench.analysis.study import Stop, Study
+    from emb_bench.config.machine import Machine
     from emb_bench.estimate.estimate import Estimate
-    from emb_bench.estimate.records import Contribution
+    from emb_bench.estimate.records import Contribution, ModelValidation, Suspect
     from emb_bench.experiment.evaluation import Evaluation
     from emb_bench.information.identifiability import Direction, Finding, Identifiability
     from emb_bench.report.content import Content, Run
@@ -143,6 +145,80 @@ def limit(effect: Contribution, e: Estimate) -> str:
 
     name, shared = shown_as(effect, e.bench.machine).name, effect.name in OF_THE_BENCH
     return f"{name}, known to {spread(e.asked.allowed[effect.name], True)}" if shared else name
+
+
+# ---- tests on the residuals ----
+
+
+def alarms(e: Estimate) -> list[str]:
+    """Reasons for which the model does not fit, an effect that explains it first; empty if it may fit."""
+    m, found = e.validation, list[str]()
+    if m.suspected:
+        found.append(explained(m.suspected[0], e.bench.machine))
+    elif m.together is not None and "scores" in m.alarming:
+        score = f"chi2 {m.together.statistic:.4g} of {m.together.rank}, {p_value(m.together.p_value)}"
+        found.append(f"the model lacks several effects together ({score})")
+    depends = [name for name in m.independence if f"current of {name}" in m.alarming]
+    if "size" in m.alarming:
+        no_pattern = ", without any pattern: the noise may be larger than the bench says"
+        why = "" if depends or m.coloured or m.suspected else no_pattern
+        found.append(f"the residuals are too large: chi2/n {m.ratio:.4g}, at most {m.expected[1]:.3f} expected{why}")
+    for name in depends:
+        test = m.independence[name]
+        found.append(
+            f"the residuals of the {name} depend on the current: F = {test.statistic:.3g}, {p_value(test.p_value)}, "
+            f"largest correlation {test.correlation:+.2f} with the current {test.lag} periods earlier"
+        )
+    if any(f"whiteness of {name}" in m.alarming for name in m.coloured):
+        found.append(f"{_coloured(m)}: the disturbance of the brake or its sensors is not white, or the model is wrong")
+    return found
+
+
+def residual_notes(e: Estimate) -> list[str]:
+    """Remarks on the residuals that are no reason against the model."""
+    m, found = e.validation, list[str]()
+    if m.disturbance is not None:
+        walks = (
+            (m.disturbance.walk, "its velocity does a random walk of {:.3g} rad/s per root of a second"),
+            (m.disturbance.load, "its load does a random walk, that of a current of {:.3g} A per root of a second"),
+        )
+        said = " and ".join(text.format(size) for size, text in walks if size > 0.0)
+        found.append(
+            f"the brake is disturbed by more than the sensors' noise: {said} (likelihood ratio "
+            f"{m.disturbance.ratio:.4g}, {p_value(m.disturbance.p_value)}); the intervals allow for it"
+        )
+    if m.ratio < m.expected[0]:
+        found.append(
+            f"the residuals are smaller than the bench's noise: chi2/n {m.ratio:.4g}, at least {m.expected[0]:.3f} "
+            "expected: the noise in the bench file, and all uncertainties, are too large"
+        )
+    if m.coloured and not any(f"whiteness of {name}" in m.alarming for name in m.coloured):
+        found.append(
+            f"{_coloured(m)}: if only the sensors are disturbed, the model may be right, but the standard deviations "
+            "by Fisher information are wrong"
+        )
+    return found
+
+
+def _coloured(m: ModelValidation) -> str:
+    tested = "; ".join(
+        f"{white.statistic:.4g} at {white.lags} lags, {p_value(white.p_value)}"
+        for white in (m.whiteness[name] for name in m.coloured)
+    )
+    return f"the residuals of the {' and '.join(m.coloured)} are correlated in time (Ljung-Box {tested})"
+
+
+def explained(s: Suspect, machine: Machine | None = None) -> str:
+    """A suspect in words that lead to the remedy; ``machine`` is that of a bench that has no brake."""
+    from emb_bench.estimate.suspects import EFFECTS, shown_as
+
+    effect, unit = EFFECTS[s.name], shown_as(s, machine).unit
+    share = 100.0 * s.value
+    amount = f"{s.value:.2g} {unit}" if unit else f"{share:.0f} %" if abs(share) >= 99.5 else f"{share:.2g} %"
+    said = effect.effect
+    for parameter in PARAMETER_NAMES:
+        said = said.replace(parameter, quantity(machine, parameter).name)
+    return f"{said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma); remedy: {effect.remedy}"
 
 
 # ---- parameters ----

@@ -96,7 +96,7 @@ def test_a_model_that_was_another_or_did_not_fit_may_be_what_has_changed(now: Es
     assert "did not fit" in found
     assert "stribeck" in found
     assert other_model(now, earlier(now, k_m=14.0)) == ""
-    wrong = replace(now, validation=replace(now.validation, alarms=("too large",)))
+    wrong = replace(now, validation=replace(now.validation, alarming=frozenset({"size"})))
     assert "does not fit" in other_model(wrong, earlier(now, k_m=40.0))
 
 

@@ -11,6 +11,7 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
 from emb_bench.estimate.records import DRIFTS, NORMAL_95, EstimationProblem, with_systematic
+from emb_bench.report.sentences import alarms, residual_notes
 from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES
 
@@ -39,7 +40,7 @@ def test_every_brake_fits_itself(bench: Bench) -> None:
     """The seed is fixed; each of these brakes may fail once in a hundred seeds."""
     for plant in ("exact", *WRONG):
         validation = fitted(bench, plant, plant).validation
-        assert validation.fits, (plant, validation.alarms)
+        assert validation.fits, (plant, validation.alarming)
         assert validation.expected[0] < validation.ratio < validation.expected[1], plant
 
 
@@ -81,27 +82,28 @@ def test_what_was_estimated_is_no_suspect(bench: Bench) -> None:
 
 
 def test_more_noise_than_the_bench_says_is_told_from_a_wrong_model(bench: Bench) -> None:
-    validation = fitted(bench, "exact", noise=1.5).validation
-    assert len(validation.alarms) == 1
-    assert "the noise may be larger than the bench says" in validation.alarms[0]
+    found = fitted(bench, "exact", noise=1.5)
+    validation = found.validation
+    assert validation.alarming == {"size"}
+    assert "the noise may be larger than the bench says" in alarms(found)[0]
     assert validation.ratio == pytest.approx(2.25, rel=0.15)
-    wrong = fitted(bench, "stribeck").validation
-    assert not any("noise may be larger" in alarm for alarm in wrong.alarms)
-    assert any("depend on the current" in alarm for alarm in wrong.alarms)
+    wrong = fitted(bench, "stribeck")
+    assert not any("noise may be larger" in alarm for alarm in alarms(wrong))
+    assert any(name.startswith("current of") for name in wrong.validation.alarming)
 
 
 def test_less_noise_than_the_bench_says_is_noted(bench: Bench) -> None:
-    validation = fitted(bench, "exact", noise=0.5).validation
-    assert validation.fits
-    assert "too large" in validation.notes[0]
-    assert validation.ratio == pytest.approx(0.25, rel=0.15)
+    found = fitted(bench, "exact", noise=0.5)
+    assert found.validation.fits
+    assert "too large" in residual_notes(found)[0]
+    assert found.validation.ratio == pytest.approx(0.25, rel=0.15)
 
 
 def test_coloured_noise_is_a_note_and_widens_the_deviations_from_the_residuals(bench: Bench) -> None:
     """Output error does not need white noise, its bound does."""
     found = fit(bench, "exact", [coloured(bench)])
     assert found.validation.fits
-    assert sum("of the angle and velocity are correlated in time" in note for note in found.validation.notes) == 1
+    assert found.validation.coloured == ("angle", "velocity")
     assert (found.robust() > 1.3 * found.cramer_rao()).all()
 
 
