@@ -146,8 +146,6 @@ class Core:
         self._rests = False  # the newest sample since then says idle
         self._rest_velocities: list[float] = []  # measured since then [rad/s]
         self._detail = ""  # of the fault
-        self._before = self._machine.run  # before the fault that is not recorded yet
-        self._fault_ns = 0  # its time
 
     # --- what the driver asks ---------------------------------------------------------------------------------------
 
@@ -262,14 +260,12 @@ class Core:
 
     def fail(self, fault: Fault, now_ns: int) -> None:
         """Latch a fault that the driver has found; :meth:`explain` records it, once a stop frame has left."""
-        self._before, self._fault_ns = self._machine.run, now_ns
         self._machine.latch(fault, now_ns)
 
     def explain(self, fault: Fault, detail: str) -> None:
         """Record a fault that was latched."""
         self._detail = self._detail or detail
-        self._machine.note(fault, detail, self._fault_ns)
-        self._machine.note_change(self._before, fault, self._fault_ns)
+        self._machine.explain(fault, detail)
 
     def stop_frame(self) -> Frame:
         """Next stop frame."""

@@ -289,6 +289,8 @@ FAULTS: dict[Fault, FaultInfo] = {
 class StateMachine:
     """A run's state, moved on by events; each change and each fault is recorded: time [ns], code and text."""
 
+    _latched: tuple[Run, int]  # State before the fault that was latched last, and its time [ns]
+
     def __init__(self, bench: Bench, push_event: Callable[[int, str, str], object]) -> None:
         self._bench = bench
         self._push_event = push_event
@@ -302,19 +304,25 @@ class StateMachine:
         if after.late and not before.late:
             self.note(Fault.SENSOR_LATE, f"{missed(self._bench, before, now_ns)} so far", now_ns)
         self.run = after
-        self.note_change(before, event, now_ns)
+        self._note_change(before, event, now_ns)
 
     def latch(self, fault: Fault, now_ns: int) -> None:
-        """Take a fault that latches, and record nothing: the stop comes before the record."""
+        """Take a fault that latches; :meth:`explain` records it, once the stop has begun."""
+        self._latched = self.run, now_ns
         self.run = step(self._bench, self.run, fault, now_ns)
+
+    def explain(self, fault: Fault, detail: str) -> None:
+        """Record the fault that was latched last, and the change of the state."""
+        before, time_ns = self._latched
+        self.note(fault, detail, time_ns)
+        self._note_change(before, fault, time_ns)
 
     def note(self, fault: Fault, detail: str, now_ns: int) -> None:
         """Record a fault; a soft one changes nothing else."""
         cause = FAULTS[fault].cause
         self._push_event(now_ns, fault.name, f"{cause}: {detail}" if detail else cause)
 
-    def note_change(self, before: Run, event: Event | Fault, now_ns: int) -> None:
-        """Record a change of the state, if there was one."""
+    def _note_change(self, before: Run, event: Event | Fault, now_ns: int) -> None:
         if self.run.state is not before.state:
             self._push_event(now_ns, self.run.state.name, f"after {event.name}")
 

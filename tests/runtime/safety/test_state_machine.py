@@ -234,13 +234,11 @@ def test_the_first_fault_that_latches_is_the_run_s_and_it_is_recorded_when_it_is
     machine: StateMachine, events: list[tuple[int, str, str]]
 ) -> None:
     begun(machine)
-    before = machine.run
     machine.latch(Fault.INTERRUPTED, 3 * MS)
     assert (machine.run.state, events[3:]) == (RunState.STOPPING, [])
-    machine.note(Fault.INTERRUPTED, "", 3 * MS)
-    machine.note_change(before, Fault.INTERRUPTED, 3 * MS)
+    machine.explain(Fault.INTERRUPTED, "")
     machine.latch(Fault.BUS_LOST, 4 * MS)
-    machine.note(Fault.BUS_LOST, "vcan0", 4 * MS)
+    machine.explain(Fault.BUS_LOST, "vcan0")
     machine.handle_event(Event.STOPPED, 5 * MS)
     assert events[3:] == [
         (3 * MS, "INTERRUPTED", FAULTS[Fault.INTERRUPTED].cause),
