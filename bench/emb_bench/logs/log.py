@@ -345,7 +345,7 @@ class RunLog:
     def layout(self) -> Layout:
         """The CAN layout of the run; LogError if the log's messages are not those of this version."""
         layout = load_layout()
-        if _definitions(self._text("emb.dbc")) != _definitions(layout.text):
+        if not _definitions(self._text("emb.dbc")) <= _definitions(layout.text):
             raise LogError(f"{self.path}: its DBC is not that of this version: read it with the version that wrote it")
         return layout
 
@@ -485,6 +485,6 @@ def _bench(text: str) -> Bench:
     return parse_bench(text, "bench.toml", analysis=True)
 
 
-def _definitions(dbc: str) -> list[str]:
+def _definitions(dbc: str) -> set[str]:
     """Lines of a DBC without its comments."""
-    return [line for line in dbc.splitlines() if not line.startswith("CM_")]
+    return {line for line in dbc.splitlines() if not line.startswith("CM_")}
