@@ -252,11 +252,6 @@ class OnBus:
         self._drive = drive
         self.receive = drive.receive
 
-    @property
-    def periods(self) -> int:
-        """Sampling periods that have passed."""
-        return self._drive.periods
-
     def tick(self, skipped: int = 0) -> list[Frame]:
         """Let a period pass; gives what is sent at its end."""
         frames = [*self._drive.tick(skipped), *self._drive.replies]

@@ -8,16 +8,15 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 from emb_bench.config.bench import load_bench
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.simulated_brake import read_brake
+from emb_bench.sim.transport import Device
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
-from emb_runtime.records import Frame
 from emb_runtime.safety import watchdog_process
 from emb_runtime.system import realtime
 from emb_runtime.system.clock import Clock
@@ -33,20 +32,6 @@ MAX_FRAMES = 64  # Most frames taken per tick: a babbling commander must not hol
 EPILOG = """\
 exit codes: 0 ended (duration over, Ctrl-C or SIGTERM), 2 usage, 4 bus
 """
-
-
-class Device(Protocol):
-    """Device on a bus that acts once per sampling period."""
-
-    @property
-    def periods(self) -> int:
-        """Sampling periods that have passed."""
-
-    def receive(self, frame: Frame) -> None:
-        """Take one frame from the bus."""
-
-    def tick(self, skipped: int = 0) -> list[Frame]:
-        """Let one period pass, and as many more as were skipped; gives what is sent at its end."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -84,9 +69,9 @@ def run_node(
 
     Late ticks are skipped, never made up in a burst; returns their number.
     """
-    skipped_total = 0
+    passed = skipped_total = 0
     deadline_ns = clock.now_ns() + period_ns
-    while not stop_requested() and (periods is None or node.periods < periods):
+    while not stop_requested() and (periods is None or passed < periods):
         # Asleep until the tick, not woken by each frame: what has come meanwhile is received then, and acts no earlier.
         skipped = (clock.sleep_until(deadline_ns) - deadline_ns) // period_ns
         for _ in range(MAX_FRAMES):
@@ -95,6 +80,7 @@ def run_node(
             node.receive(frame)
         for frame in node.tick(skipped):
             transport.send(frame)
+        passed += skipped + 1
         skipped_total += skipped
         deadline_ns += (skipped + 1) * period_ns
     return skipped_total

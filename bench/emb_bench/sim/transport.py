@@ -49,11 +49,9 @@ class Device(Protocol):
 
     def receive(self, frame: Frame) -> None:
         """Take one frame from the bus."""
-        ...
 
     def tick(self, skipped: int = 0) -> list[Frame]:
-        """Let one period pass; gives the frames that it sends at its end."""
-        ...
+        """Let one period pass, and as many more as were skipped; gives the frames that it sends at their end."""
 
 
 class LockstepBus:
