@@ -48,7 +48,8 @@ def found_text(sheet: Bench, found: Findings, logs: str) -> str:
     for name, (low, high) in measured_ranges(sheet, one).items():
         _put(document, f"brake.{name}", _rounded(min(max(one.values[name], low), high)), by_fit)
         interval = "{:.5g} to {:.5g}".format(*one.intervals[name])
-        _put(document, f"ranges.{MEASURED}.{name}", [low, high], f"95 %: {interval}; {_widening(one)[1]}")
+        _put(document, f"ranges.{MEASURED}.{name}", [low, high], f"95 %: {interval}; {_reason(sheet, one, name)}")
+    document["ranges"][MEASURED].add(tomlkit.nl())
     for name in ("angle", "velocity"):
         at_rest, moving = getattr(rest.noise, name), getattr(one.noise, name)
         origin = f"at rest {at_rest:.3g}, of the residuals {moving:.3g}; the larger times {NOISE_WIDENED:g}"
@@ -94,20 +95,28 @@ def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float,
         if one.is_unexplained or (name == "T_c" and "play" in one.features):
             continue
         low, high = one.intervals[name]
-        aside = _widening(one)[0] * one.values[name]
+        aside = _widening(one) * one.values[name]
         least, greatest = _secants(sheet, one) if name == "k_1" else (1.0, 1.0)
         low, high = least * (low - aside), greatest * (high + aside)
         found[name] = max(lowest, _rounded(low)), min(highest, _rounded(high, up=True))
     return found
 
 
-def _widening(one: Identification) -> tuple[float, str]:
-    """Share of its value by which a range exceeds the interval, and what to say of it."""
+def _widening(one: Identification) -> float:
+    """Share of its value by which a range exceeds the interval."""
+    return WIDENED if one.fits else WIDENED_MISFIT
+
+
+def _reason(sheet: Bench, one: Identification, name: str) -> str:
+    """Reason of the written range of a parameter."""
     if one.is_unexplained:
         times = math.sqrt(one.ratio)
-        return 0.0, f"no model explains the experiments; residuals {times:.3g} times the noise: the data sheet's"
-    share, why = (WIDENED, "") if one.fits else (WIDENED_MISFIT, " as no model fits")
-    return share, f"widened by {share:.0%} of the value{why}, at most the data sheet's"
+        return f"no model explains the experiments; residuals {times:.3g} times the noise: the data sheet's"
+    if name == "T_c" and "play" in one.features:
+        return "the data sheet's, as play acts as friction"
+    curved = ", and by the curve and hysteresis of the force" if _secants(sheet, one) != (1.0, 1.0) else ""
+    misfit = "" if one.fits else " as no model fits"
+    return f"widened by {_widening(one):.0%}{misfit}{curved if name == 'k_1' else ''}, at most the data sheet's"
 
 
 def outside(sheet: Bench, one: Identification) -> list[str]:

@@ -292,6 +292,7 @@ def test_with_play_of_the_gear_the_range_of_the_friction_stays_the_data_sheets(s
     box = sheet.range_set("wide")
     assert wide.pop("T_c") == (box.low.T_c, box.high.T_c) != plain.pop("T_c")
     assert wide == plain
+    assert "the data sheet's, as play acts as friction" in found_text(sheet, found(sheet, identified=one), LOGS)
 
 
 def test_a_drive_that_does_not_say_which_command_it_obeyed_may_be_a_sample_later() -> None:
