@@ -45,8 +45,7 @@ $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
 
 demo: $(VENV)/.base
 	@mkdir -p demo && rm -f demo/experiment.mcap demo/report.html
-	$(BIN)/emb-run --iface sim --log demo/experiment.mcap
-	$(BIN)/emb-replay report demo/experiment.mcap --output demo/report.html
+	$(BIN)/emb-run --iface sim --log demo/experiment.mcap --report demo/report.html
 	$(BIN)/emb-replay fim demo/experiment.mcap
 
 lint: $(VENV)/.dev

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 from emb_runtime.system.terminal import ARM_QUESTION, StopRequest, as_json, complain, confirmed, mention, show
 
 LISTEN_NS = 50_000_000  # Time between two looks at the keyboard [ns]
-VIEWERS = "emb_runtime.viewers"  # Entry-point group of the module that shows a run
+VIEWERS = "emb_runtime.viewers"  # Entry-point group of the modules that show a run: ``live``, and its ``report``
 VIEWER_TIMEOUT = 10.0  # Longest wait for the process to be ready [s]
 
 
@@ -121,10 +122,32 @@ def shown(plan: Plan) -> Iterator[None]:
 
 
 def _experiment(plan: Plan, console: Console) -> int:
+    reporter = None if plan.report is None else _reporter(plan.report)
     document, exit_code = experiment(plan, log_path(plan.log), console)
     text = as_json(document) if plan.json else summary.text(document, plan.verbose)
     show(text.partition("\n")[0] if plan.quiet else text)
+    if reporter is not None and document["log"] is not None:
+        reported = _report(reporter, document["log"], plan)
+        return exit_code or reported
     return exit_code
+
+
+def _reporter(page: Path) -> str:
+    """Module whose command ``report`` writes a page; asked for before the run."""
+    entries = list(metadata.entry_points(group=VIEWERS, name="report"))
+    if not entries:
+        raise UsageError("--report: nothing is installed that writes a page; emb_bench does: emb-excite[bench]")
+    if page.suffix not in (".html", ".htm"):
+        raise UsageError(f"--report {page}: expected a name that ends in .html or .htm")
+    if not page.absolute().parent.is_dir():
+        raise UsageError(f"--report: {page.absolute().parent} is no folder")
+    return entries[0].value
+
+
+def _report(module: str, log: str, plan: Plan) -> int:
+    """Have a process without the real-time settings of this one estimate, and write the page; its exit code."""
+    command = [sys.executable, "-P", "-m", module, "report", log, "--output", str(plan.report)]
+    return subprocess.run(command, stdout=sys.stderr if plan.json else None, check=False).returncode
 
 
 def _read(plan: Plan, console: Console) -> int:

@@ -137,6 +137,7 @@ class Plan:
     verbose: bool
     quiet: bool  # The verdict only
     strict: bool = False  # An estimate outside the ranges is no success
+    report: Path | None = None  # Page to write after the run
     drive: MappedDrive | None = None  # The node is its gateway
     operator: str = ""  # Name of who makes the run; empty if that was not said
     serial: str = ""  # Serial number of the device; empty if that was not said
@@ -189,6 +190,10 @@ def parser() -> argparse.ArgumentParser:
         "--live", nargs="?", type=int, const=LIVE_PORT, metavar="PORT",
         help="show the run while it goes on, from a process of its own, on a page for browsers at this port "
         f"(default: {LIVE_PORT})",
+    )  # fmt: skip
+    what.add_argument(
+        "--report", type=Path, metavar="FILE.html",
+        help="after the run, estimate the parameters and write the page, as emb-replay report does (needs emb_bench)",
     )  # fmt: skip
     what.add_argument(
         "--strict", action="store_true",
@@ -250,7 +255,9 @@ def prepare(args: argparse.Namespace) -> Plan:
     steps, listen = _duration(args, bench)
     if stage is not Stage.READ_ONLY and not args.long_timeouts:
         bench.refuse_long_timeouts()
-    of_an_experiment = {"--home": args.home, "--quick": args.quick, "--stop-when": args.stop_when}
+    of_an_experiment = {
+        "--home": args.home, "--quick": args.quick, "--stop-when": args.stop_when, "--report": args.report
+    }  # fmt: skip
     for option, value in of_an_experiment.items():
         if stage is Stage.READ_ONLY and value:
             raise UsageError(f"--read-only: sends nothing, so {option} has nothing to do")
@@ -289,6 +296,7 @@ def prepare(args: argparse.Namespace) -> Plan:
         verbose=args.verbose,
         quiet=args.quiet,
         strict=args.strict,
+        report=args.report,
         drive=_drive(args.iface, args.drive, bench),
         operator=one_line(args.operator, LONGEST_LABEL),
         serial=one_line(args.serial, LONGEST_LABEL),

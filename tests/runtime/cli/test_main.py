@@ -89,6 +89,28 @@ def test_the_help_documents_every_exit_code_and_every_key_of_the_simulated_bus()
     assert all(key in said for key in ("sim:KEY=VALUE", "seed", "plant", *PARAMETER_NAMES))
 
 
+def test_a_run_ends_with_its_page_where_that_is_asked_for_and_possible(
+    emb_run: EmbRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = tmp_path / "page.html"
+    ran: list[list[str]] = []
+
+    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[bytes]:
+        ran.append(command)
+        return subprocess.CompletedProcess(command, 7)
+
+    monkeypatch.setattr("emb_runtime.cli.main.subprocess.run", run)
+    emb_run.document("--report", str(page), code=7)
+    (command,) = ran
+    assert command[2:] == ["-m", "emb_bench.cli.replay", "report", str(tmp_path / "run.mcap"), "--output", str(page)]
+    (tmp_path / "run.mcap").unlink()
+    emb_run.refused("is no folder", "--report", str(tmp_path / "none" / "page.html"))
+    emb_run.refused("so --report has nothing to do", "--report", str(page), "--read-only")
+    monkeypatch.setattr("emb_runtime.cli.main.metadata.entry_points", lambda **_: [])
+    emb_run.refused("nothing is installed that writes a page", "--report", str(page))
+    assert not (tmp_path / "run.mcap").exists()
+
+
 def test_no_node_is_a_bus_error_with_the_table_and_a_document(
     emb_run: EmbRun, edited: Edited, sim: Sim, tmp_path: Path
 ) -> None:
