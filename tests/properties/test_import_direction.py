@@ -105,7 +105,7 @@ def test_every_third_party_import_is_declared_in_the_extra_where_it_belongs() ->
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     base = names(project["dependencies"])
-    bench = base.union(*(names(extras[extra]) for extra in ("bench", "mdf", "ray")))
+    bench = base.union(*(names(extras[extra]) for extra in ("bench", "mdf", "live", "ray")))
     train = bench.union(*(names(extras[extra]) for extra in ("train",)))
     allowed = {
         "runtime/emb_runtime": base,

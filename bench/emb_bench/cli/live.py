@@ -14,10 +14,11 @@ from emb_runtime.system.terminal import mention
 
 
 def live(place: Path = Path("runs"), *, host: str = HOST, port: int = PORT) -> None:
-    """Show runs while they go on, on a page in the browser.
+    """Show runs while they go on: on a page in the browser, or in Foxglove.
 
-    Show the logs that appear in a folder on a page in the browser, while they are written. The command only reads files
-    and does not affect a run. Ctrl-C ends it. emb-run --live shows one run.
+    Show the logs that appear in a folder while they are written: on a page in the browser, and in Foxglove and
+    Lichtblick over the Foxglove WebSocket protocol (open the address as a connection, with the layout of the
+    documentation). The command only reads files and does not affect a run. Ctrl-C ends it. emb-run --live shows one run.
 
     Args:
         place: folder whose new logs are shown, or one log; its parent folder must exist (default: runs/).
@@ -46,7 +47,7 @@ def live(place: Path = Path("runs"), *, host: str = HOST, port: int = PORT) -> N
         mention(str(err))
 
     try:
-        mention(f"shows {'the log' if one else 'new logs in'} {place}: {server.address}; Ctrl-C ends it")
+        mention(f"shows {'the log' if one else 'new logs in'} {place}: {server.addresses}; Ctrl-C ends it")
         follow(logs, server, wait, complain, once=one)
     except KeyboardInterrupt:
         pass

@@ -19,6 +19,7 @@ from emb_bench.logs.mcap_file import Chunk, message_class
 from emb_runtime.estimator.estimate import NORMAL_95, UNITS
 from emb_runtime.records import Reason, RunState
 
+SUBPROTOCOL = "emb-excite.page"
 KEPT = 600  # Chunks that a browser which comes later gets; a chunk has 0.1 s
 TOPICS = ("/cycle", "/estimate", "/safety")
 RUNNING = (RunState.ACTIVE, RunState.HOMING)

@@ -31,7 +31,7 @@ def main(arguments: list[str]) -> int:
         child_process.answer({"error": str(err)})
         return 1
     logs = NewLogs(Path(document["folder"]), document["pattern"])
-    child_process.answer({"ready": server.address})
+    child_process.answer({"ready": server.addresses})
     follow(logs, server, _wait, _complain)
     server.close()
     return 0

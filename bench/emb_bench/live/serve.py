@@ -1,140 +1,265 @@
-"""A page for a browser, and the chunks of logs for it as server-sent events (WHATWG HTML, section 9.2).
+"""The chunks of logs for a page in a browser, and for Foxglove and Lichtblick over the Foxglove WebSocket protocol.
 
-A page of any website may ask this computer. A browser gives it no answer of another origin; a name that is not this
-computer's, which another's name server may have given our address (DNS rebinding), is refused.
+Source: https://github.com/foxglove/ws-protocol, ``docs/spec.md``; only what a server needs that sends and obeys nobody.
+
+A page of any website may open a connection to this computer. Its browser says where the page is from (``Origin``) and
+which name it looked up (``Host``): a page from elsewhere is refused, and a name that is not this computer's, which
+another's name server may have given our address (DNS rebinding).
 """
 
 from __future__ import annotations
 
+import base64
 import ipaddress
-import queue
+import json
+import logging
 import re
-import socketserver
+import struct
 import threading
+import time
+from collections import deque
+from collections.abc import Callable
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from emb_bench.live.page import Page, html
+from mcap import records as mcap
+
+from emb_bench.live.page import SUBPROTOCOL, Page, html
 from emb_bench.logs.mcap_file import Chunk
 from emb_runtime.errors import UsageError
 
-HOST = "127.0.0.1"
-PORT = 8765
-STALLED = 2.0  # Time after which a browser that takes nothing is left [s]; it connects again by itself
+if TYPE_CHECKING:
+    from websockets.http11 import Request, Response
+    from websockets.sync.server import ServerConnection
 
+HOST = "127.0.0.1"
+PORT = 8765  # Port that viewers propose
+SUBSCRIBING = 0.1  # Time for viewers to subscribe to new topics before their first message [s]
+LINGER = 0.2  # Time for viewers to get the last messages [s]
+BACKLOG = 1 << 14  # Messages that wait for a slow viewer; a chunk has about a thousand. Then its oldest are left out.
+
+ORIGINS: Final = (
+    None,  # No page of a browser: the viewer as a program
+    "file://",  # The viewer as a program that is made as a page
+    "https://app.foxglove.dev",
+    re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d{1,5})?"),
+)
+"""Origins of the pages that may connect."""
 PAGE_HEADERS: Final = {
     "Content-Type": "text/html; charset=utf-8",
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
-    "connect-src 'self'; frame-ancestors 'none'",
+    "connect-src 'self' ws:; frame-ancestors 'none'",
     "Cache-Control": "no-store",
 }
-EVENT_HEADERS: Final = {"Content-Type": "text/event-stream", "Cache-Control": "no-store"}
-
-Waiting = queue.SimpleQueue[str | None]
-"""Messages that wait for one browser; None ends its connection."""
+SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
+MESSAGE: Final = struct.Struct("<BIQ")  # Opcode 1, number of the subscription, time [ns]; the payload follows
 
 
-class _TcpServer(socketserver.ThreadingTCPServer):
-    """A thread a connection; closing waits for them. The server of ``http.server`` looks up its own name first."""
+class Viewer:
+    """One connection: its subscriptions, and what waits to be sent by a thread of its own."""
 
-    allow_reuse_address = True
+    def __init__(self, connection: ServerConnection) -> None:
+        self._connection = connection
+        self._subscriptions: dict[int, int] = {}
+        self._said: deque[str] = deque()
+        self._messages: deque[bytes] = deque(maxlen=BACKLOG)
+        self._news = threading.Condition()
+        self._open = True
+
+    def say(self, **document: Any) -> None:
+        """Send a document, before the messages that wait."""
+        self.send(json.dumps(document))
+
+    def send(self, *texts: str) -> None:
+        """Send texts, before the messages that wait."""
+        with self._news:
+            self._said.extend(texts)
+            self._news.notify()
+
+    def log(self, channel: int, time_ns: int, data: bytes) -> None:
+        """Send a message of a channel, if the viewer has subscribed to it."""
+        if (subscription := self._subscriptions.get(channel)) is not None:
+            with self._news:
+                self._messages.append(MESSAGE.pack(1, subscription, time_ns) + data)
+                self._news.notify()
+
+    def listen(self) -> None:
+        """Take what the viewer asks for, until it leaves."""
+        sender = threading.Thread(target=self._send)
+        sender.start()
+        try:
+            for asked in self._connection:
+                self._take(asked)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            pass  # it does not speak the protocol
+        finally:
+            with self._news:
+                self._open = False
+                self._news.notify()
+            self._connection.close()
+            sender.join()
+
+    def _take(self, asked: str | bytes) -> None:
+        document = json.loads(asked) if isinstance(asked, str) else {}
+        if document.get("op") == "subscribe":
+            new = {int(each["channelId"]): int(each["id"]) & 0xFFFFFFFF for each in document["subscriptions"]}
+            self._subscriptions = self._subscriptions | new
+        elif document.get("op") == "unsubscribe":
+            ended = document["subscriptionIds"]
+            self._subscriptions = {key: value for key, value in self._subscriptions.items() if value not in ended}
+
+    def _send(self) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            while True:
+                with self._news:
+                    self._news.wait_for(lambda: self._said or self._messages or not self._open)
+                    if not self._open:
+                        return
+                    waiting: list[str | bytes] = [*self._said, *self._messages]
+                    self._said.clear()
+                    self._messages.clear()
+                for each in waiting:
+                    self._connection.send(each)
+        except ConnectionClosed:
+            pass  # listen() ends as well
 
 
 class Server:
-    """A server of one log after the other.
+    """A server of one log after the other; a topic keeps its channel where its schema stays the same.
 
     Port 0 is any free one.
 
     Raises:
-        UsageError: the port cannot be had.
+        UsageError: websockets is not installed, or the port cannot be had.
     """
 
     def __init__(self, host: str = HOST, port: int = PORT) -> None:
-        self._page = Page()
-        self._lock = threading.Lock()
-        self._browsers: list[Waiting] = []
-        server = self
-
-        class Handler(BaseHTTPRequestHandler):
-            timeout = STALLED
-
-            def do_GET(self) -> None:
-                server.answer(self, host)
-
-            def log_message(self, *_: Any) -> None:
-                pass
-
         try:
-            self._server = _TcpServer((host, port), Handler)
+            from websockets.sync.server import serve
+        except ImportError as err:
+            raise UsageError("a viewer's server needs websockets: pip install 'emb-excite[live]'") from err
+        self._host = host
+        self._lock = threading.Lock()
+        self._viewers: set[Viewer] = set()
+        self._pages: set[Viewer] = set()
+        self._page = Page()
+        self._channels: dict[tuple[str, bytes], dict[str, Any]] = {}
+        self._made = 0
+        self._schemas: dict[int, mcap.Schema] = {}
+        self._of_log: dict[int, int] = {}
+        silent = logging.Logger("emb-live", logging.CRITICAL + 1)
+        try:
+            self._server = serve(
+                self._view,
+                host,
+                port,
+                origins=ORIGINS,  # type: ignore[arg-type]
+                process_request=self._page_or_refusal,
+                subprotocols=(*SUBPROTOCOLS, SUBPROTOCOL),  # type: ignore[arg-type]
+                compression=None,
+                logger=silent,
+            )
         except (OSError, OverflowError) as err:
             raise UsageError(f"the server cannot listen at {host}:{port}: {err}") from err
-        self.address = f"http://{host}:{self._server.server_address[1]}"
-        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,))
+        place = f"{host}:{self._server.socket.getsockname()[1]}"
+        self.address = f"ws://{place}"  # For a viewer
+        self.addresses = f"http://{place} in a browser, {self.address} in Foxglove"
+        self._thread = threading.Thread(target=self._server.serve_forever)
         self._thread.start()
 
     def begin(self) -> None:
-        """Begin another log."""
-        with self._lock:
-            self._send(self._page.begin())
-
-    def add(self, chunk: Chunk) -> None:
-        """Send the messages of a chunk."""
-        with self._lock:  # a browser that comes meanwhile gets them once
-            self._send(self._page.add(chunk))
+        """Another log begins: its numbers of channels and schemas are its own."""
+        self._schemas.clear()
+        self._of_log.clear()
+        self._to_pages(self._page.begin)
 
     def end(self, reason: str) -> None:
-        """The log is whole: send the run's exit reason."""
+        """The log is whole: the run's exit reason."""
+        self._to_pages(lambda: self._page.end(reason))
+
+    def _to_pages(self, made: Callable[[], str]) -> None:
+        with self._lock:  # a page that comes meanwhile gets it once
+            text = made()
+            for page in self._pages:
+                page.send(text)
+
+    def add(self, chunk: Chunk) -> None:
+        """Serve the messages of a chunk. Their time is the one at which they happened, not that of their writing."""
+        made = self._made
+        for record in chunk.described:
+            if isinstance(record, mcap.Schema):
+                self._schemas[record.id] = record
+            elif record.id not in self._of_log and record.schema_id in self._schemas:
+                self._of_log[record.id] = self._channel(record, self._schemas[record.schema_id])
+        if self._made != made:
+            time.sleep(SUBSCRIBING)
         with self._lock:
-            self._send(self._page.end(reason))
+            viewers = tuple(self._viewers)
+        self._to_pages(lambda: self._page.add(chunk))
+        for message in chunk.messages() if viewers else ():
+            if (channel := self._of_log.get(message.channel_id)) is not None:
+                for viewer in viewers:
+                    viewer.log(channel, message.publish_time, message.data)
 
     def close(self) -> None:
-        """End the server, once the browsers have the last messages, or take none."""
-        with self._lock:
-            self._send(None)
+        """End the server, once viewers had time for the last messages."""
+        time.sleep(LINGER)
         self._server.shutdown()
-        self._server.server_close()
         self._thread.join()
 
-    def _send(self, text: str | None) -> None:
-        for waiting in self._browsers:
-            waiting.put(text)
-
-    def answer(self, request: BaseHTTPRequestHandler, host: str) -> None:
-        """Answer a browser: the page, its events, or a refusal."""
-        named = request.headers.get_all("Host", [])
-        if len(named) != 1 or not _is_ours(named[0], host):
-            request.send_error(HTTPStatus.FORBIDDEN, "connect to this computer by its address or as localhost")
-        elif request.path == "/":
-            _begin(request, PAGE_HEADERS)
-            request.wfile.write(html().encode())
-        elif request.path == "/events":
-            self._send_events(request)
-        else:
-            request.send_error(HTTPStatus.NOT_FOUND, "the page is at /")
-
-    def _send_events(self, request: BaseHTTPRequestHandler) -> None:
-        waiting: Waiting = queue.SimpleQueue()
+    def _channel(self, channel: mcap.Channel, schema: mcap.Schema) -> int:
+        """Number of the channel of a topic; one of another schema ends."""
+        key = (channel.topic, schema.data)
         with self._lock:
-            for before in self._page.so_far:
-                waiting.put(before)
-            self._browsers.append(waiting)
+            if key not in self._channels:
+                ended = [self._channels.pop(old)["id"] for old in [*self._channels] if old[0] == channel.topic]
+                self._made += 1
+                self._channels[key] = {
+                    "id": self._made,
+                    "topic": channel.topic,
+                    "encoding": channel.message_encoding,
+                    "schemaName": schema.name,
+                    "schemaEncoding": schema.encoding,
+                    "schema": base64.b64encode(schema.data).decode(),
+                }
+                for viewer in self._viewers:
+                    if ended:
+                        viewer.say(op="unadvertise", channelIds=ended)
+                    viewer.say(op="advertise", channels=[self._channels[key]])
+            return int(self._channels[key]["id"])
+
+    def _view(self, connection: ServerConnection) -> None:
+        viewer = Viewer(connection)
+        of_its_kind = self._pages if connection.subprotocol == SUBPROTOCOL else self._viewers
+        with self._lock:
+            if of_its_kind is self._pages:
+                viewer.send(*self._page.so_far)
+            else:
+                viewer.say(op="serverInfo", name="emb-excite", capabilities=[], supportedEncodings=[], metadata={})
+                if self._channels:
+                    viewer.say(op="advertise", channels=[*self._channels.values()])
+            of_its_kind.add(viewer)
         try:
-            _begin(request, EVENT_HEADERS)
-            while (text := waiting.get()) is not None:
-                request.wfile.write(f"data: {text}\n\n".encode())
-        except OSError:
-            pass  # the browser has gone, or takes nothing
+            viewer.listen()
         finally:
             with self._lock:
-                self._browsers.remove(waiting)
+                of_its_kind.discard(viewer)
 
-
-def _begin(request: BaseHTTPRequestHandler, headers: dict[str, str]) -> None:
-    request.send_response(HTTPStatus.OK)
-    for name, value in headers.items():
-        request.send_header(name, value)
-    request.end_headers()
+    def _page_or_refusal(self, connection: ServerConnection, request: Request) -> Response | None:
+        """The page for a browser; a refusal of a name that is not this computer's. An address is nobody else's name."""
+        named = request.headers.get_all("Host")
+        if len(named) != 1 or not _is_ours(named[0], self._host):
+            return connection.respond(HTTPStatus.FORBIDDEN, "connect to this computer by its address or as localhost\n")
+        if "Upgrade" in request.headers:
+            return None
+        if request.path != "/":
+            return connection.respond(HTTPStatus.NOT_FOUND, "the page is at /\n")
+        response = connection.respond(HTTPStatus.OK, html())
+        response.headers.pop("Content-Type")  # a second value would be added to it
+        response.headers.update(PAGE_HEADERS)
+        return response
 
 
 def _is_ours(named: str, host: str) -> bool:

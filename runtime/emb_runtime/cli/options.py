@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from emb_runtime.drives.mapping import Mapping
 
 LONGEST_READING = 86_400.0  # Longest ``--read-only`` [s]
-LIVE_PORT = 8765
+LIVE_PORT = 8765  # Port that viewers propose
 QUICK_GOAL = "0.6%"
 """Standard deviation of each parameter, as a part of its value, at which an experiment with ``--quick`` ends: 95 % of
 the errors are then within 1.2 %."""
@@ -188,8 +188,8 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     what.add_argument(
         "--live", nargs="?", type=int, const=LIVE_PORT, metavar="PORT",
-        help="show the run while it goes on, from a process of its own, on a page for browsers at this port "
-        f"(default: {LIVE_PORT})",
+        help="show the run while it goes on, from a process of its own: to browsers, Foxglove and Lichtblick at "
+        f"this port (default: {LIVE_PORT}; needs the extra [live])",
     )  # fmt: skip
     what.add_argument(
         "--report", type=Path, metavar="FILE.html",

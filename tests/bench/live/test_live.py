@@ -14,23 +14,24 @@ import time
 import urllib.request
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap import records as mcap
 from mcap.reader import make_reader
 from websockets.sync.client import ClientConnection, connect
 
 from emb_bench.live.follow import NewLogs, chunks, follow
 from emb_bench.live.serve import Server
 from emb_bench.logs.log import read_log
-from emb_bench.logs.mcap_file import Chunk
+from emb_bench.logs.mcap_file import HEADER, Chunk
 from emb_runtime.cli import main as emb_run
-from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, LogError
+from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, LogError, UsageError
 from emb_runtime.estimator.estimate import LOST, UNITS
 from tests.bench.damaged import rewritten, without
 
@@ -49,6 +50,14 @@ def messages_of(path: Path) -> Counter[tuple[str, int, bytes]]:
     """Topic, publish time and payload of every message, by the plain reader."""
     with path.open("rb") as file:
         return Counter((c.topic, m.publish_time, m.data) for _, c, m in make_reader(file).iter_messages())
+
+
+def topics_of(path: Path) -> set[str]:
+    """Every topic that the log describes, whether it has messages or none."""
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return {channel.topic for channel in summary.channels.values()}
 
 
 def in_last_chunk(path: Path) -> int:
@@ -127,7 +136,7 @@ def test_a_log_that_is_damaged_or_ends_early_does_not_keep_the_next_one_back(shi
         path.write_bytes(content)
         os.utime(path, ns=(order, order))
     told, wrong = Told(), list[LogError]()
-    follow(logs, told, never, wrong.append)
+    follow(logs, cast("Server", told), never, wrong.append)
     assert [len(log) > 0 for log in told.logs] == [False, True, True]
     assert sum(len(chunk.at) for chunk in told.logs[2]) == messages_of(shipped).total()
     assert len(wrong) == 1
@@ -144,8 +153,8 @@ def test_a_log_whose_messages_lack_a_field_is_named(shipped: Path, tmp_path: Pat
     assert "other.mcap: its messages are not readable: " in said
 
 
-class Told(Server):
-    """Keeps what it is given, and serves nothing."""
+class Told:
+    """A viewer that keeps what it was given."""
 
     def __init__(self) -> None:
         self.logs: list[list[Chunk]] = []
@@ -161,43 +170,52 @@ class Told(Server):
         self.reasons.append(reason)
 
 
-def sent_to_a_browser(server: Server) -> Iterator[dict[str, Any]]:
-    """What a browser gets, until the server ends."""
-    with urllib.request.urlopen(f"{server.address}/events", timeout=SECONDS) as answered:
-        assert answered.headers["Content-Type"] == "text/event-stream"
-        for line in answered:
-            if line.strip():
-                yield json.loads(line.removeprefix(b"data: "))
+def subscribe_to_everything(viewer: ClientConnection, topics: set[str]) -> dict[int, str]:
+    """Topics by the number of the subscription, once all are advertised."""
+    found: dict[int, str] = {}
+    while not topics <= set(found.values()):
+        said = viewer.recv(SECONDS)
+        document = json.loads(said) if isinstance(said, str) else {}
+        if document.get("op") == "advertise":
+            new = {channel["id"]: channel["topic"] for channel in document["channels"]}
+            assert {(c["encoding"], c["schemaEncoding"]) for c in document["channels"]} == {("protobuf", "protobuf")}
+            viewer.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": i, "channelId": i} for i in new]}))
+            found |= new
+    return found
 
 
-def test_a_browser_gets_every_sample_and_estimate_though_it_comes_late_or_the_server_ends(shipped: Path) -> None:
-    log, server, wrong = read_log(shipped), Server(port=0), list[LogError]()
-    with ThreadPoolExecutor() as threads:
-        early = sent_to_a_browser(server)
-        assert next(early) == {"begin": True}
-        follow(NewLogs(shipped.parent, shipped.name, old=True), server, never, wrong.append, once=True)
-        late = sent_to_a_browser(server)
-        assert next(late) == {"begin": True}
-        rest = [threads.submit(list[dict[str, Any]], browser) for browser in (early, late)]
-        server.close()
-        for messages in (each.result() for each in rest):
-            cycles = [cycle for said in messages for cycle in said.get("cycles", ())]
-            assert [c["angle"] for c in cycles] == log.cycles["angle"][log.cycles["step"] >= 0].tolist()
-            assert sum(len(said.get("estimates", ())) for said in messages) == log.counts["/estimate"]
-            assert messages[-1] == {"result": "DONE"}
-    assert not wrong
+def subscribed(server: Server, channels: int) -> None:
+    """Wait until the one viewer has subscribed to so many channels."""
+    deadline = time.monotonic() + SECONDS
+    while [len(viewer._subscriptions) for viewer in server._viewers] != [channels]:
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
 
 
-def test_a_browser_that_takes_nothing_does_not_keep_the_server(shipped: Path) -> None:
+def test_a_viewer_gets_every_message_over_the_foxglove_protocol(shipped: Path) -> None:
     server = Server(port=0)
-    host, port = server.address.removeprefix("http://").split(":")
-    with socket.socket() as stalled:
-        stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
-        stalled.connect((host, int(port)))
-        stalled.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        assert stalled.recv(1)
-        for _ in range(40):
-            follow(NewLogs(shipped.parent, shipped.name, old=True), server, never, print, once=True)
+    try:
+        with connect(server.address, subprotocols=["foxglove.sdk.v1"], max_size=None) as viewer:  # type: ignore[list-item]
+            wanted = messages_of(shipped)
+            first, *rest = chunks(shipped, never)
+            server.begin()
+            server.add(first)  # the topics; who subscribes gets what follows
+            for chunk in rest:
+                server.add(chunk)
+            topics = subscribe_to_everything(viewer, topics_of(shipped))
+            subscribed(server, len(topics))
+            server.begin()
+            for chunk in chunks(shipped, never):  # the same topics once more: they keep their channels
+                server.add(chunk)
+            found: Counter[tuple[str, int, bytes]] = Counter()
+            while found.total() < wanted.total():
+                said = viewer.recv(SECONDS)
+                assert isinstance(said, bytes), said
+                opcode, number, time_ns = struct.unpack_from("<BIQ", said)
+                assert opcode == 1
+                found[topics[number], time_ns, said[13:]] += 1
+            assert found == wanted
+    finally:
         server.close()
 
 
@@ -232,7 +250,7 @@ class Browser:
 def browser_at(server: Server, profile: Path) -> Iterator[Browser]:
     """The page of a server in Chromium."""
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0", f"--user-data-dir={profile}"]
-    command = ["chromium", *flags, server.address]
+    command = ["chromium", *flags, server.address.replace("ws:", "http:")]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stderr is not None
@@ -272,37 +290,112 @@ def test_the_page_in_a_browser_shows_every_sample_and_estimate(shipped: Path, tm
         page.wait(whole)
 
 
-ASKED = {  # Host and path, and the status of the answer
-    "this computer's name": ("localhost:8765", "/", 200),
-    "this computer's other address": ("[::1]:8765", "/", 200),
-    "another name with our address": ("evil.example:8765", "/", 403),
-    "another name that ends like ours": ("evil.localhost", "/", 403),
-    "another name, the events": ("evil.example", "/events", 403),
-    "no name": ("", "/", 403),
-    "nothing of ours": ("127.0.0.1", "/favicon.ico", 404),
+PORT = "{port}"
+PROTOCOL: list[Any] = ["foxglove.sdk.v1"]
+FOREIGN = {
+    "a page from elsewhere": {"origin": "https://evil.example"},
+    "a page whose address begins like ours": {"origin": "http://localhost.evil.example"},
+    "a page behind our address as its user": {"origin": "http://localhost:80@evil.example"},
+    "a page that hides where it is from": {"origin": "null"},
+    "another name with our address": {"Host": "evil.example:{port}"},
+    "another name that ends like ours": {"Host": "evil.localhost:{port}"},
+    "another name, with the page of a viewer": {"Host": "evil.example", "origin": "https://app.foxglove.dev"},
+    "no name": {"Host": ""},
+}
+OURS = {
+    "no page": {},
+    "a page of this computer": {"origin": "http://localhost:8080"},
+    "a page of this computer by its address": {"origin": "http://127.0.0.1"},
+    "the viewer's page": {"origin": "https://app.foxglove.dev"},
+    "the viewer's program": {"origin": "file://"},
+    "this computer's name": {"Host": "localhost:{port}"},
+    "this computer's other address": {"Host": "[::1]:{port}"},
 }
 
 
-@pytest.mark.parametrize("row", ASKED)
-def test_the_page_is_served_by_our_name_only_and_loads_nothing_from_elsewhere(server: Server, row: str) -> None:
-    host, path, status = ASKED[row]
-    asked = http.client.HTTPConnection(server.address.removeprefix("http://"), timeout=SECONDS)
-    asked.request("GET", path, headers={"Host": host})
-    answered = asked.getresponse()
-    assert answered.status == status
-    assert (b"<script" in answered.read()) == (status == 200)
-    assert answered.headers["Access-Control-Allow-Origin"] is None  # pages from elsewhere may not read it
-    if status == 200:
-        assert answered.headers["Content-Type"] == "text/html; charset=utf-8"
-        assert answered.headers["Content-Security-Policy"].startswith("default-src 'none'")
-    asked.close()
-
-
-def test_two_names_are_refused(server: Server) -> None:
-    host, port = server.address.removeprefix("http://").split(":")
+def answer(server: Server, *headers: str) -> str:
+    """First line of the answer to a handshake with these headers."""
+    host, port = server.address.removeprefix("ws://").split(":")
     with socket.create_connection((host, int(port)), timeout=SECONDS) as raw:
-        raw.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: evil.example\r\n\r\n")
-        assert b" 403 " in raw.makefile("rb").readline()
+        upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        upgrade += f"Sec-WebSocket-Protocol: {PROTOCOL[0]}\r\n"
+        key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+        lines = "".join(f"{header.replace(PORT, port)}\r\n" for header in headers)
+        raw.sendall(f"GET / HTTP/1.1\r\n{upgrade}{key}{lines}\r\n".encode())
+        return raw.makefile(encoding="latin-1").readline().strip()
+
+
+def test_a_page_from_elsewhere_and_a_name_that_is_not_ours_are_refused(server: Server) -> None:
+    for refused, rows in ((True, FOREIGN), (False, OURS)):
+        for row, headers in rows.items():
+            sent = {"Host": "127.0.0.1:{port}", **headers}
+            status = answer(server, *(f"{name.title()}: {value}" for name, value in sent.items()))
+            assert ("403" in status) == refused, f"{row}: {status}"
+            assert ("101" in status) != refused, f"{row}: {status}"
+
+
+def test_the_page_is_served_by_our_name_only_and_loads_nothing_from_elsewhere(server: Server) -> None:
+    for host, path, status in (("localhost", "/", 200), ("evil.example", "/", 403), ("127.0.0.1", "/favicon.ico", 404)):
+        asked = http.client.HTTPConnection(server.address.removeprefix("ws://"), timeout=SECONDS)
+        asked.request("GET", path, headers={"Host": host})
+        answered = asked.getresponse()
+        assert answered.status == status
+        assert (b"<html" in answered.read()) == (status == 200)
+        if status == 200:
+            assert answered.headers["Content-Type"] == "text/html; charset=utf-8"
+            assert answered.headers["Content-Security-Policy"].startswith("default-src 'none'")
+        asked.close()
+
+
+def test_a_handshake_with_two_names_or_two_origins_is_refused(server: Server) -> None:
+    twice = (["Host: localhost", "Host: evil.example"], ["Host: localhost", "Origin: file://", "Origin: http://evil"])
+    for headers in twice:
+        assert "403" in answer(server, *headers) or "400" in answer(server, *headers)
+
+
+def test_a_client_that_does_not_speak_the_protocol_is_left_and_the_others_stay(server: Server, shipped: Path) -> None:
+    with connect(server.address, subprotocols=PROTOCOL) as viewer:
+        for nonsense in ("nonsense", "[]", '{"op": "subscribe"}', '{"op": "subscribe", "subscriptions": [3]}'):
+            with connect(server.address, subprotocols=PROTOCOL) as wrong:
+                wrong.send(nonsense)
+                assert all(isinstance(said, str) for said in wrong)  # until it is closed
+        viewer.send(b"what is binary is passed over")
+        topics = subscribe_to_everything_once_served(server, viewer, shipped)
+        viewer.send(json.dumps({"op": "unsubscribe", "subscriptionIds": [*topics]}))
+        subscribed(server, 0)
+        server.add(next(iter(chunks(shipped, never))))
+        with pytest.raises(TimeoutError):
+            viewer.recv(0.1)
+
+
+def subscribe_to_everything_once_served(server: Server, viewer: ClientConnection, log: Path) -> dict[int, str]:
+    server.begin()
+    server.add(next(iter(chunks(log, never))))
+    return subscribe_to_everything(viewer, topics_of(log))
+
+
+def test_a_topic_with_another_schema_gets_another_channel(server: Server) -> None:
+    with connect(server.address, subprotocols=PROTOCOL) as viewer:
+        assert json.loads(viewer.recv(SECONDS))["op"] == "serverInfo"
+        for schema in (b"one", b"two", b"two"):
+            server.begin()
+            described = (
+                mcap.Schema(id=3, data=schema, encoding="protobuf", name="emb.Angle"),
+                mcap.Channel(id=5, topic="/angle", message_encoding="protobuf", metadata={}, schema_id=3),
+            )
+            server.add(Chunk(b"", np.empty(0, np.int64), np.empty(0, HEADER), described))
+        said = [json.loads(viewer.recv(SECONDS)) for _ in range(3)]
+        assert [each["op"] for each in said] == ["advertise", "unadvertise", "advertise"]
+        assert said[1]["channelIds"] == [said[0]["channels"][0]["id"]]
+        assert said[2]["channels"][0]["schema"] == "dHdv"
+        with pytest.raises(TimeoutError):
+            viewer.recv(0.05)
+
+
+def test_without_the_library_the_server_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "websockets.sync.server", None)
+    with pytest.raises(UsageError, match=r"emb-excite\[live\]"):
+        Server(port=0)
 
 
 @pytest.fixture
