@@ -410,6 +410,7 @@ def report(
     output: str | Path,
     *,
     acceptance: str | Path | None = None,
+    junit: str | Path | None = None,
     **options: Any,
 ) -> Content:
     """One page about runs of one brake, to hand over, and a JSON file beside it.
@@ -423,6 +424,7 @@ def report(
         output: page to write, .html or .htm.
         acceptance: TOML file with an [acceptance] table: tolerances, drift, budgets; each is passed, failed, or not
             decided.
+        junit: XML file to write with the results of the acceptance criteria as test cases.
         options: of :func:`estimate`; ``profile`` is on.
 
     Returns:
@@ -440,6 +442,9 @@ def report(
     given = bound.arguments
     files = [*_listed(runs), given["last"], given["map"], acceptance]
     _check_page(page, beside, [entry.path if isinstance(entry, RunLog) else Path(entry) for entry in files if entry])
+    require_place("--junit", None if junit is None else Path(junit), (".xml",))
+    if junit is not None and acceptance is None:
+        raise UsageError("--junit: expected it with --acceptance")
     options_of = _study_options(given)
     try:
         import matplotlib  # noqa: F401
@@ -461,6 +466,9 @@ def report(
         content = gather(its, logs, left_out, options_of(its), made_by, last=before, criteria=criteria)
         new_numbers.write_text(as_json(document(content)) + "\n", encoding="utf-8")
         new_page.write_text(report_page(content), encoding="utf-8")
+        if junit is not None and content.acceptance is not None:
+            with replacing(Path(junit)) as new_cases:
+                new_cases.write_text(test.junit(content.acceptance), encoding="utf-8")
     return content
 
 

@@ -18,7 +18,8 @@ def live(place: Path = Path("runs"), *, host: str = HOST, port: int = PORT) -> N
 
     Show the logs that appear in a folder while they are written: on a page in the browser, and in Foxglove and
     Lichtblick over the Foxglove WebSocket protocol (open the address as a connection, with the layout of the
-    documentation). The command only reads files and does not affect a run. Ctrl-C ends it. emb-run --live shows one run.
+    documentation). The command only reads files and does not affect a run. Ctrl-C ends it. emb-run --live shows one
+    run.
 
     Args:
         place: folder whose new logs are shown, or one log; its parent folder must exist (default: runs/).

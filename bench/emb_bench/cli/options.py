@@ -24,6 +24,7 @@ METAVARS = {
     "bench": "FILE",
     "last": "FILE",
     "acceptance": "FILE",
+    "junit": "FILE",
     "plot": "FILE",
     "output": "FILE",
     "ray": "ADDRESS",

@@ -8,12 +8,14 @@ decided where the model does not fit.
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
+from xml.etree import ElementTree
 
 import msgspec
 
@@ -27,6 +29,7 @@ from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
 
 LONGEST = 2**20  # Size limit of the file [bytes]
+NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")  # Characters that XML cannot have
 SHARED = tuple(name for name in PARAMETERS if name not in OF_A_RECORD)  # Unknowns that a tolerance can be stated for
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
@@ -257,3 +260,20 @@ def _counted(name: str, most: float, found: float | None) -> Criterion:
         return Criterion(name, required, "not measured", Result.CANNOT_TELL, "the log does not say")
     result = Result.PASS if found <= most else Result.FAIL
     return Criterion(name, required, share(found, 3), result, "" if found <= most else "over the budget")
+
+
+def junit(found: Acceptance) -> str:
+    """The results as JUnit XML for a test management system: one test case for each criterion."""
+    results = [(one, one.result) for one in found.results]
+    failed, skipped = (sum(result is kind for _, result in results) for kind in (Result.FAIL, Result.CANNOT_TELL))
+    counts = {"tests": str(len(results)), "failures": str(failed), "skipped": str(skipped)}
+    suite = ElementTree.Element("testsuite", {"name": found.criteria.source, **counts})
+    for one, result in results:
+        case = ElementTree.SubElement(suite, "testcase", {"classname": found.criteria.source, "name": one.name})
+        said = f"required {one.required}; found {one.found}"
+        if result is not Result.PASS:
+            kind = "failure" if result is Result.FAIL else "skipped"
+            ElementTree.SubElement(case, kind, {"message": one.why}).text = said
+        else:
+            ElementTree.SubElement(case, "system-out").text = said
+    return NOT_XML.sub("\ufffd", ElementTree.tostring(suite, encoding="unicode", xml_declaration=True)) + "\n"

@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import msgspec
 import pytest
@@ -166,7 +167,8 @@ def test_the_command_says_the_result_first_and_has_an_exit_code_for_each(
 
     assert '"result": "pass"' in said("good.mcap", "parameters.f_v.relative = 0.5", 0, "--strict")
     assert 'class="banner good" role="alert">ACCEPTED: all 3 criteria passed' in page.read_text(encoding="utf-8")
-    assert '"result": "fail"' in said("good.mcap", "parameters.f_v.relative = 0.1", 1, "--strict")
+    junit = ("--junit", str(tmp_path / "cases.xml"))
+    assert '"result": "fail"' in said("good.mcap", "parameters.f_v.relative = 0.1", 1, "--strict", *junit)
     assert 'class="banner bad" role="alert">NOT ACCEPTED: 1 of 3' in page.read_text(encoding="utf-8")
     assert '"result": "cannot tell"' in said("good.mcap", "drift.k_m = 0.1", 7, "--strict")
     assert 'class="banner care" role="alert">CANNOT TELL: 1 of 3' in page.read_text(encoding="utf-8")
@@ -174,3 +176,6 @@ def test_the_command_says_the_result_first_and_has_an_exit_code_for_each(
     said("aborted.mcap", "model_fit = false", 1, "--strict")
     assert 'class="banner bad" role="alert">NOT ACCEPTED. STOPPED: ' in page.read_text(encoding="utf-8")
     assert str(page) in replay.refused("report", folder / "good.mcap", "-o", page, "--acceptance", page)
+    suite = ElementTree.parse(tmp_path / "cases.xml").getroot()  # our own
+    assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("3", "1", "0")
+    assert [case.get("name") for case in suite if case.find("failure") is not None] == ["f_v"]
