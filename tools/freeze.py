@@ -57,8 +57,11 @@ COMMANDS = {
 """Console scripts. One that is renamed is renamed here; the frozen data stay."""
 CYCLES, FRAMES = "/cycle", ["/can/rx", "/can/tx"]
 """Topics of a log."""
-RENAMED: dict[str, str] = {"stopped": "ended"}
-"""Keys of JSON documents: the new name, and the frozen one."""
+RENAMED: dict[str, dict[str, str]] = {
+    "rerun": {"stopped": "ended"},
+    "estimate": {"together": "suspects_together"},
+}
+"""Keys of JSON documents by section: the new name, and the frozen one."""
 GONE: dict[str, str] = {
     "logs/emps*": "a recording of others is read by fim, estimate and report: no log is made of it",
     "estimate/emps windows/says/records/emps.mcap": "a record has the name of its file, which is the recording's own",
@@ -74,6 +77,9 @@ GONE: dict[str, str] = {
     "estimate/*/growth*": "estimate --grow is no more: score tests name the missing effect, --model all compares",
     "rerun/*/says/frames": "a cycle record has the current and the counter of its command: the frame is made of them",
     "rerun/*/says/home": "a rerun ends where the run stops: nothing is decided on after that",
+    "campaign/*/rms_error_sigmas": "the rows have the error of each run",
+    "campaign/*/covered": "the rows have the error of each run",
+    "campaign/*/spread*": "the test of homogeneity has the scatter of the runs",
     "info/*/says/messages//log": "an internal error's place is in its event's detail",
 }
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, and why."""
@@ -444,7 +450,7 @@ def run_summary(said: dict[str, Any]) -> dict[str, Any]:
     """Part of a run's document that is compared."""
     document = said["says"]
     if isinstance(document, dict):
-        said["says"] = {key: document[key] for key in OF_A_RUN.split() if key in renamed(document)}
+        said["says"] = {key: document[key] for key in OF_A_RUN.split() if key in renamed(document, "runs")}
     return said
 
 
@@ -655,16 +661,19 @@ def say(text: str) -> None:
 # ---- documents ---------------------------------------------------------------------------------------------------
 
 
-def renamed(document: Mapping[str, Any]) -> dict[str, Any]:
+def renamed(document: Mapping[str, Any], section: str) -> dict[str, Any]:
     """A document with the frozen names."""
-    return {RENAMED.get(key, key): value for key, value in document.items()}
+    names = RENAMED.get(section, {})
+    return {names.get(key, key): value for key, value in document.items()}
 
 
 def kept(value: Any, section: str, digits: int = 0) -> Any:
     """A document without what is left out, with members by name in place of lists of them, and rounded."""
     digits = digits or DIGITS.get(section, PRECISE)
     if isinstance(value, Mapping):
-        pairs = ((k, v) for k, v in renamed(value).items() if k not in LEFT_OUT.split() and not _is_time_of_day(v))
+        pairs = (
+            (k, v) for k, v in renamed(value, section).items() if k not in LEFT_OUT.split() and not _is_time_of_day(v)
+        )
         return {k: kept(v, section, PRECISE if _is_estimate(k) else digits) for k, v in pairs}
     if isinstance(value, list):
         for key in NAMES if value and all(isinstance(v, Mapping) for v in value) else ():

@@ -14,7 +14,8 @@ import numpy as np
 def to_json(value: Any) -> Any:
     """A record, or a structure of records, as the types of JSON; numbers may be infinite or NaN.
 
-    A dataclass and a named tuple become objects, an array a list, an enumeration its value, a path its text.
+    A dataclass and a named tuple become objects, an array a list, a set a sorted one, an enumeration its value, a path
+    its text.
     """
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: to_json(getattr(value, field.name)) for field in fields(value)}
@@ -28,4 +29,6 @@ def to_json(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, Path):
         return str(value)
+    if isinstance(value, frozenset):
+        return sorted(value)
     return [to_json(entry) for entry in value] if isinstance(value, list | tuple) else value

@@ -13,13 +13,13 @@ from emb_bench.analysis.several_runs import Constancy, constancy
 from emb_bench.batch.row import NONE, Options, Row, unit_of
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.documents import to_json
-from emb_bench.estimate.records import DONE, NORMAL_95
+from emb_bench.estimate.records import DONE
 from emb_bench.numbers import NOTHING, p_value, plain, spread
 from emb_bench.report.sentences import INTERVALS
 from emb_bench.report.text import Table, listed, wrapped
 
 SHOWN = 3  # Most logs of a kind that are named without ``-v``
-OF_AN_ESTIMATE = ("estimate", "low", "high", "between_runs", "repeatability", "error_sigmas")
+OF_AN_ESTIMATE = ("estimate", "low", "high", "between_runs", "repeatability")
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,9 @@ class ParameterEstimates:
 
     runs: int
     median: float
-    spread: float  # Half the distance between the quantiles that one standard deviation of a Gaussian reaches
     total: float  # Median of half the 95 % intervals, of noise, systematic errors and what the records cannot exclude
     repeatability: float  # The same, of the sensors' noise alone
     constancy: Constancy
-    rms_error_sigmas: float | None  # Root mean square error in standard deviations; None if no run was simulated
-    covered: float | None  # Share of the simulated runs whose 95 % interval holds the true value
 
 
 @dataclass(frozen=True)
@@ -61,7 +58,6 @@ class Campaign:
     misfit: tuple[Row, ...]  # Logs that the model does not fit
     outside: tuple[Row, ...]  # Logs of brakes for which the limits were not guaranteed
     violating: int
-    start_time: tuple[int, int] | None  # Of the first and of the last run [ns]; None if none has a date
     method: str
     models: tuple[str, ...]
     parameters: dict[str, ParameterSummary]
@@ -71,7 +67,6 @@ def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
     """Summary of a campaign; numbers may be infinite."""
     good = [row for row in rows if row["error"] is None]
     counted = [row for row in good if row.get("copy_of") is None]
-    starts = [row["start_time"] for row in good if row.get("start_time") is not None]
     return Campaign(
         result=result,
         logs=len(rows),
@@ -83,7 +78,6 @@ def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
         misfit=tuple(row for row in good if not row.get("fits", row.get("nominal_fits"))),
         outside=tuple(row for row in counted if row.get("outside")),
         violating=sum(bool(row.get("violations")) for row in good),
-        start_time=(min(starts), max(starts)) if starts else None,
         method=options.method,
         models=tuple(sorted({row["model"] for row in good if row.get("model") is not None})),
         parameters={name: _parameter(counted, name) for name in options.names},
@@ -135,19 +129,15 @@ def _estimates(used: Sequence[Row], name: str) -> ParameterEstimates | None:
     if not used:
         return None
     found = {key: np.array([row.get(f"{name}_{key}") for row in used], np.float64) for key in OF_AN_ESTIMATE}
-    values, errors = found["estimate"], found["error_sigmas"][np.isfinite(found["error_sigmas"])]
-    low, high = np.quantile(values, [0.158655, 0.841345])
+    values = found["estimate"]
     # Shares are of one number, so that what came out small weighs no more.
     scale = abs(float(np.median(values))) if PARAMETERS[name].relative else 1.0
     return ParameterEstimates(
         runs=len(used),
         median=float(np.median(values)),
-        spread=0.5 * float(high - low),
         total=float(np.median(0.5 * (found["high"] - found["low"]))),
         repeatability=float(np.median(found["repeatability"])),
         constancy=constancy(values.tolist(), (scale * found["between_runs"]).tolist()),
-        rms_error_sigmas=float(np.sqrt(np.mean(errors**2))) if len(errors) else None,
-        covered=float(np.mean(np.abs(errors) <= NORMAL_95)) if len(errors) else None,
     )
 
 

@@ -143,12 +143,6 @@ class Content:
         return self.estimated or self.runs
 
     @property
-    def only_alone(self) -> bool:
-        """Returns True if the model fits every run of the estimate by itself, and not all of them together."""
-        studies = [run.alone for run in self.estimated if run.alone is not None]
-        return bool(studies) and self.study is not None and not self.study.holds and all(s.holds for s in studies)
-
-    @property
     def tone(self) -> str:
         """Colour of the verdict: ``good``, ``bad`` or ``care``."""
         if self.stops or self.outside:

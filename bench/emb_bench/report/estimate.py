@@ -140,17 +140,10 @@ def document(study: Study) -> dict[str, Any]:
         "systematic": _systematic(e),
         "prior": e.asked.prior.name if e.asked.prior else None,
         "misfit": {
-            **_fields(validation, "chi2", "freedom", "expected", "whiteness", "independence"),
+            **to_json(validation),
+            "chi2_per_freedom": validation.ratio,
             "alarms": say.alarms(e),
             "notes": say.residual_notes(e),
-            "chi2_per_freedom": validation.ratio,
-            "p_value": validation.chi2_p,
-            "suspects": [_fields(s, "name", "value", "sigmas", "p_value") for s in validation.suspects],
-            "suspected": [
-                _fields(s, "name", "value", "sigmas", "p_value") | {"words": say.explained(s, e.bench.machine)}
-                for s in validation.suspected
-            ],
-            "suspects_together": validation.together and _fields(validation.together, "statistic", "p_value"),
         },
         "parameters": _parameters(study),
         "models": [

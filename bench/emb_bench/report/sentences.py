@@ -53,10 +53,9 @@ def headline(study: Study) -> str:
             "Noise biases its values; the model is not tested. Use --method oem."
         )
     if not study.model_fits:
-        return (
-            f"THE MODEL '{name}' DOES NOT FIT (chi2/n {e.validation.ratio:.3g}, at most "
-            f"{e.validation.expected[1]:.3f} expected): the intervals do not include its error."
-        )
+        size = f" (chi2/n {e.validation.ratio:.3g}, at most {e.validation.expected[1]:.3f} expected)"
+        size = size if "size" in e.validation.alarming else ""
+        return f"THE MODEL '{name}' DOES NOT FIT{size}: the intervals do not include its error."
     if not study.predicts:
         return f"THE MODEL '{name}' DOES NOT PREDICT other records: the values hold only for their own records."
     if study.identified:
@@ -81,7 +80,7 @@ def verdict(content: Content) -> str:
         if result == "cannot tell":
             return f"CANNOT TELL: {found} of {count} criteria not decided: {names}"
         return f"ACCEPTED: {'the one criterion' if count == 1 else f'all {count} criteria'} passed"
-    if content.only_alone:
+    if content.study is not None and content.study.apart:
         return ONLY_ALONE
     return f"NO ESTIMATE: {content.why_not}" if content.study is None else headline(content.study)
 
