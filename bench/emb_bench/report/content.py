@@ -113,20 +113,12 @@ class Run:
         return datetime.fromtimestamp(first // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """A file that could not be used at all."""
-
-    path: Path
-    words: str
-
-
 @dataclass(frozen=True, eq=False)
 class Content:
     """Content of a report."""
 
     runs: tuple[Run, ...]
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[tuple[Path, str], ...]  # Files that could not be used at all, and why
     study: Study | None
     why_not: str  # Reason that there is no estimate; empty if there is one
     made_by: str  # Name and version of the tool that made the report
@@ -159,7 +151,7 @@ class Content:
     def without_part(self) -> list[str]:
         """Reason for each log that was given and not used, beginning with its name."""
         return [
-            *(f"{entry.path.name}: left out: {entry.words}" for entry in self.left_out),
+            *(f"{path.name}: left out: {why}" for path, why in self.left_out),
             *(f"{run.name}: not used in the estimate: {run.why_not}" for run in self.runs if run.why_not),
         ]
 
@@ -207,7 +199,7 @@ def gather(
         run = _run(log, bench, experiment, why_not, study, number)
         runs.append(run if why_not or len(used) == 1 else replace(run, alone=make_study(bench, [log], single)))
     why_not = "" if used else "; ".join(f"{run.name}: {run.why_not}" if len(runs) > 1 else run.why_not for run in runs)
-    content = Content(tuple(runs), tuple(LeftOut(*entry) for entry in left_out), study, why_not, made_by)
+    content = Content(tuple(runs), tuple(left_out), study, why_not, made_by)
     if criteria is None:
         return content
     facts = [_facts(run) for run in runs]

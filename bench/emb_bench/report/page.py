@@ -220,7 +220,7 @@ def document(content: Content) -> dict[str, Any]:
             "model_fits": None if study is None else study.model_fits,
             "predicts": None if study is None else study.predicts,
             "why_no_estimate": content.why_not,
-            "left_out": [{"log": entry.path, "why": entry.words} for entry in content.left_out],
+            "left_out": [{"log": path, "why": why} for path, why in content.left_out],
             "estimate": None if study is None else estimate_document(study),
             "runs": [_run_document(run, study) for run in content.runs],
         }
