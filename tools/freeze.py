@@ -108,6 +108,8 @@ EXPLAINED: dict[str, str] = {
     "fim/emps/says/*": METRES,
     "report/emps/says/runs/*": METRES,
     "estimate/emps windows/says/information/*": METRES,
+    "estimate/emps windows/says/misfit/suspects/break_away/*": "acts at rest only: a secant, of the sign that none has",
+    "estimate/emps windows/says/misfit/suspects_together/statistic": "that secant is among them",
     "logs/mapped/*": STAMPED,
     "info/mapped/says/messages//*": STAMPED,
     "info/mapped/says/duration": "the arming of a lock-step drive takes one sample more",
