@@ -278,7 +278,9 @@ noise = 1.44e-8
 column = "vir"
 unit = "N"
 scale = 35.1506519
+between = "linear"
 [machine]
+window = 0.08
 nuisances = ["current_offset"]
 [machine.guess]
 mass = 80.0

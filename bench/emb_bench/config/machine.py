@@ -27,6 +27,7 @@ COMMANDS: Mapping[str, str] = {"A": "current", "V": "voltage", "1": "command", "
 torque or force has no ``k_m``: it is 1."""
 LOADS = ("Nm", "N")  # Units of a command that has no ``k_m``
 Window = Annotated[float, Meta(ge=1e-3, le=3600)]
+WINDOW = 0.5  # Length of the windows where nothing else says it [s]
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,7 @@ class Machine:
 
     unknown: tuple[Parameter, ...]  # Parameters that are estimated where a command names none
     nuisances: tuple[str, ...] = ()  # Other unknowns, likewise
-    window: Window = 0.0  # Length of the windows in which a recording is simulated [s]; 0: the recording chooses
-    between: Literal["held", "open"] = "held"
-    """Command between samples: ``held`` (zero-order hold) or ``open`` (hold or linear, which the recording chooses)."""
+    window: Window = WINDOW  # Length of the windows in which a recording is simulated [s]
     angle: Angle = "rad"  # Unit of the angle; m of a position, where the machine is linear
     command: Command = "A"  # Unit of the command
 

@@ -29,7 +29,6 @@ METHODS: Mapping[str, str] = {
     "windows": "output error over windows",
 }
 """Estimation methods by their names."""
-WINDOW = 0.5  # Length of a window of the method ``windows`` where nothing else says it [s]
 STARTS = 8  # Default number of local searches
 DONE = "DONE"  # Exit reason of a run that came to its planned end
 NORMAL_95 = estimate.NORMAL_95  # Standard deviations that 95 % of a Gaussian lie within
@@ -56,10 +55,7 @@ class EstimationProblem(Question):
     allowed: Mapping[str, float] = field(default_factory=dict)
     """Effects that are not estimated and that the total allows for: standard deviation of the prior, by name."""
     window: float = 0.0
-    """Length of the windows of the method ``windows`` [s]; 0 for what the bench says, or the records choose."""
-    between: str = ""
-    """Course of a command between its stamps in that method, ``held`` or ``linear``; empty for what the bench says, or
-    the records choose."""
+    """Length of the windows of the method ``windows`` [s]; 0 for what the bench says."""
 
     @property
     def along(self) -> tuple[str, ...]:

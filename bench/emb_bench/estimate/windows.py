@@ -13,12 +13,7 @@ neighbours counted together (Newey and West 1987). What is wrong in all windows 
 But a wrong model weighs its errors otherwise in longer windows, and the right one does not (Hausman, Econometrica 46,
 1978): the estimate is made again from windows of another length, and what it moves by counts as a deviation.
 
-**Choices.** Where neither the bench nor the caller says the length of the windows, the records choose it: of lengths
-each twice the one before, the one whose covariance, with what another length moves the estimate by, is the smallest.
 Short windows leave little time for what disturbs the machine, long ones tell it better from the noise of the sensor.
-Where it is not known how a command goes from its stamp to the next, held or straight, the likelihood chooses; if the
-windows do not agree on it (Vuong, Econometrica 57, 1989), what the other course moves the estimate by counts too. What
-is chosen is said with the estimate.
 """
 
 from __future__ import annotations
@@ -33,12 +28,13 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import OF_A_RECORD
+from emb_bench.config.machine import WINDOW
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import examine
 from emb_bench.estimate.output_error import start_points
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import NORMAL_95, WINDOW, End, ModelValidation
+from emb_bench.estimate.records import End, ModelValidation
 from emb_bench.estimate.search import EVALUATIONS, minimise
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Spectrum
@@ -53,16 +49,12 @@ STILL = 1e-9  # Share of a window's squares below which a step of its start ends
 SETTLED = 4  # Steps in which the starts of windows settle for given parameters
 FOLLOWS = 0.97  # Largest correlation of neighbouring windows' scores that is reckoned with
 START = ("x1_0", "x2_0")
-HELD, LINEAR = "held", "linear"  # Courses of a command from its stamp to the next one
 _LOST = 1e-9  # share of a start's largest singular value below which the samples do not tell it
 FEWEST = 3  # Fewest windows for each unknown that they share: with fewer their scatter says little
 JUDGED = 5000  # Samples, in whole windows, that the model is validated on: an hour has millions, and these see as much
 OTHER = 4.0  # Ratio of the lengths of the windows in two estimates whose difference is counted
 REFINED = 2  # Searches that are carried to their ends: those whose first steps led lowest
 SHORT = 6  # Simulations of a search that is only begun
-BRIEF = 20  # Samples of the shortest windows to choose from
-ENOUGH = 20
-"""Fewest windows for each unknown of the longest windows to choose from: the scatter of fewer is too uncertain."""
 
 
 class Windows(Method):
@@ -75,15 +67,10 @@ class Windows(Method):
         if any(unknown.record is not None for unknown in problem.unknowns):
             raise UsageError(f"method windows: each window has a start of its own: leave out {', '.join(OF_A_RECORD)}")
         points = start_points(problem, self.starts, self.seed)
-        if window_of(problem) and course_of(problem):
-            cut, said, moved = Cut(problem, points[0]), tuple[str, ...](), tuple[Floats, ...]()
-            searches = cut.searches(points)
-        else:
-            problem, near, moved, said = _chosen(problem, points)
-            cut = Cut(problem, near)
-            searches = [cut.search(near)]
-        at, ends = searches[0][0], tuple(end for _, end in searches)
-        return _finished(cut, at, ends, [_other(problem, at.shared) - at.shared, *moved], said)
+        cut = Cut(problem, points[0])
+        searches = cut.searches(points)
+        at = searches[0][0]
+        return _finished(cut, at, tuple(end for _, end in searches), _other(problem, at.shared) - at.shared)
 
 
 class Point(NamedTuple):
@@ -233,102 +220,13 @@ class Cut:
         return [False, *(a[0] == b[0] and a[2] == b[1] for a, b in pairwise(self.spans))]
 
 
-class _Candidate(NamedTuple):
-    """An estimate with windows of one length and one course of the command, by one step of Gauss and Newton."""
-
-    problem: Problem
-    shared: Floats  # Shape (p,)
-    covariance: Floats  # From the scatter of the windows, shape (p, p)
-    costs: Floats  # Of each window, shape (m,)
-    follows: list[bool]
-
-
-def _chosen(problem: Problem, points: Sequence[Floats]) -> tuple[Problem, Floats, tuple[Floats, ...], tuple[str, ...]]:
-    """Length of the windows and course of the command that the records choose.
-
-    Returns:
-        The problem with both, the shared unknowns where its search begins, what a course that the records do not tell
-        from the chosen one moves them by, and the choices in words.
-    """
-    lengths = [window_of(problem)] if window_of(problem) else _lengths(problem)
-    courses = (course_of(problem),) if course_of(problem) else (HELD, LINEAR)
-    first = _with(problem, lengths[len(lengths) // 2], courses[0])
-    shared = Cut(first, points[0]).searches(points)[0][0].shared
-    found = [_candidate(_with(problem, length, courses[0]), shared) for length in lengths]
-    best = min(range(len(found)), key=lambda i: _uncertainty(found, i))
-    said = []
-    if len(lengths) > 1:
-        every = ", ".join(f"{length:g}" for length in lengths)
-        said.append(
-            f"windows of {lengths[best]:g} s were chosen (tried: {every} s): they leave the parameters least uncertain "
-            f"by the scatter of the windows and by what {OTHER:g} times the length changes"
-        )
-    one, others = found[best], tuple[Floats, ...]()
-    if len(courses) > 1:
-        other = _candidate(_with(problem, lengths[best], LINEAR), shared)
-        apart = _apart(one, other)
-        one, other = (other, one) if apart > 0.0 else (one, other)
-        names = {HELD: "is held from its stamp to the next", LINEAR: "goes straight from its stamp to the next"}
-        chosen = f"the command {names[course_of(one.problem)]}, by the likelihood ({abs(apart):.1f} sigma)"
-        said.append(chosen if abs(apart) > NORMAL_95 else f"{chosen}: the intervals cover the other course too")
-        others = () if abs(apart) > NORMAL_95 else (other.shared - one.shared,)
-    return one.problem, one.shared, others, tuple(said)
-
-
-def _lengths(problem: Problem) -> list[float]:
-    """Lengths of windows to choose from, each twice the one before [s]."""
-    length, found = BRIEF * problem.bench.timing.sample_time, list[float]()
-    while not found or ENOUGH * len(problem.unknowns) * length <= _seconds(problem):
-        found.append(length)
-        length *= 2.0
-    return found
-
-
-def _with(problem: Problem, window: float, between: str) -> Problem:
-    return replace(problem, asked=replace(problem.asked, window=window, between=between))
-
-
-def _candidate(problem: Problem, shared: Floats) -> _Candidate:
-    """Estimate that windows lead to from shared unknowns that are near."""
-    cut = Cut(problem, shared)
-    _, windows = cut.settled(cut.begun)
-    information, scores = _sums(windows)
-    spectrum = Spectrum(information)
-    step = np.where(spectrum.lost, 0.0, np.linalg.pinv(information, hermitian=True) @ scores.sum(axis=0))
-    parts = [(errors - columns @ step, columns) for errors, columns in (window.projected() for window in windows)]
-    costs = np.array([float(errors @ errors) for errors, _ in parts])
-    left = np.array([columns.T @ errors for errors, columns in parts])
-    return _Candidate(problem, shared + step, by_windows(information, left, cut.follows), costs, cut.follows)
-
-
-def _uncertainty(found: Sequence[_Candidate], i: int) -> float:
-    """Logarithm of the determinant of a candidate's covariance, with what another length moves it by."""
-    steps = round(math.log2(OTHER))
-    other = found[i + steps if i + steps < len(found) else max(i - steps, 0)]
-    moved = other.shared - found[i].shared
-    sign, value = np.linalg.slogdet(found[i].covariance + np.outer(moved, moved))
-    return float(value) if sign > 0.0 and math.isfinite(value) else math.inf
-
-
-def _apart(one: _Candidate, other: _Candidate) -> float:
-    """Difference of two courses' costs in standard deviations of the sum over windows; positive if the other is lower.
-
-    The windows have the same samples, and each course has one estimate: neither has more freedom to fit.
-    """
-    lower = (one.costs - other.costs)[:, None]
-    spread = float(scatter(lower - lower.mean(), one.follows)[0, 0])
-    return float(lower.sum()) / math.sqrt(spread) if spread > 0.0 else 0.0
-
-
 def _other(problem: Problem, shared: Floats) -> Floats:
     """The shared unknowns from windows of another length: longer ones, or shorter where those would be too few."""
-    longer, shorter = (_with(problem, window_of(problem) * f, course_of(problem)) for f in (OTHER, 1.0 / OTHER))
-    enough = FEWEST * len(shared) * window_of(longer) <= _seconds(problem)
-    return Cut(longer if enough else shorter, shared).search(shared)[0].shared
-
-
-def _seconds(problem: Problem) -> float:
-    return sum(len(record.currents) for record in problem.records) * problem.bench.timing.sample_time
+    seconds = sum(record.periods for record in problem.records) * problem.bench.timing.sample_time
+    length = window_of(problem) * OTHER
+    if FEWEST * len(shared) * length > seconds:
+        length = window_of(problem) / OTHER
+    return Cut(replace(problem, asked=replace(problem.asked, window=length)), shared).search(shared)[0].shared
 
 
 def predict_windows(problem: Problem, values: Floats) -> tuple[float, float, int]:
@@ -356,8 +254,8 @@ def _sums(windows: Sequence[Window]) -> tuple[Floats, Floats]:
     return information, np.array([columns.T @ errors for errors, columns in parts])
 
 
-def _finished(cut: Cut, at: Point, ends: tuple[End, ...], moved: Sequence[Floats], said: tuple[str, ...]) -> Estimate:
-    """Estimate of what the windows share, with its information, covariance and validation."""
+def _finished(cut: Cut, at: Point, ends: tuple[End, ...], moved: Floats) -> Estimate:
+    """Estimate of what the windows share, which another length of them moves, with its validation."""
     problem = cut.problem
     information, scores = _sums(cut.linearised(at))
     covariance = by_windows(information, scores, cut.follows)
@@ -369,15 +267,12 @@ def _finished(cut: Cut, at: Point, ends: tuple[End, ...], moved: Sequence[Floats
         at.shared,
         information=information,
         prior=None,
-        sandwich=covariance + sum((np.outer(c, c) for c in moved), np.zeros_like(covariance)),
+        sandwich=covariance + np.outer(moved, moved),
         validation=_validated(cut, at),
         ends=ends,
         residuals=residuals,
         method="windows",
-        caveats=(
-            *said,
-            f"each of the {len(cut.windows)} windows of {window_of(problem):g} s has a start of its own",
-        ),
+        caveats=(f"each of the {len(cut.windows)} windows of {window_of(problem):g} s has a start of its own",),
     )
 
 
@@ -392,15 +287,9 @@ def _validated(cut: Cut, at: Point) -> ModelValidation:
 
 
 def window_of(problem: Problem) -> float:
-    """Length of the windows [s]; 0 where the records are to choose it."""
+    """Length of the windows [s]."""
     machine = problem.bench.machine
-    return problem.asked.window or (machine.window if machine is not None else WINDOW)
-
-
-def course_of(problem: Problem) -> str:
-    """Course of a command between its stamps, ``held`` or ``linear``; empty where the records are to choose it."""
-    machine = problem.bench.machine
-    return problem.asked.between or (HELD if machine is None or machine.between == HELD else "")
+    return problem.asked.window or (WINDOW if machine is None else machine.window)
 
 
 Span = tuple[int, int, int]
@@ -420,22 +309,19 @@ def _spans(problem: Problem, number: int, length: int) -> Iterator[Span]:
 def _window(problem: Problem, span: Span) -> Experiment:
     """One window; one that begins with lost samples starts from the last that was received.
 
-    A command that goes straight from stamp to stamp is the mean of both. An observer's velocity lags: instead of it a
-    window starts with the slope of a parabola through the angles around its start. One that starts too slow may stick
-    where the machine did not, and then nothing says which way to go.
+    An observer's velocity lags: instead of it a window starts with the slope of a parabola through the angles around
+    its start. One that starts too slow may stick where the machine did not, and then nothing says which way to go.
     """
     number, begin, end = span
     record = problem.records[number]
-    currents = record.currents
-    if course_of(problem) == LINEAR:
-        currents = 0.5 * (currents + np.append(currents[1:], currents[-1:]))
     received = np.flatnonzero(record.measured[:begin])
     angle, velocity = record.samples[received[-1]].tolist() if len(received) else (record.angle, record.velocity)
     if problem.plant.instruments.observer_bandwidth > 0.0:
         angles = np.concatenate([[record.angle], record.samples[:, 0]])
         velocity = _slope(angles, begin, problem.bench.timing.sample_time)
-    part = replace(record, currents=currents).part(begin, end)
-    return replace(part, angle=angle, velocity=velocity, slack=0.0, from_origin=False, assumed=None, places=None)
+    return replace(
+        record.part(begin, end), angle=angle, velocity=velocity, slack=0.0, from_origin=False, assumed=None, places=None
+    )
 
 
 def _slope(angles: Floats, at: int, t_s: float) -> float:

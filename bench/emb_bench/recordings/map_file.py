@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from emb_bench.brake.parameters import LINEAR, UNITS
-from emb_bench.config.machine import COMMANDS, LOADS, PARAMETERS
+from emb_bench.config.machine import COMMANDS, LOADS, PARAMETERS, WINDOW, Window
 from emb_runtime.config import typed
 from emb_runtime.config.typed import MAX_TOML_BYTES, FieldError, parse_toml
 from emb_runtime.errors import UsageError
@@ -39,8 +39,7 @@ class Signal(msgspec.Struct, frozen=True, kw_only=True):
     offset: float = 0.0  # Reading of the column at zero, before the factor
     noise: Positive = 0.0  # Standard deviation in ``unit``; 0 if it is not given
     delay: Annotated[float, Meta(ge=-1.0, le=1.0)] = 0.0  # Time by which it acts, or was measured, after its stamp [s]
-    between: Literal["open", "held", "linear"] = "open"
-    """Course of a command from its stamp to the next one; ``open``: the recording chooses."""
+    between: Literal["held", "linear"] = "held"  # Course of a command from its stamp to the next one
 
 
 class Signals(msgspec.Struct, frozen=True, kw_only=True):
@@ -128,7 +127,7 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True):
 
     guess: Parameters
     known: Parameters = Parameters()
-    window: Annotated[float, Meta(ge=1e-3, le=3600.0)] = 0.0  # [s]; 0: the recording chooses
+    window: Window = WINDOW  # [s]
     nuisances: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -186,12 +185,6 @@ class RecordingMap(msgspec.Struct, frozen=True, kw_only=True):
     def command_unit(self) -> str:
         """Unit of what was commanded, or of the current where only that was measured."""
         return "A" if self.signals.command is None else self.signals.command.unit
-
-    @property
-    def between(self) -> str:
-        """``open`` where the recording is to choose the course of a command between its stamps, else ``held``."""
-        command = self.signals.command
-        return "open" if self.signals.current is None and command is not None and command.between == "open" else "held"
 
     @property
     def time_unit(self) -> float:

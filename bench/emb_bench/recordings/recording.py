@@ -58,8 +58,7 @@ def bench_of(found: Found, wanted: RecordingMap) -> str:
         "machine": {
             "unknown": [*machine.unknown],
             "nuisances": [*machine.nuisances],
-            "between": wanted.between,
-            **({"window": machine.window} if machine.window else {}),
+            "window": machine.window,
             "angle": wanted.signals.angle.unit,
             "command": wanted.command_unit,
         },

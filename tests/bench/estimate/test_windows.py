@@ -125,41 +125,18 @@ def test_windows_that_disagree_widen_the_covariance_and_neighbours_count_togethe
     assert np.diag(together).sum() > 1.4 * np.diag(apart).sum()
 
 
-OPEN = MAP.replace("window = 0.5\n", "")
+def test_a_length_that_is_asked_for_goes_before_the_map_s() -> None:
+    data = record(Machine(), 2.0)
+    for e in (fitted(data, replace(ASKED, window=0.15)), fitted(data, text=MAP.replace("= 0.5", "= 0.15"))):
+        assert e.caveats[0].startswith("each of the 13 windows of 0.15 s")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("straight", [False, True])
-def test_a_record_chooses_the_course_of_the_command_that_was_simulated(straight: bool) -> None:
-    e = fitted(record(Machine(), 4.0, straight=straight), text=OPEN)
-    assert e.asked.between == ("linear" if straight else "held")
-    said = " ".join(e.caveats)
-    assert "were chosen (tried: " in said
-    assert "the intervals cover the other course too" not in said
-    found = of_machine(e)
+def test_a_command_takes_the_course_that_the_map_states(straight: bool) -> None:
+    text = MAP.replace('unit = "N"', f'unit = "N"\nbetween = "{"linear" if straight else "held"}"')
+    found = of_machine(fitted(record(Machine(), 6.0, straight=straight), text=text))
     for name, true in (("J", 95.0), ("f_v", 200.0), ("T_c", 20.0), ("current_offset", -3.0)):
         assert found[name][0] == pytest.approx(true, rel=0.01)
-
-
-@pytest.mark.slow
-def test_a_course_that_the_record_does_not_tell_is_covered_by_the_intervals() -> None:
-    data = record(Machine(disturbance=1.0), 4.0)
-    e = fitted(data, text=OPEN)
-    assert any("the intervals cover the other course too" in said for said in e.caveats)
-    other = {"held": "linear", "linear": "held"}[e.asked.between]
-    moved = fitted(data, replace(ASKED, window=e.asked.window, between=other), OPEN).values - e.values
-    low, high = e.intervals().T
-    assert (np.abs(moved) <= 0.5 * (high - low)).all()
-
-
-def test_a_length_and_a_course_that_are_said_are_taken() -> None:
-    data = record(Machine(), 2.0)
-    e = fitted(data, replace(ASKED, window=0.15), OPEN)
-    assert e.asked.window == 0.15
-    assert not any("were chosen (tried: " in said for said in e.caveats)
-    assert any("the command is held" in said for said in e.caveats)
-    text = MAP.replace("window = 0.5", "window = 0.15").replace('unit = "N"', 'unit = "N"\nbetween = "linear"')
-    assert not any(said.startswith("the command ") for said in fitted(data, text=text).caveats)
 
 
 def test_too_few_windows_and_starts_that_are_asked_for_are_refused() -> None:

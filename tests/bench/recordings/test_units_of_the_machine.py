@@ -13,8 +13,8 @@ from emb_bench.brake.parameters import quantity
 from emb_bench.cli.replay import main
 from emb_bench.config.machine import Machine as Kind
 
-LINEAR = Kind(("J",), (), 0.5, "held", "m", "N")
-TURNING = Kind(("J",), (), 0.5, "held", "rad", "V")
+LINEAR = Kind(("J",), (), 0.5, "m", "N")
+TURNING = Kind(("J",), (), 0.5, "rad", "V")
 
 
 @pytest.fixture(scope="module")
