@@ -87,6 +87,7 @@ JOINED = "one note says that the residuals of both signals are correlated in tim
 STAMPED = "what a lock-step gateway sends has its time, and its frames count"
 OTHER_SEARCH = "the search of designs has no growth of tables: other local optima; E of four became better by a third"
 GRID = "the grid of a profile has its steps in the logarithm: other points of the same curve"
+MAPPED = "a map states the course of a command: what another one moves is no part of an interval"
 LOGARITHM = "what windows of another length, or a flat prior, change is that of the logarithm"
 METRES = "a linear machine is stated in metres and newtons, not in radians of a motor"
 EXPLAINED: dict[str, str] = {
@@ -95,6 +96,9 @@ EXPLAINED: dict[str, str] = {
     "*/says/estimate/profiles/*/values*": GRID,
     "*/says/estimate/profiles/*/rise*": GRID,
     "estimate/clean windows/says/parameters/*/sandwich": LOGARITHM,
+    "estimate/emps windows/says/parameters/*/interval_95*": MAPPED,
+    "estimate/emps windows/says/parameters/*/deviation*": MAPPED,
+    "estimate/emps windows/says/parameters/*/sandwich": MAPPED,
     "estimate/clean pem/says/information/0/0": LOGARITHM,
     "estimate/several oem/says/misfit/suspects/contact/*": "0.06 of a thousandth of it is beside the logs' own offsets",
     "estimate/*/says/misfit/notes": JOINED,
