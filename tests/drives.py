@@ -30,20 +30,22 @@ def late_bench(polled: bool = False) -> str:
 
 
 class RandomMapping:
-    """The texts of a mapping with a command of random place, size, order, scale, unit and sign."""
+    """The texts of a mapping with a command of random place, size, order, scale, unit, sign and protection."""
 
     def __init__(self, seed: int) -> None:
         draw = random.Random(seed)
         self.big_endian = draw.random() < 0.5
+        self.kind = draw.choice(("none", "none", "profile1", "profile2", "profile5", "xor", "sum"))
         self.identifier, self.extended = draw.choice(
             ((draw.randrange(300, 700), False), (draw.randrange(1 << 29), True))
         )
         self.signals: list[tuple[str, int, int]] = []
-        self.is_float = draw.random() < 0.3
-        self.length = 32 if self.is_float else draw.randint(11, 32)
-        start = draw.randint(0, 64 - self.length)
-        if draw.random() < 0.5 and start >= 4:
-            self.signals.append(("Other", 0, 4))
+        bit = self._header(draw)
+        self.is_float = draw.random() < 0.3 and bit <= 32
+        self.length = 32 if self.is_float else draw.randint(11, min(32, 64 - bit - 8))
+        start = bit + draw.randint(0, 64 - bit - self.length)
+        if draw.random() < 0.5 and start - bit >= 4:
+            self.signals.append(("Other", bit, 4))
         self.signals.append(("Current", start, self.length))
         self.signed = self.is_float or draw.random() < 0.5
         self.unit, self.per_ampere = draw.choice((("A", 1.0), ("mA", 1000.0), ("Nm", draw.uniform(0.01, 2.0))))
@@ -54,6 +56,19 @@ class RandomMapping:
         self.span = span
         self.dbc = self._dbc()
         self.toml = self._toml()
+
+    def _header(self, draw: random.Random) -> int:
+        """Place checksum and counter; the first bit that is free, counted along the bus."""
+        if self.kind == "none":
+            return 0
+        self.big_endian = self.big_endian and self.kind in ("xor", "sum")
+        wide = self.kind == "profile5"
+        self.signals.append(("Checksum", 0, 16 if wide else 8))
+        if wide:
+            self.signals.append(("Counter", 16, 8))
+        elif self.kind != "sum":
+            self.signals.append(("Counter", 8, 4))
+        return 24 if wide else 16
 
     def _dbc(self) -> str:
         identifier = self.identifier | (1 << 31 if self.extended else 0)
@@ -70,9 +85,16 @@ class RandomMapping:
     def _toml(self) -> str:
         names = [name for name, _, _ in self.signals]
         accept = [*_ALWAYS, "no_current", "no_state"]
+        accept += ["no_command_crc"] if self.kind == "none" else []
         accept += ["relative_k_m"] if self.unit == "Nm" else []
         extra = f", per_ampere = {self.per_ampere!r}" if self.unit == "Nm" else ""
         others = ", others = {Other = 5}" if "Other" in names else ""
+        protection = ""
+        if self.kind != "none":
+            ids = {"profile1": [4660], "profile2": list(range(16)), "profile5": [513]}.get(self.kind)
+            protection = f'[can.protection.Command]\nkind = "{self.kind}"\nchecksum = "Checksum"\n'
+            protection += 'counter = "Counter"\n' if "Counter" in names else ""
+            protection += f"data_ids = {ids}\n" if ids else ""
         return f"""\
 schema = 1
 name = "random"
@@ -85,7 +107,7 @@ angle = {{signal = "Sensors.Angle", unit = "rad", sign = 1, range = [-100, 200]}
 velocity = {{signal = "Sensors.Velocity", unit = "rad/s", sign = 1, range = [-900, 900]}}
 command = {{signal = "Command.Current", unit = "{self.unit}", sign = {self.sign}, scale = {self.scale!r}{extra}, \
 range = [{-self.span!r}, {self.span!r}]{others}}}
-[node]
+{protection}[node]
 on_loss = "hold"
 watchdog = 0.01
 stop = "freewheel"

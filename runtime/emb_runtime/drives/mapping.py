@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from emb_runtime.can.codec import worst_bits
 from emb_runtime.config.bench import HIGHEST_BUS_LOAD, Bench
-from emb_runtime.drives.signals import Field
+from emb_runtime.drives.signals import Field, Protection
 from emb_runtime.errors import BenchFileError, UsageError
 from emb_runtime.safety.end_stop import released_speed
 
@@ -27,8 +27,9 @@ PROPERTIES = {
     "no_device_time": "the samples have no time stamps of the drive: this computer's times are used, on a grid",
     "no_identity": "the drive has no identity on the bus: a wrong drive is not refused",
     "hold_on_loss": "without host or cable the drive holds its last current for its time-out, then switches it off",
-    "no_counter": "a repeated sensor message is not noticed, nor is a frozen sensor at rest",
-    "no_crc": "no checksum but that of CAN is checked or sent",
+    "no_counter": "the sensor messages have no counter: a repeated one is not noticed, nor is a frozen sensor at rest",
+    "no_crc": "the sensor messages have no checksum of their own",
+    "no_command_crc": "the command message has no checksum of its own",
     "no_current": "the current is not measured: the commanded current is used instead",
     "no_state": "the drive does not report whether it is armed: its time-out cannot be proved",
     "relative_k_m": "the command is not a current: only the ratio of k_m to per_ampere is known",
@@ -62,7 +63,7 @@ class Commanded:
     factor: float  # DBC units per ampere, sign included
     low: float
     high: float  # Least and largest value that may leave [DBC units]
-    others: Dictionary[str, float]  # Values of the message's other signals [DBC units]
+    others: Dictionary[str, float]  # Values of the message's other signals, protection excepted [DBC units]
     is_current: bool  # False for a torque, of which ``per_ampere`` makes an ampere
 
 
@@ -80,13 +81,17 @@ class State:
 
 @dataclass(frozen=True)
 class MessageInfo:
-    """One message."""
+    """One message, of a multiplexed one what has one value of its multiplexor."""
 
-    name: str
+    name: str  # ``MESSAGE``, or ``MESSAGE[value]``
+    message: str  # Name in the DBC
     identifier: int
     extended: bool
     length: int  # Payload bytes
     fields: Dictionary[str, Field]
+    protection: Protection
+    page: Field | None = None  # Multiplexor; None where there is none
+    page_value: int = 0  # Its value
 
     @property
     def worst_bits(self) -> int:
@@ -142,7 +147,11 @@ class Mapping:
     @property
     def lost(self) -> tuple[str, ...]:
         """Names in :data:`PROPERTIES` of what the drive cannot give."""
+        sensors = [self.messages[measured.message].protection for measured in (self.angle, self.velocity)]
         has = {
+            "no_counter": all(protection.counter is not None for protection in sensors),
+            "no_crc": all(protection.checksum is not None for protection in sensors),
+            "no_command_crc": self.messages[self.command.message].protection.checksum is not None,
             "no_current": self.current is not None,
             "no_state": self.state is not None,
             "relative_k_m": self.command.is_current,

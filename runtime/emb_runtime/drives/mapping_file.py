@@ -6,6 +6,7 @@ What a drive cannot give is derived here from what the file names, and must be a
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping as Dictionary
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -26,7 +27,7 @@ from emb_runtime.drives.mapping import (
     State,
     Step,
 )
-from emb_runtime.drives.signals import Field, make_field
+from emb_runtime.drives.signals import DATA_IDS, MODULI, Field, Protection, make_field, raw_value
 from emb_runtime.errors import FrameError
 from emb_runtime.system.input_file import read_text
 
@@ -54,6 +55,7 @@ def _says(description: str) -> Meta:
 
 Positive = Annotated[float, Meta(gt=0)]
 Wait = Annotated[float, Meta(gt=0, le=5)]  # [s]
+Byte = Annotated[int, Meta(ge=0, le=255)]
 States = Annotated[tuple[int, ...], Meta(min_length=1, max_length=16)]
 
 
@@ -116,6 +118,15 @@ class _Step(Struct, kw_only=True):
     wait: _Wait | None = None
 
 
+class _Protection(Struct, kw_only=True):
+    kind: Literal["none", "profile1", "profile2", "profile5", "xor", "sum"]
+    checksum: str | None = None
+    counter: str | None = None
+    modulus: Annotated[int, Meta(ge=2, le=1 << 16)] | None = None
+    data_ids: tuple[Annotated[int, Meta(ge=0, le=0xFFFF)], ...] = ()
+    start: Byte = 0
+
+
 Sequence = Annotated[tuple[_Step, ...], Meta(max_length=MOST_STEPS)]
 
 
@@ -127,6 +138,7 @@ class _Can(Struct, kw_only=True):
     signals: _Signals
     arm: Sequence = ()
     disarm: Sequence = ()
+    protection: dict[str, Literal["none"] | _Protection] = {}
 
 
 class _Node(Struct, kw_only=True):
@@ -196,7 +208,7 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
         database = parse(dbc_text)
     except FrameError as err:
         raise MappingError(f"{source}: can.dbc: {_one_line(err)}") from err
-    reader = _Reader(source, database)
+    reader = _Reader(source, database, can.protection)
     command = reader.command(signals.command)
     state = None if signals.state is None else reader.state(signals.state)
     made = Mapping(
@@ -218,6 +230,9 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
         dbc_text=dbc_text,
         database=database,
     )
+    unused = set(can.protection) - {"default", *(info.message for info in reader.used.values())}
+    if unused:
+        raise reader.error(f"can.protection.{min(unused)}", "unknown key: no message of that name is used")
     if missing := [name for name in made.lost if name not in file.node.accept]:
         more = f"; nor are {', '.join(missing[1:])}" if missing[1:] else ""
         raise reader.error("node.accept", f"'{missing[0]}' is not accepted: {PROPERTIES[missing[0]]}{more}")
@@ -229,8 +244,8 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
 class _Reader:
     """Finds what the file names in the DBC, and keeps the messages that are used."""
 
-    def __init__(self, source: str, database: Database) -> None:
-        self._source, self._database = source, database
+    def __init__(self, source: str, database: Database, protection: Dictionary[str, str | _Protection]) -> None:
+        self._source, self._database, self._protection = source, database, protection
         self.used: dict[str, MessageInfo] = {}
 
     def error(self, key: str, reason: str) -> MappingError:
@@ -244,12 +259,17 @@ class _Reader:
     def command(self, of: _Command) -> Commanded:
         key = "can.signals.command"
         info, field = self._signal(of.signal, key)
+        if info.page is None and self._message(info.message, key).is_multiplexed():
+            raise self.error(f"{key}.signal", f"{of.signal}: expected a signal of one value of the multiplexor")
         low, high = self._range(of, key)
         if not low <= 0.0 <= high:
             raise self.error(f"{key}.range", f"0 must lie inside, got {low:g} to {high:g}")
-        needed = set(info.fields) - {field.name}
+        protected = {f.name for f in (info.protection.checksum, info.protection.counter) if f is not None}
+        needed = set(info.fields) - {field.name} - protected
         if set(of.others) != needed:
             raise self.error(f"{key}.others", f"expected a value for {_names(needed)}, got {_names(set(of.others))}")
+        if info.page is not None and of.others[info.page.name] != info.page_value:
+            raise self.error(f"{key}.others.{info.page.name}", f"expected {info.page_value}, of {of.signal}")
         is_current = not _is_torque(of.unit)
         return Commanded(info.name, field, 1.0 / self._scale(of, key), low, high, of.others, is_current)
 
@@ -261,7 +281,7 @@ class _Reader:
         if set(of.idle) & set(of.active):
             raise self.error(f"{key}.active", "a value cannot be both idle and active")
         if of.error is not None and of.error not in info.fields:
-            raise self.error(f"{key}.error", f"no such signal in {info.name}; it has {_names(set(info.fields))}")
+            raise self.error(f"{key}.error", f"no such signal in {info.message}; it has {_names(set(info.fields))}")
         error = None if of.error is None else info.fields[of.error]
         return State(info.name, field, of.idle, of.active, of.timeout, error)
 
@@ -273,7 +293,6 @@ class _Reader:
 
     def _constant(self, name: str, given: str | dict[str, float], key: str, command: Commanded) -> ConstantFrame:
         message = self._message(name, key)
-        info = self._info(message, key)
         if isinstance(given, str):
             try:
                 data = bytes.fromhex(given)
@@ -281,11 +300,14 @@ class _Reader:
                 raise self.error(key, "expected signals, or bytes in hexadecimal") from None
             if len(data) != message.length:
                 raise self.error(key, f"expected {message.length} bytes, got {len(data)}")
-            return ConstantFrame(info.name, data, None)
+            return ConstantFrame(self._info(message, _page_of(message, data), key).name, data, None)
         try:
             data = message.encode(given, padding=False, strict=True)
         except Exception as err:  # of several kinds, by what does not fit
             raise self.error(key, f"does not fit the DBC: {_one_line(err)}") from err
+        info = self._info(message, _page_of(message, data), key)
+        if info.protection.kind != "none":
+            raise self.error(key, "a protected message cannot be part of a sequence")
         if info.name == command.message and given.get(command.field.name) != 0.0:
             raise self.error(key, "a sequence commands no current: give 0, or the bytes that the drive's maker gives")
         return ConstantFrame(info.name, bytes(data), given)
@@ -297,8 +319,9 @@ class _Reader:
             raise self.error(key, f"the DBC has no message {shown(name)}") from None
         if message.is_fd or message.length > 8:
             raise self.error(key, f"{name}: expected a classical frame; use a gateway")
-        if message.is_multiplexed():
-            raise self.error(key, f"{name}: expected a message that is not multiplexed; use a gateway")
+        switches = [signal for signal in message.signals if signal.is_multiplexer]
+        if len(switches) > 1 or any(switch.multiplexer_ids for switch in switches):
+            raise self.error(key, f"{name}: expected one multiplexor at most; use a gateway")
         ours = {m.identifier for m in load_layout().messages.values()}
         if not message.is_extended_frame and message.frame_id in ours:
             raise self.error(
@@ -312,23 +335,42 @@ class _Reader:
         if not dot:
             raise self.error(key, f"expected MESSAGE.SIGNAL, got {shown(text)}")
         message = self._message(name, key)
-        info = self._info(message, key)
-        if signal not in info.fields:
-            known = _names(set(info.fields))
+        found = next((one for one in message.signals if one.name == signal), None)
+        if found is None:
+            known = _names({one.name for one in message.signals})
             raise self.error(key, f"{name} has no signal {shown(signal)}; it has {known}")
+        pages = found.multiplexer_ids or []
+        if len(pages) > 1:
+            raise self.error(key, f"{text}: expected a signal of one value of the multiplexor, it is of {len(pages)}")
+        info = self._info(message, pages[0] if pages else None, key)
         return info, info.fields[signal]
 
-    def _info(self, message: DbcMessage, key: str) -> MessageInfo:
-        if message.name in self.used:
-            return self.used[message.name]
-        fields = {one.name: make_field(one) for one in message.signals}
+    def _info(self, message: DbcMessage, page: int | None, key: str) -> MessageInfo:
+        """The message, of a multiplexed one what has this value of its multiplexor."""
+        name = message.name if page is None else f"{message.name}[{page}]"
+        if name in self.used:
+            return self.used[name]
+        chosen = [one for one in message.signals if one.multiplexer_ids is None or page in one.multiplexer_ids]
+        fields = {one.name: make_field(one) for one in chosen}
         for field in fields.values():
             if field.is_float and field.length not in (16, 32, 64):
                 raise self.error(key, f"{message.name}.{field.name}: expected a float of 16, 32 or 64 bits")
             if not math.isfinite(field.scale) or field.scale == 0.0 or not math.isfinite(field.offset):
                 raise self.error(key, f"{message.name}.{field.name}: expected a scale that is finite and not 0")
-        info = MessageInfo(message.name, message.frame_id, message.is_extended_frame, message.length, fields)
-        self.used[message.name] = info
+        protection = self._protection_of(message.name, fields)
+        if page is not None and protection.counter is not None:
+            raise self.error(f"can.protection.{message.name}", "a multiplexed message with a counter needs a gateway")
+        self.used[name] = info = MessageInfo(
+            name=name,
+            message=message.name,
+            identifier=message.frame_id,
+            extended=message.is_extended_frame,
+            length=message.length,
+            fields=fields,
+            protection=protection,
+            page=None if page is None else fields[_switch(message)],
+            page_value=page or 0,
+        )
         return info
 
     def _scale(self, of: _Angle | _Velocity | _Current | _Command, key: str) -> float:
@@ -345,6 +387,50 @@ class _Reader:
         if not low < high:
             raise self.error(f"{key}.range", f"expected the lower value first, got {low:g} and {high:g}")
         return low, high
+
+    def _protection_of(self, name: str, fields: Dictionary[str, Field]) -> Protection:
+        of, key = self._protection.get(name), f"can.protection.{name}"
+        if not isinstance(of, _Protection):
+            return Protection("none")
+        checksum = self._field(fields, of.checksum, f"{key}.checksum")
+        counter = self._field(fields, of.counter, f"{key}.counter")
+        modulus = MODULI.get(of.kind, 0)
+        if counter is not None and not modulus:
+            modulus = of.modulus or 1 << min(counter.length, 16)
+        if of.kind != "none":
+            self._check_checksum(checksum, 16 if of.kind == "profile5" else 8, f"{key}.checksum")
+        if of.kind in MODULI and counter is None:
+            raise self.error(f"{key}.counter", "missing: expected the name of a signal; add it")
+        if counter is not None and (counter.is_float or counter.signed or modulus > 1 << counter.length):
+            raise self.error(f"{key}.counter", f"expected an unsigned signal that counts to {modulus}")
+        count, highest = DATA_IDS.get(of.kind, 0), 0xFF if of.kind == "profile2" else 0xFFFF
+        if len(of.data_ids) != count or any(v > highest for v in of.data_ids):
+            raise self.error(f"{key}.data_ids", f"expected {count} whole numbers from 0 to {highest}")
+        return Protection(of.kind, checksum, counter, modulus if counter is not None else 0, of.data_ids, of.start)
+
+    def _field(self, fields: Dictionary[str, Field], name: str | None, key: str) -> Field | None:
+        if name is not None and name not in fields:
+            raise self.error(key, f"no such signal; the message has {_names(set(fields))}")
+        return None if name is None else fields[name]
+
+    def _check_checksum(self, checksum: Field | None, bits: int, key: str) -> None:
+        if checksum is None:
+            raise self.error(key, "missing: expected the name of a signal; add it")
+        first = min(checksum.positions)
+        whole = sorted(checksum.positions) == list(range(first, first + bits))
+        if checksum.length != bits or not whole or first % 8 or checksum.signed or checksum.is_float:
+            raise self.error(key, f"expected an unsigned signal of {bits} bits that begins with a byte")
+
+
+def _switch(message: DbcMessage) -> str:
+    return next(signal.name for signal in message.signals if signal.is_multiplexer)
+
+
+def _page_of(message: DbcMessage, data: bytes) -> int | None:
+    """Value of a message's multiplexor in a payload; None of a message without one."""
+    if not message.is_multiplexed():
+        return None
+    return raw_value(make_field(message.get_signal_by_name(_switch(message))), bytes(data))
 
 
 def _is_torque(unit: str) -> bool:

@@ -86,7 +86,7 @@ class DriveNode:
         self._bench = bench
         self._layout = layout
         self._period_ns = bench.timing.sample_time_ns
-        self._receiver = Receiver(mapping)
+        self._receiver = Receiver(mapping, bench.watch.stop_missed)
         self._encoder = Encoder(mapping)
         self.guard = WireGuard(mapping, bench.limits.current, send)
         self._identity = bench_identity(bench.identity_hash)
@@ -233,6 +233,8 @@ class DriveNode:
         if self.phase is Phase.ARMING and self._receiver.said_ns != said_ns:
             self.arming.hear(self._receiver.state(now_ns), self._receiver.said_ns)
         self._watch_drive(now_ns)
+        if self.phase in ARMED and (name := self._receiver.frames_missing):
+            self._give_up(f"by its counter more than a fifth of the frames of {name} are missing: check its modulus")
         if sample is None or (self._mapping.polled and not self._awaited):
             return []  # an answer to a frame of a sequence is of no sample
         self._awaited = False

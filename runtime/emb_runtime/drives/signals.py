@@ -1,13 +1,18 @@
-"""Signals of a DBC as bits of a payload: read bit by bit, by no code that writes them.
+"""Signals of a DBC as bits of a payload, and checksums: read bit by bit, by no code that writes them.
 
 cantools encodes what leaves and decodes what comes; the second guard reads what leaves by these functions alone.
+Sources of the checksums: AUTOSAR "Specification of SW-C End-to-End Communication Protection Library" (profiles 1, 2, 5)
+and "Specification of CRC Routines"; for XOR and sum the DBC files of cars, which differ in a start value only.
 """
 
 from __future__ import annotations
 
+import binascii
 import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from emb_runtime.can import e2e
 
 if TYPE_CHECKING:
     from cantools.database.can import Signal as DbcSignal
@@ -85,3 +90,69 @@ def physical_value(field: Field, data: bytes) -> float:
     raw = raw_value(field, data)
     value = struct.unpack(_FLOATS[field.length], raw.to_bytes(field.length // 8, "big"))[0] if field.is_float else raw
     return float(value * field.scale + field.offset)
+
+
+KINDS = ("none", "profile1", "profile2", "profile5", "xor", "sum")
+MODULI = {"profile1": 15, "profile2": 16, "profile5": 256}  # Number of values of the counter, where the profile says so
+DATA_IDS = {"profile1": 1, "profile2": 16, "profile5": 1}
+"""Number of data ids of a message: profile 2 has one for each value of the counter."""
+
+
+@dataclass(frozen=True)
+class Protection:
+    """Protection of one message."""
+
+    kind: str  # One of :data:`KINDS`
+    checksum: Field | None = None  # Whole bytes: one, or two with profile 5
+    counter: Field | None = None
+    modulus: int = 0  # Number of values of the counter, 0 where there is none
+    data_ids: tuple[int, ...] = ()
+    start: int = 0  # Start value of XOR and sum, 0..255
+
+    def next_counter(self, counter: int) -> int:
+        """The counter that follows."""
+        return (counter + 1) % self.modulus
+
+    def checksum_of(self, data: bytes) -> int:
+        """Checksum that a payload should have, whatever it has in its place."""
+        field = self.checksum
+        assert field is not None
+        first = min(field.positions) // 8
+        rest = data[:first] + data[first + field.length // 8 :]
+        if self.kind == "profile1":
+            return e2e.protect(e2e.profile1_start(self.data_ids[0]), rest)[0]
+        if self.kind == "profile2":
+            assert self.counter is not None
+            data_id = self.data_ids[raw_value(self.counter, data) % len(self.data_ids)]
+            return crc8_h2f(rest + bytes((data_id & 0xFF,)))
+        if self.kind == "profile5":
+            return binascii.crc_hqx(rest + self.data_ids[0].to_bytes(2, "little"), 0xFFFF)
+        state = self.start
+        for byte in rest:
+            state = state ^ byte if self.kind == "xor" else (state + byte) & 0xFF
+        return state
+
+    def fault(self, data: bytes) -> str:
+        """Fault of a received payload, in words; empty if its checksum and the counter's value are possible."""
+        if self.checksum is not None and raw_value(self.checksum, data) != self.checksum_of(data):
+            return "wrong checksum"
+        if self.counter is not None and raw_value(self.counter, data) >= self.modulus:
+            return "invalid counter"
+        return ""
+
+
+def crc8_h2f(data: bytes) -> int:
+    """CRC-8 with the polynomial 0x2F, start value and final XOR 0xFF: 0xDF for ``b"123456789"``."""
+    state = 0xFF
+    for byte in data:
+        state = _H2F[state ^ byte]
+    return state ^ 0xFF
+
+
+def _h2f(state: int) -> int:
+    for _ in range(8):
+        state = (state << 1 ^ 0x2F if state & 0x80 else state << 1) & 0xFF
+    return state
+
+
+_H2F = tuple(map(_h2f, range(256)))

@@ -6,7 +6,9 @@ import math
 from enum import StrEnum
 from typing import NamedTuple
 
+from emb_runtime.can.e2e import LeakyCount
 from emb_runtime.drives.mapping import ConstantFrame, Mapping, Measured, MessageInfo
+from emb_runtime.drives.signals import raw_value
 from emb_runtime.errors import FrameError
 from emb_runtime.records import Frame
 
@@ -40,7 +42,8 @@ class Encoder:
         self._mapping = mapping
         command = mapping.command
         self._info = mapping.messages[command.message]
-        self._message = mapping.database.get_message_by_name(self._info.name)
+        self._message = mapping.database.get_message_by_name(self._info.message)
+        self._counter = 0
 
     def command(self, current: float) -> Frame:
         """The frame that commands a current [A].
@@ -48,17 +51,27 @@ class Encoder:
         Raises:
             FrameError: it is not finite, or beyond the file's range.
         """
-        command = self._mapping.command
+        command, protection = self._mapping.command, self._info.protection
         value = current * command.factor
         if not command.low <= value <= command.high:  # this way round, NaN is refused
             raise FrameError(
                 f"{command.message}.{command.field.name}: expected {command.low:g} to {command.high:g}, got {value:g}"
             )
         values = {**command.others, command.field.name: value}
+        if protection.counter is not None:
+            values[protection.counter.name] = self._counter
+        if protection.checksum is not None:
+            values[protection.checksum.name] = 0
         try:
-            data = self._message.encode(values, padding=False, strict=True)
+            data = bytearray(self._message.encode(values, padding=False, strict=True))
         except Exception as err:  # of several kinds, by what does not fit
             raise FrameError(f"{command.message}: {' '.join(str(err).split())}") from err
+        if protection.checksum is not None:
+            size, big = protection.checksum.length // 8, protection.checksum.big_endian
+            first = min(protection.checksum.positions) // 8
+            data[first : first + size] = protection.checksum_of(bytes(data)).to_bytes(size, "big" if big else "little")
+        if protection.counter is not None:
+            self._counter = protection.next_counter(self._counter)
         return frame_of(self._info, bytes(data))
 
     def constant(self, constant: ConstantFrame) -> Frame:
@@ -78,15 +91,19 @@ class Receiver:
 
     Args:
         mapping: the drive.
+        tolerated: frames missing in a row by a message's counter that are too many; fewer if they are a share.
     """
 
-    def __init__(self, mapping: Mapping) -> None:
+    def __init__(self, mapping: Mapping, tolerated: int) -> None:
         self._mapping = mapping
         self._sensors = mapping.sensor_messages
         heard = self._sensors | ({mapping.state.message} if mapping.state else set())
-        infos = [mapping.messages[name] for name in heard]
-        self._infos = {(info.extended, info.identifier): info for info in infos}
-        self._codecs = {name: mapping.database.get_message_by_name(name) for name in heard}
+        self._infos: dict[tuple[bool, int], list[MessageInfo]] = {}
+        for info in (mapping.messages[name] for name in sorted(heard)):
+            self._infos.setdefault((info.extended, info.identifier), []).append(info)
+        self._codecs = {name: mapping.database.get_message_by_name(mapping.messages[name].message) for name in heard}
+        self._counters: dict[str, int] = {}
+        self._missing = {name: LeakyCount(tolerated) for name in heard}
         self._waiting: dict[str, tuple[dict[str, float], int]] = {}
         self._turns = 0.0
         self._wrapped: float | None = None
@@ -95,6 +112,11 @@ class Receiver:
         """Arrival of the latest message with the state [ns]."""
         self.rejected: dict[str, int] = {}
         """Number of frames that were not believed, by reason."""
+
+    @property
+    def frames_missing(self) -> str:
+        """Name of a message of which too many frames did not come, by its counter; empty if there is none."""
+        return next((name for name, missing in self._missing.items() if missing.exceeded), "")
 
     def state(self, now_ns: int) -> DriveState:
         """State of the drive now (monotonic [ns])."""
@@ -108,18 +130,35 @@ class Receiver:
 
         A frame that is none of the drive's is passed over; one that cannot be believed is counted.
         """
-        info = self._infos.get((frame.extended, frame.identifier))
-        if info is None or frame.own or frame.error or (values := self._believed(info, frame)) is None:
-            return None
-        if self._mapping.state is not None and info.name == self._mapping.state.message:
-            self._take_state(values, frame.time_ns)
-        return self._pair(info.name, values, frame.time_ns) if info.name in self._sensors else None
+        sample = None
+        for info in self._infos.get((frame.extended, frame.identifier), ()):
+            if frame.own or frame.error or not _is_of(info, frame) or (values := self._believed(info, frame)) is None:
+                continue
+            if self._mapping.state is not None and info.name == self._mapping.state.message:
+                self._take_state(values, frame.time_ns)
+            if info.name in self._sensors:
+                sample = self._pair(info.name, values, frame.time_ns) or sample
+        return sample
 
     def _believed(self, info: MessageInfo, frame: Frame) -> dict[str, float] | None:
         """Values of a frame, None if it is not to be believed."""
-        if frame.remote or len(frame.data) != info.length:
-            self._reject("wrong length")
+        if (
+            why := "wrong length"
+            if frame.remote or len(frame.data) != info.length
+            else info.protection.fault(frame.data)
+        ):
+            self._reject(why)
             return None
+        counter = info.protection.counter
+        if counter is not None:
+            count = raw_value(counter, frame.data)
+            if self._counters.get(info.name) == count:
+                self._reject("repeated")
+                return None
+            self._missing[info.name].forgive()
+            if info.name in self._counters:
+                self._missing[info.name].reject((count - self._counters[info.name]) % info.protection.modulus - 1)
+            self._counters[info.name] = count
         decoded = self._codecs[info.name].decode(frame.data, decode_choices=False)
         assert isinstance(decoded, dict)
         values = {name: float(value) for name, value in decoded.items() if isinstance(value, int | float)}
@@ -176,6 +215,13 @@ class Receiver:
             self._turns -= measured.wrap * round((value + self._turns - last) / measured.wrap)
             value = self._wrapped = value + self._turns
         return value * measured.factor + measured.offset
+
+
+def _is_of(info: MessageInfo, frame: Frame) -> bool:
+    """True if a frame of the message's identifier has its value of the multiplexor, or is too short to tell."""
+    if info.page is None or frame.remote or len(frame.data) != info.length:
+        return True
+    return raw_value(info.page, frame.data) == info.page_value
 
 
 def _si(measured: Measured, values: dict[str, float]) -> float:

@@ -1,7 +1,7 @@
 """The second guard: the one place that puts a frame on the drive's bus.
 
 It takes the frame as bytes, reads them bit by bit (:mod:`emb_runtime.drives.signals`, not the encoder's library), and
-compares with what was meant: amperes and the message's other signals. It rejects; it never mends.
+compares with what was meant: amperes, the message's other signals, checksum and counter. It rejects; it never mends.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 
 from emb_runtime.drives.mapping import ConstantFrame, Mapping, MessageInfo
-from emb_runtime.drives.signals import Field, physical_value
+from emb_runtime.drives.signals import Field, physical_value, raw_value
 from emb_runtime.errors import SafetyStopError
 from emb_runtime.records import Frame
 
@@ -38,6 +38,7 @@ class WireGuard:
         self._limit = limit
         self._send = send
         self._covered = {name: _covered_bits(info) for name, info in mapping.messages.items()}
+        self._counter: int | None = None
         self.passed = 0
         self.rejected = 0
 
@@ -81,7 +82,8 @@ class WireGuard:
         command = self._mapping.command
         info = self._mapping.messages[command.message]
         self._check_kind(frame, info)
-        value = physical_value(command.field, frame.data)
+        data, protection = frame.data, info.protection
+        value = physical_value(command.field, data)
         if not command.low <= value <= command.high:  # this way round, NaN is refused
             raise self._refused(f"its bytes say {value:g}, the file allows {command.low:g} to {command.high:g}")
         current, step = value / command.factor, command.field.step(value) / abs(command.factor)
@@ -90,8 +92,16 @@ class WireGuard:
         if not _says(current, meant, step):  # so it is within the limit as well, to half a step
             raise self._refused(f"its bytes say {current:g} A, meant were {meant:g} A")
         for name, other in command.others.items():
-            self._check_value(info.fields[name], frame.data, other)
-        self._check_unused(frame.data, info)
+            self._check_value(info.fields[name], data, other)
+        self._check_unused(data, info)
+        if protection.checksum is not None and raw_value(protection.checksum, data) != protection.checksum_of(data):
+            raise self._refused("its checksum is wrong")
+        if protection.counter is not None:
+            counter = raw_value(protection.counter, data)
+            expected = 0 if self._counter is None else protection.next_counter(self._counter)
+            if counter != expected:
+                raise self._refused(f"its counter is {counter}, expected {expected}")
+            self._counter = counter
         return current
 
     def _check_kind(self, frame: Frame, info: MessageInfo) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +21,36 @@ from tests.drives import EXAMPLES, late_bench
 from tests.runtime.operating import EmbRun
 
 Change = Callable[[Frame], Frame | None]
+
+
+def protected_odrive() -> tuple[str, str]:
+    """Mapping file and DBC of an ODrive whose current has a checksum and a counter of 15 values."""
+    toml, dbc = ((EXAMPLES / f"odrive.{kind}").read_text() for kind in ("toml", "dbc"))
+    for old, new in PROTECTED:
+        assert old in toml + dbc
+        toml, dbc = toml.replace(old, new), dbc.replace(old, new)
+    return toml, dbc
+
+
+PROTECTED = (
+    ("BO_ 20 Axis0_Get_Iq: 8", "BO_ 20 Axis0_Get_Iq: 6"),
+    (
+        ' SG_ Iq_Setpoint : 0|32@1- (1,0) [0|0] "A" Host\n SG_ Iq_Measured : 32|32@1- (1,0) [0|0] "A" Host',
+        ' SG_ Sum : 0|8@1+ (1,0) [0|0] "" Host\n SG_ Count : 8|4@1+ (1,0) [0|0] "" Host\n'
+        ' SG_ Iq_Measured : 16|32@1- (1,0) [0|0] "A" Host',
+    ),
+    ("SIG_VALTYPE_ 20 Iq_Setpoint : 1;\n", ""),
+    (
+        'default = "none"',
+        'Axis0_Get_Iq = {kind = "sum", checksum = "Sum", counter = "Count", modulus = 15, start = 3}',
+    ),
+)
+
+
+def protected(count: int, time_ns: int, current: float = 0.5, off: int = 0) -> Frame:
+    """The current of that drive."""
+    rest = struct.pack("<Bf", count, current)
+    return Frame(0x014, bytes(((sum(rest) + 3 + off) & 0xFF,)) + rest, time_ns)
 
 
 class MappedBus:

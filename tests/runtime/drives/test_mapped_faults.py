@@ -5,6 +5,7 @@ Simulated drives in lock-step. A fault that comes later comes 60 samples into a 
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,7 @@ from emb_runtime.records import Frame
 from emb_runtime.safety.end_stop import released_speed
 from simulated_drives import SimulatedDrive
 from tests.drives import SHIPPED
-from tests.runtime.drives.mapped import Change, MappedBus, rests_below, runner, within_limits
+from tests.runtime.drives.mapped import PROTECTED, Change, MappedBus, protected, rests_below, runner, within_limits
 
 pytestmark = pytest.mark.usefixtures("handlers", "one_process")
 Break = Callable[[MappedBus], object]
@@ -206,6 +207,26 @@ def test_a_command_that_the_drive_does_not_hear_ends_the_run_at_rest(
         bus.edit(*edit)
     assert emb_run.document(code=3)["result"] == "CURRENT_MISMATCH"
     rests_below(bus, 0.0)
+
+
+@pytest.mark.parametrize(("step", "code"), [(1, 0), (2, 4)])
+def test_a_drive_whose_counter_skips_every_other_frame_is_not_armed(
+    step: int, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus, emb_run = runner("odrive", tmp_path, capsys, monkeypatch, current=2.0)
+    for edit in PROTECTED:
+        bus.edit(*edit)
+    count = itertools.count(0, step)
+
+    def protect(frame: Frame) -> Frame:
+        if frame.identifier != 0x014:
+            return frame
+        return protected(next(count) % 15, frame.time_ns, struct.unpack("<f", frame.data[4:])[0])
+
+    bus.change = protect
+    printed, told = emb_run.streams(code=code)
+    assert ("frames of Axis0_Get_Iq are missing" in told) == bool(code)
+    assert printed.startswith("done") == (not code)
 
 
 def test_a_drive_that_is_not_heard_or_never_says_its_state_is_not_armed(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import struct
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,9 @@ import pytest
 from emb_runtime.drives.mapping import PROPERTIES, MappingError
 from emb_runtime.drives.mapping_file import load_mapping, parse_mapping
 from emb_runtime.drives.signals import make_field, physical_value, raw_value
+from emb_runtime.drives.wire import Encoder, Receiver
+from emb_runtime.drives.wire_guard import WireGuard, WireGuardError
+from emb_runtime.records import Frame
 from tests.drives import EXAMPLES, SHIPPED, RandomMapping
 
 
@@ -101,14 +105,68 @@ def test_a_mistake_is_one_line_that_names_it() -> None:
         ("Axis_Requested_State = 8", "Axis_State = 8", "does not fit the DBC"),
         ('{state = "active", timeout = 0.5}', '{state = "active", timeout = 50}', "timeout"),
         ('on_loss  = "hold"', 'on_loss  = "brake"', "node.on_loss"),
-        ("SG_ Iq_Setpoint : 0|32@1-", 'SG_ Page M : 0|8@1+ (1,0) [0|0] "" Host\n SG_ Iq_Setpoint m1 : 8|16@1-',
-         "expected a message that is not multiplexed"),
+        ('default = "none"', 'default = "profile1"', "can.protection.default"),
+        ('default = "none"', 'Nothing = {kind = "none"}', "can.protection.Nothing: unknown key"),
+        ('default = "none"', 'Axis0_Get_Iq = {kind = "xor"}', "checksum: missing"),
         ("[node]", "[nodes]", "nodes: unknown key"),
         ("sign = 1, range = [-2, 17]", "sign = 1, sine = 1, range = [-2, 17]", "sine: unknown key"),
     ):  # fmt: skip
         toml, dbc = next(files for files in map(texts, ("odrive", "mit")) if any(old in text for text in files))
         wrong = (toml.replace(old, new, 1), dbc) if old in toml else (toml, dbc.replace(old, new, 1))
         assert reason in refusal(*wrong), old
+
+
+def multiplexed() -> tuple[str, str]:
+    """An ODrive whose position and velocity are two pages of a message, and its torque one of another."""
+    toml, dbc = texts("odrive")
+    for old, new in (
+        (' SG_ Pos_Estimate : 0|32@1- (1,0) [0|0] "rev" Host', ' SG_ Page M : 0|8@1+ (1,0) [0|0] "" Host\n'
+         ' SG_ Age : 56|8@1+ (1,0) [0|0] "" Host\n SG_ Pos_Estimate m1 : 8|32@1- (1,0) [0|0] "rev" Host'),
+        (' SG_ Vel_Estimate : 32|32@1-', ' SG_ Vel_Estimate m2 : 8|32@1-'),
+        (' SG_ Input_Torque : 0|32@1- (1,0) [0|0] "Nm" Axis0', ' SG_ Mode M : 0|8@1+ (1,0) [0|0] "" Axis0\n'
+         ' SG_ Input_Torque m3 : 8|32@1- (1,0) [0|0] "Nm" Axis0\n SG_ Input_Vel m4 : 40|16@1- (1,0) [0|0] "" Axis0'),
+        ("BO_ 14 Axis0_Set_Input_Torque: 4", "BO_ 14 Axis0_Set_Input_Torque: 7"),
+    ):  # fmt: skip
+        assert old in dbc, old
+        dbc = dbc.replace(old, new)
+    toml = toml.replace("range = [-0.1303, 0.1303]}", "range = [-0.1303, 0.1303], others = {Mode = 3}}")
+    return toml.replace("{Input_Torque = 0}", "{Mode = 3, Input_Torque = 0}"), dbc
+
+
+def test_multiplexed_signals_are_read_by_the_value_of_their_multiplexor_and_sent_with_it() -> None:
+    mapping = parse_mapping(*multiplexed(), "drive.toml")
+    receiver = Receiver(mapping, 20)
+    page = {number: struct.pack("<Bf2xB", number, 0.25 * number, 9) for number in (1, 2, 3)}
+    for period in range(3):
+        frames = [Frame(0x009, page[1 + (n + period) % 3], 10_000_000 * period + n) for n in range(3)]  # in any order
+        frames.append(Frame(0x014, struct.pack("<ff", 0.0, 1.5), 10_000_000 * period + 3))
+        (sample,) = (found for frame in frames if (found := receiver.take(frame)) is not None)
+        assert sample[:3] == pytest.approx((0.25 * 2.0 * math.pi, 0.5 * 2.0 * math.pi, 1.5))
+    encoder, sent = Encoder(mapping), list[Frame]()
+    guard = WireGuard(mapping, 6.0, sent.append)
+    frame = encoder.command(2.0)
+    assert frame.data == b"\x03" + struct.pack("<fH", 2.0 * 0.0217, 0)
+    assert guard.command(frame, 2.0) == pytest.approx(2.0, rel=1e-6)
+    with pytest.raises(WireGuardError, match="Mode says 4"):
+        guard.command(frame._replace(data=b"\x04" + frame.data[1:]), 2.0)
+    for step in mapping.disarm:
+        for constant in step.frames:
+            guard.constant(encoder.constant(constant), constant)
+    assert sent[1].data == b"\x03" + bytes(6)
+
+
+def test_what_of_a_multiplexed_message_has_no_one_meaning_is_refused() -> None:
+    toml, dbc = multiplexed()
+    assert "expected 3, of" in refusal(toml.replace("others = {Mode = 3}", "others = {Mode = 4}"), dbc)
+    assert "expected a value for Mode" in refusal(toml.replace(", others = {Mode = 3}", ""), dbc)
+    assert "does not fit the DBC" in refusal(toml.replace("{Mode = 3, Input_Torque = 0}", "{Mode = 3}"), dbc)
+    common = dbc.replace("Input_Torque m3 :", "Input_Torque :")
+    assert "expected a signal of one value of the multiplexor" in refusal(toml, common)
+    counted = toml.replace('default = "none"', 'Axis0_Get_Encoder_Estimates = {kind = "none", counter = "Age"}')
+    assert "a multiplexed message with a counter" in refusal(counted, dbc)
+    pages = "".join(f"SG_MUL_VAL_ 9 {name} Page {n}-{n};\n" for name, n in (("Pos_Estimate", 1), ("Vel_Estimate", 2)))
+    nested = dbc.replace("SG_ Age :", "SG_ Age m1M :") + pages + "SG_MUL_VAL_ 9 Age Page 1-1;\n"
+    assert "one multiplexor at most" in refusal(toml, nested)
 
 
 def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:

@@ -8,10 +8,11 @@ import struct
 import pytest
 
 from emb_runtime.drives.mapping import Mapping
-from emb_runtime.drives.mapping_file import load_mapping
+from emb_runtime.drives.mapping_file import load_mapping, parse_mapping
 from emb_runtime.drives.wire import DriveState, Receiver
 from emb_runtime.records import Frame
 from tests.drives import EXAMPLES
+from tests.runtime.drives.mapped import protected, protected_odrive
 
 MS = 1_000_000
 
@@ -34,7 +35,7 @@ def heartbeat(state: int, time_ns: int, error: int = 0) -> Frame:
 
 def test_a_sample_is_complete_when_all_its_messages_have_come_in_any_order() -> None:
     for turned in (False, True):
-        receiver, pair = Receiver(odrive()), [encoder(1.5, -2.0, MS), iq(0.75, MS + 100_000)]
+        receiver, pair = Receiver(odrive(), 20), [encoder(1.5, -2.0, MS), iq(0.75, MS + 100_000)]
         first, second = reversed(pair) if turned else pair
         assert receiver.take(first) is None
         sample = receiver.take(second)
@@ -43,7 +44,7 @@ def test_a_sample_is_complete_when_all_its_messages_have_come_in_any_order() -> 
 
 
 def test_messages_of_two_samples_make_none() -> None:
-    receiver = Receiver(odrive())
+    receiver = Receiver(odrive(), 20)
     assert receiver.take(encoder(1.0, 0.0, MS)) is None
     assert receiver.take(iq(0.0, MS + 600_000)) is None
     assert receiver.take(encoder(2.0, 0.0, 2 * MS)) is not None
@@ -51,14 +52,14 @@ def test_messages_of_two_samples_make_none() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30, 17.1, -2.1])
 def test_a_value_that_cannot_be_believed_makes_no_sample(value: float) -> None:
-    receiver = Receiver(odrive())
+    receiver = Receiver(odrive(), 20)
     receiver.take(encoder(value, 0.0, MS))
     assert receiver.take(iq(0.0, MS)) is None
     assert receiver.rejected == {"Pos_Estimate out of range": 1}
 
 
 def test_frames_of_the_wrong_length_and_of_others_make_no_sample() -> None:
-    receiver = Receiver(odrive())
+    receiver = Receiver(odrive(), 20)
     right = encoder(1.0, 0.0, MS)
     for wrong in (
         right._replace(data=right.data[:7]),
@@ -74,7 +75,7 @@ def test_frames_of_the_wrong_length_and_of_others_make_no_sample() -> None:
 
 
 def test_the_state_is_what_the_heartbeat_says_until_it_is_too_old() -> None:
-    receiver = Receiver(odrive())
+    receiver = Receiver(odrive(), 20)
     assert receiver.state(0) is DriveState.UNKNOWN
     for frame, state in (
         (heartbeat(1, MS), DriveState.IDLE),
@@ -90,7 +91,7 @@ def test_the_state_is_what_the_heartbeat_says_until_it_is_too_old() -> None:
 
 
 def test_an_angle_that_begins_anew_is_continued() -> None:
-    receiver = Receiver(load_mapping(EXAMPLES / "vesc.toml"))
+    receiver = Receiver(load_mapping(EXAMPLES / "vesc.toml"), 20)
     true = [-2.0, 30.0, 170.0, 200.0, 340.0, 380.0, 500.0, 660.0, 740.0, 600.0, 440.0, 280.0, 110.0, -60.0]  # deg
     for index, angle in enumerate(true):
         time_ns = index * MS
@@ -100,3 +101,37 @@ def test_an_angle_that_begins_anew_is_continued() -> None:
         assert math.degrees(sample.angle) == pytest.approx(angle, abs=0.011)
         assert sample.velocity == pytest.approx(2.0 * math.pi)
         assert sample.current == pytest.approx(1.5)
+
+
+def test_a_protected_message_is_checked_and_a_repeated_one_is_none() -> None:
+    toml, dbc = protected_odrive()
+    receiver = Receiver(parse_mapping(toml, dbc, "drive.toml"), 20)
+
+    for frame, whole in (
+        (protected(0, MS), True),
+        (protected(0, 2 * MS), False),
+        (protected(1, 3 * MS, off=1), False),
+        (protected(1, 4 * MS), True),
+        (protected(15, 5 * MS), False),
+        (protected(14, 6 * MS), True),
+    ):
+        receiver.take(encoder(0.0, 0.0, frame.time_ns))
+        assert (receiver.take(frame) is not None) is whole
+    assert receiver.rejected == {"repeated": 1, "wrong checksum": 1, "invalid counter": 1}
+
+
+@pytest.mark.parametrize(("step", "missing"), [(1, False), (2, True), (14, True)])
+def test_a_message_whose_counter_skips_frames_for_ever_is_missing_some(step: int, missing: bool) -> None:
+    toml, dbc = protected_odrive()
+    receiver = Receiver(parse_mapping(toml, dbc, "drive.toml"), 5)
+    for index in range(40):
+        receiver.take(protected(index * step % 15, index * MS))
+    assert receiver.frames_missing == ("Axis0_Get_Iq" if missing else "")
+
+
+def test_frames_that_were_lost_now_and_then_are_not_too_many() -> None:
+    toml, dbc = protected_odrive()
+    receiver = Receiver(parse_mapping(toml, dbc, "drive.toml"), 5)
+    for index in (index for index in range(400) if index % 6 and index not in range(100, 104)):
+        receiver.take(protected(index % 15, index * MS))
+        assert receiver.frames_missing == ""

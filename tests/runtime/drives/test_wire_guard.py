@@ -63,6 +63,7 @@ def test_a_flipped_bit_is_refused_or_changes_nothing_of_the_current() -> None:
             except WireGuardError:
                 assert not way.bus
                 continue
+            assert drawn.kind == "none"
             assert drawn.amperes(way.bus[0].data) == pytest.approx(current, abs=0.51 * drawn.ampere_step)
 
 
@@ -126,10 +127,12 @@ BS_:
 
 BU_: Host Drive
 
-BO_ 300 Command: 4 Host
+BO_ 300 Command: 5 Host
  SG_ Current : 0|12@1- (0.125,0) [0|0] "A" Drive
  SG_ Mode : 16|4@1+ (1,0) [0|0] "" Drive
- SG_ Gain : 24|8@1- (0.5,0) [0|0] "" Drive
+ SG_ Counter : 20|4@1+ (1,0) [0|0] "" Drive
+ SG_ Checksum : 24|8@1+ (1,0) [0|0] "" Drive
+ SG_ Gain : 32|8@1- (0.5,0) [0|0] "" Drive
 
 BO_ 301 Mode: 2 Host
  SG_ Mode : 0|4@1+ (1,0) [0|0] "" Drive
@@ -149,6 +152,11 @@ pair_within = 0.001
 angle = {signal = "Sensors.Angle", unit = "rad", sign = 1, range = [-100, 200]}
 velocity = {signal = "Sensors.Velocity", unit = "rad/s", sign = 1, range = [-900, 900]}
 command = {signal = "Command.Current", unit = "A", sign = 1, range = [-5, 4.5], others = {Mode = 5, Gain = -3}}
+[can.protection.Command]
+kind = "xor"
+checksum = "Checksum"
+counter = "Counter"
+modulus = 3
 [[can.arm]]
 send = {Mode = {Mode = 2}}
 [node]
@@ -162,10 +170,11 @@ accept = ["no_answers", "no_echo", "no_device_time", "no_identity", "hold_on_los
 KNOWN = parse_mapping(TOML, DBC, "known.toml")
 
 
-def by_hand(current: float, mode: int = 5, gain: int = -6 & 0xFF, unused: int = 0) -> Frame:
+def by_hand(current: float, counter: int = 0, mode: int = 5, gain: int = -6 & 0xFF, unused: int = 0) -> Frame:
     """The command frame, packed by no code of the product."""
     first = (round(current / STEP) & 0xFFF | unused << 12).to_bytes(2, "little")
-    return Frame(300, bytes((*first, mode, gain)))
+    rest = bytes((*first, mode | counter << 4, gain))
+    return Frame(300, rest[:3] + bytes((rest[0] ^ rest[1] ^ rest[2] ^ rest[3],)) + rest[3:])
 
 
 class Guarded:
@@ -184,8 +193,9 @@ class Guarded:
 
 def test_the_packer_by_hand_says_what_the_encoder_says() -> None:
     encoder = Encoder(KNOWN)
-    currents = (1.0, -2.0, 4.5, 0.0)
-    assert [encoder.command(current) for current in currents] == [by_hand(current) for current in currents]
+    assert [encoder.command(i) for i in (1.0, -2.0, 4.5, 0.0)] == [
+        by_hand(i, n) for i, n in ((1.0, 0), (-2.0, 1), (4.5, 2), (0.0, 0))
+    ]
 
 
 def test_what_the_file_s_range_reaches_to_leaves_and_what_is_beyond_it_does_not() -> None:
@@ -204,7 +214,7 @@ def test_a_current_meant_that_is_beyond_the_limit_is_refused_whatever_the_bytes_
     for limit in (0.0, 0.5):  # little or no current
         it = Guarded(limit)
         assert it.guard.command(by_hand(-limit), -limit) == -limit
-        it.refuses(by_hand(limit + STEP), limit, f"say {limit + STEP:g} A, meant were {limit:g} A")
+        it.refuses(by_hand(limit + STEP, 1), limit, f"say {limit + STEP:g} A, meant were {limit:g} A")
 
 
 def test_bytes_may_be_off_by_half_a_step_and_by_what_floating_point_numbers_are_off() -> None:
@@ -222,6 +232,16 @@ def test_the_message_s_other_signals_say_what_the_file_says() -> None:
     Guarded().refuses(by_hand(1.0, gain=-7 & 0xFF), 1.0, "Gain says -3.5, meant was -3")
     for unused in (1, 8, 15):
         Guarded().refuses(by_hand(1.0, unused=unused), 1.0, "has a bit that no signal covers")
+
+
+def test_a_counter_that_stays_or_leaps_is_refused_until_the_next_one_comes() -> None:
+    it = Guarded()
+    for wrong in (1, 2):
+        it.refuses(by_hand(1.0, wrong), 1.0, f"its counter is {wrong}, expected 0")
+    for counter, wrong in ((0, 0), (1, 0), (2, 1), (0, 2)):
+        it.guard.command(by_hand(1.0, counter), 1.0)
+        it.refuses(by_hand(1.0, wrong), 1.0, f"its counter is {wrong}, expected")
+    assert (it.guard.passed, len(it.bus)) == (4, 4)
 
 
 def test_a_frame_of_a_sequence_that_says_something_else_than_the_file_s_values_is_refused() -> None:
