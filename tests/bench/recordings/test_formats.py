@@ -58,7 +58,6 @@ FORMATS: dict[str, tuple[Callable[[Path], None], str]] = {
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """Each format's file."""
-    pytest.importorskip("asammdf")
     folder, found = tmp_path_factory.mktemp("written"), {}
     for name, (write, _) in FORMATS.items():
         write(folder / name)

@@ -92,7 +92,8 @@ f_v = 1e-4
 
 
 def test_signals_with_times_of_their_own_are_paired_by_these(tmp_path: Path) -> None:
-    asammdf = pytest.importorskip("asammdf")
+    import asammdf
+
     k = np.arange(60)
     turns, torques, times = 0.01 * k, 0.02 * (k % 7), 0.01 * k + 0.001 * (k % 3)
     columns = {"position": (turns, times), "speed": (60.0 * turns, times), "torque": (torques, 0.01 * k + 0.0045)}

@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import pytest
 from google.protobuf.descriptor import FieldDescriptor
 
 from emb_runtime.estimator.estimate import UNITS
 from emb_runtime.log import ring_buffer, topics
 from emb_runtime.records import CycleRecord, NodeState, Reason, RunState
 from tests.independent import DATABASE
+from tools.compile_proto import FOLDER, compile_proto
 
 
 def fields(message: str) -> dict[str, Any]:
@@ -24,9 +24,6 @@ def units(message: str) -> dict[str, str]:
 
 
 def test_the_compiled_messages_are_those_of_the_proto_file(tmp_path: Path) -> None:
-    pytest.importorskip("grpc_tools")
-    from tools.compile_proto import FOLDER, compile_proto
-
     assert compile_proto(tmp_path / "emb.binpb") == 0
     assert (tmp_path / "emb.binpb").read_bytes() == (FOLDER / "emb.binpb").read_bytes()
 
