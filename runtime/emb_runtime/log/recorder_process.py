@@ -80,8 +80,9 @@ class LogWriter:
         self._attach(begin, "emb.dbc", "text/plain", header.dbc.encode())
         for attachment in header.attachments:
             self._attach(begin, *attachment)
+        there = {*header.topics, "/drive/rx"} if header.drive_bus else header.topics
         for topic in topics.TOPICS:
-            if topic not in OPTIONAL or topic in header.topics:
+            if topic not in OPTIONAL or topic in there:
                 self._register(topic)
         # A chunk needs a message to be written, and whoever reads a cut file needs this chunk.
         self.write(ClockRecord(header.start_ns, begin), begin)

@@ -152,7 +152,7 @@ class LogHeader:
     metadata: Mapping[str, Mapping[str, str]]  # Metadata records by name; ``emb.run`` has the run's identity
     messages: tuple[Message, ...] = ()  # Of that DBC: these are decoded
     attachments: Sequence[Attachment] = ()  # Further files: ``policy.onnx``, ``bench.toml``
-    topics: Sequence[str] = ()  # Topics that not every log has, and this one will have
+    topics: Sequence[str] = ()  # Topics that not every log has, and this one will have, but the drive's
     drive_bus: str = ""  # Bus of a mapped drive, whose frames the recorder reads by itself; "" for none
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -17,6 +18,7 @@ import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
+from mcap.records import Channel
 from mcap.stream_reader import StreamReader
 from msgspec import to_builtins
 
@@ -229,6 +231,16 @@ def test_in_real_time_logged_is_when_it_was_written_on_the_same_epoch(tmp_path: 
     end = time.monotonic_ns()
     for message, _ in decode(tmp_path / "a.mcap")["/safety"]:
         assert start + offset < message.publish_time <= message.log_time < end + offset
+
+
+def test_the_topic_of_a_drive_s_bus_is_described_in_the_first_chunk_too() -> None:
+    output, found = io.BytesIO(), list[str]()
+    recorder_process.LogWriter(output, replace(HEADER, drive_bus="can0"))
+    output.seek(0)
+    with pytest.raises(EndOfFile):
+        found.extend(record.topic for record in StreamReader(output).records if isinstance(record, Channel))
+    assert "/drive/rx" in found
+    assert not {"/estimate", "/learnt"} & set(found)
 
 
 def test_the_first_chunk_is_on_disk_before_the_run_begins_and_what_is_recorded_follows(tmp_path: Path) -> None:
