@@ -40,7 +40,7 @@ UNIFORM = math.sqrt(1.0 / 12.0)  # Standard deviation of an error that may be an
 
 
 def is_completed(log: Path) -> bool:
-    """True if a run came to its planned end, its log is whole, and one that only listened has samples enough."""
+    """True if a run came to its planned end, its log is whole, and one that listened has samples enough at rest."""
     try:
         opened = read_log(log)
     except LogError:
@@ -48,7 +48,7 @@ def is_completed(log: Path) -> bool:
     if not opened.complete or opened.exit_reason != "DONE":
         return False
     heard = opened.end.get("heard")
-    return heard is None or json.loads(heard)["pairs"] >= FEWEST
+    return heard is None or json.loads(heard)["resting"] >= FEWEST
 
 
 def at_rest(log: Path, sheet: Bench) -> Rest:

@@ -13,6 +13,7 @@ import numpy as np
 import onnx
 from onnx import numpy_helper
 
+from emb_bench.brake.parameters import SI
 from emb_bench.commission import examination
 from emb_bench.commission.bench_file import contradiction, measured_ranges, not_inside, outside
 from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Rest
@@ -165,7 +166,7 @@ def _judge_rest(rest: Rest, sheet: Bench, found: Findings) -> Findings:
         _require(
             got <= NOISE_EXCESS * most,
             f"the {name} scatters by {got:.3g} {unit} at rest, the data sheet's bench file has {most:.3g}, and the "
-            f"shield would allow for too little: correct noise.{name} {AGAIN}",
+            f"shield would allow for too little: wait until the brake rests, or correct noise.{name} {AGAIN}",
         )
     _require(
         abs(rest.period / sheet.timing.sample_time - 1.0) <= 0.01,
@@ -237,7 +238,7 @@ def _judge_last(last: Identification, sheet: Bench, found: Findings) -> Findings
         got = last.intervals[name]
         _require(
             not last.fits or (got[1] >= low and got[0] <= high),
-            f"by the run with the bench file that was found {name} is {got[0]:.4g} to {got[1]:.4g}, "
+            f"by the run with the bench file that was found {name} is {got[0]:.4g} to {got[1]:.4g} {SI[name]}, "
             f"in the file {low:.4g} to {high:.4g}: the brake is not the one of the steps before, or changes",
         )
     return found

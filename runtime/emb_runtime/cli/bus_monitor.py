@@ -48,7 +48,8 @@ class BusStatistics:
     pairs: int  # Valid pairs
     missing: int  # Pairs that did not come, by the node's own clock
     period: float  # Median time between samples by the node's own clock [s]; NaN with fewer than two
-    angle_scatter: float  # Standard deviation of an idle node's newest angles; NaN for fewer than two [rad]
+    resting: int  # Number of the newest pairs, all of an idle node, that the next two are of
+    angle_scatter: float  # Standard deviation of the angles; NaN for fewer than two [rad]
     velocity_scatter: float  # The same of the velocities [rad/s]
     load: float
     """Share of the bus that all frames took, with every stuff bit that there can be; of a mapped drive's its own."""
@@ -124,6 +125,7 @@ class BusMonitor:
             pairs=self.pairs,
             missing=self._missing,
             period=statistics.median(self._periods_ns) * 1e-9 if self._periods_ns else float("nan"),
+            resting=len(self._at_rest),
             angle_scatter=statistics.stdev(angles) if len(angles) > 1 else math.nan,
             velocity_scatter=statistics.stdev(velocities) if len(velocities) > 1 else math.nan,
             pairing_problem=reception.pairing_problem,

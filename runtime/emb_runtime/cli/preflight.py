@@ -206,7 +206,7 @@ def _noise(f: Findings) -> CheckResult:
     good = heard.angle_scatter <= SCATTER_TOLERANCE * noise.angle
     good = good and heard.velocity_scatter <= SCATTER_TOLERANCE * noise.velocity
     found = f"{heard.angle_scatter:.2g} rad and {heard.velocity_scatter:.2g} rad/s"
-    return _line("noise at rest", found, expected, good)
+    return _line("noise at rest", found if good else f"{found}: noise, or a brake that still creeps", expected, good)
 
 
 def _bus_load(f: Findings) -> CheckResult:

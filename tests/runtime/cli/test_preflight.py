@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import pytest
 
 from emb_bench.sim.transport import open_sim
-from emb_runtime.can.messages import Layout, StatusFrame, StopReason
+from emb_runtime.can.messages import Layout, StatusFrame, StopReason, load_layout
 from emb_runtime.cli.bus_monitor import ENOUGH_PAIRS, BusMonitor, BusStatistics, listen
 from emb_runtime.cli.options import MappedDrive, Stage, parser, prepare
 from emb_runtime.cli.preflight import CHECKS, CheckResult, Findings, RefusedError, Verdict, check, refuse
@@ -48,6 +49,7 @@ def heard(bench: Bench, layout: Layout) -> BusStatistics:
         pairs=200,
         missing=0,
         period=1e-3,
+        resting=ENOUGH_PAIRS,
         angle_scatter=bench.noise.angle,
         velocity_scatter=bench.noise.velocity,
         load=0.27,
@@ -283,6 +285,23 @@ def test_a_node_that_is_not_ready_is_waited_for_until_the_deadline(listened: Cal
     assert heard.duration == pytest.approx(0.999, abs=0.002)
     assert heard.sample is not None
     assert heard.sample.angle == pytest.approx(3.0, abs=0.5)  # the clamped spring creeps
+
+
+def test_the_scatter_is_that_of_the_samples_since_the_node_is_idle(listened: Callable[..., BusMonitor]) -> None:
+    layout, angles = load_layout(), list[float]()
+
+    def active_at_first(frame: Frame) -> Frame:
+        if frame.identifier == layout.angle.identifier:
+            angles.append(layout.decode_angle(frame).angle)
+        if frame.identifier != layout.velocity.identifier or len(angles) > 120:
+            return frame
+        seen = layout.decode_velocity(frame)
+        active = layout.encode_velocity(*seen._replace(node_state=NodeState.ACTIVE))
+        return active._replace(time_ns=frame.time_ns)
+
+    heard = listened(change=active_at_first).statistics()
+    assert (heard.pairs, heard.resting) == (ENOUGH_PAIRS, ENOUGH_PAIRS - 120)
+    assert heard.angle_scatter == pytest.approx(statistics.stdev(angles[120:ENOUGH_PAIRS]))
 
 
 def test_lost_frames_are_missing_pairs_and_damaged_ones_are_rejections(listened: Callable[..., BusMonitor]) -> None:
