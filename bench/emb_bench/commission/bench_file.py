@@ -181,6 +181,7 @@ def _draft(sheet: Bench) -> TOMLDocument:
     shield = {key: value for key, value in document["shield"].items() if key not in LEARNING}
     document["shield"] = {**shield, "ranges": SHEET}
     document.pop("estimator", None)  # it begins with the shield's ranges
+    document.get("plants", {}).pop(MEASURED, None)  # of a commissioning before, whose result may be a data sheet
     return tomlkit.parse(tomlkit.dumps(document))
 
 

@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -148,8 +149,10 @@ def test_each_step_has_left_a_log_of_the_same_brake_and_a_policy(done: tuple[Pat
 def test_it_goes_on_where_the_logs_end_and_comes_to_the_same(done: tuple[Path, Commissioned]) -> None:
     folder, result = done
     (folder / "9-full.mcap").unlink()
+    written = {path: path.stat().st_mtime_ns for path in folder.glob("*.toml")}
     again = commissioning(folder).run()
     assert again.runs == 1
+    assert written == {path: path.stat().st_mtime_ns for path in folder.glob("*.toml")}, "a full disk would empty them"
     assert again.found == result.found
     assert json.dumps(again.document())
 
@@ -190,6 +193,16 @@ def test_a_run_that_was_not_completed_is_done_again_under_another_name(tmp_path:
     with pytest.raises(EnoughError):
         commissioning(tmp_path, up_to("2-zero")).run()
     assert {path.name for path in tmp_path.glob("*.mcap")} == {"1-listen.mcap", "1-listen-attempt2.mcap"}
+
+
+@pytest.mark.parametrize(("resting", "enough"), [(299, False), (300, True)])
+def test_listening_counts_where_the_node_was_idle_for_long_enough_to_know_its_noise(
+    resting: int, enough: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heard = json.dumps({"pairs": 2000, "resting": resting, "angle_scatter": None})
+    log = SimpleNamespace(complete=True, exit_reason="DONE", end={"heard": heard})
+    monkeypatch.setattr(examination, "read_log", lambda _path: log)
+    assert examination.is_completed(Path("1-listen.mcap")) is enough
 
 
 def test_a_motion_of_no_brake_of_the_data_sheet_ends_it_with_what_to_look_at_and_its_exit_code(tmp_path: Path) -> None:

@@ -331,6 +331,14 @@ def test_a_lag_and_features_that_were_found_are_in_the_plant_of_the_file() -> No
     assert bench.shield.current_lag >= 1.9e-5
 
 
+def test_a_file_that_was_found_may_be_the_next_data_sheet_and_leaves_nothing_of_its_plant(sheet: Bench) -> None:
+    text = found_text(sheet, found(sheet, identified=identification(sheet, features={"hysteresis": 0.02})), LOGS)
+    again = parse_bench(text, "the next data sheet")
+    assert again.plants[MEASURED].mechanics.hysteresis == 0.02
+    plain = parse_bench(found_text(again, found(again), LOGS), "found")
+    assert plain.plants[MEASURED].mechanics.hysteresis == 0.0
+
+
 STEP = Step("try", 0.5, (), Window(-1.0, 2.0, 30.0), currents=(1.0, 1.0, -1.5, 0.25))
 
 ESTIMATOR = Estimator(load_bench())
