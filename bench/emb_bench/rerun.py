@@ -397,7 +397,9 @@ def text(again: Rerun, *, verbose: bool = False) -> str:
         found = len(again.differences)
         lines.append(f"NOT reproduced: {found} difference{'s' * (found != 1)} in {counts}")
     if again.stopped:
-        lines.append(f"stopped by   {again.fault.name if again.fault else 'DONE'}")
+        reason = again.fault.name if again.fault else "DONE"
+        after = "" if log.exit_reason == reason else f"; what followed is not played again: {log.exit_reason}"
+        lines.append(f"stopped by   {reason}{after}")
     elif again.followed:
         lines.append("stopped by   nothing: the log ends before the run does, and was followed up to there")
     else:

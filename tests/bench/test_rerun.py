@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from emb_bench.logs.log import read_log
-from emb_bench.rerun import Rerun, carried_policy, rerun
+from emb_bench.rerun import Rerun, carried_policy, rerun, text
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import Bench, load_bench, parse_bench
@@ -173,7 +173,9 @@ def test_a_run_with_any_fault_is_reproduced(
     run: Any = INJECTIONS[fault](record)
     assert fault.name in run.journal.codes
     purpose = "homing" if fault in OF_A_WAY_HOME else "experiment"
-    assert_reproduced(again(run, *laws, on=benches[0], purpose=purpose), run)
+    result = again(run, *laws, on=benches[0], purpose=purpose)
+    assert_reproduced(result, run)
+    assert run.outcome.fault is None or run.outcome.fault.name in text(result)  # of a fault after the stop, too
 
 
 def test_what_the_shield_learnt_comes_out_again_to_the_last_bit_and_an_altered_number_does_not(
