@@ -127,7 +127,7 @@ def main() -> None:
 
 
 def _ours(mass: float, viscous: float, coulomb: float, offset: float) -> Floats:
-    """Unknowns in coordinates of the motor; the published offset opposes the command, ours adds to it."""
+    """Unknowns in our order; the published offset opposes the command, ours adds to it."""
     return np.array([mass, viscous, coulomb, -offset])
 
 

@@ -137,6 +137,8 @@ def test_several_runs_are_compared_with_an_earlier_estimate_and_with_each_other(
     (folder / "last.json").write_text(say("estimate", "good.mcap", "--starts", "1", "--json"))
     worn = ["estimate", "worn.mcap", "--last", "last.json", "--starts", "1"]
     golden("estimate-worn", say(*worn))
+    wrong = ["estimate", "other.mcap", "--model", "exact", "--last", "last.json", "--starts", "1"]
+    golden("estimate-misfit-since", say(*wrong))
     three = ["good.mcap", "again.mcap", "third.mcap"]
     golden("estimate-three", say("estimate", *three, "--profile", "--starts", "1", "-v"))
 

@@ -20,6 +20,7 @@ from emb_bench.report.text import Table, listed, wrapped
 
 SHOWN = 3  # Most logs of a kind that are named without ``-v``
 OF_AN_ESTIMATE = ("estimate", "low", "high", "between_runs", "repeatability")
+OVER_RUNS = f"The mean is weighted by information, total and repeatability are medians. {INTERVALS}"
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ def text(c: Campaign, *, verbose: bool = False) -> str:
         lines += wrapped("NOTE: the runs are of different models: use --model, or name the logs of one")
     lines += ["", *parameter_table(c).lines()]
     if c.method != NONE:
-        lines += wrapped(f"Mean weighted by information, scatter over the stated one, else medians. {INTERVALS}", 0)
+        lines += wrapped(OVER_RUNS, 0)
     return "\n".join([*lines, *listed("", _agreement(c))])
 
 
@@ -188,7 +189,7 @@ def parameter_table(c: Campaign) -> Table:
     """Table of the parameters, over all runs."""
     estimated = c.method != NONE
     header = ["parameter", "identified"] + (
-        ["weighted mean", "total", "repeatability", "scatter"] if estimated else ["bound"]
+        ["mean", "total", "repeatability", "scatter/stated"] if estimated else ["bound"]
     )
     rows = []
     for name, p in c.parameters.items():

@@ -160,8 +160,6 @@ def _caveats(problem: Problem, used: int, periods: int) -> tuple[str, ...]:
     said = [
         "the regressors are measured with noise: the values are biased, and no deviation says by how much",
         f"{used} of {periods} periods count: in the others the direction of motion is not sure, or a sample was lost",
-        "whether the model fits is judged by simulating it at these values, so that their own error counts against "
-        "it: the model itself may be right, which another method tells",
     ]
     if any(r.late is not None and bool(np.any(np.abs(r.late) > ON_THE_GRID * t_s)) for r in problem.records):
         said.append("samples are taken as on the grid, and some are not by their stamps")

@@ -170,7 +170,7 @@ def judge(
         results.append(_model_fit(study, doubt))
     results += [_tolerated(name, one, study, doubt) for name, one in criteria.parameters.items()]
     drifts = {} if study is None else {drift.name: drift for drift in study.drifts}
-    earlier = f"the model: {study.other_model}" if study is not None and study.other_model else ""
+    earlier = f"the change may be the model's: {study.other_model}" if study is not None and study.other_model else ""
     for name, most in criteria.drift.items():
         results.append(_drifted(name, most, drifts.get(name), doubt or earlier, given=last is not None))
     for run in runs:

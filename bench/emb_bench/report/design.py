@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from emb_bench.brake.parameters import UNITS
@@ -32,7 +33,7 @@ def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
 
 def _half(deviation: float, name: str) -> str:
     """Half of the best possible 95 % interval: in percent, or in the unit of an unknown that has no scale."""
-    unit = UNITS.get(name, "").removesuffix("1")  # of a share
+    unit = UNITS.get(name, "").removesuffix("1") if math.isfinite(deviation) else ""  # none of a share
     return f"{spread(NORMAL_95 * deviation, name not in UNITS)} {unit}".rstrip()
 
 

@@ -31,10 +31,11 @@ def text(study: Study, *, verbose: bool = False) -> str:
     lines += listed("  - ", against if verbose or study.model_fits else against[:1])
     lines += listed("NOTE: ", _notes(study))
     lines += ["", *tables.parameters(study, brief=True).lines()]
+    lines += listed("  - ", _remarks(study, trades=study.holds or verbose))
     if study.holds or verbose:
-        lines += [*listed("  - ", _remarks(study)), *wrapped(say.INTERVALS, 0), "", *listed("", _limits(study))]
+        lines += [*wrapped(say.INTERVALS, 0), "", *listed("", _limits(study))]
     else:
-        lines += ["± 95 % (k=2), without the error of the model", ""]
+        lines += [f"± 95 % (k=2), without the {'bias of the method' if study.biased else 'error of the model'}", ""]
     return "\n".join([*lines, *_next(study), *(_evidence(study) if verbose else ())])
 
 
@@ -58,11 +59,11 @@ def _notes(study: Study) -> list[str]:
     return [*study.notes, *apart, say.changed_model(study), say.models(study), *study.estimate.caveats]
 
 
-def _remarks(study: Study) -> Iterator[str]:
-    """Doubts, trade-offs and changes of parameters, each with all parameters that it holds for."""
+def _remarks(study: Study, *, trades: bool) -> Iterator[str]:
+    """Doubts and changes of parameters, and their ``trades``-off, each with all parameters that it holds for."""
     said: dict[str, list[str]] = {}
     for c in study.conclusions:
-        remarks = [c.why_not, f"trades off with {', '.join(c.traded_with)}" if c.traded_with else ""]
+        remarks = [c.why_not, f"trades off with {', '.join(c.traded_with)}" if trades and c.traded_with else ""]
         remarks += [say.drift(c.drift)] if c.drift is not None else []
         if text := "; ".join(filter(None, remarks)):
             said.setdefault(text, []).append(c.label)
@@ -88,7 +89,8 @@ def _limits(study: Study) -> Iterator[str]:
 
 def _next(study: Study) -> list[str]:
     """The next step, or several to choose from."""
-    found = ["find the cause of the stop before the next run"] if study.stopped else say.remedies(study)
+    found = say.remedies(study, stopped=bool(study.stopped))
+    found = ["find the cause of the stop before the next run"] if study.stopped else found
     found = found or [f"emb-replay report {say.logs_of(study)} -o report.html   (-v shows the evidence)"]
     return listed("next: ", found) if len(found) == 1 else ["next", *listed("  - ", found)]
 
@@ -180,6 +182,7 @@ def document(study: Study) -> dict[str, Any]:
         "predicts",
         "identified",
         "drifts",
+        "other_model",
     )
     found |= _fields(study, *of_study, "left_out", "apart")
     document: dict[str, Any] = to_json(found | _fields(e, "caveats", "process_noise", "load_noise", "theta"))

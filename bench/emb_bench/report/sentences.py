@@ -177,14 +177,11 @@ def residual_notes(e: Estimate) -> list[str]:
     """Remarks on the residuals that are no reason against the model."""
     m, found = e.validation, list[str]()
     if m.disturbance is not None:
-        walks = (
-            (m.disturbance.walk, "its velocity does a random walk of {:.3g} rad/s per root of a second"),
-            (m.disturbance.load, "its load does a random walk, that of a current of {:.3g} A per root of a second"),
-        )
-        said = " and ".join(text.format(size) for size, text in walks if size > 0.0)
+        said = " and ".join(random_walks(e.bench.machine, m.disturbance.walk, m.disturbance.load))
         found.append(
-            f"the brake is disturbed by more than the sensors' noise: {said} (likelihood ratio "
-            f"{m.disturbance.ratio:.4g}, {p_value(m.disturbance.p_value)}); the intervals allow for it"
+            f"the {'brake' if e.bench.machine is None else 'machine'} is disturbed by more than the sensors' noise: "
+            f"{said} (likelihood ratio {m.disturbance.ratio:.4g}, {p_value(m.disturbance.p_value)}); the intervals "
+            "allow for it"
         )
     if m.ratio < m.expected[0]:
         found.append(
@@ -196,6 +193,18 @@ def residual_notes(e: Estimate) -> list[str]:
             f"{_coloured(m)}: if only the sensors are disturbed, the model may be right, but the standard deviations "
             "by Fisher information are wrong"
         )
+    return found
+
+
+def random_walks(machine: Machine | None, velocity: float, load: float) -> list[str]:
+    """Random walks of a disturbed machine, of its velocity and of its load; those of size 0 are left out."""
+    found, command = list[str](), quantity(machine, "current")
+    if velocity > 0.0:
+        unit = quantity(machine, "velocity").unit
+        found.append(f"its velocity does a random walk of {velocity:.3g} {unit} per root of a second")
+    if load > 0.0:
+        size = f"{load:.3g} {command.unit}".removesuffix(" 1")
+        found.append(f"its load does a random walk, that of a {command.name} of {size} per root of a second")
     return found
 
 
@@ -304,18 +313,22 @@ def pairs(found: Sequence[str]) -> str:
 # ---- what to do next ----
 
 
-MORE = "run emb-run, whose actor excites all four parameters, and estimate from both logs"
+MORE = "run emb-run, whose actor excites all four parameters, and estimate from all logs together"
 
 
 def logs_of(study: Study) -> str:
     """Logs of a study as arguments of a command."""
     from emb_bench.analysis.study import file_names
 
-    return " ".join(file_names(study.logs)[:3]) + (" ..." if len(study.logs) > 3 else "")
+    end = "" if study.estimate.bench.machine is None else " --map MAP"
+    return " ".join(file_names(study.logs)[:3]) + (" ..." if len(study.logs) > 3 else "") + end
 
 
-def remedies(study: Study) -> list[str]:
-    """Remedies for a model that does not fit or predict, and for parameters that are not identified."""
+def remedies(study: Study, *, stopped: bool) -> list[str]:
+    """Remedies for a model that does not fit or predict, and for parameters that are not identified.
+
+    Where a run was ``stopped`` no further one is named: its cause comes first.
+    """
     e, again = study.estimate, f"emb-replay estimate {logs_of(study)}"
     if study.biased:
         return [f"use another method: {again} --method oem"]
@@ -324,7 +337,7 @@ def remedies(study: Study) -> list[str]:
     if study.apart:
         return [f"estimate from each log alone: emb-replay campaign {logs_of(study)} -o rows.csv"]
     if study.model_fits:
-        return [] if study.identified or e.bench.machine is not None else [MORE]
+        return [] if stopped or study.identified or e.bench.machine is not None else [MORE]
     if e.bench.machine is None:
         found = [f"find a model that explains it: {again} --model all"]
     else:

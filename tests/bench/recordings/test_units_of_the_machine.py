@@ -12,6 +12,7 @@ import pytest
 from emb_bench.brake.parameters import quantity
 from emb_bench.cli.replay import main
 from emb_bench.config.machine import Machine as Kind
+from emb_bench.report.sentences import random_walks
 
 LINEAR = Kind(("J",), (), 0.5, "m", "N")
 TURNING = Kind(("J",), (), 0.5, "rad", "V")
@@ -75,3 +76,11 @@ def test_names_and_units_follow_what_was_measured_and_commanded() -> None:
         *(("angle", "rad"), ("voltage", "V"), ("k_m", "N·m/V"), ("voltage_offset", "V"), ("J", "kg·m²")),
     ]
     assert quantity(None, "current_offset") == ("current_offset", "A")
+
+
+def test_a_disturbance_is_in_the_units_of_the_machine() -> None:
+    for machine, velocity, command in ((LINEAR, "m/s", "a force of 2 N"), (None, "rad/s", "a current of 2 A")):
+        walks = random_walks(machine, 0.5, 2.0)
+        assert f"0.5 {velocity} per" in walks[0]
+        assert f"{command} per" in walks[1]
+    assert random_walks(LINEAR, 0.0, 0.0) == []

@@ -29,6 +29,7 @@ from emb_bench.report import figures
 from emb_bench.report.content import Content, gather
 from emb_bench.report.figures import applied_as_sent
 from emb_bench.report.page import document, intervals, report_page
+from emb_bench.report.sentences import MORE
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import EXIT_OUTSIDE
 from emb_runtime.log.ring_buffer import Attachment, EventRecord
@@ -174,6 +175,17 @@ def gathered(bench: Bench, *paths: Path) -> Content:
     """What a report would say, without the figures."""
     options = StudyOptions(EstimationProblem(), starts=1)
     return gather(bench, [read_log(path) for path in paths], [], options, "x")
+
+
+def test_a_further_run_is_named_where_a_parameter_is_not_identified_and_none_was_stopped(
+    folder: Path, bench: Bench, simulate: Simulate
+) -> None:
+    pages = []
+    for fails_at in (math.inf, 40):
+        run = simulate(lambda _a, _v, k, at=fails_at: math.nan if k >= at else 0.02, options="plant=exact", steps=60)
+        path = write_log(folder / f"stands-{fails_at}.mcap", run, steps=60)
+        pages.append(report_page(gathered(bench, path)))
+    assert [MORE[1:] in page for page in pages] == [True, False]
 
 
 def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate) -> None:
