@@ -83,7 +83,8 @@ def main(argv: list[str] | None = None) -> int:
             args.folder.mkdir(parents=True, exist_ok=True)
             result = Commissioning(args.folder, sheet, args.iface, each, emb_run, mention).run()
         except OSError as err:
-            raise UsageError(f"{args.folder}: {err.strerror}; expected a folder, made if there is none") from err
+            where, expected = err.filename or args.folder, "expected a folder to write in, made if there is none"
+            raise UsageError(f"{where}: {err.strerror}; {expected}") from err
         show(as_json(result.document()) if args.json else str(result))
     except EmbError as err:
         return complain("emb-commission", err)
