@@ -22,6 +22,7 @@ from emb_runtime.control.actor import Actor, Still, homing_steps
 from emb_runtime.control.core import Core, Proposal
 from emb_runtime.control.loop import detail_of, fault_of
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
+from emb_runtime.drives.mapping import mapping_hash
 from emb_runtime.errors import BusError, LogError, UsageError
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord
@@ -303,10 +304,14 @@ def rerun_as_recorded(log: RunLog) -> Rerun:
         policy = carried_policy(log)
         again = rerun(log, policy, policy.contract.limits.current, _stop_condition(log))
         hashes["policy_sha256"] = policy.sha256
+    recorded = dict(log.run)
+    if log.drive_files is not None:
+        hashes["mapping_sha256"] = mapping_hash(*log.drive_files)
+        recorded["mapping_sha256"] = log.metadata["emb.drive"].get("sha256", "")
     others = [
-        Difference(None, name, log.run[name], value)
+        Difference(None, name, recorded[name], value)
         for name, value in hashes.items()
-        if log.run.get(name, value) != value
+        if recorded.get(name, value) != value
     ]
     return replace(again, differences=(*others, *again.differences))
 

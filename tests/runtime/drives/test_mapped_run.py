@@ -6,6 +6,7 @@ import html
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 
 from emb_bench.api import fisher_information, open_run
 from emb_bench.cli.replay import main as emb_replay
+from emb_bench.rerun import rerun_as_recorded
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import parse_bench
 from emb_runtime.drives.lock_step import open_mapped
@@ -59,7 +61,9 @@ def test_a_run_on_a_mapped_drive_is_a_run_and_its_information_that_of_our_node(
     assert math.expm1((mapped - ours) / 4.0) == pytest.approx(0.0, abs=0.01)  # per parameter
 
 
-def test_the_log_has_the_mapping_and_reruns(odrive: tuple[MappedBus, EmbRun], tmp_path: Path) -> None:
+def test_the_log_has_the_mapping_and_reruns_and_another_mapping_in_it_is_found(
+    odrive: tuple[MappedBus, EmbRun], tmp_path: Path
+) -> None:
     bus, emb_run = odrive
     emb_run.document()
     log = emb_run.log()
@@ -70,6 +74,9 @@ def test_the_log_has_the_mapping_and_reruns(odrive: tuple[MappedBus, EmbRun], tm
     assert {frame.identifier for frame in bus.sent} - {0} == {0x00B, 0x007, 0x00E, 0x018}
     assert log.span[1] - log.span[0] == pytest.approx(0.7e9, abs=0.1e9)  # each frame has its time, the gateway's, too
     assert emb_replay(["rerun", str(tmp_path / "run.mcap")]) == 0
+    files = {"drive.toml": bus.mapping.text.replace("0.0217", "0.0218").encode()}
+    again = rerun_as_recorded(replace(log, attachments={**log.attachments, **files}))
+    assert [difference.what for difference in again.differences] == ["mapping_sha256"]
 
 
 def test_pre_flight_report_and_summary_name_what_the_drive_lacks(
