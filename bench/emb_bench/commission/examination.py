@@ -48,7 +48,7 @@ def is_completed(log: Path) -> bool:
     if not opened.complete or opened.exit_reason != "DONE":
         return False
     heard = opened.end.get("heard")
-    return heard is None or json.loads(heard)["resting"] >= FEWEST
+    return heard is None or json.loads(heard).get("resting", 0) >= FEWEST
 
 
 def at_rest(log: Path, sheet: Bench) -> Rest:

@@ -195,12 +195,11 @@ def test_a_run_that_was_not_completed_is_done_again_under_another_name(tmp_path:
     assert {path.name for path in tmp_path.glob("*.mcap")} == {"1-listen.mcap", "1-listen-attempt2.mcap"}
 
 
-@pytest.mark.parametrize(("resting", "enough"), [(299, False), (300, True)])
+@pytest.mark.parametrize(("heard", "enough"), [({"resting": 299}, False), ({"resting": 300}, True), ({}, False)])
 def test_listening_counts_where_the_node_was_idle_for_long_enough_to_know_its_noise(
-    resting: int, enough: bool, monkeypatch: pytest.MonkeyPatch
+    heard: dict[str, int], enough: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    heard = json.dumps({"pairs": 2000, "resting": resting, "angle_scatter": None})
-    log = SimpleNamespace(complete=True, exit_reason="DONE", end={"heard": heard})
+    log = SimpleNamespace(complete=True, exit_reason="DONE", end={"heard": json.dumps({"pairs": 2000, **heard})})
     monkeypatch.setattr(examination, "read_log", lambda _path: log)
     assert examination.is_completed(Path("1-listen.mcap")) is enough
 
