@@ -20,6 +20,7 @@ from types import FrameType
 from typing import Any
 
 INTERFACE, SECOND_INTERFACE = "vcan0", "vcan1"
+IP = "/sbin/ip"  # Of the package iproute2
 #: In the order of their dependencies, each with its parameters.
 _MODULES = (
     ("can", ""), ("can-raw", ""), ("can-bcm", ""), ("can-gw", ""), ("can-dev", ""),
@@ -88,7 +89,7 @@ def _make_interfaces() -> None:
 
 
 def _ip(*words: str) -> None:
-    subprocess.run(["/sbin/ip", "link", *words], check=True)
+    subprocess.run([IP, "link", *words], check=True)
 
 
 def _raise_soft_interrupts() -> None:

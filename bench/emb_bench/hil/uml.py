@@ -27,7 +27,7 @@ from pathlib import Path
 from types import FrameType
 from typing import IO, Any
 
-from emb_bench.hil.guest import JOB_FILE, RUNNING, SIGNAL_FILE, SIGNALS
+from emb_bench.hil.guest import IP, JOB_FILE, RUNNING, SIGNAL_FILE, SIGNALS
 from emb_runtime.cli.summary import SLOW_MARK
 from emb_runtime.errors import BusError
 
@@ -127,6 +127,8 @@ def _program() -> str:
     found = shutil.which(PROGRAM)
     if found is None:
         raise BusError(f"no User-Mode Linux kernel ({PROGRAM}) on PATH: `sudo apt-get install {PACKAGE}`. {_UBUNTU}")
+    if not Path(IP).exists():
+        raise BusError(f"no {IP}, which makes the interfaces in the kernel: `sudo apt-get install iproute2`")
     return found
 
 

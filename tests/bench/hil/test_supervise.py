@@ -11,6 +11,7 @@ import pytest
 
 from emb_bench.hil import uml
 from emb_bench.hil.cli import main
+from emb_runtime.errors import EXIT_BUS
 
 
 def test_ctrl_c_while_a_kernel_is_made_ready_ends_it_and_leaves_nothing(
@@ -30,6 +31,17 @@ def test_ctrl_c_while_a_kernel_is_made_ready_ends_it_and_leaves_nothing(
     assert main(["--uml", "--", "true"]) == 130
     assert capfd.readouterr() == ("", "")
     assert list((tmp_path / "state").iterdir()) == []
+
+
+def test_what_is_not_installed_is_named_with_its_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / uml.PROGRAM).touch(mode=0o755)
+    monkeypatch.setattr(uml, "IP", str(tmp_path / "ip"))
+    for path, package in (("", uml.PACKAGE), (str(tmp_path), "iproute2")):
+        monkeypatch.setenv("PATH", path)
+        assert main(["--uml", "--", "true"]) == EXIT_BUS
+        assert f"apt-get install {package}`" in capfd.readouterr().err
 
 
 def test_two_kernels_share_no_processor_and_a_further_one_is_not_pinned(
