@@ -58,7 +58,6 @@ COMMANDS = {
 CYCLES, FRAMES = "/cycle", ["/can/rx", "/can/tx"]
 """Topics of a log."""
 RENAMED: dict[str, dict[str, str]] = {
-    "rerun": {"stopped": "ended"},
     "estimate": {"together": "suspects_together"},
 }
 """Keys of JSON documents by section: the new name, and the frozen one."""
@@ -75,8 +74,6 @@ GONE: dict[str, str] = {
     "estimate/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
     "report/*/bounds*": "the range of a search is a tenth of nominal to ten times it",
     "estimate/*/growth*": "estimate --grow is no more: score tests name the missing effect, --model all compares",
-    "rerun/*/says/frames": "a cycle record has the current and the counter of its command: the frame is made of them",
-    "rerun/*/says/home": "a rerun ends where the run stops: nothing is decided on after that",
     "campaign/*/rms_error_sigmas": "the rows have the error of each run",
     "campaign/*/covered": "the rows have the error of each run",
     "campaign/*/spread*": "the test of homogeneity has the scatter of the runs",
@@ -107,8 +104,6 @@ EXPLAINED: dict[str, str] = {
     "estimate/several oem/says/misfit/suspects/contact/*": "0.06 of a thousandth of it is beside the logs' own offsets",
     "estimate/*/says/misfit/notes": JOINED,
     "estimate/*/says/misfit/alarms": JOINED,
-    "rerun/*/says/events": "those after the stop are not compared",
-    "rerun/*/says/differences*": "sent frames are not compared",
     "demo/run/numbers/24": "kB of the log: /clock has no drift_ns",
     "design/*/says/local_optima/*": OTHER_SEARCH,
     "design/*/says/checks/*": OTHER_SEARCH,

@@ -240,10 +240,10 @@ def rerun(run: Source) -> Rerun:
     """Run the loop again from the log of a run, and compare what it decides.
 
     The control loop runs again with the policy, bench file and DBC of the log. Bus and clock give the frames and times
-    that the log recorded. Each decision (policy, clip, shield, sent current, its reason), each estimate and each safety
-    event up to the stop must be the same, numbers to the last bit. A cut log is compared up to its end. Rounding may
-    differ with another ONNX Runtime, numpy, Python or processor. If a decision differs, the versions of the log are
-    printed too.
+    that the log recorded. Each decision (policy, clip, shield, sent current, its reason), each estimate, each sent
+    frame, each safety event and the outcome must be the same, numbers to the last bit. A cut log is compared up to its
+    end. Rounding may differ with another ONNX Runtime, numpy, Python or processor. If a decision differs, the versions
+    of the log are printed too.
 
     Args:
         run: MCAP file of emb-run.

@@ -2,32 +2,38 @@
 
 The log has the frames of each read with its time, and the cycle records have the times of deciding and sending. A fault
 from outside (the operator, the watchdog, a lost bus) and a wait in vain stand in the log as events: where the next
-record is one, it is given to the core. A rerun ends where the run stops: nothing is decided after that.
+record is one, it is given to the core. A stop frame names the newest sample, and so its place among the frames.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import msgspec
 
 from emb_bench.logs.estimates import by_step, learnt_by_step
 from emb_bench.logs.log import RunLog, require_driven
+from emb_runtime.can.e2e import COUNTER_MODULUS
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import CEILING_CURRENT
 from emb_runtime.control.actor import Actor, Still, homing_steps
 from emb_runtime.control.core import Core, Proposal
 from emb_runtime.control.loop import detail_of, fault_of
+from emb_runtime.control.result import Outcome
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.drives.mapping import mapping_hash
-from emb_runtime.errors import BusError, LogError, UsageError
+from emb_runtime.errors import BusError, FrameError, LogError, UsageError
 from emb_runtime.estimator.estimator import estimated
+from emb_runtime.log.recorder_process import DIED
 from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord
 from emb_runtime.records import CycleRecord, Frame, RunState
 from emb_runtime.safety.guard import Guard
+from emb_runtime.safety.heartbeat import STOP_FRAMES
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.safety.state_machine import FAULTS, Fault
 
@@ -39,6 +45,8 @@ FROM_OUTSIDE = frozenset(
     {Fault.INTERRUPTED, Fault.WATCHDOG_TRIPPED, Fault.WATCHDOG_LOST, Fault.BUS_LOST, Fault.INTERNAL}
 )
 """Faults that the driver gives to the core."""
+AT_REST = frozenset({RunState.OVER.name, Fault.NOT_AT_REST.name, Fault.MOTION_UNEXPLAINED.name})
+"""Events at the end of a stop."""
 
 
 class Difference(NamedTuple):
@@ -77,15 +85,21 @@ def read_items(log: RunLog) -> tuple[Item, ...]:
 
 
 class Playback:
-    """The run of a log again, up to its stop."""
+    """The run of a log again."""
 
     def __init__(self, log: RunLog) -> None:
         self._items = read_items(log)
         self._estimates, self._learnt = by_step(log), learnt_by_step(log)
+        self._layout = log.layout
         self._at = 0
         self._step: int | None = None
         self._refusal: BusError | None = None  # of the next frame by the bus
+        self._sent: list[tuple[int | None, Frame]] = []
+        self._echoed = 0  # frames of those that were found on the bus
+        self._stop_echoes = deque(self._recorded_stop_frames())
+        self._stops = 0  # stop frames tried
         self.decisions = 0  # Cycle records compared
+        self.frames = 0  # Sent frames found on the bus
         self.events = 0  # Safety events compared
         self.differences: list[Difference] = []  # Differences in the order in which they came
 
@@ -94,18 +108,20 @@ class Playback:
         """Returns True if all that was recorded has been played."""
         return self._at == len(self._items)
 
-    def send(self, _frame: Frame) -> None:
-        """Take a frame that the guard has let out, as the bus did."""
+    def send(self, frame: Frame) -> None:
+        """Take a frame that the guard has let out."""
         refusal, self._refusal = self._refusal, None
         if refusal is not None:
             raise refusal
+        self._sent.append((self._step, frame))
 
-    def play(self, core: Core) -> bool:
-        """Play what was recorded; returns False if the core has left it."""
+    def play(self, core: Core) -> None:
+        """Play all that was recorded, or until the core leaves it."""
         try:
             core.begin(_time_ns(self._items[0]))
             self._compare(core)
-            while core.running and not self.at_end:
+            while not self.at_end:
+                self._send_stop_frames(core)
                 item = self._items[self._at]
                 if isinstance(item, FrameRecord):
                     self._give_read(core)
@@ -115,8 +131,10 @@ class Playback:
                     raise self._left(_words(item), "no command was due")
                 self._compare(core)
         except LeftError:
-            return False
-        return True
+            return
+        if core.state is RunState.OVER and core.fault is not Fault.BUS_LOST:  # else the last one may have been lost
+            for step, frame in self._sent[self._echoed :]:
+                self.differences.append(Difference(step, "sent frame", "no such frame", _hex(frame)))
 
     # --- what goes in -----------------------------------------------------------------------------------------------
 
@@ -174,14 +192,24 @@ class Playback:
     def _give_event(self, core: Core, event: EventRecord) -> None:
         """Give what stands in the log as an event, and does not follow from the frames."""
         fault = Fault.__members__.get(event.code)
-        if fault in WAITED:
+        if core.running and fault in WAITED:
             if core.state is RunState.SILENT:
                 core.timeout(event.time_ns)
             while not core.records and core.deadline_ns <= event.time_ns:
                 core.timeout(event.time_ns)
-        elif fault in FROM_OUTSIDE:
+        elif fault in FROM_OUTSIDE and core.fault is None:
             assert fault is not None
             self._fail(core, fault, _detail(event), event.time_ns)
+        elif core.state is RunState.STOPPING and event.code == "STOP_FRAME_NOT_SENT":
+            self._refusal = BusError(_detail(event))
+            self._send_stop_frame(core, event.time_ns)
+            core.note(event.time_ns, event.code, event.text)
+        elif core.state is RunState.STOPPING and event.code.endswith("_FAILED"):  # a step of the stop
+            core.note(event.time_ns, event.code, event.text)
+        elif core.state is RunState.STOPPING and event.code in AT_REST:
+            while self._stops < STOP_FRAMES and core.fault is not Fault.WATCHDOG_TRIPPED:
+                self._send_stop_frame(core, event.time_ns)
+            core.end(event.time_ns)
         if not core.records:
             raise self._left(_words(event), "no such event")
 
@@ -189,6 +217,27 @@ class Playback:
     def _fail(core: Core, fault: Fault, detail: str, time_ns: int) -> None:
         core.fail(fault, time_ns)
         core.explain(fault, detail)
+
+    def _send_stop_frames(self, core: Core) -> None:
+        """Send the stop frames that were sent before the next sample."""
+        while core.state is RunState.STOPPING and self._stop_echoes and self._stop_echoes[0] == core.newest_counter:
+            self._stop_echoes.popleft()
+            self._send_stop_frame(core, 0)
+
+    def _send_stop_frame(self, core: Core, time_ns: int) -> None:
+        self._stops += 1
+        with contextlib.suppress(BusError):
+            core.guard.send(core.stop_frame(), core.state, time_ns, time_ns)
+
+    def _recorded_stop_frames(self) -> list[int]:
+        """Samples that the stop frames on the bus answer."""
+        answers = []
+        for item in self._items:
+            if isinstance(item, FrameRecord) and item.frame.own:
+                with contextlib.suppress(FrameError):  # of another log than ours
+                    command = self._layout.decode_command(item.frame)
+                    answers += [] if command.enable else [command.answers]
+        return answers
 
     # --- what comes out ---------------------------------------------------------------------------------------------
 
@@ -212,7 +261,10 @@ class Playback:
                     self.differences.append(Difference(item.step, name, repr(recorded), repr(came)))
         elif isinstance(item, EventRecord) and isinstance(record, EventRecord) and item.code == record.code:
             self.events += 1
-        elif not (isinstance(item, FrameRecord) and isinstance(record, FrameRecord)):
+        elif isinstance(item, FrameRecord) and isinstance(record, FrameRecord):
+            if item.frame.own:
+                self._find_sent(item.frame)
+        else:
             raise self._left(_words(item), _words(record))
 
     def _compare_numbers(
@@ -223,6 +275,21 @@ class Playback:
             return  # the log was cut just there
         if recorded is None or len(recorded) != len(came) or not all(map(_same, recorded, came)):
             self.differences.append(Difference(step, what, repr(recorded), repr(came)))
+
+    def _find_sent(self, echo: Frame) -> None:
+        """Find the sent frame whose echo was recorded; those before it were not on the bus."""
+        waiting = self._sent[self._echoed : self._echoed + COUNTER_MODULUS]
+        bare = echo._replace(time_ns=0, own=False, dropped=0)
+        at = next((n for n, (_, frame) in enumerate(waiting) if frame == bare), None)
+        if at is None:
+            step, came = (waiting[0][0], _hex(waiting[0][1])) if waiting else (self._step, "no such frame")
+            self.differences.append(Difference(step, "sent frame", _hex(echo), came))
+            self._echoed += bool(waiting)
+            return
+        for step, frame in waiting[:at]:
+            self.differences.append(Difference(step, "sent frame", "no such frame", _hex(frame)))
+        self._echoed += at + 1
+        self.frames += 1
 
     def _left(self, recorded: str, came: str) -> LeftError:
         self.differences.append(Difference(self._step, "what came next", recorded, came))
@@ -252,10 +319,14 @@ def _time_ns(item: Item) -> int:
             return item.time_ns
 
 
+def _hex(frame: Frame) -> str:
+    return f"{frame.identifier:03x}#{frame.data.hex()}"
+
+
 def _words(item: Item) -> str:
     match item:
         case FrameRecord():
-            return f"frame {item.frame.identifier:03x}#{item.frame.data.hex()}"
+            return f"frame {_hex(item.frame)}"
         case CycleRecord():
             return f"the record of step {item.step}"
         case EventRecord(_, code, text):
@@ -282,12 +353,13 @@ class Rerun:
 
     log: RunLog
     decisions: int  # Cycle records compared
+    frames: int  # Sent frames compared
     events: int  # Safety events compared
     differences: tuple[Difference, ...]  # Differences in the order in which they occurred
     followed: bool
-    """False if the loop diverged from the log; the last difference shows where."""
-    stopped: bool  # The rerun came to the stop of the run
-    fault: Fault | None  # Fault that stopped it
+    """True if the whole log was played; if not, the loop diverged from it, and the last difference shows where."""
+    outcome: Outcome | None
+    """Outcome of the rerun; None if it diverged from the log, or the log ended, before the rerun did."""
 
     @property
     def reproduced(self) -> bool:
@@ -297,23 +369,14 @@ class Rerun:
 
 def rerun_as_recorded(log: RunLog) -> Rerun:
     """Run the loop of a log again with the policy that it carries, and compare what it carries with its hashes."""
-    hashes = {"bench_hash": log.bench.identity_hash}
     if recorded_run(log).purpose == "homing":
         again = rerun(log, Still(), log.bench.limits.current)
+        carried: dict[str, str] = {}
     else:
         policy = carried_policy(log)
         again = rerun(log, policy, policy.contract.limits.current, _stop_condition(log))
-        hashes["policy_sha256"] = policy.sha256
-    recorded = dict(log.run)
-    if log.drive_files is not None:
-        hashes["mapping_sha256"] = mapping_hash(*log.drive_files)
-        recorded["mapping_sha256"] = log.metadata["emb.drive"].get("sha256", "")
-    others = [
-        Difference(None, name, recorded[name], value)
-        for name, value in hashes.items()
-        if recorded.get(name, value) != value
-    ]
-    return replace(again, differences=(*others, *again.differences))
+        carried = {"policy_sha256": policy.sha256}
+    return replace(again, differences=(*_identity(log, carried), *again.differences))
 
 
 def carried_policy(log: RunLog) -> Policy:
@@ -341,15 +404,16 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
         homing=run.purpose == "homing",
         stop_condition=stop_condition,
     )
-    followed = playback.play(core)
+    playback.play(core)
+    outcome = core.outcome() if core.state is RunState.OVER and playback.at_end else None
     return Rerun(
         log=log,
         decisions=playback.decisions,
+        frames=playback.frames,
         events=playback.events,
-        differences=tuple(playback.differences),
-        followed=followed,
-        stopped=followed and not core.running,
-        fault=core.fault,
+        differences=(*playback.differences, *(() if outcome is None else _end(log.end, outcome))),
+        followed=playback.at_end,
+        outcome=outcome,
     )
 
 
@@ -375,6 +439,32 @@ def _stop_condition(log: RunLog) -> StopCondition | None:
         raise LogError(f"{log.path}: emb.run: stop_when: {err}") from err
 
 
+def _end(recorded: Mapping[str, str], outcome: Outcome) -> list[Difference]:
+    """Differences between the outcome in the log's trailer and that of the rerun; a run whose process died has none."""
+    if recorded.get("exit_reason", DIED) == DIED:
+        return []
+    came = {"exit_reason": outcome.fault.name if outcome.fault else "DONE"}
+    came |= {name: str(value) for name, value in asdict(outcome.counters).items()}
+    return [
+        Difference(None, name, recorded[name], value)
+        for name, value in came.items()
+        if name in recorded and recorded[name] != value
+    ]
+
+
+def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
+    """Differences between the hashes of what the log carries and those that it records."""
+    recorded = dict(log.run)
+    if log.drive_files is not None:
+        carried = {**carried, "mapping_sha256": mapping_hash(*log.drive_files)}
+        recorded["mapping_sha256"] = log.metadata["emb.drive"]["sha256"]
+    return [
+        Difference(None, name, recorded[name], value)
+        for name, value in {**carried, "bench_hash": log.bench.identity_hash}.items()
+        if recorded.get(name, value) != value
+    ]
+
+
 def document(again: Rerun) -> dict[str, Any]:
     """The result as plain data."""
     log = again.log
@@ -384,9 +474,11 @@ def document(again: Rerun) -> dict[str, Any]:
         "missing": log.missing,
         "reproduced": again.reproduced,
         "decisions": again.decisions,
+        "frames": again.frames,
         "events": again.events,
+        "ended": again.outcome is not None,
+        "home": None if again.outcome is None else again.outcome.home,
         "followed": again.followed,
-        "stopped": again.stopped,
         "differences": [difference._asdict() for difference in again.differences],
     }
 
@@ -395,20 +487,19 @@ def text(again: Rerun, *, verbose: bool = False) -> str:
     """Result as text; with ``verbose`` every difference."""
     log, shown = again.log, len(again.differences) if verbose else SHOWN
     lines = [f"WARNING: {log.missing}"] if log.missing else []
-    counts = f"{again.decisions} decisions, {again.events} events"
+    counts = f"{again.decisions} decisions, {again.frames} sent frames, {again.events} events"
     if again.reproduced:
         lines.append(f"reproduced   each of {counts}")
     else:
         found = len(again.differences)
         lines.append(f"NOT reproduced: {found} difference{'s' * (found != 1)} in {counts}")
-    if again.stopped:
-        reason = again.fault.name if again.fault else "DONE"
-        after = "" if log.exit_reason == reason else f"; what followed is not played again: {log.exit_reason}"
-        lines.append(f"stopped by   {reason}{after}")
+    if again.outcome is not None:
+        home = "home" if again.outcome.home else "not home"
+        lines.append(f"outcome      {again.outcome.fault.name if again.outcome.fault else 'DONE'}, {home}")
     elif again.followed:
-        lines.append("stopped by   nothing: the log ends before the run does, and was followed up to there")
+        lines.append("outcome      none: the log ends before the run does, and was followed up to there")
     else:
-        lines.append("stopped by   nothing: the loop went another way than the log, the last difference says where")
+        lines.append("outcome      none: the loop went another way than the log, the last difference says where")
     for difference in again.differences[:shown]:
         where = "" if difference.step is None else f"step {difference.step}, "
         lines.append(f"  {where}{difference.what}: recorded {difference.recorded}, came {difference.came}")

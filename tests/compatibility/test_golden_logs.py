@@ -16,19 +16,19 @@ from emb_bench.cli.replay import main
 from emb_bench.logs.log import read_log
 
 FOLDER = Path(__file__).parent / "golden"
-LOGS = {"done": ("DONE", 251, 4), "rejected": ("FRAMES_REJECTED", 215, 12)}
-"""Exit reason, and how many decisions and safety events each holds until the run stops."""
+LOGS = {"done": ("DONE", 251, 253, 5), "rejected": ("FRAMES_REJECTED", 215, 218, 47)}
+"""Exit reason, and how many decisions, sent frames and safety events each holds."""
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_every_decision_and_event_of_a_golden_log_comes_out_again(
+def test_every_decision_frame_and_event_of_a_golden_log_comes_out_again(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    reason, decisions, events = LOGS[name]
+    reason, decisions, frames, events = LOGS[name]
     assert main(["rerun", str(FOLDER / f"{name}.mcap"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["differences"] == []
-    assert (found["decisions"], found["events"]) == (decisions, events)
+    assert (found["decisions"], found["frames"], found["events"]) == (decisions, frames, events)
     log = read_log(FOLDER / f"{name}.mcap")
     assert log.complete
     assert log.end["exit_reason"] == reason

@@ -98,7 +98,8 @@ def test_a_run_that_has_lost_its_estimate_has_none_at_the_end(
 def test_a_run_that_ended_early_decides_and_estimates_the_same_again(write: Write, bench: Bench) -> None:
     result = again(write(), bench)
     assert result.differences == ()
-    assert result.stopped
+    assert result.outcome is not None
+    assert result.outcome.goal_reached
 
 
 def test_an_estimate_that_is_other_in_its_last_bit_or_missing_is_reported(write: Write, bench: Bench) -> None:

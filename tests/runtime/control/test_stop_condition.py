@@ -184,7 +184,7 @@ def test_a_run_is_logged_with_its_estimates_and_decides_the_same_again(
     assert table["publish_time"].tolist() == log.cycles["publish_time"][:500].tolist()
     assert (np.diff(table["k_m_deviation"]) < 1e-4 * BENCH.brake.k_m).all()
     assert emb_replay(["rerun", str(path)]) == 0
-    assert capsys.readouterr().out.startswith("reproduced   each of 501 decisions, ")
+    assert capsys.readouterr().out.startswith("reproduced   each of 501 decisions, 503 sent frames")
     assert emb_replay(["info", str(path)]) == 0
     assert "\n  f_v  " in capsys.readouterr().out
     assert emb_replay(["info", str(path), "--json"]) == 0
