@@ -30,7 +30,7 @@ from scipy import special
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Marginal, Problem, by_record
 from emb_bench.estimate.records import Disturbance, Independence, ModelValidation, Whiteness
-from emb_bench.estimate.suspects import Shown, Simulated, score
+from emb_bench.estimate.suspects import DEPENDENT, Shown, Simulated, score
 
 Bools = NDArray[np.bool_]
 
@@ -38,8 +38,6 @@ OUTPUTS = ("angle", "velocity")
 LEVEL = 0.01  # Chance of a false alarm of all tests together
 LAGS = 10  # Periods back in which a current may still show in a residual
 NEIGHBOURS = 20  # Lags at which residuals are compared with each other
-
-_DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
 
 
 def examine(
@@ -185,7 +183,7 @@ def _independence(
     scaled = regressors / np.where(lengths > 0.0, lengths, 1.0)
     beside = scaled - model @ (model.T @ scaled)
     left, values, _ = np.linalg.svd(beside, full_matrices=False)
-    kept = left[:, values > _DEPENDENT]
+    kept = left[:, values > DEPENDENT]
     seen = counts.reshape(-1, 2)[:, output]
     correlations = [_correlation(e[: len(counts)].reshape(-1, 2)[seen, output], past[seen, lag]) for lag in range(LAGS)]
     lag = int(np.argmax(np.abs(correlations)))

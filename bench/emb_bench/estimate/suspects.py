@@ -43,7 +43,7 @@ ALIKE = 2.0  # Difference of two suspects' squared scores below which they are h
 
 DRIFT_STEP = 1e-4  # Step of the secant of a drift
 
-_DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
+DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
 
 
 class Shown(Protocol):
@@ -232,7 +232,7 @@ def score(
         whole[: len(column)] = column
         beside = whole - model @ (model.T @ whole)
         length = float(np.linalg.norm(beside))
-        if length <= _DEPENDENT * float(np.linalg.norm(whole)):
+        if length <= DEPENDENT * float(np.linalg.norm(whole)):
             length, beside = 0.0, np.zeros(len(errors))
         if name in priors:
             # What drifts is fitted as it is in the middle of a run, and meant from the begin to the end.
