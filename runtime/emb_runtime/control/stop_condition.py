@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError, near
-from emb_runtime.estimator.estimate import UNITS
 
-NAMES, COUNT = tuple(UNITS), len(UNITS)
+COUNT = len(PARAMETER_NAMES)  # An estimate has so many values, then their deviations
 REACHED = "KNOWN_ENOUGH"  # Code of the event that says so in the log
 
 
@@ -26,7 +26,7 @@ class StopCondition:
     def describe(self, estimate: Sequence[float]) -> str:
         """Deviations and their bounds in words, of a condition that is met."""
         return ", ".join(
-            f"{NAMES[at]} to {100.0 * estimate[COUNT + at] / abs(estimate[at]):.3g} % of {100.0 * part:.3g} %"
+            f"{PARAMETER_NAMES[at]} to {100.0 * estimate[COUNT + at] / abs(estimate[at]):.3g} % of {100.0 * part:.3g} %"
             for at, part in self.parts
         )
 
@@ -41,9 +41,9 @@ def parse_stop_condition(text: str, names: Sequence[str]) -> StopCondition:
         if (name := name.strip()) not in names:
             expected = f"--stop-when: expected one of {', '.join(names)}, which are estimated"
             raise UsageError(f"{expected}, got '{name}'{near(name, names)}")
-        if NAMES.index(name) in parts:
+        if PARAMETER_NAMES.index(name) in parts:
             raise UsageError(f"--stop-when: {name} is named twice")
-        parts[NAMES.index(name)] = _part(name, percent.strip())
+        parts[PARAMETER_NAMES.index(name)] = _part(name, percent.strip())
     return StopCondition(text, tuple(parts.items()))
 
 

@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from emb_runtime.config.bench import PARAMETER_NAMES
+
 LOST = "ESTIMATE_LOST"  # Code of the event after which a run has no estimate: it was not finite
 NORMAL_95 = 1.959963984540054  # Standard deviations that 95 % of a Gaussian lie within
-
-
 UNITS = {"k_m": "N·m/A", "k_1": "N/rad", "T_c": "N·m", "f_v": "N·m·s/rad"}  # Of the parameters
 
 
@@ -25,7 +25,7 @@ def by_name(numbers: Sequence[float]) -> dict[str, dict[str, Any]]:
             "interval_95": [value - NORMAL_95 * deviation, value + NORMAL_95 * deviation],
             "unit": UNITS[name],
         }
-        for name, value, deviation in zip(UNITS, numbers[:4], numbers[4:], strict=False)
+        for name, value, deviation in zip(PARAMETER_NAMES, numbers, numbers[len(PARAMETER_NAMES) :], strict=False)
         if deviation > 0.0
     }
 
