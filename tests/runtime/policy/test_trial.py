@@ -60,6 +60,7 @@ def test_whatever_happens_to_the_process_is_a_refusal_of_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trial, "MULTIPLE", 1.0)
+    monkeypatch.setattr(trial, "LEAST", 0.0)
     before = children()
     for code, said in (
         ("while True: pass", "of processor time"),
@@ -96,10 +97,26 @@ def test_an_honest_actor_is_admitted_on_a_computer_that_is_five_times_as_slow(
     admit_policy(shipped_actor_path(), BENCH)
 
 
+UNCOUNTED = """
+import resource, time, types
+time.process_time = lambda: 0.0
+resource.getrusage = lambda who: types.SimpleNamespace(ru_utime=0.0, ru_stime=0.0)
+"""
+"""A kernel that has given the time of this process to others: one in a virtual machine, which counts in ticks, did."""
+
+
+def test_an_honest_actor_is_admitted_where_the_kernel_has_counted_no_processor_time_yet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried_with(tmp_path, monkeypatch, "return from_file(*arguments)", UNCOUNTED)
+    admit_policy(shipped_actor_path(), BENCH)
+
+
 def test_a_file_that_makes_onnx_runtime_work_for_long_or_take_memory_is_refused_in_bounded_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(trial, "MULTIPLE", 2.0)
+    monkeypatch.setattr(trial, "LEAST", 0.0)
     products = " ".join(f"p{n + 1} = MatMul(p{n}, p{n})" for n in range(100))  # 2e11 sums in one evaluation
     rows = (
         ("p0 = Expand(zero, side) " + products + " b = ReduceMax<keepdims=1>(p100)", "{1000, 1000}", "processor time"),
