@@ -30,8 +30,8 @@ import numba  # noqa: F401  # what is loaded is used
 import numpy as np
 
 from emb_bench.config.bench import load_bench
-from emb_bench.experiment.evaluation import Question, evaluate
 from emb_bench.experiment.from_log import read_experiment
+from emb_bench.information.evaluation import Question, evaluate
 from emb_bench.logs.log import read_log
 from emb_export.export import main as emb_export
 from emb_runtime.cli.main import main as emb_run

@@ -40,8 +40,8 @@ if TYPE_CHECKING:  # scipy, numba, matplotlib and pyarrow come with the extra [b
     from emb_bench.analysis.study import Study, StudyOptions
     from emb_bench.batch.summary import Campaign
     from emb_bench.design.report import Report
-    from emb_bench.experiment.evaluation import Evaluation
     from emb_bench.export.repair import Repaired
+    from emb_bench.information.evaluation import Evaluation
     from emb_bench.report.content import Content
     from emb_bench.report.runs import RunTiming
     from emb_bench.rerun import Rerun
@@ -332,9 +332,9 @@ def fisher_information(
         UsageError: a name is unknown, or the run only listened.
         LogError: the log says too little.
     """
-    from emb_bench.experiment.evaluation import Question, bench_for, default_model, evaluate
     from emb_bench.experiment.from_log import read_experiment
     from emb_bench.experiment.theta import read_theta
+    from emb_bench.information.evaluation import Question, bench_for, default_model, evaluate
 
     Question(*_unknowns(params, nuisance, None))  # a wrong name needs no log to be refused
     log = _driven(run, map)
@@ -518,7 +518,7 @@ def campaign(
     from emb_bench.batch.campaign import run_campaign
     from emb_bench.batch.row import Options
     from emb_bench.estimate.records import EstimationProblem
-    from emb_bench.experiment.evaluation import Question
+    from emb_bench.information.evaluation import Question
 
     _check({"--starts": (starts, 1), "--seed": (seed, 0), "--jobs": (1 if jobs is None else jobs, 1)})
     if not 1e-3 <= time_limit <= 1e6:

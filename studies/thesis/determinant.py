@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from emb_bench.brake.euler import sensitivity_step, step
 from emb_bench.config.bench import Bench
+from emb_bench.experiment.experiment import planned
+from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.criteria import criteria
 from emb_bench.information.fisher import Weights, information_over_time, thesis_weights
 from emb_bench.information.symmetric import Floats, information, log_det, pack
-from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 
 AMPLITUDE = 0.7  # A
@@ -76,7 +77,7 @@ def unprotected(bench: Bench, amplitude: float) -> Unprotected:
     currents = np.full(bench.timing.horizon, amplitude)
     t_s = bench.timing.sample_time
     weights = thesis_weights(bench.noise, bench.limits)
-    run = simulate(bench.plant("euler").mechanics, bench.brake, currents, t_s, PARAMETER_NAMES)
+    run = simulate(bench.plant("euler"), Theta(bench.brake), planned(currents), t_s, PARAMETER_NAMES)
     s = run.sensitivities
     single = np.float32
     rows = s.tolist()
@@ -106,7 +107,7 @@ def protected(bench: Bench, amplitude: float, epsilon: float) -> Protected:
     currents = np.full(bench.timing.horizon, amplitude)
     t_s = bench.timing.sample_time
     weights = thesis_weights(bench.noise, bench.limits)
-    s = simulate(bench.plant("euler").mechanics, bench.brake, currents, t_s, PARAMETER_NAMES).sensitivities
+    s = simulate(bench.plant("euler"), Theta(bench.brake), planned(currents), t_s, PARAMETER_NAMES).sensitivities
     increments = np.array([information_over_time(s[k : k + 1], weights)[0] for k in range(len(s))])
     rewards, logs, alphas, matrices = normalised(increments, epsilon)
     return Protected(

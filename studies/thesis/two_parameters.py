@@ -11,9 +11,10 @@ from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import F_V, K_1
 from emb_bench.config.bench import Bench
 from emb_bench.excitation import Response, parse_excitation, run_excitation
+from emb_bench.experiment.experiment import planned
+from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.criteria import criteria
 from emb_bench.information.fisher import information_over_time, thesis_weights
-from emb_bench.sim.open_loop import simulate
 from studies.thesis.facts import Statement
 
 PARAMS = ("f_v", "k_1")
@@ -50,9 +51,9 @@ class Excited:
 def excited(bench: Bench, text: str) -> Excited:
     """Run a reference excitation, without noise."""
     excitation = parse_excitation(text, bench)
-    mechanics = bench.plant("euler").mechanics
-    response = run_excitation(bench, excitation, mechanics, bench.brake, shielded=True)
-    s = simulate(mechanics, bench.brake, response.currents, bench.timing.sample_time, PARAMS).sensitivities
+    plant, t_s = bench.plant("euler"), bench.timing.sample_time
+    response = run_excitation(bench, excitation, plant.mechanics, bench.brake, shielded=True)
+    s = simulate(plant, Theta(bench.brake), planned(response.currents), t_s, PARAMS).sensitivities
     history = information_over_time(s, thesis_weights(bench.noise, bench.limits))
     return Excited(excitation.name, response, s, np.diff(history, axis=0, prepend=np.zeros((1, 2, 2))))
 

@@ -15,9 +15,9 @@ from mcap.reader import NonSeekingReader
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
-from emb_bench.experiment.evaluation import Evaluation, Question, evaluate
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
+from emb_bench.information.evaluation import Evaluation, Question, evaluate
 from emb_bench.logs.info import info_document
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.logs.mcap_file import MAGIC, message_class

@@ -9,8 +9,10 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats, no_sensitivity, rest
 from emb_bench.compiled import compiled
-from emb_bench.config.plants import EULER, Mechanics
-from emb_bench.sim.open_loop import held, march, simulate, trajectory
+from emb_bench.config.plants import BUILT_IN, Mechanics
+from emb_bench.experiment.experiment import planned
+from emb_bench.experiment.simulate import Theta, simulate
+from emb_bench.sim.open_loop import held, march, trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, load_bench
 
 T_S = 1e-3
@@ -80,7 +82,7 @@ def changed(
 def marched(
     mechanics: Mechanics, p: BrakeParameters, currents: Floats, x0: tuple[float, float], params: tuple[str, ...] = ALL
 ) -> tuple[Floats, Floats]:
-    """States and sensitivities as :func:`emb_bench.sim.open_loop.simulate` has them, compiled."""
+    """States and sensitivities as :func:`emb_bench.experiment.simulate.simulate` has them, compiled."""
     states, sensitivities = whole(mechanics, p, currents, x0, params)
     return states[:, :2], sensitivities
 
@@ -134,11 +136,11 @@ def of_euler(
     currents: Sequence[float] | Floats, params: Sequence[str] = PARAMETER_NAMES, x0: tuple[float, float] = (0.0, 0.0)
 ) -> Floats:
     """Sensitivities of the nominal Euler brake, shape (n, len(params), 2)."""
-    return simulate(Mechanics(EULER), NOMINAL, currents, T_S, params, x0).sensitivities
+    return simulate(BUILT_IN["euler"], Theta(NOMINAL, x0), planned(currents), T_S, params).sensitivities
 
 
 def euler_states(
     p: BrakeParameters, currents: Sequence[float] | Floats, x0: tuple[float, float] = (0.0, 0.0)
 ) -> Floats:
     """States of an Euler brake, shape (n + 1, 2)."""
-    return simulate(Mechanics(EULER), p, currents, T_S, (), x0).states
+    return simulate(BUILT_IN["euler"], Theta(p, x0), planned(currents), T_S).states

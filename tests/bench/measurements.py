@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
-from emb_bench.config.plants import Plant
+from emb_bench.config.plants import Instruments, Plant
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.excitation import parse_excitation, run_excitation
-from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.experiment import Experiment, planned
+from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.sim.instruments import MEMORY, measure, settle
-from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 
 AT_REST = 7.0  # The start is the mean of about 50 samples: this many times better known than one
@@ -60,7 +60,8 @@ def record(
         x0: where the brake begins.
     """
     t_s, instruments = bench.timing.sample_time, plant.instruments
-    states = simulate(plant.mechanics, brake or bench.brake, currents, t_s, (), x0).states
+    moving = replace(plant, instruments=Instruments())
+    states = simulate(moving, Theta(brake or bench.brake, x0), planned(currents), t_s).states
     rng = np.random.default_rng(seed)
     size = 0.0 if seed is None else noise
     errors = size * rng.standard_normal((len(currents), 2)) * [bench.noise.angle, bench.noise.velocity]

@@ -25,10 +25,10 @@ from emb_bench.estimate.intervals import union
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import SAME
 from emb_bench.estimate.records import DONE, STARTS, End, EstimationProblem, Suspect, Unknown, with_systematic
-from emb_bench.experiment.evaluation import check_sample_time, default_model
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.figures import for_notebook
+from emb_bench.information.evaluation import check_sample_time, default_model
 from emb_bench.logs.log import RunLog, end_detail
 from emb_bench.numbers import amount
 from emb_runtime.config.bench import BrakeParameters

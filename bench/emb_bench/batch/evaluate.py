@@ -15,9 +15,9 @@ from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import EstimationProblem, with_systematic
-from emb_bench.experiment.evaluation import Evaluation, Question, check_sample_time, default_model, evaluate
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
+from emb_bench.information.evaluation import Evaluation, Question, check_sample_time, default_model, evaluate
 from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_bench.report.sentences import alarms, warnings

@@ -17,11 +17,12 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EXACT
 from emb_bench.design.problem import PARTS, Problem
 from emb_bench.design.search import Found, search
+from emb_bench.experiment.experiment import planned
+from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.criteria import Criterion, criteria
 from emb_bench.information.fisher import Kind, fisher
 from emb_bench.information.symmetric import Floats
 from emb_bench.output import replacing
-from emb_bench.sim.open_loop import simulate
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
 from emb_runtime.system.terminal import as_json
@@ -53,9 +54,9 @@ class Check:
 def check(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, currents: Floats, plant_name: str) -> Check:
     """Checks a sequence of currents on a brake: its criteria, and whether it keeps the bench's limits there."""
     plant = bench.plant(plant_name)
-    t_s, p, m = problem.sample_time, problem.brake, plant.mechanics
-    parts = PARTS if m.solver == EXACT else 1
-    states = simulate(m, p, np.repeat(currents, parts), t_s / parts).states
+    t_s, p = problem.sample_time, problem.brake
+    parts = PARTS if plant.mechanics.solver == EXACT else 1
+    states = simulate(plant, Theta(p), planned(np.repeat(currents, parts)), t_s / parts).states
     matrix = fisher(
         bench, p, currents, kind=kind, plant=plant, params=problem.params
     ).matrix  # relative to the parameters of the problem, which are known

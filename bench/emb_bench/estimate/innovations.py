@@ -28,10 +28,10 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import Floats, Integers
-from emb_bench.brake.parameters import OFFSET, VELOCITY_GAIN
 from emb_bench.compiled import compiled
 from emb_bench.config.plants import Mechanics
 from emb_bench.estimate.prediction import Problem
+from emb_bench.sim.instruments import reading, sensor_share
 from emb_bench.sim.open_loop import advance_period, delay_share
 from emb_runtime.config.bench import BrakeParameters
 
@@ -108,28 +108,29 @@ class Filter:
         """
         problem, record = self.problem, self.problem.records[i]
         n, names = len(record.currents), (*problem.names(i), *besides)
-        start = problem.opening(z, i, (*START, *names))
+        at = problem.at(z, i)
+        x, chosen, s = at.begin(record.before, (*START, *names))
         innovations, shares = np.zeros((n, 2)), np.zeros((n, len(names), 2))
         given = FilterInput(
-            record.currents + start.errors.current_offset + added,
+            record.currents + at.errors.current_offset + added,
             problem.bench.timing.sample_time,
-            max(start.errors.delay, 0.0),
+            max(at.errors.delay, 0.0),
             problem.plant.instruments.measurement_delay,
             np.nan_to_num(record.samples) + shifted,
             np.zeros(n) if record.late is None else record.late,
             self._unreported(i),
             root,
-            start.contact + start.offset,
-            1.0 + start.errors.velocity_gain,
+            at.contact + at.offset(problem.plant),
+            1.0 + at.errors.velocity_gain,
             self.walk,
             self.load,
         )
         moves, results = problem.mechanics(z) if mechanics is None else mechanics, Innovations(innovations, shares)
         covariance = self._uncertainty(i)
         loop = compiled(march_filtered)
-        loop(moves, start.p, given, start.chosen, start.x, start.s, covariance, held, gain, results)
-        if start.errors.delay < 0.0:  # to first order, as in the simulation
-            innovations -= start.errors.delay * shares[:, names.index("delay")]
+        loop(moves, at.brake, given, chosen, x, s, covariance, held, gain, results)
+        if at.errors.delay < 0.0:  # to first order, as in the simulation
+            innovations -= at.errors.delay * shares[:, names.index("delay")]
         return innovations, shares
 
     def _unreported(self, record: int) -> Floats:
@@ -256,19 +257,15 @@ def march_filtered(
         for output in range(2):  # angle, then velocity; the brake goes on to its stamp as it went through the period
             if root[i, output] == 0.0:
                 continue
-            if output == 0:
-                h1, h2 = 1.0, tau
-                shown = x[0] + bias + tau * (x[1] + 0.5 * tau * acceleration)
-            else:
-                h1, h2 = 0.0, velocity_scale
-                shown = velocity_scale * (x[1] + tau * acceleration)
+            shown = reading(x[0], x[1], acceleration, tau, bias, velocity_scale)[output]
+            h1, h2 = (1.0, tau) if output == 0 else (0.0, velocity_scale)
             if not held:
                 _weigh(covariance, h1, h2, 1.0 / root[i, output] ** 2, gains[i, output])
             k1, k2, scale, k3 = gains[i, output, 0], gains[i, output, 1], gains[i, output, 2], gains[i, output, 3]
             surprise = samples[i, output] - shown
             innovations[i, output] = surprise * scale
             for j in range(known, chosen.shape[0]):
-                share = h1 * s[j, 0] + h2 * s[j, 1] + _of_a_sensor(int(chosen[j]), output, shown / velocity_scale)
+                share = h1 * s[j, 0] + h2 * s[j, 1] + sensor_share(int(chosen[j]), output, shown / velocity_scale)
                 shares[i, j - known, output] = share * scale / delay_share(int(chosen[j]), late)
                 s[j, 0] -= k1 * share
                 s[j, 1] -= k2 * share
@@ -277,13 +274,6 @@ def march_filtered(
             x[1] += k2 * surprise
             acting += k3 * surprise
             x[3] += k3 * surprise  # a load is neither late nor does it lag
-
-
-def _of_a_sensor(unknown: int, output: int, velocity: float) -> float:
-    """Derivative of what a sensor shows to an unknown of its own."""
-    if output == 0:
-        return 1.0 if unknown == OFFSET else 0.0
-    return velocity if unknown == VELOCITY_GAIN else 0.0
 
 
 def _spread(covariance: Floats, s: Floats, walk: float, load: float, t_s: float) -> None:

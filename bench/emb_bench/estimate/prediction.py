@@ -11,15 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
-from emb_bench.brake.parameters import COMMAND, FEATURES, PARAMETERS
+from emb_bench.brake.motion import Floats
+from emb_bench.brake.parameters import FEATURES, PARAMETERS
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Mechanics, Plant
 from emb_bench.estimate.records import EstimationProblem, Unknown, check_model, searched
 from emb_bench.experiment.experiment import Booleans, Experiment
+from emb_bench.experiment.simulate import SystematicErrors, Theta, Trajectory, gap_ends, later, simulate
 from emb_bench.information.fisher import weights_along
-from emb_bench.sim.open_loop import Input, SystematicErrors, Trajectory, later, march, show, trajectory
+from emb_bench.sim.open_loop import march
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError, UsageError
 
@@ -40,18 +41,6 @@ class Marginal(NamedTuple):
     the unknowns of the gaps, shape (m,)."""
     jacobian: Floats  # Derivatives to z, shape (m, len(z))
     basis: Floats  # Orthonormal basis of what the gaps can explain, shape (m, gaps)
-
-
-class Opening(NamedTuple):
-    """Start of a record."""
-
-    p: BrakeParameters
-    x: Floats  # State, with the contact at the origin, as :func:`emb_bench.brake.motion.advance` takes it
-    chosen: Integers
-    s: Floats
-    contact: float  # Angle of the contact [rad]
-    offset: float  # Offset of the encoder [rad]
-    errors: SystematicErrors  # The same offset, and all others
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,22 +159,17 @@ class Problem:
         """Indices of the elements of z that a record depends on."""
         return [i for i, u in enumerate(self.unknowns) if u.record in (None, record)]
 
-    def opening(self, z: Floats, record: int, names: tuple[str, ...]) -> Opening:
-        """Start of a record, with sensitivities to some unknowns."""
+    def at(self, z: Floats, record: int) -> Theta:
+        """Values at ``z`` of all that a record depends on."""
         own = {self.unknowns[i].name: float(z[i]) for i in self.columns(record)}
         offset = own.get("offset", self.plant.instruments.encoder_offset)
         x1, x2 = self.records[record].start(offset)
         if "offset" in own:
             x1 = 0.0  # with an unknown encoder offset the brake rests at the origin, unless its start is estimated too
-        # A contact elsewhere is a brake that lies elsewhere, for nothing else depends on the place.
-        contact = own.get("contact", 0.0)
         errors = SystematicErrors(
             offset, own.get("current_offset", 0.0), own.get("delay", 0.0), own.get("velocity_gain", 0.0)
         )
-        x = rest()
-        x[0], x[1] = own.get("x1_0", x1) - contact, own.get("x2_0", x2)
-        x[3] = self.records[record].before + errors.current_offset
-        return Opening(self.theta(z), x, *no_sensitivity(names), contact, offset, errors)
+        return Theta(self.theta(z), (own.get("x1_0", x1), own.get("x2_0", x2)), errors, own.get("contact", 0.0))
 
     def names(self, record: int) -> tuple[str, ...]:
         """The unknowns that a record depends on, in the order of ``columns``."""
@@ -204,38 +188,10 @@ class Problem:
 
         Another brake moves by ``mechanics``; ``added`` is a current that acts besides [A].
         """
-        data, t_s, delay = self.records[record], self.bench.timing.sample_time, self.plant.instruments.measurement_delay
-        at = self.opening(z, record, (*self.names(record), *besides))
-        acting = Input(
-            data.currents + at.errors.current_offset + added,
-            t_s,
-            max(at.errors.delay, 0.0),
-            data.gaps[0],
-            self.breaks(record),
-            self.places(record) - [at.contact, 0.0],
-        )
-        moves = self.mechanics(z) if mechanics is None else mechanics
-        whole, moved = trajectory(compiled(march), moves, at.p, acting, at.chosen, at.x, at.s, data.gap_unknowns)
-        whole[:, 0] += at.contact
-        chosen = np.concatenate([at.chosen, np.full(data.gap_unknowns, COMMAND)])
-        return show(later(whole, delay), later(moved, delay), chosen, at.errors, data.late, t_s)
-
-    def breaks(self, record: int) -> Integers:
-        """Periods at whose ends the brake is found again after a longer gap: those of the first sample that shows it.
-
-        A place earlier would have to be found back through the period between, in which the brake may have come to
-        rest: then its velocity cannot be recovered.
-        """
-        seen = self.plant.instruments.measurement_delay == 0
-        return np.minimum(self.records[record].gaps[1] + int(seen), len(self.records[record].currents) - 1)
-
-    def places(self, record: int) -> Floats:
-        """Angle [rad] and velocity [rad/s] at the ends of the periods of ``breaks``: found, or else as measured."""
-        data, instruments = self.records[record], self.plant.instruments
-        if data.places is not None:
-            return data.places
-        after = np.minimum(self.breaks(record) + instruments.measurement_delay, len(data.samples) - 1)
-        return np.nan_to_num(data.samples[after]) - [instruments.encoder_offset, 0.0]
+        plant = replace(self.plant, mechanics=self.mechanics(z) if mechanics is None else mechanics)
+        data = replace(self.records[record], currents=self.records[record].currents + added)
+        names, t_s = (*self.names(record), *besides), self.bench.timing.sample_time
+        return simulate(plant, self.at(z, record), data, t_s, names, compiled(march))
 
     def weights(self, z: Floats) -> list[Floats]:
         """Inverse standard deviations of each record's samples at ``z``, zero where they do not count, shape (n, 2)."""
@@ -299,8 +255,9 @@ class Problem:
 
     def _gaps(self, record: int) -> tuple[Floats, Floats, Floats]:
         """Values that a record holds in its gaps, means before the samples, and inverse deviations."""
-        data, places = self.records[record], self.places(record).ravel()
+        data = self.records[record]
         pulses, breaks = data.gaps
+        places = gap_ends(data, self.plant.instruments)[1].ravel()
         assumed = data.currents if data.assumed is None else data.assumed
         inverse = np.full(len(pulses), 1.0 / self.bench.limits.current)
         low, high = self.bench.limits.angle

@@ -10,8 +10,8 @@ from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EXACT, Plant
-from emb_bench.experiment.evaluation import Question
-from emb_bench.sim.open_loop import SystematicErrors
+from emb_bench.experiment.simulate import SystematicErrors
+from emb_bench.information.evaluation import Question
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator import estimate

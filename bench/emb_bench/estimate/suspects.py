@@ -157,15 +157,15 @@ def _drifts(problem: Problem, z: Floats, record: int, shown: Floats) -> tuple[Fl
     Each is a drift by the whole parameter from the first period to the last, zero in the middle. In a period in which
     the brake turns around, the friction acts one way and then the other, as if the velocity changed evenly.
     """
-    at, data = problem.opening(z, record, ()), problem.records[record]
+    at, data = problem.at(z, record), problem.records[record]
     n, delay = len(shown), problem.plant.instruments.measurement_delay
     ends = np.concatenate([shown[delay:], np.repeat(shown[-1:], min(delay, n), axis=0)])[:n]
-    angle = np.concatenate([at.x[:1], ends[:, 0] - at.offset - at.contact])
-    velocity = np.concatenate([at.x[1:2], ends[:, 1]])
+    angle = np.append(at.start[0], ends[:, 0] - at.offset(problem.plant)) - at.contact
+    velocity = np.append(at.start[1], ends[:, 1])
     speed = np.abs(velocity[1:]) + np.abs(velocity[:-1])
     direction = (velocity[1:] + velocity[:-1]) / np.where(speed > 0.0, speed, 1.0)
     clamped = np.maximum(angle, 0.0)
-    p, share = at.p, (np.arange(n) + 0.5) / n - 0.5
+    p, share = at.brake, (np.arange(n) + 0.5) / n - 0.5
     torques = (
         p.k_m * (data.currents + at.errors.current_offset),
         -p.gamma * p.k_1 * 0.5 * (clamped[1:] + clamped[:-1]),
@@ -177,14 +177,14 @@ def _drifts(problem: Problem, z: Floats, record: int, shown: Floats) -> tuple[Fl
 
 def _clearance(problem: Problem, z: Floats, record: int, shown: Floats, play: float) -> Floats:
     """Current that turns the motor as a clearance of the gear does: nut and force lag behind the screw [A]."""
-    at = problem.opening(z, record, ())
-    angles = np.concatenate([at.x[:1], shown[:, 0] - at.offset - at.contact])
+    at = problem.at(z, record)
+    angles = np.append(at.start[0], shown[:, 0] - at.offset(problem.plant)) - at.contact
     nut, behind = float(angles[0]), np.empty(len(angles))
     for k, angle in enumerate(angles.tolist()):
         nut = min(max(nut, angle - 0.5 * play), angle + 0.5 * play)
         behind[k] = max(angle, 0.0) - max(nut, 0.0)
-    torque = at.p.gamma * at.p.k_1 * 0.5 * (behind[1:] + behind[:-1])
-    result: Floats = torque / at.p.k_m
+    torque = at.brake.gamma * at.brake.k_1 * 0.5 * (behind[1:] + behind[:-1])
+    result: Floats = torque / at.brake.k_m
     return result
 
 
@@ -283,7 +283,7 @@ def _angle_scaled(problem: Problem, z: Floats, shown: Shown) -> Floats:
     A velocity by an observer follows the angle.
     """
     parts, observed = [], problem.plant.instruments.observer_bandwidth > 0.0
-    offsets = [problem.opening(z, i, ()).offset for i in range(len(problem.records))]
+    offsets = [problem.at(z, i).offset(problem.plant) for i in range(len(problem.records))]
     for i, offset in enumerate(offsets):
         shift = (shown.motion(i) - [offset, 0.0]) * [1.0, observed]
         parts.append(shown.whitened(i, 1e-6 * shift).ravel() / 1e-6)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.config.plants import Plant
+from emb_runtime.errors import UsageError
 
 REST_SIGMAS = 4.0
 """A mean that lies this near to zero, in its own standard deviations, is taken as zero: the origin, at rest."""
@@ -137,3 +138,14 @@ class Experiment:
         """The experiment in parts of at most ``length`` periods."""
         for begin in range(0, self.periods, length):
             yield self.part(begin, begin + length)
+
+
+def planned(currents: Sequence[float] | Floats) -> Experiment:
+    """An experiment that is to be: currents [A] of its periods, from rest at the origin, no samples."""
+    row = np.asarray(currents, dtype=np.float64)
+    if row.ndim != 1:
+        raise UsageError(f"expected one row of currents, got an array of shape {row.shape}")
+    if not np.isfinite(row).all():
+        k = int(np.argmin(np.isfinite(row)))
+        raise UsageError(f"expected finite currents, got {row[k]} at step {k}")
+    return Experiment("planned", row, np.full((len(row), 2), np.nan), 0.0, 0.0, 0.0, True)

@@ -8,9 +8,9 @@ import msgspec
 
 from emb_bench.brake.parameters import SI, quantity
 from emb_bench.config.bench import Bench
+from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors
 from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import RunLog
-from emb_bench.sim.open_loop import NO_ERRORS, SystematicErrors
 from emb_bench.sim.simulated_brake import check_near_nominal, parse_assignments, true_parameters
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import LogError, UsageError, near

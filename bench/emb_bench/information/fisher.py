@@ -20,10 +20,12 @@ import numpy as np
 
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Instruments, Plant
+from emb_bench.experiment.experiment import planned
+from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.criteria import Criteria, criteria
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge
 from emb_bench.information.symmetric import Floats, pack, unpack, upper
-from emb_bench.sim.open_loop import check_unknowns, simulate
+from emb_bench.sim.open_loop import check_unknowns
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Limits, Noise, Ranges
 from emb_runtime.errors import UsageError
 
@@ -199,7 +201,7 @@ def fisher(
     if not params:
         raise UsageError(f"expected at least one parameter, such as {', '.join(PARAMETER_NAMES)}")
     names = (*params, *nuisances)
-    run = simulate(plant.mechanics, p, currents, bench.timing.sample_time, names, x0)
+    run = simulate(plant, Theta(p, x0), planned(currents), bench.timing.sample_time, names)
     weights = weights_along(bench, kind, plant.instruments, run.states)
     history = information_over_time(run.sensitivities, weights, prior, measured)
     before = np.zeros((len(names), len(names))) if prior is None else np.asarray(prior, dtype=np.float64)

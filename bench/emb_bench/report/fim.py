@@ -11,8 +11,8 @@ import numpy as np
 from emb_bench.brake.parameters import quantity
 from emb_bench.config.machine import LOADS
 from emb_bench.documents import to_json
-from emb_bench.experiment.evaluation import KINDS, Evaluation, Question, default_model, evenly
 from emb_bench.information.criteria import criteria_series
+from emb_bench.information.evaluation import KINDS, Evaluation, Question, default_model, evenly
 from emb_bench.information.identifiability import Finding, combination
 from emb_bench.numbers import NOTHING, in_samples, plain
 from emb_bench.report import sentences as say

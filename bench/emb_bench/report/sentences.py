@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.config.machine import Machine
     from emb_bench.estimate.estimate import Estimate
     from emb_bench.estimate.records import Contribution, ModelValidation, Suspect
-    from emb_bench.experiment.evaluation import Evaluation
+    from emb_bench.information.evaluation import Evaluation
     from emb_bench.information.identifiability import Direction, Finding, Identifiability
     from emb_bench.report.content import Content, Run
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from emb_bench.brake.parameters import OFFSET, VELOCITY_GAIN
 from emb_bench.config.plants import LONGEST_DELAY, Instruments
 
 DAMPING = 0.7
@@ -49,6 +50,31 @@ def command(instruments: Instruments, memory: Any, wanted: float) -> float:
     return _delayed(memory, _COMMANDS, instruments.command_delay, wanted)
 
 
+def reading(x1: Any, x2: Any, acceleration: Any, late: Any, offset: float, velocity_scale: float) -> tuple[Any, Any]:
+    """Angle [rad] and velocity [rad/s] that sensors show ``late`` [s] after a period, of one sample or of rows of them.
+
+    The brake goes on as it went through the period: the angle is right to second order and the velocity to first. The
+    error is late²/2 respectively late times the difference between the mean acceleration of the period [rad/s²] and the
+    one at its end, for 20 µs at most 6e-6 rad and 0.6 rad/s, where full braking ends in standstill. Nothing reaches the
+    brake before the sample is out, so that there is no other current to be seen.
+
+    The encoder shows ``offset`` [rad] at the origin, and the velocity's scale is ``velocity_scale``.
+    """
+    return x1 + late * (x2 + 0.5 * late * acceleration) + offset, velocity_scale * (x2 + late * acceleration)
+
+
+def sensor_share(unknown: int, output: int, shown: Any) -> Any:
+    """Derivative of a reading to an unknown of the sensors, per unit; 0 to any other.
+
+    ``output`` is 0 for the angle, 1 for the velocity; ``shown`` is the reading with the right scale.
+    """
+    if unknown == OFFSET and output == 0:
+        return 1.0
+    if unknown == VELOCITY_GAIN and output == 1:
+        return shown
+    return 0.0
+
+
 def measure(
     instruments: Instruments,
     memory: Any,
@@ -60,19 +86,13 @@ def measure(
     angle_error: float,
     velocity_error: float,
 ) -> tuple[float, float]:
-    """Angle [rad] and velocity [rad/s] that are sent at the end of a period. To be called once a period.
+    """Angle [rad] and velocity [rad/s] that are sent at the end of a period, the sensors' noise added.
 
-    A sample that is taken ``late`` [s] sees the brake go on as it went through the period: the angle is right to second
-    order and the velocity to first. The error is late²/2 respectively late times the difference between the mean
-    acceleration of the period [rad/s²] and the one at its end, for 20 µs at most 6e-6 rad and 0.6 rad/s, where full
-    braking ends in standstill. Nothing reaches the brake before the sample is out, so that there is no other current to
-    be seen.
+    To be called once a period. A sample is taken ``late`` [s], see :func:`reading`.
     """
-    y1 = x1 + late * (x2 + 0.5 * late * acceleration) + instruments.encoder_offset + angle_error
-    if instruments.observer_bandwidth > 0.0:
-        y2 = observe(instruments, memory, t_s, y1)
-    else:
-        y2 = x2 + late * acceleration + velocity_error
+    y1, y2 = reading(x1, x2, acceleration, late, instruments.encoder_offset, 1.0)
+    y1 += angle_error
+    y2 = observe(instruments, memory, t_s, y1) if instruments.observer_bandwidth > 0.0 else y2 + velocity_error
     delay = instruments.measurement_delay
     return _delayed(memory, _ANGLES, delay, y1), _delayed(memory, _VELOCITIES, delay, y2)
 

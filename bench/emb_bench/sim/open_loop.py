@@ -1,8 +1,9 @@
-"""Open-loop simulation: a brake driven through a record of currents, with the sensitivities of its state.
+"""Open loop: a brake driven through a record of currents, with the sensitivities of its state.
 
-:func:`march` is the one loop over a record; every module that needs trajectories calls it, compiled or as it is. Loops
-that need the state between two periods, because a filter corrects it or a current answers it, are
-:mod:`emb_bench.estimate.innovations` on :func:`advance_period`, and :func:`feedback` in plain Python.
+:func:`march` is the one loop over a record, compiled or as it is; what instruments show of its motion is
+:mod:`emb_bench.experiment.simulate`. Loops that need the state between two periods, because a filter corrects it or a
+current answers it, are :mod:`emb_bench.estimate.innovations` on :func:`advance_period`, and :func:`feedback` in plain
+Python.
 
 **Which samples count.** A sequence of n currents u_0..u_{n−1} moves the brake from the state x_0 to x_n, and the
 samples y_1..y_n after each period count. y_0 holds no information on a brake that starts from a known state (eq. 4.26).
@@ -22,56 +23,12 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, Integers, advance, no_sensitivity, rest
-from emb_bench.brake.parameters import COMMAND, DELAY, OFFSET, PARAMETERS, PAST_COMMAND, VELOCITY_GAIN
+from emb_bench.brake.parameters import COMMAND, DELAY, PARAMETERS, PAST_COMMAND
 from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError, near
 
 WORTH_COMPILING = 20_000  # Periods from which on loading the compiled functions takes less time than they save
-
-
-class SystematicErrors(NamedTuple):
-    """Systematic errors of bench and sensors, beyond those that belong to the plant."""
-
-    offset: float | None = None  # Reading of the encoder at the origin [rad]; None takes the plant's
-    current_offset: float = 0.0  # Current that acts beyond what the node reports [A]
-    delay: float = 0.0  # By which commands act late [samples], above -1 and below 1; below 0, samples are late
-    velocity_gain: float = 0.0  # Relative error of the velocity's scale
-
-
-NO_ERRORS = SystematicErrors()
-
-
-class Trajectory(NamedTuple):
-    """Motion of a brake, samples of it by undisturbed sensors, and their sensitivities."""
-
-    states: Floats  # Angle [rad] and velocity [rad/s] at the n + 1 instants around the n periods, shape (n + 1, 2)
-    samples: Floats  # Samples y_1..y_n: angle [rad] and velocity [rad/s], shape (n, 2)
-    sensitivities: Floats
-    """Of the samples to the parameters, shape (n, parameters, 2): of the angle [rad] and the velocity [rad/s].
-
-    Relative for the brake's parameters, θ_i ∂y/∂θ_i at its own θ (eq. 4.17); per unit for those in ``UNITS``.
-    """
-
-
-def simulate(
-    mechanics: Mechanics,
-    p: BrakeParameters,
-    currents: Sequence[float] | Floats,
-    t_s: float,
-    params: Sequence[str] = (),
-    x0: tuple[float, float] = (0.0, 0.0),
-) -> Trajectory:
-    """Moves a brake through a sequence of currents [A]; limits are not applied.
-
-    Before the first period [s] no current acted. ``params`` are any of ``PARAMETERS`` in any order; none gives the
-    states alone. Angle [rad] and velocity [rad/s] at the start are known unless ``x1_0`` and ``x2_0`` are among them.
-    """
-    check_unknowns(params)
-    chosen, s = no_sensitivity(params)
-    x = rest()
-    x[:2] = x0
-    return show(*trajectory(march, mechanics, p, held(_finite(currents), t_s), chosen, x, s), chosen)
 
 
 class Input(NamedTuple):
@@ -99,55 +56,18 @@ def trajectory(
     chosen: Integers,
     x: Floats,
     s: Floats,
-    gaps: int = 0,
 ) -> tuple[Floats, Floats]:
     """States and sensitivities at all instants, from those at the first one.
 
-    Shapes (n + 1, STATES) and (n + 1, m + gaps, SENSITIVE) of m parameters ``chosen``. ``gaps`` is 0, or all g + 2 h
-    unknowns of the gaps: the currents of ``pulses`` [per A], then angle and velocity at the end of each of ``breaks``.
-    ``loop`` is :func:`march`, as it is or compiled.
+    Shapes (n + 1, STATES) and (n + 1, m + g + 2 h, SENSITIVE) of m parameters ``chosen``, then of the unknowns of the
+    gaps: the currents of ``pulses`` [per A], angle and velocity at the end of each of ``breaks``. ``loop`` is
+    :func:`march`, as it is or compiled.
     """
-    n = len(acting.currents)
-    states, sensitivities = np.empty((n + 1, STATES)), np.zeros((n + 1, len(chosen) + gaps, SENSITIVE))
+    n, unknowns = len(acting.currents), len(chosen) + len(acting.pulses) + 2 * len(acting.breaks)
+    states, sensitivities = np.empty((n + 1, STATES)), np.zeros((n + 1, unknowns, SENSITIVE))
     states[0], sensitivities[0, : len(chosen)] = x, s
-    loop(mechanics, p, acting if gaps else acting._replace(pulses=acting.pulses[:0]), chosen, states, sensitivities)
+    loop(mechanics, p, acting, chosen, states, sensitivities)
     return states, sensitivities
-
-
-def show(
-    x: Floats,
-    s: Floats,
-    chosen: Integers,
-    errors: SystematicErrors = NO_ERRORS,
-    late: Floats | None = None,
-    t_s: float = 0.0,
-) -> Trajectory:
-    """Samples along the states ``x`` of n + 1 instants, with their sensitivities ``s`` to the unknowns ``chosen``.
-
-    The states are those of commands that act late by ``errors.delay``, if that is not negative: commands that act
-    early are counted here, to first order, for which the delay has to be among the unknowns. Each sample is taken
-    ``late`` [s] after its period of ``t_s`` [s], shape (n,), as in :mod:`emb_bench.sim.instruments`.
-    """
-    states, shifts = x[:, :2].copy(), s[:, :, :2].copy()
-    shifts[:, chosen == DELAY] /= 1.0 - max(errors.delay, 0.0)
-    if errors.delay < 0.0:
-        states += errors.delay * shifts[:, np.argmax(chosen == DELAY)]
-    shifts[:, chosen == OFFSET, 0] += 1.0
-    samples, sensitivities = states[1:] + np.array([errors.offset or 0.0, 0.0]), shifts[1:]
-    if late is not None:  # the brake goes on as it went through the period
-        acceleration = np.diff(states[:, 1]) / t_s
-        samples[:, 0] += late * (samples[:, 1] + 0.5 * late * acceleration)
-        samples[:, 1] += late * acceleration
-        sensitivities[:, :, 0] += late[:, None] * sensitivities[:, :, 1]
-    sensitivities[:, :, 1] *= 1.0 + errors.velocity_gain
-    sensitivities[:, chosen == VELOCITY_GAIN, 1] += samples[:, 1:]
-    samples[:, 1] *= 1.0 + errors.velocity_gain
-    return Trajectory(states, samples, sensitivities)
-
-
-def later(rows: Floats, delay: int) -> Floats:
-    """Rows, shape (n, ...), as they are seen ``delay`` rows later; until then the first one."""
-    return np.concatenate([np.repeat(rows[:1], delay, axis=0), rows])[: len(rows)]
 
 
 def march(mechanics: Mechanics, p: BrakeParameters, acting: Input, chosen: Integers, x: Floats, s: Floats) -> None:
@@ -202,8 +122,7 @@ def _put(x: Floats, s: Floats, k: int, place: Floats, own: int) -> None:
         x[k + 1, i] = place[i]
         for j in range(s.shape[1]):
             s[k + 1, j, i] = 0.0
-        if s.shape[1] > own:
-            s[k + 1, own + i, i] = 1.0
+        s[k + 1, own + i, i] = 1.0
 
 
 def advance_period(
@@ -272,13 +191,3 @@ def check_unknowns(params: Sequence[str]) -> None:
             raise UsageError(f"'{name}' is no parameter of the brake; expected some of {known}")
     if len(set(params)) < len(params):
         raise UsageError(f"a parameter comes twice in {', '.join(params)}: expected each once")
-
-
-def _finite(currents: Sequence[float] | Floats) -> Floats:
-    row = np.asarray(currents, dtype=np.float64)
-    if row.ndim != 1:
-        raise UsageError(f"expected one row of currents, got an array of shape {row.shape}")
-    if not np.isfinite(row).all():
-        k = int(np.argmin(np.isfinite(row)))
-        raise UsageError(f"expected finite currents, got {row[k]} at step {k}")
-    return row

@@ -11,8 +11,8 @@ from emb_bench.analysis.held_out import held_out, leave_one_out
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import EstimationProblem
-from emb_bench.experiment.experiment import Experiment
-from emb_bench.sim.open_loop import simulate
+from emb_bench.experiment.experiment import Experiment, planned
+from emb_bench.experiment.simulate import Theta, simulate
 
 from tests.bench.flows import square  # isort: skip
 from tests.bench.measurements import disturbed, fit, record  # isort: skip
@@ -37,7 +37,7 @@ def test_the_statistic_is_the_error_of_the_prediction_over_its_covariance(bench:
     e, new = estimated(bench, [run(bench, 0, currents=CURRENTS[:20])]), run(bench, 1, currents=OTHERS)
     found = held_out(e, new)
     t_s, sigma = bench.timing.sample_time, np.array([bench.noise.angle, bench.noise.velocity])
-    said = simulate(e.plant.mechanics, e.theta, OTHERS, t_s, PARAMS)
+    said = simulate(e.plant, Theta(e.theta), planned(OTHERS), t_s, PARAMS)
     errors = ((new.samples - said.states[1:]) / sigma).ravel()
     jacobian = (said.sensitivities / sigma).transpose(0, 2, 1).reshape(-1, 2)
     covariance = np.eye(80) + jacobian @ np.linalg.inv(e.information) @ jacobian.T

@@ -12,8 +12,9 @@ import pytest
 from emb_bench.cli.design import main
 from emb_bench.config.bench import load_bench
 from emb_bench.design.report import read_design
+from emb_bench.experiment.experiment import planned
+from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.fisher import fisher
-from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import UsageError
 
@@ -44,7 +45,7 @@ def test_the_file_holds_a_design_that_can_be_simulated_again(
     assert (metadata["seed"], metadata["starts"], metadata["model"]) == (4, 1, "euler")
     assert metadata["version"]
     plant = bench.plant("euler")
-    run = simulate(plant.mechanics, brake, current[:-1], 1e-3)
+    run = simulate(plant, Theta(brake), planned(current[:-1]), 1e-3)
     np.testing.assert_allclose(np.column_stack([angle, velocity]), run.states, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(time, 1e-3 * np.arange(PERIODS + 1))
     again = fisher(bench, brake, current[:-1], kind="physical", plant=plant, params=metadata["params"])

@@ -10,9 +10,9 @@ from emb_bench.config.bench import Bench
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import search, start_points
 from emb_bench.estimate.records import METHODS, EstimationProblem
-from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.experiment import Experiment, planned
+from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.fisher import fisher, uniform_prior
-from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import LogError, UsageError
 
@@ -64,7 +64,7 @@ def test_where_the_output_is_linear_in_the_unknowns_it_is_weighted_least_squares
 
     def shown(k_m: float, t_c: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
         p = bench.brake._replace(k_m=k_m, T_c=t_c)
-        return simulate(plant.mechanics, p, currents, bench.timing.sample_time).states[1:].ravel()
+        return simulate(plant, Theta(p), planned(currents), bench.timing.sample_time).states[1:].ravel()
 
     k_m, t_c = bench.brake.k_m, bench.brake.T_c
     origin = shown(k_m, t_c)
@@ -83,7 +83,7 @@ def test_a_command_that_acts_a_fraction_of_a_period_late_is_one_that_acts_late_o
     currents = currents_of(bench, "chirp")
     fine = np.repeat(currents, 10)
     fine = np.concatenate([np.zeros(3), fine])[: len(fine)]
-    states = simulate(bench.plant("exact").mechanics, bench.brake, fine, 1e-4).states[::10]
+    states = simulate(bench.plant("exact"), Theta(bench.brake), planned(fine), 1e-4).states[::10]
     problem = problem_of(bench, ("delay",), exactly(bench))
     assert problem.predict(np.array([0.3]), 0).states == pytest.approx(states, rel=1e-9, abs=1e-9)
     noise = np.random.default_rng(0).standard_normal((500, 2)) * [bench.noise.angle, bench.noise.velocity]
@@ -96,7 +96,7 @@ def test_a_command_that_acts_a_fraction_of_a_period_late_is_one_that_acts_late_o
 def test_samples_count_at_the_instants_that_the_node_stamped(bench: Bench) -> None:
     """The truth comes from a grid that is a hundred times finer."""
     plant, currents = bench.plant("exact"), currents_of(bench, "chirp")
-    fine = simulate(plant.mechanics, bench.brake, np.repeat(currents, 100), 1e-5).states
+    fine = simulate(plant, Theta(bench.brake), planned(np.repeat(currents, 100)), 1e-5).states
     rng = np.random.default_rng(0)
     steps = rng.integers(-3, 4, size=500)
     steps[-1] = 0
@@ -118,7 +118,7 @@ def test_a_lost_sample_changes_nothing_but_its_information(bench: Bench) -> None
     nominal = [getattr(bench.brake, name) for name in PARAMETER_NAMES]
     assert whole.values == pytest.approx(nominal, rel=1e-9)
     assert partial.values == pytest.approx(nominal, rel=1e-9)
-    s = simulate(plant.mechanics, bench.brake, data.currents, 0.001, PARAMETER_NAMES).sensitivities[lost]
+    s = simulate(plant, Theta(bench.brake), planned(data.currents), 0.001, PARAMETER_NAMES).sensitivities[lost]
     gone = np.einsum("kin,kjn,n->ij", s, s, [bench.noise.angle**-2, bench.noise.velocity**-2])
     assert whole.information - partial.information == pytest.approx(gone, rel=1e-5, abs=1e-8 * gone.max())
     assert np.isnan(partial.residuals[0][lost]).all()

@@ -15,6 +15,7 @@ from emb_bench.estimate.least_squares import regression
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.simulate import gap_ends
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 from tests.bench.measurements import currents_of, errors_in_sigmas, fit, problem_of, record  # isort: skip
@@ -181,7 +182,7 @@ def test_a_late_sample_after_a_gap_shows_the_brake_going_on_as_it_went_through_i
     said = every.predict(z, 0)
     data = lossy(whole, EVERY, -6.0)
     problem = problem_of(bench, PARAMETER_NAMES, data)
-    breaks = problem.breaks(0)
+    breaks, _ = gap_ends(data, plant.instruments)
     placed = problem.filled(np.concatenate([whole.currents[list(SINGLE)], said.states[breaks + 1].ravel()]))
     counts = problem.weights(z)[0][:, 0] > 0.0
     difference = np.abs(placed.predict(z, 0).samples - said.samples)[counts] / [bench.noise.angle, bench.noise.velocity]

@@ -11,8 +11,9 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
 from emb_bench.estimate.records import DRIFTS, NORMAL_95, EstimationProblem, with_systematic
+from emb_bench.experiment.experiment import planned
+from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.report.sentences import alarms, residual_notes
-from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 from tests.bench.measurements import coloured, currents_of, errors_in_sigmas, fit, record  # isort: skip
@@ -122,7 +123,8 @@ def test_the_dependence_on_the_current_is_an_f_test_of_two_regressions(bench: Be
     """The residuals regressed on the model's sensitivities, without and with the currents."""
     found = fitted(bench, "stribeck", text="constant-speed:turn=0.15")
     e, past = found.residuals[0], lagged(found.records[0].currents, LAGS)
-    s = simulate(found.plant.mechanics, found.theta, found.records[0].currents, 0.001, ("k_m", "k_1", "T_c", "f_v"))
+    currents = planned(found.records[0].currents)
+    s = simulate(found.plant, Theta(found.theta), currents, 0.001, ("k_m", "k_1", "T_c", "f_v"))
     model = (s.sensitivities / [bench.noise.angle, bench.noise.velocity]).transpose(0, 2, 1).reshape(-1, 4)
     model /= np.linalg.norm(model, axis=0)
     both = np.zeros((500, 2, LAGS))

@@ -22,8 +22,10 @@ from emb_bench.excitation import (
     run_excitation,
     schroeder_phases,
 )
+from emb_bench.experiment.experiment import planned
+from emb_bench.experiment.simulate import Theta
+from emb_bench.experiment.simulate import simulate as simulate_brake
 from emb_bench.information.symmetric import Floats
-from emb_bench.sim.open_loop import simulate as simulate_brake
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimator import Estimator
@@ -231,7 +233,8 @@ def test_without_the_shield_the_same_excitations_leave_the_limits() -> None:
 def test_without_the_shield_a_sequence_acts_as_it_is(plant: str) -> None:
     response = played("multisine", plant)
     assert np.array_equal(response.currents, currents("multisine"))
-    expected = simulate_brake(BENCH.plant(plant).mechanics, BENCH.brake, response.currents, 1e-3).states
+    acted = planned(response.currents)
+    expected = simulate_brake(BENCH.plant(plant), Theta(BENCH.brake), acted, 1e-3).states
     assert np.array_equal(response.states, expected)
 
 

@@ -12,7 +12,6 @@ import pytest
 
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
-from emb_bench.experiment.evaluation import Fit, ModelEvaluator
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import (
     LOST,
@@ -23,6 +22,8 @@ from emb_bench.experiment.from_log import (
     read_experiment,
     samples_before,
 )
+from emb_bench.experiment.simulate import Theta
+from emb_bench.information.evaluation import Fit, information_and_fit
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.e2e import NO_COUNTER
@@ -76,9 +77,8 @@ def recorded(tmp_path: Path, run: SimRun, steps: int = 500) -> tuple[RunLog, Exp
 
 
 def fit(experiment: Experiment, bench: Bench, theta: BrakeParameters, plant: Plant) -> Fit:
-    evaluator = ModelEvaluator(bench, plant, theta, experiment.x0(plant.instruments.encoder_offset))
-    evaluator.take(experiment)
-    return evaluator.fit
+    at = Theta(theta, experiment.x0(plant.instruments.encoder_offset))
+    return information_and_fit(bench, plant, at, experiment)[1]
 
 
 def test_what_acted_is_exactly_what_the_node_was_told(

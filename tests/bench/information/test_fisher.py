@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import Instruments
+from emb_bench.experiment.experiment import planned
+from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.fisher import (
     Fisher,
     Kind,
@@ -22,7 +24,6 @@ from emb_bench.information.fisher import (
     weights_along,
 )
 from emb_bench.information.symmetric import Floats, log_det, pack
-from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 from tests.bench.flows import euler_states, of_euler, square
@@ -167,13 +168,13 @@ def test_euler_finds_information_that_the_exact_brake_does_not_give(
 def test_a_brake_that_moves_once_and_stays_is_singular_and_euler_pays_for_its_chatter() -> None:
     # While it moves forward, motor and friction torque are one number; Euler never comes to rest and tells them apart.
     currents = np.full(500, 0.9)
-    chatter = simulate(EULER.mechanics, BRAKE, currents, T_S).states[-100:, 1]
+    chatter = simulate(EULER, Theta(BRAKE), planned(currents), T_S).states[-100:, 1]
     assert 0.0 < np.abs(chatter).max() < 2.0 * BRAKE.T_c * T_S / BRAKE.J
     invented = of(currents, plant="euler")
     assert invented.criteria().log_det == pytest.approx(91.4, abs=0.06)
     assert max(invented.cramer_rao().values()) < 1e-4
     found = of(currents)
-    assert (simulate(EXACT.mechanics, BRAKE, currents, T_S).states[-100:, 1] == 0.0).all()
+    assert (simulate(EXACT, Theta(BRAKE), planned(currents), T_S).states[-100:, 1] == 0.0).all()
     assert found.criteria().singular
     assert found.criteria().log_det == -math.inf
     (flat,) = found.criteria().flat
@@ -232,7 +233,7 @@ def test_an_error_of_the_sampling_instant_is_worth_what_the_output_changes_in_it
 
 
 def test_the_velocity_of_an_observer_is_no_measurement_of_its_own() -> None:
-    s = simulate(EXACT.mechanics, BRAKE, chirp(), T_S, PARAMETER_NAMES).sensitivities[:, :, 0]
+    s = simulate(EXACT, Theta(BRAKE), planned(chirp()), T_S, PARAMETER_NAMES).sensitivities[:, :, 0]
     np.testing.assert_allclose(of(chirp(), plant="observer").matrix, s.T @ s / BENCH.noise.angle**2, rtol=1e-11)
 
 

@@ -9,8 +9,9 @@ import pytest
 
 from emb_bench.brake.euler import step
 from emb_bench.config.bench import load_bench
+from emb_bench.experiment.experiment import planned
+from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.symmetric import Floats
-from emb_bench.sim.open_loop import simulate
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 from tests.bench.flows import ALL, difference, euler_states, of_euler, square
@@ -61,14 +62,14 @@ def test_the_base_install_is_enough() -> None:
 
 def test_states_do_not_depend_on_what_is_asked_about_them() -> None:
     for plant in (EULER, EXACT, BENCH.plant("rough")):
-        alone = simulate(plant.mechanics, BRAKE, square(20, 4.0), T_S, x0=(1.0, -20.0))
-        asked = simulate(plant.mechanics, BRAKE, square(20, 4.0), T_S, ALL, (1.0, -20.0))
+        theta, currents = Theta(BRAKE, (1.0, -20.0)), planned(square(20, 4.0))
+        alone, asked = (simulate(plant, theta, currents, T_S, params) for params in ((), ALL))
         np.testing.assert_array_equal(alone.states, asked.states)
         assert alone.sensitivities.shape == (500, 0, 2)
 
 
 def test_no_currents_give_the_start_and_no_samples() -> None:
-    run = simulate(EXACT.mechanics, BRAKE, [], T_S, ALL, (1.0, 2.0))
+    run = simulate(EXACT, Theta(BRAKE, (1.0, 2.0)), planned([]), T_S, ALL)
     assert run.states.tolist() == [[1.0, 2.0]]
     assert run.sensitivities.shape == (0, len(ALL), 2)
 
@@ -78,7 +79,7 @@ def test_no_currents_give_the_start_and_no_samples() -> None:
 )
 def test_parameters_that_make_no_sense_are_refused(params: tuple[str, ...], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        simulate(EULER.mechanics, BRAKE, [1.0], T_S, params)
+        simulate(EULER, Theta(BRAKE), planned([1.0]), T_S, params)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +92,7 @@ def test_through_a_reversal_euler_sensitivities_are_wrong_by_tens_of_percent_and
 ) -> None:
     worst = {}
     for plant in (EULER, EXACT):
-        s = simulate(plant.mechanics, BRAKE, currents, T_S, PARAMETER_NAMES).sensitivities
+        s = simulate(plant, Theta(BRAKE), planned(currents), T_S, PARAMETER_NAMES).sensitivities
         errors = []
         for i, name in enumerate(PARAMETER_NAMES):
             expected, smooth = difference(EXACT.mechanics, BRAKE, currents, (0.0, 0.0), name)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from emb_bench.config.bench import Bench
-from emb_bench.experiment.evaluation import ModelEvaluator
-from emb_bench.experiment.experiment import Experiment
-from emb_bench.sim.open_loop import NO_ERRORS, SystematicErrors, simulate
+from emb_bench.experiment.experiment import Experiment, Floats, planned
+from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors, Theta, simulate
+from emb_bench.information.evaluation import Fit, information_and_fit
 
 FINE = 20  # Steps of the simulation in a period
 CURRENTS = np.repeat([2.0, -1.5, 1.0, 0.3], 20)
@@ -27,21 +27,18 @@ def shown(
         gain: relative error of the velocity's scale.
     """
     acted = np.concatenate([np.zeros(max(late, 0)), np.repeat(CURRENTS, FINE)]) + current_offset
-    fine = simulate(bench.plant("exact").mechanics, bench.brake, acted, bench.timing.sample_time / FINE).states
+    plant, t_s = bench.plant("exact"), bench.timing.sample_time
+    fine = simulate(plant, Theta(bench.brake), planned(acted), t_s / FINE).states
     at = np.arange(FINE, len(CURRENTS) * FINE, FINE)
     x = fine[at - min(late, 0)]
     return Experiment("", CURRENTS[: len(x)], x * [1.0, 1.0 + gain] + [offset, 0.0], 0.0, 0.0, 0.0, True)
 
 
-def evaluated(bench: Bench, piece: Experiment, errors: SystematicErrors, *names: str) -> ModelEvaluator:
-    """Evaluates an experiment in parts."""
-    n = len(piece.currents)
-    found = ModelEvaluator(
-        bench, bench.plant("exact"), bench.brake, (0.0, 0.0), errors=errors, names=names, periods=n, instants=[n - 1]
-    )
-    for part in piece.split(30):
-        found.take(part)
-    return found
+def evaluated(bench: Bench, run: Experiment, errors: SystematicErrors, *names: str) -> tuple[Floats, Fit]:
+    """The physical information of an experiment that is evaluated in parts, and the fit."""
+    theta, last = Theta(bench.brake, errors=errors), [run.periods - 1]
+    histories, fit = information_and_fit(bench, bench.plant("exact"), theta, run, names, instants=last, piece=30)
+    return histories["physical"][-1], fit
 
 
 @pytest.mark.parametrize(
@@ -63,7 +60,7 @@ def test_a_record_is_explained_with_its_systematic_errors_only(
     bench: Bench, simulated: dict[str, Any], errors: SystematicErrors, most: float
 ) -> None:
     piece = shown(bench, **simulated)
-    explained, alone = evaluated(bench, piece, errors).fit, evaluated(bench, piece, NO_ERRORS).fit
+    (_, explained), (_, alone) = (evaluated(bench, piece, each, "k_m") for each in (errors, NO_ERRORS))
     assert max(explained.angle, explained.velocity) < most
     assert max(alone.angle, alone.velocity) > 1.0
 
@@ -77,7 +74,7 @@ def test_the_information_about_systematic_errors_is_that_of_finite_differences(b
         more, less = (shown(bench, **at | {option: at[option] + sign * step}) for sign in (1, -1))
         derivative = (more.samples - less.samples) / (2.0 * size)
         rows.append((derivative / [bench.noise.angle, bench.noise.velocity]).ravel())
-    found = evaluated(bench, shown(bench, **at), SystematicErrors(0.01, 0.05, 0.3, 0.02), *steps)
+    found, _ = evaluated(bench, shown(bench, **at), SystematicErrors(0.01, 0.05, 0.3, 0.02), *steps)
     expected = np.array(rows) @ np.array(rows).T
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    np.testing.assert_allclose(found.histories["physical"][-1] / scale, expected / scale, atol=1e-3)
+    np.testing.assert_allclose(found / scale, expected / scale, atol=1e-3)

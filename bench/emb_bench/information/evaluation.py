@@ -5,30 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from emb_bench.brake.motion import no_sensitivity, rest
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT, RECORDED_PLANT, THESIS_PLANT, Plant
 from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors, Theta, Trajectory, simulate_parts
 from emb_bench.information.fisher import Fisher, Kind, information_over_time, uniform_prior, weights_along
 from emb_bench.information.identifiability import Identifiability
 from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import RunLog
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
-from emb_bench.sim.open_loop import (
-    NO_ERRORS,
-    SystematicErrors,
-    Trajectory,
-    check_unknowns,
-    fast_loop,
-    held,
-    show,
-    trajectory,
-)
+from emb_bench.sim.open_loop import check_unknowns, fast_loop
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import LogError, UsageError
 
@@ -57,105 +48,70 @@ class Fit:
         return self.samples > 0 and self.angle <= self.expected and self.velocity <= self.expected  # not with NaN
 
 
-class ModelEvaluator:
-    """Evaluates one model along an experiment, piece by piece.
+PIECE = 8192  # Periods that are evaluated together
+INSTANTS = 1000  # Instants after which the information is kept; of a record that is no longer, after each sample
+
+
+def information_and_fit(
+    bench: Bench,
+    plant: Plant,
+    theta: Theta,
+    experiment: Experiment,
+    names: Sequence[str] = (),
+    start: Floats | None = None,
+    instants: Sequence[int] = (),
+    piece: int = PIECE,
+) -> tuple[Mapping[Kind, Floats], Fit]:
+    """Fisher information of an experiment about some unknowns over time, by kind, and the fit of the model.
+
+    The information, shape (instants, p, p), is that after the periods ``instants``, in ascending order; the physical
+    one begins at ``start``, shape (p, p). Samples count as on the grid, and what acted as it is assumed in gaps. The
+    experiment goes through the model in pieces of some periods.
 
     A measurement delay of the model shifts what a sample measures: the first ones show the brake before the experiment
     and inform of the encoder's offset and of the start alone. The jitter of the clock makes the standard deviations
-    larger where the brake is fast; an observer is run along the plant's own angle. Its noise is coloured, so that its
-    mean square scatters more than that of white noise.
-
-    Systematic ``errors`` count in the information and in the fit. The physical information before the first sample is
-    ``start``, shape (p, p); the information is kept after the ``instants`` of the ``periods``, in ascending order.
+    larger where the brake is fast. Noise of an observer's velocity is coloured, so that its mean square scatters more
+    than that of white noise.
     """
-
-    def __init__(
-        self,
-        bench: Bench,
-        plant: Plant,
-        theta: BrakeParameters,
-        x0: tuple[float, float],
-        *,
-        errors: SystematicErrors = NO_ERRORS,
-        names: Sequence[str] = (),
-        start: Floats | None = None,
-        periods: int = 0,
-        instants: Sequence[int] = (),
-    ) -> None:
-        if errors.offset is None:
-            errors = errors._replace(offset=plant.instruments.encoder_offset)
-        self._bench, self._plant, self._theta, self._errors = bench, plant, theta, errors
-        early = ("delay",) if errors.delay < 0.0 and "delay" not in names else ()
-        self._unknowns, (self._chosen, begun) = len(names), no_sensitivity((*names, *early))
-        x = rest()
-        x[:2] = x0
-        x[3] = errors.current_offset
-        # Those of the instants that the next samples show, up to the one at which the next period begins.
-        shown = plant.instruments.measurement_delay + 1
-        self._x, self._s = np.repeat(x[None], shown, axis=0), np.repeat(begun[None], shown, axis=0)
-        nothing = np.zeros((len(names), len(names)))
-        self._totals: dict[Kind, Floats] = {"physical": nothing if start is None else start, "weighted": nothing}
-        self._kept: dict[Kind, list[Floats]] = {kind: [np.empty((0, *nothing.shape))] for kind in KINDS}
-        self._instants = np.asarray(instants, np.int64)
-        self._loop = fast_loop(periods)
-        self._done = 0
-        self._memory = np.zeros(MEMORY)
-        settle(plant.instruments._replace(encoder_offset=self._errors.offset or 0.0), self._memory, x0[0])
-        self._squares, self._samples = np.zeros(2), 0
-
-    def take(self, piece: Experiment) -> None:
-        """Go through the next periods of the experiment."""
-        n, t_s = piece.periods, self._bench.timing.sample_time
-        acting = held(piece.currents + self._errors.current_offset, t_s, max(self._errors.delay, 0.0))
-        x, moved = trajectory(
-            self._loop, self._plant.mechanics, self._theta, acting, self._chosen, self._x[-1], self._s[-1]
-        )
-        self._x, self._s = np.concatenate([self._x, x[1:]]), np.concatenate([self._s, moved[1:]])
-        shown = show(self._x[: n + 1], self._s[: n + 1], self._chosen, self._errors)
-        self._x, self._s = self._x[n:], self._s[n:]
-        if self._unknowns:
-            self._inform(piece, shown)
-        self._compare(piece, shown)
-        self._done += n
-
-    def _inform(self, piece: Experiment, shown: Trajectory) -> None:
-        wanted = self._instants - self._done
-        wanted = wanted[(wanted >= 0) & (wanted < piece.periods)]
-        for kind in KINDS:
-            weights = weights_along(self._bench, kind, self._plant.instruments, shown.states)
-            s = shown.sensitivities[:, : self._unknowns]
-            history = information_over_time(s, weights, self._totals[kind], piece.measured)
-            self._totals[kind] = history[-1]
-            self._kept[kind].append(history[wanted])
-
-    def _compare(self, piece: Experiment, shown: Trajectory) -> None:
-        """Add up how far the samples lie from what the instruments show of the motion, but for their noise."""
-        instruments, t_s = self._plant.instruments, self._bench.timing.sample_time
-        jitter_only = instruments._replace(observer_bandwidth=0.0)
-        deviations = weights_along(self._bench, "physical", jitter_only, shown.states) ** -0.5
-        samples = shown.samples
-        if instruments.observer_bandwidth > 0.0:
-            observed = [observe(instruments, self._memory, t_s, float(angle)) for angle in samples[:, 0]]
-            samples[:, 1] = (1.0 + self._errors.velocity_gain) * np.array(observed)
-            deviations[:, 1] = observer_noise(instruments.observer_bandwidth, t_s, 1.0) * deviations[:, 0]
-        seen = ((piece.samples - samples) / deviations)[piece.measured]
-        self._squares += np.sum(seen**2, axis=0)
-        self._samples += len(seen)
-
-    @property
-    def fit(self) -> Fit:
-        """Fit of the model to the samples so far."""
-        angle, velocity = np.sqrt(self._squares / max(self._samples, 1)).tolist()
-        return Fit(angle, velocity, self._samples)
-
-    @property
-    def histories(self) -> Mapping[Kind, Floats]:
-        """The information after each of the instants, shape (instants, p, p), by kind."""
-        return {kind: np.concatenate(parts) for kind, parts in self._kept.items()}
+    nothing, at = np.zeros((len(names), len(names))), np.asarray(instants, np.int64)
+    totals: dict[Kind, Floats] = {"physical": nothing if start is None else start, "weighted": nothing}
+    kept: dict[Kind, list[Floats]] = {kind: [np.empty((0, *nothing.shape))] for kind in KINDS}
+    memory = np.zeros(MEMORY)
+    settle(plant.instruments._replace(encoder_offset=theta.offset(plant)), memory, theta.start[0])
+    squares, count, done = np.zeros(2), 0, 0
+    pieces = list(replace(experiment, late=None, assumed=None, places=None).split(piece))
+    loop = fast_loop(experiment.periods)
+    shown = simulate_parts(plant, theta, pieces, bench.timing.sample_time, names, loop) if pieces else ()
+    for part, motion in zip(pieces, shown, strict=True):
+        wanted = at[(at >= done) & (at < done + part.periods)] - done
+        for kind in KINDS if names else ():
+            weights = weights_along(bench, kind, plant.instruments, motion.states)
+            history = information_over_time(motion.sensitivities, weights, totals[kind], part.measured)
+            totals[kind] = history[-1]
+            kept[kind].append(history[wanted])
+        distances = _distances(bench, plant, theta, part, motion, memory)
+        squares, count, done = squares + np.sum(distances**2, axis=0), count + len(distances), done + part.periods
+    angle, velocity = np.sqrt(squares / max(count, 1)).tolist()
+    return {kind: np.concatenate(parts) for kind, parts in kept.items()}, Fit(angle, velocity, count)
 
 
-PIECE = 8192  # Periods that are evaluated together
-INSTANTS = 1000  # Instants after which the information is kept; of a record that is no longer, after each sample
+def _distances(
+    bench: Bench, plant: Plant, theta: Theta, part: Experiment, motion: Trajectory, memory: Floats
+) -> Floats:
+    """Measured samples less what the instruments show but for their noise, in standard deviations, shape (count, 2).
+
+    An observer, with its ``memory``, is run along the plant's own angle.
+    """
+    instruments, t_s = plant.instruments, bench.timing.sample_time
+    jitter_only = instruments._replace(observer_bandwidth=0.0)
+    deviations = weights_along(bench, "physical", jitter_only, motion.states) ** -0.5
+    samples = motion.samples
+    if instruments.observer_bandwidth > 0.0:
+        observed = [observe(instruments, memory, t_s, float(angle)) for angle in samples[:, 0]]
+        samples[:, 1] = (1.0 + theta.errors.velocity_gain) * np.array(observed)
+        deviations[:, 1] = observer_noise(instruments.observer_bandwidth, t_s, 1.0) * deviations[:, 0]
+    distances: Floats = ((part.samples - samples) / deviations)[part.measured]
+    return distances
 
 
 @dataclass(frozen=True)
@@ -250,32 +206,22 @@ def evaluate(
     theta: BrakeParameters,
     errors: SystematicErrors = NO_ERRORS,
 ) -> list[Evaluation]:
-    """Compute both Fisher informations over time, and how well each model fits; all go through the record together.
+    """Compute both Fisher informations over time, and how well each model fits.
 
     They are those at ``theta``, with the systematic errors of the bench there.
     """
     instants = evenly(experiment.periods, INSTANTS)
-    evaluators = [
-        ModelEvaluator(
-            bench,
-            plant,
-            theta,
-            experiment.x0(plant.instruments.encoder_offset if errors.offset is None else errors.offset),
-            errors=errors,
-            names=question.names,
-            start=question.start(theta),
-            periods=experiment.periods * len(plants),
-            instants=instants,
+    found = []
+    for plant in plants:
+        at = Theta(theta, errors=errors)
+        at = at._replace(start=experiment.x0(at.offset(plant)))
+        histories, fit = information_and_fit(
+            bench, plant, at, experiment, question.names, question.start(theta), instants
         )
-        for plant in plants
-    ]
-    for piece in experiment.split(PIECE):
-        for evaluator in evaluators:
-            evaluator.take(piece)
-    return [
-        Evaluation(log, bench, experiment, plant, theta_name, theta, errors, question, p.fit, instants, p.histories)
-        for plant, p in zip(plants, evaluators, strict=True)
-    ]
+        found.append(
+            Evaluation(log, bench, experiment, plant, theta_name, theta, errors, question, fit, instants, histories)
+        )
+    return found
 
 
 def evenly(count: int, most: int) -> list[int]:

@@ -1,0 +1,177 @@
+"""The one model of an experiment: what the instruments show of a brake under its currents, and the derivatives of that.
+
+:func:`simulate` is what information, fits, score tests, held-out predictions, the check of a design and commissioning
+compute with. In it are a late command, an unknown place of contact, gaps in the reports, the lateness of samples, and
+the errors of sensors. A filter, which corrects the state between two samples, has a loop of its own
+(:mod:`emb_bench.estimate.innovations`) around the same period and the same :func:`emb_bench.sim.instruments.reading`.
+
+**Gaps.** A single period of which no report says what acted has an unknown current. After several in a row the brake is
+somewhere: it is put to where the next sample shows it, and its angle and velocity there are unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
+from emb_bench.brake.parameters import COMMAND, DELAY
+from emb_bench.config.plants import Instruments, Plant
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.sim.instruments import reading, sensor_share
+from emb_bench.sim.open_loop import Input, check_unknowns, delay_share, march, trajectory
+from emb_runtime.config.bench import BrakeParameters
+
+
+class SystematicErrors(NamedTuple):
+    """Systematic errors of bench and sensors, beyond those that belong to the plant."""
+
+    offset: float | None = None  # Reading of the encoder at the origin [rad]; None takes the plant's
+    current_offset: float = 0.0  # Current that acts beyond what the node reports [A]
+    delay: float = 0.0  # By which commands act late [samples], above -1 and below 1; below 0, samples are late
+    velocity_gain: float = 0.0  # Relative error of the velocity's scale
+
+
+NO_ERRORS = SystematicErrors()
+
+
+class Theta(NamedTuple):
+    """Values of all that a brake's motion and its samples depend on, besides the currents."""
+
+    brake: BrakeParameters
+    start: tuple[float, float] = (0.0, 0.0)  # Angle [rad] and velocity [rad/s] before the first period
+    errors: SystematicErrors = NO_ERRORS
+    contact: float = 0.0  # Angle at which the clamping begins [rad]
+
+    def offset(self, plant: Plant) -> float:
+        """Reading of the encoder at the origin [rad]."""
+        return plant.instruments.encoder_offset if self.errors.offset is None else self.errors.offset
+
+    def begin(self, before: float, params: Sequence[str]) -> tuple[Floats, Integers, Floats]:
+        """State after a current ``before`` [A], indices of the unknowns, sensitivities to them.
+
+        As :func:`emb_bench.brake.motion.advance` takes them: a contact elsewhere is a brake that lies elsewhere, for
+        nothing else depends on the place.
+        """
+        x = rest()
+        x[0], x[1], x[3] = self.start[0] - self.contact, self.start[1], before + self.errors.current_offset
+        return x, *no_sensitivity(params)
+
+
+class Trajectory(NamedTuple):
+    """Motion of a brake, samples of it by undisturbed sensors, and their sensitivities."""
+
+    states: Floats
+    """Angle [rad] and velocity [rad/s] at the n + 1 instants that the samples y_0..y_n show, shape (n + 1, 2)."""
+    samples: Floats  # Samples y_1..y_n: angle [rad] and velocity [rad/s], shape (n, 2)
+    sensitivities: Floats
+    """Of the samples to the parameters, then to what is unknown in the gaps, shape (n, unknowns, 2).
+
+    Relative for the brake's parameters, θ_i ∂y/∂θ_i at its own θ (eq. 4.17); per unit for those in ``UNITS``, for the
+    current of a single lost report [A], and for angle and velocity after a longer gap.
+    """
+
+
+def simulate(
+    plant: Plant,
+    theta: Theta,
+    experiment: Experiment,
+    t_s: float,
+    params: Sequence[str] = (),
+    loop: Callable[..., None] = march,
+) -> Trajectory:
+    """Simulates an experiment of n periods of ``t_s`` [s]: what a plant's instruments show; limits are not applied.
+
+    ``params`` are any of ``PARAMETERS`` in any order; none gives the samples alone. ``loop`` is
+    :func:`emb_bench.sim.open_loop.march`, as it is or compiled.
+    """
+    return next(simulate_parts(plant, theta, (experiment,), t_s, params, loop))
+
+
+def simulate_parts(
+    plant: Plant,
+    theta: Theta,
+    parts: Sequence[Experiment],
+    t_s: float,
+    params: Sequence[str] = (),
+    loop: Callable[..., None] = march,
+) -> Iterator[Trajectory]:
+    """As :func:`simulate`, an experiment in parts one after the other, so that it takes little memory.
+
+    Of several parts none has a gap.
+    """
+    check_unknowns(params)
+    errors, delay = theta.errors, plant.instruments.measurement_delay
+    # A command that acts early is counted to first order, for which its sensitivity is needed.
+    early = ("delay",) if errors.delay < 0.0 and "delay" not in params else ()
+    x, chosen, s = theta.begin(parts[0].before, (*params, *early))
+    # Rows that the next samples show: until a delay has passed, the start.
+    waiting = (
+        np.repeat(x[None], delay, axis=0),
+        np.pad(np.repeat(s[None], delay, axis=0), ((0, 0), (0, parts[0].gap_unknowns), (0, 0))),
+    )
+    for part in parts:
+        breaks, places = gap_ends(part, plant.instruments)
+        acting = Input(
+            part.currents + errors.current_offset,
+            t_s,
+            max(errors.delay, 0.0),
+            part.gaps[0],
+            breaks,
+            places - [theta.contact, 0.0],
+        )
+        rows = trajectory(loop, plant.mechanics, theta.brake, acting, chosen, x, s)
+        x, s = (row[-1] for row in rows)
+        states, moved = (np.concatenate(both) for both in zip(waiting, rows, strict=True))
+        n = part.periods
+        waiting = states[n:-1], moved[n:-1]
+        unknowns = np.append(chosen, np.full(part.gap_unknowns, COMMAND))
+        shown = _shown(states[: n + 1], moved[: n + 1], unknowns, theta, theta.offset(plant), part.late, t_s)
+        if early:
+            shown = shown._replace(sensitivities=np.delete(shown.sensitivities, len(params), axis=1))
+        yield shown
+
+
+def gap_ends(experiment: Experiment, instruments: Instruments) -> tuple[Integers, Floats]:
+    """Periods at whose ends the brake is found again after longer gaps, and where: angle [rad], velocity [rad/s].
+
+    They are those of the first sample that shows it, not one period earlier: integrating back through a standstill
+    cannot recover the velocity. The place is the one that an estimate has found, or else as measured.
+    """
+    delay, last = instruments.measurement_delay, experiment.periods - 1
+    breaks = np.minimum(experiment.gaps[1] + int(delay == 0), last)
+    if experiment.places is not None:
+        return breaks, experiment.places
+    measured = experiment.samples[np.minimum(breaks + delay, last)]
+    return breaks, np.nan_to_num(measured) - [instruments.encoder_offset, 0.0]
+
+
+def later(rows: Floats, delay: int) -> Floats:
+    """Rows, shape (n, ...), as they are seen ``delay`` rows later; until then the first one."""
+    return np.concatenate([np.repeat(rows[:1], delay, axis=0), rows])[: len(rows)]
+
+
+def _shown(
+    x: Floats, s: Floats, unknowns: Integers, theta: Theta, offset: float, late: Floats | None, t_s: float
+) -> Trajectory:
+    """Samples along the states ``x`` of n + 1 instants, with their sensitivities ``s``.
+
+    The states are those of commands that act late, if they do. Each sample is taken ``late`` [s] after its period,
+    shape (n,).
+    """
+    delay, scale = theta.errors.delay, 1.0 + theta.errors.velocity_gain
+    states, shares = x[:, :2] + [theta.contact, 0.0], s[:, :, :2].copy()
+    shares[:, unknowns == DELAY] /= delay_share(DELAY, max(delay, 0.0))
+    if delay < 0.0:
+        states += delay * shares[:, np.argmax(unknowns == DELAY)]
+    stamps = np.zeros(len(states) - 1) if late is None else late
+    acceleration = np.diff(states[:, 1]) / t_s
+    samples = np.stack(reading(states[1:, 0], states[1:, 1], acceleration, stamps, offset, scale), axis=1)
+    angle, velocity = shares[1:, :, 0], shares[1:, :, 1]
+    sensitivities = np.stack([angle + stamps[:, None] * velocity, scale * velocity], axis=2)
+    for i, unknown in enumerate(unknowns.tolist()):
+        for output in range(2):
+            sensitivities[:, i, output] += sensor_share(unknown, output, samples[:, output] / scale)
+    return Trajectory(states, samples, sensitivities)
