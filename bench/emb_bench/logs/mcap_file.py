@@ -374,18 +374,37 @@ def describe(factory: Any, units: str = "{}") -> tuple[Column, ...]:
 def columns(factory: Any, payloads: Sequence[bytes], wanted: Collection[str]) -> dict[str, NDArray[Any]]:
     """Wanted fields of n serialised messages, each of shape (n,), but those that are missing, or messages themselves.
 
-    Numbers are int64 or float64, bool is bool, text and bytes are objects.
+    Numbers are int64 or float64, bool is bool, text and bytes are objects. The messages are parsed as one whose fields
+    are repeated. A field that not each of them has, which those of a log have, is parsed message by message.
 
     Raises:
         google.protobuf.message.DecodeError: a message is damaged.
         OverflowError: a number is beyond int64.
     """
-    messages = [factory.FromString(payload) for payload in payloads]
-    return {
-        entry.name: np.array([getattr(message, entry.name) for message in messages], dtype=_type(entry))
-        for entry in factory.DESCRIPTOR.fields
-        if entry.name in wanted and entry.cpp_type != entry.CPPTYPE_MESSAGE
-    }
+    joined, found = _repeated(factory).FromString(b"".join(payloads)), dict[str, NDArray[Any]]()
+    for entry in factory.DESCRIPTOR.fields:
+        if entry.name in wanted and entry.cpp_type != entry.CPPTYPE_MESSAGE:
+            values = getattr(joined, entry.name)
+            if len(values) != len(payloads):
+                values = [getattr(factory.FromString(payload), entry.name) for payload in payloads]
+            found[entry.name] = np.array(values, dtype=_type(entry))
+            if entry.cpp_type == entry.CPPTYPE_UINT64 and found[entry.name].min(initial=0) < 0:
+                raise OverflowError(f"{entry.name} is beyond 63 bits")
+    return found
+
+
+@lru_cache(maxsize=64)
+def _repeated(factory: Any) -> Any:
+    """The class of a message with the same fields, but messages, each of them repeated."""
+    file = descriptor_pb2.FileDescriptorProto(name="repeated.proto", syntax="proto3")
+    message = file.message_type.add(name="Repeated")
+    for entry in factory.DESCRIPTOR.fields:
+        if entry.cpp_type != entry.CPPTYPE_MESSAGE:
+            kind = entry.TYPE_INT32 if entry.enum_type else entry.type
+            message.field.add(name=entry.name, number=entry.number, type=kind, label="LABEL_REPEATED")
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName("Repeated"))
 
 
 def _type(entry: Any) -> type[Any]:
