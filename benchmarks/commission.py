@@ -152,7 +152,7 @@ def commissioned(
         row["written"] = (folder / "bench.toml").exists()
         row["refused"] = row["named"] and not row["written"] and not row["passed"]
     if result is not None:
-        one, found = result.identified, result.ranges
+        one, found = result.found.identified, result.ranges
         row |= {"model": one.model, "fits": one.fits, "delays": (one.command_delay, one.measurement_delay)}
         row["inside"] = {n: bool(found[n][0] <= drawn[n] <= found[n][1]) for n in PARAMETER_NAMES}
         row["in_95"] = {n: bool(one.intervals[n][0] <= drawn[n] <= one.intervals[n][1]) for n in PARAMETER_NAMES}

@@ -8,6 +8,7 @@ from importlib import metadata
 from pathlib import Path
 
 from emb_bench.config.bench import load_bench
+from emb_bench.documents import to_json
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.system.terminal import Parser, as_json, complain, mention, show
@@ -85,7 +86,7 @@ def main(argv: list[str] | None = None) -> int:
         except OSError as err:
             where, expected = err.filename or args.folder, "expected a folder to write in, made if there is none"
             raise UsageError(f"{where}: {err.strerror}; {expected}") from err
-        show(as_json(result.document()) if args.json else str(result))
+        show(as_json(to_json({"result": "done", **vars(result)})) if args.json else str(result))
     except EmbError as err:
         return complain("emb-commission", err)
     return EXIT_DONE

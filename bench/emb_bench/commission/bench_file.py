@@ -6,13 +6,12 @@ A file is made from the data sheet's; each number that is not the sheet's has it
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import tomlkit
 from tomlkit import TOMLDocument
 
-from emb_bench.brake.parameters import SI
+from emb_bench.commission.comparison import contradiction, not_inside, sheet_range
 from emb_bench.commission.records import Findings, Identification
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.config.plants import SHORTEST_LAG
@@ -24,6 +23,7 @@ from emb_runtime.safety.shield_design import make_law
 SHEET, MEASURED = "sheet", "measured"  # Names of the sets of ranges
 WRITTEN = "# Written by emb-commission from a data sheet's bench file. SI units."
 """First line of a bench file of a commissioning."""
+UNEXPLAINED = 9.0  # Mean square of the residuals, in variances of the noise at rest, from which on nothing is explained
 WIDENED = 0.1  # Share of its value by which a range exceeds the interval: brakes change as they warm and wear
 WIDENED_MISFIT = 0.25  # Share where the residuals contradict every model
 NOISE_WIDENED = 1.2  # Factor from a standard deviation that was measured to the one that is written
@@ -33,25 +33,27 @@ NARROWEST, STEP_DOWN = 10.0, 5.0  # Least upper angle limit that is tried, and b
 
 def working_text(sheet: Bench) -> str:
     """Bench file that the steps run with: the data sheet's, its angle as far as its ranges have a shield."""
-    document = _draft(sheet)
-    _limit_angle(document)
-    return _text(document)
+    return _text(_draft(sheet))
 
 
 def found_text(sheet: Bench, found: Findings, logs: str) -> str:
-    """Bench file that is found from ``logs``, as the comments call them."""
-    rest, current, one = found.rest, found.current, found.identified
-    assert rest is not None
-    assert current is not None
-    assert one is not None
+    """Bench file that is found from ``logs``, as the comments call them.
+
+    Raises:
+        BenchFileError: an interval is not inside of the data sheet's range, or no shield covers the ranges.
+    """
+    current, one = found.current, found.identified
+    if names := not_inside(sheet, one):
+        raise BenchFileError(contradiction(sheet, one, names))
     document, by_fit = _draft(sheet), f"model {one.model}, {logs}"
-    for name, (low, high) in measured_ranges(sheet, one).items():
+    for name in PARAMETER_NAMES:
+        low, high, reason = measured_range(sheet, one, name)
         _put(document, f"brake.{name}", _rounded(min(max(one.values[name], low), high)), by_fit)
         interval = "{:.5g} to {:.5g}".format(*one.intervals[name])
-        _put(document, f"ranges.{MEASURED}.{name}", [low, high], f"95 %: {interval}; {_reason(sheet, one, name)}")
+        _put(document, f"ranges.{MEASURED}.{name}", [low, high], f"95 %: {interval}; {reason}")
     document["ranges"][MEASURED].add(tomlkit.nl())
     for name in ("angle", "velocity"):
-        at_rest, moving = getattr(rest.noise, name), getattr(one.noise, name)
+        at_rest, moving = getattr(found.noise, name), getattr(one.noise, name)
         origin = f"at rest {at_rest:.3g}, of the residuals {moving:.3g}; the larger times {NOISE_WIDENED:g}"
         _put(document, f"noise.{name}", _rounded(NOISE_WIDENED * max(at_rest, moving), up=True), origin)
     age = current.latest + one.measurement_delay
@@ -61,93 +63,39 @@ def found_text(sheet: Bench, found: Findings, logs: str) -> str:
     origin = f"95 % up to {one.current_lag[1]:.3g} s, times {LAG_WIDENED:g}, at most the data sheet's"
     _put(document, "shield.current_lag", lag, origin)
     _put(document, "shield.ranges", MEASURED, "the measured ones")
-    for name, value in _features(one, current.delay).items():
+    plant: dict[str, float | int] = {name: _rounded(value) for name, value in one.features.items()}
+    if (lag := _rounded(0.5 * sum(one.current_lag))) >= SHORTEST_LAG:
+        plant["current_lag"] = lag
+    plant |= {"command_delay": current.delay, "measurement_delay": one.measurement_delay}
+    for name, value in plant.items():
         _put(document, f"plants.{MEASURED}.{name}", value, by_fit)
-    _limit_angle(document)
     return _text(document)
 
 
-def _features(one: Identification, command_delay: int) -> dict[str, float | int]:
-    """The model that was found, as a plant to simulate and to evaluate with."""
-    found: dict[str, float | int] = {name: _rounded(value) for name, value in one.features.items()}
-    if (lag := _rounded(0.5 * (one.current_lag[0] + one.current_lag[1]))) >= SHORTEST_LAG:
-        found["current_lag"] = lag
-    return found | {"command_delay": command_delay, "measurement_delay": one.measurement_delay}
+def measured_range(sheet: Bench, one: Identification, name: str) -> tuple[float, float, str]:
+    """Range of a parameter that is written, and its reason: the interval, widened and cut to the data sheet's.
 
-
-# --- ranges ---------------------------------------------------------------------------------------------------------
-
-
-def measured_ranges(sheet: Bench, one: Identification) -> dict[str, tuple[float, float]]:
-    """Ranges that are written: the intervals, widened and cut to the data sheet's; the data sheet's if no model fits.
-
-    The shield takes k_1 as the clamping force over the angle: a curve and a hysteresis that were found widen its range.
-    What play takes from the clamping force or adds to it acts as friction: with play T_c keeps the data sheet's range.
-
-    Raises:
-        BenchFileError: an interval is not inside of the data sheet's range.
+    The data sheet's stays if no model fits. The shield takes k_1 as the clamping force over the angle: a curve and a
+    hysteresis that were found widen its range. What play takes from the clamping force or adds to it acts as friction:
+    with play T_c keeps the data sheet's range.
     """
-    if names := not_inside(sheet, one):
-        raise BenchFileError(contradiction(sheet, one, names))
-    found = {}
-    for name in PARAMETER_NAMES:
-        lowest, highest = found[name] = _range(sheet, name)
-        if one.is_unexplained or (name == "T_c" and "play" in one.features):
-            continue
-        low, high = one.intervals[name]
-        aside = _widening(one) * one.values[name]
-        least, greatest = _secants(sheet, one) if name == "k_1" else (1.0, 1.0)
-        low, high = least * (low - aside), greatest * (high + aside)
-        found[name] = max(lowest, _rounded(low)), min(highest, _rounded(high, up=True))
-    return found
-
-
-def _widening(one: Identification) -> float:
-    """Share of its value by which a range exceeds the interval."""
-    return WIDENED if one.fits else WIDENED_MISFIT
-
-
-def _reason(sheet: Bench, one: Identification, name: str) -> str:
-    """Reason of the written range of a parameter."""
-    if one.is_unexplained:
+    lowest, highest = sheet_range(sheet, name)
+    if not one.fits and one.ratio > UNEXPLAINED:
         times = math.sqrt(one.ratio)
-        return f"no model explains the experiments; residuals {times:.3g} times the noise: the data sheet's"
+        reason = f"no model explains the experiments; residuals {times:.3g} times the noise: the data sheet's"
+        return lowest, highest, reason
     if name == "T_c" and "play" in one.features:
-        return "the data sheet's, as play acts as friction"
-    curved = ", and by the curve and hysteresis of the force" if _secants(sheet, one) != (1.0, 1.0) else ""
-    misfit = "" if one.fits else " as no model fits"
-    return f"widened by {_widening(one):.0%}{misfit}{curved if name == 'k_1' else ''}, at most the data sheet's"
-
-
-def outside(sheet: Bench, one: Identification) -> list[str]:
-    """Parameters whose interval and the data sheet's range have nothing in common."""
-    return [
-        name
-        for name, (low, high) in one.intervals.items()
-        if high < _range(sheet, name)[0] or low > _range(sheet, name)[1]
-    ]
-
-
-def not_inside(sheet: Bench, one: Identification, margin: float = 0.0) -> list[str]:
-    """Parameters whose interval is not known, or not inside of the data sheet's range less a share of each border."""
-    found = []
-    for name, (low, high) in one.intervals.items():
-        lowest, highest = _range(sheet, name)
-        if not ((1.0 + margin) * lowest <= low and high <= (1.0 - margin) * highest):  # this way round for NaN
-            found.append(name)
-    return found
-
-
-def contradiction(sheet: Bench, one: Identification, names: Sequence[str]) -> str:
-    """Words for parameters that may lie outside of the data sheet's ranges, and what to do."""
-    values = []
-    for name in names:
-        (low, high), (lowest, highest) = one.intervals[name], _range(sheet, name)
-        values.append(f"{name} is {low:.5g} to {high:.5g} {SI[name]} (data sheet {lowest:.5g} to {highest:.5g})")
-    return (
-        f"by the estimate {' and '.join(values)}: widen {', '.join(names)} in [ranges.{sheet.shield.ranges}] of the "
-        "data sheet's bench file and begin again in another folder"
-    )
+        return lowest, highest, "the data sheet's, as play acts as friction"
+    share = WIDENED if one.fits else WIDENED_MISFIT
+    reason = f"widened by {share:.0%}{'' if one.fits else ' as no model fits'}"
+    low, high = one.intervals[name]
+    low, high = low - share * one.values[name], high + share * one.values[name]
+    if name == "k_1" and {"quadratic", "cubic", "hysteresis"} & {*one.features}:
+        least, greatest = _secants(sheet, one)
+        low, high = least * low, greatest * high
+        reason += ", and by the curve and hysteresis of the force"
+    low, high = max(lowest, _rounded(low)), min(highest, _rounded(high, up=True))
+    return low, high, f"{reason}, at most the data sheet's"
 
 
 def _secants(sheet: Bench, one: Identification) -> tuple[float, float]:
@@ -156,11 +104,6 @@ def _secants(sheet: Bench, one: Identification) -> tuple[float, float]:
     hysteresis, highest = one.features.get("hysteresis", 0.0), sheet.limits.angle[1]
     curve = [1.0 + quadratic * x + cubic * x * x for x in (highest * k / 20 for k in range(21))]
     return min(curve) * (1.0 - hysteresis), max(curve) * (1.0 + hysteresis)
-
-
-def _range(sheet: Bench, name: str) -> tuple[float, float]:
-    ends = sheet.range_set(sheet.shield.ranges)
-    return getattr(ends.low, name), getattr(ends.high, name)
 
 
 def _rounded(value: float, *, up: bool = False) -> float:
@@ -177,7 +120,7 @@ def _rounded(value: float, *, up: bool = False) -> float:
 def _draft(sheet: Bench) -> TOMLDocument:
     """The data sheet's document with its ranges as one whole set, without the learning shield."""
     document = parse_toml(sheet.text)
-    document["ranges"] = {SHEET: {name: list(_range(sheet, name)) for name in PARAMETER_NAMES}}
+    document["ranges"] = {SHEET: {name: list(sheet_range(sheet, name)) for name in PARAMETER_NAMES}}
     shield = {key: value for key, value in document["shield"].items() if key not in LEARNING}
     document["shield"] = {**shield, "ranges": SHEET}
     document.pop("estimator", None)  # it begins with the shield's ranges
@@ -194,28 +137,23 @@ def _put(document: TOMLDocument, path: str, value: Any, origin: str) -> None:
     table[key] = tomlkit.item(value).comment(origin)
 
 
-def _limit_angle(document: TOMLDocument) -> None:
-    """Lower the upper angle limit to the largest for which there is a shield; BenchFileError if there is none."""
-    low, own = document.unwrap()["limits"]["angle"]
-    problem = _shield_problem(document)
-    highest = own
-    while problem is not None and highest - STEP_DOWN >= NARROWEST:
-        highest -= STEP_DOWN
-        origin = f"{own:g} rad by the data sheet; the largest for which a shield covers the ranges"
-        _put(document, "limits.angle", [low, highest], origin)
-        if _shield_problem(document) is None:
-            return
-    if problem is not None:
-        raise problem
-
-
-def _shield_problem(document: TOMLDocument) -> BenchFileError | None:
-    try:
-        make_law(parse_bench(tomlkit.dumps(document), "the bench of a commissioning"))
-    except BenchFileError as err:
-        return err
-    return None
-
-
 def _text(document: TOMLDocument) -> str:
-    return f"{WRITTEN}\n# A number without an origin behind it is that file's.\n\n{tomlkit.dumps(document)}"
+    """Text of a document, its upper angle limit lowered to the largest for which there is a shield.
+
+    Raises:
+        BenchFileError: there is none.
+    """
+    low, own = document.unwrap()["limits"]["angle"]
+    highest, refusal = own, None
+    while True:
+        try:
+            make_law(parse_bench(tomlkit.dumps(document), "the bench of a commissioning"))
+        except BenchFileError as err:
+            refusal = refusal or err
+            highest -= STEP_DOWN
+            if not highest >= NARROWEST:
+                raise refusal from None
+            origin = f"{own:g} rad by the data sheet; the largest for which a shield covers the ranges"
+            _put(document, "limits.angle", [low, highest], origin)
+        else:
+            return f"{WRITTEN}\n# A number without an origin behind it is that file's.\n\n{tomlkit.dumps(document)}"

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from emb_bench.brake.parameters import SI
-from emb_bench.commission import examination
-from emb_bench.commission.bench_file import WRITTEN, found_text, measured_ranges, working_text
+from emb_bench.commission import comparison, examination, steps
+from emb_bench.commission.bench_file import WRITTEN, found_text, working_text
 from emb_bench.commission.records import Findings, Identification
-from emb_bench.commission.steps import EXPERIMENTS, FULL, RECENT, STEPS, Step, policy_file, suspected
+from emb_bench.commission.steps import EXPERIMENTS, Step, policy_file
 from emb_bench.config.bench import Bench, load_bench, parse_bench
-from emb_bench.documents import to_json
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError, SafetyStopError, UsageError
@@ -25,12 +25,14 @@ from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system import terminal
 
 WORKING, FOUND = "working.toml", "bench.toml"  # Names of the bench files in the folder
+RECENT = 2  # Experiments that the parameters are estimated from: each is larger and tells more than those before it
 OUTSIDE = {Fault.OUT_OF_LIMITS.name, Fault.MOTION_OUTSIDE_SET.name}
 """Results by which the brake may lie outside of the data sheet's ranges."""
 SIMULATED = ("sim", "sim-drive")  # Buses whose brake is made anew for each run
 
 Run = Callable[[Sequence[str]], Mapping[str, Any]]
 """A run of ``emb-run --json`` with these arguments; the document that it prints."""
+Finding = TypeVar("Finding")
 
 
 class StepFailedError(EmbError):
@@ -51,19 +53,8 @@ class Commissioned:
     logs: tuple[Path, ...]  # Of the steps, in their order
     runs: int  # Runs made by this call
 
-    def document(self) -> dict[str, Any]:
-        """Result as plain data."""
-        found: dict[str, Any] = to_json({"result": "done", **vars(self)})
-        return found
-
-    @property
-    def identified(self) -> Identification:
-        """The last estimate with the data sheet's ranges."""
-        assert self.found.identified is not None
-        return self.found.identified
-
     def __str__(self) -> str:
-        one = self.identified
+        one = self.found.identified
         fits = "the residual tests accept it" if one.fits else f"NO model explains the experiments{one.reasons()}"
         lines = [f"done: {len(self.logs)} steps, {self.runs} new runs; model {one.model}: {fits}"]
         lines += [f"  {name:<4} {low:.5g} to {high:.5g} {SI[name]}" for name, (low, high) in self.ranges.items()]
@@ -87,7 +78,8 @@ class Commissioning:
     ) -> None:
         self._folder, self._sheet, self._iface, self._options = folder, sheet, iface, options
         self._make_run, self._say = run, say
-        self._logs: dict[str, Path] = {}
+        self._logs: list[Path] = []
+        self._identified: Identification | None = None
         self._identity = sheet.identity_hash  # of the bench that the node is set up for
         self._runs = 0
 
@@ -100,23 +92,35 @@ class Commissioning:
             SafetyStopError: a step contradicts the data sheet.
             BenchFileError: no shield covers the data sheet, or a parameter lies outside of it.
         """
-        path, found = self._bench_file(WORKING, working_text(self._sheet)), Findings()
-        for name, row in STEPS.items():
-            experiments = [self._logs[name] for name in EXPERIMENTS if name in self._logs]
-            if name == FULL:
-                used = " and ".join(log.name for log in experiments[-RECENT:])
-                path = self._bench_file(FOUND, found_text(self._sheet, found, used))
-            log = next(filter(examination.is_completed, self._attempts(name)[:-1]), None)
-            if log is None:
-                bench = load_bench(path)
-                log = self._run(name, row.make(bench, found), path, bench, found)
-            finding = row.examine(log, experiments, self._sheet, found)
-            found = row.judge(finding, self._sheet, found)
-            self._logs[name] = log
-            self._say(f"  found: {finding or 'no fault'}")
-        assert found.identified is not None
-        ranges = measured_ranges(self._sheet, found.identified)
-        return Commissioned(path, ranges, found, tuple(self._logs.values()), self._runs)
+        sheet, working = self._sheet, self._bench_file(WORKING, working_text(self._sheet))
+        work = load_bench(working)
+        noise = examination.noise_at_rest(self._log("1-listen", steps.LISTEN, working), sheet)
+        self._say(f"  found: noise {noise.angle:.3g} rad and {noise.velocity:.3g} rad/s")
+        comparison.check_noise(noise, sheet)
+        self._log("2-zero", steps.ZERO, working)
+        self._say("  found: no fault")
+        current = self._found(examination.current(self._log("3-current", steps.current_check(work), working)))
+        comparison.check_current(current, sheet)
+        log = self._log("4-first-move", steps.first_move(work), working)
+        move = self._found(examination.first_move(log, noise))
+        comparison.check_first_move(move, sheet)
+        for name, row in EXPERIMENTS.items():
+            self._log(name, steps.experiment(row, work, move), working)
+            recent, before = self._logs[4:][-RECENT:], self._identified
+            one = self._found(examination.identify(recent, sheet, noise, before))
+            comparison.check_experiment(one, sheet, is_first=before is None)
+            self._identified = one
+        found = Findings(noise, current, move, one)
+        path = self._bench_file(FOUND, found_text(sheet, found, " and ".join(log.name for log in recent)))
+        bench = load_bench(path)
+        log = self._log("9-full", steps.experiment(steps.FULL, bench, move), path)
+        comparison.check_last(self._found(examination.identify([log], sheet, noise, one)), bench)
+        ranges = {name: comparison.sheet_range(bench, name) for name in PARAMETER_NAMES}
+        return Commissioned(path, ranges, found, tuple(self._logs), self._runs)
+
+    def _found(self, finding: Finding) -> Finding:
+        self._say(f"  found: {finding}")
+        return finding
 
     def _bench_file(self, name: str, text: str) -> Path:
         """Write a bench file, unless logs rest on another bench of that name, or somebody else wrote it."""
@@ -134,31 +138,37 @@ class Commissioning:
         path.write_text(text, encoding="utf-8")
         return path
 
-    def _attempts(self, name: str) -> list[Path]:
-        """Logs of a step that are there, and last the one that its next run makes."""
-        paths = [self._folder / f"{name}.mcap"]
-        while paths[-1].exists():
-            paths.append(self._folder / f"{name}-attempt{len(paths) + 1}.mcap")
-        return paths
+    def _log(self, name: str, step: Step, path: Path) -> Path:
+        """The completed log of a step with a bench file: one that is there, else that of a new run."""
+        log, attempts = self._folder / f"{name}.mcap", 1
+        while log.exists() and not examination.is_completed(log):
+            attempts += 1
+            log = self._folder / f"{name}-attempt{attempts}.mcap"
+        if not log.exists():
+            self._run(name, step, path, log)
+        self._logs.append(log)
+        return log
 
-    def _run(self, name: str, step: Step, path: Path, bench: Bench, found: Findings) -> Path:
+    def _run(self, name: str, step: Step, path: Path, log: Path) -> None:
         self._say(f"{name}: {step.purpose}")
+        bench = load_bench(path)
         if bench.identity_hash != self._identity:
             self._identity = bench.identity_hash
             self._say(f"  set up the node for {path}, bench identity {bench_identity(bench.identity_hash):#06x}")
-        policy, log = self._folder / f"{name}.onnx", self._attempts(name)[-1]
+        policy = self._folder / f"{name}.onnx"
         policy.write_bytes(policy_file(step, bench))
         arguments = ["--iface", simulated(self._iface, self._sheet, self._runs), "--bench", str(path)]
         arguments += ["--policy", str(policy), "--log", str(log), "--duration", repr(step.duration)]
         self._runs += 1
         document = self._make_run([*arguments, *self._options, *step.stage, "--json"])
         if document["exit_code"] == EXIT_DONE and examination.is_completed(log):
-            return log
+            return
         why, is_outside = _failure(document)
         advice = f"see {log}, and begin again in the same folder once the cause is removed"
+        if is_outside:  # no brake of the set moves so
+            advice = comparison.suspected(self._sheet, self._identified)
         raise StepFailedError(
-            f"step {name} was not completed: {why}; {suspected(self._sheet, found) if is_outside else advice}",
-            document["exit_code"] or EXIT_SAFETY_STOP,
+            f"step {name} was not completed: {why}; {advice}", document["exit_code"] or EXIT_SAFETY_STOP
         )
 
 
@@ -193,18 +203,14 @@ def simulated(iface: str, sheet: Bench, run: int) -> str:
     Any other bus stays as it is.
     """
     head, at, bus = iface.rpartition("@")  # what lies before it is a drive's mapping
-    name, _, options = bus.partition(":")
+    name, _, given = bus.partition(":")
     if name not in SIMULATED:
         return iface
-    given = [option.strip() for option in options.split(",") if option.strip()]
-    named = {key.strip(): value.strip() for key, _, value in (option.partition("=") for option in given)}
     own = {parameter: getattr(sheet.brake, parameter) for parameter in PARAMETER_NAMES}
-    own |= {"angle_noise": sheet.noise.angle, "velocity_noise": sheet.noise.velocity}
-    given += [f"{key}={value!r}" for key, value in own.items() if key not in named]
-    seed = named.get("seed", "1")
-    if run and seed.isdecimal():
-        given = [option for option in given if not option.startswith("seed")] + [f"seed={int(seed) + run}"]
-    return f"{head}{at}{name}:{','.join(given)}"
+    own |= {"angle_noise": sheet.noise.angle, "velocity_noise": sheet.noise.velocity, "seed": 1}
+    options = ",".join([given, *(f"{key}={own[key]!r}" for key in own if not re.search(rf"\b{key} *=", given))])
+    seeded = re.sub(r"\bseed *= *(\d+)", lambda seed: f"seed={int(seed[1]) + run}", options)
+    return f"{head}{at}{name}:{seeded.lstrip(',')}"
 
 
 def _failure(document: Mapping[str, Any]) -> tuple[str, bool]:

@@ -14,7 +14,7 @@ import numpy as np
 from emb_bench.analysis.model_choice import fit_from
 from emb_bench.analysis.model_growth import grow_model
 from emb_bench.brake.parameters import FEATURES
-from emb_bench.commission.records import CurrentCheck, FirstMove, Identification, Rest
+from emb_bench.commission.records import CurrentCheck, FirstMove, Identification
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 from emb_bench.estimate.estimate import Estimate
@@ -51,19 +51,24 @@ def is_completed(log: Path) -> bool:
     return heard is None or json.loads(heard).get("resting", 0) >= FEWEST
 
 
-def at_rest(log: Path, sheet: Bench) -> Rest:
-    """Noise and period of the samples while the brake rests, as the run that listened has them.
+def noise_at_rest(log: Path, sheet: Bench) -> Noise:
+    """Noise of the samples while the brake rests, as the run that listened has it, standard deviations.
 
     A drive's signal in steps that are coarser than the noise does not show it: that counts as the data sheet's.
     """
     opened = read_log(log)
-    heard, drive = json.loads(opened.end["heard"]), opened.drive
-    coarse = (0.0, 0.0) if drive is None else (step_of(drive.angle), step_of(drive.velocity))
-    angle = sheet.noise.angle if coarse[0] > sheet.noise.angle else max(heard["angle_scatter"], QUIET_ANGLE)
-    velocity = (
-        sheet.noise.velocity if coarse[1] > sheet.noise.velocity else max(heard["velocity_scatter"], QUIET_VELOCITY)
+    heard = json.loads(opened.end["heard"])
+    angle, velocity = max(heard["angle_scatter"], QUIET_ANGLE), max(heard["velocity_scatter"], QUIET_VELOCITY)
+    angle_step, velocity_step = _steps(opened.drive)
+    return Noise(
+        sheet.noise.angle if angle_step > sheet.noise.angle else angle,
+        sheet.noise.velocity if velocity_step > sheet.noise.velocity else velocity,
     )
-    return Rest(Noise(angle, velocity), heard["period"])
+
+
+def _steps(drive: DriveMapping | None) -> tuple[float, float]:
+    """Steps of a mapped drive's angle [rad] and velocity [rad/s]; none of our own node's."""
+    return (0.0, 0.0) if drive is None else (step_of(drive.angle), step_of(drive.velocity))
 
 
 def current(log: Path) -> CurrentCheck:
@@ -126,14 +131,14 @@ def identify(logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identific
     best = _best(bench, experiments, before)
     asked = with_systematic(best.asked, bench, best.plant)
     e = fit_from(Problem(bench, best.plant, asked, best.records), best).finished() if asked.systematic else best
-    half = NORMAL_95 * e.between_runs() * e.scale
     names = [unknown.name for unknown in e.unknowns]
-    intervals = dict(zip(names, zip((e.values - half).tolist(), (e.values + half).tolist(), strict=True), strict=True))
+    half = NORMAL_95 * e.between_runs() * e.scale
     values = dict(zip(names, e.values.tolist(), strict=True))
+    intervals = dict(zip(names, np.stack([e.values - half, e.values + half], axis=1).tolist(), strict=True))
     lag = intervals.get("current_lag", (0.0, 0.0))
     return Identification(
         values={name: values[name] for name in PARAMETER_NAMES},
-        intervals={name: intervals[name] for name in PARAMETER_NAMES},
+        intervals={name: tuple(intervals[name]) for name in PARAMETER_NAMES},
         model=best.plant.name,
         fits=best.validation.fits and e.validation.fits,  # an offset explains a wrong model of a small motion
         ratio=e.validation.ratio,
@@ -190,7 +195,5 @@ def _residuals(e: Estimate, noise: Noise) -> Noise:
 
 def noise_in_motion(at_rest: Noise, drive: DriveMapping | None) -> Noise:
     """Noise of a moving brake's samples: a mapped drive's steps add to it."""
-    if drive is None:
-        return at_rest
-    added = UNIFORM * step_of(drive.angle), UNIFORM * step_of(drive.velocity)
-    return Noise(math.hypot(at_rest.angle, added[0]), math.hypot(at_rest.velocity, added[1]))
+    angle_step, velocity_step = _steps(drive)
+    return Noise(math.hypot(at_rest.angle, UNIFORM * angle_step), math.hypot(at_rest.velocity, UNIFORM * velocity_step))

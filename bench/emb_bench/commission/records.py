@@ -8,22 +8,6 @@ from dataclasses import dataclass
 from emb_bench.brake.parameters import SI
 from emb_runtime.config.bench import Noise
 
-UNEXPLAINED = 9.0  # Mean square of the residuals, in variances of the noise at rest, from which on nothing is explained
-
-
-@dataclass(frozen=True)
-class Rest:
-    """Sensors and clock at rest."""
-
-    noise: Noise  # Standard deviations
-    period: float  # Of the samples by the node's clock [s]
-
-    def __str__(self) -> str:
-        return (
-            f"noise {self.noise.angle:.3g} rad and {self.noise.velocity:.3g} rad/s, a sample each "
-            f"{1e3 * self.period:.6g} ms"
-        )
-
 
 @dataclass(frozen=True)
 class CurrentCheck:
@@ -66,30 +50,25 @@ class Identification:
     noise: Noise  # Standard deviations of the residuals of slow motion
     objections: tuple[str, ...] = ()  # Alarms of the tests on the residuals, and what would explain them
 
-    @property
-    def is_unexplained(self) -> bool:
-        """True if the residuals are so large that no number of the model means anything."""
-        return not self.fits and self.ratio > UNEXPLAINED
-
     def __str__(self) -> str:
-        fits = "" if self.fits else f", which does not fit yet{self.reasons()}"
-        return f"at 95 % {', '.join(map(self._within, self.intervals))}; model {self.model}{fits}"
+        found = []
+        for name, (low, high) in self.intervals.items():
+            value = self.values[name]
+            aside = 100.0 * max(high - value, value - low) / abs(value)
+            found.append(f"{name} {value:.5g} {SI[name]} ± {aside:.2g} %")
+        misfit = "" if self.fits else f", which does not fit yet{self.reasons()}"
+        return f"at 95 % {', '.join(found)}; model {self.model}{misfit}"
 
     def reasons(self) -> str:
         """Objections in brackets; "" without any."""
         return f" ({'; '.join(self.objections)})" if self.objections else ""
 
-    def _within(self, name: str) -> str:
-        value, (low, high) = self.values[name], self.intervals[name]
-        aside = max(high - value, value - low) / abs(value)
-        return f"{name} {value:.5g} {SI[name]} ± {100.0 * aside:.2g} %"
-
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings of the steps so far."""
+    """Findings of all steps, from which a bench file is made."""
 
-    rest: Rest | None = None
-    current: CurrentCheck | None = None
-    first_move: FirstMove | None = None
-    identified: Identification | None = None
+    noise: Noise  # At rest, standard deviations
+    current: CurrentCheck
+    first_move: FirstMove
+    identified: Identification  # From the last experiments with the data sheet's ranges

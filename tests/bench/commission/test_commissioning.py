@@ -111,7 +111,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Commissioned]:
 
 def test_the_truth_lies_inside_of_ranges_much_narrower_than_the_data_sheets(done: tuple[Path, Commissioned]) -> None:
     _, result = done
-    assert result.identified.fits
+    assert result.found.identified.fits
     for name, (low, high) in result.ranges.items():
         assert low <= TRUTH[name] <= high, name
         assert high - low <= 0.25 * TRUTH[name], name  # 150 % by the data sheet
@@ -119,12 +119,10 @@ def test_the_truth_lies_inside_of_ranges_much_narrower_than_the_data_sheets(done
 
 def test_delays_and_noise_are_found(done: tuple[Path, Commissioned]) -> None:
     folder, result = done
-    check, rest = result.found.current, result.found.rest
-    assert check is not None
-    assert rest is not None
-    assert (check.delay, result.identified.measurement_delay) == (1, 1)
+    check, noise = result.found.current, result.found.noise
+    assert (check.delay, result.found.identified.measurement_delay) == (1, 1)
     assert check.scale == pytest.approx(1.0, abs=1e-3)
-    assert (rest.noise.angle, rest.noise.velocity) == pytest.approx((NOISE.angle, NOISE.velocity), rel=0.1)
+    assert (noise.angle, noise.velocity) == pytest.approx((NOISE.angle, NOISE.velocity), rel=0.1)
     written = load_bench(folder / "bench.toml")
     assert written.shield.frame_age == (0, 2)
     instruments = written.plants[MEASURED].instruments
@@ -154,7 +152,6 @@ def test_it_goes_on_where_the_logs_end_and_comes_to_the_same(done: tuple[Path, C
     assert again.runs == 1
     assert written == {path: path.stat().st_mtime_ns for path in folder.glob("*.toml")}, "a full disk would empty them"
     assert again.found == result.found
-    assert json.dumps(again.document())
 
 
 @pytest.mark.slow
@@ -181,7 +178,7 @@ def test_a_polled_drive_is_listened_to_as_any_other(tmp_path: Path) -> None:
     with pytest.raises(EnoughError):
         on_a_drive(tmp_path, up_to("3-current"), drive="mit", frame_age="[1, 3]").run()
     assert read_log(tmp_path / "1-listen.mcap").run["stage"] == "read-only"
-    assert examination.at_rest(tmp_path / "1-listen.mcap", sheet()).period == pytest.approx(1e-3, rel=1e-6)
+    assert examination.noise_at_rest(tmp_path / "1-listen.mcap", sheet()).angle > 0.0
 
 
 def test_a_run_that_was_not_completed_is_done_again_under_another_name(tmp_path: Path) -> None:
@@ -298,8 +295,8 @@ def test_a_brake_whose_latency_the_data_sheet_excludes_is_not_moved(tmp_path: Pa
 
 def test_a_simulated_brake_keeps_its_parameters_and_any_other_bus_stays_as_it_is() -> None:
     bench = load_bench()
-    assert simulated("sim:k_m=0.03, seed = 7", bench, 2).startswith("sim:k_m=0.03,")
-    assert simulated("sim:k_m=0.03, seed = 7", bench, 2).endswith(f"velocity_noise={bench.noise.velocity},seed=9")
+    assert simulated("sim:k_m=0.03, seed = 7", bench, 2).startswith("sim:k_m=0.03, seed=9,")
+    assert simulated("sim", bench, 2).endswith(f",velocity_noise={bench.noise.velocity},seed=3")
     assert simulated("map:d@x.toml@sim-drive:vesc", bench, 0).startswith("map:d@x.toml@sim-drive:vesc,k_m=")
     for iface in ("can0", "sim0", "map:d@x.toml@can0", "can0@sim0"):
         assert simulated(iface, bench, 3) == iface
