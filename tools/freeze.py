@@ -77,6 +77,13 @@ GONE: dict[str, str] = {
     "campaign/*/rms_error_sigmas": "the rows have the error of each run",
     "campaign/*/covered": "the rows have the error of each run",
     "campaign/*/spread*": "the test of homogeneity has the scatter of the runs",
+    "estimate/*/why_not": "the reasons are codes, in doubts",
+    "report/*/why_not": "the reasons are codes, in doubts",
+    "fim/*/why_not": "the reasons are codes, in doubts",
+    "estimate/*/arbitrary": "no value is excluded where the interval is open at both ends",
+    "estimate/*/traded_with/*": "named where the deviation is above 1 %, as in the text; correlation has all",
+    "estimate/*/profiles/*/shape": "an open profile is a doubt",
+    "report/*/profiles/*/shape": "an open profile is a doubt",
     "info/*/says/messages//log": "an internal error's place is in its event's detail",
 }
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, and why."""
@@ -92,6 +99,7 @@ WINDOWS = (
 )
 METRES = "a linear machine is stated in metres and newtons, not in radians of a motor"
 EXPLAINED: dict[str, str] = {
+    "fim/*/findings/*/border": "a code, null where there is none",
     "*/says/profiles/*/values*": GRID,
     "*/says/profiles/*/rise*": GRID,
     "*/says/estimate/profiles/*/values*": GRID,

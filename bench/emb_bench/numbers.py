@@ -81,10 +81,10 @@ def _places(width: float) -> int:
 def amount(value: float, interval: tuple[float, float], unit: str) -> str:
     """A value, its unit (none where it is 1) and its interval, to the digits that the interval allows."""
     low, high = interval
+    if math.isinf(low) and math.isinf(high):
+        return "any value"
     unit = "" if unit == "1" else unit
     shown = f"{plain(value, 4)} {unit}".rstrip()
-    if math.isinf(low) and math.isinf(high):
-        return f"{shown} (any value)"
     if math.isinf(low):
         return f"{shown} (below {plain(high, 4)})"
     if math.isinf(high):

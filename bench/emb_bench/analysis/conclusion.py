@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -22,7 +22,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.intervals import interval as with_profile
 from emb_bench.estimate.records import NORMAL_95, Unknown
-from emb_bench.information.identifiability import GROSS, Finding, Spectrum
+from emb_bench.information.identifiability import GROSS, Doubt, Finding, Spectrum
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 PRECISE = 0.01
@@ -42,7 +42,8 @@ class Standing(StrEnum):
 class Conclusion:
     """Conclusion on one parameter."""
 
-    label: str
+    finding: Finding
+    """Of the Fisher information, with the doubts that the estimate adds; trade-offs only where they matter."""
     value: float  # In ``unit``
     unit: str  # SI, or of the machine that is no brake (:func:`emb_bench.brake.parameters.quantity`)
     interval: tuple[float, float]
@@ -51,23 +52,25 @@ class Conclusion:
     """Half of the 95 % interval that the sensors' noise alone would leave: scatter of further runs. In ``unit``."""
     of_interest: bool  # True if it is a parameter of interest, not a nuisance
     standing: Standing
-    why_not: str  # Reason that it is not identified; empty if it is
-    arbitrary: bool  # True if the records fit any value as well as this one
-    traded_with: tuple[str, ...]  # Parameters whose errors make up for an error of this one
     drift: Drift | None = None
     outside: tuple[float, float] | None = None
     """Range, in ``unit``, for which the shield guarantees the limits, if the whole interval lies outside of it."""
 
     @property
+    def label(self) -> str:
+        """Name of the parameter; of one of several records its number, too."""
+        return self.finding.name
+
+    @property
     def identified(self) -> bool:
         """Returns True if it is identified."""
-        return self.standing is not Standing.NOT_IDENTIFIED
+        return self.finding.identified
 
     @property
     def notable(self) -> bool:
         """Returns True if there is more to say than the value, its interval, and that it is identified."""
         drifted = self.drift is not None and self.drift.drifted
-        return bool(self.why_not or self.traded_with) or self.arbitrary or drifted
+        return bool(self.finding.doubts or self.finding.traded_with) or drifted
 
 
 def conclude(
@@ -88,28 +91,31 @@ def conclude(
     columns = (e.unknowns, e.shown, e.labels, e.values.tolist(), e.intervals().tolist(), e.between_runs().tolist())
     noise = (noise_deviations(e).tolist(), e.scale.tolist())
     for unknown, shown, label, value, (low, high), deviation, own, scale in zip(*columns, *noise, strict=True):
-        finding, one = findings.get(label), of_profile.get(label)
-        interval = (low, high)
-        if one is not None:
-            holds, biased = e.validation.fits and e.method == "oem", bool(e.open().any())
-            interval = with_profile(interval, one.interval, closed=one.shape == "closed", holds=holds, biased=biased)
         if unknown.name in e.asked.along:
             continue
-        why_not = "; ".join(_doubts(e, unknown, label, deviation, interval, finding, one))
-        weak = finding is not None and deviation > PRECISE * GROSS.get(unknown.name, 1.0)
-        of_interest = unknown.name in e.asked.params
+        one, interval = of_profile.get(label), (low, high)
+        if one is not None:
+            holds, biased = e.validation.fits and e.method == "oem", bool(e.open().any())
+            interval = with_profile(interval, one.interval, closed=one.doubt is None, holds=holds, biased=biased)
+        gross = GROSS.get(unknown.name, 1.0)
+        finding = findings.get(label)
+        if finding is None:  # of a single record
+            doubts = (Doubt.TOO_WIDE,) if deviation >= gross else ()
+            finding = Finding(label, deviation, doubts, unit="" if unknown.relative else shown.unit)
+        finding = replace(
+            finding,
+            doubts=finding.doubts + _further_doubts(e, unknown, label, interval, one, finding),
+            traded_with=finding.traded_with if deviation > PRECISE * gross else {},
+        )
         found.append(
             Conclusion(
-                label=label,
+                finding=finding,
                 value=value,
                 unit=shown.unit,
                 interval=interval,
                 repeatability=NORMAL_95 * own * scale,
-                of_interest=of_interest,
-                standing=Standing.NOT_IDENTIFIED if why_not else certain,
-                why_not=why_not,
-                arbitrary=not math.isfinite(deviation),
-                traded_with=tuple(finding.traded_with) if finding is not None and weak else (),
+                of_interest=unknown.name in e.asked.params,
+                standing=certain if finding.identified else Standing.NOT_IDENTIFIED,
                 drift=changes.get(label),
                 outside=_range_left(e, unknown, interval),
             )
@@ -141,25 +147,18 @@ def noise_deviations(e: Estimate) -> Floats:
     return deviations
 
 
-def _doubts(
+def _further_doubts(
     e: Estimate,
     unknown: Unknown,
     label: str,
-    deviation: float,
     interval: tuple[float, float],
-    finding: Finding | None,
     profile: Profile | None,
-) -> list[str]:
-    """Reasons why an unknown is not identified; none if it is."""
-    said = []
-    if finding is not None:
-        said += [finding.why_not] if finding.why_not else []
-    elif deviation >= GROSS.get(unknown.name, 1.0):
-        said.append("its deviation is no smaller than a gross error")
-    if profile is not None and profile.shape != "closed":
-        said.append(f"its profile is {profile.shape}")
+    finding: Finding,
+) -> tuple[Doubt, ...]:
+    """Reasons that an unknown is not identified beside those of the information."""
+    doubts = [] if profile is None or profile.doubt is None else [profile.doubt]
     if label in e.at_bound:
-        said.append("its value is AT THE BORDER of the search")
-    if not said and unknown.relative and interval[0] <= 0.0 <= interval[1]:
-        said.append("its interval contains zero")
-    return said
+        doubts.append(Doubt.AT_BORDER)
+    if not doubts and finding.identified and unknown.relative and interval[0] <= 0.0 <= interval[1]:
+        doubts.append(Doubt.CONTAINS_ZERO)
+    return tuple(doubts)

@@ -24,7 +24,7 @@ from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import NORMAL_95, End, searched
 from emb_bench.estimate.search import minimise
-from emb_bench.information.identifiability import GROSS
+from emb_bench.information.identifiability import GROSS, Doubt
 from emb_runtime.errors import UsageError
 
 LEVEL = NORMAL_95**2
@@ -51,7 +51,8 @@ class Profile:
     rise: Floats  # χ² above its minimum, prior included, shape (n,)
     interval: tuple[float, float]
     """95 % by the likelihood ratio; infinite on a side where the rise does not reach ``LEVEL``."""
-    shape: str  # ``closed``, ``open below``, ``open above`` or ``flat`` (open on both sides)
+    doubt: Doubt | None
+    """None if it is closed, else ``FLAT`` (open on both sides), ``OPEN_BELOW``, ``OPEN_ABOVE`` or ``CUT``."""
     fisher: tuple[float, float]
     """95 % by the Fisher information, around the profile's minimum; infinite where it identifies nothing."""
     minimum: float  # Value with the least χ², SI units
@@ -87,7 +88,7 @@ def profiles(e: Estimate, *, of_all: bool) -> tuple[Profile, ...]:
     """
     chosen = [i for i in e.shared() if i in e.wanted()]
     if not of_all:
-        unidentified = {finding.name for finding in e.verdict().findings if finding.why_not}
+        unidentified = {finding.name for finding in e.verdict().findings if not finding.identified}
         bent = any(_bent(e, i) for i in chosen)
         chosen = [i for i in chosen if bent and e.labels[i] not in unidentified]
     return tuple(profile(e, e.labels[i]) for i in chosen)
@@ -122,12 +123,14 @@ def profile(e: Estimate, label: str) -> Profile:
         return float(problem.values(z)[i])
 
     interval = (_crossing(below, value, -math.inf), _crossing(above, value, math.inf))
-    shape = {
-        (True, True): "closed",
-        (False, True): "open below",
-        (True, False): "open above",
-        (False, False): "flat",
+    doubt = {
+        (True, True): None,
+        (False, True): Doubt.OPEN_BELOW,
+        (True, False): Doubt.OPEN_ABOVE,
+        (False, False): Doubt.FLAT,
     }[below.closed, above.closed]
+    if doubt is not None and all(side.closed or side.points[-1].rise >= LEVEL for side in sides):
+        doubt = Doubt.CUT
     minimum = value(end.z)
     half = NORMAL_95 * float(e.cramer_rao()[i] * e.scale[i])
     return Profile(
@@ -135,7 +138,7 @@ def profile(e: Estimate, label: str) -> Profile:
         values=np.array([value(point.z) for point in points]),
         rise=np.array([point.rise for point in points]),
         interval=interval,
-        shape=shape,
+        doubt=doubt,
         fisher=(minimum - half, minimum + half),
         minimum=minimum,
         fell=first.cost - end.cost if end.cost < first.cost - BETTER else 0.0,

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -156,6 +157,30 @@ def schur_complement(matrix: Any, index: Sequence[int]) -> Floats:
     return result
 
 
+class Doubt(StrEnum):
+    """Reason that a parameter is not identified: by the information, or by what an estimate adds to it."""
+
+    NO_INFORMATION = "no_information"
+    ONLY_COMBINED = "only_combined"  # With other parameters
+    NOTHING_NEW = "nothing_new"  # To what was known before
+    TOO_WIDE = "too_wide"  # The deviation is no smaller than the value or a gross error
+    FLAT = "flat"  # Its likelihood profile is, or is open at one end
+    OPEN_BELOW = "open_below"
+    OPEN_ABOVE = "open_above"
+    CUT = "cut"  # The profile ends where another parameter is at the border of its search
+    AT_BORDER = "at_border"  # Of the search
+    CONTAINS_ZERO = "contains_zero"  # Its interval
+
+
+class Border(StrEnum):
+    """Place of a value that is not well inside its range."""
+
+    BELOW = "below"
+    AT_LOWER = "at_lower"  # Within a deviation of the lower end
+    AT_UPPER = "at_upper"
+    ABOVE = "above"
+
+
 @dataclass(frozen=True)
 class Finding:
     """Identifiability of one parameter."""
@@ -163,15 +188,15 @@ class Finding:
     name: str
     deviation: float
     """Least standard deviation of an estimate, relative or in the parameter's unit; inf if it is not identified."""
-    why_not: str  # Reason that it is not identified; empty if it is
-    traded_with: Mapping[str, float]  # Correlations beyond ``TRADED_OFF``, by name
-    border: str  # Text on a border of its range that its value is beyond, or within a deviation of; empty if none
+    doubts: tuple[Doubt, ...] = ()  # Reasons that it is not identified; empty if it is
+    traded_with: Mapping[str, float] = field(default_factory=dict)  # Correlations beyond ``TRADED_OFF``, by name
+    border: Border | None = None
     unit: str = ""  # Of ``deviation``; empty if it is relative
 
     @property
     def identified(self) -> bool:
         """Returns True if the data identify it."""
-        return not self.why_not
+        return not self.doubts
 
 
 @dataclass(frozen=True)
@@ -227,21 +252,21 @@ def judge(
     findings = []
     for i, name in enumerate(params):
         deviation = float(deviations[i])
-        reason = ""
+        doubt = None
         if spectrum.dead[i]:
-            reason = "the data do not depend on it"
+            doubt = Doubt.NO_INFORMATION
         elif spectrum.lost[i]:
-            reason = "only in combination with others"
+            doubt = Doubt.ONLY_COMBINED
         elif deviation >= NEWS * before[i]:
-            reason = "the data add nothing to what was known before"
+            doubt = Doubt.NOTHING_NEW
         elif deviation >= GROSS.get(name, 1.0):
-            reason = "its bound is no smaller than " + ("a gross error" if name in UNITS else "its value")
+            doubt = Doubt.TOO_WIDE
         others = {} if spectrum.lost[i] else {n: float(c) for n, c in zip(params, correlation[i], strict=True)}
         findings.append(
             Finding(
                 name=name,
                 deviation=deviation,
-                why_not=reason,
+                doubts=() if doubt is None else (doubt,),
                 traded_with={n: c for n, c in others.items() if n != name and abs(c) > TRADED_OFF},
                 border=_border(deviation, (borders or {}).get(name)),
                 unit=UNITS.get(name, ""),
@@ -265,15 +290,14 @@ def _left_to_prior(spectrum: Spectrum, params: Sequence[str], prior: Any) -> tup
     return tuple(dict(zip(params, v.tolist(), strict=True)) for v in flat if v @ known @ v > 0.0)
 
 
-def _border(deviation: float, distances: tuple[float, float] | None) -> str:
+def _border(deviation: float, distances: tuple[float, float] | None) -> Border | None:
     if distances is None or math.isinf(deviation):
-        return ""
-    for side, distance in zip(("lower", "upper"), distances, strict=True):
-        if distance < 0.0:
-            return f"outside its range, beyond the {side} border"
+        return None
+    sides = ((Border.BELOW, Border.AT_LOWER), (Border.ABOVE, Border.AT_UPPER))
+    for (beyond, at), distance in zip(sides, distances, strict=True):
         if distance <= deviation:
-            return f"at the {side} border of its range"
-    return ""
+            return beyond if distance < 0.0 else at
+    return None
 
 
 def _unidentified(spectrum: Spectrum, params: Sequence[str]) -> list[Direction]:

@@ -24,6 +24,7 @@ from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import OF_A_RECORD, PARAMETERS, SI, UNITS
 from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.numbers import amount, between, plain, share, share_between
+from emb_bench.report.sentences import doubts
 from emb_runtime.config.typed import FieldError, read
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
@@ -228,7 +229,7 @@ def _tolerated(name: str, tolerance: Tolerance, study: Study | None, doubt: str)
     if found is None:
         return Criterion(name, required, "not estimated", Result.CANNOT_TELL, doubt or "it was not estimated")
     value = amount(found.value, found.interval, found.unit)
-    return Criterion(name, required, value, *_inside(found.interval, (low, high), doubt or found.why_not))
+    return Criterion(name, required, value, *_inside(found.interval, (low, high), doubt or doubts(found.finding)))
 
 
 def _drifted(name: str, most: float, drift: Drift | None, doubt: str, *, given: bool) -> Criterion:

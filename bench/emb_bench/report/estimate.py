@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -32,7 +33,9 @@ def text(study: Study, *, verbose: bool = False) -> str:
     lines += listed("NOTE: ", _notes(study))
     lines += ["", *tables.parameters(study, brief=True).lines()]
     lines += listed("  - ", _remarks(study, trades=study.holds or verbose))
-    if study.holds or verbose:
+    if not any(math.isfinite(c.repeatability) for c in study.conclusions):
+        lines += [""]
+    elif study.holds or verbose:
         lines += [*wrapped(say.INTERVALS, 0), "", *listed("", _limits(study))]
     else:
         lines += [f"± 95 % (k=2), without the {'bias of the method' if study.biased else 'error of the model'}", ""]
@@ -63,7 +66,7 @@ def _remarks(study: Study, *, trades: bool) -> Iterator[str]:
     """Doubts and changes of parameters, and their ``trades``-off, each with all parameters that it holds for."""
     said: dict[str, list[str]] = {}
     for c in study.conclusions:
-        remarks = [c.why_not, f"trades off with {', '.join(c.traded_with)}" if trades and c.traded_with else ""]
+        remarks = [say.doubts(c.finding), say.trade_offs(c.finding) if trades else ""]
         remarks += [say.drift(c.drift)] if c.drift is not None else []
         if text := "; ".join(filter(None, remarks)):
             said.setdefault(text, []).append(c.label)
@@ -165,7 +168,7 @@ def document(study: Study) -> dict[str, Any]:
         "directions": e.verdict().directions,
         "left_to_prior": e.verdict().left_to_prior,
         "profiles": [
-            _fields(p, "label", "values", "rise", "shape") | {"interval_95": p.interval} for p in study.profiles
+            _fields(p, "label", "values", "rise", "doubt") | {"interval_95": p.interval} for p in study.profiles
         ],
         "starts": [
             _fields(end, "cost", "converged", "evaluations")
@@ -209,14 +212,14 @@ def _systematic(e: Estimate) -> dict[str, Any]:
 
 def _parameters(study: Study) -> dict[str, dict[str, Any]]:
     e, found = study.estimate, {}
-    findings = {finding.name: finding for finding in e.verdict().findings}
     columns = (e.deviations(), e.cramer_rao(), e.robust(), e.open())
     for i, c in zip(e.wanted(), study.conclusions, strict=True):
         unknown = e.unknowns[i]
         used, bound, robust, model = (column[i] for column in columns)
         suspect = e.left_open_by(i)
         found[c.label] = {
-            **_fields(c, "value", "unit", "repeatability", "identified", "standing", "why_not", "arbitrary", "outside"),
+            **_fields(c, "value", "unit", "repeatability", "identified", "standing", "outside"),
+            **_fields(c.finding, "doubts", "traded_with"),
             "interval_95": c.interval,
             "deviation": used,
             "deviation_relative": unknown.relative,
@@ -225,7 +228,6 @@ def _parameters(study: Study) -> dict[str, dict[str, Any]]:
             "sandwich": robust,
             "left_open": model,
             "left_open_by": None if suspect is None else suspect.name,
-            "traded_with": findings[c.label].traded_with if c.label in findings else {},
             "at_bound": c.label in e.at_bound,
         }
         if study.truth is not None and hasattr(study.truth, unknown.name):

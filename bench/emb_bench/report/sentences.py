@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from emb_bench.brake.parameters import UNITS, quantity
-from emb_bench.information.identifiability import combination
+from emb_bench.information.identifiability import Border, Doubt, combination
 from emb_bench.numbers import amount, between, in_samples, p_value, percent, plain, spread
 from emb_runtime.config.bench import PARAMETER_NAMES
 
@@ -39,6 +39,28 @@ TERMS = {
     "trades off": "the data determine two parameters well only together: their errors compensate",
 }
 """Terms of the results, each explained in a line."""
+
+DOUBTS = {
+    Doubt.NO_INFORMATION: "no effect on the record",
+    Doubt.ONLY_COMBINED: "only in combination with others",
+    Doubt.NOTHING_NEW: "the record adds nothing to what was known before",
+    Doubt.TOO_WIDE: "the best possible interval is as large as the value or a gross error",
+    Doubt.FLAT: "no value within the search is excluded",
+    Doubt.OPEN_BELOW: "only values above the interval are excluded",
+    Doubt.OPEN_ABOVE: "only values below the interval are excluded",
+    Doubt.CUT: "the interval ends where another parameter is at the border of its search",
+    Doubt.AT_BORDER: "the value is AT THE BORDER of the search",
+    Doubt.CONTAINS_ZERO: "the interval contains zero",
+}
+"""Reasons that a parameter is not identified."""
+
+BORDERS = {
+    Border.BELOW: "outside its range, beyond the lower border",
+    Border.AT_LOWER: "at the lower border of its range",
+    Border.AT_UPPER: "at the upper border of its range",
+    Border.ABOVE: "outside its range, beyond the upper border",
+}
+"""Places of a value at, or beyond, a border of its range."""
 
 
 # ---- the verdict on a study ----
@@ -233,17 +255,21 @@ def explained(s: Suspect, machine: Machine | None = None) -> str:
 
 
 def conclusion(c: Conclusion) -> str:
-    """Value, interval and standing of a parameter."""
-    said = [amount(c.value, c.interval, c.unit), c.standing.value + (f": {c.why_not}" if c.why_not else "")]
-    return "; ".join([*said, *details(c)])
+    """Value, interval and standing of a parameter, its trade-offs and its change."""
+    standing = ": ".join(filter(None, (c.standing.value, doubts(c.finding))))
+    change = "" if c.drift is None else drift(c.drift)
+    return "; ".join(filter(None, (amount(c.value, c.interval, c.unit), standing, trade_offs(c.finding), change)))
 
 
-def details(c: Conclusion) -> list[str]:
-    """Remarks on a parameter beside its value."""
-    said = ["any other value fits as well"] if c.arbitrary else []
-    if c.traded_with:
-        said.append(f"trades off with {', '.join(c.traded_with)}")
-    return [*said, drift(c.drift)] if c.drift is not None else said
+def doubts(f: Finding) -> str:
+    """Reasons that a parameter is not identified; empty if it is."""
+    return "; ".join(DOUBTS[doubt] for doubt in f.doubts)
+
+
+def trade_offs(f: Finding) -> str:
+    """Parameters whose errors compensate one of this parameter, with the correlations; empty without any."""
+    others = ", ".join(f"{name} ({correlation:+.4f})" for name, correlation in f.traded_with.items())
+    return f"trades off with {others}" if others else ""
 
 
 def drift(d: Drift) -> str:
@@ -337,7 +363,10 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
     if study.apart:
         return [f"estimate from each log alone: emb-replay campaign {logs_of(study)} -o rows.csv"]
     if study.model_fits:
-        return [] if stopped or study.identified or e.bench.machine is not None else [MORE]
+        if stopped or study.identified or e.bench.machine is not None:
+            return []
+        weak = [c.label for c in study.conclusions if not (c.of_interest or c.identified)]
+        return [f"estimate without {', '.join(weak)}: the record does not determine them"] if weak else [MORE]
     if e.bench.machine is None:
         found = [f"find a model that explains it: {again} --model all"]
     else:
@@ -415,11 +444,9 @@ def notes(e: Evaluation) -> list[str]:
 
 def finding(f: Finding) -> str:
     """Identifiability of one parameter."""
-    said = ["identified" if f.identified else f"NOT identified: {f.why_not}"]
-    said += [f"trades off with {', '.join(f'{name} ({value:+.4f})' for name, value in f.traded_with.items())}"] * bool(
-        f.traded_with
-    )
-    return "; ".join([*said, f.border] if f.border else said)
+    verdict = "identified" if f.identified else f"NOT identified: {doubts(f)}"
+    border = "" if f.border is None else BORDERS[f.border]
+    return "; ".join(filter(None, (verdict, trade_offs(f), border)))
 
 
 def direction(d: Direction) -> str:

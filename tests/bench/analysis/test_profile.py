@@ -13,6 +13,7 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import NORMAL_95, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
+from emb_bench.information.identifiability import Doubt
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 from tests.bench.measurements import currents_of, fit, record  # isort: skip
@@ -36,7 +37,7 @@ def test_where_the_records_tell_a_parameter_well_its_profile_is_the_parabola_of_
 ) -> None:
     found, i = profile(told, label), told.labels.index(label)
     deviation = told.cramer_rao()[i] * told.values[i]
-    assert found.shape == "closed"
+    assert found.doubt is None
     assert np.array(found.interval) == pytest.approx(told.intervals()[i], abs=0.03 * NORMAL_95 * deviation)
     parabola = ((found.values - told.values[i]) / deviation) ** 2
     assert found.rise == pytest.approx(parabola, abs=0.05 * LEVEL)
@@ -70,7 +71,7 @@ def test_the_rise_is_that_of_a_search_over_the_other_parameter(bench: Bench) -> 
 def test_a_clamping_stiffness_of_a_brake_that_never_clamps_has_a_flat_profile(bench: Bench) -> None:
     data = record(bench, bench.plant("exact"), np.full(60, -0.8))
     found = profile(estimated(bench, [data], "k_m", "k_1"), "k_1")
-    assert (found.shape, found.interval) == ("flat", (-np.inf, np.inf))
+    assert (found.doubt, found.interval) == (Doubt.FLAT, (-np.inf, np.inf))
     assert np.abs(found.rise).max() < 1e-3
     nominal = bench.brake.k_1
     assert [found.values[0], found.values[-1]] == pytest.approx([nominal / 10.0, nominal * 10.0])
@@ -81,7 +82,7 @@ def test_a_brake_that_does_not_break_away_tells_its_friction_from_below_only(ben
     plant, current = bench.plant("exact"), 0.9 * bench.brake.T_c / bench.brake.k_m
     data = record(bench, plant, np.full(200, current))
     found = profile(estimated(bench, [data], "T_c"), "T_c")
-    assert found.shape == "open above"
+    assert found.doubt is Doubt.OPEN_ABOVE
     low, high = found.interval
     assert high == np.inf
     assert low == pytest.approx(bench.brake.k_m * current, rel=1e-3)
@@ -95,7 +96,7 @@ def test_a_side_that_closes_only_because_another_unknown_meets_its_border_is_ope
     e = estimated(off, [data], *PARAMETER_NAMES, nuisances=("J",))
     found = profile(e, "k_m")
     assert found.rise.max() > LEVEL
-    assert (found.shape, found.interval) == ("flat", (-np.inf, np.inf))
+    assert (found.doubt, found.interval) == (Doubt.FLAT, (-np.inf, np.inf))
 
 
 def test_what_only_the_prior_tells_has_the_prior_s_interval(bench: Bench) -> None:

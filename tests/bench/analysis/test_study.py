@@ -17,9 +17,10 @@ from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.experiment import Experiment
+from emb_bench.information.identifiability import Doubt
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document, text
-from emb_bench.report.sentences import apart
+from emb_bench.report.sentences import apart, remedies
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import UsageError
 
@@ -139,7 +140,7 @@ def test_an_interval_that_holds_zero_identifies_nothing(bench: Bench) -> None:
     e = estimated(bench, record(bench, bench.plant("exact"), currents_of(bench, "chirp")), params=("k_m",))
     wide = replace(e, information=e.information / e.information * 1.7**2)
     (found,) = conclude(wide, (), ())
-    assert found.why_not == "its interval contains zero"
+    assert found.finding.doubts == (Doubt.CONTAINS_ZERO,)
 
 
 def test_two_brakes_in_one_call_are_said_to_fit_each_alone(bench: Bench, log: Log) -> None:
@@ -150,3 +151,11 @@ def test_two_brakes_in_one_call_are_said_to_fit_each_alone(bench: Bench, log: Lo
     assert " ".join(apart(study).split()) in " ".join(text(study).split())
     for second in ("plant=exact,seed=2", "plant=stribeck,seed=2"):  # one brake, and one that the model does not know
         assert make_study(bench, [first, log(second)], options).apart == ()
+
+
+def test_a_nuisance_at_the_border_of_its_search_cuts_the_interval_of_a_parameter(bench: Bench, log: Log) -> None:
+    curved = EstimationProblem(nuisances=("quadratic", "cubic"))
+    study = make_study(bench, [log("plant=exact,seed=2")], StudyOptions(curved))
+    assert study["k_1"].finding.doubts == (Doubt.CUT,)
+    (remedy,) = remedies(study, stopped=False)
+    assert "quadratic, cubic" in remedy

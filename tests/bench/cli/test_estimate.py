@@ -127,7 +127,7 @@ def test_strict_fails_where_the_model_does_not_fit_or_something_is_not_identifie
 
 def test_profiles_come_when_asked_for(path: Path, replay: Replay) -> None:
     got = replay.document(path, "--profile", "--starts", "1")
-    assert [(p["label"], p["shape"]) for p in got["profiles"]] == [(name, "closed") for name in PARAMETER_NAMES]
+    assert [(p["label"], p["doubt"]) for p in got["profiles"]] == [(name, None) for name in PARAMETER_NAMES]
     for found, profile in zip(got["parameters"].values(), got["profiles"], strict=True):
         (low, high), (first, last) = found["interval_95"], profile["interval_95"]
         assert low <= first < last <= high  # it allows for suspects that were not noticed, too

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.information.criteria import criteria, criteria_series
-from emb_bench.information.identifiability import Spectrum, combination, judge, schur_complement
+from emb_bench.information.identifiability import Doubt, Spectrum, combination, judge, schur_complement
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
@@ -102,7 +102,7 @@ def test_a_singular_matrix_of_any_rank_has_the_worst_values_and_a_verdict_and_no
     assert (np.abs(correlation) <= 1.0).all()
     verdict = judge(s @ s.T, names, np.zeros((9, 9)) if with_prior else None)
     assert not verdict.identified
-    assert [f.why_not for f in verdict.findings[:dead]] == ["the data do not depend on it"] * dead
+    assert [f.doubts for f in verdict.findings[:dead]] == [(Doubt.NO_INFORMATION,)] * dead
     assert all(math.isinf(f.deviation) for f in verdict.findings[:dead])
 
 
@@ -130,8 +130,8 @@ def test_what_counts_as_told_depends_on_the_unit() -> None:
     # Deviations of 2: two hundred percent of k_m, two samples of delay, two rad/s at the start.
     verdict = judge(0.25 * np.eye(3), ("k_m", "delay", "x2_0"))
     assert [f.identified for f in verdict.findings] == [False, False, True]
-    assert verdict.findings[0].why_not == "its bound is no smaller than its value"
-    assert verdict.findings[1].why_not == "its bound is no smaller than a gross error"
+    assert verdict.findings[0].doubts == (Doubt.TOO_WIDE,)
+    assert verdict.findings[1].doubts == (Doubt.TOO_WIDE,)
     assert [(f.deviation, f.unit) for f in verdict.findings] == [(2.0, ""), (2.0, "samples"), (2.0, "rad/s")]
     assert {tuple(d.shares.values()) for d in verdict.directions} == {(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)}
     assert [d.deviation for d in verdict.directions] == [2.0, 2.0]
@@ -141,7 +141,7 @@ def test_what_was_known_before_is_no_merit_of_the_data() -> None:
     prior = 12.0 * np.eye(2)
     verdict = judge(prior + np.diag([100.0, 0.1]), ("k_m", "f_v"), prior)
     assert [f.identified for f in verdict.findings] == [True, False]
-    assert verdict.findings[1].why_not == "the data add nothing to what was known before"
+    assert verdict.findings[1].doubts == (Doubt.NOTHING_NEW,)
 
 
 @pytest.mark.parametrize("interest", [(), ("J",)])

@@ -23,6 +23,7 @@ from emb_bench.information.fisher import (
     uniform_prior,
     weights_along,
 )
+from emb_bench.information.identifiability import Border
 from emb_bench.information.symmetric import Floats, log_det, pack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
@@ -217,7 +218,7 @@ def test_a_bound_above_the_value_itself_is_not_taken_for_an_answer() -> None:
     assert told == {"k_m": False, "k_1": True, "T_c": False, "f_v": True}
     (direction,) = verdict.directions
     assert direction.deviation > 1.0
-    assert verdict.findings[0].border == "at the lower border of its range"
+    assert verdict.findings[0].border is Border.AT_LOWER
     assert direction.shares["k_m"] == pytest.approx(0.469, abs=1e-3)
 
 
@@ -249,10 +250,10 @@ def test_two_estimates_that_replace_each_other_are_called_traded_off() -> None:
 
 def test_a_value_that_cannot_be_told_from_the_end_of_its_range_is_at_a_border() -> None:
     for k_1, expected in (
-        (24.0, "outside its range, beyond the lower border"),
-        (25.0, "at the lower border of its range"),
-        (30.0, ""),
-        (50.0, "at the upper border of its range"),
+        (24.0, Border.BELOW),
+        (25.0, Border.AT_LOWER),
+        (30.0, None),
+        (50.0, Border.AT_UPPER),
     ):
         verdict = of(chirp(), p=BRAKE._replace(k_1=k_1)).verdict(BENCH.range_set("viscous-stiffness"))
-        assert {f.name: f.border for f in verdict.findings} == {"k_m": "", "k_1": expected, "T_c": "", "f_v": ""}
+        assert {f.name: f.border for f in verdict.findings} == {"k_m": None, "k_1": expected, "T_c": None, "f_v": None}
