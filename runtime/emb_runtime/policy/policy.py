@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from importlib import resources
 from pathlib import Path
 
 from emb_runtime.config.bench import CEILING_CURRENT, Bench
@@ -26,7 +27,7 @@ MAX_FILE_BYTES = 4 * 1024 * 1024  # A policy is a few to hundreds of kilobytes
 
 def shipped_actor_path(quick: bool = False) -> Path:
     """Path of the policy that is shipped with the package: the one for a whole experiment, or for a short one."""
-    return Path(__file__).with_name("quick.onnx" if quick else "actor.onnx")
+    return Path(str(resources.files("emb_runtime.policy").joinpath("quick.onnx" if quick else "actor.onnx")))
 
 
 class Policy:
