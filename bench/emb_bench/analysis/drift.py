@@ -99,7 +99,7 @@ def read_last(path: Path) -> Earlier:
     except UnicodeDecodeError as err:
         raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: not UTF-8 text") from err
     except (ValueError, msgspec.MsgspecError, RecursionError) as err:
-        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: {_printable(str(err))}") from err
+        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: {printable(str(err))}") from err
 
 
 def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
@@ -108,11 +108,11 @@ def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
     common = [i for i in now.shared() if i in now.wanted() and now.labels[i] in then]
     if not common:
         raise UsageError(
-            f"nothing to compare: the earlier estimate is of {_printable(', '.join(then))}, this one of "
+            f"nothing to compare: the earlier estimate is of {printable(', '.join(then))}, this one of "
             f"{', '.join(now.labels)}"
         )
     limit = float(special.ndtri(1.0 - 0.5 * LEVEL / len(common)))
-    since = tuple(_printable(record.name) for record in last.records)
+    since = tuple(printable(record.name) for record in last.records)
     deviations = now.between_runs()
     found = []
     for i in common:
@@ -143,16 +143,6 @@ def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
     return tuple(found)
 
 
-def other_model(now: Estimate, last: Earlier) -> str:
-    """Reasons why a change since an earlier estimate may be one of the model; empty if there is none."""
-    reasons = {
-        "it did not fit then": not last.model_fits,
-        "it does not fit now": not now.validation.fits,
-        f"it was '{_printable(last.model)}' then": last.model != now.plant.name,
-    }
-    return " and ".join(reason for reason, holds in reasons.items() if holds)
-
-
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
     """Text of another file, as it can stand in a line."""
     return "".join(c if c.isprintable() else "?" for c in text[-LONG:])

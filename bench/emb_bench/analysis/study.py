@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.analysis.conclusion import Conclusion, conclude
-from emb_bench.analysis.drift import Drift, Earlier, drifts, other_model
+from emb_bench.analysis.drift import Drift, Earlier, drifts
 from emb_bench.analysis.held_out import HeldOut, leave_one_out
 from emb_bench.analysis.model_choice import ModelChoice, choose_model
 from emb_bench.analysis.profile import Profile, profiles
@@ -90,28 +90,21 @@ class Study:
     """Result of a study: the estimate from logs of one brake, its checks and the conclusions."""
 
     estimate: Estimate
-    logs: tuple[Path, ...]  # Logs of the estimate, in the order of its records
-    warnings: tuple[str, ...]  # Defects of the logs
-    notes: tuple[str, ...]
-    """Descriptions of what was taken for the currents that acted, where that is not what was told."""
-    model_reason: str
-    truth: BrakeParameters | None
-    """Parameters of the simulated brake, if known and the same in all logs of the estimate."""
+    logs: tuple[RunLog, ...]  # In the order of the estimate's records
+    options: StudyOptions
+    last: Earlier | None  # Estimate that this one is compared with
     profiles: tuple[Profile, ...]
     """Profiles of the unknowns that the records share: all, or those whose verdict may depend on one."""
     left_out: tuple[HeldOut, ...]  # Prediction of each record from the others; empty for a single record
     drifts: tuple[Drift, ...]
     conclusions: tuple[Conclusion, ...]
-    stopped: tuple[Stop, ...]  # Ends of the runs that were stopped
     choice: ModelChoice | None = None  # Models that were compared; None if one was given
-    other_model: str = ""  # Why a drift may be one of the model instead of one of the brake; empty if it is not
     apart: tuple[Differing, ...] = ()  # Parameters in which logs differ that each fit alone; empty if they fit together
 
     def __repr__(self) -> str:
         """Verdict and values in one line."""
         values = ", ".join(f"{c.label} = {amount(c.value, c.interval, c.unit)}" for c in self.conclusions)
-        logs, model = ", ".join(file_names(self.logs)), self.estimate.plant.name
-        return f"<Study of {logs}: model '{model}' {self.standing}; {values}>"
+        return f"<Study of {', '.join(self.names)}: model '{self.estimate.plant.name}' {self.standing}; {values}>"
 
     def _repr_html_(self) -> str:
         """Verdict and values as a table of a notebook."""
@@ -169,6 +162,23 @@ class Study:
             return pa.Table.from_pylist(rows).to_pandas().set_index("name")
         except ImportError as err:
             raise UsageError("a data frame needs pyarrow and pandas: pip install pyarrow pandas") from err
+
+    @property
+    def names(self) -> list[str]:
+        """Names to show for the logs."""
+        return file_names([log.path for log in self.logs])
+
+    @property
+    def truth(self) -> BrakeParameters | None:
+        """Parameters of the simulated brake, if known and the same in all logs."""
+        truths = {log.truth for log in self.logs}
+        return truths.pop() if len(truths) == 1 else None
+
+    @property
+    def stopped(self) -> list[Stop]:
+        """Ends of the runs that were stopped."""
+        ends = map(stop_of, self.logs, self.estimate.records, self.names)
+        return [stop for stop in ends if stop is not None]
 
     @property
     def model_fits(self) -> bool:
@@ -247,26 +257,14 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
         check_sample_time(log, bench)
     if wanted.model == EVERY and wanted.method != "oem":
         raise UsageError(f"--model {EVERY} compares models by output error: expected --method oem, got {wanted.method}")
-    plant, why = begun_with(bench, logs, wanted)
+    plant = begun_with(bench, logs, wanted)
     names = file_names([log.path for log in logs])
-    experiments: list[Experiment] = []
-    warnings: list[str] = []
-    notes: list[str] = []
-    stops: list[Stop] = []
-    for log, shown in zip(logs, names, strict=True):
-        experiment, said = _read(log, bench, shown)
-        said += [] if method_of(wanted.method).gaps else _hidden(experiment)
-        experiments.append(experiment)
-        stop = stop_of(log, experiment, shown)
-        stops += [stop] if stop is not None else []
-        of_which = f"{shown}: " if len(logs) > 1 else ""
-        warnings += [of_which + warning for warning in said]
-        notes += [of_which + note for note in experiment.notes]
+    experiments = [read_experiment(log, bench, name) for log, name in zip(logs, names, strict=True)]
 
     def records_of(plant: Plant) -> list[Experiment]:
         return [own.seen_by(plant) for own in experiments]
 
-    _check_different(records_of(plant))
+    _check_different(experiments)
     choice = None
     if wanted.model == EVERY:
         choice = choose_model(
@@ -277,9 +275,6 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
             starts=wanted.starts,
             seed=wanted.seed,
         )
-        plant, why = choice.best.estimate.plant, f"the best of {len(choice.candidates)}"
-        if choice.same:
-            why += f"; {', '.join(choice.same)} left out: one of them, with the encoder's offset estimated too"
         e = choice.best.estimate
     else:
         asked = wanted.problem(bench, plant)
@@ -290,11 +285,9 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
     left_out = leave_one_out(e) if len(logs) > 1 else ()
     return Study(
         estimate=e,
-        logs=tuple(log.path for log in logs),
-        warnings=tuple(warnings),
-        notes=tuple(notes),
-        model_reason=why,
-        truth=_truth(logs),
+        logs=tuple(logs),
+        options=wanted,
+        last=last,
         profiles=found,
         left_out=left_out,
         drifts=changes,
@@ -303,19 +296,21 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
             [e.unknowns[i] for i in e.wanted()],
             choice,
         ),
-        stopped=tuple(stops),
         choice=choice,
-        other_model="" if last is None else other_model(e, last),
         apart=apart(e) if wanted.method == "oem" else (),
     )
 
 
-def begun_with(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions) -> tuple[Plant, str]:
-    """The plant that a study of logs begins with, and the reason for it."""
+def begun_with(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions) -> Plant:
+    """The plant that a study of logs begins with: the one that was asked for, or that of the logs."""
     if wanted.model is not None:
-        return bench.plant(DEFAULT_PLANT if wanted.model == EVERY else wanted.model), "asked for"
-    name, why = _model(logs)
-    return bench.plant(name), why
+        return bench.plant(DEFAULT_PLANT if wanted.model == EVERY else wanted.model)
+    models = sorted({default_model(log)[0] for log in logs})
+    if len(models) > 1:
+        raise UsageError(
+            f"the logs are of different brakes ({', '.join(models)}): say which model to use, with --model"
+        )
+    return bench.plant(models[0])
 
 
 def covering(
@@ -356,37 +351,3 @@ def stop_of(log: RunLog, experiment: Experiment | None, name: str) -> Stop | Non
     fault = FAULTS[Fault[reason]] if reason in Fault.__members__ else None
     cause, advice = ("", "") if fault is None else (fault.cause, fault.advice)
     return Stop(name, reason, end_detail(log.end), periods, planned, cause, advice)
-
-
-def _read(log: RunLog, bench: Bench, name: str) -> tuple[Experiment, list[str]]:
-    """Experiment of a log, and warnings about what the log lacks."""
-    experiment = read_experiment(log, bench, name)
-    said = [log.missing] if log.missing else []
-    missing = experiment.missing
-    if log.end.get("exit_reason", DONE) != DONE:  # which is reported as the run's end
-        missing = tuple(line for line in missing if not line.startswith("the experiment ends after"))
-    return experiment, [*said, *missing]
-
-
-def _hidden(experiment: Experiment) -> list[str]:
-    """Periods without a report, for methods that take what acted from the commands or from the node's braking."""
-    lost = int((~experiment.measured).sum())
-    if not lost:
-        return []
-    return [
-        f"what acted in {lost} periods is assumed, for this method does not estimate it: the command, or the node's "
-        "braking where there was none; the right model may not fit"
-    ]
-
-
-def _model(logs: Sequence[RunLog]) -> tuple[str, str]:
-    models = {default_model(log) for log in logs}
-    if len({name for name, _ in models}) > 1:
-        names = ", ".join(sorted(name for name, _ in models))
-        raise UsageError(f"the logs are of different brakes ({names}): say which model to use, with --model")
-    return sorted(models)[0]
-
-
-def _truth(logs: Sequence[RunLog]) -> BrakeParameters | None:
-    truths = {log.truth for log in logs}
-    return truths.pop() if len(truths) == 1 else None

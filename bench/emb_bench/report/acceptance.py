@@ -24,7 +24,7 @@ from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import OF_A_RECORD, PARAMETERS, SI, UNITS
 from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.numbers import amount, between, plain, share, share_between
-from emb_bench.report.sentences import doubts
+from emb_bench.report.sentences import doubts, other_model
 from emb_runtime.config.typed import FieldError, read
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
@@ -171,7 +171,8 @@ def judge(
         results.append(_model_fit(study, doubt))
     results += [_tolerated(name, one, study, doubt) for name, one in criteria.parameters.items()]
     drifts = {} if study is None else {drift.name: drift for drift in study.drifts}
-    earlier = f"the change may be the model's: {study.other_model}" if study is not None and study.other_model else ""
+    why = "" if study is None else other_model(study.estimate, study.last)
+    earlier = f"the change may be the model's: {why}" if why else ""
     for name, most in criteria.drift.items():
         results.append(_drifted(name, most, drifts.get(name), doubt or earlier, given=last is not None))
     for run in runs:

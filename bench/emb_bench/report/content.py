@@ -224,7 +224,7 @@ def _experiment(log: RunLog, bench: Bench, wanted: StudyOptions) -> tuple[Experi
         experiment = read_experiment(log, bench)
     except LogError as err:
         return None, str(err).removeprefix(f"{log.path}: ")
-    plant, _ = begun_with(bench, [log], wanted)
+    plant = begun_with(bench, [log], wanted)
     return experiment, too_few(plant, wanted.problem(bench, plant), int(experiment.measured.sum()), 1)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.analysis.study import Study, file_names
+from emb_bench.analysis.study import Study
 from emb_bench.brake.motion import Floats
 from emb_bench.documents import to_json
 from emb_bench.estimate.estimate import Estimate
@@ -24,7 +24,7 @@ NOTICED = 2.0  # Standard deviations from which on an effect that is no alarm is
 
 def text(study: Study, *, verbose: bool = False) -> str:
     """Verdict, parameters, what limits them, next step; with ``verbose`` the evidence, too."""
-    lines = [*stops(study), *listed("", say.outside(study)), *listed("WARNING: ", study.warnings)]
+    lines = [*stops(study), *listed("", say.outside(study)), *listed("WARNING: ", say.missing(study))]
     if study.aborted and not verbose:
         return "\n".join([*lines, "next: find the cause before the next run   (-v shows values until the stop)"])
     against = list(_against(study))
@@ -59,7 +59,7 @@ def _against(study: Study) -> Iterator[str]:
 def _notes(study: Study) -> list[str]:
     """Qualifications of the values."""
     apart = [say.apart(study)] if study.apart else []
-    return [*study.notes, *apart, say.changed_model(study), say.models(study), *study.estimate.caveats]
+    return [*say.assumptions(study), *apart, say.changed_model(study), say.models(study), *study.estimate.caveats]
 
 
 def _remarks(study: Study, *, trades: bool) -> Iterator[str]:
@@ -103,13 +103,13 @@ def _evidence(study: Study) -> Iterator[str]:
     e, m = study.estimate, study.estimate.validation
     measured = (
         f"{name}: {record.measured.sum()} of {len(record.currents)} samples"
-        for name, record in zip(file_names(study.logs), e.records, strict=True)
+        for name, record in zip(study.names, e.records, strict=True)
     )
     expected = f"{m.ratio:.4g} of {m.freedom}, {m.expected[0]:.3f} to {m.expected[1]:.3f} expected"
     yield ""
     yield from facts(
         *(("record", said) for said in measured),
-        ("method", f"{METHODS[e.method]}, model {e.plant.name} ({study.model_reason})"),
+        ("method", f"{METHODS[e.method]}, model {e.plant.name} ({say.model_reason(study)})"),
         ("prior", say.prior(e)),
         ("chi2/n", f"{expected} ({p_value(m.chi2_p)})"),
     )
@@ -137,8 +137,8 @@ def document(study: Study) -> dict[str, Any]:
         "method_name": e.method,
         "model": e.plant.name,
         "records": [
-            {"name": path, "periods": len(r.currents), "measured": r.measured.sum()}
-            for path, r in zip(study.logs, e.records, strict=True)
+            {"name": log.path, "periods": len(r.currents), "measured": r.measured.sum()}
+            for log, r in zip(study.logs, e.records, strict=True)
         ],
         "params": e.asked.params,
         "nuisances": e.asked.nuisances,
@@ -176,18 +176,13 @@ def document(study: Study) -> dict[str, Any]:
             for end in e.ends
         ],
     }
-    of_study = (
-        "stopped",
-        "warnings",
-        "notes",
-        "model_reason",
-        "model_fits",
-        "predicts",
-        "identified",
-        "drifts",
-        "other_model",
-    )
-    found |= _fields(study, *of_study, "left_out", "apart")
+    found |= {
+        "warnings": say.missing(study),
+        "notes": say.assumptions(study),
+        "model_reason": say.model_reason(study),
+        "other_model": say.other_model(e, study.last),
+    }
+    found |= _fields(study, "stopped", "model_fits", "predicts", "identified", "drifts", "left_out", "apart")
     document: dict[str, Any] = to_json(found | _fields(e, "caveats", "process_noise", "load_noise", "theta"))
     return document
 

@@ -13,7 +13,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES
 
 if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.conclusion import Conclusion
-    from emb_bench.analysis.drift import Drift
+    from emb_bench.analysis.drift import Drift, Earlier
     from emb_bench.analysis.held_out import HeldOut
     from emb_bench.analysis.model_choice import Candidate
     from emb_bench.analysis.profile import Profile
@@ -140,8 +140,67 @@ def apart(study: Study) -> str:
 
 def changed_model(study: Study) -> str:
     """A warning where a drift may be one of the model instead of one of the brake; else empty."""
-    drifted = any(d.drifted for d in study.drifts)
-    return f"the changes may be the model's: {study.other_model}" if drifted and study.other_model else ""
+    why = other_model(study.estimate, study.last) if any(d.drifted for d in study.drifts) else ""
+    return f"the changes may be the model's: {why}" if why else ""
+
+
+def other_model(now: Estimate, last: Earlier | None) -> str:
+    """Reasons why a change since an earlier estimate may be one of the model; empty if there is none."""
+    if last is None:
+        return ""
+    from emb_bench.analysis.drift import printable
+
+    reasons = {
+        "it did not fit then": not last.model_fits,
+        "it does not fit now": not now.validation.fits,
+        f"it was '{printable(last.model)}' then": last.model != now.plant.name,
+    }
+    return " and ".join(reason for reason, holds in reasons.items() if holds)
+
+
+def missing(study: Study) -> list[str]:
+    """Defects of the logs; that a stopped run ended early is not repeated."""
+    from emb_bench.estimate.methods import method_of
+    from emb_bench.estimate.records import DONE
+
+    found = []
+    gaps = method_of(study.estimate.method).gaps
+    for log, record in zip(study.logs, study.estimate.records, strict=True):
+        said = [log.missing] if log.missing else []
+        stopped = log.end.get("exit_reason", DONE) != DONE
+        said += [text for text in record.missing if not (stopped and text.startswith("the experiment ends after"))]
+        lost = int((~record.measured).sum()) - record.outliers
+        if lost and not gaps:
+            said.append(
+                f"what acted in {lost} periods is assumed, for this method does not estimate it: the command, or the "
+                "node's braking where there was none; the right model may not fit"
+            )
+        found.append(said)
+    return _of_which(study, found)
+
+
+def assumptions(study: Study) -> list[str]:
+    """Assumptions about the currents that acted, where they are not those that were reported."""
+    return _of_which(study, [record.notes for record in study.estimate.records])
+
+
+def _of_which(study: Study, found: Sequence[Sequence[str]]) -> list[str]:
+    """Texts of each log, behind its name if there are several."""
+    several = len(study.logs) > 1
+    names = study.names
+    return [f"{name}: {text}" if several else text for name, own in zip(names, found, strict=True) for text in own]
+
+
+def model_reason(study: Study) -> str:
+    """Reason for the model."""
+    from emb_bench.information.evaluation import default_model
+
+    choice = study.choice
+    if choice is None:
+        return "asked for" if study.options.model else default_model(study.logs[0])[1]
+    why = f"the best of {len(choice.candidates)}"
+    same = f"; {', '.join(choice.same)} left out: one of them, with the encoder's offset estimated too"
+    return why + same if choice.same else why
 
 
 def models(study: Study) -> str:
@@ -344,10 +403,8 @@ MORE = "run emb-run, whose actor excites all four parameters, and estimate from 
 
 def logs_of(study: Study) -> str:
     """Logs of a study as arguments of a command."""
-    from emb_bench.analysis.study import file_names
-
     end = "" if study.estimate.bench.machine is None else " --map MAP"
-    return " ".join(file_names(study.logs)[:3]) + (" ..." if len(study.logs) > 3 else "") + end
+    return " ".join(study.names[:3]) + (" ..." if len(study.logs) > 3 else "") + end
 
 
 def remedies(study: Study, *, stopped: bool) -> list[str]:

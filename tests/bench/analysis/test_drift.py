@@ -12,10 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_bench.analysis.drift import Earlier, drifts, other_model, read_last
+from emb_bench.analysis.drift import Earlier, drifts, read_last
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.report.sentences import drift as sentence
+from emb_bench.report.sentences import other_model
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 

@@ -15,7 +15,7 @@ from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.numbers import in_samples
 from emb_bench.report import estimate as report
-from emb_bench.report.sentences import notes
+from emb_bench.report.sentences import assumptions, notes
 from emb_runtime.cli.main import main
 from emb_runtime.config.bench import PARAMETER_NAMES, parse_bench
 from emb_runtime.records import Frame
@@ -72,7 +72,7 @@ def test_parameters_are_known_from_a_log_of_a_drive_that_tells_its_current_coars
         assert one.interval[0] <= getattr(truth, one.label) <= one.interval[1]
         assert one.interval[1] - one.interval[0] < 0.06 * getattr(truth, one.label)  # 0.04 by an inertia known to 1 %
     assert [c.label for c in study.conclusions] == list(PARAMETER_NAMES)
-    (note,) = study.notes
+    (note,) = assumptions(study)
     assert f"the command as its bus carried it, {in_samples(late)} late" in note
     assert f"NOTE: {note}" in " ".join(report.text(study).split())
     assert note in notes(api.fisher_information(log, model="exact"))
