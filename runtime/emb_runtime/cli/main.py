@@ -14,7 +14,7 @@ from pathlib import Path
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.cli import summary
 from emb_runtime.cli.experiment import experiment
-from emb_runtime.cli.options import Ask, Plan, Stage, log_folder, log_path, names_a_file, parser, prepare
+from emb_runtime.cli.options import Plan, Stage, log_folder, log_path, names_a_file, parser, prepare
 from emb_runtime.cli.preflight import CheckResult, RefusedError, Verdict, table
 from emb_runtime.cli.session import Bus, Console, listen_only
 from emb_runtime.config.bench import shipped_bench_text
@@ -56,9 +56,9 @@ class Operator(Console):
         return self._agreed
 
     def _asks(self, bus: Bus) -> bool:
-        if self._plan.ask is Ask.REAL_BUS:
+        if self._plan.confirm is None:
             return not bus.in_process and sys.stdin is not None and sys.stdin.isatty()
-        return self._plan.ask is Ask.ALWAYS
+        return self._plan.confirm
 
     def _ask(self, bus: Bus) -> bool:
         def wait() -> None:

@@ -97,14 +97,6 @@ class Stage(StrEnum):
     FULL = "full"
 
 
-class Ask(StrEnum):
-    """Policy of asking the operator before anything is armed."""
-
-    ALWAYS = "always"
-    NEVER = "never"
-    REAL_BUS = "real bus"  # Ask where the bus is real and there is somebody to ask
-
-
 @dataclass(frozen=True)
 class MappedDrive:
     """A drive with a DBC of its own, behind the node."""
@@ -131,7 +123,7 @@ class Plan:
     log: Path  # Log path as given by the user: a file, or a folder
     real_time: bool
     watchdog: bool
-    ask: Ask
+    confirm: bool | None  # Ask before anything is armed; None where the bus is real and there is somebody to ask
     live: int | None  # Port at which the run is shown
     json: bool
     verbose: bool
@@ -290,7 +282,7 @@ def prepare(args: argparse.Namespace) -> Plan:
         log=args.log,
         real_time=not args.no_rt,
         watchdog=not args.no_watchdog,
-        ask=Ask.ALWAYS if args.confirm else Ask.NEVER if args.yes else Ask.REAL_BUS,
+        confirm=True if args.confirm else False if args.yes else None,
         live=_live(args.live),
         json=args.json,
         verbose=args.verbose,

@@ -19,7 +19,7 @@ from emb_runtime.errors import BenchFileError, UsageError
 from emb_runtime.safety.end_stop import released_speed
 
 if TYPE_CHECKING:
-    from cantools.database.can import Database
+    from cantools.database.can import Message as DbcMessage
 
 PROPERTIES = {
     "no_answers": "the drive does not check which sample a command answers: a late command still acts",
@@ -84,7 +84,7 @@ class MessageInfo:
     """One message, of a multiplexed one what has one value of its multiplexor."""
 
     name: str  # ``MESSAGE``, or ``MESSAGE[value]``
-    message: str  # Name in the DBC
+    dbc: DbcMessage  # As cantools encodes and decodes it
     identifier: int
     extended: bool
     length: int  # Payload bytes
@@ -137,7 +137,6 @@ class Mapping:
     end_stop_speed: float  # Speed into an end stop that the brake bears [rad/s]: without host or cable nothing stops it
     text: str
     dbc_text: str
-    database: Database
 
     @property
     def sha256(self) -> str:

@@ -228,9 +228,8 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
         end_stop_speed=file.node.end_stop_speed,
         text=text,
         dbc_text=dbc_text,
-        database=database,
     )
-    unused = set(can.protection) - {"default", *(info.message for info in reader.used.values())}
+    unused = set(can.protection) - {"default", *(info.dbc.name for info in reader.used.values())}
     if unused:
         raise reader.error(f"can.protection.{min(unused)}", "unknown key: no message of that name is used")
     if missing := [name for name in made.lost if name not in file.node.accept]:
@@ -259,7 +258,7 @@ class _Reader:
     def command(self, of: _Command) -> Commanded:
         key = "can.signals.command"
         info, field = self._signal(of.signal, key)
-        if info.page is None and self._message(info.message, key).is_multiplexed():
+        if info.page is None and info.dbc.is_multiplexed():
             raise self.error(f"{key}.signal", f"{of.signal}: expected a signal of one value of the multiplexor")
         low, high = self._range(of, key)
         if not low <= 0.0 <= high:
@@ -281,7 +280,7 @@ class _Reader:
         if set(of.idle) & set(of.active):
             raise self.error(f"{key}.active", "a value cannot be both idle and active")
         if of.error is not None and of.error not in info.fields:
-            raise self.error(f"{key}.error", f"no such signal in {info.message}; it has {_names(set(info.fields))}")
+            raise self.error(f"{key}.error", f"no such signal in {info.dbc.name}; it has {_names(set(info.fields))}")
         error = None if of.error is None else info.fields[of.error]
         return State(info.name, field, of.idle, of.active, of.timeout, error)
 
@@ -362,7 +361,7 @@ class _Reader:
             raise self.error(f"can.protection.{message.name}", "a multiplexed message with a counter needs a gateway")
         self.used[name] = info = MessageInfo(
             name=name,
-            message=message.name,
+            dbc=message,
             identifier=message.frame_id,
             extended=message.is_extended_frame,
             length=message.length,

@@ -42,7 +42,6 @@ class Encoder:
         self._mapping = mapping
         command = mapping.command
         self._info = mapping.messages[command.message]
-        self._message = mapping.database.get_message_by_name(self._info.message)
         self._counter = 0
 
     def command(self, current: float) -> Frame:
@@ -63,7 +62,7 @@ class Encoder:
         if protection.checksum is not None:
             values[protection.checksum.name] = 0
         try:
-            data = bytearray(self._message.encode(values, padding=False, strict=True))
+            data = bytearray(self._info.dbc.encode(values, padding=False, strict=True))
         except Exception as err:  # of several kinds, by what does not fit
             raise FrameError(f"{command.message}: {' '.join(str(err).split())}") from err
         if protection.checksum is not None:
@@ -101,7 +100,6 @@ class Receiver:
         self._infos: dict[tuple[bool, int], list[MessageInfo]] = {}
         for info in (mapping.messages[name] for name in sorted(heard)):
             self._infos.setdefault((info.extended, info.identifier), []).append(info)
-        self._codecs = {name: mapping.database.get_message_by_name(mapping.messages[name].message) for name in heard}
         self._counters: dict[str, int] = {}
         self._missing = {name: LeakyCount(tolerated) for name in heard}
         self._waiting: dict[str, tuple[dict[str, float], int]] = {}
@@ -159,7 +157,7 @@ class Receiver:
             if info.name in self._counters:
                 self._missing[info.name].reject((count - self._counters[info.name]) % info.protection.modulus - 1)
             self._counters[info.name] = count
-        decoded = self._codecs[info.name].decode(frame.data, decode_choices=False)
+        decoded = info.dbc.decode(frame.data, decode_choices=False)
         assert isinstance(decoded, dict)
         values = {name: float(value) for name, value in decoded.items() if isinstance(value, int | float)}
         mapping = self._mapping

@@ -27,10 +27,14 @@ def obtain(priority: int = PRIORITY) -> dict[str, str]:
 
     Call it last before the loop: after warm-up, and after every child was started.
     """
+    gc.collect()
+    gc.freeze()
+    gc.disable()
     return {
-        "garbage_collector": _freeze_garbage(),
-        "timer_slack": _timer_slack(),
-        "huge_pages": _no_huge_pages(),
+        "garbage_collector": "frozen, off",
+        "timer_slack": _set(_PR_SET_TIMERSLACK, "1 ns"),
+        # The kernel joins small pages to huge ones at ordinary priority; whoever touches one meanwhile waits for it.
+        "huge_pages": _set(_PR_SET_THP_DISABLE, "none are made"),
         "idle_states": _stay_awake(),
         "memory_lock": _lock_memory(),
         "scheduler": _fifo(priority),
@@ -42,22 +46,6 @@ def step_back() -> None:
     for action in (lambda: os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0)), lambda: os.nice(10)):
         with contextlib.suppress(OSError):
             action()
-
-
-def _freeze_garbage() -> str:
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    return "frozen, off"
-
-
-def _timer_slack() -> str:
-    return _set(_PR_SET_TIMERSLACK, "1 ns")
-
-
-def _no_huge_pages() -> str:
-    # The kernel joins small pages to huge ones at ordinary priority, and whoever touches one meanwhile waits for it.
-    return _set(_PR_SET_THP_DISABLE, "none are made")
 
 
 def _stay_awake() -> str:

@@ -195,7 +195,7 @@ def test_the_hash_follows_both_files() -> None:
 def test_bits_are_read_as_cantools_reads_them() -> None:
     for seed in range(100):
         drawn = RandomMapping(seed)
-        message = parse_mapping(drawn.toml, drawn.dbc, "drive.toml").database.get_message_by_name("Command")
+        message = parse_mapping(drawn.toml, drawn.dbc, "drive.toml").messages["Command"].dbc
         data = bytes((seed * 37 + 101 * i) % 251 for i in range(8))
         for signal in message.signals:
             field = make_field(signal)

@@ -34,7 +34,7 @@ def test_bytes_on_the_bus_decode_to_what_was_meant_or_nothing_leaves() -> None:
     for seed in range(150):
         drawn, draw = RandomMapping(seed), random.Random(-seed)
         mapping = parse_mapping(drawn.toml, drawn.dbc, "random.toml")
-        message = mapping.database.get_message_by_name("Command")
+        message = mapping.messages["Command"].dbc
         way = Way(mapping)
         for current in (0.0, LIMIT, -LIMIT, *(draw.uniform(-LIMIT, LIMIT) for _ in range(7))):
             said = way.command(current)
