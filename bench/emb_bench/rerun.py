@@ -215,8 +215,7 @@ class Playback:
 
     @staticmethod
     def _fail(core: Core, fault: Fault, detail: str, time_ns: int) -> None:
-        core.fail(fault, time_ns)
-        core.explain(fault, detail)
+        core.fail(fault, time_ns, detail)
 
     def _send_stop_frames(self, core: Core) -> None:
         """Send the stop frames that were sent before the next sample."""

@@ -198,7 +198,7 @@ class Core:
             try:
                 newest = self._take(frame, newest) if self.state is not OVER else None
             except StopError as stop:
-                self._fail(stop.fault, stop.detail)
+                self.fail(stop.fault, self._now_ns, stop.detail)
                 newest = None
         if not self.running:
             return None
@@ -209,7 +209,7 @@ class Core:
                 return None
             return None if newest is None else self._propose(newest)
         except StopError as ended:
-            self._fail(ended.fault, ended.detail)
+            self.fail(ended.fault, now_ns, ended.detail)
         return None
 
     def commit(self, proposal: Proposal, now_ns: int) -> Frame | None:
@@ -256,10 +256,15 @@ class Core:
             elif self.running:
                 self._miss()
         except StopError as stop:
-            self._fail(stop.fault, stop.detail)
+            self.fail(stop.fault, self._now_ns, stop.detail)
 
-    def fail(self, fault: Fault, now_ns: int) -> None:
-        """Latch a fault that the driver has found; :meth:`explain` records it, once a stop frame has left."""
+    def fail(self, fault: Fault, now_ns: int, detail: str = "") -> None:
+        """Latch a fault, and record it."""
+        self.latch(fault, now_ns)
+        self.explain(fault, detail)
+
+    def latch(self, fault: Fault, now_ns: int) -> None:
+        """Latch a fault that was raised in the driver; :meth:`explain` records it, once a stop frame has left."""
         self._machine.latch(fault, now_ns)
 
     def explain(self, fault: Fault, detail: str) -> None:
@@ -277,11 +282,13 @@ class Core:
         speed = steady_motion(self._rest_velocities[-REST_SAMPLES:], self.bench.noise.velocity)
         moves = f"without a current the node goes on to measure {speed:.1f} rad/s: friction stops any" if speed else ""
         if self.fault is None and not self._rests:
-            self._fail(
-                Fault.NOT_AT_REST, f"the node's last state is {self._last.node_state.name}" if self._last else ""
+            self.fail(
+                Fault.NOT_AT_REST,
+                now_ns,
+                f"the node's last state is {self._last.node_state.name}" if self._last else "",
             )
         elif self.fault is None and moves:
-            self._fail(Fault.MOTION_UNEXPLAINED, moves)
+            self.fail(Fault.MOTION_UNEXPLAINED, now_ns, moves)
         self._detail = self._detail or moves
         self._machine.handle_event(Event.STOPPED, now_ns)
 
@@ -316,10 +323,6 @@ class Core:
             unexplained=self._unexplained[0],
             allowed=self._unexplained[1],
         )
-
-    def _fail(self, fault: Fault, detail: str) -> None:
-        self.fail(fault, self._now_ns)
-        self.explain(fault, detail)
 
     # --- in every state: what the bus says --------------------------------------------------------------------------
 
@@ -583,7 +586,7 @@ class Core:
         try:
             self._judge_motion()
         except StopError as stop:
-            self._fail(stop.fault, stop.detail)
+            self.fail(stop.fault, self._now_ns, stop.detail)
 
     def _keep_estimate(self, estimate: tuple[float, ...], sample: SensorSample, step: int) -> None:
         """Record the estimate; once it meets the stop condition, all that is left is the way home.

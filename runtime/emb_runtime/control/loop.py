@@ -77,7 +77,6 @@ class Loop:
         # Before the frames: the watchdog's stop frames come from another socket and look like a stranger's commands.
         if (fault := self._fault_from_outside(self._now_ns)) is not None:
             core.fail(fault, self._now_ns)
-            core.explain(fault, "")
         if not frames:
             core.timeout(self._now_ns)
         elif (proposal := core.take(frames, self._now_ns)) is not None:
@@ -141,7 +140,7 @@ class Loop:
         self._attempt("CLOCK_FAILED", self._read_clock)
         # It takes the bus from this process: that is the cause of what fails here.
         self._fault = Fault.WATCHDOG_TRIPPED if self._has_tripped() else fault_of(err)
-        self.core.fail(self._fault, self._now_ns)
+        self.core.latch(self._fault, self._now_ns)
 
     def _stop(self) -> None:
         """Send the stop frames, record what ended the run, and watch the node come to rest."""
@@ -167,7 +166,6 @@ class Loop:
         self._attempt("CLOCK_FAILED", self._read_clock)
         if self.core.fault is None and self._has_tripped():  # while the stop frames went out
             self.core.fail(Fault.WATCHDOG_TRIPPED, self._now_ns)
-            self.core.explain(Fault.WATCHDOG_TRIPPED, "")
         self._listen(self._now_ns + STOP_LISTEN_NS, until_rest=True)
         self._attempt("CLOCK_FAILED", self._read_clock)
         self.core.end(self._now_ns)

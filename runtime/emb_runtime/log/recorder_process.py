@@ -31,7 +31,7 @@ from emb_runtime.can.transport import SocketCan
 from emb_runtime.errors import BusError, EmbError, LogError
 from emb_runtime.log import topics
 from emb_runtime.log.ring_buffer import (
-    KINDS,
+    TOPICS,
     ClockRecord,
     EstimateRecord,
     EventRecord,
@@ -70,7 +70,6 @@ class LogWriter:
         self._mcap.start(profile="", library=f"{tool} mcap-python/{mcap.__version__}")
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
-        self._topics = {kind.record: kind.topic for kind in KINDS}
         self._sequences: dict[int, int] = {}
         self.messages = 0  # Messages written
         self.undecoded = 0  # Frames that are no valid frame of ours: they are in the log as they were on the bus only
@@ -98,8 +97,8 @@ class LogWriter:
             values = record.code, record.text
         elif isinstance(record, EstimateRecord | LearntRecord):
             values = record.step, *record.numbers
-        topic = self._topics[type(record)]
-        names = topics.message_class(topics.TOPICS[topic]).DESCRIPTOR.fields_by_name
+        topic, message = TOPICS[type(record)]
+        names = topics.message_class(message).DESCRIPTOR.fields_by_name
         self._add(topic, log_time, record.time_ns, dict(zip(names, values, strict=True)))
 
     def write_drive(self, frame: Frame, read_ns: int, log_time: int) -> None:

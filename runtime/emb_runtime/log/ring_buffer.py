@@ -5,7 +5,7 @@ it, in the shared memory, so that both sides can read the count. Python promises
 processes on every processor, so each slot carries a checksum seeded with its index: a slot whose parts are not all
 visible yet reads as not written yet, and is read again later. A torn record can therefore not come out.
 
-The second half of the module is what travels: the header of the log, and the records of :data:`KINDS`, each as
+The second half of the module is what travels: the header of the log, and the records of :data:`TOPICS`, each as
 MessagePack after a type byte.
 """
 
@@ -175,10 +175,6 @@ class EventRecord(NamedTuple):
     code: str  # A short, stable name
     text: str  # Description for a person
 
-    def clipped(self) -> EventRecord:
-        """The record with texts that fit into a slot."""
-        return self._replace(code=_clipped(self.code, _MAX_CODE), text=_clipped(self.text, _MAX_EVENT_TEXT))
-
 
 class ClockRecord(NamedTuple):
     """One reading of both clocks."""
@@ -211,38 +207,31 @@ class LearntRecord(NamedTuple):
 Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | EstimateRecord | LearntRecord
 
 
-class Kind(NamedTuple):
-    """A kind of record: in the ring its MessagePack, in the log a message of a topic."""
-
-    record: type[Any]
-    topic: str
-    message: str  # Of ``emb.proto``, whose fields are those of the record but its ``time_ns``
-
-
-KINDS: Final = (
-    Kind(FrameRecord, "/can/rx", "CanFrame"),  # One that was sent goes to /can/tx
-    Kind(CycleRecord, "/cycle", "Cycle"),
-    Kind(EventRecord, "/safety", "SafetyEvent"),
-    Kind(ClockRecord, "/clock", "ClockSample"),
-    Kind(EstimateRecord, "/estimate", "Estimate"),
-    Kind(LearntRecord, "/learnt", "Learnt"),
-)
-"""A kind's place is its type byte in the ring."""
-_PLACES: Final = {kind.record: place for place, kind in enumerate(KINDS)}
+TOPICS: Final[dict[type[Any], tuple[str, str]]] = {
+    FrameRecord: ("/can/rx", "CanFrame"),  # One that was sent goes to /can/tx
+    CycleRecord: ("/cycle", "Cycle"),
+    EventRecord: ("/safety", "SafetyEvent"),
+    ClockRecord: ("/clock", "ClockSample"),
+    EstimateRecord: ("/estimate", "Estimate"),
+    LearntRecord: ("/learnt", "Learnt"),
+}
+"""Topic of each record, and its message in ``emb.proto``, whose fields are those of the record but its ``time_ns``. A
+record's place here is its type byte in the ring."""
 
 _MAX_CODE: Final = 40  # Bytes of an event's code
 _MAX_EVENT_TEXT: Final = MAX_PAYLOAD - _MAX_CODE - 16
 
 _ENCODER: Final = msgpack.Encoder(enc_hook=lambda number: number.item())  # of numpy
-_DECODERS: Final = tuple(msgpack.Decoder(kind.record) for kind in KINDS)
+_TYPE_BYTES: Final = {record: place for place, record in enumerate(TOPICS)}
+_DECODERS: Final = tuple(map(msgpack.Decoder, TOPICS))
 
 
 def pack(record: Record) -> tuple[int, bytes]:
     """Type byte and payload of a record: MessagePack of its fields. Texts beyond the slot are cut."""
-    kind = _PLACES[type(record)]
     if isinstance(record, EventRecord):
-        record = record.clipped()
-    return kind, _ENCODER.encode(record)
+        time_ns, code, text = record
+        record = EventRecord(time_ns, _clipped(code, _MAX_CODE), _clipped(text, _MAX_EVENT_TEXT))
+    return _TYPE_BYTES[type(record)], _ENCODER.encode(record)
 
 
 def unpack(kind: int, payload: bytes) -> Record:

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from emb_runtime.log.ring_buffer import KINDS
+from emb_runtime.log import ring_buffer
 
 _COMPILED: Final = resources.files("emb_runtime.log").joinpath("emb.binpb").read_bytes()
 _FILE: Final = descriptor_pb2.FileDescriptorSet.FromString(_COMPILED).file[0]
@@ -24,7 +24,7 @@ _COMMENTS: Final = {
 """Comments by the place of what they describe: of message i (4, i), of its field j (4, i, 2, j)."""
 
 TOPICS: Final = {
-    **{kind.topic: kind.message for kind in KINDS},
+    **dict(ring_buffer.TOPICS.values()),
     "/can/tx": "CanFrame",
     "/drive/rx": "CanFrame",
     **{f"/emb/{message.name}": message.name for message in _FILE.message_type if message.name.startswith("EMB_")},
