@@ -19,7 +19,7 @@ from emb_bench.config.plants import Mechanics, Plant
 from emb_bench.estimate.records import EstimationProblem, Unknown, check_model, searched
 from emb_bench.experiment.experiment import Booleans, Experiment
 from emb_bench.experiment.simulate import SystematicErrors, Theta, Trajectory, gap_ends, later, simulate
-from emb_bench.information.fisher import weights_along
+from emb_bench.information.fisher import information_of_range, weights_along
 from emb_bench.sim.open_loop import march
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError, UsageError
@@ -96,7 +96,7 @@ class Problem:
         if prior is not None:
             for name in self.asked.varied:
                 i, low, high = self.unknowns.index(Unknown(name)), getattr(prior.low, name), getattr(prior.high, name)
-                mean[i], inverse[i] = 0.5 * (low + high), math.sqrt(12.0) / (high - low)
+                mean[i], inverse[i] = 0.5 * (low + high), math.sqrt(information_of_range(low, high))
         for i, unknown in enumerate(self.unknowns):
             if unknown.name in self.asked.systematic:
                 mean[i] = self.plant.instruments.encoder_offset if unknown.name == "offset" else 0.0

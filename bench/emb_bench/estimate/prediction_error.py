@@ -29,6 +29,7 @@ from emb_bench.estimate.output_error import finished, of_losses, start_points
 from emb_bench.estimate.prediction import Marginal, Problem
 from emb_bench.estimate.records import Disturbance
 from emb_bench.estimate.search import converge, strong, strong_load
+from emb_bench.information.fisher import information_of_range
 
 POWERS = {"walk": range(2, -7, -1), "load": range(0, -5, -1)}
 """Powers of ten of the walks that are tried, in their units: weaker ones are lost in the noise."""
@@ -154,5 +155,5 @@ def _least(found: Filter, start: Floats) -> tuple[Floats, float]:
     weights = problem.weights(z)
     _, jacobian = found.jacobian(z, weights, found.gains(z, weights))
     low, high = problem.bounds
-    curvature = jacobian.T @ jacobian + np.diag(12.0 / (high - low) ** 2)
+    curvature = jacobian.T @ jacobian + np.diag(information_of_range(low, high))
     return z, found.deviance(z, weights) + float(np.linalg.slogdet(curvature)[1])

@@ -99,8 +99,13 @@ def information_over_time(s: Floats, weights: Weights | Floats, start: Any = Non
     return unpack(np.cumsum(steps, axis=0), size)
 
 
+def information_of_range(low: Any, high: Any) -> Any:
+    """Information of knowing a range: 1/variance of the uniform distribution on it, 12/(high - low)²."""
+    return 12.0 / (high - low) ** 2
+
+
 def uniform_prior(ranges: Ranges, params: Sequence[str], reference: BrakeParameters) -> Floats:
-    """The FIM that knowing a range is worth: 1/variance of the uniform distribution on it, relative to ``reference``.
+    """The FIM that knowing the ranges is worth (:func:`information_of_range`), relative to ``reference``.
 
     Unlike ε I it has a meaning: log |M| starts at what is known beforehand. It stands for a Gaussian prior of the same
     variance (a uniform one has no Fisher information of its own), so that it is an approximation, not a bound.
@@ -112,10 +117,10 @@ def uniform_prior(ranges: Ranges, params: Sequence[str], reference: BrakeParamet
     check_unknowns(params)
     diagonal = []
     for name in params:
-        width = getattr(ranges.high, name, 0.0) - getattr(ranges.low, name, 0.0)
-        if width == 0.0:
+        low, high = (getattr(end, name, 0.0) for end in (ranges.low, ranges.high))
+        if low == high:
             raise UsageError(f"{name} does not vary in the ranges '{ranges.name}': leave it out of the parameters")
-        diagonal.append(12.0 * (getattr(reference, name) / width) ** 2)
+        diagonal.append(getattr(reference, name) ** 2 * information_of_range(low, high))
     return np.diag(diagonal)
 
 
