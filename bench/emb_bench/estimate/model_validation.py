@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from emb_bench.brake.motion import Floats
-from emb_bench.estimate.prediction import Marginal, Problem, by_record
+from emb_bench.estimate.prediction import Problem, by_record
 from emb_bench.estimate.records import Disturbance, Independence, ModelValidation, Whiteness
 from emb_bench.estimate.suspects import DEPENDENT, Shown, Simulated, score
 
@@ -44,24 +44,27 @@ def examine(
     problem: Problem,
     z: Floats,
     weights: Sequence[Floats],
-    found: Marginal,
+    found: tuple[Floats, Floats],
     disturbance: Disturbance | None = None,
     shown: Shown | None = None,
 ) -> ModelValidation:
-    """Compare the residuals ``found`` at an estimate with what the right model would leave.
+    """Compare residuals at an estimate, ``found`` with their derivatives to z, with what the right model would leave.
 
     The ``disturbance`` is that of an estimator that whitens them, ``shown`` what is shown at the estimate; without, the
     simulation.
     """
     counts = np.concatenate([root.ravel() for root in weights]) > 0.0
-    every, residuals = found.residuals, by_record(found.residuals, weights)
+    every, jacobian = found
+    residuals = by_record(every, weights)
     e = every[: len(counts)]
-    model, whole = _basis(found.jacobian), float(every @ every)
+    model, whole = _basis(jacobian), float(every @ every)
     freedom = int(counts.sum()) - model.shape[1]
-    if found.basis.shape[1]:
-        freedom -= taken(found.basis, len(e))
-        model = np.concatenate([model, found.basis], axis=1)
-        whole -= float(np.sum(every[len(every) - found.basis.shape[1] :] ** 2))
+    count = sum(record.gap_unknowns for record in problem.records)
+    if count and shown is None:  # a filter has no unknowns in gaps
+        gaps = problem.gap_basis(z, weights)
+        freedom -= taken(gaps, len(e))
+        model = np.concatenate([model, gaps], axis=1)
+        whole -= float(np.sum(every[len(every) - count :] ** 2))
     freedom = max(freedom, 1)
     chi2 = float(e @ e)
     share = _share(disturbance)

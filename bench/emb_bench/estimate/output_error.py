@@ -3,9 +3,9 @@
 Each sample's error counts in its standard deviation, so that with white Gaussian noise this is maximum likelihood, and
 efficient. The simulation is a plant of the bench, its derivatives are the exact sensitivities, jumps at reversals
 included, at the instants of the node's own stamps. Samples that were lost are left out; what acted in the periods
-before them is unknown (:class:`emb_bench.estimate.prediction.Marginal`). The minimum is searched from several starting
-points, because there are local ones; and if none of them leads to a model that fits, from where a filter leads that
-follows the measured brake (:mod:`emb_bench.estimate.search`).
+before them is unknown (:meth:`emb_bench.estimate.prediction.Problem.jacobian`). The minimum is searched from several
+starting points, because there are local ones; and if none of them leads to a model that fits, from where a filter leads
+that follows the measured brake (:mod:`emb_bench.estimate.search`).
 
 **The start.** A record whose start cannot be distinguished from rest at the origin starts there; any other starts where
 it was measured. If ``x1_0`` or ``offset`` is unknown, the mean of the samples at rest before the experiment is one
@@ -32,7 +32,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import LEVEL, examine
-from emb_bench.estimate.prediction import Marginal, Problem, by_record
+from emb_bench.estimate.prediction import Problem, by_record
 from emb_bench.estimate.records import End, ModelValidation
 from emb_bench.estimate.search import EVALUATIONS, minimise, released
 from emb_bench.information.identifiability import Spectrum
@@ -231,20 +231,22 @@ def finished(
     z: Floats,
     weights: Sequence[Floats],
     ends: tuple[End, ...],
-    found: Marginal | None = None,
+    found: tuple[Floats, Floats] | None = None,
     validation: ModelValidation | None = None,
     **more: Any,
 ) -> Estimate:
     """Estimate with all that follows from its values: information, covariance, validation.
 
-    The residuals ``found`` at ``z`` are those of the simulation, if no others are given; ``more`` are further fields.
+    Residuals and derivatives ``found`` at ``z`` are those of the simulation, if no others are given; ``more`` are
+    further fields.
     """
-    found = found or problem.marginal(z, weights)
-    residuals, information = by_record(found.residuals, weights), found.jacobian.T @ found.jacobian
+    found = found or problem.jacobian(z, weights)
+    every, jacobian = found
+    residuals, information = by_record(every, weights), jacobian.T @ jacobian
     fields = {
         "information": information,
         "prior": np.diag((problem.prior[1] * problem.scale(z)) ** 2) if problem.prior[1].any() else None,
-        "sandwich": sandwich(information, found.jacobian, found.residuals, [len(r) for r in residuals]),
+        "sandwich": sandwich(information, jacobian, every, [len(r) for r in residuals]),
         "validation": validation or examine(problem, z, weights, found),
         "ends": ends,
         "caveats": of_losses(problem),

@@ -6,7 +6,7 @@ import math
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -25,22 +25,6 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError, UsageError
 
 NEAR_BOUND = 1e-6  # Share of what is searched within which an unknown is at its border
-
-
-class Marginal(NamedTuple):
-    """Residuals in standard deviations, with what happened in the gaps of the records already fitted to them.
-
-    Of a single period without report the current is unknown, Gaussian around the one that is assumed and as wide as the
-    bench's limit; of several in a row, angle and velocity after them, next to free. Both enter the residuals linearly
-    around what the records hold. Residuals and derivatives are what is left beside them, so that J^T J is the
-    information on z with them unknown, and |r|² the least sum of squares over them.
-    """
-
-    residuals: Floats
-    """All samples of all records, angle and velocity in turn, each record's start if that is unknown, the prior, and
-    the unknowns of the gaps, shape (m,)."""
-    jacobian: Floats  # Derivatives to z, shape (m, len(z))
-    basis: Floats  # Orthonormal basis of what the gaps can explain, shape (m, gaps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,28 +189,27 @@ class Problem:
         return result
 
     def jacobian(self, z: Floats, weights: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """Residuals measured − shown in standard deviations, and their derivatives to z.
+        """Residuals measured − shown in standard deviations and their derivatives to z, without what gaps explain.
+
+        Of a single period without report the current is unknown, Gaussian around the one that is assumed and as wide as
+        the bench's limit; of several in a row, angle and velocity after them, next to free. Both enter the residuals
+        linearly around what the records hold. What is left beside them has J^T J as the information on z with them
+        unknown, and |r|² as the least sum of squares over them.
 
         Returns:
             Shapes (m,) and (m, len(z)): all samples of all records, angle and velocity in turn, then each record's
-            start if that is unknown, then the prior, then the currents of the gaps. See :class:`Marginal`.
+            start if that is unknown, then the prior, then the unknowns of the gaps.
         """
-        found = self.marginal(z, weights)
-        return found.residuals, found.jacobian
-
-    def marginal(self, z: Floats, weights: Sequence[Floats]) -> Marginal:
-        """Residuals and derivatives as :meth:`jacobian` gives them, and what the gaps of the records take up."""
         residuals, rows = self.joint(z, weights)
-        own = rows[:, len(z) :]
-        if not own.shape[1]:
-            return Marginal(residuals, rows, own)
-        basis, _ = np.linalg.qr(own)
-        return Marginal(
-            residuals - basis @ (basis.T @ residuals), rows[:, : len(z)] - basis @ (basis.T @ rows[:, : len(z)]), basis
-        )
+        own, basis = rows[:, : len(z)], _orthonormal(rows[:, len(z) :])
+        return residuals - basis @ (basis.T @ residuals), own - basis @ (basis.T @ own)
+
+    def gap_basis(self, z: Floats, weights: Sequence[Floats]) -> Floats:
+        """Orthonormal basis of the residuals that the unknowns of the gaps can explain, shape (m, gaps)."""
+        return _orthonormal(self.joint(z, weights)[1][:, len(z) :])
 
     def joint(self, z: Floats, weights: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """Residuals as in :class:`Marginal`, with the unknowns of the gaps where the records hold them.
+        """Residuals as in :meth:`jacobian`, with the unknowns of the gaps where the records hold them.
 
         Returns:
             Shapes (m,) and (m, len(z) + gaps): derivatives to z, and to the unknowns of the gaps, record by record.
@@ -320,6 +303,11 @@ class Problem:
         residuals.append((mean - self.values(z))[known] * inverse[known])
         rows.append(-np.diag(inverse * self.scale(z))[known])
         return np.concatenate(residuals), np.concatenate(rows)
+
+
+def _orthonormal(columns: Floats) -> Floats:
+    basis: Floats = np.linalg.qr(columns)[0] if columns.shape[1] else columns
+    return basis
 
 
 def by_record(errors: Floats, weights: Sequence[Floats]) -> list[Floats]:

@@ -26,7 +26,7 @@ from emb_bench.estimate.innovations import Filter, Followed
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import examine
 from emb_bench.estimate.output_error import finished, of_losses, start_points
-from emb_bench.estimate.prediction import Marginal, Problem
+from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Disturbance
 from emb_bench.estimate.search import converge, strong, strong_load
 from emb_bench.information.fisher import information_of_range
@@ -61,8 +61,7 @@ class PredictionError(Method):
         best = ends[0].z
         weights = problem.weights(best)
         gains = found.gains(best, weights)
-        errors, jacobian = found.jacobian(best, weights, gains)
-        innovations = Marginal(errors, jacobian, np.zeros((len(errors), 0)))
+        innovations = found.jacobian(best, weights, gains)
         disturbance, shown = Disturbance(found.walk, found.load, ratio), Followed(found, best, weights, gains)
         validation = examine(problem, best, weights, innovations, disturbance, shown)
         return finished(

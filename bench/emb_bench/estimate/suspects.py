@@ -24,7 +24,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import PARAMETERS, SI, Parameter, Quantity, quantity
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import EXACT, Mechanics
-from emb_bench.estimate.prediction import Marginal, Problem
+from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import ANGLE_SCALE, DRIFTS, Contribution, JointScore, Suspect, has_time_for_a_delay
 from emb_runtime.config.bench import PARAMETER_NAMES
 
@@ -203,7 +203,7 @@ def _with(m: Mechanics, name: str, step: float) -> Mechanics | None:
 def score(
     problem: Problem,
     z: Floats,
-    left: Marginal,
+    left: tuple[Floats, Floats],
     model: Floats,
     shown: Shown,
     ratio: float,
@@ -212,10 +212,11 @@ def score(
 ) -> tuple[tuple[Suspect, ...], tuple[Contribution, ...], JointScore | None]:
     """Score tests of all effects that are not estimated: most suspicious first, their budget, all of them together.
 
-    The residuals are ``left`` at the estimate, ``model`` is a basis of what they are fitted with, orthonormal, and the
-    noise may be larger than the bench says by the ``ratio`` χ²/n. ``disturbed`` says that a disturbance was found.
+    Residuals and their derivatives to z are ``left`` at the estimate, ``model`` is a basis of what they are fitted
+    with, orthonormal, and the noise may be larger than the bench says by the ``ratio`` χ²/n. ``disturbed`` says that a
+    disturbance was found.
     """
-    names, errors, jacobian = held(problem), left.residuals, left.jacobian
+    names, (errors, jacobian) = held(problem), left
     blocks = [shown.columns(i, names) for i in range(len(problem.records))] if names else []
     added = secants(problem, z, shown)
     every = {

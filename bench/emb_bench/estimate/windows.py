@@ -283,7 +283,7 @@ def _validated(cut: Cut, at: Point) -> ModelValidation:
     chosen = sorted({round(k) for k in np.linspace(0, count - 1, min(count, few_enough)).tolist()})
     few = replace(cut.windows[0], records=tuple(cut.windows[i].records[0] for i in chosen))
     z, roots = np.concatenate([at.shared, at.starts[chosen].T.ravel()]), [cut.weights[i] for i in chosen]
-    return examine(few, z, roots, few.marginal(z, roots))
+    return examine(few, z, roots, few.jacobian(z, roots))
 
 
 def window_of(problem: Problem) -> float:
