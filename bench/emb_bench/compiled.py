@@ -15,7 +15,6 @@ import enum
 import hashlib
 import os
 import shutil
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,7 +22,7 @@ from functools import cache
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
-from typing import IO, Any, ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import emb_runtime
 from emb_runtime.errors import UsageError
@@ -31,7 +30,6 @@ from emb_runtime.errors import UsageError
 PACKAGES = ("emb_runtime", "emb_bench", "emb_train", "emb_export")
 UNUSED_LIFE = 30 * 86400.0  # [s]; each edit of a function leaves its old directory behind
 LOCK_WAIT = 30.0  # [s]; then a function is compiled as if nothing were kept
-LOCK_PAUSE = 0.05  # [s], between two tries
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -149,50 +147,24 @@ def _one_process_at_a_time(action: Callable[..., Any], directory: str) -> Callab
     between two such steps of another would find the code for other types. The lock is tried for, not waited for: numba
     compiles under one lock for all threads, and a holder that is stopped would hang them all.
     """
+    from filelock import FileLock
 
     def alone(*arguments: Any) -> Any:
+        lock = FileLock(Path(directory, "lock"), timeout=LOCK_WAIT)
         try:
-            file = Path(directory, "lock").open("w")  # noqa: SIM115  # an error of the action is not one of the lock
-        except OSError:
+            lock.acquire()
+        except (OSError, NotImplementedError):  # held by another process, or the file system has no locks
             return None
-        with file:
-            if not _locked(file):
-                return None
-            try:
-                return action(*arguments)
-            except (ImportError, AttributeError):  # a type of its signatures is elsewhere in this version
-                for kept in Path(directory).glob("*.nb?"):
-                    kept.unlink()
-                return None
+        try:
+            return action(*arguments)
+        except (ImportError, AttributeError):  # a type of its signatures is elsewhere in this version
+            for kept in Path(directory).glob("*.nb?"):
+                kept.unlink()
+            return None
+        finally:
+            lock.release()
 
     return alone
-
-
-def _locked(file: IO[str]) -> bool:
-    """Lock a file until it is closed; False where another process holds it for all of :data:`LOCK_WAIT`."""
-    end = time.monotonic() + LOCK_WAIT
-    while True:
-        try:
-            _lock(file)
-        except (BlockingIOError, PermissionError):
-            if time.monotonic() >= end:
-                return False
-            time.sleep(LOCK_PAUSE)
-        except OSError:
-            return False
-        else:
-            return True
-
-
-def _lock(file: IO[str]) -> None:
-    if sys.platform == "win32":
-        import msvcrt
-
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-    else:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _name(fn: FunctionType) -> str:
