@@ -38,7 +38,6 @@ SPARSEST = 1000  # Most periods for each control cycle in a log; a log that clai
 LONGEST = 10_000_000  # Most periods of an experiment: it is taken into memory
 UNKNOWN = -1  # Counter of a command that is not known
 
-_COLUMNS = ("step", "state", "counter", "command_counter", "device_time_ns")
 _MEASURED = {"angle": "Angle", "velocity": "Velocity", "applied_current": "AppliedCurrent"}
 """Columns that come from signals of the node's messages."""
 _FRAME = ("id", "data", "is_extended", "is_rtr", "is_error")
@@ -279,8 +278,7 @@ def control_cycles(log: RunLog, bench: Bench, planned: int) -> Iterator[tuple[In
     charges = _Reports(log, CHARGE, "Charge", math.nan, apart_ns)
     active = last = 0
     origin_ns: Integers | None = None
-    columns = {report.topic: report.columns for report in (reports, charges)}
-    for part in log.batches({"/cycle": (*_COLUMNS, *_MEASURED, "sent_current"), **columns}):
+    for part in log.batches("/cycle", reports.topic, charges.topic):
         obeyed, charge = reports.of_the_cycles(part), charges.of_the_cycles(part)
         chosen = in_experiment(part["/cycle"])
         cycles = {name: column[chosen] for name, column in part["/cycle"].items()}
@@ -387,7 +385,7 @@ def samples_before(log: RunLog, bench: Bench, count: int) -> list[SensorSample]:
     device_time_ns = 0
     if "/can/rx" in log.topics:
         log.require("/can/rx", _FRAME)
-    for part in log.batches({"/can/rx": _FRAME, "/cycle": ("step", "state", "device_time_ns")}):
+    for part in log.batches("/can/rx", "/cycle"):
         cycles = part["/cycle"]
         first = np.flatnonzero(in_experiment(cycles))[:1]
         if "/can/rx" in part:

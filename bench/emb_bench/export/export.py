@@ -50,10 +50,9 @@ def arrow_batches(log: RunLog, topic: str) -> tuple[Any, Iterator[Any]]:
     units = [{"unit": column.unit} if column.unit else None for column in table]
     fields = [pa.field(column.name, kind(column), metadata=unit) for column, unit in zip(table, units, strict=True)]
     schema = pa.schema(fields, metadata=about)
-    names = [column.name for column in table[2:]]  # behind the two times
     rows = (
         pa.table([array(column, log.values(batch[topic], column)) for column in table], schema=schema)
-        for batch in log.batches({topic: names})  # some at a time: a log may be longer than the memory
+        for batch in log.batches(topic)  # some at a time: a log may be longer than the memory
     )
     return schema, rows
 

@@ -16,10 +16,6 @@ from emb_bench.logs.timing import in_control, quantiles
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.records import CycleRecord, Reason
 
-_FIELDS = (
-    *("step", "state", "reasons", "command_counter", "missed", "angle", "velocity", "sent_current"),
-    *("receive_time_ns", "send_time_ns"),
-)
 _REASONS = {
     "unanswered": Reason.MISSED | Reason.LEFT,
     "left": Reason.LEFT,
@@ -96,7 +92,7 @@ def cycle_summary(log: RunLog) -> CycleSummary:
     counts: Counter[str] = Counter()
     low, high, speed, current = math.inf, -math.inf, 0.0, 0.0
     delays = [np.empty(0, np.int64)]
-    for part in log.batches({"/cycle": _FIELDS}):
+    for part in log.batches("/cycle"):
         c = part["/cycle"]
         active = in_control(c)
         answered = active & (c["command_counter"] != NO_COUNTER)

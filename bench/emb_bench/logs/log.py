@@ -159,53 +159,47 @@ class RunLog:
 
     def table(self, topic: str) -> Table:
         """All messages of a topic, which of a long log take much memory."""
-        names = [column.name for column in describe(self.topics[topic].factory)]
-        size = 8 * len(names) * self.topics[topic].messages
+        size = 8 * len(describe(self.topics[topic].factory)) * self.topics[topic].messages
         if size > SMALL_TABLE + TABLE * self.size:
             what = f"{topic} would take {size >> 20} MiB as a table, from {self.size} bytes"
             raise LogError(f"{self.path}: {what}: no log of ours")
-        parts = [part[topic] for part in self.batches({topic: names})]
+        parts = [part[topic] for part in self.batches(topic)]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def batches(self, wanted: Mapping[str, Sequence[str]]) -> Iterator[dict[str, Table]]:
-        """Messages by topic, some at a time and in the order of the file: for a log of any length.
+    def batches(self, *wanted: str) -> Iterator[dict[str, Table]]:
+        """Messages of some topics, some at a time and in the order of the file: for a log of any length.
 
-        Topics and fields, ``wanted`` by topic, that the log does not have are left out.
+        Topics that the log does not have are left out.
         """
+        chosen = {name: self.topics[name] for name in wanted if name in self.topics}
         held, size, some = list[tuple[int, Chunk]](), 0, False
-        for before, chunk in self.chunks.of({self.topics[topic].channel for topic in wanted if topic in self.topics}):
+        for before, chunk in self.chunks.of({topic.channel for topic in chosen.values()}):
             held.append((before, chunk))
             size += len(chunk.data)
             if size >= BATCH:
-                yield self._decoded(held, wanted)
+                yield {name: self._decoded(held, name) for name in chosen}
                 held, size, some = [], 0, True
         if held or not some:
-            yield self._decoded(held, wanted)
+            yield {name: self._decoded(held, name) for name in chosen}
 
-    def _decoded(self, held: Sequence[tuple[int, Chunk]], wanted: Mapping[str, Sequence[str]]) -> dict[str, Table]:
-        """Some fields of the messages in chunks, each behind the number of messages before it."""
-        found = dict[str, Table]()
-        for topic, names in wanted.items():
-            if topic not in self.topics:
-                continue
-            channel, _, factory, _ = self.topics[topic]
-            headers, orders = [np.empty(0, HEADER)], [np.empty(0, np.int64)]
-            for before, chunk in held:
-                own = np.flatnonzero(chunk.headers["channel"] == channel)
-                headers.append(chunk.headers[own])
-                orders.append(before + own)
-            times = np.concatenate(headers)
-            try:
-                fields = columns(factory, [data for _, chunk in held for data in chunk.payloads(channel)], names)
-                order = np.concatenate(orders)
-                found[topic] = _times(times["publish"], times["log"]) | {"order": order} | fields
-            except UNREADABLE as err:
-                raise LogError(f"{self.path}: the messages of {topic} are not readable: {message_of(err)}") from err
-        return found
+    def _decoded(self, held: Sequence[tuple[int, Chunk]], topic: str) -> Table:
+        """The messages of a topic in chunks, each behind the number of messages before it."""
+        channel, _, factory, _ = self.topics[topic]
+        headers, orders = [np.empty(0, HEADER)], [np.empty(0, np.int64)]
+        for before, chunk in held:
+            own = np.flatnonzero(chunk.headers["channel"] == channel)
+            headers.append(chunk.headers[own])
+            orders.append(before + own)
+        times = np.concatenate(headers)
+        try:
+            fields = columns(factory, [data for _, chunk in held for data in chunk.payloads(channel)])
+            return _times(times["publish"], times["log"]) | {"order": np.concatenate(orders)} | fields
+        except UNREADABLE as err:
+            raise LogError(f"{self.path}: the messages of {topic} are not readable: {message_of(err)}") from err
 
     def rows(self, topic: str, *names: str) -> Iterator[tuple[Any, ...]]:
         """Some columns of a topic, message by message; nothing if the log does not have it."""
-        for part in self.batches({topic: names}) if self._has(topic, names) else ():
+        for part in self.batches(topic) if self._has(topic, names) else ():
             yield from zip(*(part[topic][name].tolist() for name in names), strict=True)
 
     def last(self, topic: str, *names: str) -> tuple[Any, ...]:
@@ -214,8 +208,7 @@ class RunLog:
             return ()
         channel = self.topics[topic].channel
         own = [place for place in self.chunks.places if channel in place.channels]
-        held = [*replace(self.chunks, places=own[-1:]).of({channel})]
-        table = self._decoded(held, {topic: names})[topic]
+        table = self._decoded([*replace(self.chunks, places=own[-1:]).of({channel})], topic)
         return next(zip(*(table[name][-1:].tolist() for name in names), strict=True), ())
 
     def _has(self, topic: str, names: Sequence[str]) -> bool:

@@ -16,7 +16,7 @@ import io
 import json
 import struct
 import zlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -371,8 +371,8 @@ def describe(factory: Any, units: str = "{}") -> tuple[Column, ...]:
     return tuple(found)
 
 
-def columns(factory: Any, payloads: Sequence[bytes], wanted: Collection[str]) -> dict[str, NDArray[Any]]:
-    """Wanted fields of n serialised messages, each of shape (n,), but those that are missing, or messages themselves.
+def columns(factory: Any, payloads: Sequence[bytes]) -> dict[str, NDArray[Any]]:
+    """The fields of n serialised messages, each of shape (n,), but those that are messages themselves.
 
     Numbers are int64 or float64, bool is bool, text and bytes are objects. The messages are parsed as one whose fields
     are repeated. A field that not each of them has, which those of a log have, is parsed message by message.
@@ -383,7 +383,7 @@ def columns(factory: Any, payloads: Sequence[bytes], wanted: Collection[str]) ->
     """
     joined, found = _repeated(factory).FromString(b"".join(payloads)), dict[str, NDArray[Any]]()
     for entry in factory.DESCRIPTOR.fields:
-        if entry.name in wanted and entry.cpp_type != entry.CPPTYPE_MESSAGE:
+        if entry.cpp_type != entry.CPPTYPE_MESSAGE:
             values = getattr(joined, entry.name)
             if len(values) != len(payloads):
                 values = [getattr(factory.FromString(payload), entry.name) for payload in payloads]
