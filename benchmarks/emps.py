@@ -25,6 +25,7 @@ from emb_bench.estimate.windows import predict_windows
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import Recording
 from emb_bench.recordings.recording import open_recording
+from emb_bench.report.caveats import caveats
 
 Floats = NDArray[np.float64]
 
@@ -103,7 +104,7 @@ def main() -> None:
     e = method_of("windows")(bench, plant, ASKED, starts=2).fit([whole])
     fits = "fits" if e.validation.fits else "DOES NOT FIT"
     print(f"the model {fits}; {time.process_time() - begun:.1f} s of the processor")
-    print("".join(f"  - {caveat}\n" for caveat in e.caveats), end="")
+    print("".join(f"  - {caveat}\n" for caveat in caveats(e)), end="")
     for name, (value, half) in of_machine(e).items():
         covers = "covers" if abs(value - PUBLISHED[name]) <= half else "does NOT cover"
         print(f"  {name:7} {value:9.3f} ± {half:6.3f}, {covers} the published {PUBLISHED[name]:.3f}")

@@ -20,6 +20,7 @@ from emb_bench.experiment.from_log import read_experiment
 from emb_bench.information.evaluation import Evaluation, Question, check_sample_time, default_model, evaluate
 from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog, read_log, require_driven
+from emb_bench.report.caveats import caveats
 from emb_bench.report.sentences import alarms, warnings
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EmbError, UsageError
@@ -153,7 +154,7 @@ def _of_the_estimate(e: Estimate, truth: BrakeParameters | None) -> Row:
         "fits": e.validation.fits,
         "chi2_per_freedom": e.validation.ratio,
         "alarms": alarms(e),
-        "caveats": e.caveats,
+        "caveats": tuple(caveats(e)),
         "outside": tuple(said.label for said in conclusions if said.outside is not None),
     }
     deviations, between = e.deviations(), e.between_runs()

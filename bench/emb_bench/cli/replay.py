@@ -70,11 +70,11 @@ def _strict(study: Study | None) -> int:
 
 def _report(args: argparse.Namespace) -> int:
     content = api.report(**given(args, api.report), **given(args, api.estimate, leave_out=("runs",)))
-    from emb_bench.report.sentences import outside, verdict
+    from emb_bench.report.sentences import outside
 
     for name, study in content.outside:
         show("\n".join(f"{name}: {line}" for line in outside(study)))
-    show(f"{args.output} and {args.output.with_suffix('.json').name}: {verdict(content)}")
+    show(f"{args.output} and {args.output.with_suffix('.json').name}: {content.verdict}")
     for line in content.without_part:
         complain("emb-replay", LogError(line))
     return _accepted(content, strict=args.strict)

@@ -48,7 +48,8 @@ class Estimate:
     """Standard deviation of the velocity's random walk, as the prediction error method estimates it [rad/s per √s]."""
     load_noise: float = 0.0
     """Standard deviation of the load's random walk, as a current, as it estimates that [A per √s]."""
-    caveats: tuple[str, ...] = ()  # Limitations of this method on these records
+    windows: int = 0  # Windows with starts of their own; 0 of a method without
+    ideal_sensors: bool = False  # Systematic errors were asked for, and the method has no unknowns for them
 
     @property
     def bench(self) -> Bench:

@@ -10,7 +10,7 @@ on the right. Each period in which the brake surely keeps its direction updates 
 next to no trust in it.
 
 It needs no start, no search and no simulation, and it is biased: the regressors carry the sensors' noise as well. Its
-deviations do not include that; the caveats state it.
+deviations do not include that; the report states it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from emb_runtime.errors import UsageError
 
 SURE = 4.0  # Standard deviations of a velocity beyond which its sign is taken as known
 WIDE = 1e3  # Initial standard deviation of a parameter without a prior, over its nominal value
-ON_THE_GRID = 0.01  # Share of a period by which samples may be off the grid without a caveat
 
 
 class RecursiveLeastSquares(Method):
@@ -90,7 +89,6 @@ class RecursiveLeastSquares(Method):
             information=information,
             sandwich=spread,
             method="rls",
-            caveats=_caveats(problem, used, len(counts)),
         )
 
 
@@ -153,16 +151,3 @@ def recursion(rows: Floats, errors: Floats, z: Floats, covariance: Floats) -> Fl
         held = np.eye(len(z)) - np.outer(gain, row)
         covariance = held @ covariance @ held.T + np.outer(gain, gain)  # Joseph's form stays positive
     return z
-
-
-def _caveats(problem: Problem, used: int, periods: int) -> tuple[str, ...]:
-    t_s = problem.bench.timing.sample_time
-    said = [
-        "the regressors are measured with noise: the values are biased, and no deviation says by how much",
-        f"{used} of {periods} periods count: in the others the direction of motion is not sure, or a sample was lost",
-    ]
-    if any(r.late is not None and bool(np.any(np.abs(r.late) > ON_THE_GRID * t_s)) for r in problem.records):
-        said.append("samples are taken as on the grid, and some are not by their stamps")
-    if problem.plant.instruments.observer_bandwidth > 0.0:
-        said.append("the velocity is an observer's: it lags, and its errors follow from each other")
-    return tuple(said)

@@ -108,28 +108,6 @@ def few(found: Sequence[NDArray[np.bool_]]) -> bool:
     return 0 < count <= max(1.0, MOST * sum(len(mask) for mask in found))
 
 
-def of_losses(problem: Problem) -> tuple[str, ...]:
-    """Outliers, and unknowns that lost reports bring, in words."""
-    apart = sum(record.outliers for record in problem.records)
-    pulses, breaks = (sum(len(record.gaps[kind]) for record in problem.records) for kind in (0, 1))
-    said = []
-    if apart:
-        said.append(
-            f"{apart} samples lie apart from their neighbours by more than {APART:g} standard deviations: they are "
-            "left out as outliers"
-        )
-    if pulses:
-        said.append(
-            f"what acted in {pulses} single periods was not reported: each of these currents is unknown, around the "
-            f"command or the node's braking by ±{problem.bench.limits.current:g} A (one standard deviation)"
-        )
-    if breaks:
-        said.append(
-            f"of {breaks} gaps of several periods nothing was reported: angle and velocity after them are unknown"
-        )
-    return tuple(said)
-
-
 def settled(problem: Problem, end: End, weights: Sequence[Floats]) -> tuple[Problem, End]:
     """The end of a search, with what the gaps of the records hold searched along from there.
 
@@ -249,7 +227,6 @@ def finished(
         "sandwich": sandwich(information, jacobian, every, [len(r) for r in residuals]),
         "validation": validation or examine(problem, z, weights, found),
         "ends": ends,
-        "caveats": of_losses(problem),
         "residuals": tuple(np.where(root > 0.0, r, np.nan) for r, root in zip(residuals, weights, strict=True)),
     }
     return Estimate(problem.solved(z), z, **fields | more)

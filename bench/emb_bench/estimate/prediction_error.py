@@ -25,7 +25,7 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.innovations import Filter, Followed
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import examine
-from emb_bench.estimate.output_error import finished, of_losses, start_points
+from emb_bench.estimate.output_error import finished, start_points
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Disturbance
 from emb_bench.estimate.search import converge, strong, strong_load
@@ -35,9 +35,6 @@ POWERS = {"walk": range(2, -7, -1), "load": range(0, -5, -1)}
 """Powers of ten of the walks that are tried, in their units: weaker ones are lost in the noise."""
 BOTH = 6.6  # Deviance that a second kind of disturbance has to take away: by chance less in 199 of 200 cases
 _NOTHING = 1e-3  # of a deviance: what is left of searches that end
-HYSTERESIS = (
-    "where the brake is in its hysteresis or play is taken from the model: disturbances of it are not followed there"
-)
 
 
 class PredictionError(Method):
@@ -74,14 +71,6 @@ class PredictionError(Method):
             method="pem",
             process_noise=found.walk,
             load_noise=found.load,
-            caveats=(
-                *of_losses(problem),
-                *(
-                    (HYSTERESIS,)
-                    if problem.plant.mechanics.hysteresis + problem.plant.mechanics.play > 0.0 and ratio > 0.0
-                    else ()
-                ),
-            ),
         )
 
 

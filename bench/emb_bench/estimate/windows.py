@@ -272,7 +272,7 @@ def _finished(cut: Cut, at: Point, ends: tuple[End, ...], moved: Floats) -> Esti
         ends=ends,
         residuals=residuals,
         method="windows",
-        caveats=(f"each of the {len(cut.windows)} windows of {window_of(problem):g} s has a start of its own",),
+        windows=len(cut.windows),
     )
 
 

@@ -129,6 +129,17 @@ class Acceptance:
         """The criteria with a result."""
         return tuple(one for one in self.results if one.result == result)
 
+    @property
+    def verdict(self) -> str:
+        """The whole in one line, with the criteria that decided it."""
+        count, of_result = len(self.results), self.of(self.result)
+        names = ", ".join(one.name for one in of_result)
+        if self.result == Result.FAIL:
+            return f"NOT ACCEPTED: {len(of_result)} of {count} criteria failed: {names}"
+        if self.result == Result.CANNOT_TELL:
+            return f"CANNOT TELL: {len(of_result)} of {count} criteria not decided: {names}"
+        return f"ACCEPTED: {'the one criterion' if count == 1 else f'all {count} criteria'} passed"
+
     def document(self) -> dict[str, Any]:
         """JSON document."""
         return {"file": self.criteria.source, "result": self.result, "criteria": self.results}

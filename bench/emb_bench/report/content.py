@@ -24,6 +24,7 @@ from emb_bench.logs import timing
 from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import Timing
+from emb_bench.report import sentences as say
 from emb_bench.report.acceptance import Acceptance, Criteria, Result, RunFacts, judge
 from emb_runtime.errors import LogError
 from emb_runtime.records import Reason
@@ -133,6 +134,18 @@ class Content:
     def reported(self) -> tuple[Run, ...]:
         """The runs that the page is about: those of the estimate, or all where there is none."""
         return self.estimated or self.runs
+
+    @property
+    def verdict(self) -> str:
+        """The report in one line: why a run was stopped, whether the brake was accepted, or whether the model fits."""
+        if self.stops:
+            more = f", and {len(self.stops) - 1} more" if len(self.stops) > 1 else ""
+            return f"{'NOT ACCEPTED. ' if self.acceptance else ''}{say.stopped(self.stops[0])}{more}"
+        if self.acceptance is not None:
+            return self.acceptance.verdict
+        if self.study is None:
+            return f"NO ESTIMATE: {self.why_not}"
+        return say.ONLY_ALONE if self.study.apart else say.headline(self.study)
 
     @property
     def tone(self) -> str:

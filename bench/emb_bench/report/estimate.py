@@ -17,6 +17,7 @@ from emb_bench.information.identifiability import schur_complement
 from emb_bench.numbers import p_value, signed
 from emb_bench.report import sentences as say
 from emb_bench.report import tables
+from emb_bench.report.caveats import caveats
 from emb_bench.report.text import Table, facts, listed, wrapped
 
 NOTICED = 2.0  # Standard deviations from which on an effect that is no alarm is named
@@ -59,7 +60,7 @@ def _against(study: Study) -> Iterator[str]:
 def _notes(study: Study) -> list[str]:
     """Qualifications of the values."""
     apart = [say.apart(study)] if study.apart else []
-    return [*say.assumptions(study), *apart, say.changed_model(study), say.models(study), *study.estimate.caveats]
+    return [*say.assumptions(study), *apart, say.changed_model(study), say.models(study), *caveats(study.estimate)]
 
 
 def _remarks(study: Study, *, trades: bool) -> Iterator[str]:
@@ -181,9 +182,10 @@ def document(study: Study) -> dict[str, Any]:
         "notes": say.assumptions(study),
         "model_reason": say.model_reason(study),
         "other_model": say.other_model(e, study.last),
+        "caveats": caveats(e),
     }
     found |= _fields(study, "stopped", "model_fits", "predicts", "identified", "drifts", "left_out", "apart")
-    document: dict[str, Any] = to_json(found | _fields(e, "caveats", "process_noise", "load_noise", "theta"))
+    document: dict[str, Any] = to_json(found | _fields(e, "process_noise", "load_noise", "theta"))
     return document
 
 

@@ -28,6 +28,7 @@ from emb_bench.logs.info import info_document
 from emb_bench.logs.timing import INTERVALS, quantiles
 from emb_bench.numbers import plain, seconds, signed
 from emb_bench.report import figures, sentences, tables
+from emb_bench.report.caveats import caveats
 from emb_bench.report.content import REASONS, Content, Run
 from emb_bench.report.estimate import document as estimate_document
 from emb_bench.report.text import Table
@@ -186,6 +187,7 @@ def environment() -> Environment:
     made.globals |= {
         "METHODS": METHODS,
         "say": sentences,
+        "caveats": caveats,
         "tables": tables,
         "reasons": REASONS,
         "obeyed": figures.applied_as_sent,

@@ -18,12 +18,12 @@ if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.model_choice import Candidate
     from emb_bench.analysis.profile import Profile
     from emb_bench.analysis.study import Stop, Study
+    from emb_bench.config.bench import Bench
     from emb_bench.config.machine import Machine
     from emb_bench.estimate.estimate import Estimate
     from emb_bench.estimate.records import Contribution, ModelValidation, Suspect
     from emb_bench.information.evaluation import Evaluation
     from emb_bench.information.identifiability import Direction, Finding, Identifiability
-    from emb_bench.report.content import Content, Run
 
 INTERVALS = (
     "± 95 % (k=2). Repeatability: scatter of further runs by sensor noise. Total: also systematic errors and effects "
@@ -85,26 +85,6 @@ def headline(study: Study) -> str:
     others = len(study.unidentified) < len(e.asked.params)
     end = "; the values of the others may be used" if others else ""
     return f"The model '{name}' fits. NOT identified: {', '.join(study.unidentified)}{end}."
-
-
-def verdict(content: Content) -> str:
-    """A report in one line: why a run was stopped, whether the brake was accepted, or whether the model fits."""
-    acceptance = content.acceptance
-    if content.stops:
-        more = f", and {len(content.stops) - 1} more" if len(content.stops) > 1 else ""
-        return f"{'NOT ACCEPTED. ' if acceptance else ''}{stopped(content.stops[0])}{more}"
-    if acceptance is not None:
-        count, result = len(acceptance.results), acceptance.result
-        names = ", ".join(one.name for one in acceptance.of(result))
-        found = len(acceptance.of(result))
-        if result == "fail":
-            return f"NOT ACCEPTED: {found} of {count} criteria failed: {names}"
-        if result == "cannot tell":
-            return f"CANNOT TELL: {found} of {count} criteria not decided: {names}"
-        return f"ACCEPTED: {'the one criterion' if count == 1 else f'all {count} criteria'} passed"
-    if content.study is not None and content.study.apart:
-        return ONLY_ALONE
-    return f"NO ESTIMATE: {content.why_not}" if content.study is None else headline(content.study)
 
 
 ONLY_ALONE = (
@@ -433,13 +413,13 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
     return found
 
 
-def impact(run: Run, speed: float | None, why_not: str) -> str:
+def impact(bench: Bench, speed: float | None, why_not: str) -> str:
     """Effect of a loss of all commands, for any brake of the shield's set."""
     if why_not or speed is None:
         return f"unknown: {why_not}"
-    how = "the node brakes" if run.bench.node.stop == "damped" else "the node switches the current off"
+    how = "the node brakes" if bench.node.stop == "damped" else "the node switches the current off"
     if speed == 0.0:
-        return f"{how}, and no brake of the set '{run.bench.shield.ranges}' reaches an end stop"
+        return f"{how}, and no brake of the set '{bench.shield.ranges}' reaches an end stop"
     return f"{how}, and a brake of the set may hit an end stop with {plain(speed, 3)} rad/s"
 
 

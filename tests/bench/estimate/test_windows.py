@@ -10,7 +10,7 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import EstimationProblem
-from emb_bench.estimate.windows import Cut, by_windows, predict_windows
+from emb_bench.estimate.windows import Cut, by_windows, predict_windows, window_of
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.recordings.map_file import parse_map
 from emb_bench.recordings.readers import Column, experiment_of
@@ -128,7 +128,7 @@ def test_windows_that_disagree_widen_the_covariance_and_neighbours_count_togethe
 def test_a_length_that_is_asked_for_goes_before_the_map_s() -> None:
     data = record(Machine(), 2.0)
     for e in (fitted(data, replace(ASKED, window=0.15)), fitted(data, text=MAP.replace("= 0.5", "= 0.15"))):
-        assert e.caveats[0].startswith("each of the 13 windows of 0.15 s")
+        assert (e.windows, window_of(e.problem)) == (13, 0.15)
 
 
 @pytest.mark.parametrize("straight", [False, True])
