@@ -271,6 +271,14 @@ def test_check_sees_a_limit_that_is_left_and_a_brake_that_is_not_home() -> None:
     assert again.largest_speed > 500.0
 
 
+def test_check_sees_where_the_brake_is_at_the_end_where_measurements_come_late() -> None:
+    late, exact = (
+        check(BENCH, problem(model=model), Criterion("D"), "physical", np.full(60, 2.0), model)
+        for model in ("late", "exact")
+    )
+    assert replace(late, plant="exact") == exact
+
+
 @pytest.mark.slow
 def test_the_same_seed_finds_the_same_design_on_any_number_of_threads() -> None:
     p = problem(model="euler", horizon=40)
