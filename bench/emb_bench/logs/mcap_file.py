@@ -375,7 +375,8 @@ def columns(factory: Any, payloads: Sequence[bytes]) -> dict[str, NDArray[Any]]:
     """The fields of n serialised messages, each of shape (n,), but those that are messages themselves.
 
     Numbers are int64 or float64, bool is bool, text and bytes are objects. The messages are parsed as one whose fields
-    are repeated. A field that not each of them has, which those of a log have, is parsed message by message.
+    are repeated. That takes a field in each of them, as in the messages of a log: any other field is parsed message by
+    message, and so are those of a message that was cut, and of the next one, of which it took the first bytes.
 
     Raises:
         google.protobuf.message.DecodeError: a message is damaged.

@@ -73,6 +73,20 @@ def test_any_bytes_are_columns_of_one_row_each_or_refused(payloads: list[bytes])
         assert {column.shape for column in found.values()} == {(len(payloads),)}
 
 
+def test_a_message_that_was_cut_takes_nothing_of_the_next() -> None:
+    values = {"whole": 3, "natural": 4, "small": 5, "flag": True, "text": "eleven", "data": b"12", "kind": 1}
+    payload = ALL(real=2.0, **values, **{f"far{n}": n + 1 for n in range(8)}).SerializeToString()
+    for length in range(len(payload)):
+        try:
+            last = ALL.FromString(payload[:length])
+        except DecodeError:
+            with pytest.raises(DecodeError):
+                columns(ALL, [payload, payload[:length], payload])
+        else:
+            found = columns(ALL, [payload, payload[:length], payload])
+            assert {name: column[1] for name, column in found.items()} == {name: getattr(last, name) for name in KINDS}
+
+
 def test_a_number_beyond_63_bits_is_refused() -> None:
     with pytest.raises(OverflowError):
         columns(ALL, [ALL(natural=2**63).SerializeToString()])
