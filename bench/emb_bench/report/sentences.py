@@ -335,7 +335,9 @@ def held_out(h: HeldOut) -> str:
 def profile(p: Profile, e: Estimate) -> str:
     """Interval of a likelihood profile beside that of the Fisher information; in the units that are shown."""
     (low, high), fisher = p.interval, p.fisher
-    if math.isinf(low) and math.isinf(high):
+    if p.doubt is Doubt.CUT:
+        said = DOUBTS[Doubt.CUT]
+    elif math.isinf(low) and math.isinf(high):
         said = "flat: the records exclude no value within the search"
     elif math.isinf(low):
         said = f"only values above {plain(high, 4)} are excluded"

@@ -20,7 +20,8 @@ from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Doubt
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document, text
-from emb_bench.report.sentences import apart, remedies
+from emb_bench.report.sentences import DOUBTS, apart, remedies
+from emb_bench.report.sentences import profile as sentence
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import UsageError
 
@@ -157,5 +158,7 @@ def test_a_nuisance_at_the_border_of_its_search_cuts_the_interval_of_a_parameter
     curved = EstimationProblem(nuisances=("quadratic", "cubic"))
     study = make_study(bench, [log("plant=exact,seed=2")], StudyOptions(curved))
     assert study["k_1"].finding.doubts == (Doubt.CUT,)
+    (cut,) = (profile for profile in study.profiles if profile.label == "k_1")
+    assert DOUBTS[Doubt.CUT] in sentence(cut, study.estimate)
     (remedy,) = remedies(study, stopped=False)
     assert "quadratic, cubic" in remedy
