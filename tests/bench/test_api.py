@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +127,7 @@ def test_what_a_user_tries_first_works(log: Path, tmp_path: Path) -> None:
         "study.model_fits": study.model_fits,
         "study.to_dataframe()": study.to_dataframe().loc["f_v", "value"] == study["f_v"].value,
         "study.to_dict()": study.to_dict()["f_v"]["value"] == study["f_v"].value,
+        "pickle.loads(pickle.dumps(study))": pickle.loads(pickle.dumps(study)).to_dict() == study.to_dict(),
         "study.plot()": "f_v" in study.plot().axes[0].get_yticklabels()[0].get_text(),
         "study._repr_html_()": study._repr_html_().count("<tr>") == 2,
         "api.estimate([path, run])": len(both.logs) == 2,

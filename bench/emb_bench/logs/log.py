@@ -49,7 +49,7 @@ Table = Mapping[str, NDArray[Any]]
 REPAIR = "emb.repair"
 """Metadata of a log that ``emb-replay repair`` made: what is ``missing``, and ``source_sha256`` of the damaged one."""
 
-BATCH = 4 << 20  # Unpacked bytes that are decoded at a time
+BATCH = 2 << 20  # Unpacked bytes that are decoded at a time
 SMALL_TABLE = 64 << 20  # Size of a table that any log may have [bytes]
 TABLE = 16  # Times the size of the file by which it may be larger; the cycles of a log take about the size of its file
 LONGEST_REASON = 200  # Characters of the reason for a run's end
@@ -151,6 +151,10 @@ class RunLog:
     def __repr__(self) -> str:
         """Path, end and completeness in one line."""
         return f"<RunLog {self.path}: {self.exit_reason}, {'complete' if self.complete else self.missing}>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy in another process reads the file again."""
+        return read_log, (self.path,)
 
     @cached_property
     def tables(self) -> Mapping[str, Table]:

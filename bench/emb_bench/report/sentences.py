@@ -405,7 +405,7 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
         if stopped or study.identified or e.bench.machine is not None:
             return []
         weak = [c.label for c in study.conclusions if not (c.of_interest or c.identified)]
-        return [f"estimate without {', '.join(weak)}: the record does not determine them"] if weak else [MORE]
+        return [f"estimate without {', '.join(weak)}: not determined by the record"] if weak else [MORE]
     if e.bench.machine is None:
         found = [f"find a model that explains it: {again} --model all"]
     else:
