@@ -307,7 +307,7 @@ def doubts(f: Finding) -> str:
 
 def trade_offs(f: Finding) -> str:
     """Parameters whose errors compensate one of this parameter, with the correlations; empty without any."""
-    others = ", ".join(f"{name} ({correlation:+.4f})" for name, correlation in f.traded_with.items())
+    others = ", ".join(f"{name} (correlation {plain(correlation, 4)})" for name, correlation in f.traded_with.items())
     return f"trades off with {others}" if others else ""
 
 
