@@ -21,7 +21,7 @@ from emb_bench.information.evaluation import Evaluation, Question, check_sample_
 from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_bench.report.caveats import caveats
-from emb_bench.report.sentences import alarms, warnings
+from emb_bench.report.sentences import alarms, lacks, warnings
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.input_file import open_regular
@@ -93,7 +93,7 @@ def _of_the_run(log: RunLog) -> Row:
 
 def _of_the_experiment(log: RunLog, experiment: Experiment, bench: Bench) -> Row:
     missing = [log.missing] if log.missing else []
-    missing += experiment.missing
+    missing += lacks(experiment)
     (low, high), speed = bench.limits.angle, bench.limits.velocity
     angle, velocity = experiment.samples.T
     beyond = int(((angle < low) | (angle > high) | (np.abs(velocity) > speed)).sum())
@@ -124,7 +124,7 @@ def _of_the_information(e: Evaluation) -> Row:
     physical = e.fisher("physical")
     own, bounds = physical.criteria(), physical.cramer_rao()
     identified = {finding.name: finding.identified for finding in e.verdict().findings}
-    said = {e.log.missing, *e.experiment.missing}
+    said = {e.log.missing, *lacks(e.experiment)}
     found: Row = {
         "warnings": tuple(printable(warning) for warning in warnings(e) if warning not in said),
         "nominal_fits": e.fit.fits,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum, auto
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +19,21 @@ REST_SIGMAS = 4.0
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
+
+
+class Lack(Enum):
+    """Part of an experiment that is missing, or not to be trusted, with the numbers that belong to it."""
+
+    ENDS_EARLY = auto()  # Periods, and those that the run had to have
+    LOST = auto()  # Samples; what acted before them was not reported
+    LOST_WITH_CHARGE = auto()  # Samples, and periods of which the charge says what acted
+    CONTRADICTED = auto()  # Periods whose report names another current than the command
+    NO_COUNTERS = auto()
+    NO_VELOCITY = auto()  # Bandwidth of the observer in its place [rad/s]
+    NO_CURRENT = auto()
+    NO_COMMANDS = auto()
+    NO_TIMES = auto()
+    LOST_OF_RECORDING = auto()  # Samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +61,10 @@ class Experiment:
     planned: int = 0  # Periods that the run was to have
     braked: int = 0  # Periods that the node braked by itself because no command came in time
     command_delay: int = 0  # Samples by which commands acted late, by the node's reports
-    missing: tuple[str, ...] = ()  # Parts that are missing, or not to be trusted
-    notes: tuple[str, ...] = ()  # What was taken for the currents that acted, where that is not what was reported
+    lacks: Mapping[Lack, tuple[float, ...]] = field(default_factory=dict)  # With the numbers that belong to each
+    within: float | None = None
+    """Of a mapped drive: difference between command and report up to which the command acted [A], NaN if its mapping is
+    not readable, so that reports alone count; None of other nodes."""
 
     @property
     def periods(self) -> int:

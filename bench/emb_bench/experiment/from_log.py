@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import LONGEST_DELAY
-from emb_bench.experiment.experiment import REST_SIGMAS, Booleans, Experiment, Floats, Integers
+from emb_bench.experiment.experiment import REST_SIGMAS, Booleans, Experiment, Floats, Integers, Lack
 from emb_bench.logs.log import RunLog, Table
-from emb_bench.numbers import in_samples
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER
 from emb_runtime.can.messages import CHARGE, Layout
 from emb_runtime.can.receiver import Reception, fresh_ns
@@ -90,8 +89,8 @@ def read_experiment(log: RunLog, bench: Bench | None = None, name: str = "") -> 
         planned=planned,
         braked=int((counted & (samples.obeyed[1:] == NO_COUNTER)).sum()),
         command_delay=delay,
-        missing=_missing(periods, _due(log, periods, planned), lost, told, wrong[delay]),
-        notes=_notes(log, delay, within),
+        lacks=_lacks(periods, _due(log, periods, planned), lost, told, wrong[delay]),
+        within=None if log.drive_files is None else math.nan if log.drive is None else within,
     )
 
 
@@ -200,29 +199,17 @@ def currents_by_charge(samples: Samples, bench: Bench, layout: Layout) -> Floats
     return told
 
 
-def _notes(log: RunLog, late: int, within: float) -> tuple[str, ...]:
-    if log.drive_files is None:
-        return ()
-    if log.drive is None:
-        return ("the drive's mapping is not readable: what acted is taken to be what the drive reported",)
-    return (
-        f"what acted is taken to be the command as its bus carried it, {in_samples(late)} late, where what the drive "
-        f"reported lies within {within:.3g} A of it, and elsewhere what the drive reported",
-    )
-
-
-def _missing(count: int, planned: int, lost: int, told: int, disagreements: int) -> tuple[str, ...]:
-    missing = []
-    if count < planned:
-        missing.append(f"the experiment ends after {count} of {planned} samples")
-    if lost:
-        missing.append(
-            f"{lost} samples were lost: they count for no information, and what acted in the periods before them was "
-            "not reported" + (f"; the charge gives it for {told} periods" if told else "")
-        )
+def _lacks(count: int, due: int, lost: int, told: int, disagreements: int) -> dict[Lack, tuple[float, ...]]:
+    found: dict[Lack, tuple[float, ...]] = {}
+    if count < due:
+        found[Lack.ENDS_EARLY] = count, due
+    if told:
+        found[Lack.LOST_WITH_CHARGE] = lost, told
+    elif lost:
+        found[Lack.LOST] = (lost,)
     if disagreements:
-        missing.append(f"in {disagreements} periods the node reports another current than the command says")
-    return tuple(missing)
+        found[Lack.CONTRADICTED] = (disagreements,)
+    return found
 
 
 class Samples(NamedTuple):

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.config.plants import Instruments
-from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.experiment import Experiment, Lack
 from emb_bench.recordings.map_file import TIMED, RecordingMap, Signal, Source
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_runtime.errors import EmbError, UsageError
@@ -229,7 +229,7 @@ def experiment_of(columns: Mapping[str, Column], wanted: RecordingMap, kind: str
         assumed=None if received.all() else np.where(received[1:], np.nan, currents),
         first=first,
         planned=len(currents),
-        missing=_lacks(wanted, kind, bandwidth, int((~received).sum())),
+        lacks=_lacks(wanted, kind, bandwidth, int((~received).sum())),
     )
     return Found(experiment, t_s, (angle_noise, velocity_noise), bandwidth)
 
@@ -312,19 +312,16 @@ def _derived(step: Integers, angle: Floats, t_s: float, bandwidth: float) -> Flo
     return np.array([observe(instruments, memory, t_s, y1) for y1 in every.tolist()])
 
 
-def _lacks(wanted: RecordingMap, kind: str, bandwidth: float, lost: int) -> tuple[str, ...]:
-    said = ["the recording has no counters, answers or states: a repeated, late or lost command cannot be told"]
+def _lacks(wanted: RecordingMap, kind: str, bandwidth: float, lost: int) -> dict[Lack, tuple[float, ...]]:
+    found: dict[Lack, tuple[float, ...]] = {Lack.NO_COUNTERS: ()}
     if bandwidth:
-        said.append(
-            f"the recording has no velocity: an observer ({bandwidth:g} rad/s) derives one from the angles, which has "
-            "no weight in an estimate"
-        )
+        found[Lack.NO_VELOCITY] = (bandwidth,)
     if wanted.signals.current is None:
-        said.append("the recording has no measured current: what acted is taken to be what was commanded")
+        found[Lack.NO_CURRENT] = ()
     if wanted.signals.command is None:
-        said.append("the recording has no commands: what acted is the mean of the measured current over each period")
+        found[Lack.NO_COMMANDS] = ()
     if not wanted.timing.column and kind != TIMED:
-        said.append("the recording has no times: its rows are taken to be one sample time apart")
-    if not lost:
-        return tuple(said)
-    return (*said, f"{lost} samples are lost: what acted in the periods before them is not known to have acted")
+        found[Lack.NO_TIMES] = ()
+    if lost:
+        found[Lack.LOST_OF_RECORDING] = (lost,)
+    return found

@@ -36,7 +36,7 @@ def document(e: Evaluation) -> dict[str, Any]:
     numbers = ("log_det", "lambda_min", "trace_inverse", "condition", "singular")
     found: dict[str, Any] = {
         "log": e.log.path,
-        "complete": e.log.complete and not x.missing,
+        "complete": e.log.complete and not x.lacks,
         "warnings": say.warnings(e),
         "notes": say.notes(e),
         "exit_reason": e.log.exit_reason,

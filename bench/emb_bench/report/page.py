@@ -241,8 +241,11 @@ def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
     }
     x, alone = run.experiment, run.alone
     if x is not None:
-        named = ("planned", "command_delay", "missing", "notes")
-        found["experiment"] = {name: getattr(x, name) for name in named} | {
+        found["experiment"] = {
+            "planned": x.planned,
+            "command_delay": x.command_delay,
+            "missing": sentences.lacks(x),
+            "notes": sentences.taken_for_acted(x),
             "periods": len(x.currents),
             "measured": x.measured.sum(),
             "braked_periods": x.braked,

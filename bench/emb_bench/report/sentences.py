@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from emb_bench.brake.parameters import UNITS, quantity
+from emb_bench.experiment.experiment import Experiment, Lack
 from emb_bench.information.identifiability import Border, Doubt, combination
 from emb_bench.numbers import amount, between, in_samples, p_value, percent, plain, spread
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -61,6 +62,45 @@ BORDERS = {
     Border.ABOVE: "outside its range, beyond the upper border",
 }
 """Places of a value at, or beyond, a border of its range."""
+
+
+LACKS = {
+    Lack.ENDS_EARLY: "the experiment ends after {} of {} samples",
+    Lack.LOST: "{} samples were lost: they count for no information, and what acted in the periods before them was not "
+    "reported",
+    Lack.LOST_WITH_CHARGE: "{} samples were lost: they count for no information, and what acted in the periods before "
+    "them was not reported; the charge gives it for {} periods",
+    Lack.CONTRADICTED: "in {} periods the node reports another current than the command says",
+    Lack.NO_COUNTERS: "the recording has no counters, answers or states: a repeated, late or lost command cannot be "
+    "told",
+    Lack.NO_VELOCITY: "the recording has no velocity: an observer ({:g} rad/s) derives one from the angles, which has "
+    "no weight in an estimate",
+    Lack.NO_CURRENT: "the recording has no measured current: what acted is taken to be what was commanded",
+    Lack.NO_COMMANDS: "the recording has no commands: what acted is the mean of the measured current over each period",
+    Lack.NO_TIMES: "the recording has no times: its rows are taken to be one sample time apart",
+    Lack.LOST_OF_RECORDING: "{} samples are lost: what acted in the periods before them is not known to have acted",
+}
+"""Parts of an experiment that are missing, with places for their numbers."""
+
+
+# ---- an experiment ----
+
+
+def lacks(x: Experiment, but: Collection[Lack] = ()) -> list[str]:
+    """Parts of an experiment that are missing, or not to be trusted."""
+    return [LACKS[lack].format(*numbers) for lack, numbers in x.lacks.items() if lack not in but]
+
+
+def taken_for_acted(x: Experiment) -> list[str]:
+    """The currents that were taken for those that acted, where these are not the reported ones."""
+    if x.within is None:
+        return []
+    if math.isnan(x.within):
+        return ["the drive's mapping is not readable: what acted is taken to be what the drive reported"]
+    return [
+        f"what acted is taken to be the command as its bus carried it, {in_samples(x.command_delay)} late, where what "
+        f"the drive reported lies within {x.within:.3g} A of it, and elsewhere what the drive reported"
+    ]
 
 
 # ---- the verdict on a study ----
@@ -148,7 +188,7 @@ def missing(study: Study) -> list[str]:
     for log, record in zip(study.logs, study.estimate.records, strict=True):
         said = [log.missing] if log.missing else []
         stopped = log.end.get("exit_reason", DONE) != DONE
-        said += [text for text in record.missing if not (stopped and text.startswith("the experiment ends after"))]
+        said += lacks(record, but=(Lack.ENDS_EARLY,) if stopped else ())
         lost = int((~record.measured).sum()) - record.outliers
         if lost and not gaps:
             said.append(
@@ -161,7 +201,7 @@ def missing(study: Study) -> list[str]:
 
 def assumptions(study: Study) -> list[str]:
     """Assumptions about the currents that acted, where they are not those that were reported."""
-    return _of_which(study, [record.notes for record in study.estimate.records])
+    return _of_which(study, [taken_for_acted(record) for record in study.estimate.records])
 
 
 def _of_which(study: Study, found: Sequence[Sequence[str]]) -> list[str]:
@@ -430,7 +470,7 @@ def impact(bench: Bench, speed: float | None, why_not: str) -> str:
 
 def warnings(e: Evaluation) -> list[str]:
     """Reasons to doubt an information."""
-    found = [text for text in (e.log.missing, *e.experiment.missing) if text]
+    found = [text for text in (e.log.missing, *lacks(e.experiment)) if text]
     late, expected = e.experiment.command_delay, e.plant.instruments.command_delay
     if late != expected:
         found.append(
@@ -450,7 +490,7 @@ def warnings(e: Evaluation) -> list[str]:
             if e.theta_name == "nominal"
             else "the model does not include what disturbed the machine"
         )
-    elif e.log.missing or e.experiment.missing:
+    elif e.log.missing or e.experiment.lacks:
         why = "what is missing hides whether theta is right"
     else:
         why = "pass --theta or --model"
@@ -463,7 +503,7 @@ def warnings(e: Evaluation) -> list[str]:
 
 def notes(e: Evaluation) -> list[str]:
     """Assumptions about the currents that acted, and effects of the model's instruments."""
-    instruments, found = e.plant.instruments, list(e.experiment.notes)
+    instruments, found = e.plant.instruments, taken_for_acted(e.experiment)
     if known := {name: value for name, value in e.errors._asdict().items() if value}:
         values = ", ".join(f"{n} = {v:.3g} {UNITS[n]}".removesuffix(" 1") for n, v in known.items())
         found.append(f"systematic errors of this record, from {e.theta_name}, are taken as known: {values}")

@@ -7,7 +7,7 @@ import pytest
 
 from emb_bench.cli.replay import main
 from emb_bench.config.bench import load_bench
-from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.experiment import Experiment, Lack
 from emb_bench.experiment.from_log import Recording as Opened
 from emb_bench.recordings.recording import open_recording
 from emb_runtime.errors import BenchFileError
@@ -65,8 +65,7 @@ def test_a_machine_that_stands_still_is_read_as_any_other(tmp_path: Path) -> Non
 
 def test_what_a_recording_lacks_is_said_of_its_experiment(tmp_path: Path) -> None:
     experiment = opened(tmp_path, csv(tmp_path / "r.csv", RECORDING)).experiment
-    for lack in ("no counters", "no velocity", "no measured current"):
-        assert any(lack in line for line in experiment.missing)
+    assert {Lack.NO_COUNTERS, Lack.NO_VELOCITY, Lack.NO_CURRENT} <= experiment.lacks.keys()
 
 
 TURNING = """\
@@ -132,7 +131,7 @@ def test_lost_and_shifted_samples_stay_where_their_times_are(tmp_path: Path) -> 
     lost = np.flatnonzero(~experiment.measured) + 1
     assert lost.tolist() == [50, 51, 90]
     np.testing.assert_allclose(experiment.all_samples[kept, 0], found.position)
-    assert any("3 samples" in line for line in experiment.missing)
+    assert experiment.lacks[Lack.LOST_OF_RECORDING] == (3,)
 
 
 MAPS_REFUSED = (
