@@ -78,8 +78,6 @@ night: $(VENV)/.dev
 	$(HIL)
 	$(BIN)/python .ci/hil_ran.py build/hil.xml
 	$(BIN)/python -m tests.searches.shield --episodes 20000
-	$(BIN)/python -m tests.searches.learning_shield --episodes 5000
-	$(BIN)/python -m tests.searches.learning_shield --episodes 1000 --break all
 	$(BIN)/python -m tests.searches.sensor_monitor --experiments 100000
 	$(BIN)/python -m tests.searches.motion_balance --experiments 60000
 	$(BIN)/python -m tests.searches.lies

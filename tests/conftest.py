@@ -23,7 +23,7 @@ from emb_runtime.control.core import Core
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord, Record
+from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, Record
 from emb_runtime.records import CycleRecord, Frame
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import Heartbeat, Unwatched
@@ -110,10 +110,6 @@ class Journal:
     @property
     def estimates(self) -> list[EstimateRecord]:
         return [record for record in self.records if isinstance(record, EstimateRecord)]
-
-    @property
-    def learnt(self) -> list[LearntRecord]:
-        return [record for record in self.records if isinstance(record, LearntRecord)]
 
     @property
     def events(self) -> list[EventRecord]:

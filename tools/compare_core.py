@@ -31,9 +31,6 @@ from emb_runtime.config.bench import Bench, load_bench
 from emb_runtime.control import result, start_conditions
 from emb_runtime.estimator import kalman, speed_loop
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.learning import assumptions, bounded
-from emb_runtime.learning import known as estimate_set
-from emb_runtime.learning.law import law_for
 from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState, SensorSample
 from emb_runtime.safety import (
     command_limits,
@@ -286,29 +283,6 @@ def _sensors(dice: random.Random) -> Iterator[Any]:
             yield verdict, list(memory), monitor.largest_current(law, limits, memory, 6.0)
 
 
-def _learning(dice: random.Random) -> Iterator[Any]:
-    """Answers to a brake that moves about as it should, with both models, and the law then."""
-    bench, inputs = _bench(), shield_design.design_inputs(_bench())
-    plain = assumptions.make_assumptions(bench)
-    while True:
-        assumed = plain._replace(flow=dice.random() < 0.5, model_error=dice.choice((0.0, 50.0)))
-        state = bounded.start(assumed)
-        angle, velocity, current = dice.uniform(-1.0, 40.0), dice.uniform(-200.0, 200.0), 0.0
-        for _ in range(30):
-            measured = (angle + dice.gauss(0.0, 1e-3), velocity + dice.gauss(0.0, 1.0))
-            if dice.random() < 0.05:
-                answer = _tried(bounded.lose, assumed, state)
-            else:
-                heard = (_number(dice, 100.0), velocity) if dice.random() < 0.01 else measured
-                answer = _tried(bounded.hear, assumed, state, *heard, current)
-            known = estimate_set.known(state)
-            yield answer, list(state), known, _tried(law_for, inputs, bench.brake, known)
-            current = dice.uniform(-6.0, 6.0)
-            push = plain.motor * current - plain.spring * max(angle, 0.0) - plain.viscous * velocity
-            angle += 1e-3 * velocity
-            velocity += 1e-3 * (push - math.copysign(plain.coulomb, velocity))
-
-
 def _guard(dice: random.Random) -> Iterator[Any]:
     bench, layout = _bench(), load_layout()
     while True:
@@ -385,7 +359,6 @@ COMPARISONS: dict[str, Callable[[random.Random], Iterator[Any]]] = {
     "drive monitor": _drive,
     "guard": _guard,
     "sensor monitor": _sensors,
-    "learning": _learning,
     "state machine": _states,
     "bounds and counters": _bounds,
     "estimator": _estimator,

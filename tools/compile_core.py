@@ -40,7 +40,7 @@ LEFT_OUT = {
 MODULES = (
     *(
         f"{room}.{path.stem}"
-        for room in ("can", "estimator", "safety", "learning", "control")
+        for room in ("can", "estimator", "safety", "control")
         for path in sorted((ROOT / "runtime" / PACKAGE / room).glob("*.py"))
         if path.stem != "__init__" and f"{room}.{path.stem}" not in LEFT_OUT
     ),

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import msgspec
 
-from emb_bench.logs.estimates import by_step, learnt_by_step
+from emb_bench.logs.estimates import by_step
 from emb_bench.logs.log import RunLog, require_driven
 from emb_runtime.can.e2e import COUNTER_MODULUS
 from emb_runtime.can.transport import TransmitQueueFullError
@@ -30,7 +30,7 @@ from emb_runtime.drives.mapping import mapping_hash
 from emb_runtime.errors import BusError, FrameError, LogError, UsageError
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder_process import DIED
-from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord
+from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord
 from emb_runtime.records import CycleRecord, Frame, RunState
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.heartbeat import STOP_FRAMES
@@ -89,7 +89,7 @@ class Playback:
 
     def __init__(self, log: RunLog) -> None:
         self._items = read_items(log)
-        self._estimates, self._learnt = by_step(log), learnt_by_step(log)
+        self._estimates = by_step(log)
         self._layout = log.layout
         self._at = 0
         self._step: int | None = None
@@ -244,9 +244,7 @@ class Playback:
         records, core.records = core.records, []
         for record in records:
             if isinstance(record, EstimateRecord):
-                self._compare_numbers("estimate", self._estimates, record.step, record.numbers)
-            elif isinstance(record, LearntRecord):
-                self._compare_numbers("learnt", self._learnt, record.step, record.numbers)
+                self._compare_estimate(record)
             elif isinstance(record, FrameRecord | CycleRecord | EventRecord) and not self.at_end:
                 item = self._items[self._at]
                 self._at += 1
@@ -266,14 +264,13 @@ class Playback:
         else:
             raise self._left(_words(item), _words(record))
 
-    def _compare_numbers(
-        self, what: str, of_step: Mapping[int, tuple[float, ...]], step: int, came: tuple[float, ...]
-    ) -> None:
-        recorded = of_step.get(step)
+    def _compare_estimate(self, record: EstimateRecord) -> None:
+        _, step, came = record
+        recorded = self._estimates.get(step)
         if recorded is None and self.at_end:
             return  # the log was cut just there
         if recorded is None or len(recorded) != len(came) or not all(map(_same, recorded, came)):
-            self.differences.append(Difference(step, what, repr(recorded), repr(came)))
+            self.differences.append(Difference(step, "estimate", repr(recorded), repr(came)))
 
     def _find_sent(self, echo: Frame) -> None:
         """Find the sent frame whose echo was recorded; those before it were not on the bus."""

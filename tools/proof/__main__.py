@@ -9,10 +9,10 @@ from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INTERRUPTED, EmbError
 from emb_runtime.system.terminal import as_json, complain, mention, show
 from tools.proof.cases import case_of
-from tools.proof.lemmas import BOXES, EXACT, SOLVER, Verdict, judge, lemmas
+from tools.proof.lemmas import BOXES, SOLVER, Verdict, judge, lemmas
 
 COMMAND = "tools.proof"
-LOOKED = {SOLVER: "paths", BOXES: "boxes", EXACT: "points"}
+LOOKED = {SOLVER: "paths", BOXES: "boxes"}
 HEAD = "| lemma | statement | by | looked at | result | least slack | s |\n|---|---|---|---|---|---|---|"
 
 

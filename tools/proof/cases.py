@@ -12,15 +12,12 @@ without friction takes 1/c of way per speed, c = k_m I/(J V), and friction only 
 from __future__ import annotations
 
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import Bench
-from emb_runtime.learning.law import COVERED
-from emb_runtime.safety.shield_design import ANGLE_PAD, VELOCITY_PAD, ShieldLaw, make_law, stoppable
-from tools.proof.terms import Facts, Real, lifted_law
-
-WHOLE, PART, ONE = "the whole set", "any part of it", "any one brake of it"  # Brakes that a law is for
+from emb_runtime.safety.shield_design import ANGLE_PAD, ShieldLaw, make_law
+from tools.proof.terms import Real
 
 
 class Case(NamedTuple):
@@ -30,8 +27,6 @@ class Case(NamedTuple):
     law: ShieldLaw
     rounding: float
     """A command that arrives lies within this of the one that was computed: half a step of its signal [A]."""
-    brakes: str = WHOLE
-    """Brakes that the law is for: of the bench's set, or of any part of it, as a learning shield asks."""
 
     @property
     def top(self) -> float:
@@ -68,49 +63,6 @@ def case_of(bench: Bench) -> Case:
         BenchFileError: the law refuses the bench.
     """
     return Case(bench, make_law(bench), 0.5 * load_layout().command.signal("Current").factor)
-
-
-def law_terms(facts: Facts, case: Case, **changed: Real) -> Any:
-    """The law in exact numbers: the bench's, or the one of any part of its set, whose bounds are then unknowns.
-
-    Args:
-        facts: of this path; it has one law.
-        case: what is proved for.
-        changed: other numbers, for the whole set only.
-    """
-    if case.brakes == WHOLE:
-        return lifted_law(facts, case.law, **changed)
-    if facts.law is None:
-        facts.law = law_within(facts, case, lifted_law(facts, case.law), one=case.brakes == ONE)
-    return facts.law
-
-
-def law_within(facts: Facts, case: Case, outer: Any, one: bool) -> Any:
-    """The law of any part of the brakes of another one, or of any single one of them.
-
-    Its numbers are those of :func:`emb_runtime.learning.law.law_between`: a part counts viscous friction only as far as
-    the pad covers its change within a sample; what the model lacks widens friction.
-    """
-    shield, limits = case.bench.shield, case.bench.limits
-    error = facts.constant(shield.model_error if shield.learn else 0.0)
-    friction = facts.real("friction", outer.friction_low + error, outer.friction_high - error)
-    more = friction if one else facts.real("friction_high", friction, outer.friction_high - error)
-    bounds: dict[str, Real] = {"friction_low": friction - error, "friction_high": more + error}
-    for name in ("motor", "spring", "viscous"):
-        low, high = f"{name}_low", f"{name}_high"
-        bounds[low] = facts.real(low, getattr(outer, low), getattr(outer, high))
-        single = one and name != "viscous"
-        bounds[high] = bounds[low] if single else facts.real(high, bounds[low], getattr(outer, high))
-    braking = bounds["motor_low"] * outer.current + bounds["friction_low"]
-    slowed = braking + error + bounds["spring_low"] * limits.angle[1] + bounds["viscous_low"] * limits.velocity
-    squared = outer.sample_time * outer.sample_time
-    facts.at_least(2.0 * COVERED * VELOCITY_PAD, squared * bounds["viscous_low"] * slowed)
-    homeward = outer.homeward_speed
-    if case.law.homeward_speed < case.law.outward_speed:
-        stopped = facts.lift(stoppable)(-outer.bottom, facts.constant(0.0), braking, outer.sample_time)
-        homeward = facts.smaller(outer.outward_speed, stopped)
-    braking_high = bounds["motor_high"] * outer.current + bounds["friction_low"]
-    return outer._replace(**bounds, braking=braking, braking_high=braking_high, homeward_speed=homeward)
 
 
 def reserve(law: ShieldLaw, braking: Real, v: Real) -> Real:

@@ -6,21 +6,19 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-from emb_runtime.learning.assumptions import unmet_assumption
 from tools.proof import exhaustive, extensions, safety, successors, windows
 from tools.proof.boxes import Covered
 from tools.proof.cases import Case
-from tools.proof.learning import identities, parts
 from tools.proof.terms import Answer
 
-SOLVER, BOXES, EXACT = "solver", "boxes", "exact numbers"
+SOLVER, BOXES = "solver", "boxes"
 
 
 class Lemma(NamedTuple):
     """One statement and what checks it."""
 
     key: str  # The lemma of the document, and a letter where it has parts
-    check: Callable[[Case], Answer | Covered | identities.Compared]
+    check: Callable[[Case], Answer | Covered]
     statement: str
 
 
@@ -30,7 +28,7 @@ class Verdict(NamedTuple):
     key: str
     statement: str
     method: str
-    looked: int  # Ways through the functions, boxes, or points at which both sides were compared
+    looked: int  # Ways through the functions, or boxes
     proved: bool
     slack: float | None  # Least, of the boxes; the solver's inequalities are exact, and have none
     reason: str  # Reason that it is not proved: a point that breaks it, or what could not be decided
@@ -83,42 +81,24 @@ COASTING = (
     Lemma("L12c", extensions.coasting_turns_inside, "whoever turns before the apex can coast home"),
     ROLLED[0],
 )
-LEARNING = (
-    Lemma("M1a", parts.envelopes_grow, "a part of the set brakes no less than the set, and may come home no slower"),
-    Lemma("M1b", parts.safe_set_holds_envelopes, "a part's envelope lies in that of each of its brakes"),
-    Lemma("M2", parts.one_margin_serves, "no brake of the set needs more beyond full braking than the set does"),
-    Lemma("M3a", parts.part_encloses_euler, "a part's successor contains forward Euler's map of its brakes"),
-    Lemma("M3b", parts.part_encloses_flow, "a part's successor contains the flow of its brakes, angles included"),
-    Lemma("M3c", parts.part_window_is_kept, "a current of a part's window keeps any box in its envelope"),
-    Lemma("M3d", parts.one_envelope_is_safe, "the envelope of one brake lies in its safe set, within the margin"),
-    Lemma("M3e", parts.one_stop_keeps, "a stop keeps the safe set of one brake: up, along the flow, the speeds"),
-    Lemma("M3f", parts.one_stop_keeps_below, "and going down under Euler, sign() and all"),
-    Lemma("M3g", parts.one_flow_may_turn, "and where a current is held too long"),
-    Lemma("B2", identities.windows_are_exact, "Euler's windows are identities, and their pads cover every error"),
-    Lemma("B4", identities.strips_are_enclosed, "the ellipsoid after a strip is the one of the sum of both"),
-)
 
 
 def lemmas(case: Case) -> tuple[Lemma, ...]:
-    """Returns the lemmas for a law; those on learning where the bench could learn."""
+    """Returns the lemmas for a law."""
     if case.law.coasting:
         return COASTING
-    if case.law.lag > 0.0:
-        return LAGGING
-    return BRAKING if unmet_assumption(case.bench) else (*BRAKING, *LEARNING)
+    return LAGGING if case.law.lag > 0.0 else BRAKING
 
 
 def judge(lemma: Lemma, case: Case) -> Verdict:
     """Check one lemma."""
     begun = time.perf_counter()
     try:
-        found: Answer | Covered | identities.Compared = lemma.check(case)
+        found: Answer | Covered = lemma.check(case)
     except ArithmeticError as err:  # for such a law a formula has no value
         found = Answer(False, 0, str(err))
     seconds = time.perf_counter() - begun
     if isinstance(found, Covered):
         method, looked, slack = BOXES, found.boxes, found.slack
         return Verdict(lemma.key, lemma.statement, method, looked, found.proved, slack, found.breaks, seconds)
-    if isinstance(found, identities.Compared):
-        return Verdict(lemma.key, lemma.statement, EXACT, found.points, found.proved, None, found.breaks, seconds)
     return Verdict(lemma.key, lemma.statement, SOLVER, found.paths, found.proved, None, found.breaks, seconds)

@@ -17,13 +17,18 @@ from typing import Any
 from emb_bench.brake.euler import step as euler_step
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.safety.shield import damped_current
-from tools.proof.cases import Case, law_terms, reserve
+from tools.proof.cases import Case, reserve
 from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
 
 FULL, DAMPED = "full braking", "damped stop"
 
 ROUNDING = 1e-12
 """The law's floats are the nearest to sums and quotients: so much may a sample cost beyond; a billion, a mrad [rad]."""
+
+
+def _euler_law(facts: Facts, case: Case) -> Any:
+    """The law of brakes as forward Euler's are: the thesis's, with no friction beyond T_c."""
+    return lifted_law(facts, case.law, friction_high=facts.constant(case.coulomb))
 
 
 def _braking_current(facts: Facts, law: Any, v: Term, how: str) -> Real:
@@ -58,7 +63,7 @@ def envelope_is_safe(case: Case) -> Answer:
     """
 
     def above(facts: Facts) -> None:
-        law = lifted_law(facts, case.law)  # of all parts of the set it has the least braking
+        law = lifted_law(facts, case.law)
         v = facts.real("v", 0.0, law.outward_speed)
         turned = law.sample_time * (law.motor_high * law.current + law.friction_high)
         now = facts.real("now", law.braking)
@@ -66,14 +71,14 @@ def envelope_is_safe(case: Case) -> Answer:
         facts.claim("above", case.top - law.top, reserve(law, now, v) - _counted_way(law, counted, v))
 
     def below(facts: Facts, euler: bool) -> None:
-        law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
+        law = _euler_law(facts, case)
         down = facts.real("down", 0.0, law.homeward_speed)
-        way = Thrown(facts, law, case.law).down(down) if euler else reserve(law, law.braking, down)
+        way = Thrown(facts, law).down(down) if euler else reserve(law, law.braking, down)
         facts.claim("below", law.bottom - case.bottom, way - _counted_way(law, law.braking, down))
 
     def moving_up(facts: Facts) -> None:
-        law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
-        up = Thrown(facts, law, case.law).up(facts.real("up", 0.0, law.outward_speed))
+        law = _euler_law(facts, case)
+        up = Thrown(facts, law).up(facts.real("up", 0.0, law.outward_speed))
         facts.claim("below, moving up", law.bottom - case.bottom, up)
 
     parts = (above, lambda f: below(f, False), lambda f: below(f, True), moving_up)
@@ -90,7 +95,7 @@ def braking_is_enough(case: Case) -> Answer:
 
     def statement(facts: Facts) -> None:
         for how in (FULL, DAMPED):
-            law = law_terms(facts, case)
+            law = lifted_law(facts, case.law)
             brake, x = _any_brake(facts, law), facts.real("x", case.bottom, case.top)
             v = facts.real("v", -law.homeward_speed, law.outward_speed)
             if v == 0.0:
@@ -118,7 +123,7 @@ def euler_stop_stays_above(case: Case) -> Answer:
     """A sample of the slowest stop takes at least as much of the reserve as it goes: x + P does not grow, going up."""
 
     def statement(facts: Facts) -> None:
-        law = law_terms(facts, case)
+        law = lifted_law(facts, case.law)
         helped = facts.real("spring", 0.0, law.spring_low * case.bench.limits.angle[1])
         a = law.braking + helped
         v = facts.real("v", 0.0, law.outward_speed)
@@ -140,7 +145,7 @@ def flow_of_a_stop_stays(case: Case) -> Answer:
     """
 
     def statement(facts: Facts) -> None:
-        law = law_terms(facts, case)
+        law = lifted_law(facts, case.law)
         helped = facts.real("spring", 0.0, law.spring_low * case.bench.limits.angle[1])
         a = law.braking + helped
         v = facts.real("v", 0.0, law.outward_speed)
@@ -161,15 +166,13 @@ class Thrown:
     Args:
         facts: of this path.
         law: of the set of brakes that it is one of.
-        outer: law whose bounds of viscous friction are taken, where those of a wider set will do.
     """
 
-    def __init__(self, facts: Facts, law: Any, outer: Any = None) -> None:
+    def __init__(self, facts: Facts, law: Any) -> None:
         self.law = law
         self.motor: Real = facts.real("motor", law.motor_low, law.motor_high)
         self.friction: Real = facts.real("friction", law.friction_low, law.friction_high)
-        bounds = law if outer is None else outer
-        self.viscous: Real = facts.real("viscous", bounds.viscous_low, bounds.viscous_high)
+        self.viscous: Real = facts.real("viscous", law.viscous_low, law.viscous_high)
         facts.assume(self.r.z >= 0)  # a lemma of its own
         self.turning = self.w / (1.0 + self.r)
 
@@ -212,8 +215,8 @@ def euler_stop_stays_below(case: Case) -> Answer:
 
 
 def _damped_down(facts: Facts, case: Case) -> None:
-    law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
-    brake = Thrown(facts, law, case.law)
+    law = _euler_law(facts, case)
+    brake = Thrown(facts, law)
     v = facts.real("v", 0.0, law.damping_velocity)
     after = brake.damped(v)
     left = brake.down(after) if after > 0.0 else brake.up(-after)
@@ -221,8 +224,8 @@ def _damped_down(facts: Facts, case: Case) -> None:
 
 
 def _damped_up(facts: Facts, case: Case) -> None:
-    law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
-    brake = Thrown(facts, law, case.law)
+    law = _euler_law(facts, case)
+    brake = Thrown(facts, law)
     v = facts.real("v", 0.0, law.damping_velocity)
     after = brake.damped(v)
     left = brake.up(after) if after > 0.0 else brake.down(-after)
@@ -230,8 +233,8 @@ def _damped_up(facts: Facts, case: Case) -> None:
 
 
 def _full_down(facts: Facts, case: Case) -> None:
-    law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
-    brake = Thrown(facts, law, case.law)
+    law = _euler_law(facts, case)
+    brake = Thrown(facts, law)
     v = facts.real("v", 0.0, law.homeward_speed)
     after = brake.after(v)
     left = brake.down(after) if after > 0.0 else brake.up(-after)
@@ -239,8 +242,8 @@ def _full_down(facts: Facts, case: Case) -> None:
 
 
 def _damped_fast_up(facts: Facts, case: Case) -> None:
-    law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
-    brake = Thrown(facts, law, case.law)
+    law = _euler_law(facts, case)
+    brake = Thrown(facts, law)
     v = facts.real("v", law.damping_velocity, law.outward_speed)
     after = brake.after(v)
     left = brake.up(after) if after > 0.0 else brake.down(-after)
@@ -249,8 +252,8 @@ def _damped_fast_up(facts: Facts, case: Case) -> None:
 
 def _full_up(facts: Facts, case: Case) -> None:
     """Full braking of a fall that is none: it drives the brake up."""
-    law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
-    brake = Thrown(facts, law, case.law)
+    law = _euler_law(facts, case)
+    brake = Thrown(facts, law)
     v = facts.real("v", 0.0, law.outward_speed)
     after = v + law.sample_time * (brake.motor * law.current - brake.friction - brake.viscous * v)
     facts.claim("away", after, 0.0)
@@ -264,7 +267,7 @@ def damping_does_not_reverse(case: Case) -> Answer:
     """One sample of damping takes less than the whole speed, of any brake: with r below 0 it would throw it back."""
 
     def statement(facts: Facts) -> None:
-        law = law_terms(facts, case)
+        law = lifted_law(facts, case.law)
         slope = law.motor_high * law.current / law.damping_velocity + law.viscous_high
         facts.claim("r", 1.0, law.sample_time * slope)
 
@@ -278,7 +281,7 @@ def nothing_is_thrown_up(case: Case) -> Answer:
     """
 
     def euler(facts: Facts, how: str) -> None:
-        law = law_terms(facts, case, friction_high=facts.constant(case.coulomb))
+        law = _euler_law(facts, case)
         brake, x = _any_brake(facts, law), facts.real("x", case.bottom, case.top)
         v = facts.real("v", -law.homeward_speed, 0.0)
         u = facts.lift(damped_current)(v, law.current, law.damping_velocity) if how == DAMPED else -law.current
@@ -287,7 +290,7 @@ def nothing_is_thrown_up(case: Case) -> Answer:
             facts.claim(f"{how} thrown up", case.top, x_after + reserve(law, law.braking, after))
 
     def flow(facts: Facts) -> None:
-        law = law_terms(facts, case)
+        law = lifted_law(facts, case.law)
         facts.claim("motor above friction", law.motor_low * law.current, law.friction_high)
 
     return together(prove(part) for part in (lambda f: euler(f, DAMPED), lambda f: euler(f, FULL), flow))
@@ -301,7 +304,7 @@ def flow_may_turn(case: Case) -> Answer:
     """
 
     def statement(facts: Facts) -> None:
-        law = law_terms(facts, case)
+        law = lifted_law(facts, case.law)
         brake = Thrown(facts, law)
         up = facts.real("up", 0.0, law.damping_velocity)
         if up > 0.0:
@@ -320,7 +323,7 @@ def entering_the_stroke(case: Case) -> Answer:
     """A brake that leaves contact at a permitted speed can be stopped in the free stroke."""
 
     def statement(facts: Facts) -> None:
-        law = law_terms(facts, case)
+        law = lifted_law(facts, case.law)
         turned = law.sample_time * (law.motor_high * law.current + law.friction_high)  # where it moved up before
         fastest = facts.greater(law.homeward_speed, turned) + law.sample_time * law.spring_high * law.reach
         facts.claim("stop", -case.bottom, reserve(law, law.braking, fastest) + law.sample_time * fastest)
@@ -332,7 +335,7 @@ def speeds_stay(case: Case) -> Answer:
     """Damped stop and full braking let no brake pass the law's speeds, whatever the spring does."""
 
     def euler(facts: Facts, how: str) -> None:
-        law = law_terms(facts, case)
+        law = lifted_law(facts, case.law)
         brake, x = _any_brake(facts, law), facts.real("x", case.bottom, case.top)
         v = facts.real("v", -law.homeward_speed, law.outward_speed)
         u = _braking_current(facts, law, v, how)
@@ -341,7 +344,7 @@ def speeds_stay(case: Case) -> Answer:
         facts.claim(f"{how} outward", law.outward_speed, after)
 
     def flow(facts: Facts) -> None:
-        law = law_terms(facts, case)
+        law = lifted_law(facts, case.law)
         home = law.homeward_speed
         change = law.motor_high * law.current + law.friction_high + law.spring_high * case.top
         begun = home - law.sample_time * (change + law.viscous_high * home)
@@ -355,7 +358,7 @@ def rest_is_safe(case: Case) -> Answer:
     """A brake at rest at the origin is safe, and the safe set lies within the limits."""
 
     def statement(facts: Facts) -> None:
-        law = law_terms(facts, case)
+        law = lifted_law(facts, case.law)
         limits = case.bench.limits
         facts.claim("above", case.top, 0.0)
         facts.claim("below", -case.bottom, facts.greater(Thrown(facts, law).down(facts.constant(0.0)), 0.0))

@@ -8,8 +8,8 @@ from emb_bench.brake.euler import step as euler_step
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.safety.shield import _moved, _rolled, fastest_next
 from emb_runtime.safety.shield_design import VELOCITY_PAD
-from tools.proof.cases import Case, law_terms
-from tools.proof.terms import Answer, Facts, Real, Term, prove, solver_module, together
+from tools.proof.cases import Case
+from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, solver_module, together
 
 AT_ONCE = 0.004
 """Share of the pad that grows with the time in a sample, for a command's rounding; the rest grows with its square."""
@@ -39,7 +39,7 @@ class Box:
     """
 
     def __init__(self, facts: Facts, case: Case, sample_time: Real = None, only: int | None = None) -> None:
-        plain = law_terms(facts, case)
+        plain = lifted_law(facts, case.law)
         self.law = plain if sample_time is None else plain._replace(sample_time=sample_time)
         self.xl, self.xh, self.vl, self.vh = any_box(facts, case)
         self.least = least = facts.real("least", -plain.current)
@@ -171,7 +171,7 @@ def _angle(facts: Facts, case: Case, side: int) -> None:
     ts = case.law.sample_time
     t = facts.real("t", 0.0, ts)
     part = Box(facts, case, sample_time=t, only=side)
-    law = law_terms(facts, case)
+    law = lifted_law(facts, case.law)
     xl, xh, vl, vh = facts.lift(_moved)(law, part.xl, part.xh, part.vl, part.vh, part.least, part.most)
     unused = VELOCITY_PAD - grown(t / facts.constant(ts))
     if side == 0:
@@ -188,7 +188,7 @@ def lost_commands_are_contained(case: Case) -> Answer:
     """The node's damped stop, for any velocity within one sample of the box's, lies between the currents assumed."""
 
     def statement(facts: Facts) -> None:
-        law = law_terms(facts, case)._replace(age_low=1, age_high=1)
+        law = lifted_law(facts, case.law)._replace(age_low=1, age_high=1)
         measured = facts.real("velocity")
         seen: list[tuple[Real, Real]] = []
 
@@ -217,7 +217,7 @@ def change_is_bounded(case: Case) -> Answer:
     """In one sample no velocity changes by more than the law's ``change``: no torque is greater."""
 
     def statement(facts: Facts) -> None:
-        law = law_terms(facts, case)
+        law = lifted_law(facts, case.law)
         fastest = case.bench.limits.velocity
         highest = law.apex if case.law.coasting else case.top
         motor = facts.real("motor", law.motor_low, law.motor_high)

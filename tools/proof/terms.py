@@ -170,8 +170,6 @@ class Facts(Path):
         self._z3 = z3
         self._known: list[Any] = []
         self._names = 0
-        self.law: Any = None
-        """Law of unknown brakes on this path, see :func:`tools.proof.cases.law_terms`."""
         self.goals: list[tuple[str, Any]] = []
 
     def real(self, name: str, low: Real = None, high: Real = None) -> Term:

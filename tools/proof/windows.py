@@ -6,9 +6,9 @@ from typing import Any
 
 from emb_runtime.safety.shield import _braking_window, _highest_current, successor
 from emb_runtime.safety.shield_design import stoppable
-from tools.proof.cases import Case, law_terms
+from tools.proof.cases import Case
 from tools.proof.successors import any_box
-from tools.proof.terms import Answer, Facts, Real, Term, prove, together
+from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
 
 
 def window_is_kept(case: Case) -> Answer:
@@ -21,7 +21,7 @@ def window_is_kept(case: Case) -> Answer:
 
 def _kept(facts: Facts, case: Case, end: int) -> None:
     """Statement for the upper (0) or the lower (1) end of the window; the other one takes no paths."""
-    law = law_terms(facts, case)
+    law = lifted_law(facts, case.law)
     xl, xh, vl, vh = any_box(facts, case)
     asked: list[tuple[Real, ...]] = []
     ends: list[Term] = []
@@ -60,7 +60,7 @@ def stoppable_stops(case: Case) -> Answer:
     """
 
     def statement(facts: Facts) -> None:
-        law = law_terms(facts, case)
+        law = lifted_law(facts, case.law)
         low, high = case.bench.limits.angle
         room = facts.real("room", -5.0, high - low + 5.0)
         fastest = case.bench.limits.velocity + law.velocity_noise + (1.0 + law.age_high) * law.change

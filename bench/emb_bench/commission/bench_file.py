@@ -15,7 +15,7 @@ from emb_bench.commission.comparison import contradiction, not_inside, sheet_ran
 from emb_bench.commission.records import Findings, Identification
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.config.plants import SHORTEST_LAG
-from emb_runtime.config.bench import LEARNING, PARAMETER_NAMES
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.typed import parse_toml
 from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.shield_design import make_law
@@ -118,11 +118,10 @@ def _rounded(value: float, *, up: bool = False) -> float:
 
 
 def _draft(sheet: Bench) -> TOMLDocument:
-    """The data sheet's document with its ranges as one whole set, without the learning shield."""
+    """The data sheet's document with its ranges as one whole set."""
     document = parse_toml(sheet.text)
     document["ranges"] = {SHEET: {name: list(sheet_range(sheet, name)) for name in PARAMETER_NAMES}}
-    shield = {key: value for key, value in document["shield"].items() if key not in LEARNING}
-    document["shield"] = {**shield, "ranges": SHEET}
+    document["shield"] = {**document["shield"], "ranges": SHEET}
     document.pop("estimator", None)  # it begins with the shield's ranges
     document.get("plants", {}).pop(MEASURED, None)  # of a commissioning before, whose result may be a data sheet
     return tomlkit.parse(tomlkit.dumps(document))

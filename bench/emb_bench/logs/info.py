@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.logs.estimates import last_estimate, last_learnt
+from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import in_control, quantiles
 from emb_runtime.can.e2e import NO_COUNTER
@@ -66,7 +66,6 @@ def info_document(log: RunLog) -> dict[str, Any]:
     found = cycle_summary(log)
     optional = {
         "estimate": last_estimate(log),
-        "learnt": last_learnt(log),
         "drive_lacks": log.drive_lacks,
         "largest": found.largest and asdict(found.largest),
         "sensor_to_command": found.sensor_to_command,

@@ -23,7 +23,6 @@ from emb_bench.config.bench import QUANTILES
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import METHODS
 from emb_bench.logs import timing
-from emb_bench.logs.estimates import last_learnt
 from emb_bench.logs.info import info_document
 from emb_bench.logs.timing import INTERVALS, quantiles
 from emb_bench.numbers import plain, seconds, signed
@@ -191,7 +190,6 @@ def environment() -> Environment:
         "tables": tables,
         "reasons": REASONS,
         "obeyed": figures.applied_as_sent,
-        "learnt_of": last_learnt,
         "intervals_of": intervals,
         "safety_of": safety,
         "digest": lambda data: hashlib.sha256(data).hexdigest(),

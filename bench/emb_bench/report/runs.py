@@ -20,7 +20,6 @@ UNITS = ((1.0, "s"), (1e3, "ms"), (1e6, "µs"))  # Of times, with their factors
 def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
     """A :func:`emb_bench.logs.info.info_document` for a person; with ``verbose`` all metadata and events."""
     d = _lines(d)
-    learnt = d.get("learnt", {})
     lines = listed("WARNING: ", [d["missing"]])
     lines += wrapped(
         f"{d['log']}: {d['exit_reason']}{_why(d['metadata'].get('emb.end', {}))}, {d['duration']:.3f} s, log "
@@ -37,7 +36,6 @@ def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
         lines += [
             f"  {name}  {around(q['value'], NORMAL_95 * q['deviation'])} {q['unit']}" for name, q in estimate.items()
         ]
-    lines += facts(*(("learnt", f"{name} {low:.4f} to {high:.4f} of nominal") for name, (low, high) in learnt.items()))
     if not verbose:
         return "\n".join(lines)
     lines += _listed("messages", {topic: f"{count:9}" for topic, count in d["messages"].items()})

@@ -18,7 +18,6 @@ from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.errors import BenchFileError, PolicyRefusedError, UsageError
 from emb_runtime.estimator.estimator import estimated
-from emb_runtime.learning.assumptions import make_assumptions
 from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
@@ -263,8 +262,6 @@ def prepare(args: argparse.Namespace) -> Plan:
             f"timing.sample_time: the DBC's command comes every {period:g} s, got {bench.timing.sample_time:g} s"
         )
     law = make_law(bench)._replace(steps=steps)  # before the policy: where no shield can be made, no policy helps
-    if bench.shield.learn:
-        make_assumptions(bench)
     listens = stage is Stage.READ_ONLY and args.policy is None
     policy = None if listens else _policy(args.policy, args.quick, bench)
     return Plan(

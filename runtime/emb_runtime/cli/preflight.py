@@ -96,9 +96,7 @@ class Findings:
 
 def check(findings: Findings) -> tuple[CheckResult, ...]:
     """Run every check, in the order of the table."""
-    learns = findings.plan.bench.shield.learn and not findings.start_conditions.anywhere
-    special = (*((_drive,) if findings.plan.drive else ()), *((_learning,) if learns else ()))
-    return tuple(look(findings) for look in (*CHECKS, *special))
+    return tuple(look(findings) for look in (*CHECKS, *((_drive,) if findings.plan.drive else ())))
 
 
 def refuse(lines: Sequence[CheckResult]) -> None:
@@ -314,24 +312,11 @@ def _drive(f: Findings) -> CheckResult:
     return CheckResult("drive", found, f"{expected}cable that are not lost", Verdict.WARNING)
 
 
-def _learning(f: Findings) -> CheckResult:
-    shield = f.plan.bench.shield
-    found = (
-        f"model {shield.model}, model error {shield.model_error:g} rad/s², current error {shield.current_error:g} A, "
-        f"sensor errors within {shield.noise_sigmas:g} deviations"
-    )
-    expected = (
-        "all true of the bench; small violations are not noticed: friction or stiffness of another "
-        "form, a current that lags, samples off the grid, a velocity from an observer, noise that is not as declared"
-    )
-    return CheckResult("learning", found, expected)
-
-
 CHECKS: tuple[Callable[[Findings], CheckResult], ...] = (
     *(_stage, _interface, _node, _state, _rate, _noise, _bus_load),
     *(_disk, _shield, _slew, _policy, _watchdog, _realtime, _core),
 )
-"""In the order of the table; the first that refuses says why. What a shield that learns assumes follows them."""
+"""In the order of the table; the first that refuses says why."""
 
 
 def _line(what: str, found: str, expected: str, good: bool) -> CheckResult:

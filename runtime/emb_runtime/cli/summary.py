@@ -17,12 +17,11 @@ from emb_runtime.can.transport import Transport
 from emb_runtime.cli.bus_monitor import BusStatistics, planned_load
 from emb_runtime.cli.options import Plan
 from emb_runtime.cli.preflight import CheckResult, RefusedError, table
-from emb_runtime.config.bench import LEARNING, Bench
+from emb_runtime.config.bench import Bench
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import EXIT_DONE, EXIT_LOG, EXIT_OUTSIDE, BusError, EmbError
 from emb_runtime.estimator import estimate
 from emb_runtime.estimator.estimator import estimated
-from emb_runtime.learning.learner import ranges_of
 from emb_runtime.log.recorder import RecorderResult
 from emb_runtime.log.ring_buffer import Attachment, LogHeader
 from emb_runtime.records import RunType
@@ -32,7 +31,6 @@ from emb_runtime.system import compiled_core
 from emb_runtime.system.clock import Clock
 
 ESTIMATE_RATE = 100_000  # Log rate of the estimates [bytes per second]
-LEARNT_RATE = 150_000  # Log rate of what the shield learns [bytes per second]
 LOG_RATE = 500_000  # Log rate of a run at 1 kHz, with room to spare: measured are 250 to 310 kB [bytes per second]
 
 SLOW_MARK = "EMB_SLOW"  # In the environment where a kernel's time runs slowly: how many times (``emb-hil --slow``)
@@ -115,9 +113,6 @@ def header(
         records["emb.preflight"] = {
             line.what: f"{line.verdict}: {line.found} (expected {line.expected})" for line in lines
         }
-    learns = run_type is RunType.EXPERIMENT and bench.shield.learn
-    if learns:
-        records["emb.run"] |= {key: str(getattr(bench.shield, key)) for key in LEARNING if key != "learn"}
     if mapping is not None:
         records["emb.drive"] = {"name": mapping.name, "lost": ", ".join(mapping.lost), "sha256": mapping.sha256}
         attachments += [
@@ -135,7 +130,7 @@ def header(
         messages=plan.layout.known,
         metadata=records,
         attachments=tuple(attachments),
-        topics=[*topics, "/learnt"] if learns else topics,
+        topics=topics,
         drive_bus=plan.drive.bus if plan.drive is not None else "",
     )
 
@@ -143,7 +138,7 @@ def header(
 def log_bytes(plan: Plan, duration: float) -> int:
     """Size of a log of so many seconds, with its attachments [bytes]."""
     carried = len(plan.bench.text) + len(plan.layout.text)
-    rate = LOG_RATE + LEARNT_RATE * plan.bench.shield.learn
+    rate = LOG_RATE
     if plan.policy is not None:
         carried += len(plan.policy.data)
         rate += ESTIMATE_RATE
@@ -177,7 +172,6 @@ def facts(outcome: Outcome) -> dict[str, Any]:
         **asdict(outcome.counters),
         "rejections": dict(outcome.rejections),
         "bus_error_classes": dict(outcome.bus_errors),
-        "learnt": None if outcome.learnt is None else ranges_of(outcome.learnt),
         "model_fits": outcome.model_fits,
         "unexplained": outcome.unexplained if judged else None,  # by any one brake [rad/s]
         "unexplained_allowed": outcome.allowed if judged else None,
@@ -214,7 +208,6 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         "steps": ran.steps,
         "duration_s": outcome.duration_ns * 1e-9,
         **facts(outcome),
-        "learnt": {} if outcome.learnt is None else ranges_of(outcome.learnt),
         "estimate": estimate.by_name(outcome.estimate),
         "outside": beyond,
         "goal_s": outcome.goal_ns * 1e-9 if outcome.goal_reached else None,
@@ -281,11 +274,6 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
     if completed and (details or s["unexplained"] is None):
         lines.append(f"  motion     {_motion(s)}")
     lines += _unusual(s)
-    if details:
-        lines += [
-            f"  learnt     {name} between {low:.3f} and {high:.3f} of nominal, if the shield's assumptions hold"
-            for name, (low, high) in s["learnt"].items()
-        ]
     if s["estimate"] and (details or s["result"] in ("done", LOG_INCOMPLETE)):
         lines.append("running estimate ± 95 % (k=2), valid if the model is right")
         if not s["model_fits"]:

@@ -41,15 +41,11 @@ LONGEST_REJECTED = 5  # frames
 LONGEST_NODE_WATCHDOG = 0.010  # s
 LONGEST_HEARTBEAT = 0.005  # s
 
-LEARNING = ("learn", "model", "model_error", "current_error")
-"""Keys of the shield that concern what it learns while it runs: no node depends on them."""
-
 ANALYSIS = ("budgets", "plants", "systematic", "machine")  # Tables that only simulation and analysis read
 
 FASTEST = 10.0  # No time constant of a brake is shorter than the sample time over this
 REMEDY = "add it, as in the file that `emb-run --write-bench FILE` writes"
 
-LearntModel = Literal["flow", "euler"]  # A brake that sticks, or one under forward Euler
 ParameterName = Literal["k_m", "k_1", "T_c", "f_v"]
 PARAMETER_NAMES = get_args(ParameterName)  # The parameters that are identified, in the thesis's order (eq. 4.3).
 
@@ -119,7 +115,7 @@ class Timing:
 
 
 class Shield(NamedTuple):
-    """Assumptions of the envelope shield, see :mod:`emb_runtime.safety.shield`. numba takes it."""
+    """Assumptions of the envelope shield, see :mod:`emb_runtime.safety.shield`."""
 
     ranges: str  # Name of the set of brakes for which the limits are guaranteed
     frame_age: tuple[Age, Age]  # Least and most samples between a measurement and the period in which its answer acts
@@ -131,10 +127,6 @@ class Shield(NamedTuple):
     current_lag: Annotated[float, Meta(ge=0, le=0.1)] = 0.0  # Largest time constant of the current loop [s]
     break_away: Annotated[float, Meta(ge=1, le=5)] = 1.0  # Largest T_s0 / T_c (eq. 3.5)
     f_l: Annotated[float, Meta(ge=0, le=1e-4)] = 0.0  # Largest load-dependent friction, T_s = T_s0 + f_l F_cl [m]
-    learn: bool = False  # Narrows the set of brakes while it runs
-    model: LearntModel = "flow"
-    model_error: Annotated[float, Meta(ge=0, le=1e4)] = 0.0  # Acceleration that the model lacks, at most [rad/s²]
-    current_error: Annotated[float, Meta(ge=0, le=1)] = 1e-3  # By which a reported current may be off, at most [A]
 
 
 @dataclass(frozen=True)
@@ -255,7 +247,7 @@ class Bench(_Tables):
     def identity_hash(self) -> str:
         """SHA-256 of brake, ranges, limits, noise, timing, shield and the drive's mapping: node and runtime must agree.
 
-        Not of the time-outs, nor of what the shield learns.
+        Not of the time-outs.
         """
         record: dict[str, Any] = {
             "brake": self.brake._asdict(),
@@ -263,7 +255,7 @@ class Bench(_Tables):
             "limits": asdict(self.limits),
             "noise": asdict(self.noise),
             "timing": asdict(self.timing),
-            "shield": {key: value for key, value in self.shield._asdict().items() if key not in LEARNING},
+            "shield": self.shield._asdict(),
         }
         if self.can.mapping:
             record["mapping"] = self.can.mapping

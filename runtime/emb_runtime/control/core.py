@@ -30,9 +30,7 @@ from emb_runtime.control.start_conditions import READY_PAIRS, Bounds, StartCondi
 from emb_runtime.control.stop_condition import REACHED, StopCondition
 from emb_runtime.estimator.estimate import LOST
 from emb_runtime.estimator.estimator import Estimator, estimated
-from emb_runtime.learning.known import numbers
-from emb_runtime.learning.learner import Learner, words
-from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, LearntRecord, Record
+from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, Record
 from emb_runtime.records import CycleRecord, Frame, NodeState, Reason, RunState, SensorSample
 from emb_runtime.safety.command_limits import CommandLimits, Decision, checked, decide
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS, Guard
@@ -109,8 +107,6 @@ class Core:
             None  # the newest sample, not yet in it; it follows the last
         )
         self._unexplained = NAN, math.inf  # unexplained velocity and what is allowed, at the end [rad/s]
-        # The way home may begin anywhere, and is not worth learning for.
-        self._learner = Learner(bench, self.law, active=not self.homing)
         self._estimator = Estimator(bench)
         self._reversed: StopError | None = None  # the sign may be wrong, and friction is stopping the brake
         self._coasting = 0.0  # time left for that [s]
@@ -319,7 +315,6 @@ class Core:
             model_fits=self._estimator.fits,
             goal_reached=self._condition_met,
             goal_ns=self._met_ns,
-            learnt=self._learner.known if self._start_ns else None,  # not of the warming up
             unexplained=self._unexplained[0],
             allowed=self._unexplained[1],
         )
@@ -434,12 +429,9 @@ class Core:
         self._balance.begin(sample)
         self._balance.take(sample, True)
         self._balance.judge()
-        self._learner.begin(sample)
-        self._learner.hear(sample, 1)
         self._estimator.begin()
         self._estimator.take(sample.angle, sample.velocity, 0, sample.applied_current)
-        law, angle, velocity = self._learner.question(sample)
-        decide(law, self._limits, angle, velocity, 0.0, NO_PAST, 0.0, 0)
+        decide(self.law, self._limits, sample.angle, sample.velocity, 0.0, NO_PAST, 0.0, 0)
 
     # --- ACTIVE or HOMING: one cycle per sample ---------------------------------------------------------------------
 
@@ -470,7 +462,6 @@ class Core:
         self._machine.handle_event(Event.BEGIN_HOMING if self.homing else Event.BEGIN, self._now_ns)
         self._monitor.begin(sample)
         self._balance.begin(sample)
-        self._learner.begin(sample)
         self._estimator.begin()
         self.counters.pairs = 1
 
@@ -550,8 +541,7 @@ class Core:
         limits = self._limits
         if (most := self._monitor.largest_current(limits.current)) < limits.current:
             limits = limits._replace(current=max(most, abs(last) - limits.slew))  # down to it as fast as may be
-        law, angle, velocity = self._learner.question(sample)
-        decision = decide(law, limits, angle, velocity, wanted, self._past, last, step)
+        decision = decide(self.law, limits, sample.angle, sample.velocity, wanted, self._past, last, step)
         return decision._replace(reasons=decision.reasons | Reason.RETURNING) if self._condition_met else decision
 
     def _may_answer(self, sample: SensorSample, decision: Decision, decide_ns: int) -> bool:
@@ -580,9 +570,6 @@ class Core:
         """Record what is known at a sample, and judge the motion so far."""
         if self._estimates:
             self._keep_estimate(self._estimator.estimate, sample, step)
-        if self._learner.known is not None:
-            learnt = numbers(self._learner.known, self._learner.age)
-            self.records.append(LearntRecord(sample.receive_time_ns, step, learnt))
         try:
             self._judge_motion()
         except StopError as stop:
@@ -638,7 +625,6 @@ class Core:
         self._judge_sensors(elapsed_ns * 1e-9, sample, sent and obeyed, self._past[0] if sent else 0.0)
         if not self.homing and self._reversed is None:
             self._unbalanced = sample, sent and obeyed and gap == 1
-        self._learn(sample, gap)
 
     def _judge_motion(self) -> None:
         """Take the newest sample into the balance, which no command depends on: once its own has left."""
@@ -667,15 +653,6 @@ class Core:
             self._reversed = stop
             # Now, since something else may end the run meanwhile, and would hide it.
             self._machine.note(stop.fault, stop.detail, sample.receive_time_ns)
-
-    def _learn(self, sample: SensorSample, periods: int) -> None:
-        """Take in a sample; one that contradicts what the shield assumes ends the run."""
-        if self._reversed is not None:
-            return
-        self._learner.hear(sample, periods)
-        if self._learner.contradicted:
-            before = self._learner.known
-            raise StopError(Fault.SET_CONTRADICTED, "" if before is None else f"until then {words(before)} of nominal")
 
     def _record(
         self,

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Final
 
 from emb_runtime.can.messages import StopReason
-from emb_runtime.learning.known import Known
 from emb_runtime.records import NodeState, Reason, SensorSample
 from emb_runtime.safety.state_machine import Fault
 
@@ -84,8 +83,6 @@ class Outcome:
     """Velocity that no one brake explains, see :mod:`emb_runtime.safety.motion_balance`; NaN of a run that was not
     completed [rad/s]."""
     allowed: float = math.inf  # What of it is allowed; infinite where nothing was judged [rad/s]
-    learnt: Known | None = None
-    """Brakes and states that were possible at the last sample; None where the shield learnt nothing."""
     goal_reached: bool = False  # The experiment ended early because the stop condition was met
     goal_ns: int = 0  # Time from the first sample to the one at which it was met, device time [ns]; 0 if it was not
 

@@ -36,7 +36,6 @@ from emb_runtime.log.ring_buffer import (
     EstimateRecord,
     EventRecord,
     FrameRecord,
-    LearntRecord,
     LogHeader,
     Record,
     Ring,
@@ -55,7 +54,7 @@ BATCH = 128  # Records between two looks at the clock
 
 RUN = "emb.run"
 END = "emb.end"  # Names of the metadata records with the run's identity and with its outcome
-OPTIONAL = {"/estimate", "/learnt", "/drive/rx", "/emb/EMB_Charge"}  # Topics that not every log has
+OPTIONAL = {"/estimate", "/drive/rx", "/emb/EMB_Charge"}  # Topics that not every log has
 DIED = "the runtime process died"  # Exit reason in a log whose runtime ended without saying why
 
 
@@ -95,7 +94,7 @@ class LogWriter:
         values: tuple[Any, ...] = record
         if isinstance(record, EventRecord):
             values = record.code, record.text
-        elif isinstance(record, EstimateRecord | LearntRecord):
+        elif isinstance(record, EstimateRecord):
             values = record.step, *record.numbers
         topic, message = TOPICS[type(record)]
         names = topics.message_class(message).DESCRIPTOR.fields_by_name

@@ -196,15 +196,7 @@ class EstimateRecord(NamedTuple):
     numbers: tuple[float, ...]  # See :attr:`emb_runtime.estimator.estimator.Estimator.estimate`
 
 
-class LearntRecord(NamedTuple):
-    """Brakes and states that the shield has left as possible at a sample."""
-
-    time_ns: int  # Arrival time of the sample, monotonic [ns]
-    step: int
-    numbers: tuple[float, ...]  # See :func:`emb_runtime.learning.known.numbers`
-
-
-Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | EstimateRecord | LearntRecord
+Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | EstimateRecord
 
 
 TOPICS: Final[dict[type[Any], tuple[str, str]]] = {
@@ -213,7 +205,6 @@ TOPICS: Final[dict[type[Any], tuple[str, str]]] = {
     EventRecord: ("/safety", "SafetyEvent"),
     ClockRecord: ("/clock", "ClockSample"),
     EstimateRecord: ("/estimate", "Estimate"),
-    LearntRecord: ("/learnt", "Learnt"),
 }
 """Topic of each record, and its message in ``emb.proto``, whose fields are those of the record but its ``time_ns``. A
 record's place here is its type byte in the ring."""

@@ -11,39 +11,13 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-from emb_runtime.config.bench import Bench, BrakeParameters, Shield
+from emb_runtime.config.bench import Bench
 from emb_runtime.errors import BenchFileError
 
 VELOCITY_PAD: Final = 0.3
 """Forward Euler against the exact flow within one sample: viscous friction changes while the speed does [rad/s]."""
 ANGLE_PAD: Final = 0.005
 """Left of ``angle_margin`` for rounding, and for an exact flow that is not quite monotone within a sample [rad]."""
-
-
-class DesignInputs(NamedTuple):
-    """Numbers of a bench that the law is made from, beside its brakes; numba takes them."""
-
-    sample_time: float  # [s]
-    steps: int  # Commands in one experiment
-    current: float  # Limit, both signs [A]
-    lowest_angle: float  # Limit [rad]
-    highest_angle: float  # Limit [rad]
-    speed: float  # Limit, both signs [rad/s]
-    angle_noise: float  # A measured angle lies within this of the truth [rad]
-    velocity_noise: float  # A measured velocity lies within this of the truth [rad/s]
-    damping_velocity: float  # Of the node's damped stop [rad/s]
-    model_error: float  # Largest acceleration beside those of model and reported current; 0 where nothing is learnt
-    coasting: bool  # True if 0 A for ever must keep the limits
-    shield: Shield
-
-
-class Part(NamedTuple):
-    """Bounds of a law for a part of the set of brakes, or for a state that is known better than measured."""
-
-    highest_angle: float  # [rad]
-    planned_speed: float  # The way home is planned with at most this [rad/s]
-    angle_noise: float  # The angle is known to within this [rad]
-    velocity_noise: float  # The velocity is known to within this [rad/s]
 
 
 class Landing(NamedTuple):
@@ -176,62 +150,28 @@ def make_law(bench: Bench) -> ShieldLaw:
     Raises:
         BenchFileError: for that set the limits cannot be guaranteed; the message says which step of the argument fails.
     """
-    brakes, inputs = bench.range_set(bench.shield.ranges), design_inputs(bench)
-    least = brakes.low.T_c / brakes.high.J
-    if inputs.model_error >= least:
-        raise BenchFileError(
-            f"shield.model_error: expected less than the least friction of the set '{bench.shield.ranges}', "
-            f"{least:.0f} rad/s², got {inputs.model_error:g}: such a brake could not be relied on to rest"
-        )
-    law = law_of(inputs, brakes.low, brakes.high, whole(inputs))
+    law = law_of(bench)
     if reason := unmet_condition(law, bench):
         raise BenchFileError(f"the shield cannot guarantee the limits for the set '{bench.shield.ranges}': {reason}")
     return law
 
 
-def design_inputs(bench: Bench) -> DesignInputs:
-    """Of this bench."""
-    shield, limits, brakes = bench.shield, bench.limits, bench.range_set(bench.shield.ranges)
-    model_error = shield.model_error + shield.current_error * brakes.high.k_m / brakes.low.J
-    return DesignInputs(
-        sample_time=bench.timing.sample_time,
-        steps=bench.timing.horizon,
-        current=limits.current,
-        lowest_angle=limits.angle[0],
-        highest_angle=limits.angle[1],
-        speed=limits.velocity,
-        angle_noise=shield.noise_sigmas * bench.noise.angle,
-        velocity_noise=shield.noise_sigmas * bench.noise.velocity,
-        damping_velocity=bench.node.damping_velocity,
-        model_error=model_error if shield.learn else 0.0,
-        coasting=shield.envelope == "coasting",
-        shield=shield,
-    )
-
-
-def whole(inputs: DesignInputs) -> Part:
-    """Bounds for the whole set and a state that is measured."""
-    return Part(inputs.highest_angle, inputs.speed, inputs.angle_noise, inputs.velocity_noise)
-
-
-def law_of(inputs: DesignInputs, low: BrakeParameters, high: BrakeParameters, part: Part) -> ShieldLaw:
-    """The law for every brake between two, as far as there is one: nothing is checked here.
-
-    A plain scalar function, so that training can compile it and narrow the set while an experiment runs.
-    """
-    shield, ts, current = inputs.shield, inputs.sample_time, inputs.current
+def law_of(bench: Bench) -> ShieldLaw:
+    """The law of a bench, as far as there is one: nothing is checked here."""
+    shield, limits, ts = bench.shield, bench.limits, bench.timing.sample_time
+    brakes = bench.range_set(shield.ranges)
+    low, high = brakes.low, brakes.high
+    current, coasting = limits.current, shield.envelope == "coasting"
     lag, age_high = shield.current_lag, shield.frame_age[1]
     motor_low, motor_high = low.k_m / high.J, high.k_m / low.J
     spring_low, spring_high = low.gamma * low.k_1 / high.J, high.gamma * high.k_1 / low.J
-    loaded = shield.f_l * high.k_1 * part.highest_angle
-    # What the model lacks acts as friction that is weaker or stronger by as much.
-    friction_low = low.T_c / high.J - inputs.model_error
-    friction_high = (shield.break_away * high.T_c + loaded) / low.J + inputs.model_error
+    loaded = shield.f_l * high.k_1 * limits.angle[1]
+    friction_low, friction_high = low.T_c / high.J, (shield.break_away * high.T_c + loaded) / low.J
     viscous_low, viscous_high = low.f_v / high.J, high.f_v / low.J
     braking, braking_high = current * motor_low + friction_low, current * motor_high + friction_low
-    bottom = inputs.lowest_angle + shield.angle_margin
-    noise = part.velocity_noise
-    outward = inputs.speed - VELOCITY_PAD
+    bottom = limits.angle[0] + shield.angle_margin
+    noise = shield.noise_sigmas * bench.noise.velocity
+    outward = limits.velocity - VELOCITY_PAD
     # A brake that enters the free stroke at this speed still stops above the bottom.
     weak = stoppable(-bottom, 0.0, braking, ts) - lag * motor_low * current
     strong = stoppable(-bottom, 0.0, braking_high, ts) - lag * motor_high * current
@@ -241,34 +181,31 @@ def law_of(inputs: DesignInputs, low: BrakeParameters, high: BrakeParameters, pa
     ratio = motor_high / motor_low
     uneven = VELOCITY_PAD + ts * (ratio * friction_high - friction_low)
     creep = noise + periods * uneven
-    top = part.highest_angle - shield.angle_margin
+    top = limits.angle[1] - shield.angle_margin
     apex = top
-    if inputs.coasting:
+    if coasting:
         homeward = min(homeward, math.sqrt(max(-2.0 * friction_low * bottom, 0.0)))
         apex = min(apex, _apex(friction_low, spring_high, -bottom, CREEPS * creep))
     cruise = (homeward - creep) / (1.0 + periods * ts * (ratio * viscous_high - viscous_low))
-    cruise = min(cruise, part.planned_speed)
     plan = FRESH_LANDING if age_high == 0 and lag == 0.0 else LATE_LANDING
     kept = math.exp(-ts / lag) if lag > 0.0 else 0.0
     reserve = plan.reserve * ts + 2.0 * lag
     rest = noise + shield.home_velocity
     coast = (rest + noise) / friction_low
-    # However well the velocity of a brake at rest is known: a hop begins anew with what is measured.
-    settling = (inputs.velocity_noise + shield.home_velocity + inputs.velocity_noise) / friction_low
-    driven = current * motor_high + friction_high + viscous_high * inputs.speed + spring_high * apex
+    driven = current * motor_high + friction_high + viscous_high * limits.velocity + spring_high * apex
     return ShieldLaw(
         sample_time=ts,
-        steps=inputs.steps,
+        steps=bench.timing.horizon,
         age_low=shield.frame_age[0],
         age_high=age_high,
         current=current,
-        angle_noise=part.angle_noise,
+        angle_noise=shield.noise_sigmas * bench.noise.angle,
         velocity_noise=noise,
         bottom=bottom,
         top=top,
         outward_speed=outward,
         homeward_speed=homeward,
-        reach=ts * inputs.speed,
+        reach=ts * limits.velocity,
         motor_low=motor_low,
         motor_high=motor_high,
         spring_low=spring_low,
@@ -279,11 +216,11 @@ def law_of(inputs: DesignInputs, low: BrakeParameters, high: BrakeParameters, pa
         viscous_high=viscous_high,
         braking=braking,
         braking_high=braking_high,
-        damping_velocity=inputs.damping_velocity,
+        damping_velocity=bench.node.damping_velocity,
         change=VELOCITY_PAD + ts * driven,
         lag=lag,
         kept=kept,
-        coasting=inputs.coasting,
+        coasting=coasting,
         apex=apex,
         creep=creep,
         cruise=cruise,
@@ -292,7 +229,7 @@ def law_of(inputs: DesignInputs, low: BrakeParameters, high: BrakeParameters, pa
         gain=plan.gain,
         reserve=coast + reserve,
         committed=coast + reserve + COMMITTED * ts,
-        settling=settling,
+        settling=coast,
         rest_zone=0.3 * shield.home_angle,
         settled_zone=0.8 * shield.home_angle,
         rest_velocity=rest,

@@ -58,7 +58,6 @@ class Fault(IntEnum):
     DEVICE_TIME = 22
     INCOMPLETE = 23
     NODE_CHANGED = 24
-    SET_CONTRADICTED = 25
     MOTION_UNEXPLAINED = 26
     NOT_AT_REST = 27
     SENSOR_LATE = 101
@@ -249,11 +248,6 @@ FAULTS: dict[Fault, FaultInfo] = {
     Fault.NODE_CHANGED: FaultInfo(
         "the node changed during the run",
         "it restarted, or another sender uses its identifiers: check its supply and the bus",
-    ),
-    Fault.SET_CONTRADICTED: FaultInfo(
-        "no brake that the shield still allows explains the samples",
-        "an assumption of shield.learn is wrong (model, model_error, current_error, noise): correct it in the bench "
-        "file, or turn learning off",
     ),
     Fault.MOTION_UNEXPLAINED: FaultInfo(
         "no single brake explains what the node reported",

@@ -254,7 +254,6 @@ def test_the_working_bench_has_the_data_sheets_ranges_and_a_shield_for_them(shee
     assert work.shield.ranges == SHEET
     assert work.limits.angle[1] < 100.0  # the weakest motor does not hold the stiffest spring farther
     make_law(work)
-    assert not work.shield.learn
     bare = parse_bench(sheet_text() + "\n[plants.bare]\n", "sheet")
     assert "bare" in parse_bench(working_text(bare), "working").plants  # a table without an entry is kept
 

@@ -12,7 +12,6 @@ from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.messages import Layout
 from emb_runtime.errors import BusError, FrameError, PolicyRefusedError, UsageError
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.learning.learner import Learner
 from emb_runtime.records import Frame
 from emb_runtime.safety.guard import Guard, GuardRejectedError
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat, Unwatched
@@ -74,7 +73,6 @@ HANDED_IN: tuple[str, ...] = (
 )
 OURS: dict[str, tuple[type, str]] = {
     "monitor": (SensorMonitor, "check"),
-    "learner": (Learner, "hear"),
     "estimator": (Estimator, "take"),
     "guard": (Guard, "send"),
     "guard's judge": (Guard, "judge"),

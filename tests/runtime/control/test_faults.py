@@ -12,7 +12,7 @@ import pytest
 from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.can.transport import TransmitQueueFullError
-from emb_runtime.config.bench import load_bench, parse_bench, shipped_bench_text
+from emb_runtime.config.bench import load_bench
 from emb_runtime.errors import BusError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 from emb_runtime.safety.guard import Guard
@@ -23,7 +23,6 @@ from tests.conftest import SimRun, Simulate  # isort: skip
 from tests.independent import encoded, read
 
 MS = 1_000_000
-LEARNING = parse_bench(shipped_bench_text().replace("[shield]", "[shield]\nlearn = true\n#"), "learning")
 ANGLE, VELOCITY, STATUS, COMMAND = 0x100, 0x101, 0x102, 0x80
 
 
@@ -224,7 +223,6 @@ INJECTIONS: dict[Fault, Callable[[Simulate], SimRun]] = {
     Fault.DEVICE_TIME: lambda run: run(on_receive=later(ANGLE, 200, DeviceTime=lambda time: time + 0.5)),
     Fault.INCOMPLETE: lambda run: run(on_receive=dropping(ANGLE, MISSING_21_PERCENT)),
     Fault.NODE_CHANGED: lambda run: run(on_receive=later(STATUS, 200, BenchIdentity=lambda number: int(number) ^ 1)),
-    Fault.SET_CONTRADICTED: lambda run: run(on_bench=LEARNING, options="plant=euler"),
     Fault.MOTION_UNEXPLAINED: lambda run: run(
         lambda _x, _v, step: 6.0 if step // 60 % 2 == 0 else -6.0,
         on_receive=later(VELOCITY, 0, AppliedCurrent=lambda current: current + 0.4),

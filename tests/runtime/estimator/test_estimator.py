@@ -41,25 +41,24 @@ def test_a_bench_file_may_name_the_set_or_leave_the_shields() -> None:
 
 
 def test_it_takes_samples_and_begins_anew() -> None:
-    for model in ("flow", "euler"):
-        estimator = Estimator(dataclasses.replace(BENCH, shield=BENCH.shield._replace(model=model)))
-        assert estimator.model.sticks == (model == "flow")
-        fresh = estimator.state
-        for sample in SAMPLES:
-            before = estimator.state
-            estimator.take(*sample)
-            assert estimator.state == follow(estimator.model, before, *sample)
-        assert estimator.parameters == estimator.estimate != Estimator(BENCH).estimate
-        one = Estimator(dataclasses.replace(BENCH, prior="viscous"))
-        for sample in SAMPLES:
-            one.take(*sample)
-        assert one.estimate[:3] == Estimator(one_bench := dataclasses.replace(BENCH, prior="viscous")).estimate[:3]
-        assert one.estimate[4:7] == (0.0, 0.0, 0.0), one_bench.prior
-        estimator.begin()
-        assert estimator.state == fresh == start(estimator.model)
-        assert estimator.fits
-        estimator.state = fresh._replace(worst=1.01 * MISFIT)
-        assert not estimator.fits
+    estimator = Estimator(BENCH)
+    assert estimator.model.sticks
+    fresh = estimator.state
+    for sample in SAMPLES:
+        before = estimator.state
+        estimator.take(*sample)
+        assert estimator.state == follow(estimator.model, before, *sample)
+    assert estimator.parameters == estimator.estimate != Estimator(BENCH).estimate
+    one = Estimator(one_bench := dataclasses.replace(BENCH, prior="viscous"))
+    for sample in SAMPLES:
+        one.take(*sample)
+    assert one.estimate[:3] == Estimator(one_bench).estimate[:3]
+    assert one.estimate[4:7] == (0.0, 0.0, 0.0)
+    estimator.begin()
+    assert estimator.state == fresh == start(estimator.model)
+    assert estimator.fits
+    estimator.state = fresh._replace(worst=1.01 * MISFIT)
+    assert not estimator.fits
 
 
 def test_an_estimate_that_is_not_finite_is_none() -> None:

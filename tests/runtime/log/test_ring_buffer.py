@@ -20,7 +20,6 @@ from emb_runtime.log.ring_buffer import (
     EstimateRecord,
     EventRecord,
     FrameRecord,
-    LearntRecord,
     Record,
     Ring,
     pack,
@@ -156,7 +155,6 @@ FLOATS = st.floats(allow_nan=False)
         st.builds(EventRecord, INT64, st.text(max_size=10), st.text(max_size=40)),
         st.builds(ClockRecord, INT64, INT64),
         st.builds(EstimateRecord, INT64, INT64, st.tuples(*[FLOATS] * 24)),
-        st.builds(LearntRecord, INT64, INT64, st.tuples(*[FLOATS] * 13)),
     )
 )
 def test_every_record_fits_a_slot_and_travels_unchanged(record: Record) -> None:

@@ -48,7 +48,6 @@ def test_the_other_records_have_as_many_values_as_their_messages_have_fields() -
     assert tuple(fields("SafetyEvent")) == ring_buffer.EventRecord._fields[1:]
     assert tuple(fields("Estimate")) == ("step", *UNITS, *(f"{name}_deviation" for name in UNITS))
     assert units("Estimate") == {**UNITS, **{f"{name}_deviation": unit for name, unit in UNITS.items()}}
-    assert len(fields("Learnt")) == 1 + 13
 
 
 def test_the_decoded_frames_have_the_signals_of_the_dbc() -> None:

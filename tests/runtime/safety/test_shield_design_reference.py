@@ -19,11 +19,9 @@ from emb_runtime.safety.shield_design import (
     chatter_excess,
     coasting_excess,
     damped_excess,
-    design_inputs,
     law_of,
     make_law,
     stoppable,
-    whole,
 )
 
 SHIPPED = load_bench()
@@ -36,7 +34,6 @@ KINDS = [
     pytest.param({"angle_low": -4.0}, id="short stroke"),
     pytest.param({"angle_low": -20.0, "angle_high": 5.0, "current": 1.5}, id="long stroke"),
     pytest.param({"angle_low": -4.0, "current_lag": 0.002}, id="short stroke, lagging"),
-    pytest.param({"learn": True, "model_error": 90.0, "current_error": 0.002}, id="learning"),
     pytest.param({"envelope": "coasting", "angle_margin": 0.9}, id="coasting"),
     pytest.param({"envelope": "coasting", "angle_margin": 0.9, "velocity": 120.0}, id="coasting, slow"),
     pytest.param({"envelope": "coasting", "angle_margin": 0.9, "angle_high": 10.0}, id="coasting, low"),
@@ -84,9 +81,7 @@ def defined(bench: Bench) -> dict[str, float]:
     motor = [low.k_m / high.J, high.k_m / low.J]
     spring = [low.gamma * low.k_1 / high.J, high.gamma * high.k_1 / low.J]
     static = settings.break_away * high.T_c + settings.f_l * high.k_1 * limits.angle[1]
-    # A current that is off by its error pushes the strongest motor by so much more.
-    unknown = settings.model_error + settings.current_error * high.k_m / low.J if settings.learn else 0.0
-    friction = [low.T_c / high.J - unknown, static / low.J + unknown]
+    friction = [low.T_c / high.J, static / low.J]
     viscous = [low.f_v / high.J, high.f_v / low.J]
     braking = [current * m + friction[0] for m in motor]
 
@@ -161,30 +156,6 @@ def test_a_law_s_numbers_are_those_of_their_definitions(kind: dict[str, Any]) ->
     for _ in range(4):
         bench = taken(drawn_bench(rng), **kind)
         assert make_law(bench)._asdict() == pytest.approx(defined(bench), rel=1e-12)
-
-
-def test_a_velocity_that_is_better_known_shortens_all_of_the_landing_but_the_time_in_which_no_hop_is_begun() -> None:
-    """A hop begins anew with the noise of a measurement, and comes to rest by friction from it."""
-    brakes = SHIPPED.range_set("envelope")
-    inputs = design_inputs(SHIPPED)
-    part = whole(inputs)._replace(velocity_noise=0.5)
-    known, measured = law_of(inputs, brakes.low, brakes.high, part), make_law(SHIPPED)
-    friction = brakes.low.T_c / brakes.low.J
-    assert known.rest_velocity == pytest.approx(0.5 + 5.0)
-    assert measured.reserve - known.reserve == pytest.approx(2.0 * (6.0 - 0.5) / friction)
-    assert known.settling == measured.settling == pytest.approx((2.0 * 6.0 + 5.0) / friction)
-
-
-def test_a_model_error_that_friction_does_not_hold_is_refused() -> None:
-    brakes = SHIPPED.range_set("envelope")
-    least = brakes.low.T_c / brakes.high.J
-    learning = {"learn": True, "current_error": 0.0}
-    assert make_law(taken(SHIPPED, **learning, model_error=0.9 * least))
-    for error in (least, 1.5 * least):
-        said = f"less than the least friction of the set 'envelope', 1121 rad/s², got {error:g}"
-        with pytest.raises(BenchFileError, match=said):
-            make_law(taken(SHIPPED, **learning, model_error=error))
-    assert make_law(taken(SHIPPED, model_error=1.5 * least)) == make_law(SHIPPED)  # declared for learning only
 
 
 # --- Refusals: just inside the inequality a law is made, just outside the bench is refused for it --------------------
@@ -401,21 +372,10 @@ def test_the_stoppable_velocity_is_the_greatest_whose_way_the_room_allows(seed: 
 @pytest.mark.parametrize("seed", range(5))
 def test_where_the_current_lags_in_a_short_stroke_the_strongest_brake_limits_the_speed(seed: int) -> None:
     bench = taken(drawn_bench(Random(seed)), angle_low=-0.45, current_lag=2e-3)
-    low, high = bench.ranges["drawn"].low, bench.ranges["drawn"].high
-    inputs = design_inputs(bench)
-    law, expected = law_of(inputs, low, high, whole(inputs)), defined(bench)
+    law, expected = law_of(bench), defined(bench)
     assert law.homeward_speed == pytest.approx(expected["homeward_speed"], rel=1e-9)
-    weakest = law_of(inputs, low, high._replace(k_m=low.k_m), whole(inputs))
+    weakest = law_of(taken(bench, high_k_m=bench.ranges["drawn"].low.k_m))
     assert law.homeward_speed < weakest.homeward_speed - 1.0
-
-
-def test_the_way_home_is_planned_with_no_more_than_the_speed_that_is_set() -> None:
-    bench = drawn_bench(Random(5))
-    low, high = bench.ranges["drawn"].low, bench.ranges["drawn"].high
-    inputs = design_inputs(bench)
-    slow = law_of(inputs, low, high, whole(inputs)._replace(planned_speed=50.0))
-    assert slow.cruise == 50.0
-    assert slow.homeward_speed == make_law(bench).homeward_speed
 
 
 def test_no_velocity_is_stoppable_in_a_room_that_this_sample_uses_up() -> None:
