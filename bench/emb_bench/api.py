@@ -40,7 +40,6 @@ if TYPE_CHECKING:  # scipy, numba, matplotlib and pyarrow come with the extra [b
     from emb_bench.analysis.study import Study, StudyOptions
     from emb_bench.batch.summary import Campaign
     from emb_bench.design.report import Report
-    from emb_bench.export.repair import Repaired
     from emb_bench.information.evaluation import Evaluation
     from emb_bench.report.content import Content
     from emb_bench.report.runs import RunTiming
@@ -48,7 +47,7 @@ if TYPE_CHECKING:  # scipy, numba, matplotlib and pyarrow come with the extra [b
 
 __all__ = [
     *("Run", "campaign", "design", "draw", "estimate", "export", "fisher_information", "info", "open_run"),
-    *("repair", "report", "rerun", "simulate", "timing", "topic"),
+    *("report", "rerun", "simulate", "timing", "topic"),
 ]
 
 Source = RunLog | str | Path
@@ -211,29 +210,6 @@ def export(
     from emb_bench.export.export import write
 
     return write(_opened(run), Path(output), topic, _text_of(theta))
-
-
-def repair(run: str | Path, output: str | Path) -> Repaired | None:
-    """Write what is left of a cut or damaged log as a finished one that viewers open.
-
-    The new file has a summary, indexes and checksums. Topics, schemas, times, sequence numbers, attachments and
-    metadata stay as they were. The file says in itself what is missing, so that nothing takes it for a complete log. Of
-    a whole log nothing is written.
-
-    Args:
-        run: MCAP file of emb-run.
-        output: log to write.
-
-    Returns:
-        What is missing, and the number of messages that were saved; None if the log is whole and nothing was written.
-
-    Raises:
-        UsageError: a file cannot be read or written.
-        LogError: not one message is left.
-    """
-    from emb_bench.export import repair as mending
-
-    return mending.repair(Path(run), Path(output))
 
 
 def rerun(run: Source) -> Rerun:

@@ -98,7 +98,6 @@ LOG_COMMANDS = (
     ("emb-replay", "fim", "FILE"),
     ("emb-replay", "timing", "FILE"),
     ("emb-replay", "estimate", "FILE", "--params", "f_v"),
-    ("emb-replay", "repair", "FILE", "-o", "OUT.mcap"),
     ("emb-replay", "export", "FILE", "-o", "OUT.csv"),
     ("emb-replay", "rerun", "FILE"),
 )
@@ -332,7 +331,7 @@ def log_bytes(dice: random.Random, honest: bytes) -> bytes:
                 kinds = (Opcode.METADATA, Opcode.ATTACHMENT, Opcode.SCHEMA, Opcode.CHANNEL)
                 records.insert(at, (dice.choice(kinds), blind(dice, body)))
             case 7:
-                name = dice.choice(("emb.run", "emb.end", "emb.truth", "emb.repair", "\x1b[31m", "x" * 10_000))
+                name = dice.choice(("emb.run", "emb.end", "emb.truth", "\x1b[31m", "x" * 10_000))
                 key = dice.choice(("steps", "purpose", "iface", "bench_name", "f_v", "missing", "tool", "\u202e"))
                 records.insert(
                     -1 if dice.randrange(2) else at, (Opcode.METADATA, metadata(name, {key: str(dice.choice(JUNK))}))

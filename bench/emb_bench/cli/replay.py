@@ -118,18 +118,6 @@ def _rerun(args: argparse.Namespace) -> int:
     return EXIT_DONE if again.reproduced else EXIT_CHECK_FAILED
 
 
-def _repair(args: argparse.Namespace) -> int:
-    found = api.repair(**given(args, api.repair))
-    missing, kept = ((), None) if found is None else found
-    written = None if found is None else str(args.output)
-    document = {"log": str(args.run), "written": written, "missing": "; ".join(missing), "messages": kept}
-    said = f"{args.run}: the log is whole: nothing to repair, and nothing was written"
-    if found is not None:
-        said = "\n".join([f"{args.output}: {kept} messages saved", *(f"missing  {what}" for what in missing)])
-    answer(args, lambda: document, lambda _: said)
-    return EXIT_DONE
-
-
 def _info(args: argparse.Namespace) -> int:
     document = api.info(args.run)
     answer(args, lambda: document, lambda verbose: runs.info(document, verbose=verbose))
@@ -202,7 +190,6 @@ COMMANDS: Mapping[str, Command] = {
     "info": Command(api.info, _info, OF_A_LOG),
     "timing": Command(api.timing, _timing, CHECKED),
     "rerun": Command(api.rerun, _rerun, (*CHECKED, EXIT_POLICY_REFUSED)),
-    "repair": Command(api.repair, _repair, OF_A_LOG),
     "export": Command(api.export, _export, OF_A_LOG),
     "live": Command(live, _live, (EXIT_DONE, EXIT_USAGE, EXIT_LOG)),
 }

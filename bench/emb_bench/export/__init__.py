@@ -1,1 +1,1 @@
-"""Logs in the formats of other tools, and repair of damaged logs."""
+"""Logs in the formats of other tools."""

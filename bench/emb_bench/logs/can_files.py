@@ -18,7 +18,7 @@ from can.typechecking import StringPathLike
 from google.protobuf.message import DecodeError
 from mcap import records as mcap
 
-from emb_bench.logs.log import reported_missing
+from emb_bench.logs.log import missing_in
 from emb_bench.logs.mcap_file import McapFile
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.log.recorder_process import RUN
@@ -60,8 +60,11 @@ class McapReader(MessageReader):
                     yield self._message(message, received[message.channel_id], bus)
                 lost += message.channel_id not in log.channels
         if lost:
-            log.name_missing(f"{lost} messages of a topic whose description is lost, or comes later: repair the log")
-        self.missing = (*log.missing, *reported_missing(log.metadata))
+            log.name_missing(
+                f"{lost} messages of a topic whose description is lost, or comes later: "
+                "emb-replay export --topic /can/rx -o FILE.csv finds a later one"
+            )
+        self.missing = missing_in(log)
         for what in self.missing:
             logging.getLogger(__name__).warning("%s: %s", self._path, what)
 

@@ -46,9 +46,6 @@ from emb_runtime.system.input_file import open_regular
 Table = Mapping[str, NDArray[Any]]
 """One topic: its fields as columns, ``publish_time`` and ``log_time`` [Unix ns], and ``order`` in the file."""
 
-REPAIR = "emb.repair"
-"""Metadata of a log that ``emb-replay repair`` made: what is ``missing``, and ``source_sha256`` of the damaged one."""
-
 BATCH = 2 << 20  # Unpacked bytes that are decoded at a time
 SMALL_TABLE = 64 << 20  # Size of a table that any log may have [bytes]
 TABLE = 16  # Times the size of the file by which it may be larger; the cycles of a log take about the size of its file
@@ -400,7 +397,7 @@ def read_log(path: str | Path) -> RunLog:
         why = "; ".join(contents.missing) or "it holds none"
         raise LogError(f"{path}: not one message is left in this log: {why}")
     topics = _topics(path, contents, counts)
-    missing = [*contents.missing, *reported_missing(contents.metadata)]
+    missing = missing_in(contents)
     return RunLog(
         path=path,
         complete=not missing,
@@ -427,15 +424,10 @@ def end_detail(end: Mapping[str, str]) -> str:
     return "; ".join(filter(None, (end.get("detail", ""), stopped)))
 
 
-def reported_missing(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
-    """Descriptions of the parts that a log itself reports as missing."""
-    reported = []
-    dropped = metadata.get("emb.end", {}).get("dropped_records", "0")
-    if dropped != "0":
-        reported.append(f"{dropped} records were dropped while recording")
-    if REPAIR in metadata:
-        reported.append(f"this log was repaired; of the damaged one: {metadata[REPAIR].get('missing', 'not said')}")
-    return reported
+def missing_in(log: McapFile) -> tuple[str, ...]:
+    """Descriptions of the missing parts of a log that was read: what is damaged, and what it itself reports."""
+    dropped = log.metadata.get("emb.end", {}).get("dropped_records", "0")
+    return (*log.missing, *((f"{dropped} records were dropped while recording",) if dropped != "0" else ()))
 
 
 def _topics(path: Path, contents: McapFile, counts: Mapping[int, int]) -> dict[str, _Topic]:

@@ -11,12 +11,12 @@ import can
 import can.logconvert
 import pytest
 
-from emb_bench.export.repair import repair
 from emb_bench.logs.can_files import McapReader
 from emb_bench.logs.log import read_log
 from emb_runtime.log.ring_buffer import FrameRecord
 from emb_runtime.records import Frame
 
+from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import WALL, square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
 
@@ -92,11 +92,18 @@ def test_a_log_can_be_read_twice_and_a_cut_one_as_far_as_it_goes(
         assert part == whole[: len(part)]
         assert len(reader.missing) == 1
         assert f"{cut}: the file is cut at byte" in caplog.text
-    fixed = tmp_path / "fixed.mcap"
-    repair(cut, fixed)
-    with McapReader(fixed) as reader:
-        assert facts(reader) == part
-        assert "this log was repaired" in reader.missing[0]
+
+
+def test_a_log_without_its_first_chunk_has_no_frames_and_the_command_that_finds_them_is_named(
+    path: Path, tmp_path: Path, replay: Replay
+) -> None:
+    data = path.read_bytes()
+    at = data.index(b"zstd") + 40  # inside the first chunk, which describes the topics
+    path.write_bytes(data[:at] + b"\x00\x00\x00" + data[at + 3 :])
+    with McapReader(path) as reader:
+        assert list(reader) == []
+    assert "emb-replay export --topic /can/rx -o FILE.csv" in reader.missing[-1]
+    assert "rows of /can/rx" in replay.text("export", path, "--topic", "/can/rx", "-o", tmp_path / "FILE.csv")
 
 
 def test_the_base_install_is_enough_and_the_parsers_do_not_load_python_can(path: Path) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from emb_bench.export.repair import repair
 from emb_bench.logs.can_files import McapReader
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import load_layout
@@ -91,11 +90,7 @@ def test_a_cut_log_without_its_first_chunk_is_refused(path: Path) -> None:
         read_log(path)
 
 
-def repaired(path: Path) -> object:
-    return repair(path, path.with_name("repaired.mcap"))
-
-
-READERS: tuple[Callable[[Path], object], ...] = (read_log, repaired, McapReader)
+READERS: tuple[Callable[[Path], object], ...] = (read_log, McapReader)
 
 
 @pytest.mark.parametrize("read", READERS)
