@@ -40,7 +40,7 @@ class RandomMapping:
             ((draw.randrange(300, 700), False), (draw.randrange(1 << 29), True))
         )
         self.signals: list[tuple[str, int, int]] = []
-        bit = self._header(draw)
+        bit = self._header()
         self.is_float = draw.random() < 0.3 and bit <= 32
         self.length = 32 if self.is_float else draw.randint(11, min(32, 64 - bit - 8))
         start = bit + draw.randint(0, 64 - bit - self.length)
@@ -57,7 +57,7 @@ class RandomMapping:
         self.dbc = self._dbc()
         self.toml = self._toml()
 
-    def _header(self, draw: random.Random) -> int:
+    def _header(self) -> int:
         """Place checksum and counter; the first bit that is free, counted along the bus."""
         if self.kind == "none":
             return 0

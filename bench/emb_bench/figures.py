@@ -12,7 +12,6 @@ from emb_bench.output import replacing
 from emb_runtime.errors import UsageError
 
 # Blue, orange, green, pink, sky, yellow of Okabe and Ito: distinguishable by colour-blind eyes too.
-ENDINGS = (".png", ".pdf", ".svg")  # Of figures
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 GREY = "#888888"
 STYLE: Any = {

@@ -72,7 +72,7 @@ def read_experiment(log: RunLog, bench: Bench | None = None, name: str = "") -> 
     delay = int(np.argmin(wrong if log.drive_files is None else squares))
     periods, lost = len(counted), int((~counted).sum())
     currents = _acted(log, bench, samples, by_charge, delay, within)
-    angle, velocity, slack = _start(log, bench, samples)
+    angle, velocity, slack = _start(log, bench)
     reported = counted | np.isfinite(by_charge[1:])
     told = int(np.isfinite(by_charge).sum())
     return Experiment(
@@ -162,7 +162,7 @@ def _brakes(bench: Bench, velocity: Floats) -> Floats:
     return np.nan_to_num([damped_current(v, limit, damping_velocity) for v in velocity.tolist()])
 
 
-def _start(log: RunLog, bench: Bench, samples: Samples) -> tuple[float, float, float]:
+def _start(log: RunLog, bench: Bench) -> tuple[float, float, float]:
     """Angle [rad], velocity [rad/s], and standard deviation of the angle [rad] before the experiment.
 
     A resting brake has rested since the node was idle: its samples are averaged.

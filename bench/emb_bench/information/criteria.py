@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -36,7 +36,6 @@ from emb_bench.information.symmetric import (
 from emb_runtime.errors import UsageError
 
 Name = Literal["D", "A", "E"]
-NAMES: tuple[Name, ...] = get_args(Name)
 
 FLOOR = 1e-13
 """Eigenvalues below this share of the largest count as this share: a singular start still has a slope to climb."""
@@ -140,7 +139,7 @@ def criteria_series(matrices: Floats, params: Sequence[str], interest: Sequence[
 
 @dataclass(frozen=True)
 class Criterion:
-    """One of the criteria of :data:`NAMES`: a concave function of the Fisher information, which a search maximises."""
+    """One of the criteria D, A and E: a concave function of the Fisher information, which a search maximises."""
 
     name: Name
 

@@ -18,7 +18,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from emb_bench import numbers
-from emb_bench.analysis.study import Study
 from emb_bench.config.bench import QUANTILES
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import METHODS
@@ -222,13 +221,13 @@ def document(content: Content) -> dict[str, Any]:
             "why_no_estimate": content.why_not,
             "left_out": [{"log": path, "why": why} for path, why in content.left_out],
             "estimate": None if study is None else estimate_document(study),
-            "runs": [_run_document(run, study) for run in content.runs],
+            "runs": [_run_document(run) for run in content.runs],
         }
     )
     return found
 
 
-def _run_document(run: Run, study: Study | None) -> dict[str, Any]:
+def _run_document(run: Run) -> dict[str, Any]:
     found: dict[str, Any] = {
         "began": run.began,
         "simulated": run.simulated,

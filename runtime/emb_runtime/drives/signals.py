@@ -92,7 +92,6 @@ def physical_value(field: Field, data: bytes) -> float:
     return float(value * field.scale + field.offset)
 
 
-KINDS = ("none", "profile1", "profile2", "profile5", "xor", "sum")
 MODULI = {"profile1": 15, "profile2": 16, "profile5": 256}  # Number of values of the counter, where the profile says so
 DATA_IDS = {"profile1": 1, "profile2": 16, "profile5": 1}
 """Number of data ids of a message: profile 2 has one for each value of the counter."""

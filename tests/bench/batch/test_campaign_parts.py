@@ -174,7 +174,7 @@ def test_the_rows_are_a_csv_file_where_the_name_says_so(tmp_path: Path) -> None:
 
 HOUR = 3600 * 10**9
 FIRST = 1_700_000_000 * 10**9
-TRUE, DEVIATION = 0.0217, 1e-5  # k_m at the begin, and the standard deviation of an estimate, relative
+DEVIATION = 1e-5  # Relative standard deviation of an estimate of k_m
 OPTIONS = Options(params=("k_m",))
 
 

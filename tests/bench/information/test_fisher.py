@@ -49,11 +49,6 @@ def of(
     return fisher(BENCH, p, currents, kind=kind, params=params, plant=BENCH.plant(plant), **more)
 
 
-def physical(currents: Floats) -> Floats:
-    """FIM of the nominal Euler brake."""
-    return of(currents, plant="euler").matrix
-
-
 def test_the_weights_are_those_of_the_thesis_and_of_the_sensors() -> None:
     assert thesis_weights(BENCH.noise, BENCH.limits) == pytest.approx((100.0, 1.0 / 250000.0), rel=1e-12)
     assert physical_weights(BENCH.noise) == pytest.approx((1e6, 1.0), rel=1e-12)

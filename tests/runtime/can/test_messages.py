@@ -33,7 +33,6 @@ from tests.independent import DATABASE, protected
 
 LAYOUT = load_layout()
 MESSAGES = list(LAYOUT.known)
-COUNTERS = st.integers(0, 14)
 
 COMMAND = CurrentCommand(counter=3, answers=2, current=-5.5, enable=True)
 # Worked by hand from the DBC; the CRC byte from an independent library.

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_runtime.can.messages import Layout, StopReason, load_layout
+from emb_runtime.can.messages import StopReason
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
 from emb_runtime.control.actor import Still, homing_steps
 from emb_runtime.control.core import HOME_PAIRS
@@ -23,7 +23,6 @@ from tests.conftest import SimRun, Simulate
 from .test_faults import assert_within_limits
 
 BENCH: Bench = load_bench()
-LAYOUT: Layout = load_layout()
 LAW = make_law(BENCH)
 BOX = BENCH.range_set(BENCH.shield.ranges)
 CORNER = st.tuples(*(st.sampled_from((getattr(BOX.low, name), getattr(BOX.high, name))) for name in PARAMETER_NAMES))
