@@ -403,7 +403,7 @@ def read_log(path: str | Path) -> RunLog:
         complete=not missing,
         missing=terminal.one_line("; ".join(missing)),
         metadata=contents.metadata,
-        attachments={name: attachment.data for name, attachment in contents.attachments.items()},
+        attachments=contents.attachments,
         size=size,
         span=(min(first for first, _ in spans), max(last for _, last in spans)),
         chunks=Chunks(path, places),

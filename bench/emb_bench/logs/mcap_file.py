@@ -79,7 +79,7 @@ class Chunk(NamedTuple):
         return [self.data[a:b] for a, b in zip((begin + HEADER.itemsize).tolist(), ends.tolist(), strict=True)]
 
     def messages(self) -> Iterator[mcap.Message]:
-        """The messages one by one, for copying or conversion."""
+        """The messages one by one, for conversion."""
         ends = self.at + RECORD.size + self.headers["length"].astype(np.int64)
         for begin, end, header in zip(self.at.tolist(), ends.tolist(), self.headers.tolist(), strict=True):
             _, _, channel, sequence, log_time, publish_time = header
@@ -92,11 +92,10 @@ class McapFile:
     def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
         self._path, self._file, self._size = path, file, size
         # What the chunks read so far, and the records between them, hold:
-        self.header = mcap.Header("", "")
         self.schemas: dict[int, mcap.Schema] = {}
         self.channels: dict[int, mcap.Channel] = {}
         self.metadata: dict[str, dict[str, str]] = {}
-        self.attachments: dict[str, mcap.Attachment] = {}
+        self.attachments: dict[str, bytes] = {}
         self.missing: list[str] = []
         self._carried = 0  # bytes of attachments and metadata
         self._crc: int | None = zlib.crc32(MAGIC)  # over the data, then the summary; None if some of it was left out
@@ -161,7 +160,7 @@ class McapFile:
         chunk = None
         match opcode:
             case Opcode.HEADER:
-                self.header = mcap.Header.read(stream_of(body))
+                mcap.Header.read(stream_of(body))  # for its damage
             case Opcode.CHUNK:
                 chunk = unpack_chunk(body)
                 self._describe(*chunk.described)
@@ -175,7 +174,7 @@ class McapFile:
                 _require(zlib.crc32(body[:-4]) == int.from_bytes(body[-4:], "little"), "its checksum is wrong")
                 attachment = mcap.Attachment.read(stream_of(body))
                 self._carry(len(body))
-                self.attachments[attachment.name] = attachment
+                self.attachments[attachment.name] = attachment.data
             case Opcode.DATA_END:
                 self._data_ended = True
                 expected = mcap.DataEnd.read(stream_of(body)).data_section_crc
