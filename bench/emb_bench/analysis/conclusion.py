@@ -19,7 +19,9 @@ import numpy as np
 from emb_bench.analysis.drift import Drift
 from emb_bench.analysis.profile import Profile
 from emb_bench.brake.motion import Floats
+from emb_bench.brake.parameters import least
 from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.intervals import bounded
 from emb_bench.estimate.intervals import interval as with_profile
 from emb_bench.estimate.records import NORMAL_95, Unknown
 from emb_bench.information.identifiability import GROSS, Doubt, Finding, Spectrum
@@ -97,6 +99,7 @@ def conclude(
         if one is not None:
             holds, biased = e.validation.fits and e.method == "oem", bool(e.open().any())
             interval = with_profile(interval, one.interval, closed=one.doubt is None, holds=holds, biased=biased)
+        interval = bounded(interval, value, least(unknown.name))
         gross = GROSS.get(unknown.name, 1.0)
         finding = findings.get(label)
         if finding is None:  # of a single record
@@ -157,6 +160,8 @@ def _further_doubts(
 ) -> tuple[Doubt, ...]:
     """Reasons that an unknown is not identified beside those of the information."""
     doubts = [] if profile is None or profile.doubt is None else [profile.doubt]
+    if doubts in ([Doubt.OPEN_BELOW], [Doubt.OPEN_ABOVE]) and interval == (-math.inf, math.inf):
+        doubts = [Doubt.FLAT]
     if label in e.at_bound:
         doubts.append(Doubt.AT_BORDER)
     if not doubts and finding.identified and unknown.relative and interval[0] <= 0.0 <= interval[1]:

@@ -19,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.brake.motion import Floats
+from emb_bench.brake.parameters import least
 from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.intervals import bounded
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import NORMAL_95, End, searched
@@ -139,7 +141,7 @@ def profile(e: Estimate, label: str) -> Profile:
         rise=np.array([point.rise for point in points]),
         interval=interval,
         doubt=doubt,
-        fisher=(minimum - half, minimum + half),
+        fisher=bounded((minimum - half, minimum + half), minimum, least(e.unknowns[i].name)),
         minimum=minimum,
         fell=first.cost - end.cost if end.cost < first.cost - BETTER else 0.0,
     )

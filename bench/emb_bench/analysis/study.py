@@ -18,10 +18,11 @@ from emb_bench.analysis.held_out import HeldOut, leave_one_out
 from emb_bench.analysis.model_choice import ModelChoice, choose_model
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.several_runs import Differing, apart
+from emb_bench.brake.parameters import least
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY, Plant
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.intervals import union
+from emb_bench.estimate.intervals import bounded, union
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import SAME
 from emb_bench.estimate.records import DONE, STARTS, End, EstimationProblem, Suspect, Unknown, with_systematic
@@ -319,8 +320,10 @@ def covering(
     """Conclusions whose intervals cover all models that the records do not tell apart."""
     if choice is None or len(choice.left_over) < 2:
         return tuple(conclusions)
-    wide = [choice.interval(unknown) for unknown in unknowns]
-    return tuple(replace(c, interval=union(c.interval, other)) for c, other in zip(conclusions, wide, strict=True))
+    return tuple(
+        replace(c, interval=bounded(union(c.interval, choice.interval(unknown)), c.value, least(unknown.name)))
+        for c, unknown in zip(conclusions, unknowns, strict=True)
+    )
 
 
 def _check_different(records: Sequence[Experiment]) -> None:

@@ -9,6 +9,7 @@ A machine that is no brake has names and units of its own: a linear servo has a 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -198,6 +199,18 @@ PARAMETERS: Mapping[str, Parameter] = {
         addition="lag of the current",
     ),
 }
+
+CURVED = ("quadratic", "cubic")
+"""Relative parameters that may be negative."""
+
+
+def least(name: str) -> float:
+    """Least value that a brake can have, SI units."""
+    row = PARAMETERS[name]
+    if not row.relative or name in CURVED:
+        return -math.inf
+    return 1.0 if name == "break_away" else 0.0
+
 
 _index = list(PARAMETERS).index
 K_M = _index("k_m")

@@ -13,7 +13,7 @@ import numpy as np
 
 from emb_bench.analysis.model_choice import fit_from
 from emb_bench.analysis.model_growth import grow_model
-from emb_bench.brake.parameters import FEATURES
+from emb_bench.brake.parameters import FEATURES, least
 from emb_bench.commission.records import CurrentCheck, FirstMove, Identification
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
@@ -134,7 +134,8 @@ def identify(logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identific
     names = [unknown.name for unknown in e.unknowns]
     half = NORMAL_95 * e.between_runs() * e.scale
     values = dict(zip(names, e.values.tolist(), strict=True))
-    intervals = dict(zip(names, np.stack([e.values - half, e.values + half], axis=1).tolist(), strict=True))
+    lows = np.maximum(e.values - half, list(map(least, names)))
+    intervals = dict(zip(names, np.stack([lows, e.values + half], axis=1).tolist(), strict=True))
     lag = intervals.get("current_lag", (0.0, 0.0))
     return Identification(
         values={name: values[name] for name in PARAMETER_NAMES},

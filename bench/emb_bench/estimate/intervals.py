@@ -6,9 +6,12 @@
 4. *The likelihood profile*, where one was made, takes the interval's place if it is not closed, or if its assumptions
    hold: the model fits, and the method is output error. Beside a bias by rule 2 the union of both counts.
 5. *Several models* that the records do not tell apart: the union with the interval of their mixture.
+6. *What a brake can have*: an interval ends at the least value that is possible.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -38,6 +41,14 @@ def interval(gaussian: Interval, profile: Interval, *, closed: bool, holds: bool
     if closed and not holds:
         return gaussian
     return union(gaussian, profile) if biased else profile
+
+
+def bounded(interval: Interval, value: float, least: float) -> Interval:
+    """Interval of a value by rule 6; one that excludes nothing that is possible is infinite."""
+    low, high = interval
+    if not -math.inf < low < least <= value:
+        return interval
+    return (-math.inf if math.isinf(high) else least), high
 
 
 def union(one: Interval, other: Interval) -> Interval:

@@ -126,7 +126,7 @@ def _judged(m: ModelValidation, disturbance: Disturbance | None) -> ModelValidat
     return replace(
         m,
         alarming=alarming,
-        suspected=tuple(s for s in m.suspects if f"score of {s.name}" in alarming),
+        suspected=tuple(s for s in m.suspects if s.possible and f"score of {s.name}" in alarming),
         coloured=tuple(coloured),
         disturbance=disturbance if disturbance is not None and disturbance.p_value < share else None,
     )

@@ -181,6 +181,7 @@ class Suspect:
     value: float  # First-order estimate, in the unknown's unit; relative for a parameter
     sigmas: float
     p_value: float = 1.0  # Chance of as much of it if the model is right
+    possible: bool = True  # A brake can have this amount
 
 
 @dataclass(frozen=True)
@@ -228,7 +229,7 @@ class ModelValidation:
     suspects: tuple[Suspect, ...]  # Most suspicious first
     budget: tuple[Contribution, ...]  # Effects that the total allows for
     together: JointScore | None  # None without a suspect
-    suspected: tuple[Suspect, ...] = ()  # Those that an alarm is about
+    suspected: tuple[Suspect, ...] = ()  # Those of a possible amount that an alarm is about
     alarming: frozenset[str] = frozenset()
     """Tests that reject the model: ``size``, ``scores``, and ``current of``, ``whiteness of``, ``score of`` a name."""
     coloured: tuple[str, ...] = ()  # Outputs whose residuals are correlated in time

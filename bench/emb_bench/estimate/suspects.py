@@ -13,6 +13,7 @@ disturbance, drifts may be larger, by ``DISTURBED``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -21,11 +22,22 @@ import numpy as np
 from scipy import special
 
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.parameters import PARAMETERS, SI, Parameter, Quantity, quantity
+from emb_bench.brake.parameters import CURVED, PARAMETERS, SI, Parameter, Quantity, quantity
+from emb_bench.config.bench import Bench
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import EXACT, Mechanics
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import ANGLE_SCALE, DRIFTS, Contribution, JointScore, Suspect, has_time_for_a_delay
+from emb_bench.estimate.records import (
+    ANGLE_SCALE,
+    DRIFTS,
+    FACTOR,
+    Contribution,
+    JointScore,
+    Suspect,
+    Unknown,
+    has_time_for_a_delay,
+    searched,
+)
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 SLOW = 30.0  # Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]
@@ -94,7 +106,9 @@ _CLAMP = "clamp some times before the run, or use a shorter one"
 _WARM = "begin when all that moves is warm, or use a shorter run"
 EFFECTS: Mapping[str, Parameter] = {
     **{name: row for name, row in PARAMETERS.items() if row.effect},
-    "velocity_lag": Parameter("s", effect="a velocity that lags, as an observer's does", remedy=_PLANT, positive=True),
+    "velocity_lag": Parameter(
+        "s", high=0.1, effect="a velocity that lags, as an observer's does", remedy=_PLANT, positive=True
+    ),
     **{
         name: Parameter("", effect=f"a change of {name.removesuffix('_drift')} over the run", remedy=remedy)
         for name, remedy in zip(DRIFTS, (_COOL, _CLAMP, _WARM, _WARM), strict=True)
@@ -105,6 +119,25 @@ ALONE = DRIFTS[1:]
 """Effects that are no part of the test of all together, which noise with a slow colour would fail by them."""
 OF_THE_SPRING = ("k_1", "k_1_drift", "contact", "play", "f_l", "quadratic", "cubic", "hysteresis")
 """Effects that a machine without a spring cannot have."""
+
+
+def possible(name: str, bench: Bench) -> tuple[float, float]:
+    """Least and greatest amount of an effect that a brake can have.
+
+    No constant changes its sign or by more than is searched, nor does any drift over a run by more than its size. No
+    curvature lets the clamp pull. Whole samples of a delay are not searched, yet possible.
+    """
+    if name in DRIFTS:
+        return -1.0, 1.0
+    row, farthest = EFFECTS[name], max(map(abs, bench.limits.angle))
+    if name in CURVED:
+        return -(farthest ** (-1.0 if name == "quadratic" else -2.0)), row.high
+    if row.positive:
+        return 0.0, row.high - row.low
+    if row.relative:
+        return -1.0, FACTOR - 1.0
+    low, high = searched(bench, Unknown(name))
+    return low, math.inf if name == "delay" else high
 
 
 def held(problem: Problem) -> tuple[str, ...]:
@@ -247,7 +280,8 @@ def score(
         amount, sigmas = float(beside @ errors) / length**2, float(beside @ errors) / length
         away = sigmas / max(ratio, 1.0) ** 0.5
         p = float(special.ndtr(-away) if EFFECTS[name].positive else 2.0 * special.ndtr(-abs(away)))
-        found.append(Suspect(name, amount, sigmas / max(ratio, 1e-300) ** 0.5, p))
+        low, high = possible(name, problem.bench)
+        found.append(Suspect(name, amount, sigmas / max(ratio, 1e-300) ** 0.5, p, possible=low < amount < high))
     if not found:
         return (), tuple(budget), None
     axes, values, _ = np.linalg.svd(np.stack(beside_all, axis=1), full_matrices=False)

@@ -84,7 +84,11 @@ def _limits(study: Study) -> Iterator[str]:
     if by:
         yield "limited by  " + "; ".join(f"{name} ({', '.join(labels)})" for name, labels in by.items())
     if tested := e.validation.suspects:
-        hints = [f"{s.name} {signed(s.sigmas, '+.1f')}" for s in tested if abs(s.sigmas) >= NOTICED and s.p_value < 0.5]
+        hints = [
+            f"{s.name} {signed(s.sigmas, '+.1f')}"
+            for s in tested
+            if s.possible and abs(s.sigmas) >= NOTICED and s.p_value < 0.5
+        ]
         if not hints:
             yield f"effects     {len(tested)} tested, none above {NOTICED:g} sigma"
         elif not e.validation.suspected:

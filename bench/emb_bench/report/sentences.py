@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
@@ -82,6 +83,8 @@ LACKS = {
 }
 """Parts of an experiment that are missing, with places for their numbers."""
 
+
+EXPLAINS = 3.0  # Standard deviations from which on a parameter that is held fixed may explain a misfit
 
 # ---- an experiment ----
 
@@ -252,16 +255,22 @@ def limit(effect: Contribution, e: Estimate) -> str:
 
 def alarms(e: Estimate) -> list[str]:
     """Reasons for which the model does not fit, an effect that explains it first; empty if it may fit."""
-    m, found = e.validation, list[str]()
-    if m.suspected:
+    m, found, scored = e.validation, list[str](), any(name.startswith("score of") for name in e.validation.alarming)
+    if left := left_fixed(e):
+        names = ", ".join(left)
+        one = f"{names}, which is held fixed," if len(left) == 1 else f"one of {names}, which are held fixed,"
+        found.append(f"{one} may explain it; remedy: estimate {_every(e)}: leave --params out")
+    elif m.suspected:
         found.append(explained(m.suspected[0], e.bench.machine))
+    elif scored:
+        found.append("no effect explains it in an amount that is possible: look for a fault in the data")
     elif m.together is not None and "scores" in m.alarming:
         score = f"chi2 {m.together.statistic:.4g} of {m.together.rank}, {p_value(m.together.p_value)}"
         found.append(f"the model lacks several effects together ({score})")
     depends = [name for name in m.independence if f"current of {name}" in m.alarming]
     if "size" in m.alarming:
         no_pattern = ", without any pattern: the noise may be larger than the bench says"
-        why = "" if depends or m.coloured or m.suspected else no_pattern
+        why = "" if depends or m.coloured or scored else no_pattern
         found.append(f"the residuals are too large: chi2/n {m.ratio:.4g}, at most {m.expected[1]:.3f} expected{why}")
     for name in depends:
         test = m.independence[name]
@@ -272,6 +281,18 @@ def alarms(e: Estimate) -> list[str]:
     if any(f"whiteness of {name}" in m.alarming for name in m.coloured):
         found.append(f"{_coloured(m)}: the disturbance of the brake or its sensors is not white, or the model is wrong")
     return found
+
+
+def left_fixed(e: Estimate) -> list[str]:
+    """Parameters that ``--params`` leaves fixed, and that may each explain a misfit; most suspicious first."""
+    machine, m = e.bench.machine, e.validation
+    usual = PARAMETER_NAMES if machine is None else machine.unknown
+    found = [s.name for s in m.suspects if s.name in usual and abs(s.sigmas) >= EXPLAINS]
+    return [] if m.fits else [quantity(machine, name).name for name in found]
+
+
+def _every(e: Estimate) -> str:
+    return "all four" if e.bench.machine is None else "all parameters"
 
 
 def residual_notes(e: Estimate) -> list[str]:
@@ -426,7 +447,8 @@ MORE = "run emb-run, whose actor excites all four parameters, and estimate from 
 def logs_of(study: Study) -> str:
     """Logs of a study as arguments of a command."""
     end = "" if study.estimate.bench.machine is None else " --map MAP"
-    return " ".join(study.names[:3]) + (" ..." if len(study.logs) > 3 else "") + end
+    paths = [shlex.quote(str(log.path)) for log in study.logs[:3]]
+    return " ".join(paths) + (" ..." if len(study.logs) > 3 else "") + end
 
 
 def remedies(study: Study, *, stopped: bool) -> list[str]:
@@ -446,13 +468,24 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
             return []
         weak = [c.label for c in study.conclusions if not (c.of_interest or c.identified)]
         return [f"estimate without {', '.join(weak)}: not determined by the record"] if weak else [MORE]
+    found = []
+    if left_fixed(e):
+        found.append(f"estimate {_every(e)}: {again}{_options(study)}")
+    otherwise = "if that does not fit either, " if found else ""
     if e.bench.machine is None:
-        found = [f"find a model that explains it: {again} --model all"]
+        found.append(f"{otherwise}find a model that explains it: {again} --model all")
     else:
-        found = ["use the intervals: they come from the scatter of the windows, and do not need a right model"]
+        found.append(f"{otherwise}check signs, units and times in the map")
     if e.method == "oem":
-        found.append("if none does, allow for a disturbance: --method pem")
+        found.append(f"if that does not help, allow for a disturbance: {again} --method pem")
     return found
+
+
+def _options(study: Study) -> str:
+    """Options of a study but those that name unknowns."""
+    wanted, usual = study.options, "oem" if study.estimate.bench.machine is None else "windows"
+    given = {"--method": wanted.method if wanted.method != usual else "", "--model": wanted.model or ""}
+    return "".join(f" {option} {value}" for option, value in given.items() if value)
 
 
 def impact(bench: Bench, speed: float | None, why_not: str) -> str:

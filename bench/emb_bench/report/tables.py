@@ -175,8 +175,12 @@ def suspects(e: Estimate) -> Table | None:
     for s in e.validation.suspects:
         name, unit = shown_as(s, e.bench.machine)
         suggested = f"{plain(s.value)} {unit}" if unit else share(s.value, 3)
+        suggested = suggested if s.possible else NOTHING
         rows.append([name, suggested, signed(s.sigmas, "+.1f"), chance(s.p_value)])
-    title = "Score tests for effects that the model lacks: first-order amount; one-sided p if the effect is positive"
+    title = (
+        "Score tests for effects that the model lacks: first-order amount, if a brake can have it; one-sided p if the "
+        "effect is positive"
+    )
     return Table(title, ["effect", "amount", "sigma", "p"], rows) if rows else None
 
 

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +18,17 @@ from emb_bench.batch.row import Options, Source
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import EstimationProblem
+from emb_bench.estimate.suspects import EFFECTS, possible
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Doubt
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document, text
-from emb_bench.report.sentences import DOUBTS, apart, remedies
+from emb_bench.report.sentences import DOUBTS, alarms, apart, remedies
 from emb_bench.report.sentences import profile as sentence
-from emb_runtime.config.bench import shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import UsageError
 
+from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.bench.measurements import currents_of, fit, record  # isort: skip
 from tests.conftest import Simulate  # isort: skip
@@ -162,3 +166,68 @@ def test_a_nuisance_at_the_border_of_its_search_cuts_the_interval_of_a_parameter
     assert DOUBTS[Doubt.CUT] in sentence(cut, study.estimate)
     (remedy,) = remedies(study, stopped=False)
     assert "quadratic, cubic" in remedy
+
+
+SUBSETS = [chosen for count in (1, 2, 3) for chosen in combinations(PARAMETER_NAMES, count)]
+
+
+@pytest.mark.parametrize("name", PARAMETER_NAMES)
+def test_the_first_remedy_for_each_choice_of_parameters_is_a_command_that_gives_the_brake(
+    bench: Bench, log: Log, replay: Replay, name: str
+) -> None:
+    """One parameter is 40 % larger than nominal; of the 14 proper subsets seven leave it fixed."""
+    run = log(f"plant=exact,seed=3,{name}={1.4 * getattr(bench.brake, name)!r}")
+    commands = set()
+    for chosen in SUBSETS:
+        study = make_study(bench, [run], StudyOptions(EstimationProblem(chosen), starts=1))
+        assert all(s.possible for s in study.estimate.validation.suspected)
+        assert all(c.interval[0] in (-np.inf, 0.0) or c.interval[0] > 0.0 for c in study.conclusions)
+        assert study.holds == (name in chosen)
+        if not study.holds:
+            assert name in alarms(study.estimate)[0]
+            assert alarms(study.estimate)[0].endswith("estimate all four: leave --params out")
+            commands.add(remedies(study, stopped=False)[0].partition(": ")[2])
+    (command,) = commands
+    found = replay.document(*shlex.split(command.removeprefix("emb-replay ")))
+    assert found["model_fits"]
+    assert all(row["interval_95"][0] <= row["true"] <= row["interval_95"][1] for row in found["parameters"].values())
+
+
+def test_a_remedy_keeps_the_model_and_the_method_that_were_asked_for(bench: Bench, log: Log) -> None:
+    run = log("plant=stribeck,f_v=3e-5,seed=2")
+    for options, end in (
+        (StudyOptions(EstimationProblem(("k_1",)), starts=1, model="exact"), " --model exact"),
+        (StudyOptions(EstimationProblem(("k_1",)), "pem", "exact", starts=1), " --method pem --model exact"),
+    ):
+        study = make_study(bench, [run], options)
+        assert remedies(study, stopped=False)[0] == f"estimate all four: emb-replay estimate {run.path}{end}"
+
+
+@pytest.mark.parametrize(
+    ("name", "inside", "beyond"),
+    [
+        ("k_1", (-0.99, 8.9), (-1.0, 9.1)),
+        ("J", (-0.99, 8.9), (-3.0, 9.1)),
+        ("T_c_drift", (-0.99, 0.99), (-3.06, 1.5)),
+        ("delay", (-0.09, 3.5), (-0.2,)),
+        ("velocity_gain", (-0.4, 0.4), (-1.2, 0.6)),
+        ("x2_0", (-400.0, 400.0), (-800.0, 800.0)),
+        ("quadratic", (-0.005, 0.09), (-0.02, 0.2)),
+        ("play", (0.2, 9.0), (-0.1, 11.0)),
+        ("break_away", (0.5,), (-0.1, 4.1)),
+        ("velocity_lag", (1e-3,), (-1e-3, 0.2)),
+    ],
+)
+def test_an_amount_is_possible_if_a_brake_can_have_it(
+    bench: Bench, name: str, inside: tuple[float, ...], beyond: tuple[float, ...]
+) -> None:
+    low, high = possible(name, bench)
+    assert all(low < amount < high for amount in inside)
+    assert not any(low < amount < high for amount in beyond)
+
+
+def test_every_effect_has_possible_amounts_on_both_sides_or_is_positive(bench: Bench) -> None:
+    for name, row in EFFECTS.items():
+        low, high = possible(name, bench)
+        assert high > 0.0
+        assert low == 0.0 if row.positive else low < 0.0

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import numpy as np
 
-from emb_bench.estimate.intervals import deviations, interval, unnoticed
+from emb_bench.brake.parameters import least
+from emb_bench.estimate.intervals import bounded, deviations, interval, unnoticed
 
 
 def test_biases_by_several_effects_add_in_quadrature_and_none_is_zero() -> None:
@@ -33,3 +36,17 @@ def test_a_profile_counts_where_it_is_open_or_its_assumptions_hold() -> None:
     ):
         found = interval(gaussian, profile, closed=closed, holds=holds, biased=biased)
         assert found == expected, (closed, holds, biased)
+
+
+def test_an_interval_ends_at_the_least_value_that_a_brake_can_have() -> None:
+    for name, value, given, expected in (
+        ("k_1", 82.0, (-318.5, inf), (-inf, inf)),
+        ("k_1", 23.0, (-1.0, 47.0), (0.0, 47.0)),
+        ("k_1", 23.0, (22.0, 24.0), (22.0, 24.0)),
+        ("J", 8e-6, (-inf, 3e-5), (-inf, 3e-5)),
+        ("T_c", -0.01, (-0.02, 0.0), (-0.02, 0.0)),  # of a biased method
+        ("break_away", 1.2, (0.7, 1.7), (1.0, 1.7)),
+        ("quadratic", 1e-4, (-1e-4, 3e-4), (-1e-4, 3e-4)),
+        ("offset", 0.1, (-0.2, 0.4), (-0.2, 0.4)),
+    ):
+        assert bounded(given, value, least(name)) == expected, name
