@@ -34,11 +34,11 @@ RELATIVE, ABSOLUTE = 0.02, 1e-9
 SHORT = {
     "fim": 14,
     "estimate-good": 16,
-    "estimate-misfit": 16,
+    "estimate-misfit": 18,
     "estimate-aborted": 16,
     "info": 14,
     "timing": 14,
-    "campaign": 16,
+    "campaign": 17,
     "design": 14,
 }
 """Pages without ``-v``: as wide as a terminal, and at most so many lines."""

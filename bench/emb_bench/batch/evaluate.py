@@ -76,6 +76,7 @@ def _of_the_run(log: RunLog) -> Row:
     cycles, largest = found.cycles, found.largest
     return {
         "start_time": log.span[0],
+        "simulated": bool(log.simulated),
         "exit_reason": printable(log.exit_reason),
         "complete": log.complete,
         "missing": printable(log.missing),

@@ -55,6 +55,7 @@ class Campaign:
     failed: tuple[Row, ...]
     copies: tuple[Row, ...]
     stopped: tuple[Row, ...]
+    simulated: int  # Logs of no real machine
     incomplete: int
     misfit: tuple[Row, ...]  # Logs that the model does not fit
     outside: tuple[Row, ...]  # Logs of brakes for which the limits were not guaranteed
@@ -75,6 +76,7 @@ def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
         failed=tuple(row for row in rows if row["error"] is not None),
         copies=tuple(row for row in good if row.get("copy_of") is not None),
         stopped=tuple(row for row in counted if row.get("exit_reason") not in (None, DONE)),
+        simulated=sum(bool(row.get("simulated")) for row in good),
         incomplete=sum(not row.get("complete") for row in good),
         misfit=tuple(row for row in good if not row.get("fits", row.get("nominal_fits"))),
         outside=tuple(row for row in counted if row.get("outside")),
@@ -155,6 +157,8 @@ def text(c: Campaign, *, verbose: bool = False) -> str:
         f"{len(c.copies)} copies, {c.violating} beyond a limit of the bench, {len(c.misfit)} not explained by the "
         f"model ({', '.join(c.models)})"
     )
+    if c.simulated:
+        lines.append(f"SIMULATED: {c.simulated} of {c.evaluated} logs are not of a real machine")
     outside = ((row["log"], ", ".join(row["outside"])) for row in c.outside[:most])
     lines += listed("OUTSIDE: ", (f"{log}: {names}: the limits were not guaranteed" for log, names in outside))
     lines += listed("NOTE: ", _notes(c) if verbose else ())

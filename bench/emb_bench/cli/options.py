@@ -127,7 +127,7 @@ def _verdict(text: str) -> str:
     for line in text.splitlines():
         if line.startswith("    ") and lines:
             lines[-1] += f" {line.strip()}"
-        elif lines and not lines[-1].startswith(("WARNING", "NOTE", "OUTSIDE")):
+        elif lines and not lines[-1].startswith(("WARNING", "NOTE", "OUTSIDE", "SIMULATED")):
             break
         else:
             lines.append(line)

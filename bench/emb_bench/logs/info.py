@@ -72,6 +72,7 @@ def info_document(log: RunLog) -> dict[str, Any]:
     }
     return {
         "log": str(log.path),
+        "simulated": bool(log.simulated),
         "complete": log.complete,
         "missing": log.missing,
         "exit_reason": log.exit_reason,

@@ -50,6 +50,7 @@ BATCH = 2 << 20  # Unpacked bytes that are decoded at a time
 SMALL_TABLE = 64 << 20  # Size of a table that any log may have [bytes]
 TABLE = 16  # Times the size of the file by which it may be larger; the cycles of a log take about the size of its file
 LONGEST_REASON = 200  # Characters of the reason for a run's end
+LONGEST_BUS = 40  # Characters of the name of a bus
 LARGEST_TEXT = 64 << 10  # Largest bench file and DBC in a log [bytes]
 
 TIMES = ("publish_time", "log_time", "order")  # Columns that every topic has besides its fields
@@ -239,6 +240,15 @@ class RunLog:
     def run(self) -> Mapping[str, str]:
         """The run's identity."""
         return self.metadata.get("emb.run", {})
+
+    @property
+    def simulated(self) -> str:
+        """What was driven in place of a real machine, by what the log says; empty if nothing says so."""
+        bus = self.metadata.get("emb.drive", {}).get("bus") or self.run.get("iface", "")
+        if "emb.truth" in self.metadata or bus.partition(":")[0] == "sim":
+            return "a simulated brake"
+        virtual = bus.startswith(("vcan", "vxcan"))
+        return f"a node on a virtual bus ({terminal.one_line(bus, LONGEST_BUS)})" if virtual else ""
 
     @property
     def drive_lacks(self) -> dict[str, str]:

@@ -94,16 +94,11 @@ class Run:
         return self.log.exit_reason == DONE
 
     @property
-    def simulated(self) -> bool:
-        """Returns True if the brake was simulated."""
-        return "emb.truth" in self.log.metadata
-
-    @property
     def source(self) -> str:
-        """Brake that was driven: a simulated one, or the bench on its interface; or a recording of others."""
+        """What was driven: something simulated, or the bench on its interface; or a recording of others."""
         if self.log.is_recording:
             return "recording of another machine"
-        return "simulated brake" if self.simulated else f"bench on {self.log.run.get('iface', 'an unknown interface')}"
+        return self.log.simulated or f"bench on {self.log.run.get('iface', 'an unknown interface')}"
 
     @property
     def began(self) -> str:
@@ -137,7 +132,19 @@ class Content:
 
     @property
     def verdict(self) -> str:
-        """The report in one line: why a run was stopped, whether the brake was accepted, or whether the model fits."""
+        """The report in one line: why a run was stopped, whether the brake was accepted, or whether the model fits.
+
+        Before it the sentence that the machine was none.
+        """
+        return " ".join(filter(None, (self.simulated, self._verdict)))
+
+    @property
+    def simulated(self) -> str:
+        """That the values are not those of a real machine; empty if no log says so."""
+        return say.simulated([run.log for run in self.reported], [run.name for run in self.reported])
+
+    @property
+    def _verdict(self) -> str:
         if self.stops:
             more = f", and {len(self.stops) - 1} more" if len(self.stops) > 1 else ""
             return f"{'NOT ACCEPTED. ' if self.acceptance else ''}{say.stopped(self.stops[0])}{more}"
@@ -153,12 +160,14 @@ class Content:
         if self.stops or self.outside:
             return "bad"
         if self.acceptance is not None:
-            return {Result.PASS: "good", Result.FAIL: "bad", Result.CANNOT_TELL: "care"}[self.acceptance.result]
+            passed = "care" if self.simulated else "good"
+            return {Result.PASS: passed, Result.FAIL: "bad", Result.CANNOT_TELL: "care"}[self.acceptance.result]
         if self.study is None:
             return "care"
         if not self.study.holds:
             return "bad"
-        return "good" if self.study.identified and all(run.log.complete for run in self.reported) else "care"
+        good = self.study.identified and all(run.log.complete for run in self.reported) and not self.simulated
+        return "good" if good else "care"
 
     @property
     def without_part(self) -> list[str]:

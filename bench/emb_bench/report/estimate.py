@@ -25,7 +25,11 @@ NOTICED = 2.0  # Standard deviations from which on an effect that is no alarm is
 
 def text(study: Study, *, verbose: bool = False) -> str:
     """Verdict, parameters, what limits them, next step; with ``verbose`` the evidence, too."""
-    lines = [*stops(study), *listed("", say.outside(study)), *listed("WARNING: ", say.missing(study))]
+    lines = [
+        *stops(study),
+        *listed("", [*say.outside(study), say.simulated(study.logs, study.names)]),
+        *listed("WARNING: ", say.missing(study)),
+    ]
     if study.aborted and not verbose:
         return "\n".join([*lines, "next: find the cause before the next run   (-v shows values until the stop)"])
     against = list(_against(study))
@@ -138,6 +142,7 @@ def document(study: Study) -> dict[str, Any]:
     e, choice = study.estimate, study.choice
     wanted, validation = e.wanted(), e.validation
     found = {
+        "simulated": any(log.simulated for log in study.logs),
         "method": METHODS[e.method],
         "method_name": e.method,
         "model": e.plant.name,

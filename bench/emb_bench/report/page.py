@@ -214,6 +214,7 @@ def document(content: Content) -> dict[str, Any]:
     found: dict[str, Any] = to_json(
         {
             "number": content.number,
+            "simulated": bool(content.simulated),
             "made_by": content.made_by,
             "acceptance": None if content.acceptance is None else content.acceptance.document(),
             "model_fits": None if study is None else study.model_fits,
@@ -230,7 +231,7 @@ def document(content: Content) -> dict[str, Any]:
 def _run_document(run: Run) -> dict[str, Any]:
     found: dict[str, Any] = {
         "began": run.began,
-        "simulated": run.simulated,
+        "simulated": bool(run.log.simulated),
         "why_not_estimated": run.why_not,
         "sha256": run.log_sha256,
         "info": None if run.log.is_recording else info_document(run.log),

@@ -21,6 +21,7 @@ def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
     """A :func:`emb_bench.logs.info.info_document` for a person; with ``verbose`` all metadata and events."""
     d = _lines(d)
     lines = listed("WARNING: ", [d["missing"]])
+    lines += ["SIMULATED: no real machine was driven"] if d["simulated"] else []
     lines += wrapped(
         f"{d['log']}: {d['exit_reason']}{_why(d['metadata'].get('emb.end', {}))}, {d['duration']:.3f} s, log "
         f"{'complete' if d['complete'] else 'NOT complete'}"

@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.estimate.records import Contribution, ModelValidation, Suspect
     from emb_bench.information.evaluation import Evaluation
     from emb_bench.information.identifiability import Direction, Finding, Identifiability
+    from emb_bench.logs.log import RunLog
 
 INTERVALS = (
     "± 95 % (k=2). Repeatability: scatter of further runs by sensor noise. Total: also systematic errors and effects "
@@ -107,6 +108,17 @@ def taken_for_acted(x: Experiment) -> list[str]:
 
 
 # ---- the verdict on a study ----
+
+
+def simulated(logs: Sequence[RunLog], names: Sequence[str]) -> str:
+    """That values are not those of a real machine; empty if no log says so."""
+    marked = [(name, log.simulated) for name, log in zip(names, logs, strict=True) if log.simulated]
+    if not marked:
+        return ""
+    where = ", ".join(name for name, _ in marked)
+    some = f" in {len(marked)} of {len(logs)} runs ({where})" if len(marked) < len(logs) else ""
+    driven = " and ".join(dict.fromkeys(what for _, what in marked))
+    return f"SIMULATED: the values are of {driven}{some}, not of a real machine."
 
 
 def headline(study: Study) -> str:

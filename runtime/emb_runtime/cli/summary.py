@@ -113,8 +113,9 @@ def header(
         records["emb.preflight"] = {
             line.what: f"{line.verdict}: {line.found} (expected {line.expected})" for line in lines
         }
-    if mapping is not None:
+    if plan.drive is not None and mapping is not None:
         records["emb.drive"] = {"name": mapping.name, "lost": ", ".join(mapping.lost), "sha256": mapping.sha256}
+        records["emb.drive"]["bus"] = plan.drive.bus
         attachments += [
             Attachment("drive.toml", "application/toml", mapping.text.encode()),
             Attachment("drive.dbc", "text/plain", mapping.dbc_text.encode()),

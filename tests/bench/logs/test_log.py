@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,31 @@ def test_a_log_replays_alone(path: Path, run: SimRun) -> None:
     commented = load_layout().text.replace('CM_ "Electro', 'CM_ "An electro')
     assert commented != load_layout().text
     assert read_log(write_log(path, run, dbc=commented)).layout is load_layout()
+
+
+@pytest.mark.parametrize(
+    ("metadata", "driven"),
+    [
+        ({"emb.run": {"iface": "can0"}}, ""),
+        ({"emb.run": {}}, ""),
+        ({}, ""),
+        ({"emb.run": {"iface": "can0"}, "emb.truth": {"f_v": "2e-5"}}, "a simulated brake"),
+        ({"emb.run": {"iface": "sim:f_v=3e-5"}}, "a simulated brake"),
+        ({"emb.run": {"iface": "map:odrive.toml@sim-odrive"}, "emb.truth": {}}, "a simulated brake"),
+        ({"emb.run": {"iface": "vcan0"}}, "a node on a virtual bus (vcan0)"),
+        ({"emb.run": {"iface": "vxcan1"}}, "a node on a virtual bus (vxcan1)"),
+        ({"emb.run": {"iface": "vcan0"}, "emb.drive": {"bus": "can0"}}, ""),  # the bus between gateway and host
+        ({"emb.run": {"iface": "can1"}, "emb.drive": {"bus": "vcan1"}}, "a node on a virtual bus (vcan1)"),
+        ({"emb.run": {"iface": "vcan0"}, "emb.drive": {"bus": ""}}, "a node on a virtual bus (vcan0)"),
+        ({"emb.run": {"iface": "vcan\u202e\x1b" + 99 * "0"}}, f"(vcan\\u202e\\x1b{34 * '0'} … (105 characters))"),
+    ],
+)
+def test_a_log_says_whether_a_real_machine_was_driven_as_far_as_it_knows(
+    path: Path, metadata: dict[str, dict[str, str]], driven: str
+) -> None:
+    log = replace(read_log(path), metadata=metadata)
+    assert log.simulated.endswith(driven)
+    assert bool(log.simulated) == bool(driven)
 
 
 def test_decoded_signals_are_those_of_the_frames(path: Path, run: SimRun) -> None:

@@ -154,6 +154,9 @@ def test_a_wrong_file_is_refused_by_its_key(tmp_path: Path) -> None:
         assert key in str(caught.value)
 
 
+SIMULATED = "SIMULATED: the values are of a simulated brake, not of a real machine."
+
+
 def test_the_command_says_the_result_first_and_has_an_exit_code_for_each(
     tmp_path: Path, folder: Path, replay: Replay
 ) -> None:
@@ -166,15 +169,17 @@ def test_the_command_says_the_result_first_and_has_an_exit_code_for_each(
         return json.dumps(json.loads(page.with_suffix(".json").read_text(encoding="utf-8"))["acceptance"])
 
     assert '"result": "pass"' in said("good.mcap", "parameters.f_v.relative = 0.5", 0, "--strict")
-    assert 'class="banner good" role="alert">ACCEPTED: all 3 criteria passed' in page.read_text(encoding="utf-8")
+    assert f'class="banner care" role="alert">{SIMULATED} ACCEPTED: all 3 criteria passed' in page.read_text(
+        encoding="utf-8"
+    )
     junit = ("--junit", str(tmp_path / "cases.xml"))
     assert '"result": "fail"' in said("good.mcap", "parameters.f_v.relative = 0.1", 1, "--strict", *junit)
-    assert 'class="banner bad" role="alert">NOT ACCEPTED: 1 of 3' in page.read_text(encoding="utf-8")
+    assert f'class="banner bad" role="alert">{SIMULATED} NOT ACCEPTED: 1 of 3' in page.read_text(encoding="utf-8")
     assert '"result": "cannot tell"' in said("good.mcap", "drift.k_m = 0.1", 7, "--strict")
-    assert 'class="banner care" role="alert">CANNOT TELL: 1 of 3' in page.read_text(encoding="utf-8")
+    assert f'class="banner care" role="alert">{SIMULATED} CANNOT TELL: 1 of 3' in page.read_text(encoding="utf-8")
     assert "criteria not decided: drift of k_m" in page.read_text(encoding="utf-8")
     said("aborted.mcap", "model_fit = false", 1, "--strict")
-    assert 'class="banner bad" role="alert">NOT ACCEPTED. STOPPED: ' in page.read_text(encoding="utf-8")
+    assert f'class="banner bad" role="alert">{SIMULATED} NOT ACCEPTED. STOPPED: ' in page.read_text(encoding="utf-8")
     assert str(page) in replay.refused("report", folder / "good.mcap", "-o", page, "--acceptance", page)
     suite = ElementTree.parse(tmp_path / "cases.xml").getroot()  # our own
     assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("3", "1", "0")

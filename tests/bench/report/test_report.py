@@ -83,6 +83,55 @@ def test_the_report_says_what_a_loss_of_all_commands_would_do(folder: Path, simu
     assert 0.965 < float(speed[1]) < 1.5  # a bound: research by simulation found 965 rad/s
 
 
+REAL: dict[str, Any] = {"metadata": {"emb.run": {"steps": "500", "iface": "can0"}}}
+VIRTUAL: dict[str, Any] = {"metadata": {"emb.run": {"steps": "500", "iface": "vcan0"}}}
+
+
+@pytest.mark.parametrize(
+    ("logs", "said"),
+    [
+        ([REAL], ""),
+        ([{}], "SIMULATED: the values are of a simulated brake, not of a real machine."),
+        ([VIRTUAL], "SIMULATED: the values are of a node on a virtual bus (vcan0), not of a real machine."),
+        ([REAL, REAL], ""),
+        ([REAL, {}], "SIMULATED: the values are of a simulated brake in 1 of 2 runs (1.mcap), not of a real machine."),
+        (
+            [{}, VIRTUAL],
+            "SIMULATED: the values are of a simulated brake and a node on a virtual bus (vcan0), not of a real "
+            "machine.",
+        ),
+    ],
+)
+def test_what_is_not_of_a_real_machine_is_marked_on_every_sheet_and_in_every_command(
+    tmp_path: Path, simulate: Simulate, replay: Replay, logs: list[dict[str, Any]], said: str
+) -> None:
+    paths = [
+        write_log(tmp_path / f"{n}.mcap", simulate(square, options=f"plant=exact,seed={n + 1}"), **changes)
+        for n, changes in enumerate(logs)
+    ]
+    estimate = replay.text("estimate", *paths, "--model", "exact", "--starts", "1")
+    assert " ".join(estimate.split()).startswith(said or "The model")
+    assert replay.document("estimate", *paths, "--model", "exact", "--starts", "1")["simulated"] == bool(said)
+    for path, changes in zip(paths, logs, strict=True):
+        assert ("SIMULATED" in replay.text("info", path)) == (changes is not REAL)
+        assert replay.document("info", path)["simulated"] == (changes is not REAL)
+    marked = sum(changes is not REAL for changes in logs)
+    options = ("-o", tmp_path / "rows.csv", "--method", "none", "--jobs", "1")
+    of_campaign = replay.text("campaign", *paths, *options)
+    assert ("SIMULATED" in of_campaign) == bool(said)
+    if said:
+        assert f"SIMULATED: {marked} of {len(logs)} logs are not of a real machine" in of_campaign
+    page = make(tmp_path / "page.html", *paths, "--model", "exact", "--starts", "1")
+    html = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert page.numbers["simulated"] == bool(said)
+    assert page.reader.texts[0].startswith(said or "The model 'exact' fits.")
+    assert (page.reader.headings[0].startswith("SIMULATED"), "<title>SIMULATED" in html) == (bool(said), bool(said))
+    assert ('@top-left { content: "SIMULATED: Report' in html) == bool(said)  # the head of each sheet
+    tone = re.search(r'class="banner (\w+)"', html)
+    assert tone is not None
+    assert tone[1] == ("care" if said else "good")
+
+
 def test_a_run_of_a_few_samples_is_reported_without_an_estimate(
     folder: Path, simulate: Simulate, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -68,7 +68,7 @@ def test_the_log_has_the_mapping_and_reruns_and_another_mapping_in_it_is_found(
     emb_run.document()
     log = emb_run.log()
     mapping = {"name": "ODrive CANSimple, axis 0", "sha256": bus.mapping.sha256}
-    assert log.metadata["emb.drive"] == {**mapping, "lost": ", ".join(bus.mapping.lost)}
+    assert log.metadata["emb.drive"] == {**mapping, "lost": ", ".join(bus.mapping.lost), "bus": ""}
     assert log.attachments["drive.toml"] == bus.mapping.text.encode()
     assert log.attachments["drive.dbc"] == bus.mapping.dbc_text.encode()
     assert {frame.identifier for frame in bus.sent} - {0} == {0x00B, 0x007, 0x00E, 0x018}
