@@ -21,6 +21,7 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.experiment.theta import MAX_JSON_BYTES
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_text
+from emb_runtime.system.terminal import one_line
 
 LEVEL = 0.05  # Chance that anything at all is called a drift where there is none
 SMALLEST = 1e-200  # Smallest value that another one is compared with relatively
@@ -99,7 +100,9 @@ def read_last(path: Path) -> Earlier:
     except UnicodeDecodeError as err:
         raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: not UTF-8 text") from err
     except (ValueError, msgspec.MsgspecError, RecursionError) as err:
-        raise UsageError(f"--last {path}: expected the JSON of an earlier estimate: {printable(str(err))}") from err
+        raise UsageError(
+            f"--last {path}: expected the JSON of an earlier estimate: {one_line(str(err), LONG)}"
+        ) from err
 
 
 def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
@@ -108,11 +111,11 @@ def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
     common = [i for i in now.shared() if i in now.wanted() and now.labels[i] in then]
     if not common:
         raise UsageError(
-            f"nothing to compare: the earlier estimate is of {printable(', '.join(then))}, this one of "
+            f"nothing to compare: the earlier estimate is of {one_line(', '.join(then), LONG)}, this one of "
             f"{', '.join(now.labels)}"
         )
     limit = float(special.ndtri(1.0 - 0.5 * LEVEL / len(common)))
-    since = tuple(printable(record.name) for record in last.records)
+    since = tuple(one_line(record.name[-LONG:]) for record in last.records)
     deviations = now.between_runs()
     found = []
     for i in common:
@@ -141,8 +144,3 @@ def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
             )
         )
     return tuple(found)
-
-
-def printable(text: str) -> str:
-    """Text of another file, as it can stand in a line."""
-    return "".join(c if c.isprintable() else "?" for c in text[-LONG:])

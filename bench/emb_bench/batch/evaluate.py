@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.batch.row import NONE, Options, Row, Source, failed, one_line, printable
+from emb_bench.batch.row import NONE, Options, Row, Source, failed
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.estimate import Estimate
@@ -25,6 +25,7 @@ from emb_bench.report.sentences import alarms, lacks, warnings
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EmbError, UsageError
 from emb_runtime.system.input_file import open_regular
+from emb_runtime.system.terminal import escaped
 
 FIRST = 50  # Samples whose noise distinguishes a run from any other
 
@@ -36,9 +37,9 @@ def evaluate_one(source: Source, options: Options) -> Row:
         for found in _steps(source, options):
             row |= found
     except EmbError as err:
-        return row | {"error": one_line(str(err))}
+        return row | {"error": failed(source, str(err))["error"]}
     except Exception as err:  # no log may cost the others theirs, and a fault of ours is reported like one of the log
-        return row | {"error": one_line(f"{source.path}: {type(err).__name__}: {err}")}
+        return row | {"error": failed(source, f"{source.path}: {type(err).__name__}: {err}")["error"]}
     return row | {"error": None}
 
 
@@ -77,10 +78,10 @@ def _of_the_run(log: RunLog) -> Row:
     return {
         "start_time": log.span[0],
         "simulated": bool(log.simulated),
-        "exit_reason": printable(log.exit_reason),
+        "exit_reason": escaped(log.exit_reason),
         "complete": log.complete,
-        "missing": printable(log.missing),
-        "policy_sha256": None if policy is None else printable(policy),
+        "missing": escaped(log.missing),
+        "policy_sha256": None if policy is None else escaped(policy),
         "angle_min": largest and largest.angle_min,
         "angle_max": largest and largest.angle_max,
         "speed_max": largest and largest.speed,
@@ -101,12 +102,12 @@ def _of_the_experiment(log: RunLog, experiment: Experiment, bench: Bench) -> Row
     return {
         "beginning": _beginning(experiment),
         "complete": not missing and log.complete,
-        "missing": printable("; ".join(missing)),
+        "missing": escaped("; ".join(missing)),
         "planned": experiment.planned,
         "periods": experiment.periods,
         "measured": int(experiment.measured.sum()),
         "command_delay": experiment.command_delay,
-        "bench_name": printable(bench.name),
+        "bench_name": escaped(bench.name),
         "bench_hash": bench.identity_hash,
         "violations": beyond,
     }
@@ -127,7 +128,7 @@ def _of_the_information(e: Evaluation) -> Row:
     identified = {finding.name: finding.identified for finding in e.verdict().findings}
     said = {e.log.missing, *lacks(e.experiment)}
     found: Row = {
-        "warnings": tuple(printable(warning) for warning in warnings(e) if warning not in said),
+        "warnings": tuple(escaped(warning) for warning in warnings(e) if warning not in said),
         "nominal_fits": e.fit.fits,
         "nominal_angle_sigmas": e.fit.angle,
         "nominal_velocity_sigmas": e.fit.velocity,

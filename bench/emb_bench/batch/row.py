@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 
 from emb_bench.brake.parameters import SI, UNITS
 from emb_bench.estimate.records import STARTS
+from emb_bench.output import text_cells
 from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.system.terminal import escaped
 
 ENDINGS = (".parquet", ".csv")  # Of the file of rows
 NONE = "none"  # The method that estimates nothing: information alone
@@ -140,18 +142,8 @@ def unit_of(name: str, unit: str) -> str:
 
 def failed(source: Source, why: str) -> Row:
     """The row of a log that could not be evaluated, with the reason."""
-    places = {name: printable(getattr(source, name)) for name in ("root", "campaign", "log")}
-    return {**places, "error": one_line(why)}
-
-
-def one_line(text: str) -> str:
-    """A message in one line that every terminal and file takes."""
-    return printable(" ".join(text.split()))
-
-
-def printable(text: str) -> str:
-    """Text that can be written as UTF-8: bytes of a file name that are none become backslash escapes."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+    places = {name: escaped(getattr(source, name)) for name in ("root", "campaign", "log")}
+    return {**places, "error": escaped(" ".join(why.split()))}
 
 
 def write_rows(path: Path, ending: str, rows: Sequence[Row], options: Options) -> None:
@@ -188,4 +180,7 @@ def write_rows(path: Path, ending: str, rows: Sequence[Row], options: Options) -
     for number, column in enumerate(table.schema):
         if pa.types.is_list(column.type):
             table = table.set_column(number, column.name, compute.binary_join(table[number], "; "))
+    for number, column in enumerate(table.schema):
+        if pa.types.is_string(column.type):
+            table = table.set_column(number, column.name, text_cells(table[number]))
     csv.write_csv(table, path)

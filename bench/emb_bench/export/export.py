@@ -14,7 +14,7 @@ from emb_bench.export.picture import ENDINGS as PICTURES
 from emb_bench.export.picture import draw_run
 from emb_bench.logs.log import UNIX_TIME, RunLog
 from emb_bench.logs.mcap_file import Column
-from emb_bench.output import replacing
+from emb_bench.output import replacing, text_cells
 from emb_runtime.errors import UsageError
 
 
@@ -77,9 +77,11 @@ def write_csv(log: RunLog, topic: str, path: Path) -> str:
     def plain(column: Any) -> Any:
         if pa.types.is_binary(column.type):
             return pa.array([value.as_py().hex() for value in column], pa.string())
+        if pa.types.is_string(column.type):
+            return text_cells(column)
         return column.cast(pa.int64()) if pa.types.is_timestamp(column.type) else column
 
-    titles = [column.title for column in log.describe(topic)]
+    titles = text_cells(pa.array([column.title for column in log.describe(topic)], pa.string())).to_pylist()
     head = pa.table([plain(column) for column in schema.empty_table()], titles)
     with replacing(path) as beside, csv.CSVWriter(beside, head.schema) as writer:
         for table in tables:

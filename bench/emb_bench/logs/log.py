@@ -243,7 +243,7 @@ class RunLog:
 
     @property
     def simulated(self) -> str:
-        """What was driven in place of a real machine, by what the log says; empty if nothing says so."""
+        """Simulation that was driven in place of a real machine, as far as the log says; empty if it names none."""
         bus = self.metadata.get("emb.drive", {}).get("bus") or self.run.get("iface", "")
         if "emb.truth" in self.metadata or bus.partition(":")[0] == "sim":
             return "a simulated brake"

@@ -95,7 +95,7 @@ class Run:
 
     @property
     def source(self) -> str:
-        """What was driven: something simulated, or the bench on its interface; or a recording of others."""
+        """Machine that was driven: a simulated one, or the bench on its interface; or a recording of others."""
         if self.log.is_recording:
             return "recording of another machine"
         return self.log.simulated or f"bench on {self.log.run.get('iface', 'an unknown interface')}"

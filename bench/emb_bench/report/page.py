@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import functools
 import hashlib
-import re
 from dataclasses import replace
 from importlib import resources
 from typing import Any, NamedTuple
@@ -35,11 +34,11 @@ from emb_bench.report.trend import table as run_table
 from emb_bench.report.trend import trends
 from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.end_stop import end_stop_speed
+from emb_runtime.system.terminal import escaped
 
 EVENTS = 200  # Most safety events that are shown; report.json has them all
 LONGEST = 2000  # Characters of an event that are shown; report.json has them all
 SHORT_HASH = 16  # Digits of a hash that are shown where there is no room for all
-_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 class Safety(NamedTuple):
@@ -198,10 +197,10 @@ def environment() -> Environment:
 
 
 def _printable(value: Any) -> Any:
-    """Control characters have no place in HTML; they are shown as a replacement."""
+    """Text without characters that control or cannot be seen, but for spaces: a log may contain any."""
     if isinstance(value, Markup):
-        return Markup(_CONTROL.sub("\ufffd", value))
-    return _CONTROL.sub("\ufffd", value) if isinstance(value, str) else value
+        return Markup(escaped(value, "\t\n\r"))
+    return escaped(value, "\t\n\r") if isinstance(value, str) else value
 
 
 def _data_uri(svg: bytes) -> str:

@@ -12,6 +12,7 @@ from emb_bench.experiment.experiment import Experiment, Lack
 from emb_bench.information.identifiability import Border, Doubt, combination
 from emb_bench.numbers import amount, between, in_samples, p_value, percent, plain, spread
 from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.system.terminal import one_line
 
 if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.conclusion import Conclusion
@@ -85,6 +86,7 @@ LACKS = {
 """Parts of an experiment that are missing, with places for their numbers."""
 
 
+LONGEST_NAME = 80  # Characters of a name from another file
 EXPLAINS = 3.0  # Standard deviations from which on a parameter that is held fixed may explain a misfit
 
 # ---- an experiment ----
@@ -183,12 +185,10 @@ def other_model(now: Estimate, last: Earlier | None) -> str:
     """Reasons why a change since an earlier estimate may be one of the model; empty if there is none."""
     if last is None:
         return ""
-    from emb_bench.analysis.drift import printable
-
     reasons = {
         "it did not fit then": not last.model_fits,
         "it does not fit now": not now.validation.fits,
-        f"it was '{printable(last.model)}' then": last.model != now.plant.name,
+        f"it was '{one_line(last.model, LONGEST_NAME)}' then": last.model != now.plant.name,
     }
     return " and ".join(reason for reason, holds in reasons.items() if holds)
 

@@ -19,6 +19,7 @@ from emb_runtime.records import Frame, RunState
 from emb_runtime.safety.guard import GuardRejectedError
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Heartbeat, Unwatched
 from emb_runtime.safety.state_machine import Fault, StopError
+from emb_runtime.system.terminal import one_line
 
 STOP_LISTEN_NS: Final = 1_500_000_000
 """Longest time that the node may take to come to rest after the stop frames [ns]: a mapped one has a second, and then
@@ -206,7 +207,7 @@ class Loop:
         """Record what has happened, and which steps have failed."""
         failures, self._failures = self._failures, []
         for failure, err in failures:
-            self.core.note(self._now_ns, failure, one_line(err))
+            self.core.note(self._now_ns, failure, _message_of(err))
         while self.core.records:
             self._attempt("RECORD_FAILED", self._flush)
 
@@ -240,8 +241,8 @@ def detail_of(err: BaseException) -> str:
     if issubclass(type(err), StopError):
         return cast("StopError", err).detail
     if issubclass(type(err), GuardRejectedError | PolicyRefusedError | BusError):
-        return one_line(err, named=False)
-    return one_line(err) + _place(err)
+        return _message_of(err, named=False)
+    return _message_of(err) + _place(err)
 
 
 def _place(err: BaseException) -> str:
@@ -254,10 +255,10 @@ def _place(err: BaseException) -> str:
     return f" ({last.tb_frame.f_code.co_filename.rpartition('/')[2]}, line {last.tb_lineno})"
 
 
-def one_line(err: BaseException, *, named: bool = True) -> str:
+def _message_of(err: BaseException, *, named: bool = True) -> str:
     """Message of an error in one line, after its class; the class alone if the message cannot be had."""
     name = type(err).__name__
     try:
-        return (f"{name}: {err}" if named else f"{err}").partition("\n")[0]
+        return one_line((f"{name}: {err}" if named else f"{err}").partition("\n")[0])
     except BaseException:
         return name

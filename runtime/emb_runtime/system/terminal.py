@@ -26,15 +26,17 @@ ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP")
 """Signals with which an operator ends a command, those of them that this operating system has."""
 ARM_QUESTION = "Arm now? y and Enter does, anything else ends here."
 
-_CONTROL = re.compile(
-    "[\x00-\x1f\x7f-\x9f\ud800-\udfff"  # C0, DEL and C1; halves of characters, which no terminal takes
-    "\u061c\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ufff9-\ufffb\U000e0000-\U000e007f]"  # direction, invisible
-)
+_NOT_ASCII = re.compile("[^ -~]")
 
 
 def escaped(text: str, kept: str = "") -> str:
-    """A text in which characters that control a terminal, or cannot be seen, are escape sequences, but those kept."""
-    return _CONTROL.sub(lambda found: found[0] if found[0] in kept else ascii(found[0])[1:-1], text)
+    """A text in which all characters but printable ones and those ``kept`` are escape sequences.
+
+    So none controls a terminal, changes the direction of the text, or cannot be seen.
+    """
+    if text.isprintable():
+        return text
+    return _NOT_ASCII.sub(lambda c: c[0] if c[0].isprintable() or c[0] in kept else ascii(c[0])[1:-1], text)
 
 
 def one_line(text: str, most: int = LONGEST_STRING) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from emb_bench.export.mjcf import mjcf
 from emb_bench.export.picture import broken, draw_run
 from emb_bench.logs.log import RunLog, read_log
 from emb_runtime.config.bench import load_bench
+from emb_runtime.log.ring_buffer import EventRecord
 from emb_runtime.records import CycleRecord, RunState
 
 from tests.bench.conftest import Replay  # isort: skip
@@ -67,6 +69,30 @@ def test_any_topic_can_be_a_table(path: Path, run: SimRun, tmp_path: Path) -> No
         out = tmp_path / f"{topic.replace('/', '_')}.csv"
         assert export(path, "-o", out, "--topic", topic) == 0
         assert len(rows_of(out)) == count
+
+
+FORMULAS = ("=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(1)", "\t=1", "\r=1", "\n1", " =1", "＝1")
+PLAIN = ("a = b", "1 - 2", "", "it's", "'=1", "# 5")
+
+
+def test_no_text_of_a_log_is_a_formula_in_a_spreadsheet(simulate: Simulate, tmp_path: Path) -> None:
+    run, texts = simulate(square, options="plant=exact"), [*FORMULAS, *PLAIN]
+    when = run.journal.events[-1].time_ns
+    run.journal.records += [EventRecord(when, text, text) for text in texts]
+    path = write_log(tmp_path / "=1.mcap", run)
+    assert export(path, "-o", tmp_path / "events.csv", "--topic", "/safety") == 0
+    assert [row["text"] for row in rows_of(tmp_path / "events.csv")][-len(texts) :] == [
+        *(f"'{text}" for text in FORMULAS),
+        *PLAIN,
+    ]
+    folder = tmp_path / "-logs"
+    folder.mkdir()
+    shutil.copy(path, folder / "@1.mcap")
+    (folder / "+2.mcap").write_text("none")
+    assert main(["campaign", str(folder), "-o", str(tmp_path / "rows.csv"), "--method", "none", "--jobs", "1"]) == 1
+    rows = rows_of(tmp_path / "rows.csv")
+    assert [row["log"] for row in rows] == ["'+2.mcap", "'@1.mcap"]
+    assert float(rows[1]["angle_min"]) < 0.0  # a number stays one
 
 
 def test_parquet_has_the_same_numbers_and_units_and_says_what_is_missing(path: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from emb_bench.report.text import Cell, Table, show
 
 from tests.bench.report_pages import Reader, read  # isort: skip
 
-WORDS = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=60)
+WORDS = st.text(st.characters(exclude_categories=("C", "Z"), include_characters=" "), max_size=60)
 
 
 def html_of(table: Table) -> str:
@@ -38,8 +38,8 @@ def test_any_text_is_read_back_as_that_text_and_nothing_else(text: str) -> None:
 
 
 def test_control_characters_do_not_reach_the_page() -> None:
-    assert "a\ufffdb\ufffd[31mc\ufffdd\ufffde\n\tf" in html_of(
-        Table("", ["", ""], [["a\x00b\x1b[31mc\x9fd\ud800e\n\tf", "1"]])
+    assert "a\\x00b\\x1b[31mc\\x9fd\\ud800e\n\tf\\u202eg\\u200bh" in html_of(
+        Table("", ["", ""], [["a\x00b\x1b[31mc\x9fd\ud800e\n\tf\u202eg\u200bh", "1"]])
     )
 
 

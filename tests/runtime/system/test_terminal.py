@@ -52,6 +52,7 @@ HOSTILE = {
     "\u202egnp.exe\u2066\u200f\u061c": "\\u202egnp.exe\\u2066\\u200f\\u061c",
     "zero\u200bwidth\ufeff\u2028": "zero\\u200bwidth\\ufeff\\u2028",
     "\udcff\U000e0041": "\\udcff\\U000e0041",
+    "soft\u00adhyphen\u180e\ue000": "soft\\xadhyphen\\u180e\\ue000",
 }
 
 
@@ -69,8 +70,10 @@ def test_nothing_that_controls_a_terminal_reaches_it(hostile: str, capsys: pytes
 def test_every_control_character_is_escaped_and_no_letter_is() -> None:
     for code in range(0x110000):
         character = chr(code)
-        if unicodedata.category(character) in ("Cc", "Cs") or unicodedata.bidirectional(character) in DIRECTIONS:
+        unseen = unicodedata.category(character) in ("Cc", "Cf", "Cs", "Co", "Zl", "Zp")
+        if unseen or unicodedata.bidirectional(character) in DIRECTIONS:
             assert escaped(character) != character
+            assert escaped(character).isascii()
     assert escaped("grün 30 µs, ±6 A → 10⁻³ 漢字 🚗 x̂") == "grün 30 µs, ±6 A → 10⁻³ 漢字 🚗 x̂"
 
 
