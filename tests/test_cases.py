@@ -41,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path
     (here / "cut.mcap").write_bytes((here / "run.mcap").read_bytes()[:-5])
     (here / "weak.onnx").write_bytes(constant_actor(load_bench(), 2.0, sample_time=2e-3))
     (here / "cut.onnx").write_bytes(constant_actor(load_bench())[:200])
-    for name in ("folder", "folder.csv", "folder.png"):
+    for name in ("folder", *(f"folder.{ending}" for ending in ("csv", "html", "onnx", "png", "xml"))):
         (here / name).mkdir()
     for name, content in CASES["files"].items():
         (here / name).write_text(content, encoding="utf-8")

@@ -25,9 +25,9 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.design.problem import COARSE_SEARCHES
 from emb_bench.estimate.records import STARTS
-from emb_bench.figures import for_notebook, require_place
+from emb_bench.figures import for_notebook
 from emb_bench.logs.log import RunLog, read_log, require_driven
-from emb_bench.output import replacing, say_if_compiling
+from emb_bench.output import replacing, require_place, say_if_compiling
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.system.terminal import as_json, mention
@@ -412,12 +412,15 @@ def report(
         LogError: not one log can be used.
     """
     page = Path(output)
-    beside = page.with_suffix(".json")
+    beside = page.parent / f"{page.stem}.json"
     bound = inspect.signature(estimate).bind(runs, **options | {"profile": True})
     bound.apply_defaults()
     given = bound.arguments
     files = [*_listed(runs), given["last"], given["map"], acceptance]
-    _check_page(page, beside, [entry.path if isinstance(entry, RunLog) else Path(entry) for entry in files if entry])
+    for path in (entry.path if isinstance(entry, RunLog) else Path(entry) for entry in files if entry):
+        if path.resolve() in (page.resolve(), beside.resolve()):
+            raise UsageError(f"--output {page}: would write over {path}, which is read: choose another name")
+    require_place("--output", page, PAGES)
     require_place("--junit", None if junit is None else Path(junit), (".xml",))
     if junit is not None and acceptance is None:
         raise UsageError("--junit: expected it with --acceptance")
@@ -670,19 +673,6 @@ def _last(path: str | Path | None) -> Earlier | None:
     from emb_bench.analysis.drift import read_last
 
     return read_last(Path(path))
-
-
-def _check_page(page: Path, beside: Path, inputs: Sequence[Path]) -> None:
-    """Refuse what would write over a log or over the last campaign's numbers.
-
-    Raises:
-        UsageError: it would, or there is no such folder.
-    """
-    require_place("--output", page, PAGES)
-    for path in inputs:
-        for made in (page, beside):
-            if path.resolve() == made.resolve():
-                raise UsageError(f"--output {page}: would write over {path}, which is read: choose another name")
 
 
 def _usable(runs: Sequence[Source], map_path: str | Path | None) -> tuple[list[RunLog], list[tuple[Path, str]]]:

@@ -36,18 +36,6 @@ _SVG: Any = {
 }
 
 
-def require_place(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
-    """Refuse before the work a file that an option names, whose name has another ending, or that has no folder."""
-    if path is None:
-        return
-    if path.suffix not in endings:
-        raise UsageError(f"{option} {path}: expected a name that ends in {' or '.join(endings)}")
-    if not path.absolute().parent.is_dir():
-        raise UsageError(f"{option} {path}: there is no folder {path.absolute().parent}")
-    if path.is_dir():
-        raise UsageError(f"{option} {path}: expected a file to write, and it is a folder")
-
-
 @contextmanager
 def drawn(
     path: Path, rows: int, columns: int, title: str, size: tuple[float, float], *, dpi: int = 140, **shared: Any

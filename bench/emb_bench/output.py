@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -28,15 +28,8 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         UsageError: it cannot be written, or what is there is a log, a folder, a device or a pipe.
     """
-    if path.is_dir():
-        raise UsageError(f"{path}: expected a file to write, and it is a folder")
-    if path.exists() and not path.is_file():
-        raise UsageError(f"{path}: expected a file to write, and it is a device or a pipe: choose another name")
-    beside = path.with_name(f".{os.getpid()}-{path.name}")
     try:
-        if path.exists() and _is_log(path):
-            raise UsageError(f"{path}: a log, and logs are never overwritten: choose another name")
-        beside.touch()
+        beside = _beside(path)
         try:
             yield beside
             beside.replace(path)
@@ -45,6 +38,35 @@ def replacing(path: Path) -> Iterator[Path]:
                 beside.unlink()
     except OSError as err:
         raise UsageError(f"{path}: the result cannot be written: {err.strerror or err}") from err
+
+
+def require_place(option: str, path: Path | None, endings: Sequence[str]) -> None:
+    """Refuse before the work a file that an option names and that cannot be written, or whose name ends otherwise."""
+    if path is None:
+        return
+    if path.suffix.lower() not in endings:
+        raise UsageError(f"{option} {path}: expected a name that ends in {' or '.join(endings)}")
+    if not path.absolute().parent.is_dir():
+        raise UsageError(f"{option} {path}: there is no folder {path.absolute().parent}")
+    try:
+        _beside(path).unlink()
+    except UsageError as err:
+        raise UsageError(f"{option} {err}") from None
+    except OSError as err:
+        raise UsageError(f"{option} {path}: cannot be written there: {err.strerror or err}") from err
+
+
+def _beside(path: Path) -> Path:
+    """A new file beside one that may be written."""
+    if path.is_dir():
+        raise UsageError(f"{path}: expected a file to write, and it is a folder")
+    if path.exists() and not path.is_file():
+        raise UsageError(f"{path}: expected a file to write, and it is a device or a pipe: choose another name")
+    if path.exists() and _is_log(path):
+        raise UsageError(f"{path}: a log, and logs are never overwritten: choose another name")
+    beside = path.with_name(f".{os.getpid()}-{path.name}")
+    beside.touch()
+    return beside
 
 
 def text_cells(column: Any) -> Any:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from emb_bench.config.bench import load_bench
 from emb_bench.excitation import EXCITATIONS
-from emb_bench.output import replacing
+from emb_bench.output import replacing, require_place
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.terminal import Parser, complain, show
@@ -74,10 +74,11 @@ def _export(arguments: argparse.Namespace) -> str:
         raise UsageError("--bench: a training's actor is for the bench that it was trained on; leave it out")
     if path is None and not is_training:
         raise UsageError(f"{source} is no folder of a training: name the file to write, as in --output actor.onnx")
+    path = path or source / "actor.onnx"
+    require_place("--output", path, (".onnx",))
     if is_training:
         from emb_export.network import network_file
 
-        path = path or source / "actor.onnx"
         data, what = network_file(source)
     else:
         from emb_export.file import read_sequence, reference_file, sequence_file

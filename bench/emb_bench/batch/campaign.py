@@ -15,8 +15,7 @@ from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import ENDINGS as ROWS
 from emb_bench.batch.row import Options, Row, Source, failed, write_rows
 from emb_bench.batch.summary import Campaign, mark_copies, summarise
-from emb_bench.figures import require_place
-from emb_bench.output import replacing
+from emb_bench.output import replacing, require_place
 from emb_bench.parallel import Lost, shared_out, shared_out_on_ray
 from emb_runtime.errors import UsageError
 from emb_runtime.records import HOMING_LOG, LISTEN_ONLY_LOG
@@ -49,7 +48,7 @@ def run_campaign(
         else:
             numbered = shared_out_on_ray(evaluate, sources, jobs, time_limit, ray)
         rows = mark_copies(in_order(sources, numbered))
-        write_rows(beside, output.suffix, rows, options)
+        write_rows(beside, output.suffix.lower(), rows, options)
     return summarise(rows, options, str(output))
 
 

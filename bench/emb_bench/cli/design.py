@@ -9,7 +9,7 @@ from pathlib import Path
 
 from emb_bench import api
 from emb_bench.cli.options import add, add_output_options, answer, given, summary
-from emb_bench.figures import require_place
+from emb_bench.output import require_place
 from emb_runtime.errors import EXIT_DONE, EmbError
 from emb_runtime.system.terminal import Parser, complain
 

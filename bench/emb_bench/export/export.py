@@ -14,7 +14,7 @@ from emb_bench.export.picture import ENDINGS as PICTURES
 from emb_bench.export.picture import draw_run
 from emb_bench.logs.log import UNIX_TIME, RunLog
 from emb_bench.logs.mcap_file import Column
-from emb_bench.output import replacing, text_cells
+from emb_bench.output import replacing, require_place, text_cells
 from emb_runtime.errors import UsageError
 
 
@@ -98,8 +98,7 @@ CYCLE = "/cycle"
 def write(log: RunLog, path: Path, topic: str | None, theta: str) -> str:
     """Write a picture, a topic as a table, or the brake as a model, by the ending of the file; says what it holds."""
     ending = path.suffix.lower()
-    if ending not in FORMATS:
-        raise UsageError(f"--output {path}: expected a file that ends in {', '.join(FORMATS)}")
+    require_place("--output", path, FORMATS)
     if topic is not None and ending not in TABLES:
         raise UsageError(f"--topic: expected with a file that ends in {' or '.join(TABLES)}, got {path}")
     if theta and ending not in MODEL:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import subprocess
 import sys
 import time
@@ -141,6 +142,8 @@ def _reporter(page: Path) -> str:
         raise UsageError(f"--report {page}: expected a name that ends in .html or .htm")
     if not page.absolute().parent.is_dir():
         raise UsageError(f"--report: {page.absolute().parent} is no folder")
+    if page.is_dir() or not os.access(page.absolute().parent, os.W_OK):
+        raise UsageError(f"--report {page}: expected a file that can be written")
     return entries[0].value
 
 
