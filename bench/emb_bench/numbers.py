@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NOTHING = "–"
 SMALL, LARGE = 1e-3, 1e5  # Values from one to the other are written without a power of ten
 LOPSIDED = 1.2  # Longer side of an interval over half its width from which on both ends are written
@@ -31,7 +31,7 @@ def plain(value: float, digits: int = 3) -> str:
         return "∞" if value > 0 else "−∞"
     mantissa, _, exponent = f"{value:.{digits}g}".partition("e")
     mantissa = mantissa.replace("-", "−")
-    return f"{mantissa} × 10{str(int(exponent)).translate(_SUPERSCRIPT)}" if exponent else mantissa
+    return f"{mantissa} × 10{str(int(exponent)).translate(SUPERSCRIPT)}" if exponent else mantissa
 
 
 def spread(deviation: float, relative: bool, digits: int = 3) -> str:
@@ -70,7 +70,7 @@ def _in_one_power(text: str, values: tuple[float, float], width: float) -> str:
     places = _places(width / 10.0**power)
     shown = (round(value / 10.0**power, places) + 0.0 for value in values)  # no minus before a zero
     text = text.format(*(f"{value:.{places}f}" for value in shown)).replace("-", "−")
-    return text if power == 0 else f"({text}) × 10{str(power).translate(_SUPERSCRIPT)}"
+    return text if power == 0 else f"({text}) × 10{str(power).translate(SUPERSCRIPT)}"
 
 
 def _places(width: float) -> int:

@@ -149,9 +149,11 @@ def contradiction(sheet: Bench, one: Identification, names: Sequence[str]) -> st
 def suspected(sheet: Bench, one: Identification | None) -> str:
     """Words for what is wrong in a data sheet where the brake moves as none of its set does."""
     others = (
-        "look at J and gamma of [brake], at break_away, f_l, current_lag and frame_age of [shield], and whether the "
-        "brake turns freely"
+        "J and gamma of [brake], at break_away, f_l, current_lag and frame_age of [shield], and whether the brake "
+        "turns freely"
     )
-    if one is not None and (names := not_inside(sheet, one, AT_BORDER)):
-        return f"{contradiction(sheet, one, names)}; or {others}"
-    return f"no parameter that was found lies near a border of [ranges.{sheet.shield.ranges}]: {others}"
+    if one is None:
+        return f"no parameter was found yet: look at all of [ranges.{sheet.shield.ranges}] first, then at {others}"
+    if names := not_inside(sheet, one, AT_BORDER):
+        return f"{contradiction(sheet, one, names)}; or look at {others}"
+    return f"no parameter that was found lies near a border of [ranges.{sheet.shield.ranges}]: look at {others}"

@@ -41,7 +41,7 @@ def text(study: Study, *, verbose: bool = False) -> str:
     if not any(math.isfinite(c.repeatability) for c in study.conclusions):
         lines += [""]
     elif study.holds or verbose:
-        lines += [*wrapped(say.INTERVALS, 0), "", *listed("", _limits(study))]
+        lines += [*wrapped(say.intervals(study.estimate), 0), "", *listed("", _limits(study))]
     else:
         lines += [f"± 95 % (k=2), without the {'bias of the method' if study.biased else 'error of the model'}", ""]
     return "\n".join([*lines, *_next(study), *(_evidence(study) if verbose else ())])

@@ -15,7 +15,7 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.model_validation import OUTPUTS
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.figures import COLOURS, DASHED, GREY, svg
-from emb_bench.numbers import SMALL
+from emb_bench.numbers import SMALL, SUPERSCRIPT
 from emb_bench.report.content import ActiveCycles, Run, StopSamples
 from emb_runtime.records import Reason
 
@@ -23,6 +23,8 @@ WIDE = 8.6  # Width of a figure that fills the page [inch]
 PANEL = 4.4
 """Width of a figure of which two stand side by side [inch]: its text can be read on a telephone and on paper."""
 STOP = "#b3260b"  # Colour of the stop of a run
+LIGHT = "#8fcdf2"  # Colour of samples below a line that predicts them
+_LEGEND: Any = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "handlelength": 1.6, "columnspacing": 1.2}
 _BAND = "#dfe9f1"
 FAINT = {"color": "#cccccc", "linewidth": 0.8, "zorder": 0}
 _DOTTED: Any = {"color": "black", "linewidth": 0.7, "linestyle": (0, (2, 2))}
@@ -60,7 +62,7 @@ def excitation(run: Run, cycles: ActiveCycles) -> Panel:
             _mark_stop(above, cycles, after)
         above.set_ylim(-1.2 * limit, 1.2 * limit)
         above.set_ylabel("current [A]")
-        above.legend(ncols=2, loc="lower left", bbox_to_anchor=(0.0, 1.0), handlelength=1.6, columnspacing=1.2)
+        above.legend(ncols=2, **_LEGEND)
         if held:
             below = axes[1, 0]
             for row, reason in enumerate(held):
@@ -165,12 +167,12 @@ def motion(run: Run) -> list[Panel]:
             for value in borders[i] if driven else ():
                 axis.axhline(value, **DASHED)
             axis.axhline(0.0, **FAINT)
-            axis.plot(1e3 * time, measured[:, i], ".", color=COLOURS[4], markersize=3.5, label="measured")
+            axis.plot(1e3 * time, measured[:, i], ".", color=LIGHT, markersize=4.5, label="measured")
             seen = measured[np.isfinite(measured[:, i]), i]
             if run.predicted is not None:
                 shown = run.predicted[:, i]
                 at = 1e3 * period * np.arange(1, len(shown) + 1)
-                axis.plot(at, shown, color=COLOURS[1], label="predicted", linewidth=1)
+                axis.plot(at, shown, color=COLOURS[1], label="predicted", linewidth=0.8)
             if after is not None and cycles is not None:
                 when, values = (after.angle, after.velocity)[i]
                 axis.plot(1e3 * when, values, ".", color=GREY, markersize=3.0, label="while stopping")
@@ -181,7 +183,7 @@ def motion(run: Run) -> list[Panel]:
             bottom, top = min(low, seen.min(initial=0.0)), max(high, seen.max(initial=0.0))
             axis.set_ylim(bottom - 0.05 * (top - bottom), top + 0.05 * (top - bottom))
             axis.set_ylabel(f"{units[i].name} [{units[i].unit}]")
-            axis.legend(ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), handlelength=1.6, columnspacing=1.2)
+            axis.legend(ncols=3, markerscale=2.0, **_LEGEND)
             axis.set_xlabel("time [ms]")
             axis.set_xlim(0.0, 1e3 * last)
 
@@ -201,7 +203,7 @@ def residuals(run: Run, errors: Floats) -> Panel:
             axis.plot(time, errors[:, i], ".", color=COLOURS[i], markersize=3, label=name)
         axis.set_ylabel("residual [sigma]")
         axis.set_xlabel("time [ms]")
-        axis.legend(ncols=2, loc="lower left", bbox_to_anchor=(0.0, 1.0), handlelength=1.6, columnspacing=1.2)
+        axis.legend(ncols=2, markerscale=2.0, **_LEGEND)
 
     names = " and ".join(name for _, name in measured)
     shows = f"Residuals of {names} over time, in standard deviations of their sensors"
@@ -216,14 +218,19 @@ def _measured(errors: Floats) -> list[tuple[int, str]]:
 # ---- uncertainty of an estimate ----
 
 ACROSS = 4  # Most panels side by side
-_POWERS = (-2, 5)  # of ten, beyond which the axis has a common one: its numbers would touch
 
 
-def axis_unit(e: Estimate, i: int) -> tuple[float, str]:
-    """Factor and unit for distances of an unknown from its estimate: of its value in ppm or percent, or in its unit."""
+def axis_unit(e: Estimate, i: int, farthest: float) -> tuple[float, str]:
+    """Factor and unit for distances of an unknown from its estimate, SI units: of its value, or in its unit.
+
+    With them the ``farthest`` has no power of ten.
+    """
     if not e.unknowns[i].relative:
-        return 1.0, e.shown[i].unit
-    factor, unit = (1e6, "ppm") if 3.0 * float(e.deviations()[i]) < SMALL else (100.0, "%")
+        unit, power = e.shown[i].unit, math.floor(math.log10(farthest)) if farthest > 0.0 else 0
+        if power > -3:
+            return 1.0, unit
+        return 10.0**-power, f"10{str(power).translate(SUPERSCRIPT)} {unit.removesuffix('1')}".rstrip()
+    factor, unit = (1e6, "ppm") if farthest < SMALL * float(e.scale[i]) else (100.0, "%")
     return factor / float(e.scale[i]), unit
 
 
@@ -236,7 +243,7 @@ def profiles(found: Sequence[Profile], e: Estimate) -> bytes:
             axis.set_visible(False)
         for n, (axis, profile) in enumerate(zip(axes.flat, found, strict=False)):
             i = e.labels.index(profile.label)
-            factor, unit = axis_unit(e, i)
+            factor, unit = axis_unit(e, i, float(np.abs(profile.values - e.values[i]).max()))
             sigma = float(e.cramer_rao()[i] * e.scale[i]) * factor
             x = (profile.values - e.values[i]) * factor
             axis.axhline(LEVEL, **DASHED)
@@ -249,6 +256,6 @@ def profiles(found: Sequence[Profile], e: Estimate) -> bytes:
                 axis.set_ylabel("rise of chi2")
             axis.set_xlabel(f"{profile.label} [{unit}]")
             axis.locator_params(axis="x", nbins=3)
-            axis.ticklabel_format(axis="x", style="sci", scilimits=_POWERS)
+            axis.ticklabel_format(axis="x", style="plain", useOffset=False)
 
     return svg(draw, rows, columns, (WIDE, 2.3 * rows))

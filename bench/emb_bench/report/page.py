@@ -9,6 +9,8 @@ from __future__ import annotations
 import base64
 import functools
 import hashlib
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from importlib import resources
 from typing import Any, NamedTuple
@@ -17,6 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from emb_bench import numbers
+from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import QUANTILES
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import METHODS
@@ -36,6 +39,12 @@ from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.system.terminal import escaped
 
+UNITS_OF_METADATA = {
+    "limit": "A", "current": "A", "angle_min": "rad", "angle_max": "rad", "top_speed": "rad/s",
+    "unexplained": "rad/s", "unexplained_allowed": "rad/s", "gamma": "m/rad",
+    **{name: row.unit for name, row in PARAMETERS.items() if row.unit != "1"},
+}  # fmt: skip
+"""Units of numbers in a log's metadata, by the ends of their names."""
 EVENTS = 200  # Most safety events that are shown; report.json has them all
 LONGEST = 2000  # Characters of an event that are shown; report.json has them all
 SHORT_HASH = 16  # Digits of a hash that are shown where there is no room for all
@@ -127,6 +136,19 @@ def _drive(run: Run) -> dict[str, str]:
     }
 
 
+def with_units(entries: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Metadata of a log, numbers to four digits and with their units."""
+    found = []
+    for name, text in entries.items():
+        with suppress(ValueError):
+            number = float(text)
+            unit = next((unit for end, unit in UNITS_OF_METADATA.items() if name.endswith(end)), "")
+            if unit or "." in text:
+                text = f"{plain(number, 4)} {unit}".rstrip()
+        found.append((name, text))
+    return found
+
+
 def intervals(run: Run) -> Table | None:
     """Intervals of the loop; None if no sample was answered, or there was none."""
     t = run.timing
@@ -189,6 +211,7 @@ def environment() -> Environment:
         "reasons": REASONS,
         "obeyed": figures.applied_as_sent,
         "intervals_of": intervals,
+        "with_units": with_units,
         "safety_of": safety,
         "digest": lambda data: hashlib.sha256(data).hexdigest(),
         "css": Markup(resources.files("emb_bench.report").joinpath("page.css").read_text(encoding="utf-8")),

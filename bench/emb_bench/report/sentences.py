@@ -34,10 +34,13 @@ INTERVALS = (
     "that the record cannot exclude."
 )
 
+NOISE_ALONE = "± 95 % (k=2), by sensor noise alone: no systematic error and no other effect is allowed for."
+
 TERMS = {
     "sigma": "standard deviation",
     "repeatability": "half of the 95 % interval by sensor noise: the scatter of further runs",
-    "total": "half of the 95 % interval, also with systematic errors and effects that the record cannot exclude",
+    "total": "half of the 95 % interval, also with systematic errors and effects that the record cannot exclude, where "
+    "they are allowed for",
     "chi2/n": "mean square of the residuals in sigmas, near 1 if the model is right",
     "identified": "the 95 % interval is closed, excludes zero and ends at no border of the search",
     "trades off": "the data determine two parameters well only together: their errors compensate",
@@ -107,6 +110,24 @@ def taken_for_acted(x: Experiment) -> list[str]:
         f"what acted is taken to be the command as its bus carried it, {in_samples(x.command_delay)} late, where what "
         f"the drive reported lies within {x.within:.3g} A of it, and elsewhere what the drive reported"
     ]
+
+
+def intervals(e: Estimate) -> str:
+    """Sentence on the intervals of a model that holds."""
+    return INTERVALS if e.asked.systematic or e.validation.budget else NOISE_ALONE
+
+
+def effects(machine: Machine | None) -> dict[str, str]:
+    """Effects of the score tests and of the uncertainty budget by the names that are shown, each in a line."""
+    from emb_bench.estimate.records import ANGLE_SCALE, Contribution
+    from emb_bench.estimate.suspects import EFFECTS, shown_as
+
+    said = {name: row.effect.removesuffix(",") for name, row in EFFECTS.items()}
+    said[ANGLE_SCALE] = "an error of the angle's scale"
+    for parameter in PARAMETER_NAMES:
+        for name in (parameter, f"{parameter}_drift"):
+            said[name] = said[name].replace(parameter, quantity(machine, parameter).name)
+    return {shown_as(Contribution(name, ()), machine).name: line for name, line in said.items()}
 
 
 # ---- the verdict on a study ----
@@ -408,25 +429,27 @@ def held_out(h: HeldOut) -> str:
 def profile(p: Profile, e: Estimate) -> str:
     """Interval of a likelihood profile beside that of the Fisher information; in the units that are shown."""
     (low, high), fisher = p.interval, p.fisher
+    shown = e.shown[e.labels.index(p.label)].unit
+    unit = "" if shown == "1" else f" {shown}"
     if p.doubt is Doubt.CUT:
         said = DOUBTS[Doubt.CUT]
     elif math.isinf(low) and math.isinf(high):
         said = "flat: the records exclude no value within the search"
     elif math.isinf(low):
-        said = f"only values above {plain(high, 4)} are excluded"
+        said = f"only values above {plain(high, 4)}{unit} are excluded"
     elif math.isinf(high):
-        said = f"only values below {plain(low, 4)} are excluded"
+        said = f"only values below {plain(low, 4)}{unit} are excluded"
     elif math.isinf(fisher[1]):
-        said = f"{between(low, high)}; the Fisher information gives no bound"
+        said = f"{between(low, high)}{unit}; the Fisher information gives no bound"
     elif p.agrees:
-        said = f"{between(low, high)}, as the Fisher information says"
+        said = f"{between(low, high)}{unit}, as the Fisher information says"
     else:
-        said = f"{between(low, high)}; the Fisher information says {between(*fisher)}"
+        said = f"{between(low, high)}{unit}; the Fisher information says {between(*fisher)}{unit}"
     found = [said]
     if e.method != "oem":
-        found.append(f"of output error, whose minimum is at {plain(p.minimum, 6)}")
+        found.append(f"of output error, whose minimum is at {plain(p.minimum, 6)}{unit}")
     if p.fell:
-        found.append(f"chi2 fell by {p.fell:.3g} at {plain(p.minimum, 6)}: the estimate is a local minimum only")
+        found.append(f"chi2 fell by {p.fell:.3g} at {plain(p.minimum, 6)}{unit}: the estimate is a local minimum only")
     if not e.validation.fits:
         found.append("too narrow, because the model does not fit")
     return "; ".join(found)

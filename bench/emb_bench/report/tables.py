@@ -12,7 +12,7 @@ from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
 from emb_bench.estimate.records import NORMAL_95
 from emb_bench.estimate.suspects import shown_as
 from emb_bench.information.identifiability import TRADED_OFF
-from emb_bench.numbers import NOTHING, SMALL, amount, around, chance, percent, plain, share, signed, spread
+from emb_bench.numbers import NOTHING, SMALL, amount, around, chance, percent, plain, signed, spread
 from emb_bench.report.acceptance import Acceptance, Result
 from emb_bench.report.sentences import drift, limit
 from emb_bench.report.text import Cell, Table
@@ -113,8 +113,10 @@ def models(study: Study) -> Table | None:
     return Table(title, header, rows, words=(0, 1))
 
 
-def budget(study: Study) -> Table:
-    """Contributions to the uncertainty of each parameter."""
+def budget(study: Study) -> Table | None:
+    """Contributions to the uncertainty of each parameter; None where nothing but the noise is allowed for."""
+    if not (study.estimate.asked.systematic or study.estimate.validation.budget):
+        return None
     e, rows = study.estimate, []
     bound, other, every = e.cramer_rao(), e.open(OF_THE_BENCH), e.open()
     columns = (bound, np.sqrt(np.maximum(every**2 - other**2, 0.0)), other, e.robust())
@@ -174,7 +176,7 @@ def suspects(e: Estimate) -> Table | None:
     rows = []
     for s in e.validation.suspects:
         name, unit = shown_as(s, e.bench.machine)
-        suggested = f"{plain(s.value)} {unit}" if unit else share(s.value, 3)
+        suggested = f"{plain(s.value)} {unit}" if unit else f"{plain(100.0 * s.value)} %"
         suggested = suggested if s.possible else NOTHING
         rows.append([name, suggested, signed(s.sigmas, "+.1f"), chance(s.p_value)])
     title = (

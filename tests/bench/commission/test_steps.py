@@ -231,10 +231,13 @@ def test_where_the_brake_moves_as_none_of_the_set_the_parameter_to_widen_is_name
         said = suspected(sheet, with_interval(one, "k_1", shares))
         assert "widen k_1 in [ranges.wide]" in said
         assert "look at J and gamma" in said
-    for identified in (with_interval(one, "k_1", (0.56, 1.79)), identification(sheet), None):
+    for identified in (with_interval(one, "k_1", (0.56, 1.79)), identification(sheet)):
         said = suspected(sheet, identified)
         assert "look at J and gamma" in said
         assert "widen" not in said
+    nothing = suspected(sheet, None)
+    assert nothing.startswith("no parameter was found yet: look at all of [ranges.wide] first")
+    assert not any(said in nothing for said in ("look at J", "widen", "that was found"))
 
 
 def test_the_last_run_must_not_contradict_the_file(sheet: Bench) -> None:

@@ -8,7 +8,8 @@ import shutil
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,17 +20,19 @@ from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
 from emb_bench.batch.summary import summarise
 from emb_bench.batch.summary import text as text_of_campaign
+from emb_bench.brake.parameters import quantity
 from emb_bench.cli.replay import main
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.records import EstimationProblem
+from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.records import EstimationProblem, Unknown
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.figures import COLOURS
 from emb_bench.logs.log import read_log
 from emb_bench.report import figures
 from emb_bench.report.content import Content, gather
 from emb_bench.report.figures import applied_as_sent
-from emb_bench.report.page import document, intervals, report_page
-from emb_bench.report.sentences import MORE
+from emb_bench.report.page import document, intervals, report_page, with_units
+from emb_bench.report.sentences import MORE, effects
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import EXIT_OUTSIDE
 from emb_runtime.log.ring_buffer import Attachment, EventRecord
@@ -199,6 +202,56 @@ def test_the_pale_line_of_a_profile_is_the_parabola_of_the_fisher_information(
         unit = 1e6 if "ppm" in axis.get_xlabel() else 100.0
         bound = unit * e.cramer_rao()[e.labels.index(profile.label)]
         np.testing.assert_allclose(line.get_ydata(), (line.get_xdata() / bound) ** 2)
+
+
+def test_every_effect_of_the_tests_and_of_the_budget_is_explained_on_the_page_in_one_line(report: Report) -> None:
+    study = report.numbers["estimate"]
+    words = report.reader.text.partition("What the words mean")[2]
+    named = {s["name"] for s in study["misfit"]["suspects"]} | {b["name"] for b in study["misfit"]["budget"]}
+    assert {"play", "f_l", "contact", "hysteresis", "T_c_drift", "angle_scale"} <= named
+    for name in named:
+        assert f" {name.replace('angle_scale', 'angle scale')} " in words, name
+    assert all(said and not said.endswith(",") for said in effects(None).values())
+
+
+def test_metadata_has_four_digits_and_units(report: Report) -> None:
+    assert with_units({"top_speed": "491.30350000000004", "limit": "6.0", "T_c": "0.01037", "steps": "500"}) == [
+        ("top_speed", "491.3 rad/s"), ("limit", "6 A"), ("T_c", "0.01037 N·m"), ("steps", "500"),
+    ]  # fmt: skip
+    hostile = {"top_speed": "fast", "limit": "nan", "tool": "emb-excite 0.2.0", "unexplained": "3.28157663208528"}
+    assert [text for _, text in with_units(hostile)] == ["fast", "– A", "emb-excite 0.2.0", "3.282 rad/s"]
+    assert "6 A" in report.reader.texts
+
+
+@pytest.mark.parametrize(
+    ("unknown", "farthest", "expected"),
+    [
+        ("k_m", 2e-7, (1e6 / 0.02, "ppm")),
+        ("k_m", 2e-3, (100.0 / 0.02, "%")),
+        ("offset", 0.2, (1.0, "rad")),
+        ("offset", 2e-4, (1e4, "10⁻⁴ rad")),
+        ("velocity_gain", 2e-4, (1e4, "10⁻⁴")),
+        ("offset", 0.0, (1.0, "rad")),
+    ],
+)
+def test_an_axis_of_a_profile_needs_no_power_of_ten(unknown: str, farthest: float, expected: tuple[float, str]) -> None:
+    e = SimpleNamespace(unknowns=[Unknown(unknown)], scale=np.array([0.02]), shown=[quantity(None, unknown)])
+    factor, unit = figures.axis_unit(cast("Estimate", e), 0, farthest)
+    assert (factor, unit) == (pytest.approx(expected[0]), expected[1])
+
+
+def test_without_systematic_errors_nothing_says_that_they_are_in_the_total(
+    folder: Path, good: Path, replay: Replay
+) -> None:
+    options = ("--systematic", "none", "--starts", "1")
+    made = make(folder / "noise.html", good, *options)
+    verdict = made.reader.text.partition("What the words mean")[0]
+    for said in (verdict, replay.text("estimate", good, *options), replay.text("estimate", good, *options, "-v")):
+        flat = " ".join(said.split())
+        assert "by sensor noise alone" in flat
+        assert "also systematic errors" not in flat
+        assert "Uncertainty budget" not in flat
+        assert "limited by" not in flat
 
 
 def test_residuals_and_motion_are_in_the_numbers(report: Report, good: Path) -> None:
