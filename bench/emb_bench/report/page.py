@@ -41,7 +41,7 @@ from emb_runtime.system.terminal import escaped
 
 UNITS_OF_METADATA = {
     "limit": "A", "current": "A", "angle_min": "rad", "angle_max": "rad", "top_speed": "rad/s",
-    "unexplained": "rad/s", "unexplained_allowed": "rad/s", "gamma": "m/rad",
+    "unexplained": "rad/s", "unexplained_allowed": "rad/s", "gamma": "m",
     **{name: row.unit for name, row in PARAMETERS.items() if row.unit != "1"},
 }  # fmt: skip
 """Units of numbers in a log's metadata, by the ends of their names."""

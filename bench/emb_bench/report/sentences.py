@@ -114,7 +114,9 @@ def taken_for_acted(x: Experiment) -> list[str]:
 
 def intervals(e: Estimate) -> str:
     """Sentence on the intervals of a model that holds."""
-    return INTERVALS if e.asked.systematic or e.validation.budget else NOISE_ALONE
+    if not (e.asked.systematic or e.validation.budget):
+        return NOISE_ALONE
+    return INTERVALS.replace("systematic errors and ", "") if e.ideal_sensors else INTERVALS
 
 
 def effects(machine: Machine | None) -> dict[str, str]:
