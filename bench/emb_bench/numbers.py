@@ -1,13 +1,12 @@
-"""Numbers for people: formatting, and a number with its interval."""
+"""Numbers for people beside those of :mod:`emb_runtime.numbers`, and a number with its interval."""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
-SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-NOTHING = "–"
-SMALL, LARGE = 1e-3, 1e5  # Values from one to the other are written without a power of ten
+from emb_runtime.numbers import LARGE, NOTHING, SMALL, around, between, in_percent, places, plain
+
 LOPSIDED = 1.2  # Longer side of an interval over half its width from which on both ends are written
 LEVEL = 0.95  # Probability that an interval holds the number
 
@@ -20,62 +19,11 @@ class Score(NamedTuple):
     high: float
 
 
-def plain(value: float, digits: int = 3) -> str:
-    """A number with some significant digits, powers of ten written out; a dash for NaN.
-
-    ``2.16e-05`` is ``2.16 × 10⁻⁵``.
-    """
-    if math.isnan(value):
+def relative(half: float, size: float) -> str:
+    """Half an interval: in percent of a size, or as it is where the size is 0; a dash where it is open."""
+    if not math.isfinite(half):
         return NOTHING
-    if math.isinf(value):
-        return "∞" if value > 0 else "−∞"
-    mantissa, _, exponent = f"{value:.{digits}g}".partition("e")
-    mantissa = mantissa.replace("-", "−")
-    return f"{mantissa} × 10{str(int(exponent)).translate(SUPERSCRIPT)}" if exponent else mantissa
-
-
-def spread(deviation: float, relative: bool, digits: int = 3) -> str:
-    """A standard deviation: in percent if it is relative, above 100 % in whole ones."""
-    if not math.isfinite(deviation):
-        return "not identified"
-    if not relative:
-        return plain(deviation, digits)
-    share = 100.0 * deviation
-    return f"{share:.0f} %" if 100.0 <= share < 1e5 else f"{plain(share, digits)} %"
-
-
-def around(value: float, half: float) -> str:
-    """A value and half its interval, both to two digits of that half, in one power of ten.
-
-    ``(2.1592 ± 0.0061) × 10⁻⁵``; without an interval the value alone.
-    """
-    if not (math.isfinite(half) and half > 0.0 and math.isfinite(value)):
-        return plain(value, 4)
-    return _in_one_power("{} ± {}", (value, half), half)
-
-
-def between(low: float, high: float) -> str:
-    """An interval, to two digits of its width."""
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return f"{plain(low, 4)} to {plain(high, 4)}"
-    if high <= low:
-        return f"{plain(low, 4)} to {plain(high, 4)}"
-    return _in_one_power("{} to {}", (low, high), high - low)
-
-
-def _in_one_power(text: str, values: tuple[float, float], width: float) -> str:
-    """Values in a text, all to two digits of a width and in one power of ten."""
-    largest = max(map(abs, values))
-    power = 0 if SMALL <= largest < LARGE else math.floor(math.log10(largest))
-    places = _places(width / 10.0**power)
-    shown = (round(value / 10.0**power, places) + 0.0 for value in values)  # no minus before a zero
-    text = text.format(*(f"{value:.{places}f}" for value in shown)).replace("-", "−")
-    return text if power == 0 else f"({text}) × 10{str(power).translate(SUPERSCRIPT)}"
-
-
-def _places(width: float) -> int:
-    """Decimal places that show two digits of a width."""
-    return max(0, 1 - math.floor(math.log10(width)))
+    return in_percent(half / abs(size)) if size else plain(half, 2)
 
 
 def amount(value: float, interval: tuple[float, float], unit: str) -> str:
@@ -127,8 +75,8 @@ def share_between(low: float, high: float) -> str:
     if not (math.isfinite(low) and math.isfinite(high)):
         return f"{plain(factor * low)} to {plain(factor * high)} {name}"
     width = factor * (high - low)
-    places = _places(width) if width > 0.0 else 3
-    return f"{signed(factor * low, f'+.{places}f')} to {signed(factor * high, f'+.{places}f')} {name}"
+    form = f"+.{places(width) if width > 0.0 else 3}f"
+    return f"{signed(factor * low, form)} to {signed(factor * high, form)} {name}"
 
 
 def chance(p_value: float) -> str:

@@ -131,7 +131,7 @@ def test_quick_ends_in_about_a_tenth_of_a_second_with_all_four_parameters_within
     truth = {"k_m": 0.0217, "k_1": 20.0, "T_c": 0.01037, "f_v": 3e-5}
     for name, value in truth.items():
         assert said["estimate"][name]["value"] == pytest.approx(value, rel=0.02)
-    assert run.log().run["stop_when"] == "k_m=0.6%,k_1=0.6%,T_c=0.6%,f_v=0.6%"
+    assert run.log().run["stop_when"] == "k_m=1.2%,k_1=1.2%,T_c=1.2%,f_v=1.2%"
 
 
 def test_quick_ends_where_stop_when_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -105,7 +105,8 @@ class Study:
     def __repr__(self) -> str:
         """Verdict and values in one line."""
         values = ", ".join(f"{c.label} = {amount(c.value, c.interval, c.unit)}" for c in self.conclusions)
-        return f"<Study of {', '.join(self.names)}: model '{self.estimate.plant.name}' {self.standing}; {values}>"
+        model = f"model '{self.estimate.plant.name}' {self.standing}"
+        return f"<Study of {', '.join(self.names)}: {model}; ± total (95 %, k=2): {values}>"
 
     def _repr_html_(self) -> str:
         """Verdict and values as a table of a notebook."""

@@ -14,9 +14,10 @@ from emb_bench.batch.row import NONE, Options, Row, unit_of
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE
-from emb_bench.numbers import NOTHING, p_value, plain, spread
+from emb_bench.numbers import p_value, relative
 from emb_bench.report.sentences import INTERVALS
 from emb_bench.report.text import Table, listed, wrapped
+from emb_runtime.numbers import NOTHING, plain
 
 SHOWN = 3  # Most logs of a kind that are named without ``-v``
 OF_AN_ESTIMATE = ("estimate", "low", "high", "between_runs", "repeatability")
@@ -178,7 +179,7 @@ def _agreement(c: Campaign) -> Iterator[str]:
         yield f"the runs agree on {', '.join(agreed)}"
     for name, test in several.items():
         if not test.constant:
-            scatter = f"scatter {test.scatter:.3g} times the stated one"
+            scatter = f"scatter {plain(test.scatter)} times the stated one"
             yield f"{name}: the runs do NOT agree ({p_value(test.p_value)}); {scatter}"
 
 
@@ -200,17 +201,12 @@ def parameter_table(c: Campaign) -> Table:
         row = [f"{name} [{p.unit}]", f"{p.identified} of {c.evaluated}"]
         if not estimated:
             bound = math.nan if p.cramer_rao is None else p.cramer_rao
-            rows.append([*row, _share(bound, 1.0 if p.relative else 0.0)])
+            rows.append([*row, relative(bound, 1.0 if p.relative else 0.0)])
             continue
         if p.estimate is None:
             rows.append([*row, *[NOTHING] * 4])
             continue
         mean, size = p.estimate.constancy, p.estimate.median if p.relative else 0.0
-        row += [f"{mean.mean:.7g}", *(_share(half, size) for half in (p.estimate.total, p.estimate.repeatability))]
-        rows.append([*row, f"{mean.scatter:.3g}" if mean.runs > 1 else NOTHING])
+        row += [plain(mean.mean, 5), *(relative(half, size) for half in (p.estimate.total, p.estimate.repeatability))]
+        rows.append([*row, plain(mean.scatter) if mean.runs > 1 else NOTHING])
     return Table("", header, rows)
-
-
-def _share(half: float, size: float) -> str:
-    """Half an interval: in percent of a size, or as it is where the size is 0."""
-    return spread(half / abs(size), True, 2) if size and math.isfinite(half) else plain(half, 2)

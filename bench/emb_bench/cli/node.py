@@ -17,6 +17,7 @@ from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import Transport
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.numbers import plain
 from emb_runtime.safety import watchdog_process
 from emb_runtime.system import realtime
 from emb_runtime.system.clock import Clock
@@ -116,7 +117,7 @@ def _run(args: argparse.Namespace) -> int:
         node = BrakeNode(bench, layout, brake.theta, brake.noise, brake.plant, charge=brake.charge)
         if not args.no_rt:
             realtime.obtain(priority=PRIORITY)
-        parameters = ", ".join(f"{name} = {value:g}" for name, value in brake.theta._asdict().items())
+        parameters = ", ".join(f"{name} = {plain(value, 6)}" for name, value in brake.theta._asdict().items())
         mention(f"emb-node: on {transport.name}, plant {brake.plant.name}, {parameters}")
         periods = None if args.duration is None else round(args.duration / bench.timing.sample_time)
         skipped = run_node(node, transport, clock, bench.timing.sample_time_ns, periods, lambda: stop)

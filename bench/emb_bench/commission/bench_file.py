@@ -11,6 +11,7 @@ from typing import Any
 import tomlkit
 from tomlkit import TOMLDocument
 
+from emb_bench.brake.parameters import SI
 from emb_bench.commission.comparison import contradiction, not_inside, sheet_range
 from emb_bench.commission.records import Findings, Identification
 from emb_bench.config.bench import Bench, parse_bench
@@ -18,6 +19,7 @@ from emb_bench.config.plants import SHORTEST_LAG
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.typed import parse_toml
 from emb_runtime.errors import BenchFileError
+from emb_runtime.numbers import between, plain
 from emb_runtime.safety.shield_design import make_law
 
 SHEET, MEASURED = "sheet", "measured"  # Names of the sets of ranges
@@ -49,18 +51,19 @@ def found_text(sheet: Bench, found: Findings, logs: str) -> str:
     for name in PARAMETER_NAMES:
         low, high, reason = measured_range(sheet, one, name)
         _put(document, f"brake.{name}", _rounded(min(max(one.values[name], low), high)), by_fit)
-        interval = "{:.5g} to {:.5g}".format(*one.intervals[name])
-        _put(document, f"ranges.{MEASURED}.{name}", [low, high], f"95 %: {interval}; {reason}")
+        interval = f"{between(*one.intervals[name])} {SI[name]}"
+        origin = f"total (95 %) without J: {interval}; {reason}"
+        _put(document, f"ranges.{MEASURED}.{name}", [low, high], origin)
     document["ranges"][MEASURED].add(tomlkit.nl())
     for name in ("angle", "velocity"):
         at_rest, moving = getattr(found.noise, name), getattr(one.noise, name)
-        origin = f"at rest {at_rest:.3g}, of the residuals {moving:.3g}; the larger times {NOISE_WIDENED:g}"
+        origin = f"at rest {plain(at_rest)}, of the residuals {plain(moving)}; the larger times {NOISE_WIDENED:g}"
         _put(document, f"noise.{name}", _rounded(NOISE_WIDENED * max(at_rest, moving), up=True), origin)
     age = current.latest + one.measurement_delay
     origin = f"commands act {current.delay} to {current.latest} samples late, measurements {one.measurement_delay}"
     _put(document, "shield.frame_age", [min(age, sheet.shield.frame_age[0]), age], origin)
     lag = min(sheet.shield.current_lag, _rounded(LAG_WIDENED * one.current_lag[1], up=True))
-    origin = f"95 % up to {one.current_lag[1]:.3g} s, times {LAG_WIDENED:g}, at most the data sheet's"
+    origin = f"total (95 %) up to {plain(one.current_lag[1])} s, times {LAG_WIDENED:g}, at most the data sheet's"
     _put(document, "shield.current_lag", lag, origin)
     _put(document, "shield.ranges", MEASURED, "the measured ones")
     plant: dict[str, float | int] = {name: _rounded(value) for name, value in one.features.items()}
@@ -82,7 +85,7 @@ def measured_range(sheet: Bench, one: Identification, name: str) -> tuple[float,
     lowest, highest = sheet_range(sheet, name)
     if not one.fits and one.ratio > UNEXPLAINED:
         times = math.sqrt(one.ratio)
-        reason = f"no model explains the experiments; residuals {times:.3g} times the noise: the data sheet's"
+        reason = f"no model explains the experiments; residuals {plain(times)} times the noise: the data sheet's"
         return lowest, highest, reason
     if name == "T_c" and "play" in one.features:
         return lowest, highest, "the data sheet's, as play acts as friction"

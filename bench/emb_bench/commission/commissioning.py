@@ -21,6 +21,7 @@ from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError, SafetyStopError, UsageError
+from emb_runtime.numbers import between, plain
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system import terminal
 
@@ -57,7 +58,7 @@ class Commissioned:
         one = self.found.identified
         fits = "the residual tests accept it" if one.fits else f"NO model explains the experiments{one.reasons()}"
         lines = [f"done: {len(self.logs)} steps, {self.runs} new runs; model {one.model}: {fits}"]
-        lines += [f"  {name:<4} {low:.5g} to {high:.5g} {SI[name]}" for name, (low, high) in self.ranges.items()]
+        lines += [f"  {name:<4} {between(low, high)} {SI[name]}" for name, (low, high) in self.ranges.items()]
         return "\n".join([*lines, f"  bench file {self.bench}: a comment behind each measured number gives its source"])
 
 
@@ -95,7 +96,7 @@ class Commissioning:
         sheet, working = self._sheet, self._bench_file(WORKING, working_text(self._sheet))
         work = load_bench(working)
         noise = examination.noise_at_rest(self._log("1-listen", steps.LISTEN, working), sheet)
-        self._say(f"  found: noise {noise.angle:.3g} rad and {noise.velocity:.3g} rad/s")
+        self._say(f"  found: noise {plain(noise.angle)} rad and {plain(noise.velocity)} rad/s")
         comparison.check_noise(noise, sheet)
         self._log("2-zero", steps.ZERO, working)
         self._say("  found: no fault")

@@ -13,6 +13,7 @@ from emb_bench.commission.records import CurrentCheck, FirstMove, Identification
 from emb_bench.config.bench import Bench
 from emb_runtime.config.bench import Noise
 from emb_runtime.errors import BenchFileError, SafetyStopError
+from emb_runtime.numbers import between, plain
 
 SCALE_ERROR = 0.2  # By which reported and commanded current, or angle and velocity, may differ in scale
 LAG_ERROR = 0.05  # By which the time constant of the current loop may exceed the data sheet's
@@ -104,8 +105,8 @@ def check_last(last: Identification, bench: Bench) -> None:
         low, high = sheet_range(bench, name)
         _require(
             not last.fits or (got[1] >= low and got[0] <= high),
-            f"by the run with the bench file that was found {name} is {got[0]:.4g} to {got[1]:.4g} {SI[name]}, "
-            f"in the file {low:.4g} to {high:.4g}: the brake is not the one of the steps before, or changes",
+            f"by the run with the bench file that was found {name} is {between(*got)} {SI[name]}, "
+            f"in the file {plain(low, 4)} to {plain(high, 4)}: the brake is not that of the steps before, or changes",
         )
 
 
@@ -138,8 +139,8 @@ def contradiction(sheet: Bench, one: Identification, names: Sequence[str]) -> st
     """Words for parameters that may lie outside of the data sheet's ranges, and what to do."""
     values = []
     for name in names:
-        (low, high), (lowest, highest) = one.intervals[name], sheet_range(sheet, name)
-        values.append(f"{name} is {low:.5g} to {high:.5g} {SI[name]} (data sheet {lowest:.5g} to {highest:.5g})")
+        lowest, highest = (plain(end, 5) for end in sheet_range(sheet, name))
+        values.append(f"{name} is {between(*one.intervals[name])} {SI[name]} (data sheet {lowest} to {highest})")
     return (
         f"by the estimate {' and '.join(values)}: widen {', '.join(names)} in [ranges.{sheet.shield.ranges}] of the "
         "data sheet's bench file and begin again in another folder"

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from emb_bench.analysis.conclusion import noise_deviations
 from emb_bench.analysis.model_choice import fit_from
 from emb_bench.analysis.model_growth import grow_model
 from emb_bench.brake.parameters import FEATURES, least
@@ -137,9 +138,12 @@ def identify(logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identific
     lows = np.maximum(e.values - half, list(map(least, names)))
     intervals = dict(zip(names, np.stack([lows, e.values + half], axis=1).tolist(), strict=True))
     lag = intervals.get("current_lag", (0.0, 0.0))
+    both = NORMAL_95 * np.stack([noise_deviations(e), e.deviations()], axis=1)
+    halves = dict(zip(names, both.tolist(), strict=True))
     return Identification(
         values={name: values[name] for name in PARAMETER_NAMES},
         intervals={name: tuple(intervals[name]) for name in PARAMETER_NAMES},
+        halves={name: tuple(halves[name]) for name in PARAMETER_NAMES},
         model=best.plant.name,
         fits=best.validation.fits and e.validation.fits,  # an offset explains a wrong model of a small motion
         ratio=e.validation.ratio,

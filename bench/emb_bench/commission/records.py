@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from emb_bench.brake.parameters import SI
 from emb_runtime.config.bench import Noise
+from emb_runtime.numbers import in_percent, plain
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,9 @@ class Identification:
     """Parameters from the experiments so far."""
 
     values: Mapping[str, float]  # [SI]
-    intervals: Mapping[str, tuple[float, float]]  # 95 %, allowing for systematic errors that are not excluded
+    intervals: Mapping[str, tuple[float, float]]
+    """Total (95 %) without the errors of J and of the angle's scale, which the shield shares."""
+    halves: Mapping[str, tuple[float, float]]  # Repeatability and total, as shares of the value
     model: str  # Plant of the best model, with what was added to it
     fits: bool  # The residuals do not contradict the model
     ratio: float  # Mean square of the residuals, in variances of the noise at rest
@@ -51,13 +54,12 @@ class Identification:
     objections: tuple[str, ...] = ()  # Alarms of the tests on the residuals, and what would explain them
 
     def __str__(self) -> str:
-        found = []
-        for name, (low, high) in self.intervals.items():
-            value = self.values[name]
-            aside = 100.0 * max(high - value, value - low) / abs(value)
-            found.append(f"{name} {value:.5g} {SI[name]} ± {aside:.2g} %")
+        found = [
+            f"{name} {plain(self.values[name], 5)} {SI[name]} ± {in_percent(own)} (± {in_percent(total)})"
+            for name, (own, total) in self.halves.items()
+        ]
         misfit = "" if self.fits else f", which does not fit yet{self.reasons()}"
-        return f"at 95 % {', '.join(found)}; model {self.model}{misfit}"
+        return f"± repeatability (± total), 95 %, k=2: {', '.join(found)}; model {self.model}{misfit}"
 
     def reasons(self) -> str:
         """Objections in brackets; "" without any."""

@@ -1,1 +1,1 @@
-"""Tables of the bench file that simulation and analysis read: plants, budgets, systematic errors, machines."""
+"""Tables of the bench file that simulation and analysis read: plants, budgets, machines."""

@@ -1,4 +1,4 @@
-"""The bench file with the tables that simulation and analysis read: budgets, plants, systematic errors, machine."""
+"""The bench file with the tables that simulation and analysis read: budgets, plants, machine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import emb_runtime.config.bench as driven
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import BUILT_IN, Plant, read_plant
 from emb_runtime.config.bench import PARAMETER_NAMES, REMEDY, checked_bench, parse_document, read_bench_text
-from emb_runtime.config.typed import NotNegative, parse_toml, read
+from emb_runtime.config.typed import parse_toml, read
 from emb_runtime.errors import BenchFileError, near
 
 AROUND = 3.0  # Factor around its nominal parameters within which searches for those of a machine begin
@@ -57,38 +57,11 @@ class Budgets:
         return {name: value for name in TIMED if (value := getattr(self, name))}
 
 
-@dataclass(frozen=True)
-class Systematic:
-    """Systematic errors that a bench cannot exclude by itself: ``[systematic]``.
-
-    Standard deviations of Gaussian priors with mean zero, or with what the plant itself says. Most
-    records determine an error better than its prior. 0 excludes an error.
-    """
-
-    offset: NotNegative = 0.05  # Reading of the encoder at the true origin [rad]
-    current_offset: NotNegative = 0.05
-    """Current that acts beyond what the node reports; a friction that depends on the direction looks the same [A]."""
-    delay: NotNegative = 0.3  # By which commands act late, or samples early [samples]
-    velocity_gain: NotNegative = 0.02  # Relative error of the velocity's scale
-    inertia: NotNegative = 0.01  # Relative error of J, which all four parameters share
-    angle_scale: NotNegative = 0.003  # Relative error of the angle's scale, which k_m and T_c share
-    held: NotNegative = 0.02  # Relative error of each parameter that is held at its nominal value
-    quadratic: NotNegative = 1e-4  # Quadratic share of the stiffness that the plant lacks [1/rad]
-    cubic: NotNegative = 1e-6  # Cubic share of the stiffness that the plant lacks [1/rad²]
-    hysteresis: NotNegative = 1e-2  # Hysteresis of the clamping force that the plant lacks
-    play: NotNegative = 0.2  # Clearance in the gear [rad]
-    break_away: NotNegative = 0.1  # Static friction beyond the plant's, as a share of T_c
-    f_l: NotNegative = 1e-7  # Load-dependent static friction beyond the plant's [m]
-    current_lag: NotNegative = 5e-4  # Time constant of the current loop beyond the plant's [s]
-    drift: NotNegative = 0.003  # Change of each parameter from the begin of a run to its end, as a share of it
-
-
 class _Tables(msgspec.Struct, frozen=True):
     """The tables as they stand."""
 
     budgets: Budgets | None = None
     plants: dict[str, dict[str, Any]] = {}
-    systematic: Systematic = Systematic()
     machine: Machine | None = None
 
 
@@ -98,7 +71,6 @@ class Bench(driven.Bench):
 
     budgets: Budgets | None  # Timing budgets of a run; None if the file has none
     plants: Mapping[str, Plant]
-    systematic: Systematic  # Systematic errors that an estimate has to allow for
     machine: Machine | None  # A machine that is no brake of ours, for analysis only; None for a brake, which is driven
 
     def plant(self, name: str) -> Plant:
@@ -146,7 +118,7 @@ def with_tables(bench: driven.Bench, source: str) -> Bench:
     plants = dict(BUILT_IN)
     plants |= {name: read_plant(name, table, source) for name, table in tables.plants.items()}
     common = {f.name: getattr(bench, f.name) for f in fields(driven.Bench)}
-    return Bench(**common, budgets=tables.budgets, plants=plants, systematic=tables.systematic, machine=tables.machine)
+    return Bench(**common, budgets=tables.budgets, plants=plants, machine=tables.machine)
 
 
 def _never_driven(document: Mapping[str, Any], source: str) -> dict[str, Any]:

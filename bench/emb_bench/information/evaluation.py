@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT, RECORDED_PLANT, THESIS_PLANT, Plant
 from emb_bench.experiment.experiment import Experiment
@@ -18,10 +19,12 @@ from emb_bench.information.fisher import Fisher, Kind, information_over_time, un
 from emb_bench.information.identifiability import Identifiability
 from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import RunLog
+from emb_bench.numbers import relative
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_bench.sim.open_loop import check_unknowns, fast_loop
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import LogError, UsageError
+from emb_runtime.estimator.estimate import NORMAL_95
 
 KINDS: tuple[Kind, ...] = ("physical", "weighted")
 
@@ -171,8 +174,13 @@ class Evaluation:
 
     def __repr__(self) -> str:
         """Log, model and bounds in one line."""
-        bounds = ", ".join(f"{name} {bound:.3g}" for name, bound in self.fisher("physical").cramer_rao().items())
-        return f"<Evaluation of {self.log.path.name}: model '{self.plant.name}'; least deviations {bounds}>"
+        bounds = ", ".join(
+            f"{name} ± {relative(NORMAL_95 * bound, PARAMETERS[name].relative)}"
+            for name, bound in self.fisher("physical").cramer_rao().items()
+        )
+        return (
+            f"<Evaluation of {self.log.path.name}: model '{self.plant.name}'; smallest possible repeatability {bounds}>"
+        )
 
     def __getitem__(self, name: str) -> float:
         """Smallest possible standard deviation of a parameter, relative or in its unit (Cramér-Rao)."""

@@ -13,6 +13,7 @@ from typing import BinaryIO
 from mcap.opcode import Opcode
 
 from emb_bench.live.serve import Server
+from emb_bench.logs.estimates import known_errors
 from emb_bench.logs.log import UNREADABLE, read_log
 from emb_bench.logs.mcap_file import DAMAGE, LARGEST, MAGIC, MOST_CARRIED, RECORD, Chunk, message_of, unpack_chunk
 from emb_runtime.errors import LogError
@@ -106,7 +107,9 @@ def follow(
         server.begin()
         try:
             # A run that was killed leaves a log that has no end.
-            for chunk in chunks(path, lambda: wait() and not logs.waiting):
+            for number, chunk in enumerate(chunks(path, lambda: wait() and not logs.waiting)):
+                if number == 0:  # the attachments lie before it
+                    server.know(known_errors(read_log(path)))
                 server.add(chunk)
             server.end(read_log(path).exit_reason)
         except LogError as err:

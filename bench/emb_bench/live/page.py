@@ -16,13 +16,15 @@ from typing import Any
 from mcap import records as mcap
 
 from emb_bench.logs.mcap_file import Chunk, message_class
-from emb_runtime.estimator.estimate import NORMAL_95, UNITS
+from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.estimator.estimate import UNKNOWN, by_name, rows, shares, total
 from emb_runtime.records import Reason, RunState
 
 SUBPROTOCOL = "emb-excite.page"
 KEPT = 600  # Chunks that a browser which comes later gets; a chunk has 0.1 s
 TOPICS = ("/cycle", "/estimate", "/safety")
 RUNNING = (RunState.ACTIVE, RunState.HOMING)
+NUMBERS = (*PARAMETER_NAMES, *(f"{name}_deviation" for name in PARAMETER_NAMES))  # Of a message of ``/estimate``
 SHIELD = Reason.LIMITED | Reason.RETURNING | Reason.LEFT
 
 
@@ -48,6 +50,7 @@ class Page:
         self._schemas: dict[int, mcap.Schema] = {}
         self._classes: dict[int, tuple[str, Any]] = {}
         self._start_ns = -1
+        self.errors = UNKNOWN  # Systematic errors by the log's bench file
         return self.so_far[0]
 
     def add(self, chunk: Chunk) -> str:
@@ -57,15 +60,17 @@ class Page:
             TypeError, KeyError, ValueError, AttributeError, google.protobuf.message.DecodeError: it is damaged.
         """
         said: dict[str, Any] = {"cycles": [], "estimates": [], "events": []}
+        estimate: dict[str, dict[str, Any]] = {}
         for topic, message in self._messages(chunk):
             if topic == "/safety":
                 said["events"].append(f"{message.code} {message.text}")
             elif topic == "/estimate":
-                rows = [(name, _number(value), _number(half)) for name, value, half in _intervals(message)]
-                said["estimates"].append({"step": message.step, "rows": rows})
+                estimate = by_name([getattr(message, name) for name in NUMBERS], self.errors)
+                repeatability = {name: _number(share) for name, share in shares(estimate).items()}
+                said["estimates"].append({"step": message.step, "repeatability": repeatability})
             elif message.state in RUNNING:
                 said["cycles"].append(self._cycle(message))
-        return self._keep({**said, "units": UNITS})
+        return self._keep({**said, "table": [*rows(estimate)], "total": total(shares(estimate), self.errors)})
 
     def end(self, reason: str) -> str:
         """The log is whole: the run's exit reason."""
@@ -101,13 +106,6 @@ class Page:
     def _keep(self, said: dict[str, Any]) -> str:
         self._sent.append(json.dumps(said))
         return self._sent[-1]
-
-
-def _intervals(estimate: Any) -> Iterator[tuple[str, float, float]]:
-    """Name, value and half of the 95 % interval of each estimated parameter."""
-    for name in UNITS:
-        if (deviation := getattr(estimate, f"{name}_deviation")) > 0.0:
-            yield name, getattr(estimate, name), NORMAL_95 * deviation
 
 
 def _number(value: float) -> float | None:

@@ -26,6 +26,7 @@ from mcap import records as mcap
 
 from emb_bench.live.page import SUBPROTOCOL, Page, html
 from emb_bench.logs.mcap_file import Chunk
+from emb_runtime.config.bench import Systematic
 from emb_runtime.errors import UsageError
 
 if TYPE_CHECKING:
@@ -174,6 +175,10 @@ class Server:
         self._schemas.clear()
         self._of_log.clear()
         self._to_pages(self._page.begin)
+
+    def know(self, errors: Systematic) -> None:
+        """Take the systematic errors by the log's bench file, for the totals on the page."""
+        self._page.errors = errors
 
     def end(self, reason: str) -> None:
         """The log is whole: the run's exit reason."""

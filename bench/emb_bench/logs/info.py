@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.logs.estimates import last_estimate
+from emb_bench.logs.estimates import known_errors, last_estimate
 from emb_bench.logs.log import RunLog
 from emb_bench.logs.timing import in_control, quantiles
 from emb_runtime.can.e2e import NO_COUNTER
+from emb_runtime.estimator.estimate import shares, total
 from emb_runtime.records import CycleRecord, Reason
 
 _REASONS = {
@@ -65,7 +66,8 @@ def info_document(log: RunLog) -> dict[str, Any]:
     first, last = log.span
     found = cycle_summary(log)
     optional = {
-        "estimate": last_estimate(log),
+        "estimate": (estimate := last_estimate(log)),
+        "total": total(shares(estimate), known_errors(log)),
         "drive_lacks": log.drive_lacks,
         "largest": found.largest and asdict(found.largest),
         "sensor_to_command": found.sensor_to_command,

@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import tomlkit
 
-from emb_bench.config.bench import Systematic, parse_bench
+from emb_bench.config.bench import parse_bench
 from emb_bench.config.plants import RECORDED_PLANT
 from emb_bench.experiment.from_log import Recording
 from emb_bench.logs.log import Chunks
 from emb_bench.recordings.map_file import RecordingMap, read_map
 from emb_bench.recordings.readers import Found, experiment_of, read_columns
+from emb_runtime.config.bench import Systematic
 
 ACCURACY = 4e-11  # Local error of the velocity, as a share of the largest one: that of a brake at 250 rad/s
 LOOSEST = 1e-8  # Largest local error [rad/s], [m/s] of a linear machine

@@ -23,10 +23,11 @@ from emb_bench.analysis.drift import Drift, Earlier
 from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import OF_A_RECORD, PARAMETERS, SI, UNITS
 from emb_bench.estimate.records import DONE, NORMAL_95
-from emb_bench.numbers import amount, between, plain, share, share_between
+from emb_bench.numbers import amount, share, share_between
 from emb_bench.report.sentences import doubts, other_model
 from emb_runtime.config.typed import FieldError, read
 from emb_runtime.errors import UsageError
+from emb_runtime.numbers import between, plain
 from emb_runtime.system.input_file import read_text
 
 LONGEST = 2**20  # Size limit of the file [bytes]

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from emb_bench.brake.parameters import UNITS
-from emb_bench.numbers import spread
+from emb_bench.numbers import relative
 from emb_bench.report.text import Table, facts
 from emb_runtime.estimator.estimate import NORMAL_95
 
@@ -19,12 +19,12 @@ def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
     d, own = report.metadata(), report.checks[0]
     brake = f"{d['model']}, {d['kind']} information, {'returns home' if d['returns'] else 'ends anywhere'}"
     optima = ", ".join(f"{value:.6g}" for value in d["local_optima"][: None if verbose else 4])
-    bounds = d["cramer_rao"] or {}
+    bounds = ", ".join(f"{name} {_half(bound, name)}" for name, bound in (d["cramer_rao"] or {}).items())
     lines = facts(
         (d["value_is"], f"{d['value']:.7g}; {_verdict(own)}"),
         ("criterion", f"{d['criterion']} of {', '.join(d['params'])}"),
         ("brake", brake),
-        ("± 95 %", ", ".join(f"{name} {_half(bound, name)}" for name, bound in bounds.items())),
+        ("repeatability", bounds and f"smallest possible, ± 95 % (k=2): {bounds}"),
         ("optima", f"{optima} ({d['starts']} starts, seed {d['seed']})"),
         ("currents", written or "not written: use -o design.csv"),
     )
@@ -32,9 +32,9 @@ def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
 
 
 def _half(deviation: float, name: str) -> str:
-    """Half of the best possible 95 % interval: in percent, or in the unit of an unknown that has no scale."""
+    """The smallest possible repeatability: in percent, or in the unit of an unknown that has no scale."""
     unit = UNITS.get(name, "").removesuffix("1") if math.isfinite(deviation) else ""  # none of a share
-    return f"{spread(NORMAL_95 * deviation, name not in UNITS)} {unit}".rstrip()
+    return f"{relative(NORMAL_95 * deviation, name not in UNITS)} {unit}".rstrip()
 
 
 def _verdict(check: Check) -> str:

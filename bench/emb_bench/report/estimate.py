@@ -43,7 +43,7 @@ def text(study: Study, *, verbose: bool = False) -> str:
     elif study.holds or verbose:
         lines += [*wrapped(say.intervals(study.estimate), 0), "", *listed("", _limits(study))]
     else:
-        lines += [f"± 95 % (k=2), without the {'bias of the method' if study.biased else 'error of the model'}", ""]
+        lines += [say.without(study), ""]
     return "\n".join([*lines, *_next(study), *(_evidence(study) if verbose else ())])
 
 

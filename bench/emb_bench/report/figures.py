@@ -15,8 +15,8 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.model_validation import OUTPUTS
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.figures import COLOURS, DASHED, GREY, svg
-from emb_bench.numbers import SMALL, SUPERSCRIPT
 from emb_bench.report.content import ActiveCycles, Run, StopSamples
+from emb_runtime.numbers import SMALL, SUPERSCRIPT
 from emb_runtime.records import Reason
 
 WIDE = 8.6  # Width of a figure that fills the page [inch]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_left
 from typing import Any
 
@@ -14,11 +13,12 @@ from emb_bench.documents import to_json
 from emb_bench.information.criteria import criteria_series
 from emb_bench.information.evaluation import KINDS, Evaluation, Question, default_model, evenly
 from emb_bench.information.identifiability import Finding, combination
-from emb_bench.numbers import NOTHING, in_samples, plain
+from emb_bench.numbers import in_samples, relative
 from emb_bench.report import sentences as say
 from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.estimator.estimate import NORMAL_95
+from emb_runtime.estimator.estimate import NORMAL_95, total
+from emb_runtime.numbers import NOTHING, plain
 
 INSTANTS = 10  # Rows of the table over time; the document has more
 CRITERIA = {
@@ -71,7 +71,7 @@ def document(e: Evaluation) -> dict[str, Any]:
 
 
 def text(e: Evaluation, *, verbose: bool = False) -> str:
-    """The best possible intervals; what is missing comes before any number. With ``verbose`` the criteria over time."""
+    """The smallest possible repeatabilities; what is missing comes first. With ``verbose`` the criteria over time."""
     doubts, lines = [*listed("WARNING: ", say.warnings(e)), *listed("NOTE: ", say.notes(e))], _heading(e)
     fit = f"rms: angle {e.fit.angle:.3g}, velocity {e.fit.velocity:.3g} sigma (at most {e.fit.expected:.2f} if it fits)"
     lines += [*facts(("model", f"{e.plant.name} ({_why(e)})"), ("residuals", fit)), *_unknowns(e.question)]
@@ -79,12 +79,16 @@ def text(e: Evaluation, *, verbose: bool = False) -> str:
         return "\n".join([*doubts, "no information: the record does not depend on any of these parameters", *lines])
     verdict = e.verdict().shown(e.bench.machine)
     prior = "" if e.question.prior is None else ", with the prior"
-    head = wrapped(f"best possible ± 95 % (k=2){prior}, with sensor noise and no systematic error")
+    head = wrapped(f"smallest possible repeatability ± 95 % (k=2){prior}, of ideal sensors")
     rows = [[f.name, _half(f), say.finding(f)] for f in verdict.findings]
     head += [*(row.rstrip() for row in Table("", ("", "", ""), rows, words=(0, 2)).lines("  ")[1:])]
+    if e.bench.machine is None:
+        bounds = {f.name: NORMAL_95 * f.deviation for f in verdict.findings if f.name in PARAMETER_NAMES}
+        head += listed("  ", [total(bounds, e.bench.systematic)])
     head += listed("  ", say.directions(verdict))
     final = e.fisher("physical").criteria().shown(e.bench.machine)
-    shown = f"log det {final.log_det:.6g}, smallest eigenvalue {final.lambda_min:.4g}, condition {final.condition:.4g}"
+    smallest, condition = plain(final.lambda_min), plain(final.condition)
+    shown = f"log det {final.log_det:.5g}, smallest eigenvalue {smallest}, condition {condition}"
     lines = [*head, "", *lines, *facts(("information", shown))]
     return "\n".join([*doubts, *lines, *(_details(e) if verbose else ())])
 
@@ -96,17 +100,15 @@ def _why(e: Evaluation) -> str:
 
 
 def _half(f: Finding) -> str:
-    """Half of the 95 % interval that a bound allows."""
-    if math.isinf(f.deviation):
-        return NOTHING
-    half = NORMAL_95 * f.deviation
-    return f"{plain(half)} {f.unit}" if f.unit else f"{plain(100.0 * half)} %"
+    """The repeatability that a bound allows."""
+    half = relative(NORMAL_95 * f.deviation, not f.unit)
+    return half if half == NOTHING else f"± {half} {f.unit}".rstrip()
 
 
 def _details(e: Evaluation) -> list[str]:
     """Criteria of both informations, and how they grew."""
     final = {kind: e.fisher(kind).criteria().shown(e.bench.machine) for kind in KINDS}
-    rows = [[label, *(f"{getattr(final[kind], name):.6g}" for kind in KINDS)] for label, name in CRITERIA.items()]
+    rows = [[label, *(plain(getattr(final[kind], name), 6) for kind in KINDS)] for label, name in CRITERIA.items()]
     table = Table("", ("Fisher information", *KINDS), rows).lines()
     weakest = f"least determined: {combination(final['physical'].weakest)}"
     return ["", *table, *wrapped(f"  {weakest}"), "", *_over_time(e).lines()]
@@ -120,8 +122,8 @@ def _over_time(e: Evaluation) -> Table:
         [
             f"{(k + 1) * e.bench.timing.sample_time * 1e3:.6g}",
             f"{det:.4f}",
-            f"{least:.5g}",
-            f"{trace:.5g}",
+            plain(least, 5),
+            plain(trace, 5),
             f"{w:.4f}",
         ]
         for k, det, least, trace, w in zip(steps, *physical, weighted.log_det, strict=True)
@@ -136,12 +138,12 @@ def _heading(e: Evaluation) -> list[str]:
     run += f", {x.braked} braked by the node" if x.braked else ""
     run += f"; commands acted {in_samples(late)} late" if late else ""
     if machine is None:
-        theta = ", ".join(f"{name} {getattr(e.theta, name):.4g}" for name in PARAMETER_NAMES) + " (SI)"
+        theta = ", ".join(f"{name} {plain(getattr(e.theta, name), 4)}" for name in PARAMETER_NAMES) + " (SI)"
     else:
         values = e.theta._asdict()
         names = [n for n in (*PARAMETER_NAMES, "J") if values[n] and (n != "k_m" or machine.command not in LOADS)]
         known = ((quantity(machine, name), values[name]) for name in names)
-        theta = ", ".join(f"{shown.name} = {value:.4g} {shown.unit}" for shown, value in known)
+        theta = ", ".join(f"{shown.name} = {plain(value, 4)} {shown.unit}" for shown, value in known)
     return facts(
         ("log", f"{e.log.path}: {run}"),
         ("theta", f"{e.theta_name}: {theta}"),

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from emb_bench import numbers
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import QUANTILES
 from emb_bench.documents import to_json
@@ -26,7 +25,7 @@ from emb_bench.estimate.records import METHODS
 from emb_bench.logs import timing
 from emb_bench.logs.info import info_document
 from emb_bench.logs.timing import INTERVALS, quantiles
-from emb_bench.numbers import plain, seconds, signed
+from emb_bench.numbers import p_value, seconds, signed
 from emb_bench.report import figures, sentences, tables
 from emb_bench.report.caveats import caveats
 from emb_bench.report.content import REASONS, Content, Run
@@ -36,6 +35,7 @@ from emb_bench.report.trend import panels as trend_panels
 from emb_bench.report.trend import table as run_table
 from emb_bench.report.trend import trends
 from emb_runtime.errors import BenchFileError
+from emb_runtime.numbers import plain
 from emb_runtime.safety.end_stop import end_stop_speed
 from emb_runtime.system.terminal import escaped
 
@@ -196,10 +196,10 @@ def environment() -> Environment:
         finalize=_printable,
     )
     made.filters |= {
-        "plain": numbers.plain,
-        "signed": numbers.signed,
-        "seconds": numbers.seconds,
-        "p_value": numbers.p_value,
+        "plain": plain,
+        "signed": signed,
+        "seconds": seconds,
+        "p_value": p_value,
         "data_uri": _data_uri,
         "capitalize_first": lambda words: words[:1].upper() + words[1:],
     }

@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 from emb_bench.config.bench import COUNTED, QUANTILE_NAMES
 from emb_bench.logs.log import RunLog, end_detail
 from emb_bench.logs.timing import INTERVALS, BudgetCheck, Timing, document, judge, quantiles, timing
-from emb_bench.numbers import NOTHING, around, percent, plain, seconds
+from emb_bench.numbers import percent, seconds
 from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_USAGE
-from emb_runtime.estimator.estimate import NORMAL_95
+from emb_runtime.estimator.estimate import words
+from emb_runtime.numbers import NOTHING, plain
 from emb_runtime.system.terminal import one_line
 
 UNITS = ((1.0, "s"), (1e3, "ms"), (1e6, "µs"))  # Of times, with their factors
@@ -33,10 +34,8 @@ def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
         ("response", _delays(d)),
     )
     if estimate := d.get("estimate"):
-        lines += ["", *wrapped("running estimate ± 95 % (k=2), valid if the model is right", 0)]
-        lines += [
-            f"  {name}  {around(q['value'], NORMAL_95 * q['deviation'])} {q['unit']}" for name, q in estimate.items()
-        ]
+        fits = d["metadata"].get("emb.end", {}).get("model_fits") != "False"
+        lines += ["", *words(estimate, d.get("total", ""), fits=fits)]
     if not verbose:
         return "\n".join(lines)
     lines += _listed("messages", {topic: f"{count:9}" for topic, count in d["messages"].items()})

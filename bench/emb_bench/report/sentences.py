@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 from emb_bench.brake.parameters import UNITS, quantity
 from emb_bench.experiment.experiment import Experiment, Lack
 from emb_bench.information.identifiability import Border, Doubt, combination
-from emb_bench.numbers import amount, between, in_samples, p_value, percent, plain, spread
+from emb_bench.numbers import amount, in_samples, p_value, percent
 from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.numbers import between, in_percent, plain
 from emb_runtime.system.terminal import one_line
 
 if TYPE_CHECKING:  # scipy comes with the extra [bench]
@@ -34,13 +35,13 @@ INTERVALS = (
     "that the record cannot exclude."
 )
 
-NOISE_ALONE = "± 95 % (k=2), by sensor noise alone: no systematic error and no other effect is allowed for."
+NOISE_ALONE = "± repeatability (95 %, k=2), by sensor noise alone: no systematic or other error is allowed for."
 
 TERMS = {
     "sigma": "standard deviation",
-    "repeatability": "half of the 95 % interval by sensor noise: the scatter of further runs",
-    "total": "half of the 95 % interval, also with systematic errors and effects that the record cannot exclude, where "
-    "they are allowed for",
+    "repeatability": "half of the 95 % interval (k = 2) by sensor noise: the scatter of further runs",
+    "total": "half of the 95 % interval (k = 2), also with systematic errors and effects that the record cannot "
+    "exclude, where they are allowed for",
     "chi2/n": "mean square of the residuals in sigmas, near 1 if the model is right",
     "identified": "the 95 % interval is closed, excludes zero and ends at no border of the search",
     "trades off": "the data determine two parameters well only together: their errors compensate",
@@ -91,6 +92,12 @@ LACKS = {
 
 LONGEST_NAME = 80  # Characters of a name from another file
 EXPLAINS = 3.0  # Standard deviations from which on a parameter that is held fixed may explain a misfit
+
+
+def without(study: Study) -> str:
+    """Kind of the intervals of a model that does not hold, and the error that is not in them."""
+    return f"± total (95 %, k=2), without the {'bias of the method' if study.biased else 'error of the model'}"
+
 
 # ---- an experiment ----
 
@@ -155,7 +162,7 @@ def headline(study: Study) -> str:
             "Noise biases its values; the model is not tested. Use --method oem."
         )
     if not study.model_fits:
-        size = f" (chi2/n {e.validation.ratio:.3g}, at most {e.validation.expected[1]:.3f} expected)"
+        size = f" (chi2/n {plain(e.validation.ratio)}, at most {e.validation.expected[1]:.3f} expected)"
         size = size if "size" in e.validation.alarming else ""
         return f"THE MODEL '{name}' DOES NOT FIT{size}: the intervals do not include its error."
     if not study.predicts:
@@ -282,7 +289,7 @@ def limit(effect: Contribution, e: Estimate) -> str:
     from emb_bench.estimate.suspects import shown_as
 
     name, shared = shown_as(effect, e.bench.machine).name, effect.name in OF_THE_BENCH
-    return f"{name}, known to {spread(e.asked.allowed[effect.name], True)}" if shared else name
+    return f"{name}, known to {in_percent(e.asked.allowed[effect.name])}" if shared else name
 
 
 # ---- tests on the residuals ----
@@ -300,17 +307,19 @@ def alarms(e: Estimate) -> list[str]:
     elif scored:
         found.append("no effect explains it in an amount that is possible: look for a fault in the data")
     elif m.together is not None and "scores" in m.alarming:
-        score = f"chi2 {m.together.statistic:.4g} of {m.together.rank}, {p_value(m.together.p_value)}"
+        score = f"chi2 {plain(m.together.statistic, 4)} of {m.together.rank}, {p_value(m.together.p_value)}"
         found.append(f"the model lacks several effects together ({score})")
     depends = [name for name in m.independence if f"current of {name}" in m.alarming]
     if "size" in m.alarming:
         no_pattern = ", without any pattern: the noise may be larger than the bench says"
         why = "" if depends or m.coloured or scored else no_pattern
-        found.append(f"the residuals are too large: chi2/n {m.ratio:.4g}, at most {m.expected[1]:.3f} expected{why}")
+        found.append(
+            f"the residuals are too large: chi2/n {plain(m.ratio, 4)}, at most {m.expected[1]:.3f} expected{why}"
+        )
     for name in depends:
         test = m.independence[name]
         found.append(
-            f"the residuals of the {name} depend on the current: F = {test.statistic:.3g}, {p_value(test.p_value)}, "
+            f"the residuals of the {name} depend on the current: F = {plain(test.statistic)}, {p_value(test.p_value)}, "
             f"largest correlation {test.correlation:+.2f} with the current {test.lag} periods earlier"
         )
     if any(f"whiteness of {name}" in m.alarming for name in m.coloured):
@@ -337,13 +346,13 @@ def residual_notes(e: Estimate) -> list[str]:
         said = " and ".join(random_walks(e.bench.machine, m.disturbance.walk, m.disturbance.load))
         found.append(
             f"the {'brake' if e.bench.machine is None else 'machine'} is disturbed by more than the sensors' noise: "
-            f"{said} (likelihood ratio {m.disturbance.ratio:.4g}, {p_value(m.disturbance.p_value)}); the intervals "
-            "allow for it"
+            f"{said} (likelihood ratio {plain(m.disturbance.ratio, 4)}, {p_value(m.disturbance.p_value)}); the "
+            "intervals allow for it"
         )
     if m.ratio < m.expected[0]:
         found.append(
-            f"the residuals are smaller than the bench's noise: chi2/n {m.ratio:.4g}, at least {m.expected[0]:.3f} "
-            "expected: the noise in the bench file, and all uncertainties, are too large"
+            f"the residuals are smaller than the bench's noise: chi2/n {plain(m.ratio, 4)}, at least "
+            f"{m.expected[0]:.3f} expected: the noise in the bench file, and all uncertainties, are too large"
         )
     if m.coloured and not any(f"whiteness of {name}" in m.alarming for name in m.coloured):
         found.append(
@@ -358,16 +367,16 @@ def random_walks(machine: Machine | None, velocity: float, load: float) -> list[
     found, command = list[str](), quantity(machine, "current")
     if velocity > 0.0:
         unit = quantity(machine, "velocity").unit
-        found.append(f"its velocity does a random walk of {velocity:.3g} {unit} per root of a second")
+        found.append(f"its velocity does a random walk of {plain(velocity)} {unit} per root of a second")
     if load > 0.0:
-        size = f"{load:.3g} {command.unit}".removesuffix(" 1")
+        size = f"{plain(load)} {command.unit}".removesuffix(" 1")
         found.append(f"its load does a random walk, that of a {command.name} of {size} per root of a second")
     return found
 
 
 def _coloured(m: ModelValidation) -> str:
     tested = "; ".join(
-        f"{white.statistic:.4g} at {white.lags} lags, {p_value(white.p_value)}"
+        f"{plain(white.statistic, 4)} at {white.lags} lags, {p_value(white.p_value)}"
         for white in (m.whiteness[name] for name in m.coloured)
     )
     return f"the residuals of the {' and '.join(m.coloured)} are correlated in time (Ljung-Box {tested})"
@@ -378,8 +387,7 @@ def explained(s: Suspect, machine: Machine | None = None) -> str:
     from emb_bench.estimate.suspects import EFFECTS, shown_as
 
     effect, unit = EFFECTS[s.name], shown_as(s, machine).unit
-    share = 100.0 * s.value
-    amount = f"{s.value:.2g} {unit}" if unit else f"{share:.0f} %" if abs(share) >= 99.5 else f"{share:.2g} %"
+    amount = f"{plain(s.value, 2)} {unit}" if unit else in_percent(s.value)
     said = effect.effect
     for parameter in PARAMETER_NAMES:
         said = said.replace(parameter, quantity(machine, parameter).name)
@@ -415,7 +423,7 @@ def drift(d: Drift) -> str:
         return f"cannot be compared with {since}: not identified {'then' if math.isinf(d.last_deviation) else 'now'}"
 
     def size(change: float) -> str:
-        return f"{100.0 * change:.2g} %" if d.relative else f"{change:.2g}"
+        return in_percent(change) if d.relative else plain(change, 2)
 
     if not d.drifted:
         return f"no significant change since {since} (detection limit {size(d.detectable)})"
@@ -425,7 +433,9 @@ def drift(d: Drift) -> str:
 
 def held_out(h: HeldOut) -> str:
     """Prediction of one record."""
-    return f"{'predicted' if h.fits else 'NOT predicted'}, chi2/n {h.ratio:.4g} of {h.freedom}, {p_value(h.p_value)}"
+    return (
+        f"{'predicted' if h.fits else 'NOT predicted'}, chi2/n {plain(h.ratio, 4)} of {h.freedom}, {p_value(h.p_value)}"
+    )
 
 
 def profile(p: Profile, e: Estimate) -> str:
@@ -451,7 +461,7 @@ def profile(p: Profile, e: Estimate) -> str:
     if e.method != "oem":
         found.append(f"of output error, whose minimum is at {plain(p.minimum, 6)}{unit}")
     if p.fell:
-        found.append(f"chi2 fell by {p.fell:.3g} at {plain(p.minimum, 6)}{unit}: the estimate is a local minimum only")
+        found.append(f"chi2 fell by {plain(p.fell)} at {plain(p.minimum, 6)}{unit}: the estimate is a local minimum")
     if not e.validation.fits:
         found.append("too narrow, because the model does not fit")
     return "; ".join(found)
@@ -567,7 +577,7 @@ def warnings(e: Evaluation) -> list[str]:
     worst = max(e.fit.angle, e.fit.velocity)
     return [
         *found,
-        f"model '{e.plant.name}' with theta of '{e.theta_name}' does not fit (rms {worst:.3g} sigma): {why}",
+        f"model '{e.plant.name}' with theta of '{e.theta_name}' does not fit (rms {plain(worst)} sigma): {why}",
     ]
 
 
@@ -575,7 +585,7 @@ def notes(e: Evaluation) -> list[str]:
     """Assumptions about the currents that acted, and effects of the model's instruments."""
     instruments, found = e.plant.instruments, taken_for_acted(e.experiment)
     if known := {name: value for name, value in e.errors._asdict().items() if value}:
-        values = ", ".join(f"{n} = {v:.3g} {UNITS[n]}".removesuffix(" 1") for n, v in known.items())
+        values = ", ".join(f"{n} = {plain(v)} {UNITS[n]}".removesuffix(" 1") for n, v in known.items())
         found.append(f"systematic errors of this record, from {e.theta_name}, are taken as known: {values}")
     if instruments.observer_bandwidth > 0.0:
         found.append("the velocity is an observer's, derived from the angle: it adds no physical information")
@@ -602,7 +612,7 @@ def direction(d: Direction) -> str:
     """A combination of parameters that the data do not identify."""
     if math.isinf(d.deviation):
         return f"no information on {combination(d.shares)}"
-    return f"hardly any information on {combination(d.shares)}: known to {d.deviation:.3g} times its size"
+    return f"hardly any information on {combination(d.shares)}: known to {plain(d.deviation)} times its size"
 
 
 def directions(found: Identifiability) -> list[str]:

@@ -12,10 +12,11 @@ from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
 from emb_bench.estimate.records import NORMAL_95
 from emb_bench.estimate.suspects import shown_as
 from emb_bench.information.identifiability import TRADED_OFF
-from emb_bench.numbers import NOTHING, SMALL, amount, around, chance, percent, plain, signed, spread
+from emb_bench.numbers import amount, chance, percent, relative, signed
 from emb_bench.report.acceptance import Acceptance, Result
 from emb_bench.report.sentences import drift, limit
 from emb_bench.report.text import Cell, Table
+from emb_runtime.numbers import NOTHING, SMALL, around, plain
 
 TONES = {Result.PASS: "good", Result.FAIL: "bad", Result.CANNOT_TELL: "care"}  # Colours of results
 
@@ -34,7 +35,7 @@ def acceptance_table(acceptance: Acceptance | None) -> Table | None:
         [one.name, one.required, one.found, Cell(one.result.value, TONES[one.result]), one.why]
         for one in acceptance.results
     ]
-    header = ["criterion", "required", "found (± 95 %)", "result", "why"]
+    header = ["criterion", "required", "found (95 % interval)", "result", "why"]
     return Table(f"Acceptance criteria of {acceptance.criteria.source}", header, rows, words=range(len(header)))
 
 
@@ -53,8 +54,8 @@ def parameters(study: Study, *, brief: bool = False) -> Table:
         unknown = e.unknowns[i]
         size = c.value if unknown.relative else 0.0
         row: list[str] = [c.label, amount(c.value, c.interval, c.unit)]
-        row += [_half(0.5 * (c.interval[1] - c.interval[0]), size)]
-        row += [_half(c.repeatability, size)] if study.holds else []
+        row += [relative(0.5 * (c.interval[1] - c.interval[0]), size)]
+        row += [relative(c.repeatability, size)] if study.holds else []
         row.append(yes if c.identified else Cell("NO", "bad"))
         if not brief:
             nominal = getattr(e.bench.brake, unknown.name, None)
@@ -63,14 +64,7 @@ def parameters(study: Study, *, brief: bool = False) -> Table:
         rows.append(row)
     if study.truth is not None and not brief:
         rows = [[*row, *true] for row, true in zip(rows, _errors(study), strict=True)]
-    return Table("Estimates; ± is half of the 95 % interval (k=2)", header, rows, words=words)
-
-
-def _half(half: float, size: float) -> str:
-    """Half an interval: in percent of a size, or as it is where the size is 0."""
-    if not math.isfinite(half):
-        return NOTHING
-    return spread(half / abs(size), True, 2) if size else plain(half, 2)
+    return Table("Estimates; total and repeatability are each half of a 95 % interval (k=2)", header, rows, words=words)
 
 
 def _errors(study: Study) -> list[list[str]]:
@@ -129,13 +123,13 @@ def budget(study: Study) -> Table | None:
         size = c.value if e.unknowns[i].relative else 0.0
         largest = e.left_open_by(i)
         rows.append(
-            [c.label, *(_half(half, size) for half in halves), NOTHING if largest is None else limit(largest, e)]
+            [c.label, *(relative(half, size) for half in halves), NOTHING if largest is None else limit(largest, e)]
         )
     header = ["parameter", "noise", "sensors", "J, angle", "effects", "total", "by residuals", "largest"]
     title = (
-        "Uncertainty budget, each half of a 95 % interval (k=2). Noise and systematic errors of the sensors; inertia "
-        "and scale of the angle; effects that the record cannot exclude. For comparison: by the scatter of the "
-        "residuals"
+        "Uncertainty budget of the total, each half of a 95 % interval (k=2). Noise and systematic errors of the "
+        "sensors; inertia and scale of the angle; effects that the record cannot exclude. For comparison: by the "
+        "scatter of the residuals"
     )
     return Table(title, header, rows, words=(0, 7))
 
@@ -167,7 +161,7 @@ def systematic(e: Estimate) -> Table | None:
             before = e.asked.systematic[unknown.name]
             estimated = around(float(value), NORMAL_95 * float(own))
             rows.append([label, f"{estimated} {unit}".strip(), f"{plain(before)} {unit}".strip()])
-    title = "Systematic errors, estimated with the parameters; ± is half of the 95 % interval"
+    title = "Systematic errors, estimated with the parameters; ± is the total (95 %, k=2)"
     return Table(title, ["error", "estimate", "sigma in [systematic]"], rows) if rows else None
 
 
@@ -231,4 +225,4 @@ def drifts(study: Study) -> Table:
             ]
         )
     header = ["parameter", "last", "now", "change", "sigma", "drifted", ""]
-    return Table("Values ± 95 %", header, rows, words=(0, 5, 6))
+    return Table("Values ± total (95 %, k=2), without the errors that all runs share", header, rows, words=(0, 5, 6))

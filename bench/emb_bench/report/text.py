@@ -39,8 +39,9 @@ def facts(*rows: tuple[str, str]) -> list[str]:
 def wrapped(text: str, indent: int = 4) -> list[str]:
     """A text in lines of at most ``WIDTH`` columns; all but the first begin ``indent`` columns further to the right."""
     left = len(text) - len(text.lstrip())
-    later = " " * (left + indent)
-    return textwrap.wrap(text, WIDTH, subsequent_indent=later, break_long_words=False, break_on_hyphens=False) or [""]
+    later, whole = " " * (left + indent), text.replace(" × ", "\xa0×\xa0")  # a power of ten stays with its number
+    lines = textwrap.wrap(whole, WIDTH, subsequent_indent=later, break_long_words=False, break_on_hyphens=False)
+    return [line.replace("\xa0", " ") for line in lines] or [""]
 
 
 def listed(mark: str, texts: Iterable[str]) -> list[str]:

@@ -16,13 +16,14 @@ from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.records import NORMAL_95
 from emb_bench.figures import COLOURS, svg
-from emb_bench.numbers import NOTHING, SMALL, around, percent, plain
+from emb_bench.numbers import percent
 from emb_bench.report.content import Run
 from emb_bench.report.figures import FAINT, PANEL, Panel
 from emb_bench.report.text import Cell, Table
+from emb_runtime.numbers import NOTHING, SMALL, around, plain
 
 _KINDS = (
-    (True, "o", COLOURS[0], "± 95 %"),
+    (True, "o", COLOURS[0], "± total"),
     (False, "x", COLOURS[1], "model does not fit, or not identified"),
 )
 
@@ -80,7 +81,7 @@ def panels(found: Sequence[Trend]) -> list[Panel]:
     return [
         Panel(
             svg(partial(_draw, trend), 1, 1, (PANEL, 2.4)),
-            f"{trend.label} of each run evaluated alone, with 95 % intervals",
+            f"{trend.label} of each run evaluated alone, with totals (95 %, k=2)",
         )
         for trend in found
     ]
@@ -123,7 +124,7 @@ def table(runs: Sequence[Run], found: Sequence[Trend]) -> Table:
         rows.append(row)
         at += 1
     less = ", ".join(trend.less for trend in found if trend.less)
-    title = f"Each run evaluated alone; ± 95 % without errors that the runs share; {less}".removesuffix("; ")
+    title = f"Each run alone; ± total (95 %, k=2) without errors that the runs share; {less}".removesuffix("; ")
     header = ["run", "recorded [UTC]", "ended", "lost", "fits", *(f"{trend.label} [{trend.unit}]" for trend in found)]
     return Table(title, header, rows, words=(0, 1, 2, 4))
 

@@ -24,6 +24,7 @@ from emb_runtime.estimator import estimate
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder import RecorderResult
 from emb_runtime.log.ring_buffer import Attachment, LogHeader
+from emb_runtime.numbers import plain
 from emb_runtime.records import RunType
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.safety.watchdog import WatchdogResult
@@ -209,7 +210,8 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         "steps": ran.steps,
         "duration_s": outcome.duration_ns * 1e-9,
         **facts(outcome),
-        "estimate": estimate.by_name(outcome.estimate),
+        "estimate": (found := estimate.by_name(outcome.estimate, plan.bench.systematic)),
+        "total": estimate.total(estimate.shares(found), plan.bench.systematic),
         "outside": beyond,
         "goal_s": outcome.goal_ns * 1e-9 if outcome.goal_reached else None,
         "end_angle": outcome.end_angle,
@@ -232,7 +234,7 @@ def outside(bench: Bench, numbers: Sequence[float]) -> dict[str, tuple[float, fl
     name = bench.shield.ranges
     ranges = bench.range_set(name)
     found = {}
-    for parameter, found_value in estimate.by_name(numbers).items():
+    for parameter, found_value in estimate.by_name(numbers, bench.systematic).items():
         value, low, high = found_value["value"], getattr(ranges.low, parameter), getattr(ranges.high, parameter)
         if not low * (1.0 + BORDER) < value < high * (1.0 - BORDER):
             found[parameter] = (value, low, high, name)
@@ -251,18 +253,20 @@ def refusal(err: EmbError, iface: str) -> dict[str, Any]:
 
 def text(s: Mapping[str, Any], details: bool = False) -> str:
     """A :func:`document` for a person: the answer and what was unusual; every count with ``details``."""
-    early = f", ended early: precise enough after {s['goal_s']:.3f} s" if s["goal_reached"] else ""
+    where = "home" if s["home"] else "NOT HOME"
+    where = f"precise after {s['goal_s']:.3f} s, then {where}" if s["goal_reached"] else where
     completed = s["result"] == "done" and s["purpose"] == RunType.EXPERIMENT
     done = f"done, OUTSIDE THE RANGES ({', '.join(s['outside'])})" if s["outside"] else "done"
-    lines = [f"{done}: {s['answered']} of {s['steps']} samples answered, {'home' if s['home'] else 'NOT HOME'}{early}"]
+    lines = [f"{done}: {s['answered']} of {s['steps']} samples answered, {where}"]
     if s["result"] != "done":
         where = " on the way home" if s["purpose"] == RunType.HOMING else ""
         why = f"{s['cause']}: {s['detail']}" if s["detail"] else s["cause"]
         ended = "NOT RECORDED" if s["result"] == LOG_INCOMPLETE else "STOPPED"
         lines = [f"{ended}{where} ({s['result']}): {why}", f"  → {s['advice']}"]
     lines += [
-        f"  OUTSIDE    {name} = {value:.4g} {s['estimate'][name]['unit']} is at or beyond a border of ranges.{ranges} "
-        f"({low:.4g} to {high:.4g}): the limits were not guaranteed; find the cause, or widen the range"
+        f"  OUTSIDE    {name} = {plain(value, 4)} {s['estimate'][name]['unit']} is at or beyond a border of "
+        f"ranges.{ranges} ({plain(low, 4)} to {plain(high, 4)}): the limits were not guaranteed; find the cause, "
+        "or widen the range"
         for name, (value, low, high, ranges) in s["outside"].items()
     ]
     lines += [f"  way home   {name} the experiment: {brief(way)}" for name, way in s["homing"].items()]
@@ -276,14 +280,11 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
         lines.append(f"  motion     {_motion(s)}")
     lines += _unusual(s)
     if s["estimate"] and (details or s["result"] in ("done", LOG_INCOMPLETE)):
-        lines.append("running estimate ± 95 % (k=2), valid if the model is right")
-        if not s["model_fits"]:
-            lines.append("  THE MODEL DOES NOT FIT: friction, a delay or a sensor differs from the model")
-        lines += [f"  {line}" for line in estimate.words(s["estimate"])]
+        lines += estimate.words(s["estimate"], s["total"], fits=s["model_fits"])
     missing = "" if s["log_complete"] else f", INCOMPLETE: {s['log_error']}"
     lines.append(f"log: {s['log']} ({s['log_messages']} messages, {s['log_bytes'] / 1024:.0f} KiB{missing})")
     if completed and s["limit"] > 0.0:
-        lines.append(f"next: emb-replay estimate {s['log']}   (tests the model, gives the final intervals)")
+        lines.append(f"next: emb-replay estimate {s['log']}   (tests the model, gives the total)")
     return "\n".join(lines)
 
 

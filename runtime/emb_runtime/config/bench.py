@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from msgspec import Meta
 
-from emb_runtime.config.typed import MAX_TOML_BYTES, FieldError, Positive, parse_toml, read
+from emb_runtime.config.typed import MAX_TOML_BYTES, FieldError, NotNegative, Positive, parse_toml, read
 from emb_runtime.errors import BenchFileError, near
 from emb_runtime.system.input_file import read_text
 
@@ -41,7 +41,7 @@ LONGEST_REJECTED = 5  # frames
 LONGEST_NODE_WATCHDOG = 0.010  # s
 LONGEST_HEARTBEAT = 0.005  # s
 
-ANALYSIS = ("budgets", "plants", "systematic", "machine")  # Tables that only simulation and analysis read
+ANALYSIS = ("budgets", "plants", "machine")  # Tables that only simulation and analysis read
 
 FASTEST = 10.0  # No time constant of a brake is shorter than the sample time over this
 REMEDY = "add it, as in the file that `emb-run --write-bench FILE` writes"
@@ -176,6 +176,32 @@ class Can:
     """SHA-256 of the mapping of a drive, and its DBC: no other one is taken then. Empty where the file names none."""
 
 
+@dataclass(frozen=True)
+class Systematic:
+    """Systematic errors that a bench cannot exclude by itself: ``[systematic]``.
+
+    Standard deviations of Gaussian priors with mean zero, or with what the plant itself says. Most
+    records determine an error better than its prior. 0 excludes an error.
+    """
+
+    offset: NotNegative = 0.05  # Reading of the encoder at the true origin [rad]
+    current_offset: NotNegative = 0.05
+    """Current that acts beyond what the node reports; a friction that depends on the direction looks the same [A]."""
+    delay: NotNegative = 0.3  # By which commands act late, or samples early [samples]
+    velocity_gain: NotNegative = 0.02  # Relative error of the velocity's scale
+    inertia: NotNegative = 0.01  # Relative error of J, which all four parameters share
+    angle_scale: NotNegative = 0.003  # Relative error of the angle's scale, which k_m and T_c share
+    held: NotNegative = 0.02  # Relative error of each parameter that is held at its nominal value
+    quadratic: NotNegative = 1e-4  # Quadratic share of the stiffness that the plant lacks [1/rad]
+    cubic: NotNegative = 1e-6  # Cubic share of the stiffness that the plant lacks [1/rad²]
+    hysteresis: NotNegative = 1e-2  # Hysteresis of the clamping force that the plant lacks
+    play: NotNegative = 0.2  # Clearance in the gear [rad]
+    break_away: NotNegative = 0.1  # Static friction beyond the plant's, as a share of T_c
+    f_l: NotNegative = 1e-7  # Load-dependent static friction beyond the plant's [m]
+    current_lag: NotNegative = 5e-4  # Time constant of the current loop beyond the plant's [s]
+    drift: NotNegative = 0.003  # Change of each parameter from the begin of a run to its end, as a share of it
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Tables:
     """Tables of a bench file that are records as they stand."""
@@ -190,6 +216,7 @@ class _Tables:
     guard: GuardLimits
     node: Node
     can: Can
+    systematic: Systematic = Systematic()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,7 +228,6 @@ class _Document(_Tables):
     estimator: Estimator | None = None
     budgets: Any = None
     plants: Any = None
-    systematic: Any = None
     machine: Any = None
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError, near
+from emb_runtime.estimator.estimate import NORMAL_95
+from emb_runtime.numbers import in_percent
 
 COUNT = len(PARAMETER_NAMES)  # An estimate has so many values, then their deviations
 REACHED = "KNOWN_ENOUGH"  # Code of the event that says so in the log
@@ -14,20 +16,20 @@ REACHED = "KNOWN_ENOUGH"  # Code of the event that says so in the log
 
 @dataclass(frozen=True)
 class StopCondition:
-    """Standard deviations, each as a part of its value, that the estimate has to fall below."""
+    """Repeatabilities, each as a part of its value, that the estimate has to fall below."""
 
     text: str  # Text as :func:`parse_stop_condition` reads it
-    parts: tuple[tuple[int, float], ...]  # Indices of parameters, and the bound of each relative deviation; 0.01 is 1 %
+    parts: tuple[tuple[int, float], ...]  # Indices of parameters, and the bound of each repeatability; 0.01 is 1 %
 
     def reached(self, estimate: Sequence[float]) -> bool:
-        """Returns True if all deviations are below their bounds. One of zero is an error."""
-        return all(0.0 < estimate[COUNT + at] < part * abs(estimate[at]) for at, part in self.parts)
+        """Returns True if all repeatabilities are below their bounds. One of zero is an error."""
+        return all(0.0 < NORMAL_95 * estimate[COUNT + at] < part * abs(estimate[at]) for at, part in self.parts)
 
     def describe(self, estimate: Sequence[float]) -> str:
-        """Deviations and their bounds in words, of a condition that is met."""
-        return ", ".join(
-            f"{PARAMETER_NAMES[at]} to {100.0 * estimate[COUNT + at] / abs(estimate[at]):.3g} % of {100.0 * part:.3g} %"
-            for at, part in self.parts
+        """Repeatabilities and their bounds in words, of a condition that is met."""
+        shares = ((at, NORMAL_95 * estimate[COUNT + at] / abs(estimate[at]), part) for at, part in self.parts)
+        return "repeatability " + ", ".join(
+            f"{PARAMETER_NAMES[at]} ± {in_percent(share)} of {in_percent(part, 3)}" for at, share, part in shares
         )
 
 

@@ -83,6 +83,7 @@ def identification(sheet: Bench, share: float = 0.01, **changed: object) -> Iden
     one = Identification(
         values=values,
         intervals={name: (value * (1 - share), value * (1 + share)) for name, value in values.items()},
+        halves=dict.fromkeys(values, (share / 2, share)),
         model="exact",
         fits=True,
         ratio=1.0,
@@ -224,7 +225,7 @@ def test_where_the_brake_moves_as_none_of_the_set_the_parameter_to_widen_is_name
     k_1 = sheet.brake.k_1
     said = suspected(sheet, with_interval(one, "k_1", (4.0, 6.0)))
     assert (
-        f"k_1 is {4 * k_1:.5g} to {6 * k_1:.5g} N/rad (data sheet {k_1 / 2:.5g} to {k_1 * 2:.5g}): "
+        f"k_1 is {4 * k_1:.0f} to {6 * k_1:.0f} N/rad (data sheet {k_1 / 2:.5g} to {k_1 * 2:.5g}): "
         "widen k_1 in [ranges.wide]" in said
     )
     for shares in ((1.5, 9.0), (1.7, 1.9), (0.54, 0.7)):  # across a border, and near to one

@@ -31,8 +31,10 @@ from emb_bench.live.serve import Server
 from emb_bench.logs.log import read_log
 from emb_bench.logs.mcap_file import HEADER, Chunk
 from emb_runtime.cli import main as emb_run
+from emb_runtime.config.bench import Systematic, load_bench
 from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, LogError, UsageError
 from emb_runtime.estimator.estimate import LOST, UNITS
+from emb_runtime.numbers import around, in_percent
 from tests.bench.damaged import rewritten, without
 
 SECONDS = 20.0
@@ -163,6 +165,9 @@ class Told:
     def begin(self) -> None:
         self.logs.append([])
 
+    def know(self, errors: Systematic) -> None:
+        assert errors == load_bench().systematic
+
     def add(self, chunk: Chunk) -> None:
         self.logs[-1].append(chunk)
 
@@ -279,12 +284,13 @@ def test_the_page_in_a_browser_shows_every_sample_and_estimate(shipped: Path, tm
         assert page.value("estimates.length") == log.counts["/estimate"]
         page.wait("document.querySelectorAll('canvas').length === 4 && !waiting")  # the last estimate is drawn
         rows = page.value("[...document.querySelectorAll('#estimate tr')].map(r => r.innerText.split('\\t'))")
-        assert [row[0] for row in rows] == [f"{name} [{unit}]" for name, unit in UNITS.items()]
-        for name, (_, value, half, relative) in zip(UNITS, rows, strict=True):
-            assert float(value) == pytest.approx(last[name][-1], rel=1e-5)
-            assert float(half) == pytest.approx(1.96 * last[f"{name}_deviation"][-1], rel=0.06)
-            assert float(relative.removesuffix(" %")) == pytest.approx(100 * float(half) / float(value), rel=0.06)
-        page.value(f"take({{cycles: [], estimates: [], units: {{}}, events: ['{LOST} not finite']}})")
+        assert [row[0] for row in rows] == [*UNITS]
+        for name, unit, (_, value, half) in zip(UNITS, UNITS.values(), rows, strict=True):
+            assert value == f"{around(last[name][-1], 1.96 * last[f'{name}_deviation'][-1])} {unit}"
+            share = 1.96 * last[f"{name}_deviation"][-1] / last[name][-1]
+            assert half == f"repeatability ± {in_percent(share)}"
+        assert page.value("document.getElementById('total').textContent") == "total about 2 %, as J is known to 1 %"
+        page.value(f"take({{cycles: [], estimates: [], table: [], events: ['{LOST} not finite']}})")
         assert page.value("estimates.length + document.getElementById('estimate').childElementCount") == 0
     with browser_at(server, tmp_path / "late") as page:
         page.wait(whole)

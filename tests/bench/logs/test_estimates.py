@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -80,10 +81,11 @@ def test_all_of_them_are_read_with_their_names_and_units(write: Write, driven: t
     said = last_estimate(log)
     assert list(said) == ["k_m", "k_1", "T_c", "f_v"]
     value, deviation = records[-1].numbers[3::4]
-    assert {**said["f_v"], "interval_95": None} == {
-        "value": value, "deviation": deviation, "interval_95": None, "unit": "N·m·s/rad"
+    half = 1.959964 * deviation
+    assert said["f_v"] == {
+        "value": value, "deviation": deviation, "repeatability": pytest.approx(half),
+        "total": pytest.approx(math.hypot(half, 1.959964 * 0.01 * value)), "unit": "N·m·s/rad"
     }  # fmt: skip
-    assert said["f_v"]["interval_95"] == pytest.approx([value - 1.959964 * deviation, value + 1.959964 * deviation])
     assert info_document(log)["estimate"] == said
 
 

@@ -12,9 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_bench.figures import svg
-from emb_bench.numbers import around, between, chance, percent, plain, seconds, share, share_between
+from emb_bench.numbers import chance, percent, seconds, share, share_between
 from emb_bench.report.page import environment
 from emb_bench.report.text import Cell, Table, show
+from emb_runtime.numbers import around, between, plain
 
 from tests.bench.report_pages import Reader, read  # isort: skip
 

@@ -86,19 +86,21 @@ def test_an_estimate_that_is_not_finite_any_more_is_none_and_said_once(simulate:
     assert (run.outcome.estimate, run.outcome.goal_reached) == ((), False)
 
 
-def test_a_condition_is_reached_when_each_deviation_is_below_its_part_of_the_value() -> None:
+def test_a_condition_is_reached_when_each_repeatability_is_below_its_part_of_the_value() -> None:
     condition = parse_stop_condition(" k_1 = 1%, f_v=50 % ", TWO)
     assert condition.parts == ((1, 0.01), (3, 0.5))
 
-    def numbers(k_1: float, f_v: float, k_1_deviation: float, f_v_deviation: float) -> tuple[float, ...]:
-        return 1.0, k_1, 1.0, f_v, 9.0, k_1_deviation, 9.0, f_v_deviation
+    def numbers(k_1: float, f_v: float, k_1_half: float, f_v_half: float) -> tuple[float, ...]:
+        return 1.0, k_1, 1.0, f_v, 9.0, k_1_half / 1.96, 9.0, f_v_half / 1.96
 
     assert condition.reached(numbers(-2.0, 1.0, 0.0199, 0.49))
     assert not condition.reached(numbers(-2.0, 1.0, 0.0201, 0.49))
     assert not condition.reached(numbers(-2.0, 1.0, 0.0199, 0.51))
     assert not condition.reached(numbers(0.0, 1.0, 0.0, 0.1))
     assert not condition.reached(numbers(-2.0, 1.0, 0.0, 0.49)), "what is certain was not measured"
-    assert condition.describe(numbers(-2.0, 1.0, 0.019, 0.4)) == "k_1 to 0.95 % of 1 %, f_v to 40 % of 50 %"
+    assert condition.describe(numbers(-2.0, 1.0, 0.019, 0.4)) == (
+        "repeatability k_1 ± 0.95 % of 1 %, f_v ± 40 % of 50 %"
+    )
     assert parse_stop_condition("f_v=5%", TWO).reached(numbers(1.0, 1.0, 1e9, 0.04))
 
 
@@ -186,7 +188,7 @@ def test_a_run_is_logged_with_its_estimates_and_decides_the_same_again(
     assert emb_replay(["rerun", str(path)]) == 0
     assert capsys.readouterr().out.startswith("reproduced   each of 501 decisions, 503 sent frames")
     assert emb_replay(["info", str(path)]) == 0
-    assert "\n  f_v  " in capsys.readouterr().out
+    assert "\n  f_v = " in capsys.readouterr().out
     assert emb_replay(["info", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["estimate"] == summary["estimate"]
 
@@ -196,14 +198,14 @@ def test_it_ends_early_where_that_is_asked_for(
 ) -> None:
     path = tmp_path / "run.mcap"
     out = steady.text("--stop-when", "k_m=1%")
-    answered = re.match(r"done: (\d+) of 500 samples answered, home, ended early: precise enough after 0\.\d+ s\n", out)
+    answered = re.match(r"done: (\d+) of 500 samples answered, precise after 0\.\d+ s, then home\n", out)
     assert answered is not None
     assert HOME_PAIRS < int(answered[1]) < 500
     log = steady.log()
     assert log.run["stop_when"] == "k_m=1%"
     assert (log.exit_reason, log.end["goal_reached"]) == ("DONE", "True")
     (event,) = (event for event in log.events if event.code == REACHED)
-    assert event.text.startswith("k_m to 0.9")
+    assert event.text.startswith("repeatability k_m ± 0.9")
     assert emb_replay(["rerun", str(path)]) == 0
     assert f"reproduced   each of {int(answered[1]) + 1} decisions" in capsys.readouterr().out
     for command in (["fim"], ["timing"], ["info"], ["estimate"], ["report", "-o", str(tmp_path / "page.html")]):

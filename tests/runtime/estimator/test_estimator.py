@@ -7,9 +7,9 @@ import math
 
 import pytest
 
-from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, Systematic, load_bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import BenchFileError
-from emb_runtime.estimator.estimate import by_name, words
+from emb_runtime.estimator.estimate import NO_FIT, by_name, total, words
 from emb_runtime.estimator.estimator import Estimator, estimated
 from emb_runtime.estimator.kalman import MISFIT, follow, start
 
@@ -26,7 +26,7 @@ def test_it_begins_with_the_set_that_the_bench_names_and_reports_what_is_open_in
     one = dataclasses.replace(BENCH, prior="viscous")
     assert estimated(one) == ("f_v",)
     assert Estimator(one).estimate == pytest.approx((*brake[2:5], 3e-5, 0.0, 0.0, 0.0, 4e-5 / math.sqrt(12.0)))
-    assert list(by_name(Estimator(one).estimate)) == ["f_v"]
+    assert list(by_name(Estimator(one).estimate, one.systematic)) == ["f_v"]
     assert estimated(dataclasses.replace(BENCH, prior="nominal")) == ()
 
 
@@ -67,11 +67,49 @@ def test_an_estimate_that_is_not_finite_is_none() -> None:
     assert estimator.estimate == ()
 
 
-def test_an_estimate_is_given_by_name_and_in_as_many_digits_as_its_interval_allows() -> None:
-    assert by_name(()) == {}
-    record = by_name((0.0217, 23.04, 1.0, 1.0, 1.5e-7, 0.05, 0.0, 0.0))
-    assert record["k_1"]["interval_95"] == pytest.approx([22.942, 23.138], abs=1e-4)
-    assert (record["k_m"]["value"], record["k_m"]["deviation"], record["k_m"]["unit"]) == (0.0217, 1.5e-7, "N·m/A")
-    assert words(record) == ["k_m = 0.02170000 ± 2.9e-07 N·m/A   0.0014 %", "k_1 = 23.040 ± 0.098 N/rad   0.43 %"]
-    zero = {"value": 0.0, "deviation": 0.0, "unit": "N·m/A"}
-    assert words({"k_m": zero}) == ["k_m = 0.000 ± 0.0 N·m/A"]
+KNOWN = Systematic(inertia=0.01, angle_scale=0.003)
+HEAD = "running estimate ± repeatability (95 %, k=2), valid if the model is right"
+
+
+def test_an_estimate_is_given_by_name_with_both_uncertainties() -> None:
+    assert by_name((), KNOWN) == {}
+    record = by_name((0.0217, 23.04, 1.0, 1.0, 1.5e-7, 0.05, 0.0, 0.0), KNOWN)
+    assert list(record) == ["k_m", "k_1"], "what is not estimated is left out"
+    k_m, k_1 = record.values()
+    assert (k_m["value"], k_m["deviation"], k_m["unit"]) == (0.0217, 1.5e-7, "N·m/A")
+    assert k_1["repeatability"] == pytest.approx(1.96 * 0.05, rel=1e-4)
+    assert k_1["total"] == pytest.approx(1.96 * math.sqrt(0.05**2 + (0.01 * 23.04) ** 2), rel=1e-4)
+    assert k_m["total"] == pytest.approx(1.96 * 0.0217 * math.sqrt(0.01**2 + 0.003**2), rel=1e-4)
+
+
+def test_an_estimate_is_told_in_as_many_digits_as_its_repeatability_allows() -> None:
+    record = by_name((0.0217, 23.04, 0.0, 1.0, 1.5e-7, 0.05, 0.4, 0.0), KNOWN)
+    rows = [
+        "  k_m = (2.170000 ± 0.000029) × 10⁻² N·m/A   repeatability ± 0.0014 %",
+        "  k_1 = 23.040 ± 0.098 N/rad                 repeatability ± 0.43 %",
+        "  T_c = 0.00 ± 0.78 N·m",
+    ]
+    assert words(record, "total about 2 %", fits=True) == [HEAD, *rows, "  total about 2 %"]
+    assert words(record, "", fits=True) == [HEAD, *rows]
+    assert words(record, "total about 2 %", fits=False) == [HEAD, f"  {NO_FIT}", *rows], "no total of a wrong model"
+    assert words({}, "", fits=True) == [HEAD]
+
+
+@pytest.mark.parametrize(
+    ("repeatability", "inertia", "angle_scale", "said"),
+    [
+        ({"k_m": 1e-5, "f_v": 1e-5}, 0.01, 0.003, "total about 2 %, as J is known to 1 %"),
+        ({"k_1": 0.012, "f_v": math.inf}, 0.01, 0.003, "total about 2.3 %, as J is known to 1 %"),
+        ({"k_1": 1e-5, "T_c": 0.012}, 0.01, 0.003, "total about 2 to 2.4 %, as J is known to 1 %"),
+        ({"k_1": 1e-5}, 0.5, 0.0, "total about 98 %, as J is known to 50 %"),
+        ({"k_1": 1e-5}, 0.001, 0.0, "total at least 0.2 %, as J is known to 0.1 %"),
+        ({"k_m": 1e-5}, 0.0, 0.003, "total at least 0.59 %, as the angle's scale is known to 0.3 %"),
+        ({"k_m": 1e-5}, 0.0, 0.0, ""),
+        ({"k_m": math.inf}, 0.01, 0.003, ""),
+        ({}, 0.01, 0.003, ""),
+    ],
+)
+def test_the_total_is_told_by_what_is_known_before_a_run(
+    repeatability: dict[str, float], inertia: float, angle_scale: float, said: str
+) -> None:
+    assert total(repeatability, Systematic(inertia=inertia, angle_scale=angle_scale)) == said
