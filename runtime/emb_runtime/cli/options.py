@@ -69,7 +69,7 @@ examples:
   emb-run --iface can0 --read-only --duration 10    first contact with a bench: what is on the bus
   emb-run --iface can0 --zero                       second: the whole chain, but 0 A
   emb-run --iface can0 --limit 1 --home             third: at most 1 A, and back to the origin afterwards
-  emb-run --iface can0 --quick                      all four parameters in a tenth of a second: 2.3 % in total
+  emb-run --iface can0 --quick                      all four parameters in a tenth of a second
   emb-run --quick --stop-when k_1=1%,f_v=5%         ends when these two are precise enough
   emb-hil --slow 100 -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0'
                                                     where the kernel has no CAN
@@ -158,7 +158,7 @@ def parser() -> argparse.ArgumentParser:
     actor.add_argument(
         "--quick", action="store_true",
         help="use the shipped policy for a short experiment: it returns home and ends when all four parameters are "
-        f"known to a repeatability of {QUICK_GOAL}% (total: with the error of J), or to that of --stop-when",
+        f"known to a repeatability of {QUICK_GOAL}% (the total also has the error of J), or to that of --stop-when",
     )  # fmt: skip
     what.add_argument("--bench", type=Path, metavar="FILE", help="bench file (default: the shipped drum brake)")
     what.add_argument(
@@ -171,7 +171,7 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     what.add_argument(
         "--stop-when", metavar="NAME=P%[,...]",
-        help="return home and end early when the repeatability (95 %%, k=2) of the running estimate is below these "
+        help="return home and end early when the repeatability of the running estimate is below these "
         "shares of its values: k_1=1%%,f_v=5%%",
     )  # fmt: skip
     what.add_argument(
