@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from emb_runtime.numbers import LARGE, NOTHING, SMALL, around, between, in_percent, places, plain
+from emb_runtime.numbers import LARGE, NOTHING, SMALL, around, between, in_percent, places, plain, typeset
 
 LOPSIDED = 1.2  # Longer side of an interval over half its width from which on both ends are written
 LEVEL = 0.95  # Probability that an interval holds the number
@@ -48,7 +48,7 @@ def signed(value: float, form: str = "+.3g") -> str:
     if not math.isfinite(value):
         return plain(value)
     text = f"{value:{form}}"
-    return text.lstrip("+-") if float(text) == 0.0 else text.replace("-", "−")
+    return text.lstrip("+-") if float(text) == 0.0 else typeset(text)
 
 
 def percent(share: float) -> str:
@@ -65,7 +65,7 @@ def share(value: float, digits: int = 2) -> str:
     """A share of a whole, in ppm below a tenth of a percent, else in percent."""
     factor, name = (1e6, "ppm") if 0.0 < abs(value) < SMALL else (100.0, "%")
     whole = 10.0**digits <= abs(factor * value) < LARGE
-    shown = f"{factor * value:.0f}".replace("-", "−") if whole else plain(factor * value, digits)
+    shown = typeset(f"{factor * value:.0f}") if whole else plain(factor * value, digits)
     return f"{shown} {name}"
 
 

@@ -20,16 +20,20 @@ def plain(value: float, digits: int = 3) -> str:
         return NOTHING
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
-    mantissa, _, exponent = f"{value:.{digits}g}".partition("e")
-    mantissa = mantissa.replace("-", "−")
-    return f"{mantissa} × 10{str(int(exponent)).translate(SUPERSCRIPT)}" if exponent else mantissa
+    return typeset(f"{value:.{digits}g}")
+
+
+def typeset(text: str) -> str:
+    """A formatted number with minus sign and power of ten as in print."""
+    mantissa, _, exponent = text.replace("-", "−").partition("e")
+    return f"{mantissa} × 10{str(int(exponent.replace('−', '-'))).translate(SUPERSCRIPT)}" if exponent else mantissa
 
 
 def in_percent(share: float, digits: int = 2) -> str:
     """A share in percent, with some significant digits; in whole percent where these are fewer."""
     amount = 100.0 * share
     whole = 10.0**digits - 0.5 <= abs(amount) < LARGE
-    return f"{f'{amount:.0f}'.replace('-', '−') if whole else plain(amount, digits)} %"
+    return f"{typeset(f'{amount:.0f}') if whole else plain(amount, digits)} %"
 
 
 def around(value: float, half: float) -> str:
@@ -62,5 +66,5 @@ def _in_one_power(text: str, values: tuple[float, float], width: float) -> str:
     power = 0 if written_out else math.floor(math.log10(largest))
     digits = places(width / 10.0**power)
     shown = (round(value / 10.0**power, digits) + 0.0 for value in values)  # no minus before a zero
-    text = text.format(*(f"{value:.{digits}f}" for value in shown)).replace("-", "−")
+    text = text.format(*(typeset(f"{value:.{digits}f}") for value in shown))
     return text if power == 0 else f"({text}) × 10{str(power).translate(SUPERSCRIPT)}"

@@ -35,8 +35,8 @@ def check_noise(noise: Noise, sheet: Bench) -> None:
         got, most = getattr(noise, name), getattr(sheet.noise, name)
         _require(
             got <= NOISE_EXCESS * most,
-            f"the {name} scatters by {got:.3g} {unit} at rest, the data sheet's bench file has {most:.3g}, and the "
-            f"shield would allow for too little: wait until the brake rests, or correct noise.{name} {AGAIN}",
+            f"the {name} scatters by {plain(got)} {unit} at rest, the data sheet's bench file has {plain(most)}, and "
+            f"the shield would allow for too little: wait until the brake rests, or correct noise.{name} {AGAIN}",
         )
 
 
@@ -44,12 +44,12 @@ def check_current(check: CurrentCheck, sheet: Bench) -> None:
     """Refuse a current of a wrong sign or scale, a motion, and late commands; SafetyStopError."""
     _require(
         abs(check.scale - 1.0) <= SCALE_ERROR,
-        f"the drive reports {check.scale:.3g} A for 1 A commanded: sign or scale of its current is wrong",
+        f"the drive reports {plain(check.scale)} A for 1 A commanded: sign or scale of its current is wrong",
     )
     _require(
         check.moved <= AT_REST * sheet.noise.angle,
-        f"the brake moved by {check.moved:.3g} rad under a current that moves no brake of the data sheet: friction is "
-        f"lower or the motor stronger (T_c and k_m in [ranges.{sheet.shield.ranges}]), or something else turns it",
+        f"the brake moved by {plain(check.moved)} rad under a current that moves no brake of the data sheet: friction "
+        f"is lower or the motor stronger (T_c and k_m in [ranges.{sheet.shield.ranges}]), or something else turns it",
     )
     _require_early(check.delay, f"commands act {check.delay} samples late", sheet)
 
@@ -70,7 +70,7 @@ def check_first_move(move: FirstMove, sheet: Bench) -> None:
     )
     _require(
         abs(move.scale - 1.0) <= SCALE_ERROR,
-        f"the angle travels {move.scale:.3g} times as far as by the velocity: a sign or scale of a sensor is wrong",
+        f"the angle travels {plain(move.scale)} times as far as by the velocity: a sign or scale of a sensor is wrong",
     )
 
 
@@ -94,7 +94,7 @@ def check_experiment(one: Identification, sheet: Bench, *, is_first: bool) -> No
     _require_early(late, f"answers act {late} samples late ({delays})", sheet)
     _require(
         not (one.fits and one.current_lag[0] > (1.0 + LAG_ERROR) * sheet.shield.current_lag),
-        f"the current lags by {one.current_lag[0]:.3g} s at least, and the data sheet's bench file allows for "
+        f"the current lags by {plain(one.current_lag[0])} s at least, and the data sheet's bench file allows for "
         f"{sheet.shield.current_lag:g} s: correct shield.current_lag {AGAIN}",
     )
 

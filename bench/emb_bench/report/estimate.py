@@ -19,6 +19,7 @@ from emb_bench.report import sentences as say
 from emb_bench.report import tables
 from emb_bench.report.caveats import caveats
 from emb_bench.report.text import Table, facts, listed, wrapped
+from emb_runtime.numbers import plain
 
 NOTICED = 2.0  # Standard deviations from which on an effect that is no alarm is named
 
@@ -114,7 +115,7 @@ def _evidence(study: Study) -> Iterator[str]:
         f"{name}: {record.measured.sum()} of {len(record.currents)} samples"
         for name, record in zip(study.names, e.records, strict=True)
     )
-    expected = f"{m.ratio:.4g} of {m.freedom}, {m.expected[0]:.3f} to {m.expected[1]:.3f} expected"
+    expected = f"{plain(m.ratio, 4)} of {m.freedom}, {m.expected[0]:.3f} to {m.expected[1]:.3f} expected"
     yield ""
     yield from facts(
         *(("record", said) for said in measured),

@@ -93,7 +93,7 @@ def models(study: Study) -> Table | None:
     best, rows = study.choice.best, []
     names = [change.name for change in study.choice.changes(best)]
     for c in study.choice.candidates:
-        changes = [f"{change.percent:+.2g} % ({change.deviations:+.1f})" for change in study.choice.changes(c)]
+        changes = [f"{signed(change.percent)} % ({change.deviations:+.1f})" for change in study.choice.changes(c)]
         differences = [f"{value:.1f}" for value in (c.bic - best.bic, c.held_out - best.held_out)]
         cells = [NOTHING] * len(changes) if c is best else changes
         rows.append(

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_bench.figures import svg
-from emb_bench.numbers import chance, percent, seconds, share, share_between
+from emb_bench.numbers import chance, percent, seconds, share, share_between, signed
 from emb_bench.report.page import environment
 from emb_bench.report.text import Cell, Table, show
-from emb_runtime.numbers import around, between, plain
+from emb_runtime.numbers import around, between, in_percent, plain
 
 from tests.bench.report_pages import Reader, read  # isort: skip
 
@@ -72,7 +72,9 @@ def test_a_plain_number_keeps_three_digits(value: float) -> None:
 
 def test_numbers_are_written_for_people() -> None:
     table: dict[Callable[[float], str], list[tuple[float, str]]] = {
-        plain: [(np.nan, "–"), (np.inf, "∞"), (-np.inf, "−∞")],
+        plain: [(np.nan, "–"), (np.inf, "∞"), (-np.inf, "−∞"), (-2.16e-5, "−2.16 × 10⁻⁵"), (1.41e5, "1.41 × 10⁵")],
+        in_percent: [(1.4, "140 %"), (0.9996, "100 %"), (-3.06, "−306 %"), (1.4e-5, "0.0014 %"), (4e-9, "4 × 10⁻⁷ %")],
+        signed: [(140.0, "+140"), (-306.0, "−306"), (1.4e5, "+1.4 × 10⁵"), (-1e-9, "−1 × 10⁻⁹"), (-0.0, "0")],
         percent: [(0.0, "0 %"), (1e-5, "< 0.1 %"), (0.034, "3.4 %"), (0.51, "51 %"), (0.996, "99.6 %"), (1.0, "100 %")],
         chance: [(1e-58, "< 10⁻⁶"), (0.056, "0.056")],
         seconds: [(2.0, "2 s"), (3.4e-3, "3.4 ms"), (5.6e-5, "56 µs"), (0.0, "0 µs")],
@@ -82,7 +84,15 @@ def test_numbers_are_written_for_people() -> None:
         for value, text in cases:
             assert form(value) == text
     of_two: dict[Callable[[float, float], str], list[tuple[float, float, str]]] = {
-        around: [(2.5e-5, np.inf, "2.5 × 10⁻⁵"), (-6e-7, 0.48, "0.00 ± 0.48"), (2e-9, 4e-7, "(0.0 ± 4.0) × 10⁻⁷")],
+        around: [
+            (0.0216999, 2.9e-7, "(2.169990 ± 0.000029) × 10⁻²"),
+            (0.0217, 4.4e-4, "0.02170 ± 0.00044"),
+            (23.04007, 9.96e-5, "23.04007 ± 0.00010"),
+            (1.0, 5e-324, "1"),
+            (2.5e-5, np.inf, "2.5 × 10⁻⁵"),
+            (-6e-7, 0.48, "0.00 ± 0.48"),
+            (2e-9, 4e-7, "(0.0 ± 4.0) × 10⁻⁷"),
+        ],
         between: [(-np.inf, 2.0, "−∞ to 2"), (2.1586e-5, 2.1598e-5, "(2.1586 to 2.1598) × 10⁻⁵")],
         share_between: [(-8e-6, 7.9e-6, "−8 to +8 ppm"), (-8e-6, 0.02, "0.0 to +2.0 %"), (-np.inf, 0.02, "−∞ to 2 %")],
     }
