@@ -9,6 +9,7 @@ All accelerations are torques over the inertia [rad/s²]; a name that ends in ``
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 from emb_runtime.config.bench import Bench
@@ -152,8 +153,19 @@ def make_law(bench: Bench) -> ShieldLaw:
     """
     law = law_of(bench)
     if reason := unmet_condition(law, bench):
-        raise BenchFileError(f"the shield cannot guarantee the limits for the set '{bench.shield.ranges}': {reason}")
+        what = f"the shield cannot guarantee the limits for the set '{bench.shield.ranges}'"
+        raise BenchFileError(f"{what}: {reason}{_or_lower(bench)}")
     return law
+
+
+def _or_lower(bench: Bench) -> str:
+    """Another remedy: the largest whole upper angle with which every condition holds, if there is one."""
+    bottom, top = bench.limits.angle
+    for angle in range(math.ceil(top) - 1, 0, -1):
+        lower = replace(bench, limits=replace(bench.limits, angle=(bottom, float(angle))))
+        if not unmet_condition(law_of(lower), lower):
+            return f", or lower limits.angle to {angle} rad"
+    return ""
 
 
 def law_of(bench: Bench) -> ShieldLaw:
@@ -292,7 +304,7 @@ def unmet_condition(law: ShieldLaw, bench: Bench) -> str:
     if held <= 0.0 and not law.coasting:
         return (
             f"coming home at {law.homeward_speed:.0f} rad/s from {farthest:g} rad, the stiffest spring accelerates "
-            f"the weakest motor by {-held:.0f} rad/s² against full braking; narrow k_m or k_1, or lower limits.angle"
+            f"the weakest motor by {-held:.0f} rad/s² against full braking; narrow k_m or k_1"
         )
     if law.ramp <= 0.0 or law.landing <= 0.0:
         return (
