@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, as_completed
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from typing import Any, NamedTuple, TypeVar
 
 from emb_bench import ONE_THREAD
@@ -54,8 +55,9 @@ def shared_out(
     pool: Any = ProcessPool(min(jobs, len(pieces)) or 1, context=_SPAWN)  # its types do not say all
     try:
         with _one_thread():
-            for number, piece in enumerate(pieces):
-                numbers[pool.schedule(work, args=[piece], timeout=limit)] = number
+            with _deaf():
+                for number, piece in enumerate(pieces):
+                    numbers[pool.schedule(work, args=[piece], timeout=limit)] = number
             for future in as_completed(numbers):
                 yield numbers[future], _result(future, time_limit)
     finally:
@@ -74,6 +76,23 @@ def _result(future: Future[Any], time_limit: float) -> Any:
         code = err.exitcode or 0
         how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         return Lost(f"the process that evaluated it {how}")
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Have threads and processes that start inside hear no Ctrl-C, from their first line on: who waits for them does.
+
+    They inherit the mask. The tracker of shared memory would take it off again, were it not there before.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
@@ -113,7 +132,8 @@ def shared_out_on_ray(
     try:
         try:
             _require_answer(address)
-            ray.init(address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **own)
+            with _deaf():
+                ray.init(address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **own)
         except (OSError, OverflowError, RuntimeError, ValueError) as err:
             raise UsageError(f"--ray: Ray at '{address}' cannot be used: {err}") from err
         yield from _run_tasks(ray, work, pieces, jobs, time_limit)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from emb_runtime.system.entry import start
-
 
 def emb_export() -> int:
     """``emb-export``; imports the command after the first handler of a Ctrl-C."""
+    from emb_runtime.system.entry import start  # this package is also a library
+
     return start("emb_export.export", "emb-export: interrupted, nothing written")

@@ -20,10 +20,10 @@ def test_hostile_files_end_no_command_badly_and_take_little_time_and_memory() ->
     assert "| 0 of 5; " in done.stdout
 
 
-def test_emb_run_ends_cleanly_at_any_moment_and_leaves_nothing(tmp_path: Path) -> None:
+def test_emb_run_ends_cleanly_at_any_moment_and_leaves_nothing() -> None:
     """Some of the moments of ``tests/searches/interrupt.py``, which measures how long it takes, too."""
     for moment, number in ((0.4, signal.SIGTERM), (0.7, signal.SIGINT)):
-        ended = interrupted(tmp_path, moment, number)
+        ended = interrupted("emb-run", moment, number)
         assert ended.code in (0, 3, -ended.number), ended  # by the signal itself while nothing was open
         assert "Traceback" not in ended.said
         assert ended.left == ()

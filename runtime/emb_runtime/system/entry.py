@@ -1,7 +1,11 @@
-"""The commands' first step: a Ctrl-C is no traceback, neither in the imports nor when nobody has taken it."""
+"""The commands' first step: a Ctrl-C is no traceback, neither in the imports nor when nobody has taken it.
+
+Only commands import it: from then on a Ctrl-C just ends the process, for nothing is open yet.
+"""
 
 from __future__ import annotations
 
+import _thread
 import gc
 import importlib
 import io
@@ -9,8 +13,13 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from types import FrameType, TracebackType
 
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, UsageError
+
+TAKEN = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # Else somebody wants a Ctrl-C ignored
+if TAKEN:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def start(
@@ -29,25 +38,34 @@ def start(
         prepare: called before the import.
         takes_signals: ``main`` does; until then a Ctrl-C ends the process as in the imports.
     """
+    pressed: list[int] = []
+
+    def interrupt(number: int, _frame: FrameType | None) -> None:
+        pressed.append(number)
+        raise KeyboardInterrupt
+
     _prepare_streams()
-    handler = signal.getsignal(signal.SIGINT)
+    sys.excepthook, sys.unraisablehook = _show, _raise_again
     try:
-        if handler is signal.default_int_handler:  # else somebody wants it ignored
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
         if prepare is not None:
             prepare()
         gc.disable()  # imports leave no garbage to search for
         main: Callable[[], int] = importlib.import_module(module).main
         gc.freeze()
         gc.enable()
-        if not takes_signals:
-            signal.signal(signal.SIGINT, handler)
+        if TAKEN and not takes_signals:
+            signal.signal(signal.SIGINT, interrupt)
         return main()
-    except KeyboardInterrupt as err:
-        message = str(err) or message
     except BrokenPipeError:  # ``--help | head``: argparse of Python 3.11.2 lets it through
         return EXIT_DONE
+    except KeyboardInterrupt as err:
+        message = str(err) or message
+    except Exception:
+        if not pressed:  # else a library that was interrupted made another error of it
+            raise
     finally:
+        if signal.getsignal(signal.SIGINT) is interrupt:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing is open any more
         _flush()
         gc.freeze()  # or Python searches all that was imported for garbage before it ends: a fifth of a short command
     if message:
@@ -55,6 +73,22 @@ def start(
 
         mention(message)
     return interrupted
+
+
+def _show(kind: type[BaseException], err: BaseException, trace: TracebackType | None) -> None:
+    """Show an error that nobody has taken; a Ctrl-C is none."""
+    if not issubclass(kind, KeyboardInterrupt):
+        sys.__excepthook__(kind, err, trace)
+
+
+def _raise_again(lost: sys.UnraisableHookArgs) -> None:
+    """Raise a Ctrl-C again that came where Python drops errors, in a destructor or a callback of a library."""
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        from threading import Timer
+
+        Timer(0.01, _thread.interrupt_main).start()  # once this function has returned: what it raises is dropped, too
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _prepare_streams() -> None:
