@@ -200,7 +200,27 @@ def _by_msgspec(value: object, kind: Any, keys: Keys) -> Any:
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError:
-        raise _RefusedError(keys, f"expected {_wanted(inspect.type_info(kind))}, got {shown(value)}") from None
+        raise _RefusedError(
+            keys, f"expected {_wanted(info := inspect.type_info(kind))}, got {_got(value, info)}"
+        ) from None
+
+
+_KINDS: Mapping[type, tuple[str, tuple[str, ...]]] = {
+    str: ("a text in quotes, ", ("text",)),
+    int: ("a number, ", ("number",)),
+    float: ("a number, ", ("number",)),
+    list: ("a list, ", ("list", "[")),
+}
+"""Types of a value, how they are called, and words of what was expected that show that they are no surprise."""
+
+
+def _got(value: object, kind: inspect.Type) -> str:
+    """A value for a message, with its type where that is what is wrong: '0.02' may be taken for a number."""
+    if isinstance(value, bool):
+        return str(value).lower()  # as the file has it
+    noun, words = _KINDS.get(type(value), ("", ()))
+    literal = isinstance(kind, inspect.LiteralType) and type(value) in map(type, kind.values)
+    return f"{'' if literal or any(word in _wanted(kind) for word in words) else noun}{shown(value)}"
 
 
 def _missing(missing: list[tuple[Keys, Any]], remedy: str) -> str:

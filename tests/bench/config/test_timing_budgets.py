@@ -38,7 +38,7 @@ def test_a_budget_that_makes_no_sense_is_refused_with_its_name() -> None:
     for budgets, reason in [
         ("[budgets]\nmissing = 0.1", "budgets.missing: unknown key; expected some of .*missed"),
         ("[budgets]\nmissed = 1.5", "budgets.missed: expected a number from 0 to 1, got 1.5"),
-        ("[budgets]\nresponse = 1", "budgets.response: expected a table, got 1"),
+        ("[budgets]\nresponse = 1", "budgets.response: expected a table, got a number, 1"),
         ("[budgets.slack]\np50 = 1e-3", "budgets.slack: unknown key"),
         ("[budgets.age]\np42 = 1e-3", "budgets.age.p42: unknown key; expected one of p100, p50, p90, p99, p99.9"),
         ("[budgets.age]\np99 = 0", "budgets.age.p99: expected a number above 0, at most 1, got 0"),

@@ -63,13 +63,13 @@ def test_a_document_becomes_a_record() -> None:
 
 def test_what_does_not_fit_is_refused_with_its_place_what_was_expected_and_what_came() -> None:
     for document, message in [
-        (3, "expected a table, got 3"),
+        (3, "expected a table, got a number, 3"),
         ({}, "gear: missing: expected a table; add it"),
         ({"gear": {}}, "gear.ratio: missing: expected a number above 0, at most 6; add it"),
         ({"gear": {"ratio": 7}}, "gear.ratio: expected a number above 0, at most 6, got 7"),
         ({"gear": {"ratio": 0.0}}, "gear.ratio: expected a number above 0, at most 6, got 0.0"),
-        ({"gear": {"ratio": True}}, "gear.ratio: expected a number above 0, at most 6, got True"),
-        ({"gear": {"ratio": "2"}}, "gear.ratio: expected a number above 0, at most 6, got '2'"),
+        ({"gear": {"ratio": True}}, "gear.ratio: expected a number above 0, at most 6, got true"),
+        ({"gear": {"ratio": "2"}}, "gear.ratio: expected a number above 0, at most 6, got a text in quotes, '2'"),
         ({"gear": {"ratio": math.nan}}, "gear.ratio: expected a finite number"),
         ({"gear": SPUR, "load": math.inf}, "load: expected a finite number"),
         ({"gear": SPUR, "load": 10**400}, "load: expected a finite number"),
@@ -87,7 +87,7 @@ def test_what_does_not_fit_is_refused_with_its_place_what_was_expected_and_what_
         ),
         ({"gear": SPUR, "spares": {"a": SPUR, "b": {"pair": [2, 1], **SPUR}}}, "spares.b.pair: the lower value 2"),
         ({"gear": SPUR, "spares": {"a": SPUR, "b": {}}}, "spares.b.ratio: missing: expected"),
-        ({"gear": SPUR, "spares": 3}, "spares: expected a table, got 3"),
+        ({"gear": SPUR, "spares": 3}, "spares: expected a table, got a number, 3"),
         ({"gear": SPUR, "quantiles": {"p50": 1, "p42": 1}}, "quantiles.p42: unknown key; expected one of p50, p99.9"),
         ({"gear": SPUR, "quantiles": {"p50": 1, "p99.9": 0}}, "quantiles.p99.9: expected a number above 0, got 0"),
         (
@@ -98,8 +98,12 @@ def test_what_does_not_fit_is_refused_with_its_place_what_was_expected_and_what_
         ({"gear": SPUR, "name": ""}, "name: expected a printable text of 1 to 200 characters, got ''"),
         ({"gear": SPUR, "name": "a\x1b[31m"}, "name: expected a printable text"),
         ({"gear": SPUR, "name": "a" * 201}, "name: expected a printable text"),
-        ({"gear": SPUR, "name": {"x": "big"}}, "name.x: expected a number, got 'big'"),
-        ({"gear": SPUR, "flag": 1}, "flag: expected true or false, got 1"),
+        ({"gear": SPUR, "name": {"x": "big"}}, "name.x: expected a number, got a text in quotes, 'big'"),
+        ({"gear": SPUR, "flag": 1}, "flag: expected true or false, got a number, 1"),
+        ({"gear": SPUR, "flag": "true"}, "flag: expected true or false, got a text in quotes, 'true'"),
+        ({"gear": {"ratio": [2]}}, "gear.ratio: expected a number above 0, at most 6, got a list, [2]"),
+        ({"gear": {"ratio": 2, "kind": 3}}, "gear.kind: expected one of spur, worm, got a number, 3"),
+        ({"gear": SPUR, "name": 3}, "name: expected a text or a table, got a number, 3"),
     ]:
         assert refusal(document).startswith(message), document
 
