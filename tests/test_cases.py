@@ -8,6 +8,7 @@ import shlex
 import signal
 import sys
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path
     (here / "cut.mcap").write_bytes((here / "run.mcap").read_bytes()[:-5])
     (here / "weak.onnx").write_bytes(constant_actor(load_bench(), 2.0, sample_time=2e-3))
     (here / "cut.onnx").write_bytes(constant_actor(load_bench())[:200])
+    (here / "link.mcap").symlink_to("run.mcap")
     for name in ("folder", *(f"folder.{ending}" for ending in ("csv", "html", "onnx", "png", "xml"))):
         (here / name).mkdir()
     for name, content in CASES["files"].items():
@@ -58,6 +60,13 @@ def called(program: str, arguments: list[str]) -> int:
     except SystemExit as ended:  # of argparse
         return int(ended.code or 0)
     return code
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_command_tells_the_version(program: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in ([], *({"emb-replay": [["info"]], "emb-train": [["ppo"]]}.get(program, []))):
+        assert called(program, [*words, "--version"]) == 0
+        assert capsys.readouterr().out == f"{program} {metadata.version('emb-excite')}\n"
 
 
 @pytest.mark.parametrize("program", PROGRAMS)

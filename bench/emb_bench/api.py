@@ -14,6 +14,7 @@ name. All values are in SI units.
 from __future__ import annotations
 
 import inspect
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
@@ -27,7 +28,7 @@ from emb_bench.design.problem import COARSE_SEARCHES
 from emb_bench.estimate.records import STARTS
 from emb_bench.figures import for_notebook
 from emb_bench.logs.log import RunLog, read_log, require_driven
-from emb_bench.output import replacing, require_place, say_if_compiling
+from emb_bench.output import progress, replacing, require_place, say_if_compiling
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.system.terminal import as_json, mention
@@ -526,6 +527,7 @@ def design(
     starts: int = COARSE_SEARCHES,
     seed: int = 0,
     bench: str | Path | None = None,
+    told: Callable[[str], object] | None = None,
 ) -> Report:
     """The current sequence with most information about parameters that are known, under the limits of the bench.
 
@@ -535,10 +537,11 @@ def design(
         theta: the brake's parameters, as name=value,...; the others are nominal.
         model: plant of the bench (default: exact).
         kind: which Fisher information (default: physical).
-        return_home: the brake returns home at the end; else it ends anywhere within the limits.
+        return_home: the brake returns home at the end; without, it may end anywhere within the limits.
         starts: coarse searches (default: 18).
         seed: seed of the random starts (default: 0).
         bench: bench file (default: the shipped one).
+        told: called after each step of the search with what was done (default: a bar on a terminal).
 
     Returns:
         The report; ``report.found.best.currents`` are the currents [A], one per sample period.
@@ -558,10 +561,12 @@ def design(
     problem = make_problem(its, goal, names, model=model, kind=kind, brake=brake, returns=return_home)
     try:
         from emb_bench.design.report import make_report
+        from emb_bench.design.search import steps_of
     except ImportError as err:
         raise UsageError("design needs scipy and numba: pip install 'emb-excite[bench]'") from err
-    _say("searches for a design: a minute or two")
-    return make_report(its, problem, goal, kind, starts=starts, seed=seed)
+    say_if_compiling()
+    with progress("design", steps_of(starts)) as advance:
+        return make_report(its, problem, goal, kind, starts=starts, seed=seed, told=told or advance)
 
 
 def _say(text: str) -> None:
@@ -592,7 +597,12 @@ def _driven(run: Source, map_path: str | Path | None) -> RunLog:
 
 
 def _listed(runs: Source | Sequence[Source]) -> list[Source]:
-    return [runs] if isinstance(runs, RunLog | str | Path) else list(runs)
+    """The runs one by one; UsageError if one comes twice, under whatever name."""
+    found = [runs] if isinstance(runs, RunLog | str | Path) else list(runs)
+    real = [os.path.realpath(run.path if isinstance(run, RunLog) else run) for run in found]
+    if twice := [run for n, run in enumerate(found) if real[n] in real[:n]]:
+        raise UsageError(f"{getattr(twice[0], 'path', twice[0])} comes twice: expected each run once")
+    return found
 
 
 def _names(names: Names) -> tuple[str, ...]:

@@ -12,8 +12,9 @@ from pathlib import Path
 from emb_bench.config.bench import load_bench
 from emb_bench.excitation import EXCITATIONS
 from emb_bench.output import replacing, require_place
-from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.errors import EXIT_DONE, EmbError, UsageError, near
 from emb_runtime.safety.shield_design import make_law
+from emb_runtime.system.input_file import near_file
 from emb_runtime.system.terminal import Parser, complain, show
 from emb_train.presets import reference_names, wrapped
 
@@ -23,6 +24,9 @@ sequences:
 
 tuned references:
 {references}
+
+example:
+  emb-export chirp:f1=20,amplitude=0.5 -o chirp.onnx
 
 exit codes: 0 done, 2 usage, 5 the exported file does not compute what it was made of,
 130 Ctrl-C: nothing is written
@@ -87,6 +91,10 @@ def _export(arguments: argparse.Namespace) -> str:
         make_law(bench)  # where no shield can be made, emb-run would refuse the bench
         if source.suffix == ".json" or arguments.source in reference_names():
             data, what = reference_file(arguments.source, bench), "the reference"
+        elif (name := arguments.source.partition(":")[0]) not in EXCITATIONS and source.suffix != ".csv":
+            hint = near(name, (*EXCITATIONS, *reference_names())) or near_file(source)
+            named = "a reference or a sequence (emb-export --help lists them)"
+            raise UsageError(f"{source}: expected {named}, a .csv of emb-design or a .json of emb-train{hint}")
         else:
             currents, what = read_sequence(arguments.source, bench)
             data = sequence_file(currents, what, bench)

@@ -6,7 +6,7 @@ nothing that a user can cause ends in a traceback.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 EXIT_DONE = 0
 EXIT_CHECK_FAILED = 1  # Exit code of a check that ran without error and was not passed
@@ -21,12 +21,17 @@ EXIT_OUTSIDE = 9  # Exit code with --strict of a brake outside of the ranges for
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as a shell has it
 
 
-def near(got: str, names: Iterable[str]) -> str:
-    """A name that may have been meant, for the end of a message; empty if none is near what was given."""
+def near(got: str, names: Iterable[str], shown: Mapping[str, str] = {}) -> str:
+    """A name that may have been meant, for the end of a message; empty if none is near what was given.
+
+    Case and the dashes of an option count for nothing: any two options would be alike by them. A name is
+    ``shown`` as it is there.
+    """
     from difflib import get_close_matches
 
-    found = get_close_matches(got, list(names), n=1)
-    return f"; did you mean {found[0]}?" if found else ""
+    bare = {name.lstrip("-").casefold(): name for name in names}
+    found = get_close_matches(got.lstrip("-").casefold(), bare, n=1)
+    return f"; did you mean {shown.get(name := bare[found[0]], name)}?" if found else ""
 
 
 class EmbError(Exception):

@@ -182,9 +182,14 @@ echo running >"$state/status"
         ("echo Kernel panic: no init; exit 0", (), ("died before the command ran", "Kernel panic: no init")),
         (RUNNING, (), ("died while the command ran",)),
         (f"{RUNNING}sleep 60", ("--slow", "2"), ("did not say 'time runs slowly'",)),
+        (
+            "echo xor: measuring; sleep 60",
+            ("--boot", "1"),
+            ("(load ", 'last: "xor: measuring"): try again', "--boot S"),
+        ),
         (None, (), ("sudo apt-get install user-mode-linux",)),
     ],
-    ids=["dies before", "dies under it", "does not slow down", "is not there"],
+    ids=["dies before", "dies under it", "does not slow down", "does not come up", "is not there"],
 )
 def test_a_kernel_that_fails_is_an_error_that_says_how(
     tmp_path: Path, script: str | None, options: tuple[str, ...], said: tuple[str, ...]
@@ -193,6 +198,8 @@ def test_a_kernel_that_fails_is_an_error_that_says_how(
     result = with_environment(environment, "--uml", *options, "--", "true")
     assert result.returncode == 4
     assert all(words in result.stderr for words in said)
+    assert result.stderr.count("\n") == 1
+    assert len(result.stderr) < 300
 
 
 def test_a_signal_before_the_kernel_is_up_ends_everything(state: Path, tmp_path: Path) -> None:

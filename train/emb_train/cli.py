@@ -8,16 +8,14 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY
-from emb_bench.output import make_empty_folder, replacing
+from emb_bench.output import make_empty_folder, progress, replacing
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
 from emb_runtime.system.terminal import Parser, as_json, complain, mention, show
@@ -78,7 +76,6 @@ def parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("--version", action="version", version=f"%(prog)s {version('emb-excite')}")
     commands = p.add_subparsers(dest="command", metavar="COMMAND", required=True)
 
     def command(name: str, summary: str, epilog: str) -> argparse.ArgumentParser:
@@ -226,24 +223,6 @@ def _blind(text: str) -> list[float]:
     if len(numbers) % 2 == 0 or not all(math.isfinite(value) for value in numbers):
         raise argparse.ArgumentTypeError(f"expected levels and then switches, one less, got '{text}'")
     return numbers
-
-
-@contextmanager
-def progress(what: str, total: int) -> Iterator[Callable[[str], None]]:
-    """A bar on standard error; the function that it gives advances it by one, with a text beside it."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn(what),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[said]}"),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("", total=total, said="")
-        yield lambda said: bar.update(task, advance=1, said=said)
 
 
 def reference(arguments: argparse.Namespace) -> int:

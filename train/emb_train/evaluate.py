@@ -25,6 +25,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import PolicyRefusedError, UsageError, near
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
+from emb_runtime.system.input_file import near_file
 from emb_train.closed_loop import EVERYTHING, Conditions
 from emb_train.optimum import optima, searchable
 from emb_train.play import (
@@ -99,7 +100,7 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
         return Subject(given, bench, following, task.ranges, _other_shield(task.shield_ranges, bench))
     if not path.is_dir():
         names = (ACTOR, *reference_names())
-        there = f"there are: {', '.join(names)}{near(given, names)}"
+        there = f"there are: {', '.join(names)}{near(given, names) or near_file(path)}"
         raise UsageError(f"{given}: no such folder, and no reference of that name; {there}")
     if bench_file is not None:
         raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")

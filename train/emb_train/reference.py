@@ -22,7 +22,7 @@ from emb_bench.config.bench import Bench
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import OLDEST_FRAME, Ranges
 from emb_runtime.config.typed import FieldError, read
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, near
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.kalman import Four, Model, State, believed, follow, make_model, relative, start
 from emb_runtime.estimator.speed_loop import Scale, follow_reference, scale_of
@@ -155,7 +155,8 @@ def stored(source: str) -> Stored:
     """
     if not source.endswith(".json"):
         if source not in reference_names():
-            raise UsageError(f"no reference is called '{source}'; there are: {', '.join(reference_names())}")
+            there = f"there are: {', '.join(reference_names())}{near(source, reference_names())}"
+            raise UsageError(f"no reference is called '{source}'; {there}")
         return read_text(FILES.joinpath("references", f"{source}.json").read_bytes(), source)
     try:
         return read_text(read_bytes(Path(source), MAX_STORED_BYTES), source)

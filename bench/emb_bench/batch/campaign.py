@@ -15,10 +15,12 @@ from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import ENDINGS as ROWS
 from emb_bench.batch.row import Options, Row, Source, failed, write_rows
 from emb_bench.batch.summary import Campaign, mark_copies, summarise
-from emb_bench.output import replacing, require_place
+from emb_bench.output import progress, replacing, require_place
 from emb_bench.parallel import Lost, shared_out, shared_out_on_ray
 from emb_runtime.errors import UsageError
 from emb_runtime.records import HOMING_LOG, LISTEN_ONLY_LOG
+from emb_runtime.system.input_file import near_file
+from emb_runtime.system.terminal import mention
 
 SUFFIX = ".mcap"
 PASSED_OVER = (HOMING_LOG + SUFFIX, LISTEN_ONLY_LOG + SUFFIX)  # Logs of emb-run that hold no experiment
@@ -54,20 +56,15 @@ def run_campaign(
 
 def in_order(sources: Sequence[Source], numbered: Generator[tuple[int, Row | Lost], None, None]) -> list[Row]:
     """All rows in the order of the logs; shows how many there are, and says at once what failed."""
-    from rich.console import Console
-    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (MofNCompleteColumn(), TextColumn("logs"), TimeRemainingColumn(), TextColumn("left"))
-    console, rows = Console(stderr=True, markup=False, highlight=False, emoji=False), dict[int, Row]()
-    with closing(numbered), Progress(*columns, console=console, disable=not console.is_terminal) as shown:
-        task = shown.add_task("", total=len(sources))  # processes end with the generator, whatever happens
+    rows = dict[int, Row]()
+    with closing(numbered), progress("logs", len(sources)) as advance:  # processes end with the generator
         for number, found in numbered:
             source = sources[number]
             row = failed(source, f"{source.path}: {found.why}") if isinstance(found, Lost) else found
             rows[number] = row
-            shown.advance(task)
+            advance("")
             if row["error"] is not None:
-                console.print(f"FAILED {row['error']}", soft_wrap=True)
+                mention(f"FAILED {row['error']}")
     return [rows[number] for number in range(len(sources))]
 
 
@@ -85,7 +82,7 @@ def find(paths: Sequence[Path]) -> list[Source]:
         elif os.path.lexists(path):
             found.append(_source(path.parent, path, ""))
         else:
-            raise UsageError(f"{path}: expected a log or a folder with logs, and there is none")
+            raise UsageError(f"{path}: expected a log or a folder with logs, and there is none{near_file(path)}")
     seen: set[str] = set()
     logs = []
     for source in sorted(found, key=lambda s: (s.root, s.log)):

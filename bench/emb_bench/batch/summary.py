@@ -146,11 +146,11 @@ def _estimates(used: Sequence[Row], name: str) -> ParameterEstimates | None:
 
 
 def text(c: Campaign, *, verbose: bool = False) -> str:
-    """Failures, the parameters over all runs, and agreement of the runs; with ``verbose`` each log with something."""
+    """Number of failures, the parameters over all runs, and their agreement; with ``verbose`` each log with a note."""
     most = None if verbose else SHOWN
     lines = []
     if c.failed:
-        lines += [f"{len(c.failed)} of {c.logs} logs FAILED", *listed("  ", (row["error"] for row in c.failed[:most]))]
+        lines.append(f"{len(c.failed)} of {c.logs} logs FAILED")  # each was named when it did
     if not c.evaluated:
         return "\n".join(lines)
     lines += wrapped(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from importlib import metadata
 from pathlib import Path
 
 from emb_bench.config.bench import load_bench
@@ -17,6 +16,9 @@ EPILOG = """\
 Each step is a run of emb-run behind shield, guard and watchdog, and uses the results of the steps before. Its policy
 and log are in DIR. After an interruption the same command continues with the first step that has no completed log. The
 result is the bench file DIR/bench.toml.
+
+example:
+  emb-commission new --bench data-sheet.toml --iface can0 --serial 8
 
 exit codes:
   0    done
@@ -44,7 +46,6 @@ def parser() -> argparse.ArgumentParser:
     asking.add_argument("--confirm", action="store_true", help="confirm each step (default where the bus is real)")
     asking.add_argument("--yes", action="store_true", help="do not ask")
     p.add_argument("--json", action="store_true", help="print the result as JSON")
-    p.add_argument("--version", action="version", version=f"emb-commission {metadata.version('emb-excite')}")
     each = p.add_argument_group("passed to each emb-run (see emb-run --help)")
     for option, value in (("--drive", "FILE@BUS"), ("--operator", "NAME"), ("--serial", "TEXT")):
         each.add_argument(option, metavar=value)
@@ -76,10 +77,9 @@ def main(argv: list[str] | None = None) -> int:
         except ImportError as err:
             raise UsageError(f"{err}; pip install 'emb-excite[bench]'") from err
         each = options(args)
+        open_transport(args.iface, sheet, ())[0].close()  # what is wrong with it is said first, and before any step
         if "--confirm" in each and (sys.stdin is None or not sys.stdin.isatty()):
             raise UsageError("--confirm: expected a terminal on standard input; --yes runs without asking")
-        if args.iface.partition(":")[0] == "sim":
-            open_transport(args.iface, sheet)[0].close()  # a wrong option is refused before the first step
         try:
             args.folder.mkdir(parents=True, exist_ok=True)
             result = Commissioning(args.folder, sheet, args.iface, each, emb_run, mention).run()

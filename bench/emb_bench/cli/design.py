@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from importlib import metadata
 from pathlib import Path
 
 from emb_bench import api
 from emb_bench.cli.options import add, add_output_options, answer, given, summary
 from emb_bench.output import require_place
 from emb_runtime.errors import EXIT_DONE, EmbError
-from emb_runtime.system.terminal import Parser, complain
+from emb_runtime.system.terminal import Parser, complain, mention
 
 EPILOG = """\
 A design is for known parameters: it shows how good an excitation can be. Do not use it on
@@ -19,6 +18,9 @@ a brake with other parameters, which would leave its limits. The result is the b
 local optima.
 
 criteria: D log det M, A tr M^-1, E smallest eigenvalue.
+
+example:
+  emb-design -o design.csv && emb-export design.csv -o design.onnx && emb-run --policy design.onnx
 
 exit codes:
   0    done; the design keeps the limits on the brake that it was made for
@@ -36,8 +38,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("--version", action="version", version=f"emb-design {metadata.version('emb-excite')}")
-    add(p, api.design)
+    add(p, api.design, leave_out=("told",))
     p.add_argument("-o", "--output", type=Path, metavar="FILE", help="file to write: design.csv")
     add_output_options(p)
     return p
@@ -54,8 +55,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _design(args: argparse.Namespace) -> None:
+    told = mention if args.verbose and sys.stderr is not None and not sys.stderr.isatty() else None
     require_place("--output", args.output, (".csv",))
-    report = api.design(**given(args, api.design))
+    report = api.design(**given(args, api.design), told=told)
     if args.output is not None:
         from emb_bench.design.report import write
 

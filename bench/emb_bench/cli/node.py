@@ -31,6 +31,9 @@ down."""
 MAX_FRAMES = 64  # Most frames taken per tick: a babbling commander must not hold the node up
 
 EPILOG = """\
+example:
+  emb-node --iface vcan0 --brake plant=stribeck,f_v=3e-5
+
 exit codes: 0 ended (duration over, Ctrl-C or SIGTERM), 2 usage, 4 bus
 """
 

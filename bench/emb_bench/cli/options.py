@@ -55,7 +55,8 @@ def add(p: argparse.ArgumentParser, function: Function, leave_out: Sequence[str]
         if name in leave_out or parameter.kind is parameter.VAR_KEYWORD:
             continue
         kind = eval(parameter.annotation, vars(sys.modules[function.__module__]))  # our own source
-        p.add_argument(*_flags(name, parameter), help=described[name], **_form(name, parameter, kind))
+        told = described[name].rpartition("; without, ")[2] if parameter.default is True else described[name]
+        p.add_argument(*_flags(name, parameter), help=told, **_form(name, parameter, kind))
 
 
 def given(args: argparse.Namespace, function: Function, leave_out: Sequence[str] = ()) -> dict[str, Any]:

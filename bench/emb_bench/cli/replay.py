@@ -6,7 +6,6 @@ import argparse
 import sys
 from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
-from importlib import metadata
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from emb_bench import api
@@ -156,7 +155,7 @@ class Command(NamedTuple):
 MEANINGS: Mapping[int, str] = {
     EXIT_DONE: "done",
     EXIT_CHECK_FAILED: "a check failed, or a log could not be used (it is named)",
-    EXIT_USAGE: "usage: wrong argument, a file that cannot be read or written, a missing library, or no budgets",
+    EXIT_USAGE: "usage: wrong argument, a file that cannot be read or written, or a missing library",
     EXIT_POLICY_REFUSED: "the policy in the log is refused",
     EXIT_LOG: "not a log, or too damaged or too short for a result",
     EXIT_CANNOT_TELL: "--strict: not every acceptance criterion can be decided",
@@ -169,7 +168,7 @@ CHECKED = (*OF_A_LOG, EXIT_CHECK_FAILED)
 
 MISFIT = "a run was stopped, the model does not fit, does not predict a log, or a parameter is not identified"
 COMMANDS: Mapping[str, Command] = {
-    "fim": Command(api.fisher_information, _fim, OF_A_LOG),
+    "info": Command(api.info, _info, OF_A_LOG),
     "estimate": Command(
         api.estimate,
         _estimate,
@@ -186,14 +185,26 @@ COMMANDS: Mapping[str, Command] = {
         strict=f"exit with {EXIT_CHECK_FAILED} if a criterion failed, else {EXIT_CANNOT_TELL} if one is not "
         f"decided; without --acceptance as emb-replay estimate does",
     ),
-    "campaign": Command(api.campaign, _campaign, CHECKED, UNKNOWNS),
-    "info": Command(api.info, _info, OF_A_LOG),
-    "timing": Command(api.timing, _timing, CHECKED),
+    "fim": Command(api.fisher_information, _fim, OF_A_LOG),
+    "timing": Command(api.timing, _timing, CHECKED, "\nExit code 2 also if a bench file has no [budgets].\n"),
     "rerun": Command(api.rerun, _rerun, (*CHECKED, EXIT_POLICY_REFUSED)),
     "export": Command(api.export, _export, OF_A_LOG),
+    "campaign": Command(api.campaign, _campaign, CHECKED, UNKNOWNS),
     "live": Command(live, _live, (EXIT_DONE, EXIT_USAGE, EXIT_LOG)),
 }
-"""Commands in the order of ``--help``."""
+"""Commands in the order of ``--help``, which is that of their use."""
+EXAMPLES: Mapping[str, str] = {
+    "info": "run.mcap",
+    "estimate": "run.mcap --json > estimate.json",
+    "report": "run.mcap -o report.html --acceptance acceptance.toml --strict",
+    "fim": "run.mcap --theta nominal --params k_m,f_v",
+    "timing": "runs/*.mcap",
+    "rerun": "run.mcap",
+    "export": "run.mcap -o cycles.parquet --topic /cycle",
+    "campaign": "runs -o campaign.parquet --jobs 4",
+    "live": "runs",
+}
+"""Arguments of each to begin with."""
 
 
 CUT = "\nA cut log (kill -9, full disk) is read as far as it goes, and the missing part is named.\n"
@@ -213,7 +224,6 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
         epilog=epilog([*MEANINGS]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("--version", action="version", version=f"emb-replay {metadata.version('emb-excite')}")
     commands = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS if only is None else (only,):
         _, _, codes, more, strict = found = COMMANDS[name]
@@ -221,7 +231,7 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
             name,
             help=summary(found.function),
             description=f"{description(found.function)}\n{more}",
-            epilog=epilog(codes),
+            epilog=f"example:\n  emb-replay {name} {EXAMPLES[name]}\n\n{epilog(codes)}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         add(command, found.function)

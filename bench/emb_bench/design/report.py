@@ -6,6 +6,7 @@ import csv
 import hashlib
 import io
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -153,9 +154,18 @@ class Report:
         }
 
 
-def make_report(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, *, starts: int, seed: int) -> Report:
+def make_report(
+    bench: Bench,
+    problem: Problem,
+    criterion: Criterion,
+    kind: Kind,
+    *,
+    starts: int,
+    seed: int,
+    told: Callable[[str], object] = str,
+) -> Report:
     """Search for a design, and simulate it again on its own brake and on ``CHECKED``."""
-    found = search(problem, starts=starts, seed=seed)
+    found = search(problem, starts=starts, seed=seed, told=told)
     plants = dict.fromkeys((problem.plant.name, *CHECKED))
     return Report(
         bench=bench,

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -69,10 +69,19 @@ class Table(NamedTuple):
     matrix: Floats  # Fisher information, shape (p, p)
 
 
-def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: Sequence[Floats] = ()) -> Found:
+def search(
+    problem: Problem,
+    *,
+    starts: int,
+    seed: int,
+    workers: int = 0,
+    warm: Sequence[Floats] = (),
+    told: Callable[[str], object] = str,
+) -> Found:
     """The best design of many searches; the same seed finds the same design, whatever the number of workers.
 
     ``starts`` are coarse searches, ``workers`` threads, 0 for one per processor, ``warm`` currents to begin with too.
+    ``told`` is called after each of at most ``steps_of(starts)`` steps, with what was done.
     """
     seeds = np.random.SeedSequence(seed).spawn(starts + LINES)
     draws = [np.random.default_rng(s) for s in seeds[starts:]]
@@ -80,10 +89,13 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
         for wave in np.array_split(np.arange(starts), WAVES):
             found = list(tables)
-            tables += pool.map(lambda i, f=found: coarse(problem, JOURNEYS[i % len(JOURNEYS)], seeds[i], f), wave)
+            for table in pool.map(lambda i, f=found: coarse(problem, JOURNEYS[i % len(JOURNEYS)], seeds[i], f), wave):
+                tables.append(table)
+                told(f"start {len(tables)} of {starts} done")
         begun = [problem.design(table.currents) for table in _diverse(tables, LINES)]
         begun += [problem.design(u) for u in warm]
         lines = sorted(pool.map(lambda d: _better(d, polish(problem, d.currents, LONG)), begun), key=_rank)[::-1]
+        told("the best starts polished")
         ended: list[Design] = []
         history: list[float] = []
         while not _settled(history):
@@ -93,6 +105,7 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
             varied = pool.map(lambda d, rng: _varied(problem, d, rng), lines if kept > 1 else lines * LAST, draws)
             lines = sorted(varied, key=_rank, reverse=True)[:kept]
             history.append(_rank(lines[0]))
+            told(f"round {len(history)} of at most {ROUNDS} of improvement done")
     ended.append(_better(lines[0], polish(problem, lines[0].currents, LONG)))
     polished = sorted(ended, key=_rank, reverse=True)
     best = next((d for d in (_between_samples(problem, d) for d in polished) if d is not None), None)
@@ -104,6 +117,11 @@ def search(problem: Problem, *, starts: int, seed: int, workers: int = 0, warm: 
         )
     others = sorted((d for d in polished if d.feasible and d.phi < best.phi), key=_rank, reverse=True)
     return Found(best, (best, *others))
+
+
+def steps_of(starts: int) -> int:
+    """Most steps of a search, which take similar times: its starts, their polish, the rounds."""
+    return starts + 1 + ROUNDS
 
 
 def _diverse(tables: Sequence[Table], count: int) -> list[Table]:

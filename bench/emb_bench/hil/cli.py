@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import fcntl
 import os
+import shlex
 import signal
 import socket
 import struct
@@ -17,11 +18,14 @@ from emb_bench.hil.uml import KernelCommand, state_directory, supervise
 from emb_runtime.errors import EXIT_BUS, EXIT_USAGE, BusError, EmbError, UsageError
 from emb_runtime.system.terminal import Parser, complain, mention
 
-_USAGE = "emb-hil [--host | --uml] [--root] [--slow N] [--memory MB] -- COMMAND..."
+_USAGE = "emb-hil [--host | --uml] [--root] [--slow N] [--boot S] [--memory MB] -- COMMAND..."
 _EPILOG = f"""\
 If vcan0 exists and is up, the command runs on this kernel. Otherwise it runs in a User-Mode Linux kernel, with your
 files, working directory, environment and user; /proc, /sys, /dev, /run and /dev/shm are those of that kernel. Standard
 input is empty. Ctrl-C and SIGTERM reach the command; a second one kills it.
+
+example:
+  emb-hil --slow 100 -- sh -c 'emb-node --iface vcan0 & emb-run --iface vcan0'
 
 exit status: that of the command (128 + n if signal n ended it, 126 or 127 if it could not be started);
 {EXIT_BUS} no vcan0 or the kernel died, {EXIT_USAGE} wrong usage."""
@@ -49,6 +53,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--slow", type=int, default=1, metavar="N",
                         help="--uml with a clock N times slower, so that delays of this computer count N times "
                         "less; idle time is skipped (default 1: real time)")  # fmt: skip
+    parser.add_argument("--boot", type=float, default=60.0, metavar="S",
+                        help="longest wait for the kernel to come up [s] (default 60)")  # fmt: skip
     parser.add_argument("--memory", type=int, default=2048, metavar="MB", help="memory of the kernel (default 2048)")
     return parser
 
@@ -61,7 +67,7 @@ def _run(options: argparse.Namespace, command: list[str]) -> int:
     with uml.own_processor(), state_directory() as state:
 
         def start() -> KernelCommand:
-            return KernelCommand(command, state, options.memory, options.slow, options.root)
+            return KernelCommand(command, state, options.memory, options.slow, options.root, options.boot)
 
         return supervise(start)
 
@@ -96,13 +102,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     mark = given.index("--") if "--" in given else len(given)
     parser = _parser()
-    options = parser.parse_args(given[:mark])
     command = given[mark + 1 :]
     try:
+        if not command and (words := parser.parse_known_args(given[:mark])[1]) and not words[0].startswith("-"):
+            raise UsageError(f"{words[0]}: write the command after --, as in `emb-hil -- {shlex.join(words)}`")
+        options = parser.parse_args(given[:mark])
         if options.memory < 128:
             raise UsageError("--memory must be at least 128 MB")
         if not 1 <= options.slow <= SLOWEST:
             raise UsageError(f"--slow: expected 1 to {SLOWEST}, got {options.slow}")
+        if not 1 <= options.boot <= 3600:
+            raise UsageError(f"--boot: expected 1 to 3600 s, got {options.boot:g}")
         if options.slow > 1 and options.host:
             raise UsageError("--slow is for User-Mode Linux: expected no --host with it")
         options.uml |= options.slow > 1

@@ -28,8 +28,9 @@ from types import FrameType
 from typing import IO, Any
 
 from emb_bench.hil.guest import IP, JOB_FILE, RUNNING, SIGNAL_FILE, SIGNALS
-from emb_runtime.cli.summary import SLOW_MARK
+from emb_runtime.cli.preflight import SLOW_MARK
 from emb_runtime.errors import BusError
+from emb_runtime.system.terminal import one_line
 
 PROGRAM = "linux.uml"
 PACKAGE = "user-mode-linux"
@@ -154,8 +155,7 @@ def memory_directory(bytes_needed: int) -> Path:
     raise BusError(f"no place for the kernel's memory ({'; '.join(refused)}): free some, or lower --memory")
 
 
-_CONSOLE_LINES = 40
-_BOOT_LIMIT = 60.0  # Time until the command must run [s]
+LONGEST_LINE = 200  # Characters of the kernel's console that a message repeats
 _GRACE = 10.0  # Time from a signal until the command is killed [s]
 _POLL = 0.02  # Time between two looks at it [s]
 # Standard input ends without a line when emb-hil dies, by kill -9 too.
@@ -195,14 +195,15 @@ class KernelCommand:
         memory: of the kernel [MiB].
         slow: seconds of this computer's for each of its own.
         as_root: the command is root in the kernel.
+        boot: time until it must run [s].
     """
 
-    def __init__(self, command: list[str], state: Path, memory: int, slow: int, as_root: bool) -> None:
+    def __init__(self, command: list[str], state: Path, memory: int, slow: int, as_root: bool, boot: float) -> None:
         self._state = state
         self._is_slow = slow > 1
         program, environment = _program(), _environment(state, memory, slow)
         self._merged = os.path.sameopenfile(1, 2)
-        self._write_job(command, as_root, {SLOW_MARK: str(slow)} if slow > 1 else {})
+        self._write_job(command, as_root, {SLOW_MARK: str(slow)})
         self._streams = [(1, (state / "stdout").open("rb"))]
         if not self._merged:
             self._streams.append((2, (state / "stderr").open("rb")))
@@ -224,7 +225,7 @@ class KernelCommand:
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
-        self._boot_until = time.monotonic() + _BOOT_LIMIT
+        self._boot, self._boot_until = boot, time.monotonic() + boot
 
     def _write_job(self, command: list[str], as_root: bool, extra_env: Mapping[str, str]) -> None:
         umask = os.umask(0o077)
@@ -272,13 +273,15 @@ class KernelCommand:
         status = self._status()
         if not ended:
             if not status and time.monotonic() > self._boot_until:
-                raise BusError(self._obituary(f"the kernel did not come up within {_BOOT_LIMIT:.0f} s"))
+                busy = f"load {os.getloadavg()[0]:.0f} on {os.cpu_count()} processors"
+                what = f"the kernel did not come up within {self._boot:g} s ({busy}; last: {self._last()})"
+                raise BusError(f"{what}: try again, or wait longer with --boot S")
             if self._is_slow and status and SLOW_TOLD not in (self._state / "console").read_text(errors="replace"):
                 raise BusError(self._obituary(f"it did not say '{SLOW_TOLD}'"))
             return None
         last = status.splitlines()[-1:]
         if not last or last[0] == RUNNING.strip():
-            raise BusError(self._obituary("the kernel died " + ("while" if last else "before") + " the command ran"))
+            raise BusError(self._obituary(f"died {'while' if last else 'before'} the command ran"))
         return int(last[0])
 
     def _pump(self) -> None:
@@ -289,8 +292,13 @@ class KernelCommand:
                     block = block[os.write(descriptor, block) :]
 
     def _obituary(self, what: str) -> str:
-        lines = (self._state / "console").read_text(errors="replace").splitlines()
-        return "\n".join([f"User-Mode Linux: {what}. Its last console lines:", *lines[-_CONSOLE_LINES:]])
+        return f"the kernel {what}; last: {self._last('panic', 'Error')}"
+
+    def _last(self, *telling: str) -> str:
+        """The last line of the console, or the last one with one of these words, if there is such a line."""
+        lines = [line.strip() for line in (self._state / "console").read_text(errors="replace").splitlines()]
+        told = [line for line in lines if any(word in line for word in telling)] or [line for line in lines if line]
+        return f'"{one_line(told[-1], LONGEST_LINE)}"' if told else "nothing"
 
     def signal(self, number: int) -> None:
         """Hand the command a signal."""

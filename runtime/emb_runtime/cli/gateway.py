@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from importlib import metadata
 from pathlib import Path
 from textwrap import dedent
 
@@ -38,6 +37,9 @@ arms the drive by the sequence of the mapping file. The drive stays armed until 
 After a stop that emb-run did not request, the gateway disarms the drive and ends.
 """
 EPILOG = """\
+example:
+  emb-gateway drive.toml --drive can0 --node vcan0
+
 exit codes:
   0  ended by Ctrl-C or SIGTERM, the drive is disarmed
   1  the same, but commands acted later than shield.frame_age declares
@@ -68,7 +70,6 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--yes", action="store_true", help="do not ask before the drive is armed")
     p.add_argument("--no-rt", action="store_true", help="leave scheduling and memory alone")
     p.add_argument("--json", action="store_true", help="print the counts at the end as JSON")
-    p.add_argument("--version", action="version", version=f"emb-gateway {metadata.version('emb-excite')}")
     return p
 
 

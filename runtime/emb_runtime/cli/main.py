@@ -169,8 +169,11 @@ def _write_bench(path: Path) -> int:
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(shipped_bench_text())
+    except FileExistsError as err:
+        there = "it is a folder: name a file in it" if path.is_dir() else "there is one already: choose another name"
+        raise BenchFileError(f"--write-bench {path}: {there}") from err
     except OSError as err:
-        raise BenchFileError(f"{path}: cannot write the bench file: {err.strerror}") from err
+        raise BenchFileError(f"--write-bench {path}: {err.strerror}") from err
     return EXIT_DONE
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import StrEnum
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -181,7 +181,8 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     what.add_argument(
         "--report", type=Path, metavar="FILE.html",
-        help="after the run, estimate the parameters and write the page, as emb-replay report does (needs emb_bench)",
+        help="after the run, estimate the parameters and write the page, as emb-replay report does (needs the "
+        "extra [bench])",
     )  # fmt: skip
     what.add_argument(
         "--strict", action="store_true",
@@ -232,7 +233,6 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
 
     p.add_argument("--write-bench", type=Path, metavar="FILE", help="write the shipped bench file and exit")
-    p.add_argument("--version", action="version", version=f"emb-run {metadata.version('emb-excite')}")
     return p
 
 
@@ -297,6 +297,8 @@ def _drive(iface: str, given: str | None, bench: Bench) -> MappedDrive | None:
     from emb_runtime.drives.mapping import require_fit
     from emb_runtime.drives.mapping_file import load_mapping
 
+    if scheme == "map" and not all(mapped.rpartition("@")):
+        raise UsageError(f"--iface {iface}: expected map:FILE@BUS with a simulated drive on the bus")
     file, bus = Path(mapped.rpartition("@")[0]) if scheme == "map" else None, ""
     if given is not None:
         name, at, bus = given.rpartition("@")
@@ -349,7 +351,7 @@ def log_path(wanted: Path, ending: str = "") -> Path:
         name = time.strftime("%Y%m%d-%H%M%S") + f"-{time.time_ns() // 1_000_000 % 1000:03d}"
         path = wanted / f"run-{name}{ending}.mcap"
     try:
-        exists = path.exists()
+        exists = os.path.lexists(path)  # also a link that leads nowhere
     except OSError as err:
         raise UsageError(f"--log {wanted}: {err.strerror}") from err
     if exists:

@@ -7,6 +7,7 @@ says with which error the run ends, before any frame has left.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -30,6 +31,12 @@ MOST_MISSING = 0.1  # Share of the pairs that may be missing before --read-only 
 SCATTER_TOLERANCE = 2.0  # Times the bench's noise that a sensor may scatter at rest before a warning
 DISK_RESERVE = 10.0  # Logs of this length for which there should be room
 
+SLOW_MARK = (
+    "EMB_SLOW"  # In the environment of a command in a kernel of ``emb-hil``: how many times time is slower there
+)
+SLOWLY = "emb-hil --slow 100"
+OF_TIME = (Fault.NO_NODE, Fault.SENSOR_LOST, Fault.NODE_STOPPED, Fault.NOT_OBEYED, Fault.WATCHDOG_TRIPPED)
+"""Faults that a computer causes which is busy with something else."""
 
 WIDTHS = (13, 52, 40)  # Widths of the table's columns [characters]
 
@@ -103,13 +110,19 @@ def refuse(lines: Sequence[CheckResult]) -> None:
     """Raise RefusedError if a line is refused; the first one says why."""
     for line in lines:
         if line.verdict is Verdict.REFUSED:
-            advice = "" if line.fault is None else f"; {FAULTS[line.fault].advice}"
+            advice = "" if line.fault is None else f"; {advice_on(line.fault)}"
             raise RefusedError(
                 f"pre-flight, {line.what}: {line.found}; expected {line.expected}{advice}",
                 line.exit_code,
                 lines,
                 line.fault,
             )
+
+
+def advice_on(fault: Fault) -> str:
+    """Advice on a fault; for one that a busy computer causes, with what ``emb-hil`` can do about that."""
+    slow = f"; on a busy computer: {SLOWLY}" if fault in OF_TIME and os.environ.get(SLOW_MARK) == "1" else ""
+    return FAULTS[fault].advice + slow
 
 
 def table(lines: Sequence[CheckResult]) -> str:

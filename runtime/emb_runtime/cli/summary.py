@@ -16,7 +16,7 @@ from typing import Any
 from emb_runtime.can.transport import Transport
 from emb_runtime.cli.bus_monitor import BusStatistics, planned_load
 from emb_runtime.cli.options import Plan
-from emb_runtime.cli.preflight import CheckResult, RefusedError, table
+from emb_runtime.cli.preflight import SLOW_MARK, CheckResult, RefusedError, advice_on, table
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import EXIT_DONE, EXIT_LOG, EXIT_OUTSIDE, BusError, EmbError
@@ -34,7 +34,6 @@ from emb_runtime.system.clock import Clock
 ESTIMATE_RATE = 100_000  # Log rate of the estimates [bytes per second]
 LOG_RATE = 500_000  # Log rate of a run at 1 kHz, with room to spare: measured are 250 to 310 kB [bytes per second]
 
-SLOW_MARK = "EMB_SLOW"  # In the environment where a kernel's time runs slowly: how many times (``emb-hil --slow``)
 BORDER = 1e-6  # Share of a range's end that counts as the end
 LOG_INCOMPLETE = "LOG_INCOMPLETE"  # Result of a run that was completed and not recorded
 
@@ -72,7 +71,7 @@ def header(
 ) -> LogHeader:
     """Header of a log: versions, bench, policy, bus, and what the pre-flight found; 0 steps where none is answered."""
     bench, policy = plan.bench, plan.policy
-    slow = os.environ.get(SLOW_MARK)
+    slow = os.environ.get(SLOW_MARK, "1")
     mapping = plan.drive.mapping if plan.drive is not None else None
     records = {
         "emb.run": {
@@ -93,7 +92,7 @@ def header(
             "numpy": metadata.version("numpy"),
             "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
         }
-        | ({"time": f"{slow} times slower than the computer's"} if slow else {})
+        | ({"time": f"{slow} times slower than the computer's"} if slow != "1" else {})
         | {name: text for name, text in (("operator", plan.operator), ("device_serial", plan.serial)) if text}
         | {f"bus_{name}": value for name, value in transport.obtained.items()},
     }
@@ -325,7 +324,7 @@ def result_facts(fault: Fault | None, exit_code: int, detail: str) -> dict[str, 
         "exit_code": exit_code,
         "cause": FAULTS[fault].cause if fault else "",
         "detail": detail,
-        "advice": FAULTS[fault].advice if fault else "",
+        "advice": advice_on(fault) if fault else "",
     }
 
 

@@ -14,6 +14,8 @@ import os
 import stat
 from pathlib import Path
 
+from emb_runtime.errors import near
+
 _KINDS = (
     (stat.S_ISDIR, "a directory"),
     (stat.S_ISFIFO, "a pipe"),
@@ -30,8 +32,21 @@ def open_regular(path: str | Path) -> io.BufferedReader:
     """A regular file, open for reading; raises OSError for anything else."""
     try:
         return io.BufferedReader(io.FileIO(path, "rb", opener=_opened))
+    except FileNotFoundError as err:
+        raise FileNotFoundError(err.errno, f"{err.strerror}{near_file(Path(path))}", str(path)) from err
     except ValueError as err:  # a zero byte in the name
         raise OSError(errno.EINVAL, "no file can have that name", str(path)) from err
+
+
+def near_file(path: Path) -> str:
+    """The file, or the folder of a path, that may have been meant, see :func:`emb_runtime.errors.near`."""
+    try:
+        others = sorted(other for other in path.parent.iterdir() if other.name != path.name)  # one may lead nowhere
+    except OSError:
+        return "" if path.parent == path else near_file(path.parent)
+    ending = path.suffix.casefold()
+    alike = [other for other in others if other.suffix.casefold() == ending or other.stem == path.stem]
+    return near(path.stem, [other.stem for other in alike], {other.stem: str(other) for other in alike})
 
 
 def _opened(path: str, _flags: int) -> int:

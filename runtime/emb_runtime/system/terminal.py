@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -16,6 +17,7 @@ import select
 import signal
 import sys
 from collections.abc import Callable, Mapping
+from importlib import metadata
 from typing import Any, NoReturn
 
 from emb_runtime.errors import EmbError, UsageError, near
@@ -127,12 +129,18 @@ class Parser(argparse.ArgumentParser):
     """A command line whose wrong use is one line, with the option or the command that may have been meant."""
 
     def __init__(self, **options: Any) -> None:
-        """A parser that takes no option by the beginning of its name."""
+        """A parser that takes no option by the beginning of its name, and tells the version."""
         super().__init__(allow_abbrev=False, **options)
+        version = f"{self.prog.partition(' ')[0]} {metadata.version('emb-excite')}"
+        self.add_argument("--version", action="version", version=version)
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         """The arguments; ends the program with 2 where they are wrong, with 0 after a ``--help``."""
-        found, unknown = self.parse_known_args(args, namespace)
+        given, found = sys.argv[1:] if args is None else list(args), namespace
+        options = [one for one in itertools.takewhile("--".__ne__, given) if one.startswith("--")]
+        unknown = [one for one in options if one.partition("=")[0] not in self._known()]
+        if not unknown:  # a misspelt option comes before what is missing because of it
+            found, unknown = self.parse_known_args(given, namespace)
         if unknown:
             kind = "option" if unknown[0].startswith("-") else "argument"
             self.error(f"unexpected {kind} {unknown[0]}{near(unknown[0].partition('=')[0], self._known())}")
@@ -144,7 +152,9 @@ class Parser(argparse.ArgumentParser):
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
         try:
-            return super()._get_value(action, arg_string)
+            value = super()._get_value(action, arg_string)
+            names = () if isinstance(action, argparse._SubParsersAction) else action.choices or ()
+            return {str(name).casefold(): name for name in names}.get(str(value).casefold(), value)  # as --criterion d
         except argparse.ArgumentError:
             if action.type not in NUMBERS:
                 raise

@@ -121,7 +121,7 @@ def test_of_several_logs_one_that_is_not_met_decides(write: Write, replay: Repla
     good = write(punctual(), "[budgets.response]\np50 = 1e-3\n", name="good.mcap")
     bad = write(punctual(), "[budgets.response]\np50 = 1e-6\n", name="bad.mcap")
     without = write(punctual(), None, name="without.mcap")
-    replay.text("timing", good, good)
+    replay.text("timing", good, write(punctual(), "[budgets.response]\np50 = 1e-3\n", name="other.mcap"))
     replay.text("timing", good, without, code=2)
     logs = replay.document("timing", without, bad, good, code=1)["logs"]
     assert [(Path(log["log"]).name, log["met"]) for log in logs] == [

@@ -14,13 +14,23 @@ from emb_bench.sim.transport import open_sim
 from emb_runtime.can.messages import Layout, StatusFrame, StopReason, load_layout
 from emb_runtime.cli.bus_monitor import ENOUGH_PAIRS, BusMonitor, BusStatistics, listen
 from emb_runtime.cli.options import MappedDrive, Stage, parser, prepare
-from emb_runtime.cli.preflight import CHECKS, CheckResult, Findings, RefusedError, Verdict, check, refuse
+from emb_runtime.cli.preflight import (
+    CHECKS,
+    SLOW_MARK,
+    CheckResult,
+    Findings,
+    RefusedError,
+    Verdict,
+    advice_on,
+    check,
+    refuse,
+)
 from emb_runtime.config.bench import Bench, parse_bench
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import EXIT_BUS, EXIT_CHECK_FAILED, EXIT_SAFETY_STOP, EXIT_USAGE
 from emb_runtime.records import Frame, NodeState, SensorSample
-from emb_runtime.safety.state_machine import Fault
+from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.system.compiled_core import Core
 from tests.drives import EXAMPLES
 
@@ -138,6 +148,18 @@ def test_what_was_heard_that_refuses_does_so_with_its_error_and_the_first_line_c
         assert (refused.fault, refused.exit_code) == (fault, exit_code), changes
         assert str(refused).startswith(f"pre-flight, {what}: ")
         assert refused.lines == check(replace(hears(findings, **changes), free=0))
+
+
+def test_in_a_kernel_of_emb_hil_that_runs_in_real_time_no_node_may_be_a_busy_computer(
+    findings: Findings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent = hears(findings, **NOTHING)
+    for times, told in (("1", True), ("100", False), (None, False)):
+        monkeypatch.delenv(SLOW_MARK, raising=False)
+        if times is not None:
+            monkeypatch.setenv(SLOW_MARK, times)
+        assert str(refused_by(silent)).endswith("on a busy computer: emb-hil --slow 100") == told
+        assert advice_on(Fault.NOT_HOME) == FAULTS[Fault.NOT_HOME].advice
 
 
 def test_what_this_computer_or_the_bench_file_lacks_for_any_run_is_a_usage_error(findings: Findings) -> None:
