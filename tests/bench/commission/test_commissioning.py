@@ -319,8 +319,8 @@ def test_what_cannot_be_done_is_a_line_and_an_exit_code(tmp_path: Path, capfd: p
         assert capfd.readouterr().err.count("\n") == 1
     sent_nothing = ["--bench", str(tmp_path / "sheet.toml"), "--iface", "can0", str(tmp_path / "brake"), "--no-rt"]
     (tmp_path / "sheet.toml").write_text(sheet().text)
-    assert commission.main(sent_nothing) == 2  # nobody is there who could confirm
-    assert "--confirm: expected a terminal" in capfd.readouterr().err
+    assert commission.main(sent_nothing) == 4  # the bus is looked for before anybody who could confirm
+    assert capfd.readouterr().err.startswith("emb-commission: can0: ")
     assert not (tmp_path / "brake").exists()
 
 
