@@ -161,7 +161,7 @@ def make_law(bench: Bench) -> ShieldLaw:
 def _or_lower(bench: Bench) -> str:
     """Another remedy: the largest whole upper angle with which every condition holds, if there is one."""
     bottom, top = bench.limits.angle
-    for angle in range(math.ceil(top) - 1, 0, -1):
+    for angle in reversed(range(math.ceil(top))):
         lower = replace(bench, limits=replace(bench.limits, angle=(bottom, float(angle))))
         if not unmet_condition(law_of(lower), lower):
             return f", or lower limits.angle to {angle} rad"

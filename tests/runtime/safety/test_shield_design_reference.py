@@ -5,6 +5,7 @@ The benches are drawn at random; what a law must hold is written down here once 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -414,3 +415,21 @@ def test_the_coasting_excess_is_the_euler_energy_over_friction() -> None:
     assert coasting_excess(spring, friction, 0.5 * ts * spring + 0.01, free, ts) == pytest.approx(
         gained / friction * (2.93 / 0.01) ** 0.5
     )
+
+
+def test_a_refusal_names_the_largest_whole_angle_that_the_shield_could_hold_if_there_is_one() -> None:
+    bench = load_bench()
+
+    def refusal(current: float, top: float) -> str:
+        limits = dataclasses.replace(bench.limits, current=current, angle=(bench.limits.angle[0], top))
+        try:
+            make_law(dataclasses.replace(bench, limits=limits))
+        except BenchFileError as err:
+            return str(err)
+        return ""
+
+    for current, angle in ((5.0, 98), (4.0, 81), (3.0, 63)):
+        for top in (100.0, angle + 1.0, angle + 0.99):
+            assert refusal(current, top).endswith(f"; narrow k_m or k_1, or lower limits.angle to {angle} rad")
+        assert refusal(current, angle) == ""
+    assert refusal(1.0, 100.0).endswith("; narrow k_m or k_1")
