@@ -144,7 +144,7 @@ class Reception:
 
     def inhibit_reason(self, now_ns: int) -> str:
         """Reason why no current may be commanded now [ns]; "" if one may."""
-        # The stamps are the wall clock's, translated: a small step of that clock may put one just ahead of now.
+        # Another transport's clock may put a stamp just ahead of now.
         ahead_ns = -self._period_ns
         for state in self.states:
             if not ahead_ns <= now_ns - state.valid_ns <= state.fresh_ns:

@@ -34,7 +34,8 @@ _SELECT_LIMIT: Final = 1024  # FD_SETSIZE
 _SFF_MASK: Final = 0x7FF  # the hot path's, as plain numbers
 _MSG_CONFIRM: Final = 0x800
 _MSG_DONTWAIT: Final = 0x40
-_STEP_SLACK_NS: Final = 1_000_000  # A wall clock that stepped by less than a sample time is not noticed [ns]
+_OFFSET_ERROR_NS: Final = 20_000  # Error of a measured offset of the two clocks, at most; more is a step [ns]
+_OFFSETS: Final = 16  # Offsets that are kept while the queue is never empty
 
 
 class TransmitQueueFullError(BusError):
@@ -121,6 +122,8 @@ class SocketCan:
         self._clock = clock
         self._wait_readable = wait_readable
         self._dropped = 0
+        self._empty_ns = clock.now_ns()  # the queue was empty then
+        self._offsets_ns = [clock.wall_offset_ns()]  # from monotonic to wall time, measured since: the newest last
         try:
             self._socket = open_socket()
         except (OSError, AttributeError) as err:  # AttributeError: Python was built where there is no AF_CAN
@@ -134,7 +137,6 @@ class SocketCan:
         except BaseException:
             self._socket.close()
             raise
-        self._wall_offset_ns = clock.wall_offset_ns()
 
     def _set_up(self, interface: str, identifiers: tuple[int, ...] | None) -> None:
         sock = self._socket
@@ -211,14 +213,17 @@ class SocketCan:
             if not self._wait_readable(self._descriptor, (deadline_ns - now_ns) * 1e-9):
                 return None
             if (frame := self._read()) is not None:
-                return self._restamped(frame, now_ns, deadline_ns)
+                return frame
         return None
 
     def _read(self) -> Frame | None:
         """The next frame that waits, if one does."""
+        now_ns = self._clock.now_ns()
         try:
             raw, control, flags, _ = self._socket.recvmsg(_LONGEST_FRAME, _CONTROL_BYTES, _MSG_DONTWAIT)
         except BlockingIOError:
+            self._empty_ns = now_ns
+            del self._offsets_ns[:-1]
             return None
         except OSError as err:
             raise self._loss(err.errno) from err
@@ -232,7 +237,7 @@ class SocketCan:
             elif kind == _SO_RXQ_OVFL:
                 (self._dropped,) = _COUNT.unpack(value)
         identifier, length, data = _CAN_FRAME.unpack(raw)
-        time_ns, own = wall_ns - self._wall_offset_ns, bool(flags & _MSG_CONFIRM)
+        time_ns, own = self._arrival_ns(wall_ns), bool(flags & _MSG_CONFIRM)
         if identifier <= _SFF_MASK:  # nearly all of them
             return tuple.__new__(Frame, (identifier, data[:length], time_ns, False, False, False, own, self._dropped))
         remote = bool(identifier & socket.CAN_RTR_FLAG)
@@ -249,16 +254,24 @@ class SocketCan:
             dropped=self._dropped,
         )
 
-    def _restamped(self, frame: Frame, empty_ns: int, deadline_ns: int) -> Frame:
-        """A frame that came while we waited, with the wall clock's offset measured anew if that has stepped since.
+    def _arrival_ns(self, wall_ns: int) -> int:
+        """Arrival of a frame that has just been read, by the kernel's stamp; both [ns].
 
-        The queue was empty just before, so the frame cannot be older than that, nor younger than the deadline.
+        The stamp is the wall clock's, which may step at any time. What is sure is monotonic: the frame came after the
+        queue was last seen empty, and before now. Within these bounds it came as the stamp says by an offset of the two
+        clocks that was measured in between. Where a step has left several of them, the earliest arrival counts; where
+        none fits, as of a step that was taken back, the lower bound. So a step makes a frame look older, not newer,
+        and only one that waited meanwhile or was the first to be read after it.
         """
-        if empty_ns - _STEP_SLACK_NS <= frame.time_ns <= deadline_ns + _STEP_SLACK_NS:
-            return frame
-        wall_ns = frame.time_ns + self._wall_offset_ns
-        self._wall_offset_ns = self._clock.wall_offset_ns()
-        return frame._replace(time_ns=wall_ns - self._wall_offset_ns)
+        clock = self._clock
+        offset_ns = clock.wall_offset_ns()
+        if abs(offset_ns - self._offsets_ns[-1]) > _OFFSET_ERROR_NS:
+            self._offsets_ns = [*self._offsets_ns[1 - _OFFSETS :], offset_ns]
+        empty_ns, now_ns = self._empty_ns, clock.now_ns()
+        earliest_ns, latest_ns = empty_ns - _OFFSET_ERROR_NS, now_ns + _OFFSET_ERROR_NS
+        times_ns = [wall_ns - known_ns for known_ns in self._offsets_ns]
+        possible_ns = [time_ns for time_ns in times_ns if earliest_ns <= time_ns <= latest_ns]
+        return min(max(min(possible_ns), empty_ns), now_ns) if possible_ns else empty_ns
 
     def _loss(self, code: int | None) -> BusError:
         """The error about a lost bus."""

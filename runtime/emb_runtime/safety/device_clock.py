@@ -26,7 +26,7 @@ WINDOW: Final = 20  # Samples of which one at least comes without a noticeable l
 QUARTZ: Final = 500  # Difference of two honest clocks, at most: each is off by 200 [ppm], with some to spare
 ALLOWED_PERIODS: Final = 2  # Sampling periods by which the clocks may seem to differ: an older sample is not answered
 LEAST_ALLOWANCE_NS: Final = 2_000_000
-"""The same, at least: the stamps of the kernel are the wall clock's, translated, and may be 1 ms off [ns]."""
+"""The same, at least: a step of the wall clock may make a stamp of the kernel look up to a period too old [ns]."""
 OFF_GRID: Final = 5  # Samples off the sampling grid, by a leaky count, that are too many
 
 

@@ -164,7 +164,7 @@ class Guard:
         # A stop frame is never too fast.
         if self.too_fast(now_ns):
             raise _rejected(f"more than {self._most} commands in {RATE_WINDOW_PERIODS} periods")
-        # The stamp is the wall clock's, translated: a small step of that clock may put it just ahead of now.
+        # Another transport's clock may put the stamp just ahead of now.
         if not -self._period_ns <= now_ns - sample_time_ns <= OLDEST_SAMPLE_PERIODS * self._period_ns:
             raise _rejected(f"computed from a sample {(now_ns - sample_time_ns) / 1e6:.3f} ms old")
         # The counters alone say the same of the sample before and of the one 15 periods before that.

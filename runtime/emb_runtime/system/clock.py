@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import time
-from typing import Protocol
+from typing import Final, Protocol
+
+_UNDISTURBED_NS: Final = 2_000  # Time that reading both clocks takes, if nothing comes between [ns]
+_NEVER: Final = 1 << 62
 
 
 class Clock(Protocol):
@@ -31,16 +34,19 @@ class MonotonicClock:
     def wall_offset_ns(self) -> int:
         """Offset from monotonic to Unix time [ns], as measured now.
 
-        The wall clock is read between two readings of the monotonic one; of three tries the tightest counts, so that
-        being interrupted once does not spoil it.
+        The wall clock is read between two readings of the monotonic one, again if that took long: of three tries the
+        tightest counts, so that being interrupted does not spoil it.
         """
-        tries = []
+        tightest, offset = _NEVER, 0
         for _ in range(3):
             before = time.monotonic_ns()
             wall = time.time_ns()
             after = time.monotonic_ns()
-            tries.append((after - before, wall - (before + after) // 2))
-        return min(tries)[1]
+            if after - before < tightest:
+                tightest, offset = after - before, wall - (before + after) // 2
+            if tightest < _UNDISTURBED_NS:
+                break
+        return offset
 
     def sleep_until(self, time_ns: int) -> int:
         """Wait until a monotonic time [ns]; gives the time that it is then, which may be later."""

@@ -273,17 +273,19 @@ def test_stop_frames_are_still_tried_after_the_bus_was_lost() -> None:
 
 def test_what_came_before_a_loss_is_given_and_an_interface_that_is_up_again_is_a_bus_again() -> None:
     rig = Rig()
+    rig.clock.advance_to(5)
     rig.socket.incoming.append(failure(errno.ENETDOWN))
     rig.socket.arrives(0x100, at_ns=5)
     with pytest.raises(BusError, match=r"^vcan0: the interface is down"):
         rig.bus.receive(0)
     assert rig.bus.receive(0) == Frame(0x100, b"", time_ns=5)
-    assert rig.bus.receive(1_000_000) is None
+    assert rig.bus.receive(1_000_005) is None
     assert rig.waits == [pytest.approx(1e-3)]  # whoever listens on a lost bus listens as long as on another
 
 
 def test_a_waiting_frame_is_one_system_call_and_no_wait() -> None:
     rig = Rig()
+    rig.clock.advance_to(123_456_789_012_345_679)
     rig.socket.arrives(0x100, b"\x01\x02", at_ns=123_456_789_012_345_679)
     assert rig.bus.receive(10**9) == Frame(0x100, b"\x01\x02", time_ns=123_456_789_012_345_679)
     assert (rig.socket.reads, rig.waits) == (1, [])
@@ -349,23 +351,62 @@ def test_waking_without_a_frame_waits_for_the_rest_of_the_time() -> None:
     assert rig.waits == [pytest.approx(1e-3), pytest.approx(300e-6)]
 
 
-@pytest.mark.parametrize("step_ns", [-3_600_000_000_000, -50_000_000, 0, 50_000_000, 3_600_000_000_000])
-def test_a_wall_clock_that_steps_is_noticed_and_does_not_move_arrival_times(step_ns: int) -> None:
+STEPS_MS = (*range(1, 10), 0.05, 0.2, 0.5, 0.9, 1.1, 1.5, 1.9, 50, 3_600_000)
+STEPS_NS = [sign * round(step * 1e6) for step in STEPS_MS for sign in (1, -1)]
+
+
+@pytest.mark.parametrize("step_ns", STEPS_NS)
+def test_a_step_of_the_wall_clock_does_not_move_the_arrival_of_what_comes_after_it(step_ns: int) -> None:
     rig = Rig()
 
     def arrive() -> None:
         rig.clock.offset_ns += step_ns
         rig.clock.advance_to(300_000)
-        rig.socket.arrives(0x100, at_ns=290_000 + step_ns)
+        rig.socket.arrives(0x100, at_ns=20_000 + step_ns)
 
     rig.script.append(arrive)
-    frame = rig.bus.receive(1_000_000)
-    assert frame is not None
-    assert frame.time_ns == 290_000
-    rig.socket.arrives(0x101, at_ns=295_000 + step_ns)
-    frame = rig.bus.receive(0)
-    assert frame is not None
-    assert frame.time_ns == 295_000
+    assert rig.bus.receive(1_000_000) == Frame(0x100, b"", time_ns=20_000)  # it came when the queue was empty
+    assert rig.bus.receive(0) is None
+    rig.clock.advance_to(600_000)
+    rig.socket.arrives(0x101, at_ns=595_000 + step_ns)
+    assert rig.bus.receive(0) == Frame(0x101, b"", time_ns=595_000)
+
+
+@pytest.mark.parametrize("stepped_first", [True, False])
+@pytest.mark.parametrize("step_ns", STEPS_NS)
+def test_a_frame_that_waits_while_the_wall_clock_steps_looks_no_newer_and_not_older_than_the_empty_queue(
+    step_ns: int, stepped_first: bool
+) -> None:
+    rig = Rig()
+    rig.clock.advance_to(1_000_000)
+    assert rig.bus.receive(0) is None
+    rig.clock.advance_to(5_000_000)
+    rig.socket.arrives(0x100, at_ns=3_000_000 + step_ns * stepped_first)
+    rig.socket.arrives(0x101, at_ns=4_999_999 + step_ns)
+    rig.clock.offset_ns += step_ns
+    for true_ns in (3_000_000, 4_999_999):
+        frame = rig.bus.receive(0)
+        assert frame is not None
+        assert 1_000_000 <= frame.time_ns <= true_ns
+
+
+def test_a_stamp_from_a_step_that_was_taken_back_is_as_old_as_it_can_be() -> None:
+    rig = Rig()
+    rig.clock.advance_to(1_000_000)
+    assert rig.bus.receive(0) is None
+    rig.clock.advance_to(5_000_000)
+    for at_ns in (-3_600_000_000_000, 3_600_000_000_000, -WALL_NS):
+        rig.socket.arrives(0x100, at_ns=at_ns)
+        assert rig.bus.receive(0) == Frame(0x100, b"", time_ns=1_000_000)
+
+
+def test_the_offsets_of_a_clock_that_never_stands_still_are_bounded() -> None:
+    rig = Rig()
+    for _ in range(1000):  # as on a babbling bus: the queue is never empty
+        rig.clock.offset_ns += 30_000
+        rig.socket.arrives(0x100, at_ns=rig.clock.offset_ns - WALL_NS)
+        assert rig.bus.receive(0) == Frame(0x100, b"", time_ns=0)
+    assert len(rig.bus._offsets_ns) <= 16
 
 
 def test_a_real_wait_sees_what_is_readable_and_what_is_not() -> None:
