@@ -17,8 +17,9 @@ import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, as_completed
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from multiprocessing import resource_tracker
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from emb_bench import ONE_THREAD
@@ -54,7 +55,7 @@ def shared_out(
     numbers: dict[Future[Any], int] = {}
     pool: Any = ProcessPool(min(jobs, len(pieces)) or 1, context=_SPAWN)  # its types do not say all
     try:
-        with _one_thread():
+        with _environment():
             with _deaf():
                 for number, piece in enumerate(pieces):
                     numbers[pool.schedule(work, args=[piece], timeout=limit)] = number
@@ -96,10 +97,11 @@ def _deaf() -> Iterator[None]:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Give processes that start inside one thread for each library."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(ONE_THREAD)
+def _environment() -> Iterator[None]:
+    """Give processes that start inside one thread for each library, and no modules of the working directory."""
+    own = {**ONE_THREAD, "PYTHONSAFEPATH": "1"}
+    before = {name: os.environ.get(name) for name in own}
+    os.environ.update(own)
     try:
         yield
     finally:
@@ -132,7 +134,7 @@ def shared_out_on_ray(
     try:
         try:
             _require_answer(address)
-            with _deaf():
+            with _deaf(), chdir("/"):  # Ray has its processes import from the folder in which it is started
                 ray.init(address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **own)
         except (OSError, OverflowError, RuntimeError, ValueError) as err:
             raise UsageError(f"--ray: Ray at '{address}' cannot be used: {err}") from err
@@ -153,7 +155,14 @@ def _require_answer(address: str) -> None:
 def _run_tasks(
     ray: Any, work: Callable[[Piece], Result], pieces: Sequence[Piece], jobs: int | None, time_limit: float
 ) -> Generator[tuple[int, Result | Lost], None, None]:
-    task = ray.remote(lambda piece: work(piece)).options(max_retries=_RETRIES)
+    folder = Path.cwd()
+
+    def there(piece: Piece) -> Result:
+        with contextlib.suppress(OSError):  # another machine may have no such folder
+            os.chdir(folder)
+        return work(piece)
+
+    task = ray.remote(there).options(max_retries=_RETRIES)
     most = jobs or max(1, int(ray.cluster_resources().get("CPU", 1)))
     waiting, running = iter(enumerate(pieces)), dict[Any, tuple[int, float]]()
     while True:

@@ -176,7 +176,7 @@ class Commissioning:
 def emb_run(arguments: Sequence[str]) -> Mapping[str, Any]:
     """Run ``emb-run`` as a process of its own, at the operator's terminal; signals that end this one end that one."""
     code = "import sys; from emb_runtime.system.entry import emb_run; sys.exit(emb_run())"
-    process = subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([sys.executable, "-P", "-c", code, *arguments], stdout=subprocess.PIPE, text=True)
     ended: list[int] = []
 
     def end(number: int, _frame: object) -> None:

@@ -162,7 +162,7 @@ _POLL = 0.02  # Time between two looks at it [s]
 _DEATH_WATCH = 'read -r _ || { kill -s KILL -- "-$1"; rm -rf -- "$2"; }'
 _INIT = """#!/bin/sh
 export PYTHONPATH={path} PYTHONDONTWRITEBYTECODE=1 LD_LIBRARY_PATH={libraries}
-exec {python} -S -s -m emb_bench.hil.guest {state}
+exec {python} -P -S -s -m emb_bench.hil.guest {state}
 """
 
 
