@@ -42,6 +42,31 @@ def test_a_simulated_run_is_that_of_emb_run(log: Path, tmp_path: Path, capsys: p
     assert_array_equal(run.cycles[sent], api.open_run(other).cycles[sent])
 
 
+def test_nothing_that_is_handed_on_says_where_its_user_keeps_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "Müller's own"
+    (folder / "runs").mkdir(parents=True)
+    (folder / "my.toml").write_text(shipped_bench_text(), encoding="utf-8")
+    typed = ["--iface", "sim:seed=2", f"--bench={folder}/my.toml", "--log", f"{folder}/runs/a.mcap", "--serial", "8/15"]
+    monkeypatch.setattr("sys.argv", [f"{folder}/bin/emb-run", *typed])
+    assert emb_run.main() == 0
+    api.simulate(folder / "runs" / "b.mcap")
+    monkeypatch.chdir(folder)
+    api.report("runs/a.mcap", "page.html")
+    assert replay.main(["export", "runs/a.mcap", "-o", "a.parquet"]) == 0
+    assert replay.main(["campaign", "runs", "-o", "rows.parquet", "--jobs", "1"]) == 0
+    capsys.readouterr()
+    assert replay.main(["info", "runs/a.mcap", "--json"]) == 0
+    said = [str(api.open_run(log).metadata) for log in sorted(Path("runs").glob("*.mcap"))]
+    assert "emb-run --iface sim:seed=2 --bench=my.toml --log a.mcap --serial 8/15" in said[0]
+    assert "emb-run --iface sim:plant=exact,seed=1 --log b.mcap" in said[1]
+    tables = [pq.read_table(name) for name in ("a.parquet", "rows.parquet")]
+    said += [f"{table.schema.metadata}{table.to_pylist()[0]}" for table in tables]
+    said += [Path("page.html").read_text(encoding="utf-8"), capsys.readouterr().out]
+    assert [text for text in said if "own/" in text or str(tmp_path) in text] == []
+
+
 def test_fisher_information_is_that_of_emb_replay_fim(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["fim", str(log), "--json", "--model", "lag", "--params", "k_1,f_v", "--nuisance", "delay"]
     command += ["--prior", "pm50", "--theta", "f_v=3e-5"]

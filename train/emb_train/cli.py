@@ -18,7 +18,7 @@ from emb_bench.config.plants import DEFAULT_PLANT, EVERY
 from emb_bench.output import make_empty_folder, progress, replacing
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
-from emb_runtime.system.terminal import Parser, as_json, complain, mention, show
+from emb_runtime.system.terminal import Parser, as_json, complain, mention, show, typed_command
 from emb_train.presets import TASKS, listed, preset_summaries, reference_names, wrapped
 
 if TYPE_CHECKING:
@@ -262,7 +262,7 @@ def reference(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         score=found.score,
         draws=found.steps * BATCH,
-        command=f"emb-train {' '.join(arguments.given)}",
+        command=typed_command("emb-train", arguments.typed),
         command_delay=task.command_delay,
     )
     with replacing(folder / REFERENCE) as beside:
@@ -399,11 +399,10 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {"reference": referen
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    given = sys.argv[1:] if argv is None else argv
     name = "emb-train"
     try:
-        arguments: Any = parser().parse_args(given)
-        arguments.given, name = given, f"emb-train {arguments.command}"
+        arguments: Any = parser().parse_args(argv)
+        name = f"emb-train {arguments.command}"
         return COMMANDS[arguments.command](arguments)
     except ModuleNotFoundError as err:
         return complain(name, UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'"))

@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import StrEnum
@@ -130,6 +130,7 @@ class Plan:
     drive: MappedDrive | None = None  # The node is its gateway
     operator: str = ""  # Name of who makes the run; empty if that was not said
     serial: str = ""  # Serial number of the device; empty if that was not said
+    typed: Sequence[str] = ()  # Arguments as they were typed
 
 
 def parser() -> argparse.ArgumentParser:
@@ -286,6 +287,7 @@ def prepare(args: argparse.Namespace) -> Plan:
         drive=_drive(args.iface, args.drive, bench),
         operator=one_line(args.operator, LONGEST_LABEL),
         serial=one_line(args.serial, LONGEST_LABEL),
+        typed=args.typed,
     )
 
 

@@ -6,8 +6,6 @@ import json
 import math
 import os
 import platform
-import shlex
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
@@ -30,6 +28,7 @@ from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.safety.watchdog import WatchdogResult
 from emb_runtime.system import compiled_core
 from emb_runtime.system.clock import Clock
+from emb_runtime.system.terminal import typed_command, without_folders
 
 ESTIMATE_RATE = 100_000  # Log rate of the estimates [bytes per second]
 LOG_RATE = 500_000  # Log rate of a run at 1 kHz, with room to spare: measured are 250 to 310 kB [bytes per second]
@@ -76,8 +75,8 @@ def header(
     records = {
         "emb.run": {
             "tool": f"emb-excite {metadata.version('emb-excite')}",
-            "command": shlex.join(sys.argv).encode("utf-8", "replace").decode(),
-            "iface": iface,
+            "command": typed_command("emb-run", plan.typed),
+            "iface": without_folders(iface),
             "purpose": str(run_type),
             "stage": str(plan.stage),
             "limit": repr(plan.limit),

@@ -15,6 +15,7 @@ import os
 import select
 import sys
 import time
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -39,11 +40,13 @@ from emb_runtime.log.ring_buffer import (
     LogHeader,
     Record,
     Ring,
+    encodable,
     unpack,
 )
 from emb_runtime.records import Frame
 from emb_runtime.system import child_process
 from emb_runtime.system.clock import MonotonicClock
+from emb_runtime.system.input_file import open_regular
 from emb_runtime.system.realtime import step_back
 
 CHUNK = 256 * 1024  # Bytes after which a chunk is closed
@@ -74,7 +77,7 @@ class LogWriter:
         self.undecoded = 0  # Frames that are no valid frame of ours: they are in the log as they were on the bus only
         begin = self._offset + header.start_ns
         for name, entries in header.metadata.items():
-            self._mcap.add_metadata(name, dict(entries))
+            self._add_metadata(name, entries)
         self._attach(begin, "emb.dbc", "text/plain", header.dbc.encode())
         for attachment in header.attachments:
             self._attach(begin, *attachment)
@@ -111,7 +114,7 @@ class LogWriter:
     def finish(self, trailer: Mapping[str, str]) -> None:
         """Write the outcome and close the file's structure."""
         self.flush()  # a log that is cut before its last message must not say how the run ended
-        self._mcap.add_metadata(END, {**trailer, "undecoded_frames": str(self.undecoded)})
+        self._add_metadata(END, {**trailer, "undecoded_frames": str(self.undecoded)})
         self._mcap.finish()  # type: ignore[no-untyped-call]
 
     def _write_frame(self, record: FrameRecord, log_time: int) -> None:
@@ -133,6 +136,9 @@ class LogWriter:
         self._channels[topic] = self._mcap.register_channel(
             topic, MessageEncoding.Protobuf, self._schemas[message], topics.metadata(message)
         )
+
+    def _add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
+        self._mcap.add_metadata(name, {key: encodable(text) for key, text in entries.items()})
 
     def _attach(self, when: int, name: str, media_type: str, data: bytes) -> None:
         self._mcap.add_attachment(create_time=when, log_time=when, name=name, media_type=media_type, data=data)
@@ -160,10 +166,38 @@ def _frame_values(frame: Frame, read_ns: int) -> dict[str, Any]:
     }
 
 
+class NewFile(io.FileIO):
+    """A new file that knows the size and the checksum of all that was written to it."""
+
+    def __init__(self, path: Path) -> None:
+        """Make it; raises OSError, FileExistsError where it exists."""
+        super().__init__(path, "xb")
+        self.path = path
+        self._size = self._checksum = 0
+
+    def write(self, data: Any) -> int:
+        """Write as much as can be written; gives the number of bytes."""
+        count = super().write(data)
+        self._checksum = zlib.crc32(memoryview(data)[:count], self._checksum)
+        self._size += count
+        return count
+
+    def is_as_written(self) -> bool:
+        """Returns True if what its path leads to holds all that was written, and nothing else."""
+        checksum = 0
+        try:
+            with open_regular(self.path) as file:
+                while block := file.read(1 << 20):
+                    checksum = zlib.crc32(block, checksum)
+                return (file.tell(), checksum) == (self._size, self._checksum)
+        except OSError:
+            return False
+
+
 class Recording:
     """One recording: the ring at one end, the file at the other."""
 
-    def __init__(self, ring: Ring, document: Mapping[str, Any], output: BinaryIO) -> None:
+    def __init__(self, ring: Ring, document: Mapping[str, Any], file: NewFile) -> None:
         messages = tuple(map(from_document, document["header"]["messages"]))
         header = replace(convert({**document["header"], "messages": ()}, LogHeader), messages=messages)
         self._ring = ring
@@ -171,10 +205,9 @@ class Recording:
         self._simulated, self._offset = header.simulated, header.wall_offset_ns
         self._now = header.start_ns + header.wall_offset_ns
         self._inbox = b""
-        self._output = output
-        self._path = Path(document["path"])
+        self._file, self._output = file, io.BufferedWriter(file)
         self._drive_bus = SocketCan(header.drive_bus, MonotonicClock()) if header.drive_bus else None
-        self.writer = LogWriter(output, header)
+        self.writer = LogWriter(self._output, header)
         self.lost = 0  # Records that could not be written
         self.error = ""  # The first failure to write
         self.drive_error = ""  # Loss of the drive's bus, which the file outlives
@@ -223,8 +256,8 @@ class Recording:
         if self.drive_error:
             trailer["drive_bus_error"] = self.drive_error
         self._guarded(partial(self._close, trailer))
-        if not self.error and not self._is_there():
-            self.error = "it was removed or replaced while it was written: run again, and leave its folder alone"
+        if not self.error and not self._file.is_as_written():
+            self.error = "it was removed, replaced or changed while it was written: run again, and leave it alone"
         with contextlib.suppress(OSError):  # what could not be written is not tried again
             self._output.close()
         return {"messages": self.writer.messages, "lost": self.lost, "error": self.error}
@@ -233,13 +266,6 @@ class Recording:
         self.writer.finish(trailer)
         self._output.flush()
         os.fsync(self._output.fileno())
-
-    def _is_there(self) -> bool:
-        """Returns True if the log's path still leads to the file that was written."""
-        try:
-            return os.path.samestat(os.fstat(self._output.fileno()), self._path.stat())
-        except OSError:
-            return False
 
     def _listen(self, wait: float) -> dict[str, str] | None:
         """The trailer, once it is there; the one for a dead parent, once that is gone."""
@@ -263,42 +289,49 @@ class Recording:
             item = self._ring.pop()
             if item is None:
                 return False
-            record = unpack(*item)
             if self.error:
                 self.lost += 1
-                continue
-            # Nothing is written before it happened; in simulated time, which stands still, that is all there is to it.
-            self._now = max(self._now, record.time_ns + self._offset)
-            self._guarded(partial(self.writer.write, record, self._now))
+            else:
+                self._guarded(partial(self._write, *item))
         return True
 
+    def _write(self, kind: int, payload: bytes) -> None:
+        record = unpack(kind, payload)
+        # Nothing is written before it happened; in simulated time, which stands still, that is all there is to it.
+        self._now = max(self._now, record.time_ns + self._offset)
+        self.writer.write(record, self._now)
+
     def _guarded(self, action: Callable[[], None]) -> None:
-        """A disk that fails must not end the taking: the loop would fill the ring and count, and nobody would know."""
+        """No failure to write must end the taking: the loop would fill the ring and count, and nobody would know."""
         if self.error:
             return
         try:
             action()
-        except OSError as err:
-            self.error = f"writing failed: {err.strerror}"
+        except Exception as err:
+            self.error = f"writing failed: {_reason(err)}"
             self.lost += 1
 
 
 def begin(ring: Ring, document: Mapping[str, Any]) -> Recording:
     """Make the file, with its first chunk; raises LogError where that cannot be."""
-    path = Path(document["path"])
     try:
-        output = io.BufferedWriter(io.FileIO(path, "xb"))
+        file = NewFile(Path(document["path"]))
     except FileExistsError as err:
         raise LogError("the file exists; logs are never overwritten, choose another name") from err
     except OSError as err:
         raise LogError(err.strerror or str(err)) from err
     try:
-        return Recording(ring, document, output)
-    except (OSError, EmbError) as err:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())  # what could not be written is not tried again
-        path.unlink(missing_ok=True)
-        what = f"{err.strerror}; the file was begun, and is removed" if isinstance(err, OSError) else str(err)
-        raise LogError(what) from err
+        return Recording(ring, document, file)
+    except Exception as err:
+        file.close()  # what could not be written is not tried again
+        file.path.unlink(missing_ok=True)
+        told = str(err) if isinstance(err, EmbError) else f"{_reason(err)}; the file was begun, and is removed"
+        raise LogError(told) from err
+
+
+def _reason(err: Exception) -> str:
+    """Reason of a failure in one line: the system's own words, or else class and message."""
+    return (isinstance(err, OSError) and err.strerror) or f"{type(err).__name__}: {err}".partition("\n")[0]
 
 
 def main(arguments: list[str]) -> int:

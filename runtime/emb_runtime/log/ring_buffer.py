@@ -230,7 +230,12 @@ def unpack(kind: int, payload: bytes) -> Record:
     return cast(Record, _DECODERS[kind].decode(payload))
 
 
+def encodable(text: str) -> str:
+    """A text that UTF-8 can say: a lone surrogate, as of a name that is no UTF-8, becomes an escape sequence."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 def _clipped(text: str, room: int) -> str:
     """A text whose UTF-8 fits into so many bytes, cut between characters."""
-    data = text.encode("utf-8", "replace")
+    data = encodable(text).encode()
     return data.decode() if len(data) <= room else data[: room - 3].decode("utf-8", "ignore") + "…"

@@ -14,9 +14,10 @@ import math
 import os
 import re
 import select
+import shlex
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from typing import Any, NoReturn
 
@@ -30,6 +31,8 @@ ARM_QUESTION = "Arm now? y and Enter does, anything else ends here."
 
 _NOT_ASCII = re.compile("[^ -~]")
 
+_FOLDERS = re.compile(r"(^|[=@:,])(?:/|[A-Za-z]:[\\/])(?:[^\\/]*[\\/])*(?=[^\\/])")
+
 
 def escaped(text: str, kept: str = "") -> str:
     """A text in which all characters but printable ones and those ``kept`` are escape sequences.
@@ -39,6 +42,16 @@ def escaped(text: str, kept: str = "") -> str:
     if text.isprintable():
         return text
     return _NOT_ASCII.sub(lambda c: c[0] if c[0].isprintable() or c[0] in kept else ascii(c[0])[1:-1], text)
+
+
+def without_folders(text: str) -> str:
+    """A typed argument in which each absolute path is its last name: for a file that others will read."""
+    return _FOLDERS.sub(r"\1", text)
+
+
+def typed_command(name: str, arguments: Sequence[str]) -> str:
+    """The command line as it was typed, without private folders."""
+    return shlex.join([name, *map(without_folders, arguments)])
 
 
 def one_line(text: str, most: int = LONGEST_STRING) -> str:
@@ -141,6 +154,7 @@ class Parser(argparse.ArgumentParser):
         unknown = [one for one in options if one.partition("=")[0] not in self._known()]
         if not unknown:  # a misspelt option comes before what is missing because of it
             found, unknown = self.parse_known_args(given, namespace)
+            found.typed = given
         if unknown:
             kind = "option" if unknown[0].startswith("-") else "argument"
             self.error(f"unexpected {kind} {unknown[0]}{near(unknown[0].partition('=')[0], self._known())}")

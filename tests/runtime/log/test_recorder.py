@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -137,20 +138,109 @@ def test_the_loss_of_the_drive_s_bus_costs_its_frames_and_not_the_log(
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("replaced", [False, True])
-def test_a_log_that_was_removed_or_replaced_while_it_was_written_is_not_complete(
-    replaced: bool, tmp_path: Path
-) -> None:
+def overwritten(path: Path) -> None:
+    with path.open("r+b") as file:
+        file.seek(2000)
+        file.write(b"somebody else")
+
+
+def appended(path: Path) -> None:
+    with path.open("ab") as file:
+        file.write(bytes(1 << 20))
+
+
+def replaced(path: Path) -> None:
+    path.unlink()
+    path.write_bytes(b"another file")
+
+
+def turned_into_a_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def turned_into_a_folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+MEDDLING: dict[str, Callable[[Path], None]] = {
+    "removed": Path.unlink,
+    "replaced": replaced,
+    "emptied": lambda path: os.truncate(path, 0),
+    "cut": lambda path: os.truncate(path, path.stat().st_size - 100),
+    "grown": lambda path: os.truncate(path, 1 << 20),
+    "overwritten": overwritten,
+    "appended to": appended,
+    "a pipe": turned_into_a_pipe,
+    "a folder": turned_into_a_folder,
+}
+
+
+@pytest.mark.parametrize("what", MEDDLING)
+def test_a_log_that_was_meddled_with_while_it_was_written_is_not_complete(what: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     recorder = Recorder.start(path, HEADER)
     recorder.push(cycle(0, START + 1000))
-    path.unlink()
-    if replaced:
-        path.write_bytes(b"another file")
+    MEDDLING[what](path)
     result = recorder.finish({"exit_reason": "done"})
     assert not result.complete
-    assert "removed or replaced" in result.error
-    assert path.exists() is replaced
+    assert result.error == "it was removed, replaced or changed while it was written: run again, and leave it alone"
+
+
+def test_a_log_that_was_moved_to_another_disk_and_back_is_complete(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorder = Recorder.start(path, HEADER)
+    (tmp_path / "other.mcap").hardlink_to(path)
+    path.unlink()
+    (tmp_path / "other.mcap").rename(path)
+    assert recorder.finish({"exit_reason": "done"}).complete
+
+
+class ZstdError(Exception):
+    """As zstandard raises, which is no OSError."""
+
+
+@pytest.mark.parametrize("kind", [OSError, ZstdError, MemoryError, ValueError, UnicodeError, KeyError, RecursionError])
+@pytest.mark.parametrize("place", ["add_message", "flush", "finish", "add_metadata"])
+def test_whatever_writing_raises_the_run_is_told(
+    kind: type[Exception], place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ring = Ring.create(16)
+    header = to_builtins(HEADER, str_keys=True)
+    recording = recorder_process.begin(ring, {"path": str(tmp_path / "run.mcap"), "parent": 0, "header": header})
+
+    def fail(*_: object, **__: object) -> None:
+        raise kind("planted")
+
+    monkeypatch.setattr(recording.writer._mcap, place, fail)
+    ring.push(*pack(EventRecord(START, "X", "")))
+    answer = recording.finish({"exit_reason": "done"})
+    assert answer["error"] == f"writing failed: {kind.__name__}: {kind('planted')}"
+
+
+def test_what_the_first_chunk_raises_is_told_before_the_run_and_no_file_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise ZstdError("planted")
+
+    monkeypatch.setattr(recorder_process.LogWriter, "flush", fail)
+    header = to_builtins(HEADER, str_keys=True)
+    with pytest.raises(LogError, match="ZstdError: planted; the file was begun, and is removed"):
+        recorder_process.begin(Ring.create(16), {"path": str(tmp_path / "run.mcap"), "parent": 0, "header": header})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_text_that_is_no_unicode_is_written_with_escape_sequences(tmp_path: Path) -> None:
+    name, half = os.fsdecode(b"r\xfcn"), "a\ud800"
+    recorder = Recorder.start(tmp_path / f"{name}.mcap", replace(HEADER, metadata={"emb.run": {"operator": half}}))
+    recorder.push(EventRecord(START, "X", half))
+    result = recorder.finish({"exit_reason": half})
+    assert (result.complete, result.error) == (True, "")
+    _, metadata, _ = summary(result.path)
+    assert (metadata["emb.run"]["operator"], metadata["emb.end"]["exit_reason"]) == ("a\\ud800", "a\\ud800")
+    assert decode(result.path)["/safety"][0][1].text == "a\\ud800"
 
 
 def test_a_plain_reader_finds_every_record_with_the_descriptors_in_the_file(log: Path) -> None:

@@ -20,6 +20,7 @@ from emb_runtime.system.terminal import (
     mention,
     one_line,
     show,
+    without_folders,
 )
 
 
@@ -142,3 +143,22 @@ def test_a_reader_that_has_had_enough_does_not_change_the_exit_code(tmp_path: Pa
     finally:
         os.close(writing)
     assert ran.returncode == code
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        ("/home/ann/run.mcap", "run.mcap"),
+        ("/home/ann/runs/", "runs/"),
+        ("--log=/home/ann b/run.mcap", "--log=run.mcap"),
+        ("map:/home/ann/vesc.toml@sim:seed=2", "map:vesc.toml@sim:seed=2"),
+        ("C:\\Users\\Ann\\run.mcap", "run.mcap"),
+        ("runs/run.mcap", "runs/run.mcap"),
+        ("sim:plant=exact,seed=1", "sim:plant=exact,seed=1"),
+        ("8/15", "8/15"),
+        ("/", "/"),
+        ("", ""),
+    ],
+)
+def test_an_argument_is_told_without_folders_of_its_user(typed: str, told: str) -> None:
+    assert without_folders(typed) == told
