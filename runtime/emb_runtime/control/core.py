@@ -34,7 +34,7 @@ from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord
 from emb_runtime.records import CycleRecord, Frame, NodeState, Reason, RunState, SensorSample
 from emb_runtime.safety.command_limits import CommandLimits, Decision, checked, decide
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS, Guard
-from emb_runtime.safety.motion_balance import REST_SAMPLES, MotionBalance, steady_motion
+from emb_runtime.safety.motion_balance import REST_SAMPLES, MotionBalance, unheld_motion
 from emb_runtime.safety.sensor_monitor import SensorMonitor
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
@@ -140,7 +140,7 @@ class Core:
         self._armed = False
         self._stopped = False  # a sample since the stop began says that the node obeys no more
         self._rests = False  # the newest sample since then says idle
-        self._rest_velocities: list[float] = []  # measured since then [rad/s]
+        self._stopping: list[SensorSample] = []  # the last ones since then
         self._detail = ""  # of the fault
 
     # --- what the driver asks ---------------------------------------------------------------------------------------
@@ -275,17 +275,16 @@ class Core:
     def end(self, now_ns: int) -> None:
         """Judge how the node came to rest; the run is over."""
         self._now_ns = now_ns
-        speed = steady_motion(self._rest_velocities[-REST_SAMPLES:], self.bench.noise.velocity)
-        moves = f"without a current the node goes on to measure {speed:.1f} rad/s: friction stops any" if speed else ""
+        speed = unheld_motion(self.bench, self._stopping)
         if self.fault is None and not self._rests:
             self.fail(
                 Fault.NOT_AT_REST,
                 now_ns,
                 f"the node's last state is {self._last.node_state.name}" if self._last else "",
             )
-        elif self.fault is None and moves:
+        elif self.fault is None and speed:
+            moves = f"in the stop the node goes on to measure {speed:.1f} rad/s, where friction holds any brake"
             self.fail(Fault.MOTION_UNEXPLAINED, now_ns, moves)
-        self._detail = self._detail or moves
         self._machine.handle_event(Event.STOPPED, now_ns)
 
     def note(self, time_ns: int, code: str, text: str) -> None:
@@ -376,7 +375,7 @@ class Core:
             self._stopped = True
             self._reception.status = None  # its reason was that of another stop
         self._rests = sample.node_state is IDLE
-        self._rest_velocities.append(sample.velocity)
+        self._stopping = [*self._stopping[1 - REST_SAMPLES :], sample]
 
     def _check_bus(self) -> None:
         if self._reception.foreign_command:

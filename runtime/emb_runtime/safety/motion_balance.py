@@ -323,6 +323,23 @@ def steady_motion(velocities: Sequence[float], deviation: float) -> float:
     return mean if stays and abs(mean) > MOVING * deviation else 0.0
 
 
+def unheld_motion(bench: Bench, stopping: Sequence[SensorSample]) -> float:
+    """Velocity that stays at the end of a stop, where friction holds every brake of the bench's ranges [rad/s].
+
+    0 where it is none, or where spring and current together may overcome the least friction: then the brake creeps on.
+    """
+    last = stopping[-REST_SAMPLES:]
+    speed = steady_motion([sample.velocity for sample in last], bench.noise.velocity)
+    if not speed:
+        return 0.0
+    box, along = bench.range_set(bench.shield.ranges), math.copysign(1.0 / REST_SAMPLES, speed)
+    behind = -along * sum(sample.angle for sample in last)  # towards home: the spring drives it
+    current = along * sum(sample.applied_current for sample in last)
+    spring = box.high.gamma * box.high.k_1 * max(behind, 0.0)
+    motor = max(box.low.k_m * current, box.high.k_m * current)
+    return speed if spring + motor < box.low.T_c else 0.0
+
+
 class MotionBalance:
     """The balance of one run on a bench."""
 

@@ -11,7 +11,7 @@ import pytest
 
 from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.messages import Layout, StopReason
-from emb_runtime.config.bench import Bench
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench
 from emb_runtime.records import Frame, NodeState, Reason
 from emb_runtime.safety.heartbeat import STOP_FRAMES, Unwatched
 from emb_runtime.safety.state_machine import Fault
@@ -40,6 +40,34 @@ def assert_ended_safely(run: SimRun, layout: Layout) -> None:
 def older_by(duration_ns: int) -> Callable[[Frame], Frame]:
     """Gives a frame that came earlier."""
     return lambda frame: frame._replace(time_ns=frame.time_ns - duration_ns)
+
+
+def corner(bench: Bench, number: int) -> str:
+    """One of the 16 brakes at the corners of the shield's ranges, as options of the simulated bus."""
+    box = bench.range_set(bench.shield.ranges)
+    ends = [(box.low, box.high)[number >> place & 1] for place in range(4)]
+    return ",".join(f"{name}={getattr(end, name)!r}" for name, end in zip(PARAMETER_NAMES, ends, strict=True))
+
+
+@pytest.mark.parametrize("plant", ["exact", "euler"])
+def test_an_end_by_the_operator_is_explained_by_nothing_else(simulate: Simulate, bench: Bench, plant: str) -> None:
+    for number, period in enumerate(range(5, 500, 10)):
+        asked = iter([False] * 2 * period)
+        options = f"plant={plant},{corner(bench, number)},seed={number + 1}"
+        run = simulate(lambda *_: 6.0, options=options, stop_requested=lambda asked=asked: next(asked, True))
+        row = f"period {period}, {options}"
+        assert (run.outcome.fault, run.outcome.detail) == (Fault.INTERRUPTED, ""), row
+        assert set(run.journal.codes) <= {"SILENT", "ARMED", "ACTIVE", "INTERRUPTED", "STOPPING", "OVER"}, row
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.5, 1.0, 2.0, 4.0])
+def test_a_short_run_of_a_few_amperes_ends_without_a_fault_wherever_it_ends(
+    simulate: Simulate, bench: Bench, limit: float
+) -> None:
+    for number, steps in enumerate(range(40, 320, 40)):
+        options = f"{corner(bench, number + int(4 * limit))},seed={number + 1}"
+        fault = simulate(lambda *_: 6.0, options=options, steps=steps, limit=limit).outcome.fault
+        assert fault is None, f"{steps} periods, {options}: {fault}"
 
 
 def test_a_full_experiment_answers_every_sample_once_and_comes_home(simulate: Simulate, layout: Layout) -> None:

@@ -32,6 +32,7 @@ from emb_runtime.safety.motion_balance import (
     steady_motion,
     take,
     unexplained,
+    unheld_motion,
 )
 from emb_runtime.safety.state_machine import Fault, StopError
 
@@ -288,6 +289,29 @@ def split(rows: list[Row]) -> tuple[SensorSample, Iterator[Row]]:
 def test_a_velocity_that_stays_at_rest_is_an_error(velocities: list[float], found: float) -> None:
     assert steady_motion(velocities, 1.0) == pytest.approx(found)
     assert steady_motion([2.0 * v for v in velocities], 2.0) == pytest.approx(2.0 * found)
+
+
+def ending(angle: float, velocity: float, current: float, bench: Bench = BENCH) -> float:
+    """What is found where the last samples of a stop are all like this."""
+    one = SensorSample(0, angle, velocity, 0, 0, current, 0, NodeState.STOPPING)
+    return unheld_motion(bench, [one._replace(velocity=-velocity), *[one] * REST_SAMPLES])
+
+
+def test_a_velocity_is_an_error_only_where_friction_holds_every_brake_of_the_ranges() -> None:
+    low, high = BENCH.range_set(BENCH.shield.ranges).low, BENCH.range_set(BENCH.shield.ranges).high
+    farthest = low.T_c / (high.gamma * high.k_1)  # at which the least friction holds the stiffest spring [rad]
+    for sign in (1.0, -1.0):
+        assert ending(0.0, sign * 5.0, 0.0) == pytest.approx(sign * 5.0)
+        assert ending(-sign * farthest * 0.999, sign * 5.0, 0.0) == pytest.approx(sign * 5.0)
+        assert ending(-sign * farthest * 1.001, sign * 5.0, 0.0) == 0.0  # the spring brings it home
+        assert ending(sign * farthest * 10.0, sign * 5.0, 0.0) == pytest.approx(sign * 5.0)  # nothing drives it away
+        most = low.T_c / high.k_m
+        assert ending(0.0, sign * 5.0, sign * most * 0.999) == pytest.approx(sign * 5.0)
+        assert ending(0.0, sign * 5.0, sign * most * 1.001) == 0.0
+        braking = (high.gamma * high.k_1 * 30.0 - low.T_c) / low.k_m  # holds every brake at 30 rad, with friction
+        assert ending(-sign * 30.0, sign * 5.0, -sign * braking * 1.001) == pytest.approx(sign * 5.0)
+        assert ending(-sign * 30.0, sign * 5.0, -sign * braking * 0.999) == 0.0
+    assert ending(0.0, 1.0, 0.0) == 0.0
 
 
 # --- the spring's origin: least squares with an unknown velocity at the begin of each stretch -------------------------
