@@ -40,6 +40,7 @@ from emb_runtime.drives.mapping_file import parse_mapping
 from emb_runtime.errors import BenchFileError, LogError, UsageError, near
 from emb_runtime.log import topics
 from emb_runtime.records import CycleRecord, Frame, RunType
+from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.system import terminal
 from emb_runtime.system.input_file import open_regular
 
@@ -428,10 +429,11 @@ def require_driven(log: RunLog) -> None:
 
 
 def end_detail(end: Mapping[str, str]) -> str:
-    """Detail of a run's end beside its reason: that of the loop, and the stop reason of a node that stopped."""
+    """Detail of a run's end beside its reason: that of the loop, else its cause, and the stop reason of the node."""
     node = end.get("node_stop_reason", "NONE")
     stopped = "" if node in ("NONE", "NEVER_COMMANDED") else f"stop reason of the node: {node}"
-    return "; ".join(filter(None, (end.get("detail", ""), stopped)))
+    cause = FAULTS[Fault[end["exit_reason"]]].cause if end.get("exit_reason") in Fault.__members__ else ""
+    return "; ".join(filter(None, (end.get("detail") or cause, stopped)))
 
 
 def missing_in(log: McapFile) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import pytest
 from mcap.writer import Writer
 
 from emb_bench.logs.can_files import McapReader
-from emb_bench.logs.log import read_log
+from emb_bench.logs.log import end_detail, read_log
 from emb_runtime.can.messages import load_layout
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.log.recorder import Recorder
@@ -214,3 +214,19 @@ def test_what_a_log_should_carry_and_does_not_is_said(tmp_path: Path, run: SimRu
         log = read_log(write_log(tmp_path / "x.mcap", run, **changes))
         with pytest.raises(LogError, match=reason):
             getattr(log, part)
+
+
+@pytest.mark.parametrize(
+    ("end", "told"),
+    [
+        ({"exit_reason": "INTERRUPTED", "detail": ""}, "stopped by the operator"),
+        (
+            {"exit_reason": "NODE_STOPPED", "detail": "x", "node_stop_reason": "LIMIT"},
+            "x; stop reason of the node: LIMIT",
+        ),
+        ({"exit_reason": "DONE", "detail": "", "node_stop_reason": "NONE"}, ""),
+        ({}, ""),
+    ],
+)
+def test_the_end_of_a_run_is_explained_by_its_detail_or_the_cause(end: dict[str, str], told: str) -> None:
+    assert end_detail(end) == told
