@@ -14,6 +14,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from emb_bench.compiled import on_compiling
 from emb_runtime.errors import UsageError
+from emb_runtime.system.input_file import open_regular
 
 _FORMULA = re.compile(r"\s*[=+\-@＝＋－＠]|[\t\r\n]")  # the wide ones count, too
 """Beginnings of a formula (OWASP, CSV injection)."""
@@ -78,7 +79,7 @@ def text_cells(column: Any) -> Any:
 
 
 def _is_log(path: Path) -> bool:
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         return file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
 
 

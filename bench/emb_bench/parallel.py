@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, as_completed
-from contextlib import chdir, contextmanager
+from contextlib import chdir, contextmanager, suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -158,7 +158,7 @@ def _run_tasks(
     folder = Path.cwd()
 
     def there(piece: Piece) -> Result:
-        with contextlib.suppress(OSError):  # another machine may have no such folder
+        with suppress(OSError):  # another machine may have no such folder
             os.chdir(folder)
         return work(piece)
 

@@ -28,6 +28,7 @@ from emb_bench.report import sentences as say
 from emb_bench.report.acceptance import Acceptance, Criteria, Result, RunFacts, judge
 from emb_runtime.errors import LogError
 from emb_runtime.records import Reason
+from emb_runtime.system.input_file import open_regular
 
 REASONS = {
     Reason.CLIPPED: "beyond the bench's current",
@@ -59,7 +60,7 @@ class Run:
     def log_sha256(self) -> str:
         """SHA-256 of the log's file."""
         try:
-            with self.log.path.open("rb") as file:
+            with open_regular(self.log.path) as file:
                 return hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as err:
             raise LogError(f"{self.log.path}: {err.strerror}") from err

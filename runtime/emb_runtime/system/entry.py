@@ -60,9 +60,13 @@ def start(
         return EXIT_DONE
     except KeyboardInterrupt as err:
         message = str(err) or message
-    except Exception:
+    except Exception as err:
         if not pressed:  # else a library that was interrupted made another error of it
-            raise
+            if not isinstance(err, OSError) or err.filename is None:
+                raise
+            from emb_runtime.system.terminal import complain
+
+            return complain(sys.argv[0].rpartition("/")[2], UsageError(f"{err.filename}: {err.strerror}"))
     finally:
         if signal.getsignal(signal.SIGINT) is interrupt:
             signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing is open any more

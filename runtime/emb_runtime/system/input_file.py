@@ -13,8 +13,11 @@ import operator
 import os
 import stat
 from pathlib import Path
+from typing import Any, TypeVar
 
 from emb_runtime.errors import near
+
+T = TypeVar("T")
 
 _KINDS = (
     (stat.S_ISDIR, "a directory"),
@@ -28,10 +31,29 @@ _FLAGS = functools.reduce(operator.or_, (getattr(os, name, 0) for name in _WANTE
 """Those of the flags that this operating system has. Not to wait: a pipe opens when somebody writes to it."""
 
 
+class _Regular(io.FileIO):
+    """A file of which each read gives bytes or raises OSError: of one of the kernel's own it may have to be waited."""
+
+    def readinto(self, buffer: Any) -> int:
+        """Read into a buffer; gives the number of bytes."""
+        count: int | None = super().readinto(buffer)
+        return _there(count)
+
+    def readall(self) -> bytes:
+        """Read all that is left."""
+        return _there(super().readall())
+
+
+def _there(found: T | None) -> T:
+    if found is None:
+        raise OSError(errno.EAGAIN, "expected a regular file, and its content has to be waited for")
+    return found
+
+
 def open_regular(path: str | Path) -> io.BufferedReader:
     """A regular file, open for reading; raises OSError for anything else."""
     try:
-        return io.BufferedReader(io.FileIO(path, "rb", opener=_opened))
+        return io.BufferedReader(_Regular(path, "rb", opener=_opened))
     except FileNotFoundError as err:
         raise FileNotFoundError(err.errno, f"{err.strerror}{near_file(Path(path))}", str(path)) from err
     except ValueError as err:  # a zero byte in the name
@@ -62,7 +84,7 @@ def _opened(path: str, _flags: int) -> int:
 def read_bytes(path: str | Path, most: int) -> bytes:
     """Content of a regular file of at most so many bytes; raises OSError for anything else."""
     with open_regular(path) as file:
-        data = file.read(most + 1) or b""  # None where a file of the kernel's own would let us wait
+        data = file.read(most + 1)
     if len(data) > most:
         raise OSError(errno.EFBIG, f"expected at most {most} bytes, and it has more", str(path))
     return data

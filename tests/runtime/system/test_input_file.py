@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import stat
 from collections.abc import Callable
 from pathlib import Path
 
@@ -41,6 +42,16 @@ def test_what_is_no_regular_file_is_refused_and_nobody_waits_for_it(
     with pytest.raises(OSError, match=said):
         open_regular(path)
     assert open_files() == before
+
+
+def test_what_has_to_be_waited_for_is_an_error_and_not_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipe = tmp_path / "pipe"  # as /proc/kmsg, which says that it is a regular file
+    os.mkfifo(pipe)
+    monkeypatch.setattr(stat, "S_ISREG", lambda _mode: True)
+    with open_regular(pipe) as file, pipe.open("wb"):
+        for read in (file.read, file.read1, lambda: file.read(5), lambda: file.readinto(bytearray(5))):
+            with pytest.raises(OSError, match="expected a regular file, and its content has to be waited for"):
+                read()
 
 
 def test_a_name_that_no_file_can_have_is_refused_alike() -> None:

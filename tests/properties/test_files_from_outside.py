@@ -1,0 +1,82 @@
+"""Whatever a path that is typed leads to: one line on the error stream, the documented exit code, and no waiting."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from emb_runtime.system.entry import start
+from emb_runtime.system.input_file import _Regular
+from tests.bench.simulated_logs import square, write_log
+from tests.conftest import Simulate
+from tests.test_cases import PROGRAMS
+
+COMMANDS = {
+    "emb-run --iface sim --log new.mcap --policy {}": {2, 5},
+    "emb-run --iface sim --log new.mcap --bench {}": {2},
+    "emb-run --iface map:{}@sim --log new.mcap": {2},
+    "emb-run --write-bench {}": {2},
+    "emb-gateway --iface vcan0 --bench {} --drive x.toml@vcan1": {2},
+    "emb-gateway --iface vcan0 --drive {}@vcan1": {2},
+    "emb-node --iface vcan0 --bench {}": {2},
+    "emb-commission brake --iface sim --yes --bench {}": {2},
+    "emb-replay info {}": {2, 6},
+    "emb-replay timing {}": {2, 6},
+    "emb-replay rerun {}": {2, 6},
+    "emb-replay estimate {}": {2, 6},
+    "emb-replay estimate {}.csv --map map.toml": {2},
+    "emb-replay estimate run.mcap --map {}": {2},
+    "emb-replay estimate run.mcap --bench {}": {2},
+    "emb-replay estimate run.mcap --last {}": {2, 6},
+    "emb-replay report run.mcap -o new.html --acceptance {}": {2},
+    "emb-replay report run.mcap -o {}/new.html": {2},
+    "emb-replay export run.mcap -o {}/new.csv": {2},
+    "emb-replay fim run.mcap --theta {}": {2, 6},
+    "emb-replay campaign run.mcap --jobs 1 -o new.parquet --bench {}": {2},
+    "emb-design --starts 1 -o new.csv --bench {}": {2},
+    "emb-export {} -o new.onnx": {2},
+    "emb-export design:file={} -o new.onnx": {2},
+    "emb-export chirp -o new.onnx --bench {}": {2},
+}
+"""Command lines, and the exit codes that they may have."""
+KINDS = ("pipe", "/proc/self/mem", "fails", "n" * 300)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path:
+    here = tmp_path_factory.mktemp("outside")
+    write_log(here / "run.mcap", simulate(square, options="plant=exact"))
+    os.mkfifo(here / "pipe")
+    (here / "map.toml").write_text("[columns]\n")
+    (here / "fails").write_bytes(b"some content")
+    return here
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind[:9])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_whatever_the_path_leads_to_one_line_says_so(
+    command: str, kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def readinto(file: _Regular, buffer: memoryview) -> int:
+        if kind == "fails" and str(file.name) == kind:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return plain(file, buffer)
+
+    plain = _Regular.readinto  # of a disk that is broken
+    monkeypatch.setattr(_Regular, "readinto", readinto)
+    monkeypatch.chdir(folder)
+    program, *arguments = (word.replace("{}", kind) for word in command.split())
+    monkeypatch.setattr("sys.argv", [program, *arguments])
+    before = sorted(Path().iterdir())
+    try:
+        code = start(PROGRAMS[program], "")
+    except SystemExit as ended:
+        code = int(ended.code or 0)
+    said = capsys.readouterr().err
+    assert code in COMMANDS[command], said
+    assert said.splitlines()[-1].startswith(program), said
+    assert "Traceback" not in said
+    assert sorted(Path().iterdir()) == before
