@@ -129,6 +129,7 @@ class Core:
         self._skipped = 0  # samples that the node's counter has skipped, and its device time has not
         self._was_active = False  # the node has obeyed a command of this run
         self._status: StatusFrame | None = None  # the newest status judged
+        self._active_then = False  # it came when the node had obeyed
         self._past = NO_PAST  # the last own commands, newest first
         self._answered: int | None = None  # counter of the sample that the newest of them answered
         self._permitted = True
@@ -523,8 +524,23 @@ class Core:
         status = self._reception.status
         if status is self._status:
             return ""
+        # The first one may be from before the run, when the node was still in another stop.
+        found = self._contradicted(status) if self._status is not None and status is not None else ""
         self._status = status
-        return self._start_conditions.mismatch(status)
+        return found or self._start_conditions.mismatch(status)
+
+    def _contradicted(self, status: StatusFrame) -> str:
+        """Contradiction of a new status to the pairs, in words; empty if there is none.
+
+        A node that stops, or has a fault, is not in control, whatever its pairs say: an honest one that sends its status
+        first ends the run with its next pair. That it is idle it may have sent just before it obeyed the first command,
+        but not once an earlier status has come while it did.
+        """
+        before, self._active_then = self._active_then, self._was_active
+        if status.node_state in UNFIT:
+            raise StopError(Fault.NODE_STOPPED, f"the node's status says {status.node_state.name}")
+        idle = before and status.node_state is IDLE
+        return "the node's status says IDLE while its pairs say ACTIVE" if idle else ""
 
     def _decide(self, sample: SensorSample, wanted: float, step: int) -> Decision:
         """Command for a sample, in the shield's view of time: on the way home the end is always near."""

@@ -50,6 +50,8 @@ class StartConditions:
         """Reason why the run may not begin at the newest sample, in hand at a monotonic time [ns]; empty if it may."""
         if now_ns - sample.receive_time_ns > OLDEST_SAMPLE_PERIODS * self.bench.timing.sample_time_ns:
             return "its samples are read too late, this computer is too slow"  # or catching up with what had piled up
+        if status is not None and status.node_state is NodeState.FAULT:
+            return "its status says FAULT"
         return self.mismatch(status) or self.not_at_rest(sample)
 
     def mismatch(self, status: StatusFrame | None) -> str:

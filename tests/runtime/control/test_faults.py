@@ -348,3 +348,41 @@ def assert_within_limits(run: SimRun) -> None:
 
 def commands(run: SimRun, layout: Layout) -> list[CurrentCommand]:
     return [layout.decode_command(frame) for frame in run.sent]
+
+
+@pytest.mark.parametrize(
+    ("state", "fault", "within"),
+    [
+        (NodeState.FAULT, Fault.NODE_STOPPED, 1),
+        (NodeState.STOPPING, Fault.NODE_STOPPED, 1),
+        (NodeState.IDLE, Fault.NODE_CHANGED, 101),
+    ],
+)
+def test_a_status_that_contradicts_the_pairs_ends_the_run(
+    simulate: Simulate, state: NodeState, fault: Fault, within: int
+) -> None:
+    said: list[int] = []
+
+    def receive(frame: Frame | None, transport: SimTransport, _clock: SteppedClock) -> Frame | None:
+        if frame is None or frame.identifier != STATUS or transport.node.periods < 250:
+            return frame
+        said.append(transport.node.periods)
+        return saying(NodeState=int(state))(frame)
+
+    run = simulate(on_receive=receive)
+    assert run.outcome.fault is fault, run.outcome.detail
+    assert f"status says {state.name}" in run.outcome.detail
+    assert run.journal.cycles[-1].step + run.journal.cycles[0].device_time_ns // 1_000_000 <= said[0] + within
+    assert_within_limits(run)
+
+
+@pytest.mark.parametrize(("state", "until"), [(NodeState.IDLE, 101), (NodeState.STOPPING, 1)])
+def test_a_status_from_before_the_first_command_ends_no_run(simulate: Simulate, state: NodeState, until: int) -> None:
+    late = changing(saying(NodeState=int(state)), STATUS, range(until + 1))
+    assert simulate(on_receive=late).outcome.fault is None
+
+
+def test_a_node_whose_status_says_fault_is_not_armed(simulate: Simulate) -> None:
+    outcome = simulate(on_receive=changing(saying(NodeState=int(NodeState.FAULT)), STATUS)).outcome
+    assert (outcome.fault, outcome.armed) == (Fault.NODE_NOT_READY, False)
+    assert outcome.detail == "its status says FAULT"
