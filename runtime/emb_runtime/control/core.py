@@ -532,7 +532,7 @@ class Core:
     def _contradicted(self, status: StatusFrame) -> str:
         """Contradiction of a new status to the pairs, in words; empty if there is none.
 
-        A node that stops, or has a fault, is not in control, whatever its pairs say: an honest one that sends its status
+        A node that stops or has a fault is not in control, whatever its pairs say: an honest one that sends its status
         first ends the run with its next pair. That it is idle it may have sent just before it obeyed the first command,
         but not once an earlier status has come while it did.
         """
