@@ -330,8 +330,6 @@ def unheld_motion(bench: Bench, stopping: Sequence[SensorSample]) -> float:
     """
     last = stopping[-REST_SAMPLES:]
     speed = steady_motion([sample.velocity for sample in last], bench.noise.velocity)
-    if not speed:
-        return 0.0
     box, along = bench.range_set(bench.shield.ranges), math.copysign(1.0 / REST_SAMPLES, speed)
     behind = -along * sum(sample.angle for sample in last)  # towards home: the spring drives it
     current = along * sum(sample.applied_current for sample in last)

@@ -308,6 +308,7 @@ def test_a_velocity_is_an_error_only_where_friction_holds_every_brake_of_the_ran
         most = low.T_c / high.k_m
         assert ending(0.0, sign * 5.0, sign * most * 0.999) == pytest.approx(sign * 5.0)
         assert ending(0.0, sign * 5.0, sign * most * 1.001) == 0.0
+        assert ending(sign * 30.0, sign * 5.0, sign * most * 1.001) == 0.0  # the softest spring may press less
         braking = (high.gamma * high.k_1 * 30.0 - low.T_c) / low.k_m  # holds every brake at 30 rad, with friction
         assert ending(-sign * 30.0, sign * 5.0, -sign * braking * 1.001) == pytest.approx(sign * 5.0)
         assert ending(-sign * 30.0, sign * 5.0, -sign * braking * 0.999) == 0.0
