@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import struct
 from pathlib import Path
@@ -42,7 +43,7 @@ class RandomMapping:
         self.signals: list[tuple[str, int, int]] = []
         bit = self._header()
         self.is_float = draw.random() < 0.3 and bit <= 32
-        self.length = 32 if self.is_float else draw.randint(11, min(32, 64 - bit - 8))
+        self.length = self._length(draw, 64 - bit)
         start = bit + draw.randint(0, 64 - bit - self.length)
         if draw.random() < 0.5 and start - bit >= 4:
             self.signals.append(("Other", bit, 4))
@@ -51,11 +52,18 @@ class RandomMapping:
         self.unit, self.per_ampere = draw.choice((("A", 1.0), ("mA", 1000.0), ("Nm", draw.uniform(0.01, 2.0))))
         self.sign, self.scale = draw.choice((1, -1)), draw.uniform(0.5, 4.0)
         span = LIMIT * self.per_ampere / self.scale * 1.01
-        self.step = 1.0 if self.is_float else 2.0 * span / ((1 << self.length) - 2)
-        self.offset = 0.0 if self.signed else -span
         self.span = span
+        self.step = 1.0 if self.is_float else 2.0 * span / ((1 << self.length) - 2)
+        self.offset, self.range = 0.0 if self.signed else -span, "[0|0]"
+        self._distort(draw)
         self.dbc = self._dbc()
         self.toml = self._toml()
+
+    def _length(self, draw: random.Random, free: int) -> int:
+        return 32 if self.is_float else draw.randint(11, min(32, free - 8))
+
+    def _distort(self, draw: random.Random) -> None:
+        """Change what the signal carries."""
 
     def _header(self) -> int:
         """Place checksum and counter; the first bit that is free, counted along the bus."""
@@ -78,7 +86,7 @@ class RandomMapping:
             mine = name == "Current"
             sign = "-" if mine and self.signed else "+"
             scale = f"({self.step!r},{self.offset!r})" if mine else "(1,0)"
-            lines.append(f' SG_ {name} : {start}|{length}@{order}{sign} {scale} [0|0] "" Drive')
+            lines.append(f' SG_ {name} : {start}|{length}@{order}{sign} {scale} {self.range} "" Drive')
         types = _SENSOR_TYPES + (f"SIG_VALTYPE_ {identifier} Current : 1;\n" if self.is_float else "")
         return 'VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: Host Drive\n\n' + "\n".join(lines) + "\n\n" + _SENSORS + types
 
@@ -123,15 +131,48 @@ accept = {accept}
         else:
             text = "".join(f"{byte:08b}" for byte in reversed(data))[64 - bit - length : 64 - bit]
         if self.is_float:
-            value = struct.unpack("<f", int(text, 2).to_bytes(4, "little"))[0]
+            code = {16: "<e", 32: "<f"}[length]
+            raw = struct.unpack(code, int(text, 2).to_bytes(length // 8, "little"))[0]
         else:
             raw = int(text, 2)
             raw -= (1 << length) if self.signed and text[0] == "1" else 0
-            value = raw * self.step + self.offset
-        return float(value * self.scale * self.sign / self.per_ampere)
+        return float((raw * self.step + self.offset) * self.scale * self.sign / self.per_ampere)
 
     @property
     def ampere_step(self) -> float:
         """Distance of neighbouring currents, at most [A]."""
         step = self.span * 2.0**-23 if self.is_float else self.step
+        return step * self.scale / self.per_ampere
+
+
+class AnyCommand(RandomMapping):
+    """One whose command has 8 to 16 bits or is a float, with any step, sign, offset and range in the DBC."""
+
+    def _length(self, draw: random.Random, free: int) -> int:
+        return draw.choice((16, 32)) if self.is_float else draw.randint(8, min(16, free))
+
+    def _distort(self, draw: random.Random) -> None:
+        if self.is_float:
+            self.step, around = 10.0 ** draw.uniform(-6.0, 3.0), self.span * draw.choice((0.0, 1.0, 100.0))
+        else:
+            self.step *= draw.choice((0.5, 0.999, 1.0, 1.01, 1.5, 4.0)) * draw.choice((1, 1, -1))
+            around = self.span * draw.choice((0.0, 0.0, 1.0, 2.0))
+        self.offset = draw.choice((self.offset, draw.uniform(-around, around), around, -around))
+        self.range = draw.choice(("[0|0]", "[0|65535]", "[-3|3]", "[7|1]", "[-1E9|1E9]"))
+
+    def error_carried(self, value: float) -> float:
+        """Least difference of what the signal can say from a value, in its steps [DBC units]."""
+        wanted = (value - self.offset) / self.step
+        if self.is_float:
+            return 0.0 if abs(wanted) <= {16: 65504.0, 32: 3.4028e38}[self.length] else math.inf
+        least = -(1 << self.length - 1) if self.signed else 0
+        return abs(min(max(round(wanted), least), least + (1 << self.length) - 1) - wanted)
+
+    @property
+    def ampere_step(self) -> float:
+        """Distance of neighbouring currents, at most [A]."""
+        step = abs(self.step)
+        if self.is_float:
+            largest = (self.span + abs(self.offset)) / step
+            step *= largest * 2.0 ** {16: -10, 32: -23}[self.length] + {16: 2.0**-24, 32: 2.0**-149}[self.length]
         return step * self.scale / self.per_ampere

@@ -213,17 +213,20 @@ def require_fit(mapping: Mapping, bench: Bench) -> None:
 def _fit_problems(mapping: Mapping, bench: Bench) -> Iterator[tuple[str, str]]:
     """Keys of a mapping that are not enough for a bench, or too long, and why."""
     limits, command = bench.limits, mapping.command
-    amperes = command.low / command.factor, command.high / command.factor
+    wanted_current = -limits.current, limits.current
     for name, ends, wanted, unit in (
-        ("command", amperes, (-limits.current, limits.current), "A"),
+        ("command", (command.low / command.factor, command.high / command.factor), wanted_current, "A"),
         ("angle", _si_range(mapping.angle), limits.angle, "rad"),
         ("velocity", _si_range(mapping.velocity), (-limits.velocity, limits.velocity), "rad/s"),
     ):
         low, high = sorted(ends)
-        if not (low <= wanted[0] and wanted[1] <= high):
+        covers = low <= wanted[0] and wanted[1] <= high
+        if name == "command":  # as the encoder compares: a quotient may be rounded the other way
+            covers = all(command.low <= current * command.factor <= command.high for current in wanted)
+        if not covers:
             covered = f"{low:.4g} to {high:.4g} {unit} does not cover"
             yield f"can.signals.{name}.range", f"{covered} the bench's {wanted[0]:g} to {wanted[1]:g} {unit}"
-    step = command.field.step(command.high) / abs(command.factor)
+    step = max(map(command.field.step, (command.low, command.high))) / abs(command.factor)
     if not step <= COARSEST_CURRENT:
         yield "can.signals.command", f"a step of {step:.3g} A is too coarse, expected at most {COARSEST_CURRENT:g} A"
     if mapping.pair_within > LONGEST_PAIR_PERIODS * bench.timing.sample_time:

@@ -16,6 +16,7 @@ from emb_runtime.can.codec import parse
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import LONGEST_NODE_WATCHDOG, Bitrate
 from emb_runtime.config.typed import MAX_TOML_BYTES, parse_toml, read, shown
+from emb_runtime.drives.dbc import MAX_DBC_BYTES, MessageText, find_messages
 from emb_runtime.drives.mapping import (
     PROPERTIES,
     Commanded,
@@ -28,14 +29,14 @@ from emb_runtime.drives.mapping import (
     Step,
 )
 from emb_runtime.drives.signals import DATA_IDS, MODULI, Field, Protection, make_field, raw_value
+from emb_runtime.drives.wire import Encoder
+from emb_runtime.drives.wire_guard import WireGuard, WireGuardError
 from emb_runtime.errors import FrameError
 from emb_runtime.system.input_file import read_text
 
 if TYPE_CHECKING:
-    from cantools.database.can import Database
     from cantools.database.can import Message as DbcMessage
 
-MAX_DBC_BYTES = 4 << 20
 MOST_STEPS = 16  # Steps of a sequence, and frames of a step
 
 UNITS = {
@@ -205,10 +206,10 @@ def _text(path: str | Path, most: int) -> str:
 def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
     can, signals = file.can, file.can.signals
     try:
-        database = parse(dbc_text)
+        messages = find_messages(dbc_text)
     except FrameError as err:
-        raise MappingError(f"{source}: can.dbc: {_one_line(err)}") from err
-    reader = _Reader(source, database, can.protection)
+        raise MappingError(f"{source}: can.dbc: {err}") from err
+    reader = _Reader(source, messages, can.protection)
     command = reader.command(signals.command)
     state = None if signals.state is None else reader.state(signals.state)
     made = Mapping(
@@ -237,14 +238,37 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
         raise reader.error("node.accept", f"'{missing[0]}' is not accepted: {PROPERTIES[missing[0]]}{more}")
     if surplus := [name for name in file.node.accept if name not in made.lost]:
         raise reader.error("node.accept", f"{shown(surplus[0])} is nothing that this drive lacks")
+    _require_carried(reader, made)
     return made
+
+
+def _require_carried(reader: _Reader, made: Mapping) -> None:
+    """Send every frame to nobody, the command with both ends of its range and zero: the DBC must carry them."""
+    command = made.command
+    ends = command.low / command.factor, command.high / command.factor
+    encoder, guard = Encoder(made), WireGuard(made, max(map(abs, ends)), lambda _frame: None)
+    for value in (command.low, 0.0, command.high):
+        try:
+            guard.command(encoder.value(value), value / command.factor)
+        except (FrameError, WireGuardError) as err:
+            amount = f"{value:g}, {value / command.factor:g} A"
+            raise reader.error("can.signals.command", f"the DBC cannot carry {amount}: {err}") from err
+    for name, steps in (("arm", made.arm), ("disarm", made.disarm)):
+        for number, constant in ((n, frame) for n, step in enumerate(steps) for frame in step.frames):
+            try:
+                guard.constant(encoder.constant(constant), constant)
+            except WireGuardError as err:
+                message = made.messages[constant.message].dbc.name
+                raise reader.error(f"can.{name}[{number}].send.{message}", f"the DBC cannot carry it: {err}") from err
 
 
 class _Reader:
     """Finds what the file names in the DBC, and keeps the messages that are used."""
 
-    def __init__(self, source: str, database: Database, protection: Dictionary[str, str | _Protection]) -> None:
-        self._source, self._database, self._protection = source, database, protection
+    def __init__(
+        self, source: str, found: Dictionary[str, MessageText], protection: Dictionary[str, str | _Protection]
+    ) -> None:
+        self._source, self._found, self._protection = source, found, protection
         self.used: dict[str, MessageInfo] = {}
 
     def error(self, key: str, reason: str) -> MappingError:
@@ -253,7 +277,12 @@ class _Reader:
     def measured(self, of: _Angle | _Velocity | _Current, key: str) -> Measured:
         info, field = self._signal(of.signal, key)
         wrap = of.wrap or 0.0 if isinstance(of, _Angle) else 0.0
-        return Measured(info.name, field, self._scale(of, key), of.offset, *self._range(of, key), wrap)
+        low, high = self._range(of, key)
+        if not (field.carries(low) and field.carries(high)):
+            raise self.error(f"{key}.range", f"{of.signal} carries no value beyond {_ends(field)}: narrow the range")
+        if high - low < wrap - field.step(high):
+            raise self.error(f"{key}.range", f"expected all values of a period of {wrap:g}, got {low:g} to {high:g}")
+        return Measured(info.name, field, self._scale(of, key), of.offset, low, high, wrap)
 
     def command(self, of: _Command) -> Commanded:
         key = "can.signals.command"
@@ -279,6 +308,9 @@ class _Reader:
             raise self.error(f"{key}.signal", "expected a signal of whole numbers")
         if set(of.idle) & set(of.active):
             raise self.error(f"{key}.active", "a value cannot be both idle and active")
+        for value in (*of.idle, *of.active):
+            if not field.carries(value):
+                raise self.error(f"{key}.signal", f"{of.signal} carries {_ends(field)}, and never {value}")
         if of.error is not None and of.error not in info.fields:
             raise self.error(f"{key}.error", f"no such signal in {info.dbc.name}; it has {_names(set(info.fields))}")
         error = None if of.error is None else info.fields[of.error]
@@ -312,15 +344,16 @@ class _Reader:
         return ConstantFrame(info.name, bytes(data), given)
 
     def _message(self, name: str, key: str) -> DbcMessage:
-        try:
-            message = self._database.get_message_by_name(name)
-        except KeyError:
-            raise self.error(key, f"the DBC has no message {shown(name)}") from None
-        if message.is_fd or message.length > 8:
+        if (found := self._found.get(name)) is None:
+            raise self.error(key, f"the DBC has no message {shown(name)}")
+        if found.is_fd or found.length > 8:
             raise self.error(key, f"{name}: expected a classical frame; use a gateway")
-        switches = [signal for signal in message.signals if signal.is_multiplexer]
-        if len(switches) > 1 or any(switch.multiplexer_ids for switch in switches):
+        if found.multiplexors > 1 or found.multiplexed:
             raise self.error(key, f"{name}: expected one multiplexor at most; use a gateway")
+        try:
+            (message,) = parse(found.text).messages
+        except (FrameError, ValueError) as err:
+            raise self.error(key, f"{name}: {found.fault or _one_line(err)[:200]}") from err
         ours = {m.identifier for m in load_layout().messages.values()}
         if not message.is_extended_frame and message.frame_id in ours:
             raise self.error(
@@ -356,6 +389,8 @@ class _Reader:
                 raise self.error(key, f"{message.name}.{field.name}: expected a float of 16, 32 or 64 bits")
             if not math.isfinite(field.scale) or field.scale == 0.0 or not math.isfinite(field.offset):
                 raise self.error(key, f"{message.name}.{field.name}: expected a scale that is finite and not 0")
+        if page is not None and (fields[_switch(message)].scale, fields[_switch(message)].offset) != (1.0, 0.0):
+            raise self.error(key, f"{message.name}.{_switch(message)}: expected a multiplexor without scale and offset")
         protection = self._protection_of(message.name, fields)
         if page is not None and protection.counter is not None:
             raise self.error(f"can.protection.{message.name}", "a multiplexed message with a counter needs a gateway")
@@ -423,6 +458,10 @@ class _Reader:
 
 def _switch(message: DbcMessage) -> str:
     return next(signal.name for signal in message.signals if signal.is_multiplexer)
+
+
+def _ends(field: Field) -> str:
+    return " to ".join(f"{end:g}" for end in field.ends)
 
 
 def _page_of(message: DbcMessage, data: bytes) -> int | None:

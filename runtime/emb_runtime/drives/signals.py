@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import binascii
 import struct
+import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
     from cantools.database.can import Signal as DbcSignal
 
 _FLOATS = {16: ">e", 32: ">f", 64: ">d"}
+_MANTISSA = {16: 10, 32: 23, 64: 52}  # Bits of the fraction
+_SMALLEST = {16: 2.0**-24, 32: 2.0**-149, 64: 2.0**-1074}
+_LARGEST = {16: 65504.0, 32: (2.0 - 2.0**-23) * 2.0**127, 64: sys.float_info.max}
+EXACT = 1e-12  # Part of a value by which floating-point numbers may be off
 
 
 @dataclass(frozen=True)
@@ -46,11 +51,28 @@ class Field:
         return tuple(found)
 
     def step(self, value: float) -> float:
-        """Distance of neighbouring values about a value [DBC units]."""
+        """Distance of neighbouring values about a value, and what is lost beside a large offset [DBC units]."""
+        step, lost = abs(self.scale), EXACT * abs(self.offset)
         if not self.is_float:
-            return abs(self.scale)
-        mantissa = {16: 10, 32: 23, 64: 52}[self.length]
-        return abs(value) * 2.0**-mantissa + 2.0**-100
+            return step + lost
+        bits = self.length
+        return abs(value - self.offset) * 2.0 ** -_MANTISSA[bits] + step * _SMALLEST[bits] + lost
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Least and largest value [DBC units]."""
+        if self.is_float:
+            least, most = -_LARGEST[self.length], _LARGEST[self.length]
+        else:
+            least = float(-(1 << self.length - 1) if self.signed else 0)
+            most = least + (1 << self.length) - 1
+        one, other = least * self.scale + self.offset, most * self.scale + self.offset
+        return min(one, other), max(one, other)
+
+    def carries(self, value: float) -> bool:
+        """Returns True if a value is one of the signal's, to half a step [DBC units]."""
+        (low, high), half = self.ends, 0.0 if self.is_float else 0.5 * self.step(value)
+        return low - half <= value <= high + half
 
 
 def make_field(signal: DbcSignal) -> Field:

@@ -50,17 +50,25 @@ class Encoder:
         Raises:
             FrameError: it is not finite, or beyond the file's range.
         """
-        command, protection = self._mapping.command, self._info.protection
+        command = self._mapping.command
         value = current * command.factor
         if not command.low <= value <= command.high:  # this way round, NaN is refused
             raise FrameError(
                 f"{command.message}.{command.field.name}: expected {command.low:g} to {command.high:g}, got {value:g}"
             )
+        return self.value(value)
+
+    def value(self, value: float) -> Frame:
+        """The frame with a value of the command's signal [DBC units].
+
+        Raises:
+            FrameError: it cannot be encoded.
+        """
+        command, protection = self._mapping.command, self._info.protection
         values = {**command.others, command.field.name: value}
-        if protection.counter is not None:
-            values[protection.counter.name] = self._counter
-        if protection.checksum is not None:
-            values[protection.checksum.name] = 0
+        for field, raw in ((protection.counter, self._counter), (protection.checksum, 0)):
+            if field is not None:
+                values[field.name] = raw * field.scale + field.offset
         try:
             data = bytearray(self._info.dbc.encode(values, padding=False, strict=True))
         except Exception as err:  # of several kinds, by what does not fit

@@ -10,12 +10,11 @@ import math
 from collections.abc import Callable
 
 from emb_runtime.drives.mapping import ConstantFrame, Mapping, MessageInfo
-from emb_runtime.drives.signals import Field, physical_value, raw_value
+from emb_runtime.drives.signals import EXACT, Field, physical_value, raw_value
 from emb_runtime.errors import SafetyStopError
 from emb_runtime.records import Frame
 
 ROUNDING = 1e-6  # Part of a step by which floating-point numbers may be off, beyond half a step
-EXACT = 1e-12  # Part of a value by which floating-point numbers may be off
 
 
 class WireGuardError(SafetyStopError):
@@ -84,7 +83,8 @@ class WireGuard:
         self._check_kind(frame, info)
         data, protection = frame.data, info.protection
         value = physical_value(command.field, data)
-        if not command.low <= value <= command.high:  # this way round, NaN is refused
+        least, most = ((0.5 + ROUNDING) * command.field.step(end) for end in (command.low, command.high))
+        if not command.low - least <= value <= command.high + most:  # this way round, NaN is refused
             raise self._refused(f"its bytes say {value:g}, the file allows {command.low:g} to {command.high:g}")
         current, step = value / command.factor, command.field.step(value) / abs(command.factor)
         if not abs(meant) <= self._limit:

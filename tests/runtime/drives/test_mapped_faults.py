@@ -90,12 +90,12 @@ DOUBLED = {
 OTHER_ANGLE = {
     "odrive": 'unit = "rad", sign = 1, range = [-12, 110]',
     "vesc": 'unit = "rad", sign = 1, range = [0, 360], wrap = 360',
-    "mit": 'unit = "rad", sign = 1, range = [-10.8, 101.7]',
+    "mit": 'unit = "rev", sign = 1, scale = 9, range = [-1.2, 11.3]',
 }
 OTHER_VELOCITY = {
     "odrive": 'unit = "rad/s", sign = 1, range = [-510, 510]',
     "vesc": 'unit = "rpm", sign = 1, scale = 1, range = [-40000, 40000]',
-    "mit": 'unit = "rad/s", sign = 1, range = [-510, 510]',
+    "mit": 'unit = "rev/s", sign = 1, scale = 9, range = [-60, 60]',
 }
 OTHER_SENSORS = {
     "odrive": (("BO_ 9 ", "BO_ 41 "), ("_ 9 Pos", "_ 41 Pos"), ("_ 9 Vel", "_ 41 Vel")),
@@ -162,13 +162,13 @@ FAULTS = {
     ),
     "angle in another unit": Fault(
         lambda drive: edited((ANGLE[drive], OTHER_ANGLE[drive])),
-        ("NODE_STOPPED", "NODE_NOT_READY", "NODE_STOPPED"),
+        ("NODE_STOPPED", "NODE_NOT_READY", "SENSOR_LOST"),
         (CONTRADICT,) * 3,
     ),
     "velocity in another unit": Fault(
         lambda drive: edited((VELOCITY[drive], OTHER_VELOCITY[drive])),
-        ("NODE_STOPPED", "NODE_STOPPED", "SENSOR_LOST"),
-        (CONTRADICT,) * 3,
+        ("NODE_STOPPED", "NODE_STOPPED", "MOTION_OUTSIDE_SET"),
+        (CONTRADICT, CONTRADICT, ""),
     ),
     "both in another unit": Fault(
         lambda drive: edited((ANGLE[drive], OTHER_ANGLE[drive]), (VELOCITY[drive], OTHER_VELOCITY[drive])),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 import re
 import struct
 from pathlib import Path
@@ -15,7 +16,7 @@ from emb_runtime.drives.signals import make_field, physical_value, raw_value
 from emb_runtime.drives.wire import Encoder, Receiver
 from emb_runtime.drives.wire_guard import WireGuard, WireGuardError
 from emb_runtime.records import Frame
-from tests.drives import EXAMPLES, SHIPPED, RandomMapping
+from tests.drives import EXAMPLES, LIMIT, SHIPPED, AnyCommand, RandomMapping
 
 
 def texts(name: str) -> tuple[str, str]:
@@ -102,6 +103,13 @@ def test_a_mistake_is_one_line_that_names_it() -> None:
         ("pair_within = 0.0005", "pair_within = 0", "can.pair_within"),
         ("Input_Torque = 0}", "Input_Torque = 0.1}", "a sequence commands no current"),
         ("Axis_Requested_State = 8", "Axis_Requested_State = -1", "does not fit the DBC"),
+        ("Axis_Requested_State = 8", "Axis_Requested_State = 4294967296", "does not fit the DBC"),
+        (", Kp = 0", ", Kp = 600", "can.signals.command: the DBC cannot carry -1.18, -6.04199 A"),
+        ("range = [-1.18, 1.18]", "range = [-1.18, 18.1]", "can.signals.command: the DBC cannot carry 18.1"),
+        ("range = [-1.2, 11.3]", "range = [-1.2, 12.6]", "can.signals.angle.range: MIT_Reply.Position carries"),
+        ("range = [-60, 60]", "range = [-65.1, 60]", "can.signals.velocity.range: MIT_Reply.Velocity carries"),
+        ("active = [8]", "active = [256]", "Axis0_Heartbeat.Axis_State carries 0 to 255, and never 256"),
+        ("BO_ 9 ", "BO_ 99999999999 ", "the DBC has no message 'Axis0_Get_Encoder_Estimates'"),
         ("Axis_Requested_State = 8", "Axis_State = 8", "does not fit the DBC"),
         ('{state = "active", timeout = 0.5}', '{state = "active", timeout = 50}', "timeout"),
         ('on_loss  = "hold"', 'on_loss  = "brake"', "node.on_loss"),
@@ -114,6 +122,27 @@ def test_a_mistake_is_one_line_that_names_it() -> None:
         toml, dbc = next(files for files in map(texts, ("odrive", "mit")) if any(old in text for text in files))
         wrong = (toml.replace(old, new, 1), dbc) if old in toml else (toml, dbc.replace(old, new, 1))
         assert reason in refusal(*wrong), old
+
+
+def test_the_ranges_of_the_dbc_are_not_used() -> None:
+    for name in SHIPPED:
+        toml, dbc = texts(name)
+        for narrow in ("[0|0]", "[7|7]", "[-1|1]", "[5|-5]"):
+            mapping = parse_mapping(toml, dbc.replace("[0|0]", narrow), "drive.toml")
+            for current in (-6.0, 6.0):
+                assert Encoder(mapping).command(current) == Encoder(load_mapping(EXAMPLES / f"{name}.toml")).command(
+                    current
+                )
+
+
+def test_an_angle_that_begins_anew_is_believed_over_its_whole_period() -> None:
+    toml, dbc = texts("vesc")
+    for low, high, whole in ((0, 359.98, True), (-180, 180, True), (0, 350, False), (0, 720, False)):
+        changed = toml.replace("range = [0, 360]", f"range = [{low}, {high}]")
+        if whole:
+            parse_mapping(changed, dbc, "drive.toml")
+        else:
+            assert "can.signals.angle.range: " in refusal(changed, dbc)
 
 
 def multiplexed() -> tuple[str, str]:
@@ -160,6 +189,8 @@ def test_what_of_a_multiplexed_message_has_no_one_meaning_is_refused() -> None:
     assert "expected 3, of" in refusal(toml.replace("others = {Mode = 3}", "others = {Mode = 4}"), dbc)
     assert "expected a value for Mode" in refusal(toml.replace(", others = {Mode = 3}", ""), dbc)
     assert "does not fit the DBC" in refusal(toml.replace("{Mode = 3, Input_Torque = 0}", "{Mode = 3}"), dbc)
+    scaled = dbc.replace("SG_ Page M : 0|8@1+ (1,0)", "SG_ Page M : 0|8@1+ (2,0)")
+    assert "expected a multiplexor without scale and offset" in refusal(toml, scaled)
     common = dbc.replace("Input_Torque m3 :", "Input_Torque :")
     assert "expected a signal of one value of the multiplexor" in refusal(toml, common)
     counted = toml.replace('default = "none"', 'Axis0_Get_Encoder_Estimates = {kind = "none", counter = "Age"}')
@@ -167,6 +198,29 @@ def test_what_of_a_multiplexed_message_has_no_one_meaning_is_refused() -> None:
     pages = "".join(f"SG_MUL_VAL_ 9 {name} Page {n}-{n};\n" for name, n in (("Pos_Estimate", 1), ("Vel_Estimate", 2)))
     nested = dbc.replace("SG_ Age :", "SG_ Age m1M :") + pages + "SG_MUL_VAL_ 9 Age Page 1-1;\n"
     assert "one multiplexor at most" in refusal(toml, nested)
+
+
+def test_a_command_of_any_signal_is_decoded_as_the_current_that_was_meant_or_the_mapping_is_refused() -> None:
+    refused = 0
+    for seed in range(500):
+        drawn, draw = AnyCommand(seed), random.Random(seed)
+        misfit, reason = max(map(drawn.error_carried, (-drawn.span, 0.0, drawn.span))), ""
+        try:
+            mapping = parse_mapping(drawn.toml, drawn.dbc, "drive.toml")
+        except MappingError as err:
+            reason = str(err)
+        if misfit > 0.501:
+            assert "can.signals.command: the DBC cannot carry" in reason
+            refused += 1
+            continue
+        assert reason == "", seed
+        sent = list[Frame]()
+        encoder, guard = Encoder(mapping), WireGuard(mapping, 2.0 * LIMIT, sent.append)
+        ends = [end / mapping.command.factor for end in (-drawn.span, drawn.span)]
+        for meant in (0.0, *(end * (1.0 - 1e-15) for end in ends), *(draw.uniform(*ends) for _ in range(10))):
+            guard.command(encoder.command(meant), meant)
+            assert abs(drawn.amperes(sent[-1].data) - meant) <= 0.501 * drawn.ampere_step, seed
+    assert 100 < refused < 400
 
 
 def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:

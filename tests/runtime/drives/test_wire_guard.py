@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import random
+import struct
 from dataclasses import replace
 
 import pytest
@@ -206,6 +207,32 @@ def test_what_the_file_s_range_reaches_to_leaves_and_what_is_beyond_it_does_not(
         assert (it.guard.passed, it.guard.rejected) == (1, 0)
     for current in (-5.125, 4.625, 100.0):
         Guarded().refuses(by_hand(current), current, f"its bytes say {current:g}, the file allows -5 to 4.5")
+
+
+@pytest.mark.parametrize(("end", "says", "passes"), [(-5.0625, -5.125, True), (-5.06249, -5.125, False)])
+def test_an_end_of_the_range_may_be_passed_by_half_a_step(end: float, says: float, passes: bool) -> None:
+    for sign in (1.0, -1.0):
+        bounds = sorted((sign * end, 0.0))
+        command = replace(KNOWN.command, low=bounds[0], high=bounds[1])
+        guard = WireGuard(replace(KNOWN, command=command), LIMIT, lambda _frame: None)
+        if passes:
+            assert guard.command(by_hand(sign * says), sign * end) == sign * says
+        else:
+            with pytest.raises(WireGuardError, match="the file allows"):
+                guard.command(by_hand(sign * says), sign * end)
+
+
+def test_numbers_that_are_not_finite_are_refused() -> None:
+    guard = WireGuard(load_mapping(EXAMPLES / "odrive.toml"), LIMIT, lambda _frame: None)
+    for value in (math.inf, -math.inf, math.nan):
+        with pytest.raises(WireGuardError, match="the file allows"):
+            guard.command(Frame(0x00E, struct.pack("<f", value)), 0.0)
+
+
+def test_a_counter_and_a_checksum_with_scale_and_offset_are_sent_as_they_are_counted() -> None:
+    dbc = DBC.replace("Counter : 20|4@1+ (1,0)", "Counter : 20|4@1+ (2,1)").replace("24|8@1+ (1,0)", "24|8@1+ (1,7)")
+    encoder = Encoder(parse_mapping(TOML, dbc, "known.toml"))
+    assert [encoder.command(1.0) for _ in range(4)] == [by_hand(1.0, counter) for counter in (0, 1, 2, 0)]
 
 
 def test_a_current_meant_that_is_beyond_the_limit_is_refused_whatever_the_bytes_say() -> None:
