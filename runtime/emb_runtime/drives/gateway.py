@@ -11,7 +11,7 @@ from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import TransmitQueueFullError, Transport
 from emb_runtime.config.bench import Bench
 from emb_runtime.drives.mapping import Mapping
-from emb_runtime.drives.node import DriveNode, Phase
+from emb_runtime.drives.node import INTRUDED, DriveNode, Phase
 from emb_runtime.errors import BusError, SafetyStopError
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import Clock
@@ -53,10 +53,14 @@ class Gateway:
         self.node = DriveNode(mapping, bench, load_layout(), drive_bus.send)
         self._drive_bus, self._node_bus, self._clock, self._wait = drive_bus, node_bus, clock, wait
         self._node_lost: BusError | None = None
-        command = mapping.messages[mapping.command.message]
-        sensors = (mapping.messages[name] for name in mapping.sensor_messages)
-        answers = {(info.extended, info.identifier) for info in sensors}
-        self._commands = {(command.extended, command.identifier)} - answers  # a drive may answer under the same one
+        steps = (*mapping.arm, *mapping.disarm)
+        sent = {mapping.command.message} | {constant.message for step in steps for constant in step.frames}
+        heard = mapping.sensor_messages | ({mapping.state.message} if mapping.state else set())
+        ours, theirs = (
+            {(info.extended, info.identifier) for info in map(mapping.messages.__getitem__, names)}
+            for names in (sent, heard)
+        )
+        self._commands = ours - theirs  # a drive may answer under the identifier of its command
         self._is_commanded = False  # by another node
         self._layout, self._counter = load_layout(), 0
 
@@ -132,7 +136,7 @@ class Gateway:
                 raise BusError("no samples of the drive: check that it is on, on this bus, with this DBC")
             self.step()
             if self._is_commanded:
-                raise BusError("cannot arm the drive: another node commands it; end that first, a second gateway maybe")
+                raise BusError(f"cannot arm the drive: {INTRUDED}")
         else:
             return False
         self.node.arm(self._clock.now_ns())
@@ -162,12 +166,18 @@ class Gateway:
             if (frame := self._drive_bus.receive(0)) is None:
                 break
             if not (frame.own or frame.error) and (frame.extended, frame.identifier) in self._commands:
-                self._is_commanded = True
+                self._intruded()
             for ours in self.node.take_drive(frame, self._clock.now_ns()):
                 self._pass_on(ours)
                 if ours.identifier == self._layout.status.identifier:
                     self._pass_on(self._counts())
         self.node.tick(self._clock.now_ns())
+
+    def _intruded(self) -> None:
+        """Take note of another commander: the node lets go, and the host hears of one as on a bus that they share."""
+        self._is_commanded = True
+        if self.node.intruded():  # a disabled command that the host has not sent
+            self._pass_on(self._layout.encode_command(0, 0, 0.0, False))
 
     def _after(self, seconds: float) -> int:
         """Time so much later than now [ns]."""

@@ -40,6 +40,8 @@ READY_SAMPLES = 10  # Samples of a drive that broadcasts, before it is armed
 REST_TRAVEL = 0.05  # rad
 REST_PERIODS = 50  # The brake rests when it has stayed within REST_TRAVEL for so many samples
 LONGEST_STOP_PERIODS = 1000  # Samples after which a stopping drive is disarmed, at rest or not
+MOST_INTRUSIONS = 3  # Commands of another node after which a moving drive is let go: braking against them is no use
+INTRUDED = "another node commands it; end that first, a second gateway maybe"
 ARMED_PERIODS = 600_000  # Samples after which a drive that is armed and not commanded is let go
 CONTRADICTIONS = 3
 """Samples in a row that contradict the one before, or a share of them, after which the drive is let go."""
@@ -114,6 +116,7 @@ class DriveNode:
         self.arming = Arming(mapping, self._period_ns, self._send_step)
         self.times = SampleTimes(mapping, bench)
         self._is_ending = False  # the next stop ends with the drive let go
+        self._intrusions = 0
         self.phase = Phase.OFF
         self.stop_reason = StopReason.NEVER_COMMANDED
         self.failure = ""
@@ -172,6 +175,21 @@ class DriveNode:
             self._latch(StopReason.DISABLED)
         elif self.phase in (Phase.ARMING, Phase.READY):
             self._let_go()
+
+    def intruded(self) -> bool:
+        """Take note of a command of another node; returns True if the drive was armed, or about to be.
+
+        A brake that moves is stopped, and the drive let go at rest; at once if such commands go on.
+        """
+        if self.phase not in (Phase.ARMING, *ARMED):
+            return False
+        self._intrusions += 1
+        if self.phase in (Phase.ARMING, Phase.READY) or self._intrusions >= MOST_INTRUSIONS:
+            self._give_up(INTRUDED)
+        else:
+            self.failure = INTRUDED
+            self.disarm()
+        return True
 
     def abandon(self) -> None:
         """Let an armed drive go at once, moving or not."""

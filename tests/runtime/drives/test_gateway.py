@@ -20,7 +20,7 @@ from emb_runtime.cli import gateway as cli
 from emb_runtime.config.bench import parse_bench
 from emb_runtime.drives.gateway import LISTEN, MOST_FRAMES, Gateway
 from emb_runtime.drives.mapping_file import load_mapping
-from emb_runtime.drives.node import ARMED_PERIODS, LONGEST_STOP_PERIODS, READY_SAMPLES, DriveNode, Phase
+from emb_runtime.drives.node import ARMED_PERIODS, INTRUDED, LONGEST_STOP_PERIODS, READY_SAMPLES, DriveNode, Phase
 from emb_runtime.errors import BusError, SafetyStopError
 from emb_runtime.records import Frame, NodeState
 from emb_runtime.system import terminal
@@ -438,6 +438,55 @@ def test_a_drive_that_another_node_commands_is_not_armed() -> None:
                 with pytest.raises(BusError, match="another node commands it"):
                     gateway.run(lambda: False, lambda: None, arms=True)
             assert it.drive.sent == []
+
+
+def foreign(played: Played, identifier: int = 0x00E, **changed: bool) -> list[Frame]:
+    """A stranger's frame of one that the mapping sends; commands that the host hears of."""
+    before = len(played.host.sent)
+    length = 8 if identifier == 0x00B else 0 if identifier == 0x018 else 4
+    played.drive.waiting.append(Frame(identifier, bytes(length), played.clock.now_ns())._replace(**changed))
+    played.gateway.step()
+    return [f for f in played.host.sent[before:] if f.identifier == LAYOUT.command.identifier]
+
+
+@pytest.mark.parametrize("identifier", [0x007, 0x00B, 0x00E, 0x018])
+def test_a_frame_of_another_commander_stops_a_moving_brake_and_the_host_hears_a_foreign_command(
+    identifier: int,
+) -> None:
+    played = Played()
+    played.arm()
+    played.drive_on(2.0)
+    assert foreign(played, identifier, own=True) == foreign(played, identifier, error=True) == []
+    assert foreign(played, identifier, extended=True) == []
+    assert (played.node.phase, played.node.failure) == (Phase.ACTIVE, "")
+    (told,) = foreign(played, identifier)
+    assert LAYOUT.decode_command(told)[2:] == (0.0, False)
+    assert (played.node.phase, played.node.failure) == (Phase.STOPPING, INTRUDED)
+    assert IDLE not in played.asked_states
+    played.until(Phase.OFF)
+    assert (played.torques[-1], played.asked_states[-1]) == (0.0, IDLE)
+    assert foreign(played, identifier) == []  # nothing of ours is at stake
+
+
+def test_commands_of_another_node_that_go_on_let_a_moving_drive_go_at_once(played: Played) -> None:
+    played.arm()
+    played.drive_on(2.0)
+    for number in (1, 2, 3):
+        assert len(foreign(played)) == 1
+        assert (played.node.phase is Phase.FAILED) == (number == 3)
+    assert (played.torques[-1], played.asked_states[-1]) == (0.0, IDLE)
+
+
+def test_a_drive_at_rest_or_about_to_be_armed_is_let_go_with_the_first_command_of_another_node() -> None:
+    played = Played()
+    with pytest.raises(SafetyStopError, match="disarmed: another node commands it"):
+        run(played, 5000, lambda: played.drive.waiting.append(Frame(0x00E, bytes(4), played.clock.now_ns())))
+    assert (played.periods, played.asked_states[-1]) == (1300, IDLE)
+    arming = Played()
+    arming.serve(60, lambda: arming.drive.waiting.append(Frame(0x00E, bytes(4), arming.clock.now_ns())))
+    with pytest.raises(BusError, match="cannot arm the drive: another node commands it"):
+        arming.gateway.run(lambda: False, lambda: None, arms=True)
+    assert (arming.torques[-1], arming.asked_states[-1]) == (0.0, IDLE)
 
 
 def test_an_end_while_the_drive_is_armed_lets_it_go_and_is_not_ready(played: Played) -> None:

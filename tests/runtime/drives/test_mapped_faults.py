@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from emb_runtime.drives.node import INTRUDED
 from emb_runtime.errors import BusError
 from emb_runtime.records import Frame
 from emb_runtime.safety.end_stop import released_speed
@@ -59,6 +60,34 @@ def interface_down(bus: MappedBus) -> None:
         bus.change = bus.before_send = down
 
     bus.at = 60, go_down
+
+
+def inject(bus: MappedBus, frame: Frame) -> None:
+    """Put a frame of a stranger on the drive's bus."""
+    bus.drive.receive(frame)
+    bus.bus._queue.append(frame._replace(time_ns=bus.bus._clock.now_ns(), own=False))
+
+
+def repeated(bus: MappedBus) -> None:
+    """A stranger sends our latest command once more: 6 A."""
+    bus.at = 60, lambda _drive: inject(bus, bus.sent[-1])
+
+
+def fought_over(bus: MappedBus) -> None:
+    """A stranger sends that command after each of ours, for half a second."""
+
+    def fight(_drive: SimulatedDrive) -> None:
+        kept, send, left = bus.sent[-1], bus.bus.send, itertools.count()
+
+        def sent(frame: Frame) -> None:
+            send(frame)
+            if next(left) < 500:
+                inject(bus, kept)
+
+        bus.bus.send = sent  # type: ignore[method-assign]
+        inject(bus, kept)
+
+    bus.at = 60, fight
 
 
 def replaced(identifier: int, of: Callable[[bytes], bytes]) -> Break:
@@ -175,6 +204,8 @@ FAULTS = {
         ("MOTION_OUTSIDE_SET", "NODE_NOT_READY", "MOTION_OUTSIDE_SET"),
         ("", CONTRADICT, ""),
     ),
+    "a command of another node": Fault(lambda _: repeated, ("FOREIGN_COMMAND",) * 3, (INTRUDED,) * 3),
+    "commands of another node": Fault(lambda _: fought_over, ("FOREIGN_COMMAND",) * 3, (INTRUDED,) * 3),
     "current doubled": Fault(lambda drive: edited((COMMAND[drive], DOUBLED[drive])), ("MOTION_OUTSIDE_SET",) * 3),
 }
 
