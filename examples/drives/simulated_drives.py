@@ -138,7 +138,7 @@ class ODrive(SimulatedDrive):
         turns = struct.pack("<ff", angle / (2.0 * math.pi), velocity / (2.0 * math.pi))
         asked = self.asked if self.armed else 0.0
         frames = [Frame(0x009, turns), Frame(0x014, struct.pack("<ff", asked, self.applied))]
-        if self.periods % self.HEARTBEAT_PERIODS == 1:
+        if self.periods % self.HEARTBEAT_PERIODS == 1 % self.HEARTBEAT_PERIODS:
             frames.insert(0, Frame(0x001, struct.pack("<IBBBB", self.error, self.state, 0, 0, 0)))
         return frames
 

@@ -98,7 +98,7 @@ def _serve(args: argparse.Namespace) -> int:
         raise UsageError(
             f"{mapping.name} does not say what it is, and nobody has: expected --serial TEXT, the number on the drive"
         )
-    speed = released_speed(bench, mapping.watchdog)
+    speed = released_speed(bench, mapping.longest_hold(bench.timing.sample_time))
     mention(_description(mapping, bench.name, bench_identity(bench.identity_hash), speed, args.serial))
     stop = StopRequest()
     if not args.listen and not _may_arm(args.yes, stop):

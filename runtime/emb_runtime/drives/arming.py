@@ -8,6 +8,9 @@ from emb_runtime.drives.mapping import Mapping, Step
 from emb_runtime.drives.time_out_proof import TimeOutProof
 from emb_runtime.drives.wire import DriveState
 
+AIMS = (1.0, 0.75, 1.0, 0.75)
+"""Periods after the time-out at which the message that decides is to come: one more silence with each, if none does."""
+
 
 class Arming:
     """Brings one drive from off to armed.
@@ -25,6 +28,7 @@ class Arming:
         self._steps: list[Step] = []
         self._until_ns = 0
         self._proof: TimeOutProof | None = None
+        self._silences = 0
         self.done = False
         """The drive is armed, as far as it says so."""
         self.failure = ""
@@ -42,10 +46,25 @@ class Arming:
     def begin(self, now_ns: int) -> None:
         """Send the first frames (monotonic time [ns])."""
         self._proof, self.done, self.failure = None, False, ""
+        self._silences = 0
+        self._prove(now_ns)
+
+    def _prove(self, now_ns: int) -> None:
         if self._mapping.state is not None:
-            watchdog, polled = self._mapping.watchdog, self._mapping.polled
-            self._proof = TimeOutProof(watchdog, self._mapping.state, self._period_ns, polled=polled)
+            watchdog, polled, aim = self._mapping.watchdog, self._mapping.polled, AIMS[self._silences]
+            self._proof = TimeOutProof(watchdog, self._mapping.state, self._period_ns, polled=polled, aim=aim)
+            self._silences += 1
         self._begin_sequence(now_ns)
+
+    @property
+    def asks_ns(self) -> int | None:
+        """Time at which a polled drive is asked after a silence [ns]; None if there is none."""
+        return None if self._proof is None else self._proof.asks_ns
+
+    def fed(self, now_ns: int) -> None:
+        """Note that a frame leaves to the drive, not before this time [ns]."""
+        if self._proof is not None:
+            self._proof.fed(now_ns)
 
     def silent(self, now_ns: int) -> bool:
         """Returns True if nothing may leave now."""
@@ -79,6 +98,7 @@ class Arming:
             step = self._steps[0]
             if not self._send(step):
                 return
+            self.fed(now_ns)
             if step.timeout:
                 self._until_ns = now_ns + round(step.timeout * 1e9)
                 return
@@ -91,3 +111,10 @@ class Arming:
         self.failure = self._proof.failure
         if self._proof.done:  # it has let go: arm it once more
             self._begin_sequence(now_ns)
+        elif self._proof.unresolved and self._silences < len(AIMS):
+            self._prove(now_ns)
+        elif self._proof.unresolved:
+            self.failure = (
+                f"its time-out is not proved: in {self._silences} silences it was not seen to act, the last one "
+                f"{self._proof.seen_ns * 1e-9:.3f} s; set the drive's to node.watchdog = {self._mapping.watchdog:g} s"
+            )

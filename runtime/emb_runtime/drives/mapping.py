@@ -37,6 +37,10 @@ PROPERTIES = {
 """Properties that a drive may lack, and what is lost with each. Each must be accepted by name."""
 
 
+PASSED_PERIODS = 2
+"""Periods by which the proof of a time-out lets it be longer: the drive looks at its clock, its message waits."""
+
+
 class MappingError(UsageError):
     """A mapping file, or its DBC, is missing, malformed, incomplete, or lacks what nothing replaces."""
 
@@ -143,6 +147,10 @@ class Mapping:
         """See :func:`mapping_hash`."""
         return mapping_hash(self.text, self.dbc_text)
 
+    def longest_hold(self, sample_time: float) -> float:
+        """Longest time for which an armed drive holds its last current without commands, for a sample time [s]."""
+        return self.watchdog + PASSED_PERIODS * sample_time
+
     @property
     def lost(self) -> tuple[str, ...]:
         """Names in :data:`PROPERTIES` of what the drive cannot give."""
@@ -234,10 +242,11 @@ def _fit_problems(mapping: Mapping, bench: Bench) -> Iterator[tuple[str, str]]:
     if mapping.watchdog > bench.node.watchdog:
         longest = f"the bench's node.watchdog = {bench.node.watchdog:g} s"
         yield "node.watchdog", f"{mapping.watchdog:g} s is longer than {longest}"
-    if (worst := released_speed(bench, mapping.watchdog)) > mapping.end_stop_speed:
+    hold = mapping.longest_hold(bench.timing.sample_time)
+    if (worst := released_speed(bench, hold)) > mapping.end_stop_speed:
         yield (
             "node.end_stop_speed",
-            f"without host or cable the drive holds its current for {mapping.watchdog:g} s, then switches it off: the "
+            f"without host or cable the drive holds its current for up to {hold:g} s, then switches it off: the "
             f"brake may reach {worst:.4g} rad/s, and bears {mapping.end_stop_speed:g} rad/s; narrow the bench's limits",
         )
     if (load := mapping.bus_load(bench.timing.sample_time)) > HIGHEST_BUS_LOAD:

@@ -149,6 +149,8 @@ class DriveNode:
         times = [now_ns + self._period_ns]
         if self._mapping.polled:
             times += [self._poll_ns] if self._polls(now_ns) else []
+            if self._silent(now_ns) and self.arming.asks_ns is not None:
+                times.append(self.arming.asks_ns)
         elif self._sample is not None and not (self._answered or self._braked):
             times.append(self._deadline_ns())
         return max(now_ns, min(times))
@@ -288,7 +290,8 @@ class DriveNode:
         if self._silent(sample_ns):
             return
         if self.phase in (Phase.ARMING, Phase.READY):  # a drive says late that it is armed, and its time-out runs
-            self._command(0.0)
+            if self._command(0.0):
+                self.arming.fed(sample_ns)
         elif self.phase is Phase.STOPPING:
             self._command(self._own_current())
 
@@ -374,7 +377,8 @@ class DriveNode:
             self._command(pending)
             self.times.acted(now_ns)
         else:
-            self._command(self._own_current() if self.phase in (Phase.ACTIVE, Phase.STOPPING) else 0.0)
+            if self._command(self._own_current() if self.phase in (Phase.ACTIVE, Phase.STOPPING) else 0.0):
+                self.arming.fed(now_ns)
         self.times.asked(now_ns)
 
     def _own_current(self) -> float:

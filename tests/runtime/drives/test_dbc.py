@@ -98,7 +98,7 @@ def filled(piece: str, after: str = "") -> Callable[[], str]:
     return lambda: DBC + after + piece * ((MAX_DBC_BYTES - len(DBC) - len(after)) // len(piece))
 
 
-LARGE = {
+LARGE: dict[str, Callable[[], str]] = {
     "pages": lambda: DBC.replace(TORQUE, "".join(muxed(MOST_STATEMENTS - 2)) + TORQUE.replace("0|", "16|")).replace(
         "Torque: 4", "Torque: 8"
     ),

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -440,7 +441,7 @@ def test_a_drive_that_another_node_commands_is_not_armed() -> None:
             assert it.drive.sent == []
 
 
-def foreign(played: Played, identifier: int = 0x00E, **changed: bool) -> list[Frame]:
+def foreign(played: Played, identifier: int = 0x00E, **changed: Any) -> list[Frame]:
     """A stranger's frame of one that the mapping sends; commands that the host hears of."""
     before = len(played.host.sent)
     length = 8 if identifier == 0x00B else 0 if identifier == 0x018 else 4

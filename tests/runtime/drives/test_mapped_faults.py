@@ -224,7 +224,7 @@ def test_a_fault_ends_the_run_with_its_name_and_the_brake_where_it_may_be(
     if expected.says[drive]:
         assert not bus.drive.armed
     if expected.lets_go:
-        rests_below(bus, released_speed(bus.bench, bus.mapping.watchdog))
+        rests_below(bus, released_speed(bus.bench, bus.mapping.longest_hold(bus.bench.timing.sample_time)))
     else:
         within_limits(bus)
 

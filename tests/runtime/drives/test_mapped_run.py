@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import html
 import json
 import math
@@ -20,7 +21,8 @@ from emb_runtime.config.bench import parse_bench
 from emb_runtime.drives.lock_step import open_mapped
 from emb_runtime.drives.mapping import PROPERTIES, require_fit
 from emb_runtime.drives.node import Phase
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import BusError, UsageError
+from simulated_drives import ODrive
 from tests.actors import constant_actor
 from tests.drives import SHIPPED, late_bench
 from tests.runtime.drives.mapped import MappedBus, runner, within_limits
@@ -124,7 +126,7 @@ def test_with_zero_only_0_a_leaves_and_the_time_out_was_proved_whenever_the_hear
         bus.shift = shift
         assert emb_run.document("--duration", "0.05", "--zero")["result"] == "done"
         assert {frame.data for frame in bus.sent if frame.identifier == 0x00E} == {bytes(4)}
-        assert bus.transport.node.arming.time_out == "disarmed within 0.013 s without a command"
+        assert bus.transport.node.arming.time_out == "disarmed within 0.011 s without a command"
         within_limits(bus)
 
 
@@ -136,10 +138,25 @@ def test_a_drive_whose_time_out_does_not_act_gets_no_current(
         bus, emb_run = runner("odrive", folder, capsys, monkeypatch)
         bus.watchdog = watchdog
         _, err = emb_run.streams(code=4)
-        assert "its time-out did not act: 0.013 s after" in err
-        assert "node.watchdog says 0.01 s; switch it on in the drive" in err
+        late = "set the drive's to node.watchdog = 0.01 s"
+        assert (late if watchdog else "its time-out did not act: 0.111 s after the last command") in err
         assert not bus.drive.armed
         assert {frame.data for frame in bus.sent if frame.identifier == 0x00E} == {bytes(4)}
+
+
+@pytest.mark.parametrize("says", [1, 2, 5, 7, 11, 12, 13, 20])
+def test_no_drive_is_armed_whose_time_out_exceeds_what_its_end_stop_speed_was_computed_with(
+    says: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ODrive, "HEARTBEAT_PERIODS", says)
+    bus, armed = MappedBus("odrive", late_bench(), tmp_path), set[int]()
+    for time_out in (5, 9, 10, 11, 12, 13, 14, 15, 20, 30):
+        bus.watchdog, bus.shift = time_out * 1e-3 - 1e-6, 7 * time_out
+        with contextlib.suppress(BusError):
+            bus.open("", bus.bench)
+            armed.add(time_out)
+    assert armed <= {5, 9, 10, 11, 12}
+    assert armed >= {5, 9, 10}
 
 
 def test_the_age_of_answers_is_measured_and_one_beyond_the_declared_named(
@@ -169,7 +186,7 @@ def test_a_mapping_that_does_not_fit_the_bench_is_refused_before_anything_is_sen
         ("odrive", "range = [-90, 90]", "range = [-70, 70]", "", "", "does not cover the bench's -500 to 500 rad/s"),
         ("mit", "0.1953, range = [-1.18", "0.05, range = [-1.18", "", "", "a step of 0.176 A is too coarse"),
         ("odrive", "pair_within = 0.0005", "pair_within = 0.0006", "", "", "at most half of the bench's sample time"),
-        ("odrive", "speed = 1800", "speed = 1700", "", "", "may reach 1711 rad/s, and bears 1700 rad/s; narrow"),
+        ("odrive", "speed = 1800", "speed = 1795", "", "", "may reach 1796 rad/s, and bears 1795 rad/s; narrow"),
         ("odrive", "", "", "watchdog         = 0.010", "watchdog = 0.008", "longer than the bench's node.watchdog"),
         ("odrive", "", "", "frame_age     = [0, 1]", "frame_age = [0, 0]", "a mapped drive does not answer by sample"),
         ("mit", "", "", "frame_age     = [1, 1]", "frame_age = [0, 1]", "a mapped drive does not answer by sample"),
