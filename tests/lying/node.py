@@ -63,6 +63,8 @@ class Lie:
     reported: float = 0.0  # The said current of an obeyed command is off by this [A]
     friction_rate: float = 0.0  # Rate at which Coulomb friction grows, as a share of it [1/s]
     stiffness: float = 1.0  # Stiffness from begin on, as a multiple
+    imagined: float = 1.0
+    """What is said is no measurement, but a model of the brake with the spring of the true one and so much of its motor."""
     blind: bool = False  # The node's own limits see what is said, not what is true: they never act
     lost: float = 0.0  # Share of the samples, from the start, whose velocity frame has a wrong CRC
     duty: float = 1.0  # Share of the periods in which it lies, evenly spread; an angle that drifts goes on meanwhile
@@ -117,6 +119,7 @@ class LyingNode:
         """Period of the first lie; None if there was none."""
         self.stopped: int | None = None
         """Period in which the stop began, after the first obeyed command."""
+        self._model = self.angle, self.velocity  # what the lie's model does
         self._counter = 14
         self._status_counter = 0
         self._taken: tuple[int, float, bool] | None = None
@@ -223,7 +226,8 @@ class LyingNode:
                 self._stop(WATCHDOG)
         if self.state == IDLE:
             return 0.0, NO_COMMAND
-        braking = min(max(-self.velocity / 60.0 * 6.0, -6.0), 6.0)
+        seen = self.velocity if self._lie.imagined == 1.0 else self._model[1]
+        braking = min(max(-seen / 60.0 * 6.0, -6.0), 6.0)
         return round(braking / 2e-4) * 2e-4, NO_COMMAND
 
     def _stop(self, reason: int) -> None:
@@ -237,6 +241,13 @@ class LyingNode:
             left = 1e-3 / STEPS
             while left > 0.0:  # Twice where the brake comes to rest within the step
                 left -= self._step(left, current, stiffness, coulomb)
+        if self._lie.imagined != 1.0:
+            true, (self.angle, self.velocity) = (self.angle, self.velocity), self._model
+            for _ in range(STEPS):
+                left = 1e-3 / STEPS
+                while left > 0.0:
+                    left -= self._step(left, current * self._lie.imagined, K_1, T_C)
+            self._model, (self.angle, self.velocity) = (self.angle, self.velocity), true
         self.lowest, self.highest = min(self.lowest, self.angle), max(self.highest, self.angle)
         self.fastest = max(self.fastest, abs(self.velocity))
         if (
@@ -272,9 +283,10 @@ class LyingNode:
 
     def _sample(self, applied: float, obeyed: int) -> list[Said]:
         lie, time_s = self._lie, self.periods * 1e-3 + self._late
-        true = self.angle - lie.zero
+        true_angle, true_velocity = (self.angle, self.velocity) if lie.imagined == 1.0 else self._model
+        true = true_angle - lie.zero
         angle = true - lie.curve * true * true + self._random.gauss(0.0, 1e-3)
-        velocity = self.velocity * self._scale() * (1.0 - 2.0 * lie.curve * true) + self._random.gauss(0.0, 1.0)
+        velocity = true_velocity * self._scale() * (1.0 - 2.0 * lie.curve * true) + self._random.gauss(0.0, 1.0)
         velocity += 0.0 if self.began is None else lie.both
         state, wrong = self.state, 0
         if self.lying:

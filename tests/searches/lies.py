@@ -53,10 +53,11 @@ NEW: dict[str, tuple[Lie, ...]] = {
     "current off, unreported [A]": tuple(Lie(offset_current=a, begin=0.0) for a in (0.4, -0.4, 0.2)),
     "dead band of the drive [A]": tuple(Lie(dead=a, begin=0.0) for a in (0.2, 0.5, 1.0)),
     "friction grows [1/s]": tuple(Lie(friction_rate=r, begin=0.0) for r in (1.0, 3.0, -1.0)),
+    "a model for the encoder, k_m times": tuple(Lie(imagined=k, blind=True) for k in (0.6, 0.75, 1.3)),
     "stiffness changes to": tuple(Lie(stiffness=k, begin=0.25) for k in (0.5, 0.8, 1.3)),
 }
 """Kinds that were not among those found by the first attack."""
-UNDETECTED = 7  # Named in docs/explanation/sensor-monitor.md
+UNDETECTED = 10  # Named in docs/explanation/sensor-monitor.md
 
 
 def size_of(lie: Lie) -> str:

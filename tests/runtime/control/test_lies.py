@@ -349,7 +349,7 @@ UNEXPLAINED: dict[str, Lie] = {
     "friction doubles": Lie(friction_rate=1.0, begin=0.0),
     "stiffness halves": Lie(stiffness=0.5, begin=0.25),
 }
-"""All of these were called done with exit code 0; the shipped actor drives. tests/searches/lies.py plays 61."""
+"""All of these were called done with exit code 0; the shipped actor drives. tests/searches/lies.py plays 64."""
 
 
 @pytest.fixture(scope="module")

@@ -97,12 +97,15 @@ def test_what_it_says_up_to_two_periods_after_the_time_out_decides(
 ODD = 0.0157  # Time of which the nanoseconds, rounded off and not to the nearest, are one fewer [s]
 
 
+def test_before_a_silence_nothing_is_asked() -> None:
+    assert proof(polled=True).asks_ns is None
+
+
 @pytest.mark.parametrize("aim", [1.0, 0.75])
 def test_a_polled_drive_is_asked_after_the_silence_to_the_nanosecond(aim: float) -> None:
     length = 15_700_000 + round(aim * MS)
     for polled in (True, False):
         it = TimeOutProof(ODD, STATE, MS, polled=polled, aim=aim)
-        assert it.asks_ns is None
         it.take(ACTIVE, 3 * MS)
         it.take(ACTIVE, 5 * MS)
         begin = 5 * MS if polled else 5 * MS + -length % (2 * MS)
