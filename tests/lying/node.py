@@ -64,7 +64,7 @@ class Lie:
     friction_rate: float = 0.0  # Rate at which Coulomb friction grows, as a share of it [1/s]
     stiffness: float = 1.0  # Stiffness from begin on, as a multiple
     imagined: float = 1.0
-    """What is said is no measurement, but a model of the brake with the spring of the true one and so much of its motor."""
+    """What is said is no measurement, but a model: the true brake with this many times its k_m."""
     blind: bool = False  # The node's own limits see what is said, not what is true: they never act
     lost: float = 0.0  # Share of the samples, from the start, whose velocity frame has a wrong CRC
     duty: float = 1.0  # Share of the periods in which it lies, evenly spread; an angle that drifts goes on meanwhile
