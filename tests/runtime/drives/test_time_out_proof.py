@@ -97,8 +97,34 @@ def test_what_it_says_up_to_two_periods_after_the_time_out_decides(
 ODD = 0.0157  # Time of which the nanoseconds, rounded off and not to the nearest, are one fewer [s]
 
 
-def test_before_a_silence_nothing_is_asked() -> None:
-    assert proof(polled=True).asks_ns is None
+def test_before_a_silence_nothing_is_asked_and_nothing_seen() -> None:
+    it = proof(polled=True)
+    assert (it.asks_ns, it.seen_ns) == (None, 0)
+    assert it.silent(0) is False
+
+
+def test_without_a_frame_to_it_a_drive_has_been_left_alone_since_the_begin_of_time() -> None:
+    it = proof()
+    for ms, said in ((500, ACTIVE), (511, ACTIVE), (522, IDLE)):
+        it.take(said, ms * MS)
+    assert (it.unresolved, it.seen_ns) == (True, 522 * MS)
+
+
+def test_times_are_rounded_to_the_nearest_nanosecond() -> None:
+    it = TimeOutProof(0.010, STATE, MS + 1, polled=True, aim=0.75)
+    for ns in (5, 6):
+        it.take(ACTIVE, ns)
+    assert it.asks_ns == 6 + 10_750_001
+    it = TimeOutProof(0.010, STATE, MS + 1, polled=False)
+    for ns in (5, 6):
+        it.take(ACTIVE, ns)
+    assert it.silent(7)
+    it = TimeOutProof(ODD, STATE, MS, polled=False)
+    for ns in (5, 6):
+        it.take(ACTIVE, ns)
+    it.fed(6)
+    it.take(IDLE, 6 + 15_700_000 + 2 * MS)
+    assert it.done
 
 
 @pytest.mark.parametrize("aim", [1.0, 0.75])

@@ -222,6 +222,19 @@ def test_an_end_of_the_range_may_be_passed_by_half_a_step(end: float, says: floa
                 guard.command(by_hand(sign * says), sign * end)
 
 
+def test_half_a_step_beyond_the_range_is_half_a_step_to_the_last_bit() -> None:
+    field = KNOWN.command.field
+    for sign in (1.0, -1.0):
+        says = sign * 5.125
+        end = says - sign * 0.500001 * field.step(says)
+        assert end + sign * 0.500001 * field.step(end) == says
+        low, high = sorted((end, 0.0))
+        guard = WireGuard(
+            replace(KNOWN, command=replace(KNOWN.command, low=low, high=high)), LIMIT, lambda _frame: None
+        )
+        assert guard.command(by_hand(says), sign * 5.1) == says
+
+
 def test_numbers_that_are_not_finite_are_refused() -> None:
     guard = WireGuard(load_mapping(EXAMPLES / "odrive.toml"), LIMIT, lambda _frame: None)
     for value in (math.inf, -math.inf, math.nan):
