@@ -469,6 +469,21 @@ def test_a_frame_of_another_commander_stops_a_moving_brake_and_the_host_hears_a_
     assert foreign(played, identifier) == []  # nothing of ours is at stake
 
 
+@pytest.mark.parametrize(("shared", "counts"), [(None, True), (0x009, False), (0x014, False), (0x001, False)])
+def test_a_drive_may_answer_under_the_identifier_of_its_command(shared: int | None, counts: bool) -> None:
+    it = Played()
+    mapping = replace(load_mapping(EXAMPLES / "odrive.toml"), arm=(), disarm=())
+    command = mapping.messages[mapping.command.message]
+    identifier = shared or command.identifier
+    messages = {**mapping.messages, command.name: replace(command, identifier=identifier)}
+    bench = parse_bench(late_bench(), "bench.toml")
+    gateway = Gateway(replace(mapping, messages=messages), bench, it.drive, it.host, it.clock, lambda _ns: None)
+    it.drive.waiting.append(Frame(identifier, bytes(8), it.clock.now_ns()))
+    it.drive.passes = lambda: it.clock.advance_to(it.clock.now_ns() + MS)
+    with pytest.raises(BusError, match="another node commands it" if counts else "no samples of the drive"):
+        gateway.run(lambda: False, lambda: None, arms=True)
+
+
 def test_commands_of_another_node_that_go_on_let_a_moving_drive_go_at_once(played: Played) -> None:
     played.arm()
     played.drive_on(2.0)
