@@ -461,7 +461,7 @@ def test_a_frame_of_another_commander_stops_a_moving_brake_and_the_host_hears_a_
     assert foreign(played, identifier, extended=True) == []
     assert (played.node.phase, played.node.failure) == (Phase.ACTIVE, "")
     (told,) = foreign(played, identifier)
-    assert LAYOUT.decode_command(told)[2:] == (0.0, False)
+    assert LAYOUT.decode_command(told) == (0, 0, 0.0, False)
     assert (played.node.phase, played.node.failure) == (Phase.STOPPING, INTRUDED)
     assert IDLE not in played.asked_states
     played.until(Phase.OFF)
