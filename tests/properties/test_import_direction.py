@@ -22,7 +22,7 @@ MAY_IMPORT = {
 }
 OURS = set.union(*MAY_IMPORT.values())
 ROOMS = {
-    "runtime/emb_runtime": "errors records system config can estimator policy log safety drives control cli",
+    "runtime/emb_runtime": "errors records numbers system config can estimator policy log safety drives control cli",
     "bench/emb_bench": "config documents numbers compiled output figures parallel brake sim logs experiment "
     "information design excitation recordings export hil rerun estimate analysis report commission live batch api cli",
     "train/emb_train": "presets rewards closed_loop env play reference trial evolve ppo training optimum evaluate cli",
