@@ -30,7 +30,7 @@ from emb_bench.figures import for_notebook
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_bench.output import progress, replacing, require_place, say_if_compiling
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.errors import LogError, UsageError
+from emb_runtime.errors import LogError, UsageError, needs
 from emb_runtime.system.terminal import as_json, mention
 
 if TYPE_CHECKING:  # scipy, numba, matplotlib and pyarrow come with the extra [bench]
@@ -71,10 +71,10 @@ class Run(RunLog):
             UsageError: the run has no such topic, or pyarrow or pandas is missing.
             LogError: the topic cannot be decoded.
         """
-        try:
+        with needs("a frame", "notebook"):
+            import pandas  # noqa: F401
+
             return topic(self, name).to_pandas()
-        except ImportError as err:
-            raise UsageError("a frame needs pandas: pip install pandas") from err
 
     def plot(self) -> Any:
         """A figure of matplotlib, see :func:`draw`.
@@ -426,10 +426,8 @@ def report(
     if junit is not None and acceptance is None:
         raise UsageError("--junit: expected it with --acceptance")
     options_of = _study_options(given)
-    try:
+    with needs("a report", "bench"):
         import matplotlib  # noqa: F401
-    except ImportError as err:
-        raise UsageError("a report needs matplotlib: pip install 'emb-excite[bench]'") from err
     from emb_bench.report import acceptance as test
     from emb_bench.report.content import gather
     from emb_bench.report.page import document, report_page
@@ -559,11 +557,9 @@ def design(
     given = parse_assignments(_text_of(theta).replace("nominal", ""), "--theta: ")
     brake = true_parameters(its, given, option="--theta: ")
     problem = make_problem(its, goal, names, model=model, kind=kind, brake=brake, returns=return_home)
-    try:
+    with needs("a design", "bench"):
         from emb_bench.design.report import make_report
         from emb_bench.design.search import steps_of
-    except ImportError as err:
-        raise UsageError("design needs scipy and numba: pip install 'emb-excite[bench]'") from err
     say_if_compiling()
     with progress("design", steps_of(starts)) as advance:
         return make_report(its, problem, goal, kind, starts=starts, seed=seed, told=told or advance)
@@ -651,12 +647,10 @@ def _study_options(given: Mapping[str, Any]) -> Callable[[Bench], StudyOptions]:
 
     unknowns = given["params"], given["nuisance"]
     EstimationProblem(*_unknowns(*unknowns, None), window=given["window"])
-    try:
+    with needs("an estimate", "bench"):
         import numba  # noqa: F401
 
         from emb_bench.analysis.study import StudyOptions
-    except ImportError as err:
-        raise UsageError("an estimate needs scipy and numba: pip install 'emb-excite[bench]'") from err
 
     def of(bench: Bench) -> StudyOptions:
         prior = None if given["prior"] is None else bench.range_set(given["prior"])

@@ -25,7 +25,7 @@ from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import Any, ParamSpec, TypeVar, cast
 
 import emb_runtime
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import needs
 
 PACKAGES = ("emb_runtime", "emb_bench", "emb_train", "emb_export")
 UNUSED_LIFE = 30 * 86400.0  # [s]; each edit of a function leaves its old directory behind
@@ -121,10 +121,8 @@ def source_module(name: str) -> ModuleType:
 
 
 def _jit(fn: FunctionType, directory: str | None, parallel: bool, entry: bool) -> Any:
-    try:
+    with needs("the batch", "bench"):
         import numba
-    except ImportError as err:
-        raise UsageError("the batch needs numba: pip install 'emb-excite[bench]'") from err
     config: Any = numba.config
     before = config.CACHE_DIR
     config.CACHE_DIR = directory or before  # numba reads it once, here, for this function

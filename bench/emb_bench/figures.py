@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from emb_bench.output import replacing
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import needs
 
 # Blue, orange, green, pink, sky, yellow of Okabe and Ito: distinguishable by colour-blind eyes too.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -71,19 +71,15 @@ def svg(draw: Callable[[Any], None], rows: int, columns: int, size: tuple[float,
 
 def for_notebook(rows: int, size: tuple[float, float], **shared: Any) -> tuple[Any, Any]:
     """A figure of matplotlib that a notebook shows, and its axes below each other; in matplotlib's own style."""
-    try:
+    with needs("a plot", "bench"):
         from matplotlib import pyplot as plt
-    except ImportError as err:
-        raise UsageError("a plot needs matplotlib: pip install 'emb-excite[bench]'") from err
     return plt.subplots(rows, figsize=size, layout="constrained", **shared)
 
 
 @contextmanager
 def _figure(rows: int, columns: int, size: tuple[float, float], style: Any, shared: Any) -> Iterator[tuple[Any, Any]]:
-    try:
+    with needs("a figure", "bench"):
         import matplotlib as mpl
-    except ImportError as err:
-        raise UsageError("the figures need matplotlib: pip install 'emb-excite[bench]'") from err
     from matplotlib.figure import Figure
 
     with mpl.rc_context(STYLE | style):

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from emb_bench import ONE_THREAD
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, needs
 
 LOCAL = "local"  # Address that stands for a Ray started here, on this machine
 
@@ -123,10 +123,8 @@ def shared_out_on_ray(
     The work raises nothing. A task that takes longer than the limit [s] is ended.
     """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # else Ray reports to its makers that it is used
-    try:
+    with needs("--ray", "ray"):
         import ray
-    except ImportError as err:
-        raise UsageError("--ray needs ray: pip install 'emb-excite[ray]'") from err
     # The path of a socket may have 107 characters, and Ray's lie deep inside its folder.
     folder = tempfile.mkdtemp(prefix="ray-", dir="/tmp") if address == LOCAL else None
     own: dict[str, Any] = {"num_cpus": jobs, "include_dashboard": False, "_temp_dir": folder} if folder else {}

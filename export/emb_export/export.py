@@ -12,7 +12,7 @@ from pathlib import Path
 from emb_bench.config.bench import load_bench
 from emb_bench.excitation import EXCITATIONS
 from emb_bench.output import replacing, require_place
-from emb_runtime.errors import EXIT_DONE, EmbError, UsageError, near
+from emb_runtime.errors import EXIT_DONE, EmbError, UsageError, near, needs
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.input_file import near_file
 from emb_runtime.system.terminal import Parser, complain, show
@@ -62,10 +62,8 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     arguments = parser().parse_args(argv)
     try:
-        show(_export(arguments))
-    except ModuleNotFoundError as err:
-        extra = "bench" if err.name == "onnx" else "train"
-        return complain("emb-export", UsageError(f"{err.name} is not installed: pip install 'emb-excite[{extra}]'"))
+        with needs("an export", "train"):
+            show(_export(arguments))
     except EmbError as err:
         return complain("emb-export", err)
     return EXIT_DONE
@@ -85,7 +83,8 @@ def _export(arguments: argparse.Namespace) -> str:
 
         data, what = network_file(source)
     else:
-        from emb_export.file import read_sequence, reference_file, sequence_file
+        with needs("an export", "bench"):
+            from emb_export.file import read_sequence, reference_file, sequence_file
 
         bench = load_bench(arguments.bench)
         make_law(bench)  # where no shield can be made, emb-run would refuse the bench

@@ -6,7 +6,8 @@ nothing that a user can cause ends in a traceback.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 
 EXIT_DONE = 0
 EXIT_CHECK_FAILED = 1  # Exit code of a check that ran without error and was not passed
@@ -42,6 +43,19 @@ class EmbError(Exception):
 
 class UsageError(EmbError):
     """The command was given a request that it cannot meet: wrong argument, missing file, missing extra."""
+
+
+@contextmanager
+def needs(purpose: str, extra: str) -> Iterator[None]:
+    """Imports for a purpose; a library that is missing is a UsageError that says how its extra is installed."""
+    try:
+        yield
+    except ImportError as err:
+        library = (err.name or str(err)).partition(".")[0]
+        raise UsageError(
+            f"{purpose} needs {library}: in the clone, pip install -c constraints.txt -e '.[{extra}]'; "
+            f"from a wheel, pip install 'FILE.whl[{extra}]'"
+        ) from err
 
 
 class BenchFileError(UsageError):

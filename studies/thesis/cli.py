@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from emb_bench.config.bench import Bench, load_bench
-from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
+from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError, needs
 from emb_runtime.system.terminal import complain, mention, show
 from studies.thesis.determinant_facts import protected_facts, unprotected_facts
 from studies.thesis.facts import Fact, Statement, facts_text
@@ -66,9 +66,8 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point of ``python -m studies.thesis``."""
     args = parser().parse_args(argv)
     try:
-        show(_run(args))
-    except ModuleNotFoundError as err:
-        return complain(PROGRAM, UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'"))
+        with needs("the thesis's analysis", "train"):
+            show(_run(args))
     except EmbError as err:
         return complain(PROGRAM, err)
     except KeyboardInterrupt:

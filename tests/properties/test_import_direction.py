@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import graphlib
 import importlib.metadata
+import re
 import subprocess
 import sys
 import tomllib
@@ -20,6 +21,7 @@ MAY_IMPORT = {
     "train/emb_train": {"emb_runtime", "emb_bench", "emb_train"},
     "export/emb_export": {"emb_runtime", "emb_bench", "emb_train", "emb_export"},
 }
+OWN = Path(__file__).relative_to(ROOT)
 OURS = set.union(*MAY_IMPORT.values())
 ROOMS = {
     "runtime/emb_runtime": "errors records numbers system config can estimator policy log safety drives control cli",
@@ -33,11 +35,16 @@ ROOMS = {
 
 def imported_modules(path: Path) -> Iterator[str]:
     """Every module that a file imports, at its top or in a function; ``a.b.name`` for ``from a.b import name``."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    return modules_in(ast.parse(path.read_text(encoding="utf-8")))
+
+
+def modules_in(tree: ast.AST) -> Iterator[str]:
+    """Every module that a part of a file imports."""
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import"
+            assert node.level == 0, "relative import"
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
@@ -105,7 +112,7 @@ def test_every_third_party_import_is_declared_in_the_extra_where_it_belongs() ->
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     base = names(project["dependencies"])
-    bench = base.union(*(names(extras[extra]) for extra in ("bench", "mdf", "live", "ray")))
+    bench = base.union(*(names(extras[extra]) for extra in ("bench", "mdf", "live", "ray", "notebook")))
     train = bench.union(*(names(extras[extra]) for extra in ("train",)))
     allowed = {
         "runtime/emb_runtime": base,
@@ -120,6 +127,75 @@ def test_every_third_party_import_is_declared_in_the_extra_where_it_belongs() ->
                 # A namespace such as google.protobuf belongs to several distributions: one declared is enough.
                 providers = {p.lower().replace("_", "-") for p in by_module[module]}
                 assert providers & declared, f"{path} imports {module} ({providers})"
+
+
+def test_an_extra_that_a_message_names_has_every_library_whose_lack_it_explains() -> None:
+    by_module = importlib.metadata.packages_distributions()
+    guards = 0
+    for path in (file for room in (*MAY_IMPORT, "studies", "tools") for file in (ROOT / room).rglob("*.py")):
+        for guard in (
+            node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.With)
+        ):
+            call = guard.items[0].context_expr
+            if isinstance(call, ast.Call) and ast.unparse(call.func) == "needs":
+                guards += 1
+                extra = ast.literal_eval(call.args[1])
+                for module in loaded_by(guard, path):
+                    providers = {p.lower().replace("_", "-") for p in by_module[module]}
+                    assert providers & everything_in(extra), f"{path}: [{extra}] has no {module} ({providers})"
+    assert guards > 15
+
+
+def loaded_by(guard: ast.With, path: Path) -> set[str]:
+    """Third-party packages that the imports below a guard load; where it has calls only, those of its file."""
+    inside = list(modules_in(guard)) or list(imported_modules(path))
+    ours, found = set[str](), set[str]()
+    while inside:
+        module = inside.pop()
+        package, *rest = module.split(".")
+        if package not in OURS:
+            found |= {package} - set(sys.stdlib_module_names) - {"studies", "tools", "tests"}
+        elif module not in ours:
+            ours.add(module)
+            file = next(iter(ROOT.glob(f"*/{package}"))).joinpath(*rest).with_suffix(".py")
+            if file.exists():  # else a name in one, whose own module is found without it
+                top = ast.parse(file.read_text(encoding="utf-8")).body
+                inside += [
+                    name for node in top if isinstance(node, ast.Import | ast.ImportFrom) for name in modules_in(node)
+                ]
+            inside += [module.rpartition(".")[0]] if rest else []
+    return found
+
+
+def everything_in(extra: str) -> set[str]:
+    """Distributions that an extra brings."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    found = set(project["dependencies"])
+    waiting = [extra]
+    while waiting:
+        for each in project["optional-dependencies"][waiting.pop()]:
+            if each.startswith("emb-excite["):
+                waiting += each.removeprefix("emb-excite[").rstrip("]").split(",")
+            else:
+                found.add(each)
+    return names([*found])
+
+
+def test_every_line_that_installs_the_project_works_in_a_clone() -> None:
+    """It is in no index, and without the constraints a training gets another torch."""
+    tracked = subprocess.run(["git", "ls-files"], capture_output=True, text=True, check=True, cwd=ROOT).stdout.split()
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    lines = 0
+    for name in tracked:
+        if not name.endswith((".py", ".md", ".ipynb", ".yml")) or name == "CHANGELOG.md" or Path(name) == OWN:
+            continue
+        text = (ROOT / name).read_text(encoding="utf-8")
+        assert not re.search(r"pip install[^`\n]*emb[-_]excite\[", text), name
+        for options, extra in re.findall(r"pip install ([^`\n]*?)['\"]\.\[([^]]*)\]", text):
+            lines += 1
+            assert "-c constraints.txt" in options, name
+            assert extra in {*extras, "{extra}"}, name
+    assert lines > 8
 
 
 def names(requirements: list[str]) -> set[str]:

@@ -15,7 +15,7 @@ from fractions import Fraction
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import needs
 from tools.proof.symbolic_execution import DeadEnd, Path, lift, walk
 
 Real = Any  # A term, or a plain number
@@ -32,10 +32,8 @@ def solver_module() -> Any:
     Raises:
         UsageError: it is not installed.
     """
-    try:
+    with needs("checking the shield's proof", "dev"):
         return importlib.import_module("z3")  # it comes without types
-    except ImportError as err:
-        raise UsageError("checking the shield's proof needs z3: pip install 'emb-excite[dev]'") from err
 
 
 def _exact(value: Any) -> Any:

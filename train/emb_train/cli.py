@@ -17,7 +17,7 @@ from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY
 from emb_bench.output import make_empty_folder, progress, replacing
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError
+from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError, needs
 from emb_runtime.system.terminal import Parser, as_json, complain, mention, show, typed_command
 from emb_train.presets import TASKS, listed, preset_summaries, reference_names, wrapped
 
@@ -403,9 +403,8 @@ def main(argv: list[str] | None = None) -> int:
     try:
         arguments: Any = parser().parse_args(argv)
         name = f"emb-train {arguments.command}"
-        return COMMANDS[arguments.command](arguments)
-    except ModuleNotFoundError as err:
-        return complain(name, UsageError(f"{err.name} is not installed: pip install 'emb-excite[train]'"))
+        with needs("training", "train"):
+            return COMMANDS[arguments.command](arguments)
     except EmbError as err:
         return complain(name, err)
     except KeyboardInterrupt as err:

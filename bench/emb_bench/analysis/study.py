@@ -33,7 +33,7 @@ from emb_bench.information.evaluation import check_sample_time, default_model
 from emb_bench.logs.log import RunLog, end_detail
 from emb_bench.numbers import amount
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, needs
 from emb_runtime.safety.state_machine import FAULTS, Fault
 
 SHOWN = 3  # Most suspected effects that are named
@@ -158,12 +158,11 @@ class Study:
     def to_dataframe(self) -> Any:
         """A pandas frame with a row for each parameter, the columns those of :meth:`to_dict`."""
         rows = [{"name": label, **row} for label, row in self.to_dict().items()]
-        try:
+        with needs("a frame", "notebook"):
+            import pandas  # noqa: F401
             import pyarrow as pa
 
             return pa.Table.from_pylist(rows).to_pandas().set_index("name")
-        except ImportError as err:
-            raise UsageError("a data frame needs pyarrow and pandas: pip install pyarrow pandas") from err
 
     @property
     def names(self) -> list[str]:

@@ -17,7 +17,7 @@ from emb_bench.batch.row import Options, Row, Source, failed, write_rows
 from emb_bench.batch.summary import Campaign, mark_copies, summarise
 from emb_bench.output import progress, replacing, require_place
 from emb_bench.parallel import Lost, shared_out, shared_out_on_ray
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, needs
 from emb_runtime.records import HOMING_LOG, LISTEN_ONLY_LOG
 from emb_runtime.system.input_file import near_file
 from emb_runtime.system.terminal import mention
@@ -37,12 +37,10 @@ def run_campaign(
 ) -> Campaign:
     """Evaluate logs, and write their rows; the arguments are those of :func:`emb_bench.api.campaign`."""
     require_place("--output", output, ROWS)
-    try:
+    with needs("a campaign", "bench"):
         import numba  # noqa: F401
         import pyarrow  # noqa: F401
         import scipy  # noqa: F401
-    except ImportError as err:
-        raise UsageError(f"a campaign needs {err.name}: pip install 'emb-excite[bench]'") from err
     sources, evaluate = find(paths), partial(evaluate_one, options=options)
     with replacing(output) as beside:
         if ray is None:

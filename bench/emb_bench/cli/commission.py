@@ -9,7 +9,7 @@ from pathlib import Path
 from emb_bench.config.bench import load_bench
 from emb_bench.documents import to_json
 from emb_runtime.can.interfaces import open_transport
-from emb_runtime.errors import EXIT_DONE, EmbError, UsageError
+from emb_runtime.errors import EXIT_DONE, EmbError, UsageError, needs
 from emb_runtime.system.terminal import Parser, as_json, complain, mention, show
 
 EPILOG = """\
@@ -72,10 +72,8 @@ def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     try:
         sheet = load_bench(args.bench)
-        try:
+        with needs("commissioning", "bench"):
             from emb_bench.commission.commissioning import Commissioning, emb_run
-        except ImportError as err:
-            raise UsageError(f"{err}; pip install 'emb-excite[bench]'") from err
         each = options(args)
         open_transport(args.iface, sheet, ())[0].close()  # what is wrong with it is said first, and before any step
         if "--confirm" in each and (sys.stdin is None or not sys.stdin.isatty()):

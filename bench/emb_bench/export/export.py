@@ -15,7 +15,7 @@ from emb_bench.export.picture import draw_run
 from emb_bench.logs.log import UNIX_TIME, RunLog
 from emb_bench.logs.mcap_file import Column
 from emb_bench.output import replacing, require_place, text_cells
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, needs
 
 
 def arrow_batches(log: RunLog, topic: str) -> tuple[Any, Iterator[Any]]:
@@ -23,10 +23,8 @@ def arrow_batches(log: RunLog, topic: str) -> tuple[Any, Iterator[Any]]:
 
     Units are in the fields' metadata, the run's identity and completeness in the schema's.
     """
-    try:
+    with needs("an Arrow table", "bench"):
         import pyarrow as pa
-    except ImportError as err:
-        raise UsageError("Arrow and Parquet need pyarrow: pip install 'emb-excite[bench]'") from err
     table = log.describe(topic)
 
     def kind(column: Column) -> Any:

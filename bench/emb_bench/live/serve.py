@@ -27,7 +27,7 @@ from mcap import records as mcap
 from emb_bench.live.page import SUBPROTOCOL, Page, html
 from emb_bench.logs.mcap_file import Chunk
 from emb_runtime.config.bench import Systematic
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, needs
 
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
@@ -137,10 +137,8 @@ class Server:
     """
 
     def __init__(self, host: str = HOST, port: int = PORT) -> None:
-        try:
+        with needs("a viewer's server", "live"):
             from websockets.sync.server import serve
-        except ImportError as err:
-            raise UsageError("a viewer's server needs websockets: pip install 'emb-excite[live]'") from err
         self._host = host
         self._lock = threading.Lock()
         self._viewers: set[Viewer] = set()

@@ -20,7 +20,7 @@ from emb_bench.config.plants import Instruments
 from emb_bench.experiment.experiment import Experiment, Lack
 from emb_bench.recordings.map_file import TIMED, RecordingMap, Signal, Source
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
-from emb_runtime.errors import EmbError, UsageError
+from emb_runtime.errors import EmbError, UsageError, needs
 from emb_runtime.system.input_file import open_regular
 
 Floats = NDArray[np.float64]
@@ -39,19 +39,19 @@ class Column(NamedTuple):
 def read_columns(path: Path, kind: str, source: Source, names: Sequence[str]) -> dict[str, Column]:
     """Named columns of a file of a kind; ``struct.field`` inside MATLAB structures."""
     names = list(dict.fromkeys(names))
-    readers: Mapping[str, tuple[str, str, Callable[[], Iterator[tuple[str, Any, Any]]]]] = {
-        "csv": ("CSV", "pyarrow", lambda: _csv(path, source, names)),
-        "parquet": ("Parquet", "pyarrow", lambda: _parquet(path, names)),
-        "matlab": ("MATLAB", "scipy", lambda: _matlab(path, names)),
-        "mdf": ("MDF", "asammdf", lambda: _mdf(path, names)),
+    readers: Mapping[str, tuple[str, Callable[[], Iterator[tuple[str, Any, Any]]]]] = {
+        "csv": ("CSV", lambda: _csv(path, source, names)),
+        "parquet": ("Parquet", lambda: _parquet(path, names)),
+        "matlab": ("MATLAB", lambda: _matlab(path, names)),
+        "mdf": ("MDF", lambda: _mdf(path, names)),
     }
-    title, library, read = readers[kind]
+    title, read = readers[kind]
     found = {}
     try:
         open_regular(path).close()
     except OSError as err:
         raise UsageError(f"{path}: cannot read the recording: {err.strerror}") from err
-    with _errors_in_one_line(path, title, library):
+    with _errors_in_one_line(path, title):
         for name, values, time in read():
             found[name] = Column(_numbers(path, name, values), None if time is None else _numbers(path, name, time))
     for name, column in found.items():
@@ -61,13 +61,12 @@ def read_columns(path: Path, kind: str, source: Source, names: Sequence[str]) ->
 
 
 @contextmanager
-def _errors_in_one_line(path: Path, kind: str, library: str) -> Iterator[None]:
+def _errors_in_one_line(path: Path, kind: str) -> Iterator[None]:
     try:
-        yield
+        with needs(f"{path}: reading {kind}", "mdf"):
+            yield
     except EmbError:
         raise
-    except ImportError as err:
-        raise UsageError(f"{path}: reading {kind} needs {library}: pip install 'emb-excite[mdf]'") from err
     except Exception as err:  # every library has errors of its own, and some raise whatever they meet
         _let_go(err)
         said = " ".join(str(err).split())[:120] or type(err).__name__

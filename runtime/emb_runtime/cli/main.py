@@ -104,7 +104,7 @@ def shown(plan: Plan) -> Iterator[None]:
         raise UsageError("--live: needs Linux; emb-replay live shows a run from another terminal")
     entries = list(metadata.entry_points(group=VIEWERS, name="live"))
     if not entries:
-        raise UsageError("--live: nothing is installed that shows a run; emb_bench does")
+        raise UsageError("--live: no module is installed that shows a run; emb_bench has one")
     one = names_a_file(plan.log)
     document = {
         "folder": str(plan.log.parent if one else plan.log),
@@ -137,7 +137,7 @@ def _reporter(page: Path) -> str:
     """Module whose command ``report`` writes a page; asked for before the run."""
     entries = list(metadata.entry_points(group=VIEWERS, name="report"))
     if not entries:
-        raise UsageError("--report: nothing is installed that writes a page; emb_bench does: emb-excite[bench]")
+        raise UsageError("--report: no module is installed that writes a page; emb_bench has one")
     if page.suffix not in (".html", ".htm"):
         raise UsageError(f"--report {page}: expected a name that ends in .html or .htm")
     if not page.absolute().parent.is_dir():

@@ -142,9 +142,9 @@ def test_a_missing_library_is_named_with_what_to_install(
 ) -> None:
     (tmp_path / "1.mcap").touch()
     monkeypatch.setitem(sys.modules, "ray", None)
-    assert "emb-excite[ray]" in replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet", "--ray", "local")
+    assert "'.[ray]'" in replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet", "--ray", "local")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    assert "emb-excite[bench]" in replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet")
+    assert "'.[bench]'" in replay.refused("campaign", tmp_path, "-o", tmp_path / "r.parquet")
 
 
 def test_a_run_counts_once_and_the_whole_log_or_the_one_that_holds_most_of_it_is_the_one() -> None:

@@ -150,4 +150,4 @@ def test_without_scipy_and_numba_the_other_commands_work_and_this_one_says_what_
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 2
         assert done.stderr.count("\n") == 1
-        assert "emb-excite[bench]" in done.stderr
+        assert "'.[bench]'" in done.stderr

@@ -206,7 +206,7 @@ def test_a_motion_of_no_brake_of_the_data_sheet_ends_it_with_what_to_look_at_and
     for fault in ("OUT_OF_LIMITS", "MOTION_OUTSIDE_SET"):
         failed = {**fine, "result": fault, "cause": "the brake moves as none"}
         for document in (failed, {**fine, "homing": {"before": failed}}):
-            with pytest.raises(StepFailedError, match=rf"{fault}: the brake moves.*; no parameter was found yet") as ended:
+            with pytest.raises(StepFailedError, match=rf"{fault}: the brake moves.*; no parameter was found") as ended:
                 commissioning(tmp_path, partial(_gives, document)).run()
             assert ended.value.exit_code == 3
     with pytest.raises(StepFailedError, match="begin again in the same folder") as ended:

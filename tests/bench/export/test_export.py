@@ -189,7 +189,8 @@ def test_a_missing_extra_is_named(path: Path, tmp_path: Path, monkeypatch: pytes
         with monkeypatch.context() as missing:
             missing.setitem(sys.modules, module, None)
             said = replay.refused("export", path, "-o", tmp_path / name)
-        assert "pip install 'emb-excite[bench]'" in said
+        assert f"needs {module}: " in said
+        assert "pip install -c constraints.txt -e '.[bench]'" in said
         assert not (tmp_path / name).exists()
 
 

@@ -400,7 +400,7 @@ def test_a_topic_with_another_schema_gets_another_channel(server: Server) -> Non
 
 def test_without_the_library_the_server_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "websockets.sync.server", None)
-    with pytest.raises(UsageError, match=r"emb-excite\[live\]"):
+    with pytest.raises(UsageError, match=r"needs websockets: .*'\.\[live\]'"):
         Server(port=0)
 
 
