@@ -1,6 +1,7 @@
-# make demo   one simulated experiment with the shipped actor, its report as a page, and its Fisher information
+# make demo   one simulated experiment with the shipped actor, and its report as a page
 # make test   style, types, and the tests: no root, no kernel, nothing outside .venv (4 minutes on two processors)
 # make hil    the programs as shipped on a real vcan0, with faults; needs user-mode-linux, gcc, libc6-dev, iproute2
+# make browser   pages in a real browser: a run on its live page, a report on screen and on paper; needs chromium, pdftotext
 # make night  what takes longer: slow tests, every fault, searches, fuzzing, all mutants
 # make coverage   branch coverage of codec, guard, shield and state machine, which must be 100 %
 # make mutation | mutation-changed   changes one place of them at a time; each change must make a test fail
@@ -19,7 +20,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 TORCH := $(shell grep '^torch==' constraints.txt)
 WORKERS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 
-.PHONY: help demo test pytest hil night compiled lint coverage mutation mutation-changed package bench docs clean
+.PHONY: help demo test pytest hil browser night compiled lint coverage mutation mutation-changed package bench docs clean
 
 help:
 	@sed -n '/^$$/q; s/^# //p' Makefile
@@ -32,21 +33,29 @@ $(BIN)/python:
 		|| { echo "$(PYTHON) cannot make environments: sudo apt-get install python3-venv"; exit 1; }
 	$(PYTHON) -m venv --clear $(VENV)
 
-# What drives and analyses: no torch.
+# What drives and analyses: no torch. pip is quiet: a line says what takes the time.
 $(VENV)/.base: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing the bench into $(VENV): about a minute ..."
 	$(PIP) -e '.[bench]'
 	@touch $@
 
 # torch first and pinned: left open, it is looked up anew, and may come with gigabytes of CUDA.
 $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing everything, with torch, into $(VENV): some minutes ..."
 	$(PIP) $(TORCH)
 	$(PIP) -e '.[dev]'
-	@touch $@ $(VENV)/.base
+	@touch $@ $(VENV)/.base $(VENV)/.docs
+
+# The site's modules are read, not imported.
+$(VENV)/.docs: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing mkdocs into $(VENV): about a minute ..."
+	$(PIP) -e '.[docs]'
+	@touch $@
 
 demo: $(VENV)/.base
 	@mkdir -p demo && rm -f demo/experiment.mcap demo/report.html
 	$(BIN)/emb-run --iface sim --log demo/experiment.mcap --report demo/report.html
-	$(BIN)/emb-replay fim demo/experiment.mcap
+	@echo "open demo/report.html"
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -56,13 +65,18 @@ lint: $(VENV)/.dev
 
 PYTEST := $(BIN)/python -m pytest
 PARALLEL := --numprocesses=$(WORKERS) --dist=worksteal --ignore=tests/hil
+QUICK := 'not slow and not browser'
 
 # mypy takes one processor for a minute: the tests begin beside it.
 test: $(VENV)/.dev
 	$(MAKE) --jobs=2 --no-print-directory lint pytest
+	@echo "not run here: programs on a vcan0 (make hil), pages in a browser (make browser), long tests and searches (make night)"
 
 pytest: $(VENV)/.dev
-	$(PYTEST) $(PARALLEL) -m 'not slow'
+	$(PYTEST) $(PARALLEL) -m $(QUICK)
+
+browser: $(VENV)/.dev
+	$(PYTEST) -m browser tests/bench/live tests/bench/report
 
 # The plays in one worker, since one kernel plays them all; emb-hil itself in the other.
 HIL := $(PYTEST) --numprocesses=2 --dist=loadfile --junitxml=build/hil.xml tests/hil
@@ -135,8 +149,9 @@ clean:
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The site, into build/site; it reads without a network.
-docs: $(VENV)/.dev
+docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "open build/site/index.html"
 
 .PHONY: study-thesis study-reproduce figures proof
 

@@ -16,8 +16,6 @@ from emb_bench import api
 from emb_bench.commission.records import Identification
 from emb_bench.live.follow import chunks
 from emb_bench.live.page import Page, html
-from emb_bench.logs.estimates import known_errors
-from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, Noise, load_bench
 
@@ -39,8 +37,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shown_live(path: Path) -> dict[str, Any]:
     """The last message of the page on an estimate."""
     page = Page()
-    page.errors = known_errors(read_log(path))
-    told = [json.loads(page.add(chunk)) for chunk in chunks(path, lambda: False)]
+    told = [json.loads(page.add(chunk)) for chunk in chunks(path, lambda: False, page.know)]
     return [one for one in told if one["table"]][-1]  # type: ignore[no-any-return]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import shlex
 import time
 from pathlib import Path
 
@@ -16,13 +17,13 @@ from emb_runtime.system.terminal import mention
 def live(place: Path = Path("runs"), *, host: str = HOST, port: int = PORT) -> None:
     """Show runs while they go on: on a page in the browser, or in Foxglove.
 
-    Show the logs that appear in a folder while they are written: on a page in the browser, and in Foxglove and
-    Lichtblick over the Foxglove WebSocket protocol (open the address as a connection, with the layout of the
-    documentation). The command only reads files and does not affect a run. Ctrl-C ends it. emb-run --live shows one
-    run.
+    Show the newest log of a folder and those that appear, while they are written: on a page in the browser, which
+    lists the others, and in Foxglove and Lichtblick over the Foxglove WebSocket protocol (open the address as a
+    connection, with the layout of the documentation). The command only reads files and does not affect a run. Ctrl-C
+    ends it. emb-run --live shows one run.
 
     Args:
-        place: folder whose new logs are shown, or one log; its parent folder must exist (default: runs/).
+        place: folder whose logs are shown, or one log; its parent folder must exist (default: runs/).
         host: address to listen at (default: 127.0.0.1, this computer only).
         port: port to listen at; 0 for a free one (default: 8765).
 
@@ -34,9 +35,12 @@ def live(place: Path = Path("runs"), *, host: str = HOST, port: int = PORT) -> N
         raise UsageError(f"--port: expected 0 to 65535, got {port}")
     if not place.parent.is_dir():
         raise UsageError(f"{place}: there is no folder {place.parent}: make it, or name a place in another")
-    server = Server(host, port)
     one = bool(place.suffix) and not place.is_dir()
+    command = f"emb-run --iface sim --log {shlex.quote(str(place) if one else f'{place}/')}"
+    server = Server(host, port, f"no log {'is' if one else 'in'} {place} yet: in another terminal, {command}")
     logs = NewLogs(place.parent, glob.escape(place.name), old=True) if one else NewLogs(place)
+    for newest in logs.names[:1]:
+        logs.choose(newest)
 
     def wait() -> bool:
         time.sleep(POLL)
@@ -48,8 +52,8 @@ def live(place: Path = Path("runs"), *, host: str = HOST, port: int = PORT) -> N
         mention(str(err))
 
     try:
-        mention(f"shows {'the log' if one else 'new logs in'} {place}: {server.addresses}; Ctrl-C ends it")
-        follow(logs, server, wait, complain, once=one)
+        mention(f"shows {'the log' if one else 'the logs in'} {place}: {server.addresses}; Ctrl-C ends it")
+        follow(logs, server, wait, complain)
     except KeyboardInterrupt:
         pass
     finally:

@@ -10,20 +10,31 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from mcap import records as mcap
 from mcap.opcode import Opcode
 
 from emb_bench.live.serve import Server
-from emb_bench.logs.estimates import known_errors
-from emb_bench.logs.log import UNREADABLE, read_log
-from emb_bench.logs.mcap_file import DAMAGE, LARGEST, MAGIC, MOST_CARRIED, RECORD, Chunk, message_of, unpack_chunk
+from emb_bench.logs.log import LARGEST_TEXT, UNREADABLE, read_log
+from emb_bench.logs.mcap_file import (
+    DAMAGE,
+    LARGEST,
+    MAGIC,
+    MOST_CARRIED,
+    RECORD,
+    Chunk,
+    message_of,
+    stream_of,
+    unpack_chunk,
+)
 from emb_runtime.errors import LogError
 from emb_runtime.system.input_file import open_regular
 
 
-def chunks(path: Path, wait: Callable[[], bool]) -> Iterator[Chunk]:
+def chunks(path: Path, wait: Callable[[], bool], bench: Callable[[bytes], object] = len) -> Iterator[Chunk]:
     """The chunks of a log, each as soon as it is whole; ends with the log's footer.
 
     ``wait`` is called where the file has no more yet, waits a little, and is False if nothing more is to be waited for.
+    ``bench`` gets the bench file inside the log.
 
     Raises:
         LogError: it cannot be read, or is no log.
@@ -41,6 +52,10 @@ def chunks(path: Path, wait: Callable[[], bool]) -> Iterator[Chunk]:
                     return
                 if opcode == Opcode.CHUNK:
                     yield unpack_chunk(body)
+                elif opcode == Opcode.ATTACHMENT:
+                    attached = mcap.Attachment.read(stream_of(body))
+                    if attached.name == "bench.toml" and len(attached.data) <= LARGEST_TEXT:
+                        bench(attached.data)
     except OSError as err:
         raise LogError(f"{path}: {err.strerror}") from err
     except DAMAGE as err:
@@ -59,19 +74,36 @@ def _read(file: BinaryIO, count: int, wait: Callable[[], bool]) -> bytes | None:
     return data
 
 
+MOST_LISTED = 100  # Logs of a folder that can be chosen
+
+
 class NewLogs:
-    """The logs that appear in a folder, the oldest first; with ``old`` those that are there already, too."""
+    """The logs that appear in a folder, the oldest first; with ``old`` those that are there already, too.
+
+    One that is chosen comes before them.
+    """
 
     def __init__(self, folder: Path, pattern: str = "*.mcap", old: bool = False) -> None:
         self._folder = folder
         self._pattern = pattern
         self._seen = set() if old else set(self._logs())
+        self._chosen: Path | None = None
 
     def next(self) -> Path | None:
         """The next log, if there is one yet."""
-        new = self._new()
-        self._seen.update(new[:1])
+        new = self._new()[:1]
+        self._chosen = None
+        self._seen.update(new)
         return new[0] if new else None
+
+    def choose(self, name: str) -> None:
+        """Let the log of a name be the next, if it is here."""
+        self._chosen = next((path for path in self._logs() if path.name == name), None)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the latest logs, the newest first."""
+        return [path.name for path in self._logs()[: -MOST_LISTED - 1 : -1]]
 
     @property
     def waiting(self) -> bool:
@@ -79,7 +111,8 @@ class NewLogs:
         return bool(self._new())
 
     def _new(self) -> list[Path]:
-        return [path for path in self._logs() if path not in self._seen]
+        chosen = [] if self._chosen is None else [self._chosen]
+        return chosen + [path for path in self._logs() if path not in self._seen]
 
     def _logs(self) -> list[Path]:
         try:
@@ -93,27 +126,25 @@ def follow(
     server: Server,
     wait: Callable[[], bool],
     complain: Callable[[LogError], object],
-    once: bool = False,
 ) -> None:
-    """Give a server every log that appears, or the first only, as it grows, until ``wait`` says that no more comes.
+    """Give a server every log that appears or is chosen, as it grows, until ``wait`` is False.
 
     ``complain`` takes what is wrong with a log; the next is followed all the same.
     """
     goes_on = True
-    while goes_on or (logs.waiting and not once):
+    server.choose = logs.choose
+    while goes_on or logs.waiting:
         if (path := logs.next()) is None:
             goes_on = wait()
             continue
-        server.begin()
+        server.begin(path.name, logs.names)
         try:
             # A run that was killed leaves a log that has no end.
-            for number, chunk in enumerate(chunks(path, lambda: wait() and not logs.waiting)):
-                if number == 0:  # the attachments lie before it
-                    server.know(known_errors(read_log(path)))
+            for chunk in chunks(path, lambda: wait() and not logs.waiting, server.know):
                 server.add(chunk)
             server.end(read_log(path).exit_reason)
-        except LogError as err:
-            complain(err)
-        except UNREADABLE as err:
-            complain(LogError(f"{path}: its messages are not readable: {message_of(err)}"))
-        goes_on &= not once
+        except (LogError, *UNREADABLE) as err:
+            told = LogError(f"{path}: its messages are not readable: {message_of(err)}")
+            told = err if isinstance(err, LogError) else told
+            server.end(str(told))
+            complain(told)

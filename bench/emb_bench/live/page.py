@@ -9,14 +9,16 @@ from __future__ import annotations
 import json
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import resources
 from typing import Any
 
 from mcap import records as mcap
 
+from emb_bench.config.bench import parse_bench
 from emb_bench.logs.mcap_file import Chunk, message_class
 from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.errors import BenchFileError
 from emb_runtime.estimator.estimate import UNKNOWN, by_name, rows, shares, total
 from emb_runtime.records import Reason, RunState
 
@@ -36,22 +38,34 @@ def html() -> str:
 class Page:
     """One log after the other as the messages that the page takes."""
 
-    def __init__(self) -> None:
-        self.begin()
+    def __init__(self, empty: str = "") -> None:
+        self.begin("", ())
+        self._first = json.dumps({"empty": empty})
 
     @property
     def so_far(self) -> list[str]:
-        """Messages of the present log, the beginning first."""
-        return [json.dumps({"begin": True}), *self._sent]
+        """Messages of the present log, the beginning first; without one what to do."""
+        return [self._first, *self._sent]
 
-    def begin(self) -> str:
-        """Another log begins."""
+    def begin(self, name: str, logs: Sequence[str]) -> str:
+        """Another log begins, one of some that can be shown."""
+        self._first = json.dumps({"begin": name, "logs": logs})
         self._sent: deque[str] = deque(maxlen=KEPT)
         self._schemas: dict[int, mcap.Schema] = {}
         self._classes: dict[int, tuple[str, Any]] = {}
         self._start_ns = -1
-        self.errors = UNKNOWN  # Systematic errors by the log's bench file
-        return self.so_far[0]
+        self._errors = UNKNOWN  # Systematic errors by the log's bench file
+        return self._first
+
+    def know(self, bench: bytes) -> str:
+        """Limits of the run's bench file, none if it is refused; its systematic errors count from now on."""
+        try:
+            found = parse_bench(bench.decode(), "bench.toml", analysis=True)
+        except (BenchFileError, UnicodeDecodeError):
+            return self._keep({})
+        self._errors, limits = found.systematic, found.limits
+        speed, current = limits.velocity, limits.current
+        return self._keep({"limits": [limits.angle, (-speed, speed), (-current, current)]})
 
     def add(self, chunk: Chunk) -> str:
         """Samples, estimates and transitions of a chunk; times in seconds since the experiment began.
@@ -61,23 +75,26 @@ class Page:
         """
         said: dict[str, Any] = {"cycles": [], "estimates": [], "events": []}
         estimate: dict[str, dict[str, Any]] = {}
-        for topic, message in self._messages(chunk):
+        for topic, time_ns, message in self._messages(chunk):
             if topic == "/safety":
-                said["events"].append(f"{message.code} {message.text}")
+                said["events"].append((1e-9 * time_ns, f"{message.code} {message.text}"))
             elif topic == "/estimate":
-                estimate = by_name([getattr(message, name) for name in NUMBERS], self.errors)
+                estimate = by_name([getattr(message, name) for name in NUMBERS], self._errors)
                 repeatability = {name: _number(share) for name, share in shares(estimate).items()}
                 said["estimates"].append({"step": message.step, "repeatability": repeatability})
             elif message.state in RUNNING:
+                if self._start_ns < 0:
+                    self._start_ns = message.receive_time_ns
+                    said["start"] = 1e-9 * time_ns
                 said["cycles"].append(self._cycle(message))
-        return self._keep({**said, "table": [*rows(estimate)], "total": total(shares(estimate), self.errors)})
+        return self._keep({**said, "table": [*rows(estimate)], "total": total(shares(estimate), self._errors)})
 
     def end(self, reason: str) -> str:
         """The log is whole: the run's exit reason."""
         return self._keep({"result": reason})
 
-    def _messages(self, chunk: Chunk) -> Iterator[tuple[str, Any]]:
-        """Topic and content of each message in a chunk that the page shows."""
+    def _messages(self, chunk: Chunk) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time [ns] and content of each message in a chunk that the page shows."""
         for record in chunk.described:
             if isinstance(record, mcap.Schema):
                 self._schemas[record.id] = record
@@ -87,11 +104,9 @@ class Page:
         for message in chunk.messages():
             if message.channel_id in self._classes:
                 topic, factory = self._classes[message.channel_id]
-                yield topic, factory.FromString(message.data)
+                yield topic, message.publish_time, factory.FromString(message.data)
 
     def _cycle(self, c: Any) -> dict[str, float | None]:
-        if self._start_ns < 0:
-            self._start_ns = c.receive_time_ns
         return {
             "step": c.step,
             "time": 1e-9 * (c.receive_time_ns - self._start_ns),

@@ -26,12 +26,12 @@ def main(arguments: list[str]) -> int:
     (fd,) = map(int, arguments)
     document = child_process.read_document(fd)
     try:
-        server = Server(port=document["port"])
+        server = Server(port=document["port"], empty="the run has not begun yet")
     except UsageError as err:
         child_process.answer({"error": str(err)})
         return 1
     logs = NewLogs(Path(document["folder"]), document["pattern"])
-    child_process.answer({"ready": server.addresses})
+    child_process.answer({"ready": [server.page, server.addresses]})
     follow(logs, server, _wait, _complain)
     server.close()
     return 0

@@ -18,7 +18,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,7 +26,6 @@ from mcap import records as mcap
 
 from emb_bench.live.page import SUBPROTOCOL, Page, html
 from emb_bench.logs.mcap_file import Chunk
-from emb_runtime.config.bench import Systematic
 from emb_runtime.errors import UsageError, needs
 
 if TYPE_CHECKING:
@@ -38,6 +37,11 @@ PORT = 8765  # Port that viewers propose
 SUBSCRIBING = 0.1  # Time for viewers to subscribe to new topics before their first message [s]
 LINGER = 0.2  # Time for viewers to get the last messages [s]
 BACKLOG = 1 << 14  # Messages that wait for a slow viewer; a chunk has about a thousand. Then its oldest are left out.
+MOST_WAITING = 32 << 20  # Size of them [bytes]
+MOST_SAID = 1000  # Texts that wait for a slow viewer, which is left then; a page that comes late gets ``KEPT`` at once
+MOST_VIEWERS = 16
+LARGEST_REQUEST = 64 << 10  # [bytes]
+OPENING, CLOSING = 2.0, 0.5  # Longest handshakes [s]
 
 ORIGINS: Final = (
     None,  # No page of a browser: the viewer as a program
@@ -59,11 +63,13 @@ MESSAGE: Final = struct.Struct("<BIQ")  # Opcode 1, number of the subscription, 
 class Viewer:
     """One connection: its subscriptions, and what waits to be sent by a thread of its own."""
 
-    def __init__(self, connection: ServerConnection) -> None:
+    def __init__(self, connection: ServerConnection, server: Server) -> None:
         self._connection = connection
+        self._server = server
         self._subscriptions: dict[int, int] = {}
         self._said: deque[str] = deque()
-        self._messages: deque[bytes] = deque(maxlen=BACKLOG)
+        self._messages: deque[bytes] = deque()
+        self._waiting = 0  # Size of the messages [bytes]
         self._news = threading.Condition()
         self._open = True
 
@@ -74,7 +80,9 @@ class Viewer:
     def send(self, *texts: str) -> None:
         """Send texts, before the messages that wait."""
         with self._news:
-            self._said.extend(texts)
+            if self._open:
+                self._said.extend(texts)
+                self._open = len(self._said) <= MOST_SAID
             self._news.notify()
 
     def log(self, channel: int, time_ns: int, data: bytes) -> None:
@@ -82,6 +90,9 @@ class Viewer:
         if (subscription := self._subscriptions.get(channel)) is not None:
             with self._news:
                 self._messages.append(MESSAGE.pack(1, subscription, time_ns) + data)
+                self._waiting += len(data)
+                while len(self._messages) > BACKLOG or self._waiting > MOST_WAITING:
+                    self._waiting -= len(self._messages.popleft()) - MESSAGE.size
                 self._news.notify()
 
     def listen(self) -> None:
@@ -91,7 +102,7 @@ class Viewer:
         try:
             for asked in self._connection:
                 self._take(asked)
-        except (KeyError, TypeError, ValueError, AttributeError):
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError):
             pass  # it does not speak the protocol
         finally:
             with self._news:
@@ -104,25 +115,34 @@ class Viewer:
         document = json.loads(asked) if isinstance(asked, str) else {}
         if document.get("op") == "subscribe":
             new = {int(each["channelId"]): int(each["id"]) & 0xFFFFFFFF for each in document["subscriptions"]}
-            self._subscriptions = self._subscriptions | new
+            known = self._server.advertised
+            self._subscriptions = {key: value for key, value in (self._subscriptions | new).items() if key in known}
+            if unknown := new.keys() - known:
+                self.say(op="status", level=2, message=f"no channel is numbered {min(unknown)}")
         elif document.get("op") == "unsubscribe":
             ended = document["subscriptionIds"]
             self._subscriptions = {key: value for key, value in self._subscriptions.items() if value not in ended}
+        elif document.get("op") == "show":
+            self._server.choose(str(document["log"]))
 
     def _send(self) -> None:
         from websockets.exceptions import ConnectionClosed
+        from websockets.frames import CloseCode
 
         try:
             while True:
                 with self._news:
                     self._news.wait_for(lambda: self._said or self._messages or not self._open)
                     if not self._open:
-                        return
+                        break
                     waiting: list[str | bytes] = [*self._said, *self._messages]
                     self._said.clear()
                     self._messages.clear()
+                    self._waiting = 0
                 for each in waiting:
                     self._connection.send(each)
+            if len(self._said) > MOST_SAID:
+                self._connection.close(CloseCode.TRY_AGAIN_LATER, "too slow: load the page again")
         except ConnectionClosed:
             pass  # listen() ends as well
 
@@ -136,14 +156,16 @@ class Server:
         UsageError: websockets is not installed, or the port cannot be had.
     """
 
-    def __init__(self, host: str = HOST, port: int = PORT) -> None:
+    def __init__(self, host: str = HOST, port: int = PORT, empty: str = "") -> None:
         with needs("a viewer's server", "live"):
             from websockets.sync.server import serve
         self._host = host
         self._lock = threading.Lock()
         self._viewers: set[Viewer] = set()
         self._pages: set[Viewer] = set()
-        self._page = Page()
+        self._page = Page(empty)
+        self.choose: Callable[[str], object] = str
+        """Called with the name of the log that a page asks for."""
         self._channels: dict[tuple[str, bytes], dict[str, Any]] = {}
         self._made = 0
         self._schemas: dict[int, mcap.Schema] = {}
@@ -158,25 +180,37 @@ class Server:
                 process_request=self._page_or_refusal,
                 subprotocols=(*SUBPROTOCOLS, SUBPROTOCOL),  # type: ignore[arg-type]
                 compression=None,
+                open_timeout=OPENING,
+                close_timeout=CLOSING,
+                max_size=LARGEST_REQUEST,
                 logger=silent,
             )
         except (OSError, OverflowError) as err:
-            raise UsageError(f"the server cannot listen at {host}:{port}: {err}") from err
+            raise UsageError(
+                f"the server cannot listen at {host}:{port}: {err}; choose another port, or 0 for a free one"
+            ) from err
         place = f"{host}:{self._server.socket.getsockname()[1]}"
         self.address = f"ws://{place}"  # For a viewer
-        self.addresses = f"http://{place} in a browser, {self.address} in Foxglove"
+        self.page = f"http://{place}"  # For a browser
+        self.addresses = f"{self.page} in a browser, {self.address} in Foxglove"
         self._thread = threading.Thread(target=self._server.serve_forever)
         self._thread.start()
 
-    def begin(self) -> None:
-        """Another log begins: its numbers of channels and schemas are its own."""
+    def begin(self, name: str = "", logs: Sequence[str] = ()) -> None:
+        """Another log begins, one of some that can be asked for: its numbers of channels and schemas are its own."""
         self._schemas.clear()
         self._of_log.clear()
-        self._to_pages(self._page.begin)
+        self._to_pages(lambda: self._page.begin(name, logs))
 
-    def know(self, errors: Systematic) -> None:
-        """Take the systematic errors by the log's bench file, for the totals on the page."""
-        self._page.errors = errors
+    def know(self, bench: bytes) -> None:
+        """Show the limits by the log's bench file, and totals with its systematic errors."""
+        self._to_pages(lambda: self._page.know(bench))
+
+    @property
+    def advertised(self) -> set[int]:
+        """Numbers of the channels that a viewer may subscribe to."""
+        with self._lock:
+            return {channel["id"] for channel in self._channels.values()}
 
     def end(self, reason: str) -> None:
         """The log is whole: the run's exit reason."""
@@ -234,9 +268,13 @@ class Server:
             return int(self._channels[key]["id"])
 
     def _view(self, connection: ServerConnection) -> None:
-        viewer = Viewer(connection)
+        from websockets.frames import CloseCode
+
+        viewer = Viewer(connection, self)
         of_its_kind = self._pages if connection.subprotocol == SUBPROTOCOL else self._viewers
         with self._lock:
+            if len(self._viewers) + len(self._pages) >= MOST_VIEWERS:
+                return connection.close(CloseCode.TRY_AGAIN_LATER, f"there are {MOST_VIEWERS} viewers: close one")
             if of_its_kind is self._pages:
                 viewer.send(*self._page.so_far)
             else:

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -82,7 +82,7 @@ def main(argv: list[str] | None = None) -> int:
         plan = prepare(args)
         console = Operator(plan, StopRequest())
         try:
-            with log_folder(plan.log), shown(plan):
+            with log_folder(plan.log), shown(plan, console.stop_requested):
                 if plan.stage is Stage.READ_ONLY:
                     return _read(plan, console)
                 return _experiment(plan, console)
@@ -95,8 +95,11 @@ def main(argv: list[str] | None = None) -> int:
 
 
 @contextmanager
-def shown(plan: Plan) -> Iterator[None]:
-    """While this lasts, another process shows the growing logs of a plan, where ``--live`` asks for that."""
+def shown(plan: Plan, stop_requested: Callable[[], bool]) -> Iterator[None]:
+    """While this lasts, another process shows the growing logs of a plan, where ``--live`` asks for that.
+
+    On a terminal the page stays afterwards, until Ctrl-C: a run is over before a browser has been opened.
+    """
     if plan.live is None:
         yield
         return
@@ -116,10 +119,24 @@ def shown(plan: Plan) -> Iterator[None]:
     except OSError as err:
         raise UsageError(f"--live: {err}") from err
     try:
-        mention(f"live at {child.ready}")
+        page, addresses = child.ready
+        mention(f"live at {addresses}")
+        if plan.open:
+            _open(page)
         yield
+        if sys.stdout is not None and sys.stdout.isatty() and not stop_requested():
+            mention(f"page stays at {page} until Ctrl-C")
+            while child.alive and not stop_requested():
+                time.sleep(LISTEN_NS * 1e-9)
     finally:
         child.end()
+
+
+def _open(page: str) -> None:
+    import webbrowser  # only here: it looks for programs
+
+    if not webbrowser.open(page):
+        mention(f"--open: no browser is found here; open {page} in one")
 
 
 def _experiment(plan: Plan, console: Console) -> int:

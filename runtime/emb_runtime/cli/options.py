@@ -122,6 +122,7 @@ class Plan:
     watchdog: bool
     confirm: bool | None  # Ask before anything is armed; None where the bus is real and there is somebody to ask
     live: int | None  # Port at which the run is shown
+    open: bool  # A browser is started that shows it
     json: bool
     verbose: bool
     quiet: bool  # The verdict only
@@ -178,8 +179,10 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument(
         "--live", nargs="?", type=int, const=LIVE_PORT, metavar="PORT",
         help="show the run while it goes on, from a process of its own: to browsers, Foxglove and Lichtblick at "
-        f"this port (default: {LIVE_PORT}; needs the extra [live])",
+        f"this port (default: {LIVE_PORT}; needs the extra [live]). On a terminal the page stays after the run, until "
+        "Ctrl-C",
     )  # fmt: skip
+    what.add_argument("--open", action="store_true", help="open the page of --live in the browser")
     what.add_argument(
         "--report", type=Path, metavar="FILE.html",
         help="after the run, estimate the parameters and write the page, as emb-replay report does (needs the "
@@ -244,6 +247,8 @@ def prepare(args: argparse.Namespace) -> Plan:
     steps, listen = _duration(args, bench)
     if stage is not Stage.READ_ONLY and not args.long_timeouts:
         bench.refuse_long_timeouts()
+    if args.open and args.live is None:
+        raise UsageError("--open: expected it with --live, whose page it opens")
     of_an_experiment = {
         "--home": args.home, "--quick": args.quick, "--stop-when": args.stop_when, "--report": args.report
     }  # fmt: skip
@@ -279,6 +284,7 @@ def prepare(args: argparse.Namespace) -> Plan:
         watchdog=not args.no_watchdog,
         confirm=True if args.confirm else False if args.yes else None,
         live=_live(args.live),
+        open=args.open,
         json=args.json,
         verbose=args.verbose,
         quiet=args.quiet,

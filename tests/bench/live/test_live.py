@@ -3,6 +3,7 @@ from __future__ import annotations
 import http.client
 import json
 import os
+import pty
 import random
 import shutil
 import signal
@@ -14,7 +15,7 @@ import time
 import urllib.request
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,15 +25,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap import records as mcap
 from mcap.reader import make_reader
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from emb_bench.live.follow import NewLogs, chunks, follow
-from emb_bench.live.serve import Server
+from emb_bench.live.page import SUBPROTOCOL
+from emb_bench.live.serve import BACKLOG, LARGEST_REQUEST, MOST_SAID, MOST_VIEWERS, MOST_WAITING, Server, Viewer
 from emb_bench.logs.log import read_log
 from emb_bench.logs.mcap_file import HEADER, Chunk
 from emb_runtime.cli import main as emb_run
-from emb_runtime.config.bench import Systematic, load_bench
-from emb_runtime.errors import EXIT_DONE, EXIT_USAGE, LogError, UsageError
+from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EXIT_USAGE, LogError, UsageError
 from emb_runtime.estimator.estimate import LOST, UNITS
 from emb_runtime.numbers import around, in_percent
 from tests.bench.damaged import rewritten, without
@@ -141,9 +143,9 @@ def test_a_log_that_is_damaged_or_ends_early_does_not_keep_the_next_one_back(shi
     follow(logs, cast("Server", told), never, wrong.append)
     assert [len(log) > 0 for log in told.logs] == [False, True, True]
     assert sum(len(chunk.at) for chunk in told.logs[2]) == messages_of(shipped).total()
-    assert len(wrong) == 1
-    assert told.reasons[0].startswith("unknown")
-    assert told.reasons[1:] == ["DONE"]
+    assert told.reasons[0] == str(wrong[0])
+    assert told.reasons[1].startswith("unknown")
+    assert told.reasons[2:] == ["DONE"]
 
 
 def test_a_log_whose_messages_lack_a_field_is_named(shipped: Path, tmp_path: Path, server: Server) -> None:
@@ -162,11 +164,11 @@ class Told:
         self.logs: list[list[Chunk]] = []
         self.reasons: list[str] = []
 
-    def begin(self) -> None:
+    def begin(self, name: str, logs: list[str]) -> None:
         self.logs.append([])
 
-    def know(self, errors: Systematic) -> None:
-        assert errors == load_bench().systematic
+    def know(self, bench: bytes) -> None:
+        assert b"[limits]" in bench
 
     def add(self, chunk: Chunk) -> None:
         self.logs[-1].append(chunk)
@@ -226,7 +228,7 @@ def test_a_viewer_gets_every_message_over_the_foxglove_protocol(shipped: Path) -
 
 @pytest.fixture
 def server() -> Iterator[Server]:
-    served = Server(port=0)
+    served = Server(port=0, empty="no log yet")
     yield served
     served.close()
 
@@ -269,20 +271,25 @@ def browser_at(server: Server, profile: Path) -> Iterator[Browser]:
             process.communicate(timeout=SECONDS)
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
+@pytest.mark.browser
 def test_the_page_in_a_browser_shows_every_sample_and_estimate(shipped: Path, tmp_path: Path, server: Server) -> None:
     log = read_log(shipped)
     cycles, last, wrong = log.cycles["step"] >= 0, log.tables["/estimate"], list[LogError]()
     whole = f"cycles.length === {cycles.sum()} && document.title.startsWith('DONE')"
     with browser_at(server, tmp_path / "early") as page:
-        page.wait("document.getElementById('state').textContent === 'waiting for a run'")
+        page.wait("document.getElementById('state').textContent === 'no log yet'")
         for _ in range(2):  # the second log takes the place of the first
             page.value("document.title = ''")
-            follow(NewLogs(shipped.parent, shipped.name, old=True), server, never, wrong.append, once=True)
+            follow(NewLogs(shipped.parent, shipped.name, old=True), server, never, wrong.append)
             page.wait(whole)
         assert page.value("cycles.map(c => c.angle)") == log.cycles["angle"][cycles].tolist()
         assert page.value("estimates.length") == log.counts["/estimate"]
         page.wait("document.querySelectorAll('canvas').length === 4 && !waiting")  # the last estimate is drawn
+        assert page.value("document.body.innerText").startswith(f"{shipped.name} DONE")
+        assert page.value("limits") == [[-10, 100], [-500, 500], [-6, 6]]
+        assert "0.000 s  ACTIVE after BEGIN" in page.value(
+            "[...document.querySelectorAll('li')].map(e => e.textContent)"
+        )
         rows = page.value("[...document.querySelectorAll('#estimate tr')].map(r => r.innerText.split('\\t'))")
         assert [row[0] for row in rows] == [*UNITS]
         for name, unit, (_, value, half) in zip(UNITS, UNITS.values(), rows, strict=True):
@@ -290,7 +297,7 @@ def test_the_page_in_a_browser_shows_every_sample_and_estimate(shipped: Path, tm
             share = 1.96 * last[f"{name}_deviation"][-1] / last[name][-1]
             assert half == f"repeatability ± {in_percent(share)}"
         assert page.value("document.getElementById('total').textContent") == "total about 2 %, as J is known to 1 %"
-        page.value(f"take({{cycles: [], estimates: [], table: [], events: ['{LOST} not finite']}})")
+        page.value(f"take({{cycles: [], estimates: [], table: [], events: [[0, '{LOST} not finite']]}})")
         assert page.value("estimates.length + document.getElementById('estimate').childElementCount") == 0
     with browser_at(server, tmp_path / "late") as page:
         page.wait(whole)
@@ -298,6 +305,7 @@ def test_the_page_in_a_browser_shows_every_sample_and_estimate(shipped: Path, tm
 
 PORT = "{port}"
 PROTOCOL: list[Any] = ["foxglove.sdk.v1"]
+PAGE: list[Any] = [SUBPROTOCOL]
 FOREIGN = {
     "a page from elsewhere": {"origin": "https://evil.example"},
     "a page whose address begins like ours": {"origin": "http://localhost.evil.example"},
@@ -398,6 +406,82 @@ def test_a_topic_with_another_schema_gets_another_channel(server: Server) -> Non
             viewer.recv(0.05)
 
 
+def test_the_newest_log_of_a_folder_is_shown_first_and_the_page_may_ask_for_another(
+    shipped: Path, tmp_path: Path, server: Server
+) -> None:
+    for order, name in enumerate(("old", "new")):
+        shutil.copy(shipped, tmp_path / f"{name}.mcap")
+        os.utime(tmp_path / f"{name}.mcap", ns=(order, order))
+    logs = NewLogs(tmp_path)
+    with connect(server.address, subprotocols=PAGE, max_size=None) as page:
+        assert json.loads(page.recv(SECONDS)) == {"empty": "no log yet"}
+        logs.choose(logs.names[0])
+        for name in ("new", "old"):
+            follow(logs, server, never, lambda err: pytest.fail(str(err)))
+            said = [json.loads(page.recv(SECONDS))]
+            while "result" not in said[-1]:
+                said.append(json.loads(page.recv(SECONDS)))
+            assert said[0] == {"begin": f"{name}.mcap", "logs": ["new.mcap", "old.mcap"]}
+            assert [each["limits"] for each in said if "limits" in each] == [[[-10, 100], [-500, 500], [-6, 6]]]
+            events = [event for each in said for event in each.get("events", ())]
+            (start,) = (each["start"] for each in said if "start" in each)
+            assert [text for time, text in events if abs(time - start) < 1e-6] == ["ACTIVE after BEGIN"]
+            for asked in ("../run.mcap", str(shipped), "", "old.mcap"):
+                page.send(json.dumps({"op": "show", "log": asked}))
+            deadline = time.monotonic() + SECONDS
+            while not logs.waiting and time.monotonic() < deadline:
+                time.sleep(0.01)
+
+
+def test_an_empty_folder_says_what_to_type(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "emb_bench.cli.replay", "live", "--port", "0", "my runs"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+        assert process.stderr is not None
+        address = process.stderr.readline().split("http://")[1].split()[0]
+        with connect(f"ws://{address}", subprotocols=PAGE) as page:
+            said = json.loads(page.recv(SECONDS))["empty"]
+        process.send_signal(signal.SIGINT)
+        assert process.wait(SECONDS) == EXIT_DONE
+    assert said == "no log in my runs yet: in another terminal, emb-run --iface sim --log 'my runs/'"
+
+
+def test_a_viewer_may_subscribe_to_what_is_advertised_and_nothing_else(server: Server, shipped: Path) -> None:
+    with connect(server.address, subprotocols=PROTOCOL) as viewer:
+        topics = subscribe_to_everything_once_served(server, viewer, shipped)
+        many = [{"id": number, "channelId": number} for number in range(1000, 2000)]
+        for _ in range(50):
+            viewer.send(json.dumps({"op": "subscribe", "subscriptions": many}))
+            said = json.loads(viewer.recv(SECONDS))
+            assert said == {"op": "status", "level": 2, "message": "no channel is numbered 1000"}
+        subscribed(server, len(topics))
+        viewer.send("x" * (LARGEST_REQUEST + 1))
+        with pytest.raises(ConnectionClosed, match="1009"):
+            viewer.recv(SECONDS)
+
+
+def test_one_viewer_too_many_is_told_so_and_the_others_stay(server: Server) -> None:
+    with ExitStack() as held:
+        viewers = [held.enter_context(connect(server.address, subprotocols=PROTOCOL)) for _ in range(MOST_VIEWERS)]
+        assert all(json.loads(viewer.recv(SECONDS))["op"] == "serverInfo" for viewer in viewers)
+        for kind in (PROTOCOL, PAGE):
+            with connect(server.address, subprotocols=kind) as refused, pytest.raises(ConnectionClosed, match="1013"):
+                refused.recv(SECONDS)
+        viewers[0].ping().wait(SECONDS)
+
+
+def test_what_waits_for_a_slow_viewer_is_bounded() -> None:
+    slow = Viewer(cast("Any", None), cast("Any", None))
+    slow._subscriptions = {1: 7}
+    for size, most in ((10, BACKLOG), (MOST_WAITING // 4, 4)):
+        for _ in range(BACKLOG + 10 if size == 10 else 20):
+            slow.log(1, 0, bytes(size))
+        assert len(slow._messages) == most
+    for _ in range(2 * MOST_SAID):
+        slow.say(op="status")
+    assert len(slow._said) == MOST_SAID + 1
+    assert not slow._open  # it is left
+
+
 def test_without_the_library_the_server_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "websockets.sync.server", None)
     with pytest.raises(UsageError, match=r"needs websockets: .*'\.\[live\]'"):
@@ -434,11 +518,53 @@ def test_a_run_that_is_shown_is_the_same_run(shipped: Path, tmp_path: Path) -> N
         assert list(map(repr, ours[column].tolist())) == list(map(repr, theirs[column].tolist())), column
 
 
+def on_a_terminal(arguments: list[str], cwd: Path, until: bytes, **environment: str) -> tuple[int, str]:
+    """Play emb-run on a terminal, and press Ctrl-C there once it has said something: exit code, and what it said."""
+    ours, its = pty.openpty()
+    command = [sys.executable, "-m", "emb_runtime.cli.main", "--no-rt", *arguments]
+    with subprocess.Popen(
+        command, stdin=its, stdout=its, stderr=its, cwd=cwd, start_new_session=True, env=os.environ | environment
+    ) as process:
+        os.close(its)
+        try:
+            said = b""
+            while until not in said:
+                said += os.read(ours, 4096)
+            page = said.decode().split("live at ")[1].split()[0]
+            socket_at = page.replace("http", "ws")
+            with connect(socket_at, subprotocols=PAGE) as first, connect(socket_at, subprotocols=PROTOCOL) as second:
+                assert "begin" in json.loads(first.recv(SECONDS))  # who comes after the run still sees it
+                assert json.loads(second.recv(SECONDS))["op"] == "serverInfo"
+                process.send_signal(signal.SIGINT)
+                return process.wait(SECONDS), said.decode()
+        finally:
+            process.kill()
+            os.close(ours)
+
+
+def test_on_a_terminal_the_page_stays_until_ctrl_c_which_gives_the_exit_code_of_the_run(tmp_path: Path) -> None:
+    started = tmp_path / "browser"
+    started.write_text(f"#!/bin/sh\necho $1 > {tmp_path}/opened\n")
+    started.chmod(0o755)
+    for sim, code, environment in (
+        ("sim", EXIT_DONE, {"BROWSER": str(started)}),
+        ("sim:k_m=0.05", EXIT_SAFETY_STOP, {"BROWSER": "/nonexistent", "PATH": "/nonexistent", "DISPLAY": ""}),
+    ):
+        found, said = on_a_terminal(
+            ["--iface", sim, "--live", "0", "--open", "--log", "runs/"], tmp_path, b"until Ctrl-C", **environment
+        )
+        assert (found, "Traceback" in said) == (code, False), said
+        page = said.split("page stays at ")[1].split()[0]
+        assert f"live at {page} in a browser" in said
+        assert f"open {page} in one" in said or (tmp_path / "opened").read_text().strip() == page
+    assert "no browser is found here" in said
+
+
 def test_ctrl_c_is_how_watching_a_folder_ends(tmp_path: Path) -> None:
     arguments = [sys.executable, "-m", "emb_bench.cli.replay", "live", "--port", "0", str(tmp_path)]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
-        assert "shows new logs in" in process.stderr.readline()
+        assert "shows the logs in" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
         assert process.wait(SECONDS) == EXIT_DONE
         assert process.stderr.read() == ""

@@ -16,7 +16,7 @@ from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.bench.report_pages import Report, make, read  # isort: skip
 from tests.conftest import Simulate  # isort: skip
 
-pytestmark = pytest.mark.slow  # what it needs is not of Python
+pytestmark = pytest.mark.browser  # what it needs is not of Python
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
