@@ -218,7 +218,13 @@ def faults_tables() -> str:
     return "\n".join(lines)
 
 
+def peers_table() -> str:
+    """The comparison with other programs of the README."""
+    return (ROOT / "README.md").read_text(encoding="utf-8").split("<!-- peers -->\n")[1].split("\n<!-- /peers -->")[0]
+
+
 MARKERS = {
+    "<!-- peers -->": peers_table,
     "<!-- rooms -->": rooms_table,
     "<!-- messages -->": messages_tables,
     "<!-- topics -->": topics_tables,
