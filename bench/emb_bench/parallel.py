@@ -132,7 +132,7 @@ def shared_out_on_ray(
     try:
         try:
             _require_answer(address)
-            with _deaf(), chdir("/"):  # Ray has its processes import from the folder in which it is started
+            with chdir("/"), _deaf():  # Ray has its processes import from the folder in which it is started
                 ray.init(address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **own)
         except (OSError, OverflowError, RuntimeError, ValueError) as err:
             raise UsageError(f"--ray: Ray at '{address}' cannot be used: {err}") from err

@@ -107,7 +107,7 @@ def test_a_run_ends_with_its_page_where_that_is_asked_for_and_possible(
     emb_run.refused("is no folder", "--report", str(tmp_path / "none" / "page.html"))
     emb_run.refused("so --report has nothing to do", "--report", str(page), "--read-only")
     monkeypatch.setattr("emb_runtime.cli.main.metadata.entry_points", lambda **_: [])
-    emb_run.refused("nothing is installed that writes a page", "--report", str(page))
+    emb_run.refused("no module is installed that writes a page", "--report", str(page))
     assert not (tmp_path / "run.mcap").exists()
 
 

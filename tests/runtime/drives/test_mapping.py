@@ -90,7 +90,7 @@ def test_a_mistake_is_one_line_that_names_it() -> None:
         ('unit = "rev/s"', 'unit = "knots"', "can.signals.velocity.unit: expected one of"),
         ('unit = "rev", sign = 1', 'unit = "rev"', "can.signals.angle.sign: missing"),
         ('unit = "rev", sign = 1', 'unit = "rev", sign = 2', "expected one of -1, 1, got 2"),
-        ('unit = "rev", sign = 1', 'unit = "rev", sign = true', "expected one of -1, 1, got True"),
+        ('unit = "rev", sign = 1', 'unit = "rev", sign = true', "expected one of -1, 1, got true"),
         (", range = [-2, 17]", "", "can.signals.angle.range: missing"),
         ("range = [-2, 17]", "range = [17, -2]", "the lower value"),
         ("range = [-2, 17]", "range = [nan, 17]", "finite"),
