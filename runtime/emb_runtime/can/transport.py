@@ -36,6 +36,7 @@ _MSG_CONFIRM: Final = 0x800
 _MSG_DONTWAIT: Final = 0x40
 _OFFSET_ERROR_NS: Final = 20_000  # Error of a measured offset of the two clocks, at most; more is a step [ns]
 _OFFSETS: Final = 16  # Offsets that are kept while the queue is never empty
+_DELIVERY_NS: Final = 1_000_000_000  # Longest time from a stamp until the frame is in the queue [ns]
 
 
 class TransmitQueueFullError(BusError):
@@ -257,11 +258,12 @@ class SocketCan:
     def _arrival_ns(self, wall_ns: int) -> int:
         """Arrival of a frame that has just been read, by the kernel's stamp; both [ns].
 
-        The stamp is the wall clock's, which may step at any time. What is sure is monotonic: the frame came after the
-        queue was last seen empty, and before now. Within these bounds it came as the stamp says by an offset of the two
-        clocks that was measured in between. Where a step has left several of them, the earliest arrival counts; where
-        none fits, as of a step that was taken back, the lower bound. So a step makes a frame look older, not newer,
-        and only one that waited meanwhile or was the first to be read after it.
+        The stamp is the wall clock's, which may step at any time. What is sure is monotonic: the frame was put into the
+        queue after that was last seen empty, and before now. Within these bounds it came as the stamp says by an offset
+        of the two clocks that was measured in between. Where a step has left several of them, the earliest arrival
+        counts. Where none fits, the kernel was late with it, and it came before the queue was seen empty; or, as of a
+        step that was taken back, the lower bound counts. So a step makes a frame look older, not newer, and only one
+        that waited meanwhile or was the first to be read after it.
         """
         clock = self._clock
         offset_ns = clock.wall_offset_ns()
@@ -270,8 +272,9 @@ class SocketCan:
         empty_ns, now_ns = self._empty_ns, clock.now_ns()
         earliest_ns, latest_ns = empty_ns - _OFFSET_ERROR_NS, now_ns + _OFFSET_ERROR_NS
         times_ns = [wall_ns - known_ns for known_ns in self._offsets_ns]
-        possible_ns = [time_ns for time_ns in times_ns if earliest_ns <= time_ns <= latest_ns]
-        return min(max(min(possible_ns), empty_ns), now_ns) if possible_ns else empty_ns
+        if possible_ns := [time_ns for time_ns in times_ns if earliest_ns <= time_ns <= latest_ns]:
+            return min(max(min(possible_ns), empty_ns), now_ns)
+        return max((time_ns for time_ns in times_ns if 0 < empty_ns - time_ns < _DELIVERY_NS), default=empty_ns)
 
     def _loss(self, code: int | None) -> BusError:
         """The error about a lost bus."""

@@ -358,11 +358,7 @@ def log_path(wanted: Path, ending: str = "") -> Path:
     if not names_a_file(wanted):
         name = time.strftime("%Y%m%d-%H%M%S") + f"-{time.time_ns() // 1_000_000 % 1000:03d}"
         path = wanted / f"run-{name}{ending}.mcap"
-    try:
-        exists = os.path.lexists(path)  # also a link that leads nowhere
-    except OSError as err:
-        raise UsageError(f"--log {wanted}: {err.strerror}") from err
-    if exists:
+    if os.path.lexists(path):  # also a link that leads nowhere
         raise UsageError(f"--log: {path}: the file exists; logs are never overwritten, choose another name")
     return path
 

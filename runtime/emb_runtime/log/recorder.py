@@ -26,6 +26,7 @@ from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 
 START_TIMEOUT: Final = 30.0  # Longest wait for the recorder process to have the file on disk [s]
 FINISH_TIMEOUT: Final = 30.0  # Longest wait for it to write what is left and close the file [s]
+READ_BACK: Final = 20e6  # Rate at which the slowest disk gives the file back, which takes longer [bytes per second]
 
 
 class RecorderResult(NamedTuple):
@@ -110,6 +111,11 @@ class Recorder:
         while len(self._ring) > self._ring.slots // 2 and self._child.alive:
             self._child.make_room()
 
+    @property
+    def _size(self) -> int:
+        """Size of what is at the log's path now [bytes]."""
+        return self.path.stat().st_size if self.path.exists() else 0
+
     def push(self, record: Record) -> None:
         """Record anything; never waits."""
         self._ring.push(*pack(record))
@@ -121,14 +127,13 @@ class Recorder:
         """
         with contextlib.suppress(OSError):  # if the process is gone, what it last said follows
             self._child.tell(trailer)
-        answer = self._child.answer(timeout)
+        answer = self._child.answer(timeout + self._size / READ_BACK)
         dropped = self._ring.dropped
         backlog = len(self._ring)
         self._child.end()
         self._ring.close()
-        size = self.path.stat().st_size if self.path.exists() else 0
         lost = dropped + int(answer.get("lost", backlog))
         error = str(answer.get("error", ""))
         if not error and lost:
             error = f"{lost} records did not fit into the ring"
-        return RecorderResult(self.path, int(answer.get("messages", 0)), size, lost, not error, error)
+        return RecorderResult(self.path, int(answer.get("messages", 0)), self._size, lost, not error, error)

@@ -187,9 +187,11 @@ class NewFile(io.FileIO):
         checksum = 0
         try:
             with open_regular(self.path) as file:
+                if os.fstat(file.fileno()).st_size != self._size:
+                    return False
                 while block := file.read(1 << 20):
                     checksum = zlib.crc32(block, checksum)
-                return (file.tell(), checksum) == (self._size, self._checksum)
+                return checksum == self._checksum
         except OSError:
             return False
 

@@ -390,6 +390,16 @@ def test_a_frame_that_waits_while_the_wall_clock_steps_looks_no_newer_and_not_ol
         assert 1_000_000 <= frame.time_ns <= true_ns
 
 
+@pytest.mark.parametrize("late_ns", [100_000, 3_000_000, 50_000_000])
+def test_a_frame_that_the_kernel_is_late_with_is_no_newer_than_its_stamp(late_ns: int) -> None:
+    rig = Rig()
+    rig.clock.advance_to(100_000_000)
+    assert rig.bus.receive(0) is None  # stamped already, and not yet in the queue
+    rig.clock.advance_to(100_200_000)
+    rig.socket.arrives(0x100, at_ns=100_000_000 - late_ns)
+    assert rig.bus.receive(0) == Frame(0x100, b"", time_ns=100_000_000 - late_ns)
+
+
 def test_a_stamp_from_a_step_that_was_taken_back_is_as_old_as_it_can_be() -> None:
     rig = Rig()
     rig.clock.advance_to(1_000_000)

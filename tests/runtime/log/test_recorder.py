@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -169,7 +169,7 @@ MEDDLING: dict[str, Callable[[Path], None]] = {
     "replaced": replaced,
     "emptied": lambda path: os.truncate(path, 0),
     "cut": lambda path: os.truncate(path, path.stat().st_size - 100),
-    "grown": lambda path: os.truncate(path, 1 << 20),
+    "grown by far more than can be read": lambda path: os.truncate(path, 1 << 40),
     "overwritten": overwritten,
     "appended to": appended,
     "a pipe": turned_into_a_pipe,
@@ -385,6 +385,28 @@ def test_a_recorder_that_does_not_start_does_not_hang_the_runtime(
     monkeypatch.setattr(sys, "executable", str(sleeper))
     with pytest.raises(LogError, match=r"did not answer within 0\.2 s"):
         Recorder.start(tmp_path / "run.mcap", HEADER, timeout=0.2)
+
+
+class Waiting:
+    """Recorder process that tells how long it was waited for."""
+
+    waited = 0.0
+
+    def tell(self, trailer: object) -> None: ...
+
+    def answer(self, timeout: float) -> dict[str, Any]:
+        self.waited = timeout
+        return {}
+
+    def end(self) -> None: ...
+
+
+def test_a_day_of_listening_is_waited_for_while_it_is_read_back(tmp_path: Path) -> None:
+    path, process = tmp_path / "run.mcap", Waiting()
+    path.touch()
+    os.truncate(path, 25_000_000_000)
+    Recorder(path, Ring.create(8), cast(Any, process)).finish({})
+    assert process.waited >= 25_000_000_000 / 100e6  # of a slow disk
 
 
 def test_a_recorder_that_cannot_be_started_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
