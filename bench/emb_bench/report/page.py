@@ -137,14 +137,12 @@ def _drive(run: Run) -> dict[str, str]:
 
 
 def with_units(entries: Mapping[str, str]) -> list[tuple[str, str]]:
-    """Metadata of a log, numbers to four digits and with their units."""
+    """Metadata of a log, numbers that have a unit with it and to four digits; others may be serial numbers."""
     found = []
     for name, text in entries.items():
         with suppress(ValueError):
-            number = float(text)
-            unit = next((unit for end, unit in UNITS_OF_METADATA.items() if name.endswith(end)), "")
-            if unit or "." in text:
-                text = f"{plain(number, 4)} {unit}".rstrip()
+            if unit := next((unit for end, unit in UNITS_OF_METADATA.items() if name.endswith(end)), ""):
+                text = f"{plain(float(text), 4)} {unit}"
         found.append((name, text))
     return found
 

@@ -123,7 +123,7 @@ DATA_IDS = {"profile1": 1, "profile2": 16, "profile5": 1}
 class Protection:
     """Protection of one message."""
 
-    kind: str  # One of :data:`KINDS`
+    kind: str  # That of the mapping file's can.protection
     checksum: Field | None = None  # Whole bytes: one, or two with profile 5
     counter: Field | None = None
     modulus: int = 0  # Number of values of the counter, 0 where there is none

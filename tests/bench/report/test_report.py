@@ -220,6 +220,8 @@ def test_metadata_has_four_digits_and_units(report: Report) -> None:
     ]  # fmt: skip
     hostile = {"top_speed": "fast", "limit": "nan", "tool": "emb-excite 0.2.0", "unexplained": "3.28157663208528"}
     assert [text for _, text in with_units(hostile)] == ["fast", "– A", "emb-excite 0.2.0", "3.282 rad/s"]
+    names = {"device_serial": "2024.0150", "operator": "1.50", "bench_name": "3.0"}
+    assert dict(with_units(names)) == names
     assert "6 A" in report.reader.texts
 
 
