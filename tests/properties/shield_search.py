@@ -22,7 +22,7 @@ from emb_bench.brake.motion import SENSITIVE, STATES, advance
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Mechanics
-from emb_runtime.config.bench import BrakeParameters, Ranges
+from emb_runtime.config.bench import BrakeParameters, Ranges, Sensors
 from emb_runtime.safety.shield import NO_PAST, PAST, shield
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 
@@ -60,6 +60,9 @@ EXTENSIONS: dict[str, dict[str, Any]] = {
     "frame ages 0..5": {"frame_age": (0, 5)},
     "frame ages 5..5": {"frame_age": (5, 5)},
     "coasting": COASTING,
+    "observer 1520 rad/s": {"observer": 1520.0},
+    "observer 800 rad/s": {"observer": 800.0},
+    "observer 1520 rad/s, frame ages 0..1": {"observer": 1520.0, "frame_age": (0, 1)},
 }
 """What a bench may declare for its shield beyond the thesis's brake."""
 PLANTS: dict[str, dict[str, Any]] = {
@@ -74,8 +77,10 @@ PLANTS: dict[str, dict[str, Any]] = {
 
 
 def bench_with(**declared: Any) -> Bench:
-    """The shipped bench with other settings of its shield."""
+    """The shipped bench with other settings of its shield, and with an ``observer`` of that bandwidth [rad/s]."""
     bench = load_bench()
+    if bandwidth := declared.pop("observer", None):
+        bench = replace(bench, sensors=Sensors("observer", bandwidth))
     return replace(bench, shield=bench.shield._replace(**declared))
 
 
@@ -316,6 +321,19 @@ class Script(NamedTuple):
     features: Floats  # One row of :class:`Features` per episode, for the fine brake
     plant: Mechanics  # For the project's own
     stop: Codes
+    observers: Floats  # Bandwidth [rad/s], 0 for a sensor; damping; 1 if sampled with the brake, 0 continuously
+
+
+def observe(o: Floats, tracked: Floats, angle: float, h: float) -> None:
+    """A tracking loop of second order after one more angle, in place: ``tracked`` is its angle and velocity.
+
+    With the poles of a continuous one. In the pieces of the fine brake it is as good as that.
+    """
+    radius = math.exp(-o[1] * o[0] * h)
+    real = radius * math.cos(math.sqrt(1.0 - o[1] * o[1]) * o[0] * h)
+    ahead = tracked[0] + h * tracked[1]
+    tracked[0] = ahead + (1.0 - radius * radius) * (angle - ahead)
+    tracked[1] += (1.0 + radius * radius - 2.0 * real) / h * (angle - ahead)
 
 
 def _wanted(feedback: int, planned: float, v: float, limit: float) -> float:
@@ -344,8 +362,10 @@ def _drive(
     solver: int,
     within: bool,
     row: Floats,
+    observer: Floats,
+    tracked: Floats,
 ) -> None:
-    """One period of the true brake, in place; its extremes go into ``row``."""
+    """One period of the true brake, in place; its extremes go into ``row``, its angles to a continuous observer."""
     for _ in range(round(law.sample_time / PIECE) if solver == FINE else 1):
         x, v = float(state[0]), float(state[1])
         if solver == EULER:
@@ -359,6 +379,8 @@ def _drive(
             advance(plant, p, state, u, law.sample_time, np.zeros(0, np.int64), np.zeros((0, SENSITIVE)))
             x, v = float(state[0]), float(state[1])
         state[0], state[1] = x, v
+        if observer[0] > 0.0 and observer[2] == 0.0:
+            observe(observer, tracked, x, PIECE)
         row[LOWEST] = min(row[LOWEST], x)
         row[HIGHEST] = max(row[HIGHEST], x)
         row[FASTEST] = max(row[FASTEST], v)
@@ -380,6 +402,8 @@ def episode(law: ShieldLaw, script: Script, i: int, row: Floats) -> None:
     f = Features(s[0], s[1], s[2], s[3], s[4], s[5], s[6])
     angles = np.zeros(PAST + 1)  # the true states, newest first
     velocities = np.zeros(PAST + 1)
+    shown = np.zeros(PAST + 1)  # velocities that are measured, without noise
+    tracked = np.zeros(2)
     counts = np.zeros(2)
     state = np.zeros(STATES)
     x = v = 0.0
@@ -389,7 +413,12 @@ def episode(law: ShieldLaw, script: Script, i: int, row: Floats) -> None:
     for k in range(script.wanted.shape[1]):
         angles[1:] = angles[:-1].copy()
         velocities[1:] = velocities[:-1].copy()
-        angles[0], velocities[0] = x, v
+        shown[1:] = shown[:-1].copy()
+        angles[0], velocities[0], shown[0] = x, v, v
+        if script.observers[i, 0] > 0.0:
+            if script.observers[i, 2] > 0.0 and k > 0:
+                observe(script.observers[i], tracked, x, law.sample_time)
+            shown[0] = tracked[1]
         if script.feedback[i] == REVERSE_WHEN_LIMITED and bits & 2:
             touched += 1
             if touched % script.touches[i] == 0:
@@ -399,7 +428,7 @@ def episode(law: ShieldLaw, script: Script, i: int, row: Floats) -> None:
         u, bits = shield(
             law,
             angles[age] + side * script.errors[i, k, 0] * law.angle_noise,
-            velocities[age] + side * script.errors[i, k, 1] * law.velocity_noise,
+            shown[age] + side * script.errors[i, k, 1] * law.velocity_noise,
             turn * _wanted(script.feedback[i], script.wanted[i, k], v, law.current),
             past,
             k,
@@ -409,7 +438,7 @@ def episode(law: ShieldLaw, script: Script, i: int, row: Floats) -> None:
         if lost:
             u = 0.0 if script.stop[i] == FREEWHEEL else damped(law, v)
         within = lost and script.stop[i] == DAMPED_WITHIN
-        _drive(law, script.plant, f, p, state, u, script.solvers[i], within, row)
+        _drive(law, script.plant, f, p, state, u, script.solvers[i], within, row, script.observers[i], tracked)
         x, v = float(state[0]), float(state[1])
         row[LAST_SPEED] = abs(v)
         if k == law.steps - 1:
@@ -507,6 +536,20 @@ def draw_features(rng: Generator, bench: Bench, n: int) -> Floats:
     return features
 
 
+def draw_observers(rng: Generator, bandwidth: float, solvers: Codes) -> Floats:
+    """Observers of at least this bandwidth, with a damping from 0.7 to 1; half of them have just that.
+
+    Sampled or, of the fine brake, as good as continuous. Euler's angles are half a period late: its velocity is shown.
+    """
+    n = len(solvers)
+    observers = np.zeros((n, 3))
+    seen = solvers != EULER
+    observers[:, 0] = np.where(seen, bandwidth * rng.choice([1.0, 1.0, 2.0, 20.0], n), 0.0)
+    observers[:, 1] = rng.choice([0.7, 0.85, 1.0, 1.0], n)
+    observers[:, 2] = np.where(solvers == FINE, rng.integers(0, 2, n), 1.0)
+    return observers
+
+
 def of_plant(mechanics: Mechanics) -> Features:
     """The features of one of the bench's plants."""
     return Features(*(getattr(mechanics, name) for name in Features._fields))
@@ -533,6 +576,7 @@ def search(
     drops: tuple[str, ...] = tuple(DROPS),
     freewheel: bool = False,
     plant: str | None = None,
+    bandwidth: float | None = None,
 ) -> Found:
     """Run ``n`` random adversarial episodes against the shield of a bench.
 
@@ -547,10 +591,12 @@ def search(
         freewheel: the node switches the current off in place of the damped stop.
         plant: the bench's plant whose features the brakes have, half of them by the project's own solver; without it
             Euler's brake and the fine one, with what the shield allows.
+        bandwidth: of the true observers, at least [rad/s]; without it the one that the bench declares, or no observer.
     """
     law = law or make_law(bench)
     youngest, oldest = ages or (law.age_low, law.age_high)
     rng = np.random.default_rng(seed)
+    bandwidth = bandwidth or bench.sensors.observer_bandwidth or 0.0
     box = bench.range_set(truth or bench.shield.ranges)
     mechanics = bench.plant(plant or "exact").mechanics
     features = np.tile(np.array(of_plant(mechanics)), (n, 1))
@@ -588,6 +634,7 @@ def search(
             features=features[part],
             plant=mechanics,
             stop=np.full(m, FREEWHEEL) if freewheel else rng.integers(0, 2, m),
+            observers=draw_observers(rng, bandwidth, solvers) if bandwidth else np.zeros((m, 3)),
         )
         labels[part] = np.stack([policy, noise, kind, solvers], axis=1)
         compiled(episodes)(law, script, rows[part])

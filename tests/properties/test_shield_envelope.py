@@ -191,8 +191,22 @@ def test_half_of_the_lag_is_not_enough() -> None:
     assert search(bench_with(current_lag=0.0007), 600, seed=24, plant="lag").violated.any()
 
 
+def test_an_observer_that_is_not_declared_breaks_the_limits() -> None:
+    assert search(SHIPPED, 300, seed=27, bandwidth=1520.0).violated.mean() > 0.1
+
+
+@pytest.mark.parametrize("bandwidth", [800.0, 1520.0])
+def test_an_observer_of_half_the_declared_bandwidth_breaks_the_limits(bandwidth: float) -> None:
+    assert search(bench_with(observer=bandwidth), 600, seed=28, bandwidth=0.5 * bandwidth).violated.mean() > 0.01
+
+
+def test_hill_climbing_finds_the_way_out_for_an_observer_a_fifth_below_the_declared_bandwidth() -> None:
+    bench = bench_with(observer=1520.0)
+    assert climb(bench, 40, 40, seed=29, bandwidth=0.8 * 1520.0).min() < 0.0 < climb(bench, 40, 40, seed=29).min()
+
+
 def test_hill_climbing_finds_no_way_out() -> None:
-    for declared in ({}, ROUGH, COASTING, {"frame_age": (0, 5)}):
+    for declared in ({}, ROUGH, COASTING, {"frame_age": (0, 5)}, {"observer": 1520.0}):
         assert climb(bench_with(**declared), 20, 30, seed=26).min() > 0.0
 
 

@@ -32,6 +32,7 @@ from tests.properties.shield_search import (
     PLANTS,
     SLOWEST,
     Found,
+    bench_with,
     search,
 )
 
@@ -79,7 +80,7 @@ def show_search(n: int, seed: int) -> bool:
     for name in ("pm50", "viscous", "viscous-stiffness", "known"):
         fails |= report(name, search(bench_for(name), n // 5, seed))
     for name, declared in EXTENSIONS.items():
-        fails |= report(f"envelope, {name}", search(bench_for(**declared), n // 5, seed, freewheel="coasting" in name))
+        fails |= report(f"envelope, {name}", search(bench_with(**declared), n // 5, seed, freewheel="coasting" in name))
     table("Brakes that are not the model, half by the bench's own solver: without the bound and with it")
     for plant, declared in PLANTS.items():
         report(f"{plant}, nothing declared", search(bench_for(), n // 5, seed, plant=plant))
@@ -98,7 +99,7 @@ def show_climbs(n: int, seed: int) -> bool:
     )
     chains, fails = 50, False
     for name, declared in {"envelope": {}, **EXTENSIONS}.items():
-        margins = climb(bench_for(**declared), chains, n // chains, seed)
+        margins = climb(bench_with(**declared), chains, n // chains, seed)
         print(f"  {name:36s} {chains * (n // chains):7d} episodes   {margins.min():7.3f}")
         fails |= bool(margins.min() < 0.0)
     law = make_law(bench_for())
@@ -110,13 +111,16 @@ def show_climbs(n: int, seed: int) -> bool:
 
 def show_broken(n: int, seed: int) -> bool:
     """Each assumption broken in turn; whether a search does not find one."""
-    bench = bench_for()
+    bench, observed = bench_for(), bench_with(observer=1520.0)
     law = make_law(bench)
     table("Search with an assumption broken (violations must be found)")
     careless = law._replace(bottom=law.bottom - 0.3, top=law.top + 0.3)
     finds = report("brake outside the set (viscous, envelope)", search(bench_for("viscous"), n, seed, truth="envelope"))
     finds &= report("no angle margin", search(bench, n, seed, law=careless))
     finds &= report("frames one period late", search(bench, n, seed, ages=(0, 1)))
+    finds &= report("observer at 80 % of what is declared", search(observed, n, seed, bandwidth=0.8 * 1520.0))
+    finds &= report("observer at half of it", search(observed, n, seed, bandwidth=0.5 * 1520.0))
+    finds &= report("observer, nothing declared", search(bench, n, seed, bandwidth=1520.0))
     found = search(bench, n, seed, drops=("killed",), freewheel=True)
     finds &= report("freewheel after a kill", found)
     for stop, column, limit in (("lower", LOWEST, -10.0), ("upper", HIGHEST, 100.0)):

@@ -24,7 +24,7 @@ import tools.proof.successors as successors_module
 import tools.proof.windows as windows_module
 from emb_bench.brake.euler import step as euler_step
 from emb_runtime.config.bench import BrakeParameters, Ranges, load_bench
-from tests.properties.shield_search import damped
+from tests.properties.shield_search import bench_with, damped
 from tools.proof.__main__ import main
 from tools.proof.boxes import cover, slack_of
 from tools.proof.cases import Case, case_of, reserve
@@ -55,9 +55,11 @@ def law_with(**changed: Any) -> Case:
 
 LAGGING = declared(current_lag=0.002)
 COASTING = declared(envelope="coasting", angle_margin=1.2)
+OBSERVED = case_of(bench_with(observer=1520.0, frame_age=(0, 1)))
 EXTENSIONS = {"L10a": LAGGING, "L10b": LAGGING, "L11a": LAGGING, "L11b": LAGGING}
 EXTENSIONS |= {"L12a": COASTING, "L12b": COASTING, "L12c": COASTING}
-ALL = {lemma.key: lemma for lemma in (*lemmas(LAGGING), *lemmas(COASTING), *BRAKING)}
+EXTENSIONS["L13"] = OBSERVED
+ALL = {lemma.key: lemma for law in (LAGGING, COASTING, OBSERVED, SHIPPED) for lemma in lemmas(law)}
 
 # --- What is proved --------------------------------------------------------------------------------------------------
 
@@ -75,7 +77,7 @@ PROVED: dict[str, tuple[str, Case]] = {
 
 
 # Half a second to four seconds of solver each: at night, and by `make proof`.
-DEAR = ("L10b", "L12a", "L1c", "L1d", "L1e", "L2b", "L5b")
+DEAR = ("L10b", "L12a", "L13", "L1c", "L1d", "L1e", "L2b", "L5b")
 
 
 AT_NIGHT = pytest.mark.parametrize("dear", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -112,6 +114,7 @@ def test_each_law_is_judged_by_the_lemmas_of_what_it_declares() -> None:
     assert {lemma.key for lemma in lemmas(declared(break_away=1.2))} == set(LEMMAS)
     assert lemmas(SHIPPED) == BRAKING
     assert {lemma.key for lemma in lemmas(LAGGING)} == {"L1a", "L2a", "L9a", "L10a", "L10b", "L11a", "L11b"}
+    assert {lemma.key for lemma in lemmas(OBSERVED)} == {*LEMMAS, "L13"} - {"L6"}
     coasting = {"L1a", "L1b", "L1c", "L1d", "L1e", "L9a", "L12a", "L12b", "L12c"}
     assert {lemma.key for lemma in lemmas(COASTING)} == coasting
 
@@ -180,11 +183,22 @@ BROKEN_FUNCTIONS = [
     ("L12a", "_coasting_window", "- 0.5 * law.spring_high * squeezed * squeezed", ""),
     ("L12a", "_coasting_window", "max(vh + law.change, 0.0)", "max(vh, 0.0)"),
     ("L12a", "_coasting_window", "return min(bottom, 0.0)", "return max(bottom, 0.0)"),
+    (
+        "L13",
+        "_unseen",
+        "slow, fast = slow - law.change, fast + law.change",
+        "slow, fast = vl - law.change, vh + law.change",
+    ),
+    ("L13", "_unseen", "min(u_low, damped_current", "max(u_low, damped_current"),
+    ("L13", "_unseen", "* ts * max(_moved_by(law, slow", "* 0.99 * ts * max(_moved_by(law, slow"),
+    ("L13", "_unseen", "risen = -blind, blind", "risen = -blind, 0.9 * blind"),
+    ("L13", "_unseen", "xl - i * law.reach", "xl + law.reach"),
+    ("L13", "_moved_by", "- law.friction_low", "- law.friction_high"),
     ("L5b", "reserve", "v + limit if v >= limit else v + v", "limit if v >= limit else v"),
 ]
 
 
-DEAR_TO_REFUTE = ("L12a", "L1e", "L2b")
+DEAR_TO_REFUTE = ("L12a", "L13", "L1e", "L2b")
 
 
 @AT_NIGHT

@@ -1,7 +1,8 @@
-"""Lemmas on what else a bench can declare: a current that lags, and a drive that can only let go."""
+"""Lemmas on what else a bench can declare: a lagging current, a drive that can only let go, an observer's velocity."""
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,9 +13,12 @@ from emb_runtime.safety.shield import (
     _highest_current,
     _lagging_current,
     _lagging_window,
+    _moved_by,
+    _unseen,
     damped_current,
     successor,
 )
+from emb_runtime.safety.shield_design import OVERSHOOT
 from tools.proof.cases import Case
 from tools.proof.successors import any_box
 from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, together
@@ -246,3 +250,79 @@ def lagging_stop_stays(case: Case) -> Answer:
         facts.claim("falls", (steepness + half * a) * (motor * command + friction), v * a)
 
     return prove(statement)
+
+
+def observer_is_bounded(case: Case) -> Answer:
+    """The change that an observer does not show yet lies within what is assumed, whichever commands were lost.
+
+    Period by period no acceleration is beyond the assumed one; and then the sum, with any share of each period up to
+    the law's, and any rest: of what acted before, and of what overshoots.
+    """
+    sides = [(end, age) for end in (0, 1) for age in range(case.law.age_high + 1)]
+    parts = [(end, age, i) for end, age in sides for i in range(PAST - age)]
+    accelerations = (prove(lambda facts, p=part: _accelerates(facts, case, *p)) for part in parts)  # type: ignore[misc]
+    return together((*accelerations, *(prove(lambda facts, s=s: _sums_up(facts, case, *s)) for s in sides)))  # type: ignore[misc]
+
+
+def _observed(
+    facts: Facts, case: Case, age: int, asked: Any, own: tuple[Real, ...], shown: Real
+) -> tuple[Any, tuple[Real, Real], Real, Real]:
+    """The law; least and greatest change by its :func:`_unseen`; least and greatest angle of the measurement."""
+    law = lifted_law(facts, case.law)._replace(kept=case.law.kept)
+    x = facts.real("angle", case.bottom, case.top)
+    xl, xh = x - law.angle_noise, x + law.angle_noise
+    run = facts.lift(_unseen, math=math, min=facts.smaller, max=facts.greater, _moved_by=asked)
+    vl, vh = shown - law.velocity_noise, shown + law.velocity_noise
+    return law, run(law, xl, xh, vl, vh, own, age, True), xl, xh
+
+
+def _accelerates(facts: Facts, case: Case, end: int, age: int, i: int) -> None:
+    """Acceleration within the i-th period before the measurement, upwards (0) or downwards (1)."""
+    plain = facts.lift(_moved_by)
+    bounds: list[Real] = []
+
+    def watched(*args: Any) -> Any:
+        """The bounds come in pairs; only one is examined, the others take no paths."""
+        bounds.append(plain(*args) if len(bounds) == 2 * i + end else facts.constant(0.0))
+        return bounds[-1]
+
+    own = tuple(facts.real("own", -case.law.current, case.law.current) for _ in range(PAST))
+    shown = facts.real("shown", -1e4, 1e4)
+    law, _, xl, xh = _observed(facts, case, age, watched, own, shown)
+    away = law.velocity_noise + (_total(case, 0) + i + 1) * law.change
+    v, begun = facts.real("v", shown - away, shown + away), facts.real("begun", shown - away, shown + away)
+    x = facts.real("x", xl - (i + 1) * law.reach, xh + (i + 1) * law.reach)
+    motor = facts.real("motor", law.motor_low, law.motor_high)
+    spring = facts.real("spring", law.spring_low, law.spring_high)
+    viscous = facts.real("viscous", law.viscous_low, law.viscous_high)
+    braked = facts.lift(damped_current)(begun, law.current, law.damping_velocity)
+    current = facts.real("current", facts.smaller(own[age + i], braked), facts.greater(own[age + i], braked))
+    friction = facts.real("friction", -law.friction_high, law.friction_high)
+    if v > 0.0:
+        facts.at_least(friction, law.friction_low)
+    elif v < 0.0:
+        facts.at_least(-law.friction_low, friction)
+    a = motor * current - spring * facts.greater(x, 0.0) - friction - viscous * v
+    facts.claim("acceleration", bounds[2 * i + end], -a if end else a)
+
+
+def _total(case: Case, periods: int) -> float:
+    """Samples by which an observer lags for what acted more than so many samples ago, and overshoots."""
+    scaled = -math.log(case.law.kept)
+    return (2.0 + scaled * periods) * math.exp(-scaled * periods) / scaled + OVERSHOOT / min(scaled, 1.5)
+
+
+def _sums_up(facts: Facts, case: Case, end: int, age: int) -> None:
+    asked: list[tuple[Real, ...]] = []
+    any_bound = facts.stand_in(-1e6, asked)
+    own = tuple(facts.real("own", -case.law.current, case.law.current) for _ in range(PAST))
+    law, changes, _, _ = _observed(facts, case, age, any_bound, own, facts.real("shown", -1e4, 1e4))
+    rest = _total(case, PAST - age) * law.change
+    total = facts.real("rest", -rest, rest)
+    for i in range(PAST - age):
+        bound = asked[2 * i + end][0]
+        facts.at_least(case.law.change / case.law.sample_time, bound)
+        a = facts.real("a", None, bound)
+        share = law.sample_time * (_total(case, i) - _total(case, i + 1))
+        total += facts.real("share", 0.0, share) * a
+    facts.claim("change", (-changes[0] if end else changes[1]) + 1e-9, total)

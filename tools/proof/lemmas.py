@@ -74,6 +74,11 @@ LAGGING = (
     Lemma("L11b", extensions.lagging_stop_stays, "along the flow a stop uses up e's reserve as it goes"),
     ROLLED[0],
 )
+OBSERVED = (
+    *BRAKING[:-3],
+    Lemma("L13", extensions.observer_is_bounded, "what an observer does not show yet is within what is assumed"),
+    *ROLLED,
+)
 COASTING = (
     *BOX,
     Lemma("L12a", extensions.coasting_window_is_kept, "a current of the window leaves what friction can take, or is 0"),
@@ -87,7 +92,9 @@ def lemmas(case: Case) -> tuple[Lemma, ...]:
     """Returns the lemmas for a law."""
     if case.law.coasting:
         return COASTING
-    return LAGGING if case.law.lag > 0.0 else BRAKING
+    if case.law.lag > 0.0:
+        return LAGGING
+    return OBSERVED if case.law.kept > 0.0 else BRAKING
 
 
 def judge(lemma: Lemma, case: Case) -> Verdict:

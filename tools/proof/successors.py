@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from emb_bench.brake.euler import step as euler_step
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.safety.shield import _moved, _rolled, fastest_next
-from emb_runtime.safety.shield_design import VELOCITY_PAD
+from emb_runtime.safety.shield_design import VELOCITY_PAD, unseen
 from tools.proof.cases import Case
 from tools.proof.terms import Answer, Facts, Real, Term, lifted_law, prove, solver_module, together
 
@@ -22,6 +23,9 @@ def any_box(facts: Facts, case: Case) -> tuple[Term, Term, Term, Term]:
     low, high = case.bench.limits.angle
     widest = (1 + law.age_high) * law.reach
     fastest = case.bench.limits.velocity + law.velocity_noise + (1 + law.age_high) * law.change
+    if law.kept > 0.0 and law.lag == 0.0:
+        scaled = -math.log(law.kept)
+        fastest += (2.0 / scaled + unseen(scaled, 0)) * law.change
     xl = facts.real("xl", low - widest, high + widest)
     xh = facts.real("xh", xl, high + widest)
     vl = facts.real("vl", -fastest, fastest)
@@ -197,7 +201,7 @@ def lost_commands_are_contained(case: Case) -> Answer:
             return xl, xh, xl, xh
 
         own = facts.real("own", -law.current, law.current)
-        roll = facts.lift(_rolled, _moved=watched)
+        roll = facts.lift(_rolled, _moved=watched, _unseen=lambda *_: (0.0, 0.0))  # an observer widens the box
         roll(law, facts.real("angle"), measured, (own, 0.0, 0.0, 0.0, 0.0), 1, True)
         ((least, most),) = seen
         room = law.velocity_noise + law.change

@@ -97,6 +97,15 @@ class Noise:
 
 
 @dataclass(frozen=True)
+class Sensors:
+    """Origin of the measured velocity."""
+
+    velocity: Literal["sensor", "observer"] = "sensor"
+    observer_bandwidth: Annotated[float, Meta(gt=0, le=1e6)] | None = None
+    """Least bandwidth of the observer that derives the velocity from the angle, with a damping from 0.7 to 1 [rad/s]"""
+
+
+@dataclass(frozen=True)
 class Timing:
     """The experiment's time grid."""
 
@@ -217,6 +226,7 @@ class _Tables:
     node: Node
     can: Can
     systematic: Systematic = Systematic()
+    sensors: Sensors = Sensors()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,9 +281,9 @@ class Bench(_Tables):
 
     @property
     def identity_hash(self) -> str:
-        """SHA-256 of brake, ranges, limits, noise, timing, shield and the drive's mapping: node and runtime must agree.
+        """SHA-256 of what node and runtime must agree on: brake, ranges, limits, noise, timing, shield.
 
-        Not of the time-outs.
+        And of the drive's mapping and the observer where they are declared; not of the time-outs.
         """
         record: dict[str, Any] = {
             "brake": self.brake._asdict(),
@@ -285,6 +295,8 @@ class Bench(_Tables):
         }
         if self.can.mapping:
             record["mapping"] = self.can.mapping
+        if self.sensors.velocity == "observer":
+            record["sensors"] = asdict(self.sensors)
         return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
@@ -394,6 +406,8 @@ def _limit_problems(bench: Bench, driven: bool) -> Iterator[tuple[str, str]]:
 def _setting_problems(bench: Bench, driven: bool) -> Iterator[tuple[str, str]]:
     """Keys of the shield and the time-outs that contradict others, and why."""
     shield, watch, covered = bench.shield, bench.watch, bench.ranges.get(bench.shield.ranges)
+    if (bench.sensors.velocity == "observer") != (bench.sensors.observer_bandwidth is not None):
+        yield "sensors.observer_bandwidth", 'goes with velocity = "observer", and is needed there: its least, in rad/s'
     _check_pair("shield.frame_age", shield.frame_age)
     if covered is None:
         yield "shield.ranges", f"no set [ranges.{shield.ranges}] in this file"

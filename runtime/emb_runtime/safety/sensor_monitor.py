@@ -167,12 +167,21 @@ def unseen_speed(law: ShieldLaw, limits: SensorThresholds, memory: Any) -> float
 
     Causes are frames that act late, a current that lags, and a velocity that an observer derives from the angle.
     """
-    speed = 0.0
-    for i in range(law.age_high + 1):
-        acted = max(-memory[LOWS + i], memory[HIGHS + i])
-        speed += law.motor_high * acted * (law.sample_time if i < law.age_high else limits.lag)
+    speed = acted = 0.0
+    for i in range(_oldest(law) + 1):
+        acted = max(-memory[LOWS + i], memory[HIGHS + i], acted if i > law.age_high else 0.0)
+        if i < law.age_high:
+            speed += law.motor_high * acted * law.sample_time
+    speed += law.motor_high * acted * limits.lag
     flowing: float = max(-memory[FLOWING_LOW], memory[FLOWING_HIGH])
     return speed + law.motor_high * law.lag * flowing
+
+
+def _oldest(law: ShieldLaw) -> int:
+    """Number of periods before the last two whose currents the velocity may show only now: late frames, an observer."""
+    if law.kept == 0.0 or law.lag > 0.0:
+        return law.age_high
+    return min(law.age_high + int(-1.0 / math.log(law.kept)), OLDEST_FRAME)
 
 
 def _held_stroke(law: ShieldLaw, friction: float) -> float:
@@ -251,7 +260,7 @@ def _acting(
     """Least and greatest current that may have caused the change between the last two samples [A].
 
     That of the period before counts as well: a measured velocity lags. So do those of older ones where frames may be
-    late. Where no command acted, the node braked by itself, or let go.
+    late, or an observer derives the velocity. Where no command acted, the node braked by itself, or let go.
     """
     if obeyed and periods == 1:
         low = high = command
@@ -265,14 +274,14 @@ def _acting(
         high = max(damped_current(vl - late, law.current, law.damping_velocity), 0.0)
         if periods > 1:
             low, high = min(low, command), max(high, command)
-    least, most = low, high
-    for i in range(law.age_high + 1):
+    least, most, oldest = low, high, _oldest(law)
+    for i in range(oldest + 1):
         if memory[LOWS + i] < least:
             least = memory[LOWS + i]
         if memory[HIGHS + i] > most:
             most = memory[HIGHS + i]
-    for _ in range(min(periods, law.age_high + 1)):
-        for i in range(law.age_high, 0, -1):
+    for _ in range(min(periods, oldest + 1)):
+        for i in range(oldest, 0, -1):
             memory[LOWS + i], memory[HIGHS + i] = memory[LOWS + i - 1], memory[HIGHS + i - 1]
         memory[LOWS], memory[HIGHS] = low, high
     if law.lag > 0.0:

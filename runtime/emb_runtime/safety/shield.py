@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, stoppable
+from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, stoppable, unseen
 
 # Values of records.Reason; plain integers, because the compiled function cannot see an IntFlag.
 LIMITED: Final = 2
@@ -213,7 +213,7 @@ def _lagging_current(
 
 def _believable(law: ShieldLaw, angle: float, velocity: float, past: Past) -> bool:
     total = abs(angle)
-    if law.age_high > 0 or law.lag > 0.0:
+    if law.age_high > 0 or law.lag > 0.0 or law.kept > 0.0:
         total += abs(past[0]) + abs(past[1]) + abs(past[2]) + abs(past[3]) + abs(past[4])
     return abs(velocity) <= BELIEVABLE and total <= BELIEVABLE
 
@@ -229,6 +229,9 @@ def _rolled(
     xh = angle + law.angle_noise
     vl = velocity - law.velocity_noise
     vh = velocity + law.velocity_noise
+    if law.kept > 0.0 and law.lag == 0.0:
+        fallen, risen = _unseen(law, xl, xh, vl, vh, past, age, lost)
+        vl, vh = vl + fallen, vh + risen
     for i in range(age, 0, -1):
         u_low = u_high = past[i - 1]
         if lost:
@@ -236,6 +239,42 @@ def _rolled(
             u_high = max(u_high, damped_current(vl - law.change, law.current, law.damping_velocity))
         xl, xh, vl, vh = _moved(law, xl, xh, vl, vh, u_low, u_high)
     return xl, xh, vl, vh
+
+
+def _unseen(
+    law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, past: Past, age: int, lost: bool
+) -> tuple[float, float]:
+    """Least and greatest change of the velocity that an observer does not show yet, by a measurement of that age.
+
+    The share (1 + ωτ) exp(−ωτ) of what the acceleration has changed until the time τ before, at most; less what an
+    observer overshoots by. ``lost`` as for :func:`_rolled`.
+    """
+    ts = law.sample_time
+    scaled = -math.log(law.kept)
+    blind = unseen(scaled, PAST - age) * law.change
+    aside = blind + (2.0 / scaled) * law.change
+    slow, fast = vl - aside, vh + aside
+    fallen, risen = -blind, blind
+    left = 2.0 / scaled
+    for i in range(PAST - age):
+        u_low = u_high = past[age + i]
+        slow, fast = slow - law.change, fast + law.change
+        if lost:
+            u_low = min(u_low, damped_current(fast, law.current, law.damping_velocity))
+            u_high = max(u_high, damped_current(slow, law.current, law.damping_velocity))
+        low, high = drives(law, xl - i * law.reach, xh + i * law.reach, u_low, u_high)
+        before = left
+        left = (2.0 / scaled + i + 1) * math.exp(-scaled * (i + 1))
+        risen += (before - left) * ts * max(_moved_by(law, slow, high), 0.0)
+        fallen -= (before - left) * ts * max(_moved_by(law, -fast, -low), 0.0)
+    return fallen, risen
+
+
+def _moved_by(law: ShieldLaw, slowest: float, drive: float) -> float:
+    """Greatest acceleration from ``slowest`` or above, where ``drive`` bounds motor and spring [rad/s²]."""
+    if slowest > 0.0:
+        return drive - law.friction_low - law.viscous_low * slowest
+    return drive + law.friction_high - law.viscous_high * slowest
 
 
 def damped_current(velocity: float, limit: float, damping_velocity: float) -> float:

@@ -12,7 +12,7 @@ import math
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from emb_runtime.config.bench import Bench
+from emb_runtime.config.bench import OLDEST_FRAME, Bench
 from emb_runtime.errors import BenchFileError
 
 VELOCITY_PAD: Final = 0.3
@@ -34,8 +34,15 @@ FRESH_LANDING = Landing(share=0.8, gain=0.6, reserve=7)
 """For commands that act in the very period of the sample that they answer."""
 LATE_LANDING = Landing(share=0.5, gain=0.283, reserve=25)
 """For unknown or greater frame ages, where the loop has dead time."""
+OBSERVED_LANDING = Landing(share=0.65, gain=0.4, reserve=5)
+"""For a velocity that an observer derives from the angle."""
 CREEPS: Final = 3.0  # Coasting: speed allowed at the largest angle, as a multiple of ``creep``
 LONGEST_LAG: Final = 2.0  # Samples. With a slower current loop the limits would hold, but the landing would not.
+OVERSHOOT: Final = 0.125  # Observer: what its response exceeds that of a critically damped one by, over its bandwidth
+SHARPEST: Final = 1.5  # Bandwidth times sample time beyond which the overshoot of a sampled observer falls no further
+FASTEST_OBSERVER: Final = 3.0  # The same beyond which a sampled observer lags no less: it begins with two angles
+SLOWEST_OBSERVER: Final = 0.75  # The same below which the way home was not searched
+LATEST_OBSERVED: Final = 1  # Frame age; with older frames and an observer the limits would hold, but not the landing.
 COMMITTED: Final = 16  # Samples before the reserve in which the policy does not get control back
 
 
@@ -67,7 +74,11 @@ class ShieldLaw(NamedTuple):
     damping_velocity: float  # The node's, also used when there is no believable angle [rad/s]
     change: float  # Largest change of the velocity in one sample [rad/s]
     lag: float  # Largest time constant of the current loop [s]
-    kept: float  # Share of a difference between current and command that the slowest current loop keeps over one sample
+    kept: float
+    """Share that the slowest time constant keeps over one sample; 0 if there is none.
+
+    With a ``lag``, of a difference between current and command; without, of an observer's between two velocities.
+    """
     coasting: bool  # 0 A for ever must keep the limits, in place of the damped stop
     apex: float  # Coasting: no brake of the box gets beyond this angle [rad]
     creep: float  # Coasting: speed home that may be below its limit [rad/s]
@@ -99,6 +110,16 @@ def stoppable(room: float, v: float, braking: float, ts: float) -> float:
     if rest <= 0.0:
         return -1.0
     return math.sqrt(half * half + 2.0 * braking * rest) - half
+
+
+def unseen(scaled: float, periods: int) -> float:
+    """Samples by which an observer may lag for what acted before the last ``periods`` samples.
+
+    That of a critically damped observer, the integral of (1 + ωτ) exp(−ωτ), and the overshoot of one that is less
+    damped. ``scaled`` is the bandwidth times the sample time.
+    """
+    began = scaled * periods
+    return (2.0 + began) * math.exp(-began) / scaled + OVERSHOOT / min(scaled, SHARPEST)
 
 
 def damped_excess(motor: float, friction: float, current: float, damping_velocity: float, sample_time: float) -> float:
@@ -198,13 +219,21 @@ def law_of(bench: Bench) -> ShieldLaw:
     if coasting:
         homeward = min(homeward, math.sqrt(max(-2.0 * friction_low * bottom, 0.0)))
         apex = min(apex, _apex(friction_low, spring_high, -bottom, CREEPS * creep))
-    cruise = (homeward - creep) / (1.0 + periods * ts * (ratio * viscous_high - viscous_low))
+    driven = current * motor_high + friction_high + viscous_high * limits.velocity + spring_high * apex
+    change = VELOCITY_PAD + ts * driven
     plan = FRESH_LANDING if age_high == 0 and lag == 0.0 else LATE_LANDING
     kept = math.exp(-ts / lag) if lag > 0.0 else 0.0
-    reserve = plan.reserve * ts + 2.0 * lag
+    reckoned, behind = float(periods), lag
+    if bench.sensors.observer_bandwidth is not None:
+        plan = OBSERVED_LANDING if age_high == 0 else LATE_LANDING
+        scaled = min(bench.sensors.observer_bandwidth * ts, FASTEST_OBSERVER)
+        kept, behind = math.exp(-scaled), 6.0 * ts / scaled  # three times the longest lag, by search
+        creep += 2.0 / scaled * uneven + unseen(scaled, OLDEST_FRAME - age_high) * change
+        reckoned += 2.0 / scaled
+    cruise = (homeward - creep) / (1.0 + reckoned * ts * (ratio * viscous_high - viscous_low))
+    reserve = plan.reserve * ts + 2.0 * behind
     rest = noise + shield.home_velocity
     coast = (rest + noise) / friction_low
-    driven = current * motor_high + friction_high + viscous_high * limits.velocity + spring_high * apex
     return ShieldLaw(
         sample_time=ts,
         steps=bench.timing.horizon,
@@ -229,7 +258,7 @@ def law_of(bench: Bench) -> ShieldLaw:
         braking=braking,
         braking_high=braking_high,
         damping_velocity=bench.node.damping_velocity,
-        change=VELOCITY_PAD + ts * driven,
+        change=change,
         lag=lag,
         kept=kept,
         coasting=coasting,
@@ -258,16 +287,8 @@ def unmet_condition(law: ShieldLaw, bench: Bench) -> str:
     """The first step of the argument that does not hold for this law; "" if all do."""
     ts = law.sample_time
     speed, farthest = bench.limits.velocity, law.apex if law.coasting else bench.limits.angle[1]
-    if (law.lag > 0.0) + law.coasting + (law.age_high > 0) > 1:
-        return (
-            "a lag of the current, frames that may be late and the coasting envelope are covered one at a time; choose "
-            "one of shield.current_lag, shield.frame_age and shield.envelope"
-        )
-    if law.lag > LONGEST_LAG * ts:
-        return (
-            f"the way home works for a shield.current_lag of {LONGEST_LAG * ts:g} s at most, got {law.lag:g} s; "
-            "shorten the lag of the current loop"
-        )
+    if reason := _uncovered(law, bench.sensors.observer_bandwidth):
+        return reason
     if law.coasting and law.apex <= 0.0:
         return (
             f"from no angle would a brake come to rest in {-law.bottom:.2f} rad of free stroke by friction alone; "
@@ -316,11 +337,42 @@ def unmet_condition(law: ShieldLaw, bench: Bench) -> str:
     spread += (law.viscous_high - law.viscous_low) * speed + (law.spring_high - law.spring_low) * farthest
     width = 2.0 * law.velocity_noise + (law.age_high + 1) * (2.0 * VELOCITY_PAD + ts * spread)
     width += (4.0 * law.lag + 2.0 * ts * law.age_high) * law.motor_high * law.current
+    if bench.sensors.observer_bandwidth is not None:
+        scaled = -math.log(law.kept)
+        width += 2.0 * (2.0 / scaled + unseen(scaled, OLDEST_FRAME - law.age_high)) * law.change
     room = 2.0 * (0.5 * width * width / law.braking + ts * width * (law.age_high + 2) + law.angle_noise)
     if law.top - law.bottom <= room and not law.coasting:
         return (
             f"what one measurement leaves open needs {room:.2f} rad between the angle limits and there are "
             f"{law.top - law.bottom:.2f} rad; widen limits.angle"
+        )
+    return ""
+
+
+def _uncovered(law: ShieldLaw, bandwidth: float | None) -> str:
+    """Settings that are not covered, or not together; "" if all are. ``bandwidth`` is an observer's [rad/s]."""
+    ts = law.sample_time
+    if (law.lag > 0.0) + law.coasting + (law.age_high > 0) > 1:
+        return (
+            "a lag of the current, frames that may be late and the coasting envelope are covered one at a time; choose "
+            "one of shield.current_lag, shield.frame_age and shield.envelope"
+        )
+    if bandwidth is not None:
+        if law.lag > 0.0 or law.coasting or law.age_high > LATEST_OBSERVED:
+            return (
+                f"an observer's velocity is covered with frames of age {LATEST_OBSERVED} at most, and neither with a "
+                "lag of the current nor with the coasting envelope; change shield.frame_age, shield.current_lag or "
+                "shield.envelope"
+            )
+        if bandwidth * ts < SLOWEST_OBSERVER:
+            return (
+                f"the way home works for a sensors.observer_bandwidth of {SLOWEST_OBSERVER / ts:g} rad/s at least, got "
+                f"{bandwidth:g} rad/s; make the observer faster"
+            )
+    if law.lag > LONGEST_LAG * ts:
+        return (
+            f"the way home works for a shield.current_lag of {LONGEST_LAG * ts:g} s at most, got {law.lag:g} s; "
+            "shorten the lag of the current loop"
         )
     return ""
 

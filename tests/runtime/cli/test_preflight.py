@@ -25,7 +25,7 @@ from emb_runtime.cli.preflight import (
     check,
     refuse,
 )
-from emb_runtime.config.bench import Bench, parse_bench
+from emb_runtime.config.bench import Bench, Sensors, parse_bench
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import EXIT_BUS, EXIT_CHECK_FAILED, EXIT_SAFETY_STOP, EXIT_USAGE
@@ -194,6 +194,14 @@ def test_what_only_warns_stands_in_its_line_alone(findings: Findings) -> None:
         assert [line.what for line in lines if line.verdict is not Verdict.OK] == [what]
         assert said in lines_of(found)[what].found
         refuse(lines)
+
+
+def test_a_declared_observer_of_the_velocity_is_named(findings: Findings) -> None:
+    assert "observer" not in lines_of(findings)["shield"].found
+    bench = replace(findings.plan.bench, sensors=Sensors("observer", 1520.0))
+    line = lines_of(planned(findings, bench=bench))["shield"]
+    assert line.found.endswith("; the velocity is an observer's, of at least 1520 rad/s")
+    assert line.verdict is Verdict.OK
 
 
 def test_with_read_only_a_tenth_of_the_samples_missing_is_a_failed_check(findings: Findings) -> None:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_bench.config.bench import Bench, parse_bench
-from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, Sensors, shipped_bench_text
 from emb_runtime.errors import EXIT_USAGE, BenchFileError
 
 TEXT = shipped_bench_text()
@@ -93,6 +93,16 @@ def test_what_is_wrong_is_refused_with_file_key_and_reason() -> None:
         ("J     = 4.624e-6", "J     = 1" + "0" * 5000, "", "not valid TOML"),
         ("k_m   = 2.170e-2", "k_m   = 9.0e-2", "shield.ranges", "leaves out the nominal k_m = 0.09"),
         ("[can]\nbitrate = 1000000", "can = 3", "can", "expected a table"),
+        *(
+            ("[timing]", f"[sensors]\n{wrong}\n[timing]", f"sensors.{key}", reason)
+            for wrong, key, reason in (
+                ('velocity = "derived"', "velocity", "one of observer, sensor"),
+                ('velocity = "observer"', "observer_bandwidth", 'goes with velocity = "observer", and is needed there'),
+                ("observer_bandwidth = 1520.0", "observer_bandwidth", 'goes with velocity = "observer"'),
+                ('velocity = "observer"\nobserver_bandwidth = 0.0', "observer_bandwidth", "above 0"),
+                ('velocity = "observer"\nobserver_damping = 0.7', "observer_damping", "unknown key"),
+            )
+        ),
     ]:
         assert old in TEXT
         broken = TEXT.replace(old, new, 1)
@@ -105,6 +115,17 @@ def test_what_is_wrong_is_refused_with_file_key_and_reason() -> None:
         assert reason in message, new
         assert "\n" not in message
         assert caught.value.exit_code == EXIT_USAGE
+
+
+def test_a_declared_observer_belongs_to_the_identity_and_a_declared_sensor_is_what_is_assumed(bench: Bench) -> None:
+    def declaring(text: str) -> Bench:
+        return parse_bench(TEXT.replace("[timing]", f"[sensors]\n{text}\n[timing]"), "t")
+
+    sensor = declaring('velocity = "sensor"')
+    observers = [declaring(f'velocity = "observer"\nobserver_bandwidth = {w}') for w in (800.0, 1520.0)]
+    assert (sensor.sensors, sensor.identity_hash) == (bench.sensors, bench.identity_hash)
+    assert observers[1].sensors == Sensors("observer", 1520.0)
+    assert len({b.identity_hash for b in (bench, *observers)}) == 3
 
 
 def test_all_that_an_old_file_lacks_is_named_at_once_with_where_to_find_it() -> None:

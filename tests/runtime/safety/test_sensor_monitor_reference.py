@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import pytest
 
-from emb_runtime.config.bench import OLDEST_FRAME, load_bench
+from emb_runtime.config.bench import OLDEST_FRAME, Sensors, load_bench
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.sensor_monitor import (
     ANGLE,
@@ -82,7 +82,7 @@ class Reference:
         self.motion, self.opposed_motion = [0.0, 0.0], [0.0, 0.0]
         self.opposed_travel, self.opposed_from, self.integral = 0.0, velocity, 0.0
         self.confirmed = self.obeys = False
-        self.acted: list[Range] = [(0.0, 0.0)] * (law.age_high + 1)
+        self.acted: list[Range] = [(0.0, 0.0)] * (shown_late(law) + 1)
         self.flowing: Range = (0.0, 0.0)
 
     @property
@@ -174,7 +174,7 @@ class Reference:
             candidates = [0.0, *damped]
         now = min(candidates), max(candidates)
         may = [now, *self.acted]
-        self.acted = ([now] * (missing + 1) + self.acted)[: law.age_high + 1]
+        self.acted = ([now] * (missing + 1) + self.acted)[: shown_late(law) + 1]
         acting = min(low for low, _ in may), max(high for _, high in may)
         if law.lag == 0.0:
             return acting
@@ -184,6 +184,12 @@ class Reference:
             max(acting[1], acting[1] + law.kept * (high - acting[1])),
         )
         return min(acting[0], low), max(acting[1], high)
+
+
+def shown_late(law: ShieldLaw) -> int:
+    """Periods before the last two that count: those of late frames, and whole time constants of an observer."""
+    constants = 0.0 if law.lag or not law.kept else 1.0 / math.log(1.0 / law.kept)
+    return min(law.age_high + math.floor(constants), 5)
 
 
 def drives_of(law: ShieldLaw, angles: Range, currents: Range) -> Iterator[float]:
@@ -210,7 +216,7 @@ def drawn_law(rng: Random) -> ShieldLaw:
         sorted((rng.uniform(low, high), rng.uniform(low, high)))
         for low, high in ((1500.0, 6000.0), (30.0, 140.0), (800.0, 3400.0), (2.0, 9.0))
     )
-    lag = rng.choice([0.0, rng.uniform(5e-4, 3e-3)])
+    lag, observer = rng.choice([(0.0, 0.0), (rng.uniform(5e-4, 3e-3), 0.0), (0.0, rng.uniform(0.3, 3.0))])
     return SHIPPED._replace(
         sample_time=rng.uniform(0.8e-3, 1.2e-3),
         age_high=rng.choice([0, 0, 1, 2, OLDEST_FRAME]),
@@ -230,7 +236,7 @@ def drawn_law(rng: Random) -> ShieldLaw:
         damping_velocity=rng.uniform(40.0, 90.0),
         change=rng.uniform(5.0, 60.0),
         lag=lag,
-        kept=math.exp(-1e-3 / lag) if lag else 0.0,
+        kept=math.exp(-1e-3 / lag) if lag else math.exp(-observer) if observer else 0.0,
     )
 
 
@@ -449,6 +455,8 @@ def test_the_thresholds_are_those_of_the_page() -> None:
         )
         law = drawn_law(rng)
         t = law.sample_time
+        observed = replace(bench, sensors=Sensors("observer", 0.5 / t if seed % 2 else 4.0 / t))
+        assert sensor_thresholds(observed, law).lag == pytest.approx(4.0 * t if seed % 2 else 0.75 * t)
         found = sensor_thresholds(bench, law)
         assert found.offset == pytest.approx(sigma / 2)
         assert found.travel == pytest.approx(2 * law.angle_noise + 4 * t * sigma * math.log(2 * horizon / 1e-9))
@@ -549,8 +557,8 @@ def test_the_reported_current_of_the_sample_is_the_one_that_counts(reported: flo
 
 def unseen_of_the_page(law: ShieldLaw, limits: SensorThresholds, memory: list[float]) -> float:
     """Speed that currents add which have acted and are not in the sample yet."""
-    acted = [max(abs(memory[LOWS + i]), abs(memory[HIGHS + i])) for i in range(law.age_high + 1)]
-    unseen = law.sample_time * sum(acted[: law.age_high]) + limits.lag * acted[law.age_high]
+    acted = [max(abs(memory[LOWS + i]), abs(memory[HIGHS + i])) for i in range(shown_late(law) + 1)]
+    unseen = law.sample_time * sum(acted[: law.age_high]) + limits.lag * max(acted[law.age_high :])
     return law.motor_high * (unseen + law.lag * max(abs(memory[FLOWING_LOW]), abs(memory[FLOWING_HIGH])))
 
 
@@ -585,7 +593,7 @@ def test_the_first_move_is_what_friction_stops_by_the_page() -> None:
     for _ in range(4000):
         law, limits, memory = drawn_law(rng), drawn_limits(rng), [0.0] * MEMORY
         begin(memory, rng.uniform(-1.0, 1.0) * rng.choice([0.5, 6.0]), rng.gauss(0.0, 10.0))
-        for i in range(law.age_high + 1):
+        for i in range(shown_late(law) + 1):
             memory[LOWS + i], memory[HIGHS + i] = sorted(rng.choice([0.0, 1.0]) * rng.gauss(0.0, 1.0) for _ in "ab")
         if law.lag:
             memory[FLOWING_LOW], memory[FLOWING_HIGH] = -rng.random(), rng.random()

@@ -6,15 +6,18 @@ The benches are drawn at random; what a law must hold is written down here once 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
 from random import Random
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Limits, Noise, Ranges, Shield, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Limits, Noise, Ranges, Sensors, Shield, load_bench
 from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.shield_design import (
     chatter_excess,
@@ -23,6 +26,7 @@ from emb_runtime.safety.shield_design import (
     law_of,
     make_law,
     stoppable,
+    unseen,
 )
 
 SHIPPED = load_bench()
@@ -32,6 +36,9 @@ KINDS = [
     pytest.param({"frame_age": (0, 3)}, id="late"),
     pytest.param({"frame_age": (2, 2)}, id="of one age"),
     pytest.param({"current_lag": 0.002}, id="lagging"),
+    pytest.param({"observer": 900.0}, id="observed"),
+    pytest.param({"observer": 1800.0, "frame_age": (0, 1)}, id="observed, late"),
+    pytest.param({"observer": 5000.0}, id="observed without delay"),
     pytest.param({"angle_low": -4.0}, id="short stroke"),
     pytest.param({"angle_low": -20.0, "angle_high": 5.0, "current": 1.5}, id="long stroke"),
     pytest.param({"angle_low": -4.0, "current_lag": 0.002}, id="short stroke, lagging"),
@@ -70,12 +77,26 @@ def drawn_bench(rng: Random) -> Bench:
     )
 
 
+def behind(scaled: float, begun: float) -> float:
+    """Samples by which an observer lags for what acted so many samples ago or before: it overshoots as well.
+
+    Simpson's rule over the share of a change that a critically damped observer does not show yet.
+    """
+    n, end = 16000, 60.0
+    h = (end - scaled * begun) / n
+    weights = [(4.0 if i % 2 else 2.0) * (1.0 if 0 < i < n else 0.5) for i in range(n + 1)]
+    at = [scaled * begun + i * h for i in range(n + 1)]
+    missing = h / 3.0 * sum(w * (1.0 + s) * math.exp(-s) for w, s in zip(weights, at, strict=True))
+    return missing / scaled + max(0.125 / scaled, 0.125 / 1.5)
+
+
 def defined(bench: Bench) -> dict[str, float]:
     """The numbers of a bench's law, by their definitions."""
     brakes, limits, settings = bench.ranges["drawn"], bench.limits, bench.shield
     low, high = brakes.low, brakes.high
     ts, current, lag = bench.timing.sample_time, limits.current, settings.current_lag
     coasting = settings.envelope == "coasting"
+    observer = min((bench.sensors.observer_bandwidth or 0.0) * ts, 3.0)
     late = settings.frame_age[1] > 0 or lag > 0.0
     bottom, top = limits.angle[0] + settings.angle_margin, limits.angle[1] - settings.angle_margin
     noise = settings.noise_sigmas * bench.noise.velocity
@@ -102,12 +123,15 @@ def defined(bench: Bench) -> dict[str, float]:
         # T_c/J (apex + stroke) = ½ w apex² + ½ v²: friction takes what the spring and the creep give.
         a, b, c = 0.5 * spring[1], -friction[0], 0.5 * (3.0 * creep) ** 2 + friction[0] * bottom
         apex = min(apex, (-b + math.sqrt(b * b - 4.0 * a * c)) / (2.0 * a))
-    cruise = (home - creep) / (1.0 + samples * ts * (motor[1] / motor[0] * viscous[1] - viscous[0]))
-    share, gain, reserve = (0.5, 0.283, 25) if late else (0.8, 0.6, 7)
+    change = PAD + ts * (current * motor[1] + friction[1] + viscous[1] * limits.velocity + spring[1] * apex)
+    seen = samples + (2.0 / observer if observer else 0.0)
+    if observer:
+        creep += 2.0 / observer * uneven + behind(observer, 5 - settings.frame_age[1]) * change
+    cruise = (home - creep) / (1.0 + seen * ts * (motor[1] / motor[0] * viscous[1] - viscous[0]))
+    share, gain, reserve = (0.5, 0.283, 25) if late else (0.65, 0.4, 5) if observer else (0.8, 0.6, 7)
     rest = noise + settings.home_velocity
     coast = (rest + noise) / friction[0]
-    kept = coast + reserve * ts + 2.0 * lag
-    change = PAD + ts * (current * motor[1] + friction[1] + viscous[1] * limits.velocity + spring[1] * apex)
+    kept = coast + reserve * ts + 2.0 * lag + (12.0 * ts / observer if observer else 0.0)
     return {
         "sample_time": ts,
         "steps": bench.timing.horizon,
@@ -134,7 +158,7 @@ def defined(bench: Bench) -> dict[str, float]:
         "damping_velocity": bench.node.damping_velocity,
         "change": change,
         "lag": lag,
-        "kept": math.exp(-ts / lag) if lag else 0.0,
+        "kept": math.exp(-ts / lag) if lag else math.exp(-observer) if observer else 0.0,
         "coasting": coasting,
         "apex": apex,
         "creep": creep,
@@ -165,7 +189,9 @@ def test_a_law_s_numbers_are_those_of_their_definitions(kind: dict[str, Any]) ->
 def taken(bench: Bench, **changes: Any) -> Bench:
     """A bench with other numbers: of its limits, its shield, its node, or ``low_``/``high_`` of its brakes."""
     for name, value in changes.items():
-        if name in ("angle_low", "angle_high"):
+        if name == "observer":
+            bench = replace(bench, sensors=Sensors("observer", value))
+        elif name in ("angle_low", "angle_high"):
             ends = (value, bench.limits.angle[1]) if name == "angle_low" else (bench.limits.angle[0], value)
             bench = replace(bench, limits=replace(bench.limits, angle=ends))
         elif name.startswith(("low_", "high_")):
@@ -183,6 +209,11 @@ def taken(bench: Bench, **changes: Any) -> Bench:
 
 def longest_lag(bench: Bench) -> float:
     return 2.0 * bench.timing.sample_time - bench.shield.current_lag
+
+
+def slowest_observer(bench: Bench) -> float:
+    assert bench.sensors.observer_bandwidth is not None
+    return bench.sensors.observer_bandwidth * bench.timing.sample_time - 0.75
 
 
 def least_speed(bench: Bench) -> float:
@@ -248,6 +279,9 @@ def between_the_limits(bench: Bench) -> float:
     acceleration = law["current"] * spread["motor"] + law["friction_low"] + law["friction_high"]
     acceleration += spread["viscous"] * bench.limits.velocity + spread["spring"] * bench.limits.angle[1]
     width = 2.0 * law["velocity_noise"] + (late + 1) * (2.0 * PAD + ts * acceleration)
+    if bench.sensors.observer_bandwidth is not None:
+        scaled = -math.log(law["kept"])
+        width += 2.0 * (2.0 / scaled + behind(scaled, 5 - late)) * law["change"]
     width += (4.0 * law["lag"] + 2.0 * ts * late) * law["motor_high"] * law["current"]
     braked = width**2 / (2.0 * law["braking"]) + ts * width * (late + 2)
     return law["top"] - law["bottom"] - 2.0 * (braked + law["angle_noise"])
@@ -273,6 +307,8 @@ REFUSED = [
     pytest.param({"angle_high": 2.0}, "high_k_1", 28.0, 2e3, landing, "greatest friction", id="landing"),
     pytest.param({"frame_age": (0, 5)}, "angle_high", 90.0, -5.0, between_the_limits, "between the angle", id="room"),
     pytest.param({"current_lag": 2e-3}, "angle_high", 90.0, -8.0, between_the_limits, "between", id="room, lag"),
+    pytest.param({"observer": 800.0}, "angle_high", 90.0, -6.5, between_the_limits, "between", id="room, observer"),
+    pytest.param({}, "observer", 1e3, 3e2, slowest_observer, "of 750 rad/s at least", id="observer"),
 ]
 
 
@@ -310,6 +346,50 @@ def test_a_lag_late_frames_and_coasting_are_covered_one_at_a_time(lag: float, la
         return
     with pytest.raises(BenchFileError, match="are covered one at a time"):
         make_law(bench)
+
+
+@pytest.mark.parametrize(
+    "beside", [{"current_lag": 1e-3}, {"frame_age": (0, 2)}, {"envelope": "coasting", "angle_margin": 0.9}]
+)
+def test_an_observer_is_covered_with_frames_of_one_sample_and_nothing_else(beside: dict[str, Any]) -> None:
+    bench = taken(drawn_bench(Random(5)), observer=1500.0)
+    make_law(taken(bench, frame_age=(1, 1)))
+    with pytest.raises(BenchFileError, match="an observer's velocity is covered with frames of age 1 at most"):
+        make_law(taken(bench, **beside))
+
+
+@pytest.mark.parametrize("scaled", [0.3, 1.5, 1.6, 3.0])
+def test_what_an_observer_lags_by_is_the_integral_of_what_it_does_not_show(scaled: float) -> None:
+    for periods in range(6):
+        assert unseen(scaled, periods) == pytest.approx(behind(scaled, periods), rel=1e-6)
+
+
+def missing(damping: float, step: float, n: int) -> NDArray[np.float64]:
+    """Share of a step of velocity that a tracking loop does not show after 0 to n of its samples.
+
+    Its poles are those of damping and bandwidth; ``step`` is bandwidth times its sample time.
+    """
+    pole = np.exp(step * complex(-damping, math.sqrt(1.0 - damping**2)))
+    a, b = 2.0 * pole.real, -(abs(pole) ** 2)
+    shown = [0.0, 1.0 - a - b]
+    for _ in range(n - 1):
+        shown.append(a * shown[-1] + b * (shown[-2] if len(shown) > 2 else 0.0) + 1.0 - a - b)
+    return 1.0 - np.array(shown)
+
+
+@pytest.mark.parametrize("parts", [1, 2, 5, 40])
+def test_every_observer_of_that_damping_and_at_least_that_bandwidth_is_among_those_assumed(parts: int) -> None:
+    """Sampled once or more often a sample: it lags by no more in any sample, up to the share for what overshoots."""
+    fine, n = 40, 60
+    for damping, scaled in itertools.product(np.linspace(0.7, 1.0, 7), [*np.linspace(0.5, 6.0, 56), 10.0, 40.0]):
+        nodes = missing(damping, scaled / parts, n * parts)
+        share = np.interp(np.arange(n * fine + 1) / fine * parts, np.arange(n * parts + 1), nodes)
+        middles = 0.5 * (share[1:] + share[:-1]).reshape(n, fine)
+        declared = min(scaled, 3.0)
+        most = [unseen(declared, i) - unseen(declared, i + 1) for i in range(n)]
+        beyond = np.maximum(np.maximum(middles, 0.0).sum(axis=1) / fine - most, 0.0).sum()
+        beyond += np.maximum(-middles, 0.0).sum() / fine
+        assert beyond <= 0.125 / min(declared, 1.5), (damping, scaled, beyond)
 
 
 def test_a_margin_of_just_what_is_needed_is_enough() -> None:

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from emb_runtime.config.bench import load_bench
 from emb_runtime.records import Reason
-from emb_runtime.safety.shield import LIMITED, NO_PAST, RETURNING, Past, shield, successor, window
+from emb_runtime.safety.shield import LIMITED, NO_PAST, RETURNING, Past, _moved_by, shield, successor, window
 from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, make_law
 
 Box = tuple[float, float, float, float]
@@ -256,6 +256,75 @@ def after_commands(law: ShieldLaw, box: Box, commands: tuple[float, ...], lost: 
     return box
 
 
+def integral(f: Callable[[float], float], low: float, high: float) -> float:
+    """By Simpson's rule."""
+    n = 400
+    h = (high - low) / n
+    inner = sum((4.0 if i % 2 else 2.0) * f(low + i * h) for i in range(1, n))
+    return h / 3.0 * (f(low) + inner + f(high))
+
+
+def observed(law: ShieldLaw, angle: float, velocity: float, past: Past, age: int, lost: bool) -> Box:
+    """The box of a measurement whose velocity is an observer's, by what the brakes at the corners of the set did.
+
+    At the time τ before, a critically damped observer of the bandwidth ω shows 1 − (1 + ωτ) exp(−ωτ) of a change.
+    """
+    scaled = math.log(1.0 / law.kept)  # ω times the sample time
+
+    def hidden(first: int, end: float) -> float:
+        """Samples that an acceleration between these samples before counts for."""
+        return integral(lambda t: (1.0 + scaled * t) * math.exp(-scaled * t), float(first), end)
+
+    overshot = max(0.125 / scaled, 0.125 / 1.5)
+    known = 5 - age
+    rest = (2.0 / scaled - sum(hidden(i, i + 1.0) for i in range(known)) + overshot) * law.change
+    xl, xh, vl, vh = measured(law, angle, velocity)
+    low, high = vl - rest, vh + rest
+    for i in range(known):
+        apart = rest + 2.0 / scaled * law.change + (i + 1) * law.change
+        slowest, fastest = vl - apart, vh + apart
+        own = past[age + i]
+        u = [own, damped(law, slowest), damped(law, fastest)] if lost else [own]
+        accelerations = [
+            m * current - k * max(x, 0.0) - math.copysign(d, v) - c * v
+            for m, current, k, x, d, c, v in itertools.product(
+                (law.motor_low, law.motor_high),
+                (min(u), max(u)),
+                (law.spring_low, law.spring_high),
+                (xl - (i + 1) * law.reach, xh + (i + 1) * law.reach),
+                (law.friction_low, law.friction_high),
+                (law.viscous_low, law.viscous_high),
+                (slowest, fastest),
+            )
+        ]
+        low += law.sample_time * hidden(i, i + 1.0) * min(*accelerations, 0.0)
+        high += law.sample_time * hidden(i, i + 1.0) * max(*accelerations, 0.0)
+    return xl, xh, low, high
+
+
+OBSERVED_AGES = [(0, 0), (0, 1), (1, 1)]
+
+
+@pytest.mark.parametrize("ages", OBSERVED_AGES)
+def test_the_window_behind_an_observer_holds_whatever_it_does_not_show_yet(ages: tuple[int, int]) -> None:
+    rng = Random(100 + 10 * ages[0] + ages[1])
+    for _ in range(60):
+        law = drawn_law(rng)._replace(age_low=ages[0], age_high=ages[1], kept=rng.uniform(0.05, 0.6))
+        angle, velocity = drawn_state(rng, law)
+        past = drawn_past(rng, law)
+        boxes = [
+            after_commands(law, observed(law, angle, velocity, past, age, True), past[:age][::-1], lost=True)
+            for age in range(ages[0], ages[1] + 1)
+        ]
+        assert_exact(law, boxes, velocity, window(law, angle, velocity, past), law.current, held_by_braking)
+
+
+def test_a_brake_at_rest_may_be_pushed_by_its_friction_the_next_moment() -> None:
+    law = drawn_law(Random(13))
+    assert _moved_by(law, 0.0, 10.0) == 10.0 + law.friction_high
+    assert _moved_by(law, 2.0, 10.0) == 10.0 - law.friction_low - law.viscous_low * 2.0
+
+
 def drawn_past(rng: Random, law: ShieldLaw) -> Past:
     one, two, three, four, five = (rng.uniform(-1.5, 1.5) * law.current for _ in range(5))
     return one, two, three, four, five
@@ -425,6 +494,20 @@ def test_late_measurements_are_rolled_on_to_where_the_way_home_begins(ages: tupl
         assert_returns_at(law, state, past, (min(xl), max(xh), min(vl), max(vh)))
 
 
+@pytest.mark.parametrize("ages", OBSERVED_AGES)
+def test_the_way_home_begins_with_what_an_observer_does_not_show_yet(ages: tuple[int, int]) -> None:
+    rng = Random(200 + 10 * ages[0] + ages[1])
+    for _ in range(40):
+        law = drawn_law(rng)._replace(age_low=ages[0], age_high=ages[1], kept=rng.uniform(0.05, 0.6))
+        state, past = inner_state(rng, law), drawn_past(rng, law)
+        boxes = [
+            after_commands(law, observed(law, *state, past, age, False), past[:age][::-1], lost=False)
+            for age in range(ages[0], ages[1] + 1)
+        ]
+        xl, xh, vl, vh = zip(*boxes, strict=True)
+        assert_returns_at(law, state, past, (min(xl), max(xh), min(vl), max(vh)))
+
+
 def test_the_way_home_of_a_late_current_begins_after_what_flows_has_decayed() -> None:
     for rng in draws():
         law = drawn_law(rng)._replace(lag=rng.uniform(1e-3, 3e-3), kept=rng.uniform(0.2, 0.6))
@@ -556,7 +639,12 @@ def test_the_last_believable_numbers_are_answered_with_full_braking(angle: float
 
 
 def test_own_commands_are_believed_together_with_the_angle_where_a_law_looks_at_them() -> None:
-    kinds: list[dict[str, Any]] = [{"age_high": 1}, {"age_low": 1, "age_high": 1}, {"lag": 1e-3, "kept": 0.4}]
+    kinds: list[dict[str, Any]] = [
+        {"age_high": 1},
+        {"age_low": 1, "age_high": 1},
+        {"lag": 1e-3, "kept": 0.4},
+        {"kept": 0.4},
+    ]
     for which, kind in itertools.product(range(5), kinds):
         law = drawn_law(Random(7))._replace(**kind)
         stop = damped(law, 20.0)
@@ -664,7 +752,7 @@ anything = st.floats(allow_nan=True, allow_infinity=True)
 def test_whatever_comes_in_a_finite_current_within_the_limit_comes_out(
     ages: tuple[int, int], angle: float, velocity: float, wanted: float, past: Past, step: int
 ) -> None:
-    law = SHIPPED._replace(age_low=ages[0], age_high=ages[1])
+    law = SHIPPED._replace(age_low=ages[0], age_high=ages[1], kept=0.2 if step % 2 else 0.0)
     current, bits = shield(law, angle, velocity, wanted, past, step)
     assert abs(current) <= law.current
     assert bits in {0, LIMITED, RETURNING, LIMITED | RETURNING}
