@@ -168,10 +168,10 @@ def unseen_speed(law: ShieldLaw, limits: SensorThresholds, memory: Any) -> float
     Causes are frames that act late, a current that lags, and a velocity that an observer derives from the angle.
     """
     speed = acted = 0.0
-    for i in range(_oldest(law) + 1):
-        acted = max(-memory[LOWS + i], memory[HIGHS + i], acted if i > law.age_high else 0.0)
-        if i < law.age_high:
-            speed += law.motor_high * acted * law.sample_time
+    for i in range(law.age_high):
+        speed += law.motor_high * max(-memory[LOWS + i], memory[HIGHS + i]) * law.sample_time
+    for i in range(law.age_high, _oldest(law) + 1):
+        acted = max(-memory[LOWS + i], memory[HIGHS + i], acted)
     speed += law.motor_high * acted * limits.lag
     flowing: float = max(-memory[FLOWING_LOW], memory[FLOWING_HIGH])
     return speed + law.motor_high * law.lag * flowing

@@ -308,6 +308,9 @@ REFUSED = [
     pytest.param({"frame_age": (0, 5)}, "angle_high", 90.0, -5.0, between_the_limits, "between the angle", id="room"),
     pytest.param({"current_lag": 2e-3}, "angle_high", 90.0, -8.0, between_the_limits, "between", id="room, lag"),
     pytest.param({"observer": 800.0}, "angle_high", 90.0, -6.5, between_the_limits, "between", id="room, observer"),
+    pytest.param(
+        {"observer": 800.0, "frame_age": (1, 1)}, "angle_high", 90.0, -6.0, between_the_limits, "between", id="room, 2"
+    ),
     pytest.param({}, "observer", 1e3, 3e2, slowest_observer, "of 750 rad/s at least", id="observer"),
 ]
 
@@ -354,6 +357,7 @@ def test_a_lag_late_frames_and_coasting_are_covered_one_at_a_time(lag: float, la
 def test_an_observer_is_covered_with_frames_of_one_sample_and_nothing_else(beside: dict[str, Any]) -> None:
     bench = taken(drawn_bench(Random(5)), observer=1500.0)
     make_law(taken(bench, frame_age=(1, 1)))
+    make_law(taken(bench, observer=750.0))
     with pytest.raises(BenchFileError, match="an observer's velocity is covered with frames of age 1 at most"):
         make_law(taken(bench, **beside))
 
