@@ -135,6 +135,21 @@ def lie(kind: int, size: float, ts: float, told: Floats, angle: float, velocity:
         told[1] = frozen_velocity
 
 
+def moved(
+    mechanics: Mechanics,
+    instruments: Instruments,
+    p: BrakeParameters,
+    ts: float,
+    current: float,
+    errors: Floats,
+    x: Floats,
+    instrument: Floats,
+) -> tuple[float, float]:
+    """Measured angle [rad] and velocity [rad/s] at the end of a sample period, see :func:`pass_period`."""
+    none, e = np.zeros(0, np.int64), (errors[0], errors[1], errors[2])
+    return pass_period(mechanics, instruments, p, ts, current, e, x, none, np.zeros((0, SENSITIVE)), instrument)
+
+
 def fly(
     law: ShieldLaw,
     limits: SensorThresholds,
@@ -148,7 +163,6 @@ def fly(
     ts = law.sample_time
     memory, instrument = np.zeros(MEMORY), np.zeros(INSTRUMENTS_MEMORY)
     x, halted, told = np.zeros(STATES), np.zeros(STATES), np.zeros(3)
-    no_unknowns, no_sensitivity = np.zeros(0, np.int64), np.zeros((0, SENSITIVE))
     for m in range(out.shape[0]):
         b = script.brakes[m]
         p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
@@ -181,18 +195,7 @@ def fly(
             past = (0.0 if math.isnan(u) else u, past[0], past[1], past[2], past[3])
             e = script.errors[m, k + 1]
             before = angle
-            angle, velocity = pass_period(
-                mechanics,
-                instruments,
-                p,
-                ts,
-                sign * felt,
-                (e[0], e[1], e[2]),
-                x,
-                no_unknowns,
-                no_sensitivity,
-                instrument,
-            )
+            angle, velocity = moved(mechanics, instruments, p, ts, sign * felt, e, x, instrument)
             row[LOWEST], row[HIGHEST] = min(row[LOWEST], x[0]), max(row[HIGHEST], x[0])
             row[FASTEST] = max(row[FASTEST], abs(x[1]))
             since = k + 1 - script.onsets[m]
@@ -238,18 +241,7 @@ def halt(
     for k in range(STOP):
         seen = -x[1] if kind in (VELOCITY_REVERSED, BOTH_REVERSED, MOTOR_REVERSED) else x[1]
         u = 0.0 if k * law.sample_time < waits else damped_current(seen, law.current, law.damping_velocity)
-        pass_period(
-            mechanics,
-            instruments,
-            p,
-            law.sample_time,
-            u,
-            (0.0, 0.0, 0.0),
-            x,
-            np.zeros(0, np.int64),
-            np.zeros((0, SENSITIVE)),
-            instrument,
-        )
+        moved(mechanics, instruments, p, law.sample_time, u, np.zeros(3), x, instrument)
         row[column], row[column + 1] = min(row[column], x[0]), max(row[column + 1], x[0])
 
 
