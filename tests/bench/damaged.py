@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import struct
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zstandard
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorSet
 from mcap.reader import NonSeekingReader
 from mcap.well_known import MessageEncoding, SchemaEncoding
@@ -106,6 +108,21 @@ def records(data: bytes) -> list[tuple[int, int, int]]:
 
 def record(opcode: int, body: bytes) -> bytes:
     return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def chunk(
+    data: bytes,
+    *,
+    size: int | None = None,
+    crc: int | None = None,
+    packed: bytes | None = None,
+    compression: bytes = b"zstd",
+) -> bytes:
+    """The body of a chunk; it may claim another size or checksum than it has, or hold other bytes."""
+    packed = zstandard.compress(data) if packed is None else packed
+    claimed = len(data) if size is None else size, zlib.crc32(data) if crc is None else crc
+    name = struct.pack("<I", len(compression)) + compression
+    return struct.pack("<QQQI", 0, 2**63, *claimed) + name + struct.pack("<Q", len(packed)) + packed
 
 
 def spliced(path: Path, extra: bytes, opcode: int = CHUNK) -> None:

@@ -33,6 +33,7 @@ from emb_runtime.config.bench import load_bench, shipped_bench_text
 from emb_runtime.policy.contract import CONTRACT_KEY
 from emb_runtime.policy.onnx_file import FIXED
 from tests.actors import constant_actor, reference_actor
+from tests.bench.damaged import chunk, record, records
 
 LONGEST = 5.0  # Time that a command may take with a file that it refuses, or that has little in it [s]
 MOST_MEMORY = 512 << 20  # Memory of its largest process [bytes]
@@ -261,31 +262,12 @@ def _spoil(dice: random.Random, record: Any) -> None:
 
 def records_of(log: bytes) -> list[tuple[int, bytes]]:
     """Opcode and body of each record of a whole log."""
-    at, found = len(MAGIC), []
-    while at < len(log) - len(MAGIC):
-        opcode, length = struct.unpack_from("<BQ", log, at)
-        found.append((opcode, log[at + 9 : at + 9 + length]))
-        at += 9 + length
-    return found
+    return [(opcode, log[begin + 9 : end]) for opcode, begin, end in records(log)]
 
 
-def file_of(records: Sequence[tuple[int, bytes]]) -> bytes:
+def file_of(parts: Sequence[tuple[int, bytes]]) -> bytes:
     """A log of such records; the checksum over its data is left out."""
-    return MAGIC + b"".join(record(opcode, body) for opcode, body in records) + MAGIC
-
-
-def record(opcode: int, body: bytes) -> bytes:
-    """One record."""
-    return struct.pack("<BQ", opcode, len(body)) + body
-
-
-def chunk(content: bytes, size: int | None = None, crc: int | None = None, packed: bytes | None = None) -> bytes:
-    """The body of a chunk; size, checksum and packed content are those of ``content`` unless they are given."""
-    packed = zstandard.ZstdCompressor(level=3).compress(content) if packed is None else packed
-    head = struct.pack(
-        "<QQQI", 0, 2**63, len(content) if size is None else size, zlib.crc32(content) if crc is None else crc
-    )
-    return head + struct.pack("<I4sQ", 4, b"zstd", len(packed)) + packed
+    return MAGIC + b"".join(record(opcode, body) for opcode, body in parts) + MAGIC
 
 
 def content_of(body: bytes) -> bytes:
@@ -313,40 +295,40 @@ def bomb(dice: random.Random) -> bytes:
 
 def log_bytes(dice: random.Random, honest: bytes) -> bytes:
     """A log that was changed."""
-    records = records_of(honest)
+    parts = records_of(honest)
     which = dice.randrange(10)
     if which == 0:
         return blind(dice, honest)
     for _ in range(dice.choice((1, 1, 2, 3))):
-        at = dice.choice([k for k, (opcode, _) in enumerate(records) if opcode == Opcode.CHUNK])
-        _, body = records[dice.randrange(1, len(records))]
+        at = dice.choice([k for k, (opcode, _) in enumerate(parts) if opcode == Opcode.CHUNK])
+        _, body = parts[dice.randrange(1, len(parts))]
         match which:
             case 1 | 2:  # the content of a chunk, with its checksum
-                records[at] = (Opcode.CHUNK, chunk(blind(dice, content_of(records[at][1]))))
+                parts[at] = (Opcode.CHUNK, chunk(blind(dice, content_of(parts[at][1]))))
             case 3:
-                records[at] = (Opcode.CHUNK, chunk(content_of(records[at][1]), size=dice.choice(NUMBERS)))
+                parts[at] = (Opcode.CHUNK, chunk(content_of(parts[at][1]), size=dice.choice(NUMBERS)))
             case 4 | 5:
-                records[at:at] = [(Opcode.CHUNK, chunk(bomb(dice)))] * dice.choice((1, 5, 50))
+                parts[at:at] = [(Opcode.CHUNK, chunk(bomb(dice)))] * dice.choice((1, 5, 50))
             case 6:
                 kinds = (Opcode.METADATA, Opcode.ATTACHMENT, Opcode.SCHEMA, Opcode.CHANNEL)
-                records.insert(at, (dice.choice(kinds), blind(dice, body)))
+                parts.insert(at, (dice.choice(kinds), blind(dice, body)))
             case 7:
                 name = dice.choice(("emb.run", "emb.end", "emb.truth", "\x1b[31m", "x" * 10_000))
                 key = dice.choice(("steps", "purpose", "iface", "bench_name", "f_v", "missing", "tool", "\u202e"))
-                records.insert(
+                parts.insert(
                     -1 if dice.randrange(2) else at, (Opcode.METADATA, metadata(name, {key: str(dice.choice(JUNK))}))
                 )
             case 8:
                 whole = attachment(dice.choice(("bench.toml", "emb.dbc", "policy.onnx")), _inside(dice))
-                records = [r for r in records if not (r[0] == Opcode.ATTACHMENT and r[1][16:40] == whole[16:40])]
-                records.insert(1, (Opcode.ATTACHMENT, whole))
+                parts = [r for r in parts if not (r[0] == Opcode.ATTACHMENT and r[1][16:40] == whole[16:40])]
+                parts.insert(1, (Opcode.ATTACHMENT, whole))
             case 9:
                 filler = dice.choice(
                     (b"\x70" + b"\0" * 8, b"\x09" + b"\0" * 8, _LURE, b"\x0c" + struct.pack("<Q", 8) + b"\0" * 8)
                 )
                 where = dice.choice((20, 300_000))
                 return honest[:where] + filler * (dice.choice((1000, 300_000)) // len(filler)) + honest[where:]
-    return file_of(records)
+    return file_of(parts)
 
 
 _LURE = b"\x06" + struct.pack("<QQQQI", 300_000, 0, 0, 300_000, 7) + b"\x04\0\0\0zstd" + struct.pack("<Q", 299_000)

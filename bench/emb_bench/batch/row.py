@@ -180,7 +180,6 @@ def write_rows(path: Path, ending: str, rows: Sequence[Row], options: Options) -
     for number, column in enumerate(table.schema):
         if pa.types.is_list(column.type):
             table = table.set_column(number, column.name, compute.binary_join(table[number], "; "))
-    for number, column in enumerate(table.schema):
-        if pa.types.is_string(column.type):
+        if pa.types.is_string(table.schema[number].type):
             table = table.set_column(number, column.name, text_cells(table[number]))
     csv.write_csv(table, path)

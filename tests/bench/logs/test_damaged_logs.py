@@ -33,6 +33,7 @@ from tests.bench.damaged import (  # isort: skip
     FOOTER,
     METADATA,
     Read,
+    chunk,
     judge,
     read,
     read_or_refuse,
@@ -73,15 +74,6 @@ def whole(undamaged: Path) -> Read:
 def path(tmp_path: Path, undamaged: Path) -> Path:
     """A copy that a test may damage."""
     return Path(shutil.copy(undamaged, tmp_path))
-
-
-def chunk(data: bytes, *, size: int | None = None, packed: bytes | None = None, compression: bytes = b"zstd") -> bytes:
-    """A chunk record; it may claim another size than it has."""
-    packed = zstandard.compress(data) if packed is None else packed
-    head = struct.pack("<QQQI", 0, 0, len(data) if size is None else size, zlib.crc32(data))
-    return record(
-        CHUNK, head + struct.pack("<I", len(compression)) + compression + struct.pack("<Q", len(packed)) + packed
-    )
 
 
 @FIXTURE
@@ -141,7 +133,7 @@ def test_a_chunk_that_unpacks_to_gigabytes_is_left_out_in_little_memory(path: Pa
         (told, 1000, "its frame claims to unpack to"),
     ):
         path.write_bytes(clean)
-        spliced(path, chunk(b"", size=size, packed=packed))
+        spliced(path, record(CHUNK, chunk(b"", size=size, packed=packed)))
         found = judge(path, whole)
         assert found is not None
         assert found.said
@@ -169,11 +161,11 @@ def test_a_huge_record_that_is_really_there_is_passed_over_in_little_memory(path
 def test_a_malformed_record_is_left_out_and_the_rest_is_right(path: Path, whole: Read) -> None:
     true, crc = path.read_bytes(), zlib.crc32
     for extra in (
-        chunk(b"", compression=b"lz4"),
-        chunk(b"\x05" + struct.pack("<Q", 10) + bytes(10)),
-        chunk(b"\x05" + struct.pack("<Q", 2**63) + bytes(30)),
-        chunk(b"\x40" + struct.pack("<Q", 0) + b"\x40\x00"),
-        chunk(b"\x04" + struct.pack("<Q", 2) + b"\x00\x01"),
+        record(CHUNK, chunk(b"", compression=b"lz4")),
+        record(CHUNK, chunk(b"\x05" + struct.pack("<Q", 10) + bytes(10))),
+        record(CHUNK, chunk(b"\x05" + struct.pack("<Q", 2**63) + bytes(30))),
+        record(CHUNK, chunk(b"\x40" + struct.pack("<Q", 0) + b"\x40\x00")),
+        record(CHUNK, chunk(b"\x04" + struct.pack("<Q", 2) + b"\x00\x01")),
         record(5, bytes(40)),
         record(0x40, b"x"),
         record(METADATA, b"\xff\xff\xff\xff"),
