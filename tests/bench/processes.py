@@ -1,4 +1,4 @@
-"""Commands in processes of their own, and what lives of their process groups."""
+"""Commands in processes of their own, and what lives of their process groups and sessions."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import pytest
 WAIT = 150.0  # s; most that a test waits for a process
 
 
-def processes(group: int) -> dict[int, str]:
-    """Living processes of a group, with their command lines."""
+def processes(leader: int) -> dict[int, str]:
+    """Living processes of a group or session, with their command lines."""
     found = {}
     for entry in Path("/proc").iterdir():
         try:
-            state, _, pgrp = (entry / "stat").read_text().rpartition(")")[2].split()[:3]
-            if entry.name.isdecimal() and int(pgrp) == group and state != "Z":
+            state, _, *of = (entry / "stat").read_text().rpartition(")")[2].split()[:4]
+            if entry.name.isdecimal() and str(leader) in of and state != "Z":
                 found[int(entry.name)] = (entry / "cmdline").read_text().replace("\0", " ")
         except (OSError, ValueError):
             continue
@@ -45,12 +45,12 @@ def press_ctrl_c(running: subprocess.Popen[str]) -> tuple[int, str, str]:
     return running.returncode, out, err
 
 
-def left_of(group: int) -> dict[int, str]:
-    """Processes of a group that do not end."""
+def left_of(leader: int) -> dict[int, str]:
+    """Processes of a group or session that do not end."""
     gone_by = time.monotonic() + WAIT
-    while processes(group) and time.monotonic() < gone_by:
+    while processes(leader) and time.monotonic() < gone_by:
         time.sleep(0.05)
-    return processes(group)
+    return processes(leader)
 
 
 def wait_until_gone(pid: int) -> None:

@@ -26,4 +26,4 @@ def test_emb_run_ends_cleanly_at_any_moment_and_leaves_nothing() -> None:
         ended = interrupted("emb-run", moment, number)
         assert ended.code in (0, 3, -ended.number), ended  # by the signal itself while nothing was open
         assert "Traceback" not in ended.said
-        assert ended.left == ()
+        assert ended.left == {}

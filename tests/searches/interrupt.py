@@ -27,6 +27,7 @@ from typing import NamedTuple
 from emb_bench.api import simulate
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.policy.policy import shipped_actor_path
+from tests.bench.processes import processes
 
 LONGEST = {"emb-run": 1.0, "emb-replay campaign --ray local": 10.0}  # Time from the signal to the end [s]
 LONGEST_OTHERS = 5.0
@@ -83,7 +84,7 @@ class Ended(NamedTuple):
     took: float  # From the signal to its end [s]
     code: int
     said: str
-    left: tuple[int, ...]  # Processes that it left
+    left: dict[int, str]  # Processes that it left
 
     @property
     def fault(self) -> str:
@@ -94,7 +95,7 @@ class Ended(NamedTuple):
             return f"exit code {self.code}"
         if "Traceback" in self.said or "Exception ignored" in self.said:
             return "a traceback"
-        return f"left the processes {self.left}" if self.left else ""
+        return f"left {', '.join(self.left.values())}" if self.left else ""
 
 
 def interrupted(command: str, moment: float, number: int, log: Path | None = None) -> Ended:
@@ -123,27 +124,13 @@ def interrupted(command: str, moment: float, number: int, log: Path | None = Non
             os.killpg(process.pid, number)
         _, said = process.communicate(timeout=60)
         took = time.monotonic() - sent
-        left = _session(process.pid)
+        left = processes(process.pid)
         if left:  # a process that is ended by the end of its parent takes its time; those of Ray more
             time.sleep(8.0 if "--ray" in words else 1.0)
-            left = _session(process.pid)
+            left = processes(process.pid)
     return Ended(
         command, min(moment, sent - began), number, took, process.returncode, said.decode("utf-8", "replace"), left
     )
-
-
-def _session(leader: int) -> tuple[int, ...]:
-    """The processes of a session."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdecimal():
-            try:
-                ended = (entry / "stat").read_text().rpartition(")")[2].split()[0] == "Z"  # not yet reaped by init
-                if os.getsid(int(entry.name)) == leader and not ended:
-                    found.append(int(entry.name))
-            except OSError:
-                continue
-    return tuple(found)
 
 
 def main() -> int:

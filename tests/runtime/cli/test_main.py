@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
-import time
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +15,7 @@ from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, load_bench, shipped_bench_text
 from emb_runtime.errors import EXIT_LOG
 from tests.actors import constant_actor
+from tests.bench.processes import left_of
 from tests.runtime.operating import Edited, EmbRun, Sim
 
 pytestmark = pytest.mark.usefixtures("handlers")
@@ -180,21 +178,4 @@ def test_a_signal_before_the_run_just_ends_it_and_one_from_then_on_is_a_safety_s
             assert read_log(log).complete
         else:
             assert (process.returncode, out, err, log.exists()) == (-number, b"", b"", False)
-        wait_for(lambda leader=process.pid: not members(leader))
-
-
-def members(leader: int) -> list[int]:
-    """The processes of a session."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            found += [int(entry.name)] if os.getsid(int(entry.name)) == leader else []
-    return found
-
-
-def wait_for(condition: object, seconds: float = 60.0) -> None:
-    assert callable(condition)
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.05)
+        assert left_of(process.pid) == {}
