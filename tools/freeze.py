@@ -87,6 +87,8 @@ GONE: dict[str, str] = {
     "report/*/profiles/*/shape": "an open profile is a doubt",
     "info/*/says/estimate/*/interval_95*": NAMED,
     "runs/*/says/estimate/*/interval_95*": NAMED,
+    "logs/*/says/estimate/*/interval_95*": NAMED,
+    "estimate/*/says/misfit/suspected/*": "no effect is suspected in an amount that no brake can have",
     "info/*/says/messages//log": "an internal error's place is in its event's detail",
 }
 """Patterns of frozen paths, ``section/name/key/...``, that are no more, and why."""
@@ -116,6 +118,7 @@ EXPLAINED: dict[str, str] = {
     "estimate/*/says/misfit/notes": JOINED,
     "estimate/*/says/misfit/alarms": JOINED,
     "demo/*/numbers*": "one format of numbers, and kB of the log: /clock has no drift_ns",
+    "estimate/disturbed pem/says/parameters/*/interval_95/0": "an interval ends at the least value that is possible",
     "runs/quick/*": "it ends at a repeatability of 1.2 %, a sample earlier than at deviations of 0.6 %",
     "design/*/says/local_optima/*": OTHER_SEARCH,
     "design/*/says/checks/*": OTHER_SEARCH,
