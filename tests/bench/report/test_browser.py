@@ -102,8 +102,9 @@ def test_it_is_printed_with_its_verdict_on_the_first_of_several_pages(
     sheets = text.decode("utf-8").rstrip("\f").split("\f")
     assert len(sheets) <= 4
     header, _, first = " ".join(sheets[0].split()).partition(" emb-excite ")
-    assert header == f"Report {report.numbers['number']}"
-    assert first.startswith("THE MODEL 'exact' DOES NOT FIT")
+    assert header == f"SIMULATED: Report {report.numbers['number']}"
+    simulated = "SIMULATED: the values are of a simulated brake, not of a real machine."
+    assert first.startswith(f"{simulated} THE MODEL 'exact' DOES NOT FIT")
     whole = " ".join(text.decode("utf-8").split())
     headings = report.reader.headings
     for heading in headings[: headings.index("Evidence")]:
