@@ -159,7 +159,7 @@ class Vesc(SimulatedDrive):
         """CAN_PACKET_STATUS and CAN_PACKET_STATUS_4."""
         angle, velocity = self.measured
         erpm = round(velocity * 60.0 / (2.0 * math.pi) * self.POLE_PAIRS)
-        first = struct.pack(">ihh", erpm, round(self.applied * 10.0), 0)
+        first = struct.pack(">ihh", erpm, max(min(round(self.applied * 10.0), 32767), -32768), 0)
         fourth = struct.pack(">hhhh", 250, 250, 0, round(math.degrees(angle) % 360.0 * 50.0))
         return [
             Frame(9 << 8 | self.IDENTIFIER, first, extended=True),

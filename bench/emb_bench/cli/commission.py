@@ -29,6 +29,13 @@ exit codes:
 """
 
 
+def folder(text: str) -> Path:
+    """The folder of a commissioning, by its name."""
+    if not text:
+        raise argparse.ArgumentTypeError("expected the name of a folder, got an empty one")
+    return Path(text)
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = Parser(
@@ -37,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("folder", type=Path, metavar="DIR", help="folder for bench files, policies and logs")
+    p.add_argument("folder", type=folder, metavar="DIR", help="folder for bench files, policies and logs")
     p.add_argument(
         "--bench", type=Path, metavar="FILE", help="bench file with the data sheet's ranges in the set of its shield"
     )

@@ -70,25 +70,32 @@ def find_messages(text: str) -> dict[str, MessageText]:
         if fault and end >= ended:
             raise FrameError(f"DBC: not readable: it ends within the message {name}")
         said = more.get(identifier, [])
-        if len(signals) + len(said) > MOST_STATEMENTS or sum(map(_page_count, said)) > MOST_PAGES:
-            fault = f"expected at most {MOST_STATEMENTS} statements and {MOST_PAGES} values of its multiplexor"
-        if name in found:
-            fault = "its name is there twice"
+        pages = sum(map(_page_count, said))
+        fault = _excess(int(identifier), len(signals) + len(said), pages, name in found) or fault
         lines = [f"BO_ {identifier} {name}: {length} X"]
         for signal_name, page, start, bits, order, sign, scale, offset in signals[:MOST_STATEMENTS]:
             lines.append(f' SG_ {signal_name} {page} : {start}|{bits}@{order}{sign} ({scale},{offset}) [0|0] "" X')
-        pages = [page for _, page, *_ in signals if page.endswith("M")]
+        switches = [page for _, page, *_ in signals if page.endswith("M")]
         found[name] = MessageText(
             length=int(length),
             is_fd=identifier in fast,
-            multiplexors=len(pages),
-            multiplexed=any(page != "M" for page in pages),
+            multiplexors=len(switches),
+            multiplexed=any(page != "M" for page in switches),
             text="" if fault else "\n".join([*lines, *said]) + "\n",
             fault=fault,
         )
     if not found:
         raise FrameError("DBC: not readable: it has no message")
     return found
+
+
+def _excess(identifier: int, statements: int, pages: int, twice: bool) -> str:
+    """Reason why a message is beyond the bounds; empty if it is not."""
+    if identifier >> 32:
+        return f"expected an identifier of 32 bits, got {identifier}"
+    if statements > MOST_STATEMENTS or pages > MOST_PAGES:
+        return f"expected at most {MOST_STATEMENTS} statements and {MOST_PAGES} values of its multiplexor"
+    return "its name is there twice" if twice else ""
 
 
 def _statements(bare: str) -> dict[str, list[str]]:

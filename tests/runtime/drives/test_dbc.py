@@ -53,6 +53,14 @@ def test_a_dbc_that_is_cut_off_is_refused_wherever_a_statement_is_not_whole() ->
         assert cut_in_statement > 0.9 * len(DBC)
 
 
+@pytest.mark.parametrize("identifier", [1 << 32, (1 << 32) + 14, 1 << 33, 9_999_999_999])
+def test_an_identifier_of_more_than_32_bits_is_no_other_one(identifier: int) -> None:
+    refusal = read(
+        DBC.replace("BO_ 14 ", f"BO_ {identifier} ").replace("SIG_VALTYPE_ 14 ", f"SIG_VALTYPE_ {identifier} ")
+    )
+    assert f"expected an identifier of 32 bits, got {identifier}" in str(refusal)
+
+
 def test_a_dbc_with_bytes_changed_is_read_or_refused_in_one_line() -> None:
     junk = ["", "e999", "9" * 5000, "\0", "\u202e", "m1M", "SG_ ", "BO_ ", "\n", *'90-|:"\\; ']
     for seed in range(1500):
