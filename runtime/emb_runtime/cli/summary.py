@@ -71,7 +71,7 @@ def header(
     """Header of a log: versions, bench, policy, bus, and what the pre-flight found; 0 steps where none is answered."""
     bench, policy = plan.bench, plan.policy
     slow = os.environ.get(SLOW_MARK, "1")
-    mapping = plan.drive.mapping if plan.drive is not None else None
+    drive = plan.drive
     records = {
         "emb.run": {
             "tool": f"emb-excite {metadata.version('emb-excite')}",
@@ -84,7 +84,7 @@ def header(
             "bench_name": bench.name,
             "bench_hash": bench.identity_hash,
             "dbc_protocol": str(plan.layout.protocol_version),
-            "bus_load_worst": f"{planned_load(bench, plan.layout, mapping):.4f}",
+            "bus_load_worst": f"{planned_load(bench, plan.layout, drive.mapping if drive is not None else None):.4f}",
             "core": compiled_core.running().text,
             "python": platform.python_version(),
             "onnxruntime": metadata.version("onnxruntime"),
@@ -112,9 +112,10 @@ def header(
         records["emb.preflight"] = {
             line.what: f"{line.verdict}: {line.found} (expected {line.expected})" for line in lines
         }
-    if plan.drive is not None and mapping is not None:
-        records["emb.drive"] = {"name": mapping.name, "lost": ", ".join(mapping.lost), "sha256": mapping.sha256}
-        records["emb.drive"]["bus"] = plan.drive.bus
+    if drive is not None:
+        mapping = drive.mapping
+        lost = ", ".join(mapping.lost)
+        records["emb.drive"] = {"name": mapping.name, "lost": lost, "sha256": mapping.sha256, "bus": drive.bus}
         attachments += [
             Attachment("drive.toml", "application/toml", mapping.text.encode()),
             Attachment("drive.dbc", "text/plain", mapping.dbc_text.encode()),
@@ -131,7 +132,7 @@ def header(
         metadata=records,
         attachments=tuple(attachments),
         topics=topics,
-        drive_bus=plan.drive.bus if plan.drive is not None else "",
+        drive_bus=drive.bus if drive is not None else "",
     )
 
 
