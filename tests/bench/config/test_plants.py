@@ -83,7 +83,8 @@ def test_what_makes_no_plant_is_refused_with_file_key_and_reason() -> None:
         (["measurement_delay = -1"], "measurement_delay", "from 0 to 10"),
         (["encoder_offset = 11"], "encoder_offset", "-10 to 10"),
         (["clock_jitter = 0.1"], "clock_jitter", "0 to 0.001"),
-        (["observer_bandwidth = 5"], "observer_bandwidth", "300 to 2000"),
+        (["observer_bandwidth = 5"], "observer_bandwidth", "300 to 6000"),
+        (["observer_bandwidth = 6001"], "observer_bandwidth", "300 to 6000"),
         (['solver = "euler"', "current_lag = 0.002"], "current_lag", 'goes with solver = "exact", not with "euler"'),
         (['solver = "euler"', "break_away = 1.2"], "break_away", 'goes with solver = "exact"'),
     ]:
