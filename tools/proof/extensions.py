@@ -268,7 +268,7 @@ def _observed(
     facts: Facts, case: Case, age: int, asked: Any, own: tuple[Real, ...], shown: Real
 ) -> tuple[Any, tuple[Real, Real], Real, Real]:
     """The law; least and greatest change by its :func:`_unseen`; least and greatest angle of the measurement."""
-    law = lifted_law(facts, case.law)._replace(kept=case.law.kept)
+    law = lifted_law(facts, case.law)._replace(observer=case.law.observer)
     x = facts.real("angle", case.bottom, case.top)
     xl, xh = x - law.angle_noise, x + law.angle_noise
     run = facts.lift(_unseen, math=math, min=facts.smaller, max=facts.greater, _moved_by=asked)
@@ -308,7 +308,7 @@ def _accelerates(facts: Facts, case: Case, end: int, age: int, i: int) -> None:
 
 def _total(case: Case, periods: int) -> float:
     """Samples by which an observer lags for what acted more than so many samples ago, and overshoots."""
-    scaled = -math.log(case.law.kept)
+    scaled = case.law.observer
     return (2.0 + scaled * periods) * math.exp(-scaled * periods) / scaled + OVERSHOOT / min(scaled, 1.5)
 
 

@@ -94,7 +94,7 @@ def lemmas(case: Case) -> tuple[Lemma, ...]:
         return COASTING
     if case.law.lag > 0.0:
         return LAGGING
-    return OBSERVED if case.law.kept > 0.0 else BRAKING
+    return OBSERVED if case.law.observer > 0.0 else BRAKING
 
 
 def judge(lemma: Lemma, case: Case) -> Verdict:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from emb_bench.brake.euler import step as euler_step
@@ -23,9 +22,8 @@ def any_box(facts: Facts, case: Case) -> tuple[Term, Term, Term, Term]:
     low, high = case.bench.limits.angle
     widest = (1 + law.age_high) * law.reach
     fastest = case.bench.limits.velocity + law.velocity_noise + (1 + law.age_high) * law.change
-    if law.kept > 0.0 and law.lag == 0.0:
-        scaled = -math.log(law.kept)
-        fastest += (2.0 / scaled + unseen(scaled, 0)) * law.change
+    if law.observer > 0.0:
+        fastest += (2.0 / law.observer + unseen(law.observer, 0)) * law.change
     xl = facts.real("xl", low - widest, high + widest)
     xh = facts.real("xh", xl, high + widest)
     vl = facts.real("vl", -fastest, fastest)

@@ -179,9 +179,9 @@ def unseen_speed(law: ShieldLaw, limits: SensorThresholds, memory: Any) -> float
 
 def _oldest(law: ShieldLaw) -> int:
     """Number of periods before the last two whose currents the velocity may show only now: late frames, an observer."""
-    if law.kept == 0.0 or law.lag > 0.0:
+    if law.observer == 0.0:
         return law.age_high
-    return min(law.age_high + int(-1.0 / math.log(law.kept)), OLDEST_FRAME)
+    return min(law.age_high + int(1.0 / law.observer), OLDEST_FRAME)
 
 
 def _held_stroke(law: ShieldLaw, friction: float) -> float:

@@ -41,12 +41,11 @@ def sensor_thresholds(bench: Bench, law: ShieldLaw) -> SensorThresholds:
     # it may begin anew at each sample, and in either direction.
     walk = ts * CORRELATION * deviation
     noise = math.log(2.0 * bench.timing.horizon / FALSE_ALARMS) * walk * walk / (2.0 * ts * offset)
-    bandwidth = bench.sensors.observer_bandwidth or math.inf
     mistaken = ts * (law.friction_low + law.friction_high)  # the sign of a lagging velocity, for one sample
     return SensorThresholds(
         travel=2.0 * law.angle_noise + noise,
         offset=offset,
-        lag=max(LAG * ts, 2.0 / bandwidth),
+        lag=max(LAG, 2.0 / law.observer) * ts if law.observer > 0.0 else LAG * ts,
         motion=2.0 * law.velocity_noise + mistaken,
         current_error=bench.guard.current_error,
         first_current=min(FIRST_MOVE * law.friction_high / law.motor_low, law.current),

@@ -213,7 +213,7 @@ def _lagging_current(
 
 def _believable(law: ShieldLaw, angle: float, velocity: float, past: Past) -> bool:
     total = abs(angle)
-    if law.age_high > 0 or law.lag > 0.0 or law.kept > 0.0:
+    if law.age_high > 0 or law.lag > 0.0 or law.observer > 0.0:
         total += abs(past[0]) + abs(past[1]) + abs(past[2]) + abs(past[3]) + abs(past[4])
     return abs(velocity) <= BELIEVABLE and total <= BELIEVABLE
 
@@ -229,7 +229,7 @@ def _rolled(
     xh = angle + law.angle_noise
     vl = velocity - law.velocity_noise
     vh = velocity + law.velocity_noise
-    if law.kept > 0.0 and law.lag == 0.0:
+    if law.observer > 0.0:
         fallen, risen = _unseen(law, xl, xh, vl, vh, past, age, lost)
         vl, vh = vl + fallen, vh + risen
     for i in range(age, 0, -1):
@@ -249,8 +249,7 @@ def _unseen(
     The share (1 + ωτ) exp(−ωτ) of what the acceleration has changed until the time τ before, at most; less what an
     observer overshoots by. ``lost`` as for :func:`_rolled`.
     """
-    ts = law.sample_time
-    scaled = -math.log(law.kept)
+    ts, scaled = law.sample_time, law.observer
     blind = unseen(scaled, PAST - age) * law.change
     aside = blind + (2.0 / scaled) * law.change
     slow, fast = vl - aside, vh + aside

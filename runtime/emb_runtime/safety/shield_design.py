@@ -74,10 +74,11 @@ class ShieldLaw(NamedTuple):
     damping_velocity: float  # The node's, also used when there is no believable angle [rad/s]
     change: float  # Largest change of the velocity in one sample [rad/s]
     lag: float  # Largest time constant of the current loop [s]
-    kept: float
-    """Share that the slowest time constant keeps over one sample; 0 if there is none.
+    kept: float  # Share of a difference between current and command that the longest lag keeps over a sample
+    observer: float
+    """Least bandwidth of the observer that derives the velocity from the angle, times the sample time; 0 for a sensor.
 
-    With a ``lag``, of a difference between current and command; without, of an observer's between two velocities.
+    It is at most that of an observer that lags no less.
     """
     coasting: bool  # 0 A for ever must keep the limits, in place of the damped stop
     apex: float  # Coasting: no brake of the box gets beyond this angle [rad]
@@ -222,14 +223,13 @@ def law_of(bench: Bench) -> ShieldLaw:
     driven = current * motor_high + friction_high + viscous_high * limits.velocity + spring_high * apex
     change = VELOCITY_PAD + ts * driven
     plan = FRESH_LANDING if age_high == 0 and lag == 0.0 else LATE_LANDING
-    kept = math.exp(-ts / lag) if lag > 0.0 else 0.0
-    reckoned, behind = float(periods), lag
+    observer, reckoned, behind = 0.0, float(periods), lag
     if bench.sensors.observer_bandwidth is not None:
         plan = OBSERVED_LANDING if age_high == 0 else LATE_LANDING
-        scaled = min(bench.sensors.observer_bandwidth * ts, FASTEST_OBSERVER)
-        kept, behind = math.exp(-scaled), 6.0 * ts / scaled  # three times the longest lag, by search
-        creep += 2.0 / scaled * uneven + unseen(scaled, OLDEST_FRAME - age_high) * change
-        reckoned += 2.0 / scaled
+        observer = min(bench.sensors.observer_bandwidth * ts, FASTEST_OBSERVER)
+        behind = 6.0 * ts / observer  # three times the longest lag, by search
+        creep += 2.0 / observer * uneven + unseen(observer, OLDEST_FRAME - age_high) * change
+        reckoned += 2.0 / observer
     cruise = (homeward - creep) / (1.0 + reckoned * ts * (ratio * viscous_high - viscous_low))
     reserve = plan.reserve * ts + 2.0 * behind
     rest = noise + shield.home_velocity
@@ -260,7 +260,8 @@ def law_of(bench: Bench) -> ShieldLaw:
         damping_velocity=bench.node.damping_velocity,
         change=change,
         lag=lag,
-        kept=kept,
+        kept=math.exp(-ts / lag) if lag > 0.0 else 0.0,
+        observer=observer,
         coasting=coasting,
         apex=apex,
         creep=creep,
@@ -287,7 +288,7 @@ def unmet_condition(law: ShieldLaw, bench: Bench) -> str:
     """The first step of the argument that does not hold for this law; "" if all do."""
     ts = law.sample_time
     speed, farthest = bench.limits.velocity, law.apex if law.coasting else bench.limits.angle[1]
-    if reason := _uncovered(law, bench.sensors.observer_bandwidth):
+    if reason := _uncovered(law):
         return reason
     if law.coasting and law.apex <= 0.0:
         return (
@@ -337,9 +338,8 @@ def unmet_condition(law: ShieldLaw, bench: Bench) -> str:
     spread += (law.viscous_high - law.viscous_low) * speed + (law.spring_high - law.spring_low) * farthest
     width = 2.0 * law.velocity_noise + (law.age_high + 1) * (2.0 * VELOCITY_PAD + ts * spread)
     width += (4.0 * law.lag + 2.0 * ts * law.age_high) * law.motor_high * law.current
-    if bench.sensors.observer_bandwidth is not None:
-        scaled = -math.log(law.kept)
-        width += 2.0 * (2.0 / scaled + unseen(scaled, OLDEST_FRAME - law.age_high)) * law.change
+    if law.observer > 0.0:
+        width += 2.0 * (2.0 / law.observer + unseen(law.observer, OLDEST_FRAME - law.age_high)) * law.change
     room = 2.0 * (0.5 * width * width / law.braking + ts * width * (law.age_high + 2) + law.angle_noise)
     if law.top - law.bottom <= room and not law.coasting:
         return (
@@ -349,25 +349,25 @@ def unmet_condition(law: ShieldLaw, bench: Bench) -> str:
     return ""
 
 
-def _uncovered(law: ShieldLaw, bandwidth: float | None) -> str:
-    """Settings that are not covered, or not together; "" if all are. ``bandwidth`` is an observer's [rad/s]."""
+def _uncovered(law: ShieldLaw) -> str:
+    """Settings that are not covered, or not together; "" if all are."""
     ts = law.sample_time
     if (law.lag > 0.0) + law.coasting + (law.age_high > 0) > 1:
         return (
             "a lag of the current, frames that may be late and the coasting envelope are covered one at a time; choose "
             "one of shield.current_lag, shield.frame_age and shield.envelope"
         )
-    if bandwidth is not None:
+    if law.observer > 0.0:
         if law.lag > 0.0 or law.coasting or law.age_high > LATEST_OBSERVED:
             return (
                 f"an observer's velocity is covered with frames of age {LATEST_OBSERVED} at most, and neither with a "
                 "lag of the current nor with the coasting envelope; change shield.frame_age, shield.current_lag or "
                 "shield.envelope"
             )
-        if bandwidth * ts < SLOWEST_OBSERVER:
+        if law.observer < SLOWEST_OBSERVER:
             return (
                 f"the way home works for a sensors.observer_bandwidth of {SLOWEST_OBSERVER / ts:g} rad/s at least, got "
-                f"{bandwidth:g} rad/s; make the observer faster"
+                f"{law.observer / ts:g} rad/s; make the observer faster"
             )
     if law.lag > LONGEST_LAG * ts:
         return (

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import pytest
 
-from emb_runtime.config.bench import OLDEST_FRAME, Sensors, load_bench
+from emb_runtime.config.bench import OLDEST_FRAME, load_bench
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.sensor_monitor import (
     ANGLE,
@@ -188,8 +188,7 @@ class Reference:
 
 def shown_late(law: ShieldLaw) -> int:
     """Periods before the last two that count: those of late frames, and whole time constants of an observer."""
-    constants = 0.0 if law.lag or not law.kept else 1.0 / math.log(1.0 / law.kept)
-    return min(law.age_high + math.floor(constants), 5)
+    return min(law.age_high + (math.floor(1.0 / law.observer) if law.observer else 0), 5)
 
 
 def drives_of(law: ShieldLaw, angles: Range, currents: Range) -> Iterator[float]:
@@ -236,7 +235,8 @@ def drawn_law(rng: Random) -> ShieldLaw:
         damping_velocity=rng.uniform(40.0, 90.0),
         change=rng.uniform(5.0, 60.0),
         lag=lag,
-        kept=math.exp(-1e-3 / lag) if lag else math.exp(-observer) if observer else 0.0,
+        kept=math.exp(-1e-3 / lag) if lag else 0.0,
+        observer=observer,
     )
 
 
@@ -453,10 +453,10 @@ def test_the_thresholds_are_those_of_the_page() -> None:
             timing=replace(BENCH.timing, horizon=horizon),
             guard=replace(BENCH.guard, current_error=tolerated),
         )
-        law = drawn_law(rng)
+        law = drawn_law(rng)._replace(observer=0.0)
         t = law.sample_time
-        observed = replace(bench, sensors=Sensors("observer", 0.5 / t if seed % 2 else 4.0 / t))
-        assert sensor_thresholds(observed, law).lag == pytest.approx(4.0 * t if seed % 2 else 0.75 * t)
+        for observer, samples in ((0.5, 4.0), (2.0, 1.0), (3.0, 0.75)):
+            assert sensor_thresholds(bench, law._replace(observer=observer)).lag == pytest.approx(samples * t)
         found = sensor_thresholds(bench, law)
         assert found.offset == pytest.approx(sigma / 2)
         assert found.travel == pytest.approx(2 * law.angle_noise + 4 * t * sigma * math.log(2 * horizon / 1e-9))

@@ -158,7 +158,8 @@ def defined(bench: Bench) -> dict[str, float]:
         "damping_velocity": bench.node.damping_velocity,
         "change": change,
         "lag": lag,
-        "kept": math.exp(-ts / lag) if lag else math.exp(-observer) if observer else 0.0,
+        "kept": math.exp(-ts / lag) if lag else 0.0,
+        "observer": observer,
         "coasting": coasting,
         "apex": apex,
         "creep": creep,
@@ -280,8 +281,7 @@ def between_the_limits(bench: Bench) -> float:
     acceleration += spread["viscous"] * bench.limits.velocity + spread["spring"] * bench.limits.angle[1]
     width = 2.0 * law["velocity_noise"] + (late + 1) * (2.0 * PAD + ts * acceleration)
     if bench.sensors.observer_bandwidth is not None:
-        scaled = -math.log(law["kept"])
-        width += 2.0 * (2.0 / scaled + behind(scaled, 5 - late)) * law["change"]
+        width += 2.0 * (2.0 / law["observer"] + behind(law["observer"], 5 - late)) * law["change"]
     width += (4.0 * law["lag"] + 2.0 * ts * late) * law["motor_high"] * law["current"]
     braked = width**2 / (2.0 * law["braking"]) + ts * width * (late + 2)
     return law["top"] - law["bottom"] - 2.0 * (braked + law["angle_noise"])

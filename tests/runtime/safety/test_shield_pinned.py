@@ -20,11 +20,11 @@ from emb_runtime.safety.shield_design import ShieldLaw, make_law
 
 COASTING = {"envelope": "coasting", "angle_margin": 1.1}
 PINNED: dict[str, tuple[dict[str, Any], str, str]] = {
-    "shipped": ({}, "8b043698192a4bdc", "8be85b96d02b3130"),
-    "lagging": ({"current_lag": 0.002}, "32d388c13140aa8e", "c17f5a1f891682a0"),
-    "late": ({"frame_age": (0, 3)}, "de3652ab9b946d96", "00b847c61a6e6b19"),
-    "of one age": ({"frame_age": (1, 1)}, "24fce3347b660174", "0c731be54ff2e987"),
-    "coasting": (COASTING, "4f30e14bc66bea5c", "d99565461ca7e2db"),
+    "shipped": ({}, "bcc80fbf85c5546a", "8be85b96d02b3130"),
+    "lagging": ({"current_lag": 0.002}, "2b6f7edada5bbdb7", "c17f5a1f891682a0"),
+    "late": ({"frame_age": (0, 3)}, "86bb046f111720ad", "00b847c61a6e6b19"),
+    "of one age": ({"frame_age": (1, 1)}, "185d1f3062e36c5a", "0c731be54ff2e987"),
+    "coasting": (COASTING, "f454d49bd7d2eb2b", "d99565461ca7e2db"),
 }
 """Settings of the shield; digests of its law, and of its decisions."""
 

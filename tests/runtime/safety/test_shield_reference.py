@@ -269,7 +269,7 @@ def observed(law: ShieldLaw, angle: float, velocity: float, past: Past, age: int
 
     At the time τ before, a critically damped observer of the bandwidth ω shows 1 − (1 + ωτ) exp(−ωτ) of a change.
     """
-    scaled = math.log(1.0 / law.kept)  # ω times the sample time
+    scaled = law.observer
 
     def hidden(first: int, end: float) -> float:
         """Samples that an acceleration between these samples before counts for."""
@@ -309,7 +309,7 @@ OBSERVED_AGES = [(0, 0), (0, 1), (1, 1)]
 def test_the_window_behind_an_observer_holds_whatever_it_does_not_show_yet(ages: tuple[int, int]) -> None:
     rng = Random(100 + 10 * ages[0] + ages[1])
     for _ in range(100):
-        law = drawn_law(rng)._replace(age_low=ages[0], age_high=ages[1], kept=rng.uniform(0.05, 0.6))
+        law = drawn_law(rng)._replace(age_low=ages[0], age_high=ages[1], observer=rng.uniform(0.5, 3.0))
         law = law._replace(change=rng.choice([law.change, 5.0]))
         angle, velocity = drawn_state(rng, law)
         past = drawn_past(rng, law)
@@ -499,7 +499,7 @@ def test_late_measurements_are_rolled_on_to_where_the_way_home_begins(ages: tupl
 def test_the_way_home_begins_with_what_an_observer_does_not_show_yet(ages: tuple[int, int]) -> None:
     rng = Random(200 + 10 * ages[0] + ages[1])
     for _ in range(40):
-        law = drawn_law(rng)._replace(age_low=ages[0], age_high=ages[1], kept=rng.uniform(0.05, 0.6))
+        law = drawn_law(rng)._replace(age_low=ages[0], age_high=ages[1], observer=rng.uniform(0.5, 3.0))
         state, past = inner_state(rng, law), drawn_past(rng, law)
         boxes = [
             after_commands(law, observed(law, *state, past, age, False), past[:age][::-1], lost=False)
@@ -644,7 +644,7 @@ def test_own_commands_are_believed_together_with_the_angle_where_a_law_looks_at_
         {"age_high": 1},
         {"age_low": 1, "age_high": 1},
         {"lag": 1e-3, "kept": 0.0},
-        {"kept": 0.4},
+        {"observer": 0.9},
     ]
     for which, kind in itertools.product(range(5), kinds):
         law = drawn_law(Random(7))._replace(**kind)
@@ -755,7 +755,7 @@ anything = st.floats(allow_nan=True, allow_infinity=True)
 def test_whatever_comes_in_a_finite_current_within_the_limit_comes_out(
     ages: tuple[int, int], angle: float, velocity: float, wanted: float, past: Past, step: int
 ) -> None:
-    law = SHIPPED._replace(age_low=ages[0], age_high=ages[1], kept=0.2 if step % 2 else 0.0)
+    law = SHIPPED._replace(age_low=ages[0], age_high=ages[1], observer=1.6 if step % 2 else 0.0)
     current, bits = shield(law, angle, velocity, wanted, past, step)
     assert abs(current) <= law.current
     assert bits in {0, LIMITED, RETURNING, LIMITED | RETURNING}
