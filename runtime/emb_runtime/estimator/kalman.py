@@ -2,7 +2,8 @@
 
 It predicts with the brake of eq. 3.12-3.14 and the current that acted, and corrects with the measured angle and then
 with the velocity, which for independent noise is the joint correction (Simon, Optimal State Estimation, 2006, chapters
-6 and 13). The parameters are constant. docs/explanation/runtime.md says why each of the following is as it is.
+6 and 13). The velocity of an observer is a function of the angles and no measurement: there the angle alone corrects.
+The parameters are constant. docs/explanation/runtime.md says why each of the following is as it is.
 
 - **Direction of motion.** For a velocity v ± σ, sign(v) has the mean s ≈ tanh(0.8 v/σ) and the variance 1 − s². The
   mean goes into the prediction, the variance into that of the velocity.
@@ -26,7 +27,7 @@ from typing import Final, NamedTuple
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, BrakeParameters, Ranges
 from emb_runtime.estimator.stick_slip import Accelerations, contact, move
 
-MEMORY: Final = 64.0  # Memory of the running mean of the squared innovations [samples]
+MEMORY: Final = 128.0  # Memory of the running mean of the squared innovations, of which a sample has one or two
 MISFIT: Final = 1.6  # The right model reached a running mean of 1.48 in one of 10,000 experiments
 SLOPE: Final = 0.8  # tanh(SLOPE z) is within 0.03 of the mean sign of a Gaussian number with mean z and deviation 1
 LEAST_VARIANCE: Final = 1e-12  # Of a velocity, where it is divided by its standard deviation [rad²/s²]
@@ -62,6 +63,7 @@ class Model(NamedTuple):
     high: Four  # Greatest
     angle_variance: float  # Of a measured angle [rad²]
     velocity_variance: float  # Of a measured velocity [rad²/s²]
+    derived: bool  # True if the velocity is an observer's, which derives it from the angle
     start_angle_variance: float  # Of the angle before the first sample: anywhere at home [rad²]
     start_velocity_variance: float  # Of the velocity [rad²/s²]
     lost: float  # Uncertainty of the velocity after a period with an unknown current [rad/s]
@@ -108,6 +110,7 @@ def make_model(bench: Bench, ranges: Ranges, *, sticks: bool) -> Model:
         high=relative(bench, ranges.high),
         angle_variance=bench.noise.angle**2,
         velocity_variance=bench.noise.velocity**2,
+        derived=bench.sensors.velocity == "observer",
         start_angle_variance=bench.shield.home_angle**2,
         start_velocity_variance=bench.shield.home_velocity**2,
         lost=t_s * ranges.high.k_m / brake.J * bench.limits.current,
@@ -141,7 +144,7 @@ def start(model: Model) -> State:
 
 
 def follow(model: Model, state: State, angle: float, velocity: float, step: float, applied: float) -> State:
-    """Estimate with one more sample, measured [rad, rad/s].
+    """Estimate with one more sample, measured [rad, rad/s]; an observer's velocity is not used.
 
     Samples were lost where its ``step`` does not follow the last one. The current ``applied`` acted in the period that
     ends at the sample [A].
@@ -149,9 +152,12 @@ def follow(model: Model, state: State, angle: float, velocity: float, step: floa
     mean, p = predict(model, state, step - state.step, applied)
     row = p[0], p[1], p[2], p[3], p[4], p[5]
     mean, p, square = _correct(mean, p, row, angle - mean[0], row[0] + model.angle_variance)
-    row = p[1], p[6], p[7], p[8], p[9], p[10]
-    mean, p, other = _correct(mean, p, row, velocity - mean[1], row[1] + model.velocity_variance)
-    innovation = state.innovation + (0.5 * (square + other) - state.innovation) / MEMORY
+    samples = MEMORY
+    if not model.derived:
+        row = p[1], p[6], p[7], p[8], p[9], p[10]
+        mean, p, other = _correct(mean, p, row, velocity - mean[1], row[1] + model.velocity_variance)
+        square, samples = 0.5 * (square + other), 0.5 * MEMORY
+    innovation = state.innovation + (square - state.innovation) / samples
     return State(step, mean, p, innovation, max(state.worst, innovation))
 
 

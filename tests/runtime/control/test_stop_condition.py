@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.cli.replay import main as emb_replay
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Sensors, load_bench
 from emb_runtime.control.core import HOME_PAIRS
 from emb_runtime.control.stop_condition import REACHED, parse_stop_condition
 from emb_runtime.errors import UsageError
@@ -69,6 +69,21 @@ def test_the_loop_estimates_along_whatever_the_policy_is_and_records_each_estima
     for value, deviation, true in zip(estimate[:4], estimate[4:], BENCH.brake[2:], strict=True):
         assert abs(value - true) < 4.0 * deviation < 0.2 * true
     assert not run.outcome.goal_reached
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_the_model_fits_an_observer_that_is_declared_and_no_other(simulate: Simulate, declared: bool) -> None:
+    sensors = Sensors("observer", 1520.0) if declared else Sensors()
+    run = simulate(
+        actor=FunctionActor(LAWS["square"]),
+        on_bench=dataclasses.replace(BENCH, sensors=sensors),
+        options="plant=observer",
+    )
+    assert (run.outcome.fault, run.outcome.model_fits) == (None, declared)
+    values, deviations, true = run.outcome.estimate[:4], run.outcome.estimate[4:], BENCH.brake[2:]
+    errors = [abs(value - brake) for value, brake in zip(values, true, strict=True)]
+    if declared:
+        assert all(error < 4.0 * known < 0.2 * b for error, known, b in zip(errors, deviations, true, strict=True))
 
 
 def test_on_the_way_home_and_where_the_bench_leaves_nothing_open_nothing_is_recorded(simulate: Simulate) -> None:

@@ -15,7 +15,7 @@ from emb_bench.brake import euler
 from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.config.bench import load_bench
 from emb_bench.information.symmetric import Floats, unpack
-from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.config.bench import PARAMETER_NAMES, Sensors
 from emb_runtime.estimator.kalman import (
     Model,
     State,
@@ -31,6 +31,7 @@ from emb_runtime.estimator.kalman import (
 BENCH = load_bench()
 PM50 = BENCH.range_set("pm50")
 EULER, EXACT = (make_model(BENCH, PM50, sticks=sticks) for sticks in (False, True))
+OBSERVED = make_model(replace(BENCH, sensors=Sensors("observer", 1520.0)), PM50, sticks=True)
 NOMINAL = np.array([getattr(BENCH.brake, n) for n in PARAMETER_NAMES])
 T_S = BENCH.timing.sample_time
 UNIT = (1.0, 1.0, 1.0, 1.0)
@@ -114,6 +115,45 @@ def test_two_corrections_in_turn_are_the_textbooks_joint_one(seed: int) -> None:
     assert unpack(np.array(found.covariance), 6) == pytest.approx(p - gain @ p[:2], rel=1e-6, abs=1e-12)
 
 
+def with_angles(state: State, samples: list[tuple[float, float]]) -> tuple[Floats, Floats, list[float]]:
+    """Mean, covariance and squared innovations of the book's filter, which corrects with the angle alone.
+
+    A sample is an angle [rad] and the current of the period before [A].
+    """
+    h, squares = np.eye(6)[:1], []
+    for k, (angle, current) in enumerate(samples, 1):
+        mean, packed = predict(OBSERVED, state, 1.0, current)
+        p = unpack(np.array(packed), 6)
+        s = h @ p @ h.T + BENCH.noise.angle**2
+        gain, innovation = p @ h.T @ np.linalg.inv(s), angle - mean[0]
+        squares.append(innovation**2 / s[0, 0])
+        joseph = np.eye(6) - gain @ h
+        p = joseph @ p @ joseph.T + gain @ gain.T * BENCH.noise.angle**2
+        state = state_of(mean + gain[:, 0] * innovation, p)._replace(step=float(k))
+    return np.array(state.mean), unpack(np.array(state.covariance), 6), squares
+
+
+def test_with_a_declared_observer_the_angle_alone_corrects_whatever_the_velocity_is() -> None:
+    rng, x, v, samples = np.random.default_rng(5), 0.0, 0.0, []
+    for k in range(60):
+        current = 6.0 if k < 30 else -6.0
+        x, v = after(EXACT, np.array([x, v, *UNIT]), current)[:2]
+        samples.append((x + 1e-3 * rng.standard_normal(), current))
+    mean, p, squares = with_angles(start(OBSERVED), samples)
+    running, worst = 1.0, 1.0
+    for square in squares:  # of one innovation a sample: the memory is as many innovations as with two
+        running += (square - running) / 128.0
+        worst = max(worst, running)
+    for shown in (0.0, 300.0, -math.inf, math.nan):
+        state = start(OBSERVED)
+        for k, (angle, current) in enumerate(samples, 1):
+            state = follow(OBSERVED, state, angle, shown, float(k), current)
+        assert state.mean == pytest.approx(mean, rel=1e-6, abs=1e-9)
+        assert unpack(np.array(state.covariance), 6) == pytest.approx(p, rel=1e-5, abs=1e-12)
+        assert (state.innovation, state.worst) == pytest.approx((running, worst), rel=1e-6)
+        assert abs(state.mean[1] - v) < 5.0
+
+
 def test_the_prior_is_uniform_in_the_ranges_and_at_home() -> None:
     ranges = BENCH.range_set("viscous")
     state = start(make_model(BENCH, ranges, sticks=True))
@@ -135,6 +175,7 @@ def test_the_model_has_the_numbers_of_the_bench() -> None:
     noisy = replace(BENCH, noise=replace(BENCH.noise, angle=2e-3, velocity=1.3))
     noise = make_model(noisy, PM50, sticks=True)
     assert (noise.angle_variance, noise.velocity_variance) == pytest.approx((4e-6, 1.69))
+    assert (noise.derived, OBSERVED) == (False, EXACT._replace(derived=True))
     assert (model.start_angle_variance, model.start_velocity_variance) == pytest.approx((0.25, 25.0))
     assert model.lost == pytest.approx(6.0 * 1.5 * model.motor * 1e-3)
     assert model.low == pytest.approx([0.5] * 4)
