@@ -4,11 +4,12 @@
 
 Plays honest experiments with every plant of the bench, with brakes of the shield's set, noise, lost samples and
 commands, jitter and delays, as tests/searches/sensor_monitor.py draws them; policies are the shipped actor, that of
-``--quick``, and those drawn there; an experiment has 500, 250 or 100 samples. For each plant: alarms, and the largest
-unexplained velocity and distance of the spring's origin as shares of what is allowed. Then the node stops the brake, as
-late as its watchdog lets it: the longest time until it is idle (NOT_AT_REST beyond 1.5 s), and how often the velocity
-that it then measures is taken for a motion. Last: how often the estimator's model does not fit, as it must for brakes
-of another kind: it ends no run.
+``--quick``, and those drawn there; an experiment has 500, 250 or 100 samples. Then with declared observers, as fast as
+declared and twice that. For each plant: alarms, and the largest unexplained velocity and distance of the spring's
+origin as shares of what is allowed; experiments that end at home and are not said to, and that show a speed beyond the
+limits, of those that keep them. Then the node stops the brake, as late as its watchdog lets it: the longest time until
+it is idle (NOT_AT_REST beyond 1.5 s), and how often the velocity that it then measures is taken for a motion. Last: how
+often the estimator's model does not fit, as it must for brakes of another kind: it ends no run.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,10 +33,12 @@ from emb_bench.sim.instruments import command, settle
 from emb_bench.sim.node import REST_TIME, REST_TRAVEL
 from emb_bench.sim.simulated_brake import pass_period, sent_current
 from emb_runtime.can.messages import load_layout
-from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.bench import BrakeParameters, Sensors
 from emb_runtime.control.loop import STOP_LISTEN_NS
+from emb_runtime.control.start_conditions import Bounds
 from emb_runtime.estimator.kalman import Model, fits, follow, make_model, start
 from emb_runtime.estimator.speed_loop import Scale
+from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.motion_balance import MEMORY as BALANCE_MEMORY
 from emb_runtime.safety.motion_balance import (
     REST_SAMPLES,
@@ -60,8 +64,16 @@ Floats = NDArray[np.float64]
 CHUNK = 1000
 ACTORS = ("four-d-exact-quadratic", "four-time-exact-quadratic")
 LENGTHS = (500, 500, 250, 100)
-PLANTS = {**COVERED, "play": {}}
-LARGEST, JUDGED, ORIGIN, REST, DOUBTED, FIRST_VELOCITY = range(6)  # Columns of a row of results; REST in periods
+PLANTS = (*(name for name in COVERED if name != "observer"), "play")
+DECLARED = {
+    f"observer of {factor * least:.0f}, {least:.0f} declared": (least, factor * least)
+    for least in (800.0, 1520.0, 3040.0)
+    for factor in (1.0, 2.0)
+}
+"""Least and true bandwidth [rad/s]."""
+LARGEST, JUDGED, ORIGIN, REST, DOUBTED, SPEED, SHOWN, TRUE, FIRST_VELOCITY = 0, 1, 2, 3, 4, 5, 6, 8, 10
+"""Columns of a row of results: REST in periods; SPEED is the largest that was shown; two columns each for angle and
+velocity at the end, as shown and in truth."""
 COLUMNS = FIRST_VELOCITY + REST_SAMPLES
 STATUS_PERIODS = 100  # Most samples that a node at rest sends until its status says why it stopped
 
@@ -137,10 +149,12 @@ def fly(
             )
             if script.losses[m, k] == SAMPLE_LOST and k < law.steps - 1:
                 continue
+            out[m, SPEED] = max(out[m, SPEED], abs(velocity))
             judge(law, limits, memory, periods * ts, angle, velocity, obeyed and periods == 1, sent, felt)
             if take(balance, sums, obeyed and periods == 1, angle, velocity, felt):
                 out[m, LARGEST] = max(out[m, LARGEST], unexplained(balance, sums) / allowance(balance, sums))
             periods = 0
+        out[m, SHOWN], out[m, SHOWN + 1], out[m, TRUE], out[m, TRUE + 1] = angle, velocity, x[0], x[1]
         last = unexplained(balance, sums) / allowance(balance, sums)
         out[m, LARGEST] = max(out[m, LARGEST], last)
         out[m, JUDGED] = last > 0.0
@@ -199,12 +213,16 @@ def halt(
         row[FIRST_VELOCITY + i] = kept[(newest + i) % REST_SAMPLES]
 
 
-def results(bench: Bench, plant: str, count: int, rng: np.random.Generator) -> Floats:
+def results(bench: Bench, name: str, count: int, rng: np.random.Generator) -> Floats:
     """Rows of results of so many experiments: half of them under a shipped actor."""
-    case = covered(bench, plant) if plant in COVERED else bench
-    law, chosen = make_law(case), case.plant(plant)
-    prior = bench.range_set(bench.prior)
-    model, box = make_model(bench, prior, sticks=True), box_of(bench, prior)
+    plant = "observer" if name in DECLARED else name
+    case, chosen = covered(bench, plant) if plant in COVERED else bench, bench.plant(plant)
+    if name in DECLARED:
+        least, true = DECLARED[name]
+        case = replace(bench, sensors=Sensors("observer", least))
+        chosen = replace(chosen, instruments=chosen.instruments._replace(observer_bandwidth=true))
+    law, prior = make_law(case), bench.range_set(bench.prior)
+    model, box = make_model(case, prior, sticks=True), box_of(bench, prior)
     stop = Stop(
         late=math.ceil(case.node.watchdog / law.sample_time - 1e-9),
         current_step=load_layout().command.signal("Current").factor,
@@ -238,6 +256,17 @@ def results(bench: Bench, plant: str, count: int, rng: np.random.Generator) -> F
     return np.concatenate(rows)
 
 
+def at_home(bench: Bench, r: Floats) -> tuple[int, int]:
+    """Experiments that end at home and are not said to, and that are said to and do not."""
+    bounds, home = Bounds(bench), bench.shield
+    said = [
+        bounds.is_home(SensorSample(0, angle, velocity, 0, 0, 0.0, 0, NodeState.ACTIVE))
+        for angle, velocity in r[:, SHOWN : SHOWN + 2].tolist()
+    ]
+    there = (abs(r[:, TRUE]) <= home.home_angle) & (abs(r[:, TRUE + 1]) <= home.home_velocity)
+    return int(np.count_nonzero(there & ~np.array(said))), int(np.count_nonzero(~there & np.array(said)))
+
+
 def main() -> int:
     """Print the table; 1 if a share of false alarms is above its limit beyond chance."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -246,37 +275,39 @@ def main() -> int:
     arguments = p.parse_args()
     bench, rng = load_bench(), np.random.default_rng(arguments.seed)
     each, totals = (
-        max(arguments.experiments // len(PLANTS), 1),
-        {"unexplained": 0, "not at rest": 0, "in motion": 0, "model does not fit": 0},
+        max(arguments.experiments // len(names := (*PLANTS, *DECLARED)), 1),
+        dict.fromkeys(("unexplained", "too fast", "not home", "not at rest", "in motion", "model does not fit"), 0),
     )
     judged = total = 0
     print(
-        "| plant | experiments | judged | alarms | share allowed | level of 1e-6 | of the origin | level | "
-        "longest until idle [s] | not idle | in motion | model does not fit |"
+        "| plant | experiments | judged | alarms | share allowed | level of 1e-6 | of the origin | level | too fast | "
+        "home, not said | said, not home | longest until idle [s] | not idle | in motion | model does not fit |"
     )
-    print("|---" * 12 + "|", flush=True)
-    for plant in PLANTS:
+    print("|---" * 15 + "|", flush=True)
+    fastest = bench.limits.velocity + bench.shield.noise_sigmas * bench.noise.velocity
+    for plant in names:
         r = results(bench, plant, each, rng)
         share, origins = r[:, LARGEST], r[:, ORIGIN]
         found, used = int(np.count_nonzero((share > 1.0) | (origins > 1.0))), int(np.count_nonzero(r[:, JUDGED]))
         longest = int(STOP_LISTEN_NS / 1e9 / bench.timing.sample_time)
         restless = int(np.count_nonzero(r[:, REST] > longest))
         moving = sum(steady_motion([*map(float, v)], bench.noise.velocity) != 0.0 for v in r[:, FIRST_VELOCITY:])
-        doubted = int(np.count_nonzero(r[:, DOUBTED]))
-        for name, count in zip(totals, (found, restless, moving, doubted), strict=True):
+        doubted, fast = (int(np.count_nonzero(column)) for column in (r[:, DOUBTED], r[:, SPEED] > fastest))
+        missed, mistaken = at_home(bench, r)
+        for name, count in zip(totals, (found, fast, missed, restless, moving, doubted), strict=True):
             totals[name] += count
         judged, total = judged + used, total + len(r)
         print(
             f"| {plant} | {len(r)} | {used} | {found} | {share.max():.2f} | {tail(share):.2f} | "
-            f"{origins.max():.2f} | {tail(origins):.2f} | {r[:, REST].max() * bench.timing.sample_time:.3f} | "
-            f"{restless} | {moving} | {doubted} |",
+            f"{origins.max():.2f} | {tail(origins):.2f} | {fast} | {missed} | {mistaken} | "
+            f"{r[:, REST].max() * bench.timing.sample_time:.3f} | {restless} | {moving} | {doubted} |",
             flush=True,
         )
     print(f"\n{judged} of {total} experiments are judged by the balance")
     above = False
     for name, count in totals.items():
         low, high = stats.binomtest(count, total).proportion_ci(method="exact")
-        what = f"honest experiments over {len(PLANTS)} plants: {name}"
+        what = f"honest experiments over {len(names)} plants: {name}"
         limit = "–" if name == "model does not fit" else "1e-4"
         above = above or (limit != "–" and low > 1e-4)
         print(f"| {what} | {limit} | {count} of {total}, {low:.1e} to {high:.1e} |")

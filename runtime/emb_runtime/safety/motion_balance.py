@@ -12,6 +12,10 @@ current that is not reported adds one as well. This torque is one more regressor
 on the velocities less their mean in each stretch of sliding: the errors of velocities are independent, those of their
 changes are not.
 
+An observer shows the velocity late, and how late is known from above only. There the velocity is the change of the
+angle in a period: the mean of that period, which lags for no brake. From one mean to the next acts the mean torque of
+both periods.
+
 Plain scalar functions on one row of numbers, so that the runtime and a compiled batch run the same code. What it sees
 and what it cannot: ``docs/explanation/sensor-monitor.md``.
 """
@@ -91,12 +95,16 @@ class BalanceModel(NamedTuple):
     stretch: float  # Allowed beside that for each stretch [rad/s]
     load: float  # What friction that grows with the load may explain [rad/s]
     late: float  # Allowed beside that where all of the current acts a sample late [rad/s]
+    rate: float  # Samples a second, where velocities are differences of angles; 0 where they are measured [1/s]
 
 
 def balance_model(bench: Bench) -> BalanceModel:
     """The model of a bench."""
     brake, t = bench.brake, bench.timing.sample_time
-    deviation, fastest = bench.noise.velocity, bench.limits.velocity
+    deviation, fastest, rate = bench.noise.velocity, bench.limits.velocity, 0.0
+    if bench.sensors.velocity == "observer":
+        rate = 1.0 / t
+        deviation = math.sqrt(2.0) * bench.noise.angle * rate
     covered = bench.shield.frame_age[1] <= PAST and bench.shield.current_lag == 0.0
     return BalanceModel(
         motor=t * brake.k_m / brake.J,
@@ -112,6 +120,7 @@ def balance_model(bench: Bench) -> BalanceModel:
         stretch=BREAK * deviation,
         load=LOAD * fastest,
         late=LATE * fastest,
+        rate=rate,
     )
 
 
@@ -138,13 +147,16 @@ def take(model: BalanceModel, memory: Any, follows: bool, angle: float, velocity
     """
     x, v, u1, u2 = memory[ANGLE], memory[VELOCITY], memory[CURRENT], memory[CURRENT + 1]
     followed = memory[FOLLOWED] + 1.0 if follows else 0.0
+    acted, pressed = current, 0.5 * (x + angle)
+    if model.rate > 0.0:
+        velocity, acted, pressed = model.rate * (angle - x), 0.5 * (current + u1), x
     memory[ANGLE], memory[VELOCITY], memory[CURRENT], memory[CURRENT + 1] = angle, velocity, current, u1
     memory[FOLLOWED] = followed
     sign = 1.0 if min(v, velocity) > model.slides else -1.0 if max(v, velocity) < -model.slides else 0.0
     if followed > PAST and sign != 0.0:
-        pressed = max(0.5 * (x + angle), 0.0)
+        pressed = max(pressed, 0.0)
         row = (
-            model.motor * current,
+            model.motor * acted,
             -model.spring * pressed,
             -model.coulomb * sign,
             -model.viscous * 0.5 * (v + velocity),
