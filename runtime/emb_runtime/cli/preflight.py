@@ -256,8 +256,8 @@ def _shield(f: Findings) -> CheckResult:
         f"{shield.envelope} envelope for '{shield.ranges}', margin {shield.angle_margin:g} rad; without commands a "
         f"{node.stop} stop, {end}"
     )
-    if (bandwidth := f.plan.bench.sensors.observer_bandwidth) is not None:
-        found += f"; the velocity is an observer's, of at least {bandwidth:g} rad/s"
+    if (sensors := f.plan.bench.sensors).velocity == "observer":
+        found += f"; the velocity is {sensors}"
     return _line("shield", found, "no brake of the set leaves its limits", speed == 0.0)
 
 

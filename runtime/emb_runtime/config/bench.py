@@ -34,6 +34,8 @@ OLDEST_FRAME = 5  # samples
 HIGHEST_BUS_LOAD = 0.8  # Beyond it, at worst-case bit stuffing, frames wait for each other
 FAR = 1e9  # of a machine that is never driven, in SI units
 SHORTEST_SAMPLE = 1e-4  # s
+PER_LAG = 0.9
+"""Bandwidth of the second order that covers an observer, times the lag of that observer: L13 of the shield."""
 
 # Ceilings of what is armed on a bus with a brake; up to those above, a file can be read and a bus without one driven.
 LONGEST_MISSED = 20  # periods
@@ -98,11 +100,23 @@ class Noise:
 
 @dataclass(frozen=True)
 class Sensors:
-    """Origin of the measured velocity."""
+    """Origin of the measured velocity: an observer derives it from the angle, where it is not measured."""
 
     velocity: Literal["sensor", "observer"] = "sensor"
     observer_bandwidth: Annotated[float, Meta(gt=0, le=1e6)] | None = None
-    """Least bandwidth of the observer that derives the velocity from the angle, with a damping from 0.7 to 1 [rad/s]"""
+    """Least bandwidth of an observer of second order with a damping from 0.7 to 1 [rad/s]"""
+    velocity_lag: Annotated[float, Meta(gt=0, le=0.1)] | None = None
+    """Longest lag of an observer of which nothing else is known [s]"""
+
+    @property
+    def bandwidth(self) -> float | None:
+        """Least bandwidth of an observer of second order that covers the declared one [rad/s]; None of a sensor."""
+        return self.observer_bandwidth if self.velocity_lag is None else PER_LAG / self.velocity_lag
+
+    def __str__(self) -> str:
+        if self.velocity_lag is not None:
+            return f"an observer's, {self.velocity_lag * 1e3:g} ms late at most"
+        return "a sensor's" if self.velocity == "sensor" else f"an observer's, of at least {self.bandwidth:g} rad/s"
 
 
 @dataclass(frozen=True)
@@ -403,11 +417,22 @@ def _limit_problems(bench: Bench, driven: bool) -> Iterator[tuple[str, str]]:
             yield "brake", f"{wanted}, got {lasts:g} s"
 
 
+def _sensor_problems(sensors: Sensors) -> Iterator[tuple[str, str]]:
+    """Keys of the velocity's origin that contradict each other, and why."""
+    given = [key for key in ("observer_bandwidth", "velocity_lag") if getattr(sensors, key) is not None]
+    if sensors.velocity == "sensor":
+        yield from ((f"sensors.{key}", 'goes with velocity = "observer"') for key in given)
+    elif not given:
+        wanted = "observer_bandwidth in rad/s, its least, or velocity_lag in s, its longest"
+        yield "sensors", f'velocity = "observer" needs {wanted}'
+    elif len(given) == 2:
+        yield "sensors.velocity_lag", "does not go with observer_bandwidth: expected one of the two"
+
+
 def _setting_problems(bench: Bench, driven: bool) -> Iterator[tuple[str, str]]:
     """Keys of the shield and the time-outs that contradict others, and why."""
     shield, watch, covered = bench.shield, bench.watch, bench.ranges.get(bench.shield.ranges)
-    if (bench.sensors.velocity == "observer") != (bench.sensors.observer_bandwidth is not None):
-        yield "sensors.observer_bandwidth", 'goes with velocity = "observer", and is needed there: its least, in rad/s'
+    yield from _sensor_problems(bench.sensors)
     _check_pair("shield.frame_age", shield.frame_age)
     if covered is None:
         yield "shield.ranges", f"no set [ranges.{shield.ranges}] in this file"

@@ -12,7 +12,7 @@ import math
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from emb_runtime.config.bench import OLDEST_FRAME, Bench
+from emb_runtime.config.bench import OLDEST_FRAME, PER_LAG, Bench
 from emb_runtime.errors import BenchFileError
 
 VELOCITY_PAD: Final = 0.3
@@ -224,9 +224,9 @@ def law_of(bench: Bench) -> ShieldLaw:
     change = VELOCITY_PAD + ts * driven
     plan = FRESH_LANDING if age_high == 0 and lag == 0.0 else LATE_LANDING
     observer, reckoned, behind = 0.0, float(periods), lag
-    if bench.sensors.observer_bandwidth is not None:
+    if (bandwidth := bench.sensors.bandwidth) is not None:
         plan = OBSERVED_LANDING if age_high == 0 else LATE_LANDING
-        observer = min(bench.sensors.observer_bandwidth * ts, FASTEST_OBSERVER)
+        observer = min(bandwidth * ts, FASTEST_OBSERVER)
         behind = 6.0 * ts / observer  # three times the longest lag, by search
         creep += 2.0 / observer * uneven + unseen(observer, OLDEST_FRAME - age_high) * change
         reckoned += 2.0 / observer
@@ -365,9 +365,11 @@ def _uncovered(law: ShieldLaw) -> str:
                 "shield.envelope"
             )
         if law.observer < SLOWEST_OBSERVER:
+            least, got = SLOWEST_OBSERVER / ts, law.observer / ts
             return (
-                f"the way home works for a sensors.observer_bandwidth of {SLOWEST_OBSERVER / ts:g} rad/s at least, got "
-                f"{law.observer / ts:g} rad/s; make the observer faster"
+                f"the way home works for a sensors.observer_bandwidth of {least:g} rad/s at least, or a "
+                f"sensors.velocity_lag of {PER_LAG / least:g} s at most, got {got:g} rad/s, or {PER_LAG / got:g} s; "
+                "make the observer faster"
             )
     if law.lag > LONGEST_LAG * ts:
         return (

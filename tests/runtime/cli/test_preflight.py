@@ -198,10 +198,13 @@ def test_what_only_warns_stands_in_its_line_alone(findings: Findings) -> None:
 
 def test_a_declared_observer_of_the_velocity_is_named(findings: Findings) -> None:
     assert "observer" not in lines_of(findings)["shield"].found
-    bench = replace(findings.plan.bench, sensors=Sensors("observer", 1520.0))
-    line = lines_of(planned(findings, bench=bench))["shield"]
-    assert line.found.endswith("; the velocity is an observer's, of at least 1520 rad/s")
-    assert line.verdict is Verdict.OK
+    for sensors, said in (
+        (Sensors("observer", 1520.0), "of at least 1520 rad/s"),
+        (Sensors("observer", velocity_lag=1e-3), "1 ms late at most"),
+    ):
+        line = lines_of(planned(findings, bench=replace(findings.plan.bench, sensors=sensors)))["shield"]
+        assert line.found.endswith(f"; the velocity is an observer's, {said}")
+        assert line.verdict is Verdict.OK
 
 
 def test_with_read_only_a_tenth_of_the_samples_missing_is_a_failed_check(findings: Findings) -> None:

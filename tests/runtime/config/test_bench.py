@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from emb_bench.config.bench import Bench, parse_bench
 from emb_runtime.config.bench import PARAMETER_NAMES, Sensors, shipped_bench_text
 from emb_runtime.errors import EXIT_USAGE, BenchFileError
+from emb_runtime.safety.shield_design import make_law
 
 TEXT = shipped_bench_text()
 
@@ -94,12 +96,20 @@ def test_what_is_wrong_is_refused_with_file_key_and_reason() -> None:
         ("k_m   = 2.170e-2", "k_m   = 9.0e-2", "shield.ranges", "leaves out the nominal k_m = 0.09"),
         ("[can]\nbitrate = 1000000", "can = 3", "can", "expected a table"),
         *(
-            ("[timing]", f"[sensors]\n{wrong}\n[timing]", f"sensors.{key}", reason)
+            ("[timing]", f"[sensors]\n{wrong}\n[timing]", f"sensors.{key}".rstrip("."), reason)
             for wrong, key, reason in (
                 ('velocity = "derived"', "velocity", "one of observer, sensor"),
-                ('velocity = "observer"', "observer_bandwidth", 'goes with velocity = "observer", and is needed there'),
+                ('velocity = "observer"', "", "needs observer_bandwidth in rad/s, its least, or velocity_lag in s"),
                 ("observer_bandwidth = 1520.0", "observer_bandwidth", 'goes with velocity = "observer"'),
+                ('velocity = "sensor"\nvelocity_lag = 0.001', "velocity_lag", 'goes with velocity = "observer"'),
+                (
+                    'velocity = "observer"\nobserver_bandwidth = 1520.0\nvelocity_lag = 0.001',
+                    "velocity_lag",
+                    "expected one of the two",
+                ),
                 ('velocity = "observer"\nobserver_bandwidth = 0.0', "observer_bandwidth", "above 0"),
+                ('velocity = "observer"\nvelocity_lag = 0.0', "velocity_lag", "above 0"),
+                ('velocity = "observer"\nvelocity_lag = 1.0', "velocity_lag", "0.1"),
                 ('velocity = "observer"\nobserver_damping = 0.7', "observer_damping", "unknown key"),
             )
         ),
@@ -124,8 +134,21 @@ def test_a_declared_observer_belongs_to_the_identity_and_a_declared_sensor_is_wh
     sensor = declaring('velocity = "sensor"')
     observers = [declaring(f'velocity = "observer"\nobserver_bandwidth = {w}') for w in (800.0, 1520.0)]
     assert (sensor.sensors, sensor.identity_hash) == (bench.sensors, bench.identity_hash)
+    lagging = declaring('velocity = "observer"\nvelocity_lag = 0.0008')
     assert observers[1].sensors == Sensors("observer", 1520.0)
-    assert len({b.identity_hash for b in (bench, *observers)}) == 3
+    assert lagging.sensors == Sensors("observer", velocity_lag=8e-4)
+    assert len({b.identity_hash for b in (bench, *observers, lagging)}) == 4
+
+
+def test_an_observer_that_is_known_by_its_lag_alone_counts_as_one_of_second_order(bench: Bench) -> None:
+    assert [Sensors("observer", velocity_lag=1e-3).bandwidth, Sensors("observer", 800.0).bandwidth] == [900.0, 800.0]
+    assert bench.sensors.bandwidth is None
+    lagging, known = (replace(bench, sensors=s) for s in (Sensors("observer", None, 1e-3), Sensors("observer", 900.0)))
+    assert make_law(lagging) == make_law(known)
+    with pytest.raises(
+        BenchFileError, match=r"a sensors\.velocity_lag of 0\.0012 s at most, got 450 rad/s, or 0\.002 s"
+    ):
+        make_law(replace(bench, sensors=Sensors("observer", None, 2e-3)))
 
 
 def test_all_that_an_old_file_lacks_is_named_at_once_with_where_to_find_it() -> None:

@@ -388,12 +388,48 @@ def test_every_observer_of_that_damping_and_at_least_that_bandwidth_is_among_tho
     for damping, scaled in itertools.product(np.linspace(0.7, 1.0, 7), [*np.linspace(0.5, 6.0, 56), 10.0, 40.0]):
         nodes = missing(damping, scaled / parts, n * parts)
         share = np.interp(np.arange(n * fine + 1) / fine * parts, np.arange(n * parts + 1), nodes)
-        middles = 0.5 * (share[1:] + share[:-1]).reshape(n, fine)
-        declared = min(scaled, 3.0)
-        most = [unseen(declared, i) - unseen(declared, i + 1) for i in range(n)]
-        beyond = np.maximum(np.maximum(middles, 0.0).sum(axis=1) / fine - most, 0.0).sum()
-        beyond += np.maximum(-middles, 0.0).sum() / fine
-        assert beyond <= 0.125 / min(declared, 1.5), (damping, scaled, beyond)
+        assert_assumed(share, fine, scaled)
+        assert_assumed(share, fine, 0.9 / float(np.trapezoid(share, dx=1.0 / fine)))  # declared by its lag alone
+
+
+def assert_assumed(share: NDArray[np.float64], fine: int, scaled: float) -> None:
+    """What is not shown, ``fine`` values a sample, is in each sample what the law assumes of a bandwidth.
+
+    Up to the share for what overshoots. ``scaled`` is the bandwidth that is declared, times the sample time.
+    """
+    middles = 0.5 * (share[1:] + share[:-1]).reshape(-1, fine)
+    declared = min(scaled, 3.0)
+    most = [unseen(declared, i) - unseen(declared, i + 1) for i in range(len(middles))]
+    beyond = np.maximum(np.maximum(middles, 0.0).sum(axis=1) / fine - most, 0.0).sum()
+    beyond += np.maximum(-middles, 0.0).sum() / fine
+    assert beyond <= 0.125 / min(declared, 1.5), (scaled, beyond)
+
+
+@pytest.mark.parametrize("lag", [0.2, 0.5, 0.9, 1.2])
+def test_every_chain_of_delays_averages_and_low_passes_of_that_lag_is_among_those_assumed(lag: float) -> None:
+    """Its response is a random delay's with a log-concave density; those that matter are truncated exponentials.
+
+    Moving averages and difference quotients are even densities, low-passes exponential ones, and pure delays points.
+    """
+    fine = 100
+    after = np.arange(60 * fine + 1) / fine
+    for first, rate in itertools.product(
+        [0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0], [-30.0, -8.0, -2.0, 1e-6, 2.0, 8.0, 30.0]
+    ):
+        mean = first + 1.0 / rate - 1.0 / math.expm1(rate)  # of the density exp(-rate τ) in a width of 1
+        inside = np.clip(after * mean / lag - first, 0.0, 1.0)
+        assert_assumed(1.0 - np.expm1(-rate * inside) / math.expm1(-rate), fine, 0.9 / lag)
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.2, 0.41])
+def test_a_low_passed_difference_quotient_is_among_those_assumed_of_its_lag(kept: float) -> None:
+    """In samples: v̂ keeps a share of itself, and takes the rest of the newest quotient."""
+    fine, n = 40, 60
+    nodes = kept ** np.arange(n + 1.0)
+    share = np.interp(np.arange(n * fine + 1) / fine, np.arange(n + 1), nodes)
+    lag = float(np.trapezoid(share, dx=1.0 / fine))
+    assert lag == pytest.approx(0.5 + kept / (1.0 - kept))
+    assert_assumed(share, fine, 0.9 / lag)
 
 
 def test_a_margin_of_just_what_is_needed_is_enough() -> None:
