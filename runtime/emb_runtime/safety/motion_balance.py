@@ -80,14 +80,14 @@ MEMORY: Final = ORIGIN + TERMS  # Length of the row
 
 
 class BalanceModel(NamedTuple):
-    """Numbers that the balance works with; floats only, so that what uses it compiles."""
+    """Numbers that the balance works with; floats and a flag, so that what uses it compiles."""
 
     motor: float  # Change of the velocity in a period by 1 A, on the nominal brake [rad/(s·A)]
     spring: float  # By 1 rad [1/s]
     coulomb: float  # By Coulomb friction [rad/s]
     viscous: float  # By 1 rad/s
     curved: float  # By 1 rad², where the stiffness doubles over the whole travel [1/(rad·s)]
-    deviation: float  # Standard deviation of a velocity [rad/s]
+    deviation: float  # Standard deviation of a velocity, as :func:`take` has it [rad/s]
     travel: float  # Largest angle [rad]
     slides: float  # Speed above which a period counts [rad/s]
     prior: float  # Weight of the nominal brake in the normal equations [rad²/s²]
@@ -95,16 +95,15 @@ class BalanceModel(NamedTuple):
     stretch: float  # Allowed beside that for each stretch [rad/s]
     load: float  # What friction that grows with the load may explain [rad/s]
     late: float  # Allowed beside that where all of the current acts a sample late [rad/s]
-    rate: float  # Samples a second, where velocities are differences of angles; 0 where they are measured [1/s]
+    sample_time: float  # [s]
+    derived: bool  # True if the velocity is an observer's, which derives it from the angle
 
 
 def balance_model(bench: Bench) -> BalanceModel:
     """The model of a bench."""
     brake, t = bench.brake, bench.timing.sample_time
-    deviation, fastest, rate = bench.noise.velocity, bench.limits.velocity, 0.0
-    if bench.sensors.velocity == "observer":
-        rate = 1.0 / t
-        deviation = math.sqrt(2.0) * bench.noise.angle * rate
+    derived, fastest = bench.sensors.velocity == "observer", bench.limits.velocity
+    deviation = math.sqrt(2.0) * bench.noise.angle / t if derived else bench.noise.velocity
     covered = bench.shield.frame_age[1] <= PAST and bench.shield.current_lag == 0.0
     return BalanceModel(
         motor=t * brake.k_m / brake.J,
@@ -120,7 +119,8 @@ def balance_model(bench: Bench) -> BalanceModel:
         stretch=BREAK * deviation,
         load=LOAD * fastest,
         late=LATE * fastest,
-        rate=rate,
+        sample_time=t,
+        derived=derived,
     )
 
 
@@ -148,8 +148,8 @@ def take(model: BalanceModel, memory: Any, follows: bool, angle: float, velocity
     x, v, u1, u2 = memory[ANGLE], memory[VELOCITY], memory[CURRENT], memory[CURRENT + 1]
     followed = memory[FOLLOWED] + 1.0 if follows else 0.0
     acted, pressed = current, 0.5 * (x + angle)
-    if model.rate > 0.0:
-        velocity, acted, pressed = model.rate * (angle - x), 0.5 * (current + u1), x
+    if model.derived:
+        velocity, acted, pressed = (angle - x) / model.sample_time, 0.5 * (current + u1), x
     memory[ANGLE], memory[VELOCITY], memory[CURRENT], memory[CURRENT + 1] = angle, velocity, current, u1
     memory[FOLLOWED] = followed
     sign = 1.0 if min(v, velocity) > model.slides else -1.0 if max(v, velocity) < -model.slides else 0.0
