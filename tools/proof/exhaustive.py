@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from emb_runtime.safety.shield import _braking_window, _highest_current
-from emb_runtime.safety.shield_design import ANGLE_PAD, ShieldLaw, damped_excess
+from emb_runtime.safety.shield import PAST, _braking_window, _highest_current
+from emb_runtime.safety.shield_design import ANGLE_PAD, ShieldLaw, damped_excess, unseen
 from tools.proof.boxes import Covered, Slack, cover
 from tools.proof.cases import Case
 from tools.proof.intervals import Boxes, Interval, greater
@@ -26,6 +26,7 @@ def some_current_is_left(case: Case) -> Covered:
     Holds for any measurement within the limits and the noise, possible or not, of any age. The slack is that of the
     ends [A], or that of the speed over what a sample can change [rad/s].
     """
+    hidden = _most_unseen(case)
 
     def statement(boxes: Boxes) -> Slack:
         law = interval_law(boxes, case.law)
@@ -39,9 +40,9 @@ def some_current_is_left(case: Case) -> Covered:
         window = boxes.lift(_braking_window, _highest_current=watched)
 
         def slack(angle: Interval, velocity: Interval) -> Any:
-            # Older measurements leave wider boxes.
+            # Older measurements, and those of an observer, leave wider boxes.
             wide = law.angle_noise + case.law.age_high * law.reach
-            fast = law.velocity_noise + case.law.age_high * law.change
+            fast = law.velocity_noise + case.law.age_high * law.change + hidden
             window(law, angle - wide, angle + wide, velocity - fast, velocity + fast)
             top, bottom = ends[-2], -ends[-1]
             left = greater(top - bottom, greater(-law.current - bottom, top - law.current))
@@ -55,6 +56,20 @@ def some_current_is_left(case: Case) -> Covered:
         "velocity": (-law.homeward_speed - law.velocity_noise, law.outward_speed + law.velocity_noise),
     }
     return cover(statement, region, MOST)
+
+
+def _most_unseen(case: Case) -> float:
+    """Greatest change of the velocity that :func:`emb_runtime.safety.shield._unseen` reckons with [rad/s]."""
+    law = case.law
+    if law.observer == 0.0:
+        return 0.0
+    rest = unseen(law.observer, PAST - law.age_high) * law.change
+    away = rest + (2.0 / law.observer + PAST) * law.change
+    fastest = law.outward_speed + 2.0 * law.velocity_noise + away
+    farthest = case.top + 2.0 * law.angle_noise + PAST * law.reach
+    accelerated = law.motor_high * law.current + law.friction_high
+    accelerated += law.viscous_high * fastest + law.spring_high * farthest
+    return rest + 2.0 / law.observer * law.sample_time * accelerated
 
 
 def damped_stop_is_counted(case: Case) -> Covered:

@@ -75,9 +75,8 @@ LAGGING = (
     ROLLED[0],
 )
 OBSERVED = (
-    *BRAKING[:-3],
+    *BRAKING,
     Lemma("L13", extensions.observer_is_bounded, "what an observer does not show yet is within what is assumed"),
-    *ROLLED,
 )
 COASTING = (
     *BOX,
