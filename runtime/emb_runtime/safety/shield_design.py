@@ -34,7 +34,7 @@ FRESH_LANDING = Landing(share=0.8, gain=0.6, reserve=7)
 """For commands that act in the very period of the sample that they answer."""
 LATE_LANDING = Landing(share=0.5, gain=0.283, reserve=25)
 """For unknown or greater frame ages, where the loop has dead time."""
-OBSERVED_LANDING = Landing(share=0.65, gain=0.4, reserve=5)
+OBSERVED_LANDING = Landing(share=0.65, gain=0.5, reserve=2)
 """For a velocity that an observer derives from the angle."""
 CREEPS: Final = 3.0  # Coasting: speed allowed at the largest angle, as a multiple of ``creep``
 LONGEST_LAG: Final = 2.0  # Samples. With a slower current loop the limits would hold, but the landing would not.

@@ -128,7 +128,7 @@ def defined(bench: Bench) -> dict[str, float]:
     if observer:
         creep += 2.0 / observer * uneven + behind(observer, 5 - settings.frame_age[1]) * change
     cruise = (home - creep) / (1.0 + seen * ts * (motor[1] / motor[0] * viscous[1] - viscous[0]))
-    share, gain, reserve = (0.5, 0.283, 25) if late else (0.65, 0.4, 5) if observer else (0.8, 0.6, 7)
+    share, gain, reserve = (0.5, 0.283, 25) if late else (0.65, 0.5, 2) if observer else (0.8, 0.6, 7)
     rest = noise + settings.home_velocity
     coast = (rest + noise) / friction[0]
     kept = coast + reserve * ts + 2.0 * lag + (12.0 * ts / observer if observer else 0.0)
