@@ -127,6 +127,8 @@ EXPLAINED: dict[str, str] = {
     "fim/emps/says/physical/matrix/[012]/3": METRES,
     "fim/emps/says/physical/cramer_rao/current_offset": METRES,
     "fim/emps/says/physical/findings/current_offset/deviation": METRES,
+    "fim/emps/says/fit_sigmas/velocity": "an observer derives it: it is no measurement to compare with",
+    "estimate/disturbed pem/says/misfit/suspected/velocity_lag": "the velocity itself shows no observer",
     "fim/emps/says/weighted/*": "the outputs are divided by a brake's 100 and 500, which are of metres now",
     "report/emps/says/runs/0/experiment/*": METRES,
     "estimate/emps windows/says/information/3/3": METRES,

@@ -317,7 +317,7 @@ def fisher_information(
     log = _driven(run, map)
     its = bench_for(log, bench)
     question = Question(*_unknowns(params, nuisance, its), None if prior is None else its.range_set(prior))
-    plant = its.plant(model or default_model(log)[0])
+    plant = its.model(model or default_model(log)[0])
     name, brake, errors = read_theta(_text_of(theta), log, its)
     return evaluate(log, read_experiment(log, its), its, [plant], question, name, brake, errors)[0]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from emb_bench.design.problem import Problem, make_problem
 from emb_bench.excitation import parse_excitation, run_excitation
 from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import fisher
-from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, Sensors, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError
 from emb_train import optimum
 from emb_train.cli import main
@@ -151,6 +152,16 @@ def test_the_known_optimum_is_the_information_of_the_currents_that_were_found(se
         own = fisher(BENCH, brake, currents, kind="weighted", plant=plant, params=("f_v",))
         assert value == pytest.approx(own.matrix[0, 0], rel=1e-9)
     assert searched == [3e-5, 1e-5, 4e-5]
+
+
+def test_the_known_optimum_is_behind_ideal_instruments_where_the_bench_declares_an_observer_too(
+    searched: list[float],
+) -> None:
+    brakes = [BENCH.brake._replace(f_v=v) for v in (3e-5, 1e-5)]
+    observed = replace(BENCH, sensors=Sensors("observer", 1520.0))
+    found = [optima(bench, MEASURES["D"], ("f_v",), "exact", brakes, quiet) for bench in (BENCH, observed)]
+    assert found[0].tolist() == found[1].tolist()
+    assert len(searched) == 4
 
 
 def test_speeds_that_are_followed_are_reached_on_another_brake() -> None:

@@ -8,6 +8,7 @@ result is the best that was found, not proved to be the best there is.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -20,7 +21,7 @@ from emb_bench.design.problem import Problem, make_problem
 from emb_bench.design.search import search
 from emb_bench.information.symmetric import Floats
 from emb_bench.sim.open_loop import feedback
-from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.bench import BrakeParameters, Sensors
 from emb_train.play import Measure
 
 FIRST_STARTS = 24  # Coarse searches for the brake in the middle
@@ -64,11 +65,11 @@ def optima(
         UsageError: nothing that was found for a brake keeps the limits.
     """
     speeds: Sequence[float] = ()
-    matrices = []
+    matrices, ideal = [], replace(bench, sensors=Sensors())
     for number, brake in enumerate(brakes, 1):
         tell(f"optimum on {plant}, brake {number} of {len(brakes)}")
         goal = measure.goal
-        problem = make_problem(bench, goal, parameters, model=plant, kind=measure.kind, brake=brake, returns=True)
+        problem = make_problem(ideal, goal, parameters, model=plant, kind=measure.kind, brake=brake, returns=True)
         warm = [followed(problem, speeds)] if speeds else []
         found = search(problem, starts=STARTS if speeds else FIRST_STARTS, seed=SEED, warm=warm)
         design = problem.design(found.best.currents)

@@ -270,7 +270,7 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
     if wanted.model == EVERY:
         choice = choose_model(
             bench,
-            list(bench.plants.values()),
+            [bench.model(name) for name in bench.plants],
             records_of,
             wanted.problem(bench, plant),
             starts=wanted.starts,
@@ -305,13 +305,13 @@ def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, la
 def begun_with(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions) -> Plant:
     """The plant that a study of logs begins with: the one that was asked for, or that of the logs."""
     if wanted.model is not None:
-        return bench.plant(DEFAULT_PLANT if wanted.model == EVERY else wanted.model)
+        return bench.model(DEFAULT_PLANT if wanted.model == EVERY else wanted.model)
     models = sorted({default_model(log)[0] for log in logs})
     if len(models) > 1:
         raise UsageError(
             f"the logs are of different brakes ({', '.join(models)}): say which model to use, with --model"
         )
-    return bench.plant(models[0])
+    return bench.model(models[0])
 
 
 def covering(

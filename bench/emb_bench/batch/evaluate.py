@@ -54,7 +54,7 @@ def _steps(source: Source, options: Options) -> Iterator[Row]:
     require_driven(log)
     bench = log.bench if options.bench_text is None else parse_bench(options.bench_text, "--bench", analysis=True)
     check_sample_time(log, bench)
-    plant = bench.plant(options.model or default_model(log)[0])
+    plant = bench.model(options.model or default_model(log)[0])
     prior = None if options.prior is None else bench.range_set(options.prior)
     question = Question(options.params, options.nuisances, prior)
     experiment = read_experiment(log, bench, source.path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -80,6 +80,13 @@ class Bench(driven.Bench):
         except KeyError:
             known = f"{', '.join(self.plants)}{near(name, self.plants)}"
             raise BenchFileError(f"no plant is called {name!r}; this bench has: {known}") from None
+
+    def model(self, name: str) -> Plant:
+        """The named brake as a record of this bench is evaluated: behind the observer that ``[sensors]`` declares."""
+        plant, bandwidth = self.plant(name), self.sensors.observer_bandwidth
+        if bandwidth is None:
+            return plant
+        return replace(plant, instruments=plant.instruments._replace(observer_bandwidth=bandwidth))
 
 
 def load_bench(path: str | Path | None = None, *, analysis: bool = False) -> Bench:

@@ -15,7 +15,7 @@ from emb_bench.config.plants import DEFAULT_PLANT, EXACT, Plant
 from emb_bench.design import kernel
 from emb_bench.design.kernel import Box, Task
 from emb_bench.information.criteria import Criterion
-from emb_bench.information.fisher import Kind, Weights, weights_of
+from emb_bench.information.fisher import Kind, Weights, weights_along
 from emb_bench.information.symmetric import packed_size, unpack
 from emb_bench.sim.open_loop import check_unknowns, held, march, trajectory
 from emb_runtime.config.bench import BrakeParameters
@@ -134,16 +134,17 @@ def make_problem(
     if not params:
         raise UsageError(f"expected at least one parameter of {', '.join(PARAMETERS)}")
     check_unknowns(params)
-    plant = bench.plant(model)
-    if kind == "physical" and (plant.instruments.clock_jitter > 0.0 or plant.instruments.observer_bandwidth > 0.0):
-        raise UsageError(f"plant '{model}': a design is for exact sample times and a velocity that is measured")
+    plant = bench.model(model)
+    if kind == "physical" and plant.instruments.clock_jitter > 0.0:
+        raise UsageError(f"plant '{model}': a design is for exact sample times")
     limits, home = bench.limits, bench.shield
+    (weights,) = weights_along(bench, kind, plant.instruments, np.zeros((2, STATES)))
     return Problem(
         plant=plant,
         brake=bench.brake if brake is None else brake,
         params=params,
         goal=goal,
-        weights=weights_of(bench, kind),
+        weights=Weights(*weights.tolist()),
         box=Box(
             limits.current,
             limits.angle[0] + MARGIN,

@@ -54,7 +54,7 @@ class Check:
 
 def check(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, currents: Floats, plant_name: str) -> Check:
     """Checks a sequence of currents on a brake: its criteria, and whether it keeps the bench's limits there."""
-    plant = bench.plant(plant_name)
+    plant = bench.model(plant_name)
     # What the brake does, not what sensors show of it later: the last periods count, too.
     plant = replace(plant, instruments=plant.instruments._replace(measurement_delay=0))
     t_s, p = problem.sample_time, problem.brake

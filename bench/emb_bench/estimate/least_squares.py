@@ -26,7 +26,6 @@ from emb_bench.estimate.output_error import finished, sandwich
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.sim.instruments import observer_noise
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 
@@ -104,7 +103,7 @@ def regression(problem: Problem, record: Experiment) -> tuple[Floats, Floats]:
     seen = record.samples[delay:]
     begun, ended = seen[:-1], seen[1:]
     mean = 0.5 * (begun + ended)
-    noise = velocity_noise(problem)
+    noise = problem.bench.noise.velocity
     sign = np.sign(mean[:, 1])
     impulses = {
         "k_m": record.currents[1 : len(seen)] * t_s,
@@ -121,14 +120,6 @@ def regression(problem: Problem, record: Experiment) -> tuple[Floats, Floats]:
     counts = moves & np.isfinite(mean[:, 0]) & reported
     deviation = np.sqrt(2.0) * p.J * noise
     return np.where(counts[:, None], rows / deviation, 0.0), np.where(counts, whole / deviation, 0.0)
-
-
-def velocity_noise(problem: Problem) -> float:
-    """Standard deviation of a measured velocity [rad/s]."""
-    bench, bandwidth = problem.bench, problem.plant.instruments.observer_bandwidth
-    if bandwidth > 0.0:
-        return observer_noise(bandwidth, bench.timing.sample_time, bench.noise.angle)
-    return bench.noise.velocity
 
 
 def beginning(problem: Problem) -> tuple[Floats, Floats]:

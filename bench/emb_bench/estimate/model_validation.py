@@ -30,7 +30,7 @@ from scipy import special
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem, by_record
 from emb_bench.estimate.records import Disturbance, Independence, ModelValidation, Whiteness
-from emb_bench.estimate.suspects import DEPENDENT, Shown, Simulated, score
+from emb_bench.estimate.suspects import DEPENDENT, LAGGING, Shown, Simulated, score
 
 Bools = NDArray[np.bool_]
 
@@ -126,7 +126,11 @@ def _judged(m: ModelValidation, disturbance: Disturbance | None) -> ModelValidat
     return replace(
         m,
         alarming=alarming,
-        suspected=tuple(s for s in m.suspects if s.possible and f"score of {s.name}" in alarming),
+        suspected=tuple(
+            s
+            for s in m.suspects
+            if s.possible and f"score of {s.name}" in alarming and (s.name != LAGGING or s.observer)
+        ),
         coloured=tuple(coloured),
         disturbance=disturbance if disturbance is not None and disturbance.p_value < share else None,
     )

@@ -173,6 +173,15 @@ class Independence:
     lag: int  # At this many samples
 
 
+class Derived(NamedTuple):
+    """Observer that derives the velocity from the angle."""
+
+    bandwidth: float  # [rad/s]
+    least: float  # Least bandwidth that is not told apart from it [rad/s]
+    is_known: bool  # False if it may be much larger
+    p_value: float  # Chance of such a lag in a velocity that is measured
+
+
 @dataclass(frozen=True)
 class Suspect:
     """An effect that the model lacks, and how much of it the residuals ask for (Rao's score test)."""
@@ -182,6 +191,7 @@ class Suspect:
     sigmas: float
     p_value: float = 1.0  # Chance of as much of it if the model is right
     possible: bool = True  # A brake can have this amount
+    observer: Derived | None = None  # What the velocity's lag comes from, if the record shows it
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -26,6 +26,7 @@ from emb_bench.brake.parameters import CURVED, PARAMETERS, SI, Parameter, Quanti
 from emb_bench.config.bench import Bench
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import EXACT, Mechanics
+from emb_bench.estimate.derived_velocity import derived
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import (
     ANGLE_SCALE,
@@ -104,9 +105,10 @@ class Simulated:
 _COOL = "keep the motor cool, or use a shorter run"
 _CLAMP = "clamp some times before the run, or use a shorter one"
 _WARM = "begin when all that moves is warm, or use a shorter run"
+LAGGING = "velocity_lag"  # Explains a misfit if the velocity itself shows an observer
 EFFECTS: Mapping[str, Parameter] = {
     **{name: row for name, row in PARAMETERS.items() if row.effect},
-    "velocity_lag": Parameter(
+    LAGGING: Parameter(
         "s", high=0.1, effect="a velocity that lags, as an observer's does", remedy=_PLANT, positive=True
     ),
     **{
@@ -149,7 +151,7 @@ def held(problem: Problem) -> tuple[str, ...]:
         name
         for name, effect in EFFECTS.items()
         if effect.step == 0.0
-        and name not in estimated | {"velocity_lag", *DRIFTS}
+        and name not in estimated | {LAGGING, *DRIFTS}
         and (name != "delay" or timed)
         and (name != "velocity_gain" or not observed)
     )
@@ -180,7 +182,7 @@ def secants(problem: Problem, z: Floats, model: Shown) -> dict[str, list[Floats]
         if not observed:
             slope = np.diff(motion[:, 1], prepend=record.velocity) / problem.bench.timing.sample_time
             lag = np.stack([np.zeros_like(slope), -slope], axis=1)
-            found.setdefault("velocity_lag", []).append(model.whitened(i, 1e-6 * lag) / 1e-6)
+            found.setdefault(LAGGING, []).append(model.whitened(i, 1e-6 * lag) / 1e-6)
     return found
 
 
@@ -288,7 +290,7 @@ def score(
     kept = axes[:, values > 1e-3]
     statistic, rank = float(np.sum((kept.T @ errors) ** 2)), kept.shape[1]
     p_value = float(special.chdtrc(rank, statistic / max(ratio, 1.0)))
-    return _ranked(found), tuple(budget), JointScore(statistic, rank, p_value)
+    return _with_observer(_ranked(found), problem), tuple(budget), JointScore(statistic, rank, p_value)
 
 
 def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
@@ -304,6 +306,18 @@ def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
     alike = [s for s in ordered if s.sigmas**2 >= least and s.p_value < 0.5]
     alike.sort(key=lambda s: list(EFFECTS).index(s.name))
     return (*alike, *(s for s in ordered if s not in alike))
+
+
+def _with_observer(found: tuple[Suspect, ...], problem: Problem) -> tuple[Suspect, ...]:
+    """Suspects with the observer that derives the velocity, if a record shows one: the lag of it comes first."""
+    observed = problem.plant.instruments.observer_bandwidth > 0.0
+    if observed or (observer := derived(problem.records, problem.bench.timing.sample_time)) is None:
+        return found
+    ordered = sorted(found, key=lambda s: s.name != LAGGING)
+    return tuple(
+        replace(s, p_value=observer.p_value, possible=True, observer=observer) if s.name == LAGGING else s
+        for s in ordered
+    )
 
 
 def _lengths(jacobian: Floats) -> Floats:

@@ -14,13 +14,12 @@ from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT, RECORDED_PLANT, THESIS_PLANT, Plant
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors, Theta, Trajectory, simulate_parts
+from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors, Theta, simulate_parts
 from emb_bench.information.fisher import Fisher, Kind, information_over_time, uniform_prior, weights_along
 from emb_bench.information.identifiability import Identifiability
 from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import RunLog
 from emb_bench.numbers import relative
-from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_bench.sim.open_loop import check_unknowns, fast_loop
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import LogError, UsageError
@@ -37,7 +36,7 @@ class Fit:
     """
 
     angle: float
-    velocity: float
+    velocity: float | None  # None of a velocity that an observer derives: it is no measurement of its own
     samples: int
 
     @property
@@ -46,9 +45,14 @@ class Fit:
         return 1.0 + 6.0 / math.sqrt(2.0 * max(self.samples, 1))
 
     @property
+    def compared(self) -> tuple[float, ...]:
+        """The distances of what is measured."""
+        return (self.angle,) if self.velocity is None else (self.angle, self.velocity)
+
+    @property
     def fits(self) -> bool:
         """True if there are samples, and they differ no more than the sensors' noise explains."""
-        return self.samples > 0 and self.angle <= self.expected and self.velocity <= self.expected  # not with NaN
+        return self.samples > 0 and all(each <= self.expected for each in self.compared)  # not with NaN
 
 
 PIECE = 8192  # Periods that are evaluated together
@@ -73,14 +77,11 @@ def information_and_fit(
 
     A measurement delay of the model shifts what a sample measures: the first ones show the brake before the experiment
     and inform of the encoder's offset and of the start alone. The jitter of the clock makes the standard deviations
-    larger where the brake is fast. Noise of an observer's velocity is coloured, so that its mean square scatters more
-    than that of white noise.
+    larger where the brake is fast. An observer's velocity is not compared.
     """
     nothing, at = np.zeros((len(names), len(names))), np.asarray(instants, np.int64)
     totals: dict[Kind, Floats] = {"physical": nothing if start is None else start, "weighted": nothing}
     kept: dict[Kind, list[Floats]] = {kind: [np.empty((0, *nothing.shape))] for kind in KINDS}
-    memory = np.zeros(MEMORY)
-    settle(plant.instruments._replace(encoder_offset=theta.offset(plant)), memory, theta.start[0])
     squares, count, done = np.zeros(2), 0, 0
     pieces = list(replace(experiment, late=None, assumed=None, places=None).split(piece))
     loop = fast_loop(experiment.periods)
@@ -92,29 +93,12 @@ def information_and_fit(
             history = information_over_time(motion.sensitivities, weights, totals[kind], part.measured)
             totals[kind] = history[-1]
             kept[kind].append(history[wanted])
-        distances = _distances(bench, plant, theta, part, motion, memory)
+        roots = np.sqrt(weights_along(bench, "physical", plant.instruments, motion.states))
+        distances = ((part.samples - motion.samples) * roots)[part.measured]
         squares, count, done = squares + np.sum(distances**2, axis=0), count + len(distances), done + part.periods
     angle, velocity = np.sqrt(squares / max(count, 1)).tolist()
-    return {kind: np.concatenate(parts) for kind, parts in kept.items()}, Fit(angle, velocity, count)
-
-
-def _distances(
-    bench: Bench, plant: Plant, theta: Theta, part: Experiment, motion: Trajectory, memory: Floats
-) -> Floats:
-    """Measured samples less what the instruments show but for their noise, in standard deviations, shape (count, 2).
-
-    An observer, with its ``memory``, is run along the plant's own angle.
-    """
-    instruments, t_s = plant.instruments, bench.timing.sample_time
-    jitter_only = instruments._replace(observer_bandwidth=0.0)
-    deviations = weights_along(bench, "physical", jitter_only, motion.states) ** -0.5
-    samples = motion.samples
-    if instruments.observer_bandwidth > 0.0:
-        observed = [observe(instruments, memory, t_s, float(angle)) for angle in samples[:, 0]]
-        samples[:, 1] = (1.0 + theta.errors.velocity_gain) * np.array(observed)
-        deviations[:, 1] = observer_noise(instruments.observer_bandwidth, t_s, 1.0) * deviations[:, 0]
-    distances: Floats = ((part.samples - samples) / deviations)[part.measured]
-    return distances
+    fit = Fit(angle, None if plant.instruments.observer_bandwidth > 0.0 else velocity, count)
+    return {kind: np.concatenate(parts) for kind, parts in kept.items()}, fit
 
 
 @dataclass(frozen=True)

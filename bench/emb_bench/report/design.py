@@ -17,7 +17,8 @@ if TYPE_CHECKING:  # a search for designs takes a second to import
 def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
     """Value of the criterion, the limits on the design's own brake, and what the design would tell."""
     d, own = report.metadata(), report.checks[0]
-    brake = f"{d['model']}, {d['kind']} information, {'returns home' if d['returns'] else 'ends anywhere'}"
+    alone = "" if report.problem.weights.velocity else " of the angle alone"
+    brake = f"{d['model']}, {d['kind']} information{alone}, {'returns home' if d['returns'] else 'ends anywhere'}"
     optima = ", ".join(f"{value:.6g}" for value in d["local_optima"][: None if verbose else 4])
     bounds = ", ".join(f"{name} {_half(bound, name)}" for name, bound in (d["cramer_rao"] or {}).items())
     lines = facts(

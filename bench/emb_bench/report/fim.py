@@ -73,8 +73,8 @@ def document(e: Evaluation) -> dict[str, Any]:
 def text(e: Evaluation, *, verbose: bool = False) -> str:
     """The smallest possible repeatabilities; what is missing comes first. With ``verbose`` the criteria over time."""
     doubts, lines = [*listed("WARNING: ", say.warnings(e)), *listed("NOTE: ", say.notes(e))], _heading(e)
-    fit = f"rms: angle {plain(e.fit.angle)}, velocity {plain(e.fit.velocity)} sigma"
-    fit += f" (at most {e.fit.expected:.2f} if it fits)"
+    velocity = "" if e.fit.velocity is None else f", velocity {plain(e.fit.velocity)}"
+    fit = f"rms: angle {plain(e.fit.angle)}{velocity} sigma (at most {e.fit.expected:.2f} if it fits)"
     lines += [*facts(("model", f"{e.plant.name} ({_why(e)})"), ("residuals", fit)), *_unknowns(e.question)]
     if not e.fisher("weighted").matrix.any():  # which has no prior
         return "\n".join([*doubts, "no information: the record does not depend on any of these parameters", *lines])

@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.config.bench import Bench
     from emb_bench.config.machine import Machine
     from emb_bench.estimate.estimate import Estimate
-    from emb_bench.estimate.records import Contribution, ModelValidation, Suspect
+    from emb_bench.estimate.records import Contribution, Derived, ModelValidation, Suspect
     from emb_bench.information.evaluation import Evaluation
     from emb_bench.information.identifiability import Direction, Finding, Identifiability
     from emb_bench.logs.log import RunLog
@@ -298,7 +298,9 @@ def limit(effect: Contribution, e: Estimate) -> str:
 def alarms(e: Estimate) -> list[str]:
     """Reasons for which the model does not fit, an effect that explains it first; empty if it may fit."""
     m, found, scored = e.validation, list[str](), any(name.startswith("score of") for name in e.validation.alarming)
-    if left := left_fixed(e):
+    if m.suspected and m.suspected[0].observer:
+        found.append(explained(m.suspected[0], e.bench.machine))
+    elif left := left_fixed(e):
         names = ", ".join(left)
         one = f"{names}, which is held fixed," if len(left) == 1 else f"one of {names}, which are held fixed,"
         found.append(f"{one} may explain it; remedy: estimate {_every(e)}: leave --params out")
@@ -386,12 +388,26 @@ def explained(s: Suspect, machine: Machine | None = None) -> str:
     """A suspect in words that lead to the remedy; ``machine`` is that of a bench that has no brake."""
     from emb_bench.estimate.suspects import EFFECTS, shown_as
 
+    if s.observer:
+        return derived_velocity(s.observer, machine)
     effect, unit = EFFECTS[s.name], shown_as(s, machine).unit
     amount = f"{plain(s.value, 2)} {unit}" if unit else in_percent(s.value)
     said = effect.effect
     for parameter in PARAMETER_NAMES:
         said = said.replace(parameter, quantity(machine, parameter).name)
     return f"{said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma); remedy: {effect.remedy}"
+
+
+def derived_velocity(observer: Derived, machine: Machine | None) -> str:
+    """An observer that is not declared; ``machine`` as for :func:`explained`."""
+    best, least, declared = (float(f"{w:.2g}") for w in (observer.bandwidth, observer.least, 0.9 * observer.least))
+    known = f"about {best:g}" if observer.is_known else f"at least {least:g}"
+    remedy = (
+        f'declare it ([sensors] velocity = "observer", observer_bandwidth = {declared:g}) in a bench file: --bench FILE'
+        if machine is None
+        else "leave its column out of the map"
+    )
+    return f"the velocity is derived from the angle, bandwidth {known} rad/s: {remedy}"
 
 
 # ---- parameters ----
@@ -574,7 +590,7 @@ def warnings(e: Evaluation) -> list[str]:
         why = "what is missing hides whether theta is right"
     else:
         why = "pass --theta or --model"
-    worst = max(e.fit.angle, e.fit.velocity)
+    worst = max(e.fit.compared)
     return [
         *found,
         f"model '{e.plant.name}' with theta of '{e.theta_name}' does not fit (rms {plain(worst)} sigma): {why}",

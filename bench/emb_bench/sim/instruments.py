@@ -107,13 +107,13 @@ def observe(instruments: Instruments, memory: Any, t_s: float, y1: float) -> flo
     return float(memory[_TRACKED_VELOCITY])
 
 
-def observer_gains(bandwidth: float, t_s: float) -> tuple[float, float]:
+def observer_gains(bandwidth: float, t_s: float, damping: float = DAMPING) -> tuple[float, float]:
     """α and β of the observer of a bandwidth ω_o [rad/s].
 
     The filter's poles solve z² − (2 − α − β) z + (1 − α) = 0, so that α = 1 − |z|² and β = 1 + |z|² − 2 Re z.
     """
-    radius = math.exp(-DAMPING * bandwidth * t_s)
-    real = radius * math.cos(math.sqrt(1.0 - DAMPING * DAMPING) * bandwidth * t_s)
+    radius = math.exp(-damping * bandwidth * t_s)
+    real = radius * math.cos(math.sqrt(1.0 - damping * damping) * bandwidth * t_s)
     return 1.0 - radius * radius, 1.0 + radius * radius - 2.0 * real
 
 

@@ -55,6 +55,27 @@ def test_the_file_holds_a_design_that_can_be_simulated_again(
     assert read_design(out, bench)[0].tolist() == current[:-1].tolist()
 
 
+@pytest.mark.parametrize("told", ["--bench", "--model"])
+def test_behind_an_observer_a_design_is_of_the_angle_alone(
+    short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], told: str
+) -> None:
+    """Of one that the bench declares, and of a plant's own."""
+    if told == "--bench":
+        text = short.read_text(encoding="utf-8")
+        short.write_text(f'{text}\n[sensors]\nvelocity = "observer"\nobserver_bandwidth = 800\n', encoding="utf-8")
+    out, model = tmp_path / "design.csv", "exact" if told == "--bench" else "observer"
+    more = ["--starts", "1", "--params", "k_m,T_c", "--model", model, "--output", str(out)]
+    assert main(["--bench", str(short), *more]) == 0
+    assert "physical information of the angle alone" in capsys.readouterr().out
+    bench = load_bench(short)
+    metadata = json.loads(out.read_text(encoding="utf-8").splitlines()[0].removeprefix("# "))
+    currents, _ = read_design(out, bench)
+    s = simulate(bench.plant(model), Theta(bench.brake), planned(currents), 1e-3, ("k_m", "T_c")).sensitivities[:, :, 0]
+    log_det = np.linalg.slogdet(s.T @ s / bench.noise.angle**2)[1]
+    assert metadata["value"] == pytest.approx(log_det, rel=1e-9)
+    assert metadata["checks"][0]["value"] == pytest.approx(log_det, rel=1e-9)
+
+
 def test_a_file_that_is_no_design_of_the_bench_is_refused(short: Path, tmp_path: Path) -> None:
     bench, path = load_bench(short), tmp_path / "design.csv"
     of_the_bench = json.dumps({"identity_hash": bench.identity_hash, "criterion": "D"})

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
@@ -109,6 +110,28 @@ def test_an_observer_s_velocity_counts_for_nothing_and_that_is_said(bench: Bench
     assert len(replay.document("fim", path)["notes"]) == 1
     observed, direct = (replay.document("fim", path, "--model", name)["physical"] for name in ("observer", "exact"))
     assert observed["log_det"] < direct["log_det"]
+
+
+@pytest.mark.parametrize("plant", ["observer", "exact", "stribeck"])
+def test_of_a_bench_that_declares_an_observer_every_command_counts_the_angle_alone(
+    bench: Bench, log: Log, replay: Replay, tmp_path: Path, plant: str
+) -> None:
+    path, declared = log("run.mcap", f"plant={plant}"), tmp_path / "declared.toml"
+    declared.write_text(f'{shipped_bench_text()}\n[sensors]\nvelocity = "observer"\nobserver_bandwidth = 760\n')
+    told = replay.document("fim", path, "--theta", "true", "--bench", declared)
+    measured = replay.document("fim", path, "--theta", "true", "--model", "exact" if plant == "observer" else plant)
+    assert told["fit_sigmas"] == {"angle": measured["fit_sigmas"]["angle"], "velocity": None, "fits": True}
+    assert [note for note in told["notes"] if "observer" in note]
+    assert told["physical"]["log_det"] < measured["physical"]["log_det"]
+    assert told["weighted"] == measured["weighted"]
+    assert ", velocity" not in replay.text("fim", path, "--theta", "true", "--bench", declared)
+    found = replay.document("estimate", path, "--bench", declared)
+    assert (found["model"], found["model_fits"]) == (plant, True)
+    assert [*found["misfit"]["whiteness"]] == ["angle"]
+    assert main(["campaign", str(path), "--output", str(tmp_path / "c.csv"), "--bench", str(declared)]) == 0
+    with (tmp_path / "c.csv").open(encoding="utf-8") as file:
+        (row,) = csv.DictReader(file)
+    assert (row["nominal_velocity_sigmas"], row["model"]) == ("", plant)
 
 
 def test_what_a_measurement_delay_hides_counts_for_nothing(bench: Bench, log: Log, replay: Replay) -> None:

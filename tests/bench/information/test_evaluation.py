@@ -61,8 +61,8 @@ def test_a_record_is_explained_with_its_systematic_errors_only(
 ) -> None:
     piece = shown(bench, **simulated)
     (_, explained), (_, alone) = (evaluated(bench, piece, each, "k_m") for each in (errors, NO_ERRORS))
-    assert max(explained.angle, explained.velocity) < most
-    assert max(alone.angle, alone.velocity) > 1.0
+    assert max(explained.compared) < most
+    assert max(alone.compared) > 1.0
 
 
 def test_the_information_about_systematic_errors_is_that_of_finite_differences(bench: Bench) -> None:

@@ -68,6 +68,28 @@ def test_what_a_recording_lacks_is_said_of_its_experiment(tmp_path: Path) -> Non
     assert {Lack.NO_COUNTERS, Lack.NO_VELOCITY, Lack.NO_CURRENT} <= experiment.lacks.keys()
 
 
+def test_a_column_that_an_observer_derives_is_told_and_without_it_the_machine_is_the_same(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = record(Machine(), 2.0)
+    pole = np.exp(complex(-0.7, 0.51**0.5) * 800.0 * T_S)
+    alpha, beta = 1.0 - abs(pole) ** 2, 1.0 + abs(pole) ** 2 - 2.0 * pole.real
+    tracked, speed, rows = float(found.position[0]), 0.0, ["t,x,F,v"]
+    for t, x, force in zip(*(column.tolist() for column in found), strict=True):
+        ahead = tracked + T_S * speed
+        tracked, speed = ahead + alpha * (x - ahead), speed + beta / T_S * (x - ahead)
+        rows.append(f"{t!r},{x!r},{force!r},{float(speed)!r}")
+    (tmp_path / "r.csv").write_text("\n".join(rows) + "\n")
+    text, own = MAP.replace("window = 0.5", "window = 0.1"), '[signals.velocity]\ncolumn = "v"\nunit = "m/s"\n'
+    said = []
+    for given in (text.replace("[signals.command]", f"{own}noise = 1e-4\n\n[signals.command]"), text):
+        (tmp_path / "map.toml").write_text(given)
+        assert main(["estimate", str(tmp_path / "r.csv"), "--map", str(tmp_path / "map.toml")]) == 0
+        said.append(" ".join(capsys.readouterr().out.split()))
+    told = "the velocity is derived from the angle, bandwidth about 800 rad/s: leave its column out of the map"
+    assert [told in out for out in said] == [True, False]
+
+
 TURNING = """\
 schema = 1
 name = "a drive that turns"
