@@ -108,7 +108,10 @@ class Reception:
         noise, sigmas = bench.noise, bench.shield.noise_sigmas
         self._angle_noise, self._velocity_noise = sigmas * 1.5 * noise.angle, sigmas * noise.velocity
         self._period_ns = bench.timing.sample_time_ns
-        self._half_top_acceleration = 0.5 * _top_acceleration(bench)
+        top_acceleration = _top_acceleration(bench)
+        self._half_top_acceleration = 0.5 * top_acceleration
+        if (bandwidth := bench.sensors.bandwidth) is not None:  # whose lag L13 of docs/explanation/shield.md bounds
+            self._velocity_noise += 2.25 / min(bandwidth, 3.0 / bench.timing.sample_time) * top_acceleration
         self._angle, self._velocity, self._status = (
             MessageState(m.name, m.identifier, fresh_ns(m), CounterCheck(bench.watch.rejected))
             for m in (layout.angle, layout.velocity, layout.status)
