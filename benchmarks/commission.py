@@ -9,11 +9,15 @@ through its mapping, commands 0 or 1 sample late; an ODrive, or those of ``--dri
 
 A limit counts as passed where the true angle or velocity in any period of any run was beyond the bench's.
 
+With ``--observer`` the velocity of each brake is an observer's of 800 to 4000 rad/s, drawn log-uniformly, and the data
+sheet does not say where it comes from. Counted is how many of the written files declare an observer that is no faster.
+
 With ``--outside`` each brake has one parameter, in turns, that is 1 to 10 % below or above the data sheet's range.
 Counted is how many end with that range named, no bench file written and no limit passed.
 
     python benchmarks/commission.py --brakes 50
     python benchmarks/commission.py --brakes 20 --outside
+    python benchmarks/commission.py --brakes 20 --observer
     python benchmarks/commission.py --brakes 50 --plants mapped --drives vesc mit
 """
 
@@ -23,6 +27,7 @@ import argparse
 import contextlib
 import io
 import json
+import math
 import re
 import sys
 import tempfile
@@ -89,6 +94,10 @@ def sheet_text(plant: str, generator: np.random.Generator, polled: bool = False)
     text = shipped_bench_text().replace("[limits] ", "\n".join(["[ranges.sheet]", *rows, "", "[limits] "]), 1)
     text = text.replace('ranges        = "envelope"', 'ranges = "sheet"', 1)
     drawn = "[plants.drawn]\n"
+    if plant == "observer":
+        # Of 1 mrad in the angle at most, where the observer overshoots.
+        text = text.replace("velocity = 1.0 ", "velocity = 1.8 ", 1)
+        drawn += f"observer_bandwidth = {800.0 * 5.0 ** generator.uniform()!r}\n"
     if plant == "late":
         text = text.replace("frame_age     = [0, 0]", "frame_age = [0, 3]", 1)
         drawn += f"command_delay = {generator.integers(3)}\nmeasurement_delay = {generator.integers(2)}\n"
@@ -119,11 +128,17 @@ def put_outside(number: int, drawn: dict[str, float], sheet: Bench) -> str:
 
 
 def commissioned(
-    number: int, folder: Path, drive: str, said: Callable[[str], None], *, is_outside: bool = False
+    number: int,
+    folder: Path,
+    drive: str,
+    said: Callable[[str], None],
+    *,
+    is_outside: bool = False,
+    is_observed: bool = False,
 ) -> dict[str, Any]:
     """One brake, drawn and taken into service; a drive is asked for where the plant is ``mapped``."""
     generator = np.random.default_rng([16, number])
-    plant = PLANTS[number % len(PLANTS)]
+    plant = "observer" if is_observed else PLANTS[number % len(PLANTS)]
     polled = load_mapping(MAPPINGS / f"{drive}.toml").polled
     sheet = parse_bench(sheet_text(plant, generator, polled), "the data sheet")
     drawn = {n: getattr(sheet.brake, n) * FACTOR ** generator.uniform(-1.0, 1.0) for n in PARAMETER_NAMES}
@@ -162,7 +177,14 @@ def commissioned(
         late = instruments.command_delay + instruments.measurement_delay + int(plant == "mapped" and polled)
         row["delay_covered"] = written.shield.frame_age[0] <= late <= written.shield.frame_age[1]
         row["lag_covered"] = sheet.plants["drawn"].mechanics.current_lag <= written.shield.current_lag * 1.001
-        row["noise_covered"] = all(noise[n] <= getattr(written.noise, n) for n in noise)
+        row["noise_covered"] = noise["angle"] <= written.noise.angle and (
+            plant == "observer" or noise["velocity"] <= written.noise.velocity
+        )
+        bandwidth = instruments.observer_bandwidth
+        row["velocity_covered"] = written.sensors.velocity == ("observer" if bandwidth else "sensor")
+        if bandwidth:
+            least = written.sensors.observer_bandwidth or math.inf
+            row |= {"bandwidth": bandwidth, "share": least / bandwidth, "velocity_covered": least <= bandwidth}
     return row
 
 
@@ -180,6 +202,9 @@ def main() -> None:
     kinds = sorted(simulated_drives.DRIVES)
     p.add_argument("--drives", nargs="+", default=("odrive",), choices=kinds, help="of those mapped")
     p.add_argument("--outside", action="store_true", help="brakes of which one parameter is outside of the data sheet")
+    p.add_argument(
+        "--observer", action="store_true", help="brakes whose velocity is an observer's, in place of the plants"
+    )
     p.add_argument("--keep", type=Path, help="folder for the logs; without, they are deleted")
     p.add_argument("-o", "--output", type=Path, help="a line of JSON for each brake")
     args = p.parse_args()
@@ -187,12 +212,18 @@ def main() -> None:
     setattr(simulated_drives, "DRIVES", {name: recorded(kind) for name, kind in simulated_drives.DRIVES.items()})  # noqa: B010
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
-        chosen = [n for n in range(args.first, args.first + args.brakes) if PLANTS[n % len(PLANTS)] in args.plants]
+        chosen = [
+            n
+            for n in range(args.first, args.first + args.brakes)
+            if args.observer or PLANTS[n % len(PLANTS)] in args.plants
+        ]
         for number in chosen:
             folder = (args.keep or Path(scratch)) / str(number)
             folder.mkdir(parents=True)
             drive = args.drives[number // len(PLANTS) % len(args.drives)]
-            row = commissioned(number, folder, drive, lambda _: None, is_outside=args.outside)
+            row = commissioned(
+                number, folder, drive, lambda _: None, is_outside=args.outside, is_observed=args.observer
+            )
             rows.append(row)
             if args.output:
                 with args.output.open("a") as file:
@@ -215,15 +246,18 @@ def main() -> None:
         return
     done = [row for row in rows if "inside" in row]
     inside, passed = sum(all(row["inside"].values()) for row in done), sum(row["passed"] for row in rows)
+    plants = "observer" if args.observer else ", ".join(args.plants)
     print(
-        f"| commissioning of {len(rows)} random brakes ({', '.join(args.plants)}): limits passed; truth inside of the "
+        f"| commissioning of {len(rows)} random brakes ({plants}): limits passed; truth inside of the "
         f"written ranges | 0; {len(rows)} | {passed}; {inside} |"
     )
     for name in PARAMETER_NAMES:
         within = sum(row["in_95"][name] for row in done)
         width = np.median([row["width"][name] for row in done])
         print(f"  {name}: inside of the 95 % interval {within}, width of the written range {width:.0%} (median)")
-    for key in ("delay_covered", "lag_covered", "noise_covered", "fits"):
+    for row in done if args.observer else ():
+        print(f"  observer of {row['bandwidth']:.0f} rad/s: {row['share']:.1%} of it written")
+    for key in ("delay_covered", "lag_covered", "noise_covered", "velocity_covered", "fits"):
         print(f"  {key.replace('_', ' ')}: {sum(row[key] for row in done)} of {len(done)}")
     for plant in sorted({row["plant"] for row in done}):
         seconds = [row["seconds"] for row in done if row["plant"] == plant]

@@ -33,13 +33,14 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # far beyond what a 
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the play left what it did."""
     folder = tmp_path_factory.mktemp("commission")
-    (folder / "sheet.toml").write_text(sheet().text.replace("[0, 3]", "[0, 0]"))
+    measured = f'{sheet().text}\n[sensors]\nvelocity = "sensor"\n'
+    (folder / "sheet.toml").write_text(measured.replace("[0, 3]", "[0, 0]"))
 
     def call(iface: str, bench: str, into: str, *more: str) -> list[str]:
         return [str(folder / into), "--iface", iface, "--bench", str(folder / bench), "--no-rt", *more]
 
     run = call("vcan0", "sheet.toml", "brake")
-    (folder / "late.toml").write_text(sheet().text.replace("[0, 3]", "[0, 1]"))
+    (folder / "late.toml").write_text(measured.replace("[0, 3]", "[0, 1]"))
     mapping = str(mapping_for(folder, "odrive"))
     mapped = call("vcan0", "late.toml", "mapped", "--drive", f"{mapping}@vcan1")
     brake = {**TRUTH, "angle_noise": sheet().noise.angle, "velocity_noise": sheet().noise.velocity}

@@ -6,6 +6,7 @@ A file is made from the data sheet's; each number that is not the sheet's has it
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Any
 
 import tomlkit
@@ -13,14 +14,15 @@ from tomlkit import TOMLDocument
 
 from emb_bench.brake.parameters import SI
 from emb_bench.commission.comparison import contradiction, not_inside, sheet_range
-from emb_bench.commission.records import Findings, Identification
+from emb_bench.commission.records import Findings, Identification, Velocity
+from emb_bench.commission.velocity import MARGIN
 from emb_bench.config.bench import Bench, parse_bench
-from emb_bench.config.plants import SHORTEST_LAG
+from emb_bench.config.plants import FASTEST_LOOP, SHORTEST_LAG
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.config.typed import parse_toml
 from emb_runtime.errors import BenchFileError
 from emb_runtime.numbers import between, plain
-from emb_runtime.safety.shield_design import make_law
+from emb_runtime.safety.shield_design import SLOWEST_OBSERVER, make_law
 
 SHEET, MEASURED = "sheet", "measured"  # Names of the sets of ranges
 WRITTEN = "# Written by emb-commission from a data sheet's bench file. SI units."
@@ -33,9 +35,26 @@ LAG_WIDENED = 1.25  # Factor from the interval of the current loop's time consta
 NARROWEST, STEP_DOWN = 10.0, 5.0  # Least upper angle limit that is tried, and by how much each try is lower [rad]
 
 
-def working_text(sheet: Bench) -> str:
-    """Bench file that the steps run with: the data sheet's, its angle as far as its ranges have a shield."""
-    return _text(_draft(sheet))
+def working_text(sheet: Bench, velocity: Velocity | None = None) -> str:
+    """Bench file that the steps run with: the data sheet's, its angle as far as its ranges have a shield.
+
+    Args:
+        sheet: the data sheet's bench file.
+        velocity: as the free stroke has shown it. Before, a sheet that does not say where it comes from counts as that
+            of the slowest observer, if there is a shield for one.
+    """
+    document = _draft(sheet)
+    if velocity is not None:
+        _put_velocity(document, velocity, "5-free-stroke.mcap")
+    elif "sensors" not in document:
+        slowest = SLOWEST_OBSERVER / sheet.timing.sample_time
+        document.add("sensors", tomlkit.table())
+        _put(document, "sensors.velocity", "observer", "until it is measured: the data sheet does not say it")
+        _put(document, "sensors.observer_bandwidth", slowest, "the slowest for which there is a shield")
+        with suppress(BenchFileError):
+            return _text(document)
+        document = _draft(sheet)
+    return _text(document)
 
 
 def found_text(sheet: Bench, found: Findings, logs: str) -> str:
@@ -62,6 +81,7 @@ def found_text(sheet: Bench, found: Findings, logs: str) -> str:
     age = current.latest + one.measurement_delay
     origin = f"commands act {current.delay} to {current.latest} samples late, measurements {one.measurement_delay}"
     _put(document, "shield.frame_age", [min(age, sheet.shield.frame_age[0]), age], origin)
+    _put_velocity(document, one.velocity, logs)
     lag = min(sheet.shield.current_lag, _rounded(LAG_WIDENED * one.current_lag[1], up=True))
     origin = f"total (95 %) up to {plain(one.current_lag[1])} s, times {LAG_WIDENED:g}, at most the data sheet's"
     _put(document, "shield.current_lag", lag, origin)
@@ -69,6 +89,8 @@ def found_text(sheet: Bench, found: Findings, logs: str) -> str:
     plant: dict[str, float | int] = {name: _rounded(value) for name, value in one.features.items()}
     if (lag := _rounded(0.5 * sum(one.current_lag))) >= SHORTEST_LAG:
         plant["current_lag"] = lag
+    if one.velocity.bandwidth:
+        plant["observer_bandwidth"] = _rounded(min(one.velocity.bandwidth, FASTEST_LOOP))
     plant |= {"command_delay": current.delay, "measurement_delay": one.measurement_delay}
     for name, value in plant.items():
         _put(document, f"plants.{MEASURED}.{name}", value, by_fit)
@@ -137,6 +159,16 @@ def _put(document: TOMLDocument, path: str, value: Any, origin: str) -> None:
     for name in tables:
         table = table.setdefault(name, {})
     table[key] = tomlkit.item(value).comment(origin)
+
+
+def _put_velocity(document: TOMLDocument, velocity: Velocity, logs: str) -> None:
+    """Set the velocity's origin, as ``logs`` show it."""
+    document.pop("sensors", None)
+    document.add("sensors", tomlkit.table())
+    _put(document, "sensors.velocity", velocity.sensors.velocity, f"by {logs} it is {velocity}")
+    if velocity.least:
+        origin = f"of the slowest loop that cannot be excluded, or of one that lags no less, {MARGIN:.0%}"
+        _put(document, "sensors.observer_bandwidth", _rounded(velocity.least), origin)
 
 
 def _text(document: TOMLDocument) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import signal
 import subprocess
@@ -25,7 +26,8 @@ from emb_runtime.numbers import between, plain
 from emb_runtime.safety.state_machine import Fault
 from emb_runtime.system import terminal
 
-WORKING, FOUND = "working.toml", "bench.toml"  # Names of the bench files in the folder
+WORKING, FASTER, FOUND = "working.toml", "working-2.toml", "bench.toml"
+"""Names of the bench files in the folder: up to the free stroke, once the velocity is known, and in the end."""
 RECENT = 2  # Experiments that the parameters are estimated from: each is larger and tells more than those before it
 OUTSIDE = {Fault.OUT_OF_LIMITS.name, Fault.MOTION_OUTSIDE_SET.name}
 """Results by which the brake may lie outside of the data sheet's ranges."""
@@ -59,6 +61,7 @@ class Commissioned:
         fits = "the residual tests accept it" if one.fits else f"NO model explains the experiments{one.reasons()}"
         lines = [f"done: {len(self.logs)} steps, {self.runs} new runs; model {one.model}: {fits}"]
         lines += [f"  {name:<4} {between(low, high)} {SI[name]}" for name, (low, high) in self.ranges.items()]
+        lines.append(f"  the velocity is {one.velocity}")
         return "\n".join([*lines, f"  bench file {self.bench}: a comment behind each measured number gives its source"])
 
 
@@ -109,6 +112,11 @@ class Commissioning:
             self._log(name, steps.experiment(row, work, move), working)
             recent, before = self._logs[4:][-RECENT:], self._identified
             one = self._found(examination.identify(recent, sheet, noise, before))
+            comparison.check_velocity(one.velocity, work.sensors)
+            known = one.velocity.sensors
+            if before is None and (known.bandwidth or math.inf) > (work.sensors.bandwidth or math.inf):
+                working = self._bench_file(FASTER, working_text(sheet, one.velocity))
+                work = load_bench(working)
             comparison.check_experiment(one, sheet, is_first=before is None)
             self._identified = one
         found = Findings(noise, current, move, one)

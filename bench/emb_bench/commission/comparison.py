@@ -9,9 +9,9 @@ import math
 from collections.abc import Sequence
 
 from emb_bench.brake.parameters import SI
-from emb_bench.commission.records import CurrentCheck, FirstMove, Identification
+from emb_bench.commission.records import CurrentCheck, FirstMove, Identification, Velocity
 from emb_bench.config.bench import Bench
-from emb_runtime.config.bench import Noise
+from emb_runtime.config.bench import Noise, Sensors
 from emb_runtime.errors import BenchFileError, SafetyStopError
 from emb_runtime.numbers import between, plain
 
@@ -71,6 +71,15 @@ def check_first_move(move: FirstMove, sheet: Bench) -> None:
     _require(
         abs(move.scale - 1.0) <= SCALE_ERROR,
         f"the angle travels {plain(move.scale)} times as far as by the velocity: a sign or scale of a sensor is wrong",
+    )
+
+
+def check_velocity(velocity: Velocity, declared: Sensors) -> None:
+    """Refuse a velocity that an observer derives from the angle more slowly than is declared; SafetyStopError."""
+    _require(
+        not velocity.least or velocity.most >= (declared.bandwidth or math.inf),
+        f"the velocity is {velocity}, and the bench file declares {declared}: declare velocity = "
+        f'"observer" and observer_bandwidth = {velocity.least:.0f} in [sensors] {AGAIN}',
     )
 
 

@@ -16,6 +16,7 @@ from emb_bench.analysis.model_choice import fit_from
 from emb_bench.analysis.model_growth import grow_model
 from emb_bench.brake.parameters import FEATURES, least
 from emb_bench.commission.records import CurrentCheck, FirstMove, Identification
+from emb_bench.commission.velocity import velocity_origin
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 from emb_bench.estimate.estimate import Estimate
@@ -127,9 +128,10 @@ def identify(logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identific
     angle's scale, which the shield shares: with them the parameters move the brake as it was measured.
     """
     opened = [read_log(log) for log in logs]
-    bench = replace(sheet, noise=noise_in_motion(noise, opened[0].drive))
     experiments = [read_experiment(log) for log in opened]
-    best = _best(bench, experiments, before)
+    velocity = velocity_origin(experiments, sheet.timing.sample_time)
+    bench = replace(sheet, noise=noise_in_motion(noise, opened[0].drive), sensors=velocity.sensors)
+    best = _best(bench, experiments, before, velocity.bandwidth)
     asked = with_systematic(best.asked, bench, best.plant)
     e = fit_from(Problem(bench, best.plant, asked, best.records), best).finished() if asked.systematic else best
     names = [unknown.name for unknown in e.unknowns]
@@ -152,13 +154,17 @@ def identify(logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identific
         current_lag=(max(0.0, lag[0]), max(0.0, lag[1])),
         features={name: value for name, value in values.items() if name in FEATURES and name != "current_lag"},
         noise=_residuals(e, bench.noise),
+        velocity=velocity,
         objections=tuple(alarms(e) or alarms(best)),
     )
 
 
-def _best(bench: Bench, experiments: Sequence[Experiment], before: Identification | None) -> Estimate:
+def _best(
+    bench: Bench, experiments: Sequence[Experiment], before: Identification | None, observer_bandwidth: float
+) -> Estimate:
     """Estimate by the model that explains the experiments best: the one before, a plain one, one that has grown.
 
+    Of a velocity that is an observer's the angles alone are explained.
     A delay of the measurements that the data sheet excludes counts only where it explains everything.
     """
     lags = ("current_lag",) if bench.shield.current_lag > 0.0 else ()
@@ -167,7 +173,7 @@ def _best(bench: Bench, experiments: Sequence[Experiment], before: Identificatio
 
     def fit(late: int, features: Mapping[str, float], name: str) -> Estimate:
         mechanics = Mechanics(**cast(dict[str, Any], features))
-        plant = Plant(name, mechanics, Instruments(measurement_delay=late))
+        plant = Plant(name, mechanics, Instruments(measurement_delay=late, observer_bandwidth=observer_bandwidth))
         records = [own.seen_by(plant) for own in experiments]
         prior = bench.range_set(bench.shield.ranges)
         asked = EstimationProblem(PARAMETER_NAMES, (*features, *lags, *starts), prior)
@@ -194,7 +200,8 @@ def _residuals(e: Estimate, noise: Noise) -> Noise:
     both = np.concatenate(e.residuals)
     speed = np.abs(np.concatenate([record.samples[:, 1] for record in e.records]))
     slow = both[speed <= np.nanmedian(speed)]
-    angle, velocity = np.sqrt(np.nanmean(slow**2, axis=0)).tolist()
+    count = np.maximum(np.isfinite(slow).sum(axis=0), 1)  # none of a velocity that an observer derives
+    angle, velocity = np.sqrt(np.nansum(slow**2, axis=0) / count).tolist()
     return Noise(angle * noise.angle, velocity * noise.velocity)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from emb_bench.brake.parameters import SI
-from emb_runtime.config.bench import Noise
+from emb_runtime.config.bench import Noise, Sensors
 from emb_runtime.numbers import in_percent, plain
 
 
@@ -36,6 +36,25 @@ class FirstMove:
 
 
 @dataclass(frozen=True)
+class Velocity:
+    """Origin of the velocity: a sensor, unless a loop that derives it from the angle has a bandwidth."""
+
+    bandwidth: float = 0.0  # Of the loop that is nearest [rad/s]
+    least: float = 0.0  # Bandwidth that the loop has at least: what is declared [rad/s]
+    most: float = 0.0  # Bandwidth that it has at most [rad/s]
+
+    @property
+    def sensors(self) -> Sensors:
+        """As a bench file declares it."""
+        return Sensors("observer", self.least) if self.least else Sensors()
+
+    def __str__(self) -> str:
+        if not self.least:
+            return "a sensor's"
+        return f"an observer's, bandwidth {self.bandwidth:.0f} rad/s, at least {self.least:.0f} rad/s"
+
+
+@dataclass(frozen=True)
 class Identification:
     """Parameters from the experiments so far."""
 
@@ -51,6 +70,7 @@ class Identification:
     current_lag: tuple[float, float]  # Interval of the current loop's time constant [s]; zeros where none is needed
     features: Mapping[str, float]  # Features beyond eq. 3.12-3.14 that the model needed, by name [SI]
     noise: Noise  # Standard deviations of the residuals of slow motion
+    velocity: Velocity
     objections: tuple[str, ...] = ()  # Alarms of the tests on the residuals, and what would explain them
 
     def __str__(self) -> str:
@@ -59,7 +79,8 @@ class Identification:
             for name, (own, total) in self.halves.items()
         ]
         misfit = "" if self.fits else f", which does not fit yet{self.reasons()}"
-        return f"± repeatability (± total), 95 %, k=2: {', '.join(found)}; model {self.model}{misfit}"
+        result = f"± repeatability (± total), 95 %, k=2: {', '.join(found)}; model {self.model}{misfit}"
+        return f"{result}; the velocity is {self.velocity}"
 
     def reasons(self) -> str:
         """Objections in brackets; "" without any."""

@@ -24,6 +24,7 @@ EULER = 0
 EXACT = 1
 SHORTEST_LAG = 1e-5  # Least time constant of a current that lags at all [s]
 LONGEST_DELAY = 10  # Samples
+FASTEST_LOOP = 6000.0  # Largest bandwidth of an observer [rad/s]
 
 
 class Mechanics(NamedTuple):
@@ -59,7 +60,7 @@ class Instruments(NamedTuple):
     measurement_delay: Annotated[int, Meta(ge=0, le=LONGEST_DELAY)] = 0  # The same of a measurement
     encoder_offset: Annotated[float, Meta(ge=-10, le=10)] = 0.0  # Reading of the encoder at the true origin [rad]
     clock_jitter: Annotated[float, Meta(ge=0, le=1e-3)] = 0.0  # Deviation of the instant of a measurement, white [s]
-    observer_bandwidth: Annotated[float, Meta(ge=300, le=6000)] = 0.0
+    observer_bandwidth: Annotated[float, Meta(ge=300, le=FASTEST_LOOP)] = 0.0
     """The velocity is that of a tracking observer of the measured angle with this bandwidth [rad/s]; 0: it is a
     measurement of its own, as in the thesis. Below 300 the noise of its velocity is correlated over so long that a fit
     cannot be judged by its size; sampled at 1 kHz, 6000 is the difference of two angles within 2 % of its gains."""

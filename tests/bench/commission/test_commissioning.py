@@ -30,7 +30,7 @@ from emb_bench.config.bench import Bench, load_bench, parse_bench
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.cli.main import main
-from emb_runtime.config.bench import Noise, shipped_bench_text
+from emb_runtime.config.bench import Noise, Sensors, shipped_bench_text
 from emb_runtime.errors import EmbError
 from tests.bench.commission.test_steps import identification, sheet_text, with_interval
 from tests.drives import EXAMPLES
@@ -152,6 +152,34 @@ def test_it_goes_on_where_the_logs_end_and_comes_to_the_same(done: tuple[Path, C
     assert again.runs == 1
     assert written == {path: path.stat().st_mtime_ns for path in folder.glob("*.toml")}, "a full disk would empty them"
     assert again.found == result.found
+
+
+@pytest.mark.parametrize("bandwidth", [800.0, 4000.0, 0.0])
+def test_once_the_velocity_is_known_the_steps_go_on_with_it(tmp_path: Path, bandwidth: float) -> None:
+    plant = f"[plants.drawn]\nobserver_bandwidth = {bandwidth}\n" if bandwidth else "[plants.drawn]\n"
+    text = sheet("[0, 0]").text.replace("velocity = 1.0 ", "velocity = 1.8 ")
+    bench = parse_bench(f"{text}\n{plant}", "sheet")
+    with pytest.raises(EnoughError):
+        commissioning(tmp_path, up_to("7-medium"), bench, "sim:plant=drawn").run()
+    first, second = (load_bench(tmp_path / f"working{number}.toml") for number in ("", "-2"))
+    assert first.sensors == Sensors("observer", 750.0)
+    if bandwidth:
+        least = min(bandwidth, 3000.0)
+        assert second.sensors.observer_bandwidth == pytest.approx(0.97 * least, rel=0.04)
+    else:
+        assert second.sensors == Sensors()
+    assert second.identity_hash == read_log(tmp_path / "6-small.mcap").bench.identity_hash
+    assert first.identity_hash == read_log(tmp_path / "5-free-stroke.mcap").bench.identity_hash
+
+
+def test_an_observer_that_the_data_sheet_denies_ends_it_at_low_speed(tmp_path: Path) -> None:
+    bench = parse_bench(f'{sheet("[0, 0]").text}\n[sensors]\nvelocity = "sensor"\n', "sheet")
+    with pytest.raises(
+        EmbError, match=r"observer's, bandwidth 15\d\d rad/s.* observer_bandwidth = 14\d\d in \[sensors\]"
+    ):
+        commissioning(tmp_path, in_process, bench, "sim:plant=observer").run()
+    assert float(read_log(tmp_path / "5-free-stroke.mcap").end["top_speed"]) < 60.0
+    assert not (tmp_path / "6-small.mcap").exists()
 
 
 @pytest.mark.slow

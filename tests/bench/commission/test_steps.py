@@ -23,10 +23,11 @@ from emb_bench.commission.comparison import (
     check_first_move,
     check_last,
     check_noise,
+    check_velocity,
     suspected,
 )
 from emb_bench.commission.examination import noise_in_motion
-from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification
+from emb_bench.commission.records import CurrentCheck, Findings, FirstMove, Identification, Velocity
 from emb_bench.commission.steps import (
     EXPERIMENTS,
     FULL,
@@ -41,7 +42,7 @@ from emb_bench.commission.steps import (
     policy_file,
 )
 from emb_bench.config.bench import Bench, load_bench, parse_bench
-from emb_runtime.config.bench import PARAMETER_NAMES, Noise, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, Noise, Sensors, shipped_bench_text
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import BenchFileError, EmbError
 from emb_runtime.estimator.estimator import Estimator
@@ -92,6 +93,7 @@ def identification(sheet: Bench, share: float = 0.01, **changed: object) -> Iden
         current_lag=(0.0, 0.0),
         features={},
         noise=Noise(9e-4, 0.8),
+        velocity=Velocity(),
     )
     return replace(one, **changed)  # type: ignore[arg-type]
 
@@ -173,6 +175,19 @@ def test_what_contradicts_the_data_sheet_ends_it(sheet: Bench) -> None:
     ):
         with pytest.raises(EmbError, match=words):
             check(finding, sheet)
+
+
+def test_a_velocity_that_lags_more_than_is_declared_ends_it(sheet: Bench) -> None:
+    observed = Velocity(1500.0, 1410.0, 1520.0)
+    for declared in (Sensors("observer", 1500.0), Sensors("observer", velocity_lag=1e-3), Sensors("observer", 750.0)):
+        check_velocity(observed, declared)
+        check_velocity(Velocity(), declared)
+    for declared, words in (
+        (Sensors(), "a sensor's"),
+        (Sensors("observer", 1600.0), "an observer's, of at least 1600"),
+    ):
+        with pytest.raises(EmbError, match=rf'declares {words}.* velocity = "observer" and observer_bandwidth = 1410'):
+            check_velocity(observed, declared)
 
 
 def test_what_agrees_with_the_data_sheet_is_accepted(sheet: Bench) -> None:
@@ -260,6 +275,32 @@ def test_the_working_bench_has_the_data_sheets_ranges_and_a_shield_for_them(shee
     make_law(work)
     bare = parse_bench(sheet_text() + "\n[plants.bare]\n", "sheet")
     assert "bare" in parse_bench(working_text(bare), "working").plants  # a table without an entry is kept
+
+
+def test_until_the_velocity_is_known_a_sheet_that_does_not_say_it_counts_as_of_the_slowest_observer() -> None:
+    def sensors(text: str, velocity: Velocity | None = None) -> Sensors:
+        return parse_bench(working_text(parse_bench(text, "sheet"), velocity), "working").sensors
+
+    silent = sheet_text()
+    declared = f'{silent}\n[sensors]\nvelocity = "observer"\nvelocity_lag = 0.001\n'
+    assert sensors(silent) == Sensors("observer", 750.0)
+    assert sensors(declared) == Sensors("observer", velocity_lag=1e-3)
+    assert sensors(f'{silent}\n[sensors]\nvelocity = "sensor"\n') == Sensors()
+    assert sensors(sheet_text(frame_age="[0, 3]")) == Sensors(), "no shield covers it beside late frames"
+    for text in (silent, declared):
+        assert sensors(text, Velocity(1500.0, 1410.0, 1520.0)) == Sensors("observer", 1410.0)
+        assert sensors(text, Velocity()) == Sensors()
+
+
+def test_the_file_declares_the_velocity_as_it_was_measured() -> None:
+    for declared in ("", '\n[sensors]\nvelocity = "observer"\nobserver_bandwidth = 800.0\n'):
+        sheet = parse_bench(sheet_text() + declared, "sheet")
+        for velocity in (Velocity(), Velocity(1520.0, 1428.8, 1520.0)):
+            text = found_text(sheet, found(sheet, identified=identification(sheet, velocity=velocity)), LOGS)
+            bench = parse_bench(text, "found")
+            assert bench.sensors == velocity.sensors
+            assert bench.plants[MEASURED].instruments.observer_bandwidth == velocity.bandwidth
+            assert f"# by {LOGS} it is {velocity}\n" in text
 
 
 def test_a_data_sheet_without_any_shield_is_refused_with_the_reason() -> None:
