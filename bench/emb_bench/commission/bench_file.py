@@ -14,8 +14,8 @@ from tomlkit import TOMLDocument
 
 from emb_bench.brake.parameters import SI
 from emb_bench.commission.comparison import contradiction, not_inside, sheet_range
+from emb_bench.commission.examination import MARGIN
 from emb_bench.commission.records import Findings, Identification, Velocity
-from emb_bench.commission.velocity import MARGIN
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.config.plants import FASTEST_LOOP, SHORTEST_LAG
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -167,7 +167,7 @@ def _put_velocity(document: TOMLDocument, velocity: Velocity, logs: str) -> None
     document.add("sensors", tomlkit.table())
     _put(document, "sensors.velocity", velocity.sensors.velocity, f"by {logs} it is {velocity}")
     if velocity.least:
-        origin = f"of the slowest loop that cannot be excluded, or of one that lags no less, {MARGIN:.0%}"
+        origin = f"{MARGIN:.0%} of the slowest that cannot be excluded, or of one that lags no less"
         _put(document, "sensors.observer_bandwidth", _rounded(velocity.least), origin)
 
 

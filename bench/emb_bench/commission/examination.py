@@ -15,10 +15,10 @@ from emb_bench.analysis.conclusion import noise_deviations
 from emb_bench.analysis.model_choice import fit_from
 from emb_bench.analysis.model_growth import grow_model
 from emb_bench.brake.parameters import FEATURES, least
-from emb_bench.commission.records import CurrentCheck, FirstMove, Identification
-from emb_bench.commission.velocity import velocity_origin
+from emb_bench.commission.records import CurrentCheck, FirstMove, Identification, Velocity
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
+from emb_bench.estimate.derived_velocity import derived
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
@@ -38,6 +38,8 @@ MOVING = 6.0  # Standard deviations of the velocity from which on the brake move
 SMOOTHED = 10  # Samples of a mean in which a motion shows, and noise counts a third
 QUIET_ANGLE, QUIET_VELOCITY = 1e-5, 1e-2
 """Least standard deviations that are taken, of the order of the wire's rounding [rad, rad/s]."""
+MARGIN = 0.94  # Written bandwidth of an observer, over the least one that cannot be excluded
+LAGS_NO_LESS = 3.0  # Bandwidth times sample time beyond which no observer lags less
 UNIFORM = math.sqrt(1.0 / 12.0)  # Standard deviation of an error that may be anything within a step, in steps
 
 
@@ -129,7 +131,7 @@ def identify(logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identific
     """
     opened = [read_log(log) for log in logs]
     experiments = [read_experiment(log) for log in opened]
-    velocity = velocity_origin(experiments, sheet.timing.sample_time)
+    velocity = velocity_of(experiments, sheet.timing.sample_time)
     bench = replace(sheet, noise=noise_in_motion(noise, opened[0].drive), sensors=velocity.sensors)
     best = _best(bench, experiments, before, velocity.bandwidth)
     asked = with_systematic(best.asked, bench, best.plant)
@@ -157,6 +159,15 @@ def identify(logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identific
         velocity=velocity,
         objections=tuple(alarms(e) or alarms(best)),
     )
+
+
+def velocity_of(experiments: Sequence[Experiment], t_s: float) -> Velocity:
+    """Origin of the velocity in experiments with this sample time [s], of which the last tells most."""
+    found = derived(experiments[::-1], t_s)
+    if found is None:
+        return Velocity()
+    least = min(MARGIN * found.least, LAGS_NO_LESS / t_s)
+    return Velocity(found.bandwidth, least, found.bandwidth if found.is_known else math.inf)
 
 
 def _best(

@@ -70,7 +70,7 @@ class Identification:
     current_lag: tuple[float, float]  # Interval of the current loop's time constant [s]; zeros where none is needed
     features: Mapping[str, float]  # Features beyond eq. 3.12-3.14 that the model needed, by name [SI]
     noise: Noise  # Standard deviations of the residuals of slow motion
-    velocity: Velocity
+    velocity: Velocity = Velocity()
     objections: tuple[str, ...] = ()  # Alarms of the tests on the residuals, and what would explain them
 
     def __str__(self) -> str:

@@ -83,7 +83,7 @@ class Bench(driven.Bench):
 
     def model(self, name: str) -> Plant:
         """The named brake as a record of this bench is evaluated: behind the observer that ``[sensors]`` declares."""
-        plant, bandwidth = self.plant(name), self.sensors.observer_bandwidth
+        plant, bandwidth = self.plant(name), self.sensors.bandwidth
         if bandwidth is None:
             return plant
         return replace(plant, instruments=plant.instruments._replace(observer_bandwidth=bandwidth))

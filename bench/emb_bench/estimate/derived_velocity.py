@@ -24,6 +24,8 @@ LEAST = 0.1  # Lag [samples]: no observer has less
 DAMPINGS = (0.7, 0.85, 1.0)
 PARTS = (1, 2, 8)  # Of a period, after each of which the observer takes an angle
 SCALED = np.geomspace(0.03, 6.0, 60)  # Bandwidth times sample time
+BOUNDS = [(0.02, 10.0), (0.7, 1.0)]  # Of what is searched
+STARTS = 3  # Of the nearest, from which a nearer one is searched
 ALIKE = 1.25  # Ratio of mean squares of two observers that are not told apart
 TOLD = 1.3  # Ratio of the ends of a bandwidth that is known
 SETTLED = 20  # Samples after the begin or a gap, during which an observer forgets what is not known
@@ -64,22 +66,20 @@ def _bandwidth(angle: Floats, velocity: Floats, t_s: float) -> tuple[float, floa
         settled[unknown : unknown + SETTLED] = False
     counted = settled if 2 * settled.sum() > received.sum() else received
     found = []
-    for parts, damping in itertools.product(PARTS, DAMPINGS):
+    for parts in PARTS:
         finer = np.interp(np.arange((len(at) - 1) * parts + 1) / parts, at, every)
 
-        def square(scaled: float, parts: int = parts, damping: float = damping, finer: Floats = finer) -> float:
-            """Mean square of the velocity less an observer's."""
+        def square(at: Sequence[float], parts: int = parts, finer: Floats = finer) -> float:
+            """Mean square of the velocity less that of an observer of this bandwidth and damping."""
+            scaled, damping = at
             alpha, beta = observer_gains(scaled / parts, 1.0, damping)
             ahead = np.array([1.0, alpha + beta - 2.0, 1.0 - alpha])
             shown = signal.lfilter([beta, -beta], ahead, finer)[::parts] * parts / t_s
             return float(np.mean((velocity - shown)[counted] ** 2))
 
-        squares = np.array([square(scaled) for scaled in SCALED])
-        found += [*zip(SCALED, squares, strict=True)]
-        for n in signal.argrelmin(squares, mode="wrap")[0]:  # the lag falls and rises again
-            near = SCALED[max(n - 1, 0)], SCALED[min(n + 1, len(SCALED) - 1)]
-            best = optimize.minimize_scalar(square, bounds=near, method="bounded", options={"xatol": 1e-3 * SCALED[n]})
-            found.append((best.x, best.fun))
+        row = sorted((square(at), at) for at in itertools.product(SCALED.tolist(), DAMPINGS))
+        searched = [optimize.minimize(square, at, method="Nelder-Mead", bounds=BOUNDS) for _, at in row[:STARTS]]
+        found += [(at[0], value) for value, at in row] + [(best.x[0], best.fun) for best in searched]
     scaled, squares = np.array(found).T
     alike = scaled[squares <= ALIKE * squares.min()]
     best, least = scaled[np.argmin(squares)] / t_s, alike.min() / t_s

@@ -93,7 +93,6 @@ def identification(sheet: Bench, share: float = 0.01, **changed: object) -> Iden
         current_lag=(0.0, 0.0),
         features={},
         noise=Noise(9e-4, 0.8),
-        velocity=Velocity(),
     )
     return replace(one, **changed)  # type: ignore[arg-type]
 
