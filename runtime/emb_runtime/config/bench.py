@@ -53,6 +53,8 @@ PARAMETER_NAMES = get_args(ParameterName)  # The parameters that are identified,
 
 Bitrate = Annotated[int, Meta(ge=125_000, le=1_000_000)]
 Age = Annotated[int, Meta(ge=0, le=OLDEST_FRAME)]
+Bandwidth = Annotated[float, Meta(gt=0, le=1e6)]  # [rad/s]
+Lag = Annotated[float, Meta(gt=0, le=0.1)]  # [s]
 
 
 class BrakeParameters(NamedTuple):
@@ -103,9 +105,9 @@ class Sensors:
     """Origin of the measured velocity: an observer derives it from the angle, where it is not measured."""
 
     velocity: Literal["sensor", "observer"] = "sensor"
-    observer_bandwidth: Annotated[float, Meta(gt=0, le=1e6)] | None = None
+    observer_bandwidth: Bandwidth | None = None
     """Least bandwidth of an observer of second order with a damping from 0.7 to 1 [rad/s]"""
-    velocity_lag: Annotated[float, Meta(gt=0, le=0.1)] | None = None
+    velocity_lag: Lag | None = None
     """Longest lag of an observer of which nothing else is known [s]"""
 
     @property

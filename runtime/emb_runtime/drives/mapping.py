@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from emb_runtime.can.codec import worst_bits
-from emb_runtime.config.bench import HIGHEST_BUS_LOAD, Bench
+from emb_runtime.config.bench import HIGHEST_BUS_LOAD, Bench, Sensors
 from emb_runtime.drives.signals import Field, Protection
 from emb_runtime.errors import BenchFileError, UsageError
 from emb_runtime.safety.end_stop import released_speed
@@ -132,6 +132,7 @@ class Mapping:
     messages: Dictionary[str, MessageInfo]  # Those that are used, by name
     angle: Measured
     velocity: Measured
+    sensors: Sensors  # Origin of the velocity; a sensor where the file says nothing of it
     current: Measured | None
     command: Commanded
     state: State | None
@@ -209,6 +210,12 @@ def require_fit(mapping: Mapping, bench: Bench) -> None:
         )
     for key, reason in _fit_problems(mapping, bench):
         raise MappingError(f"{mapping.name}: {key}: {reason}")
+    of_drive, declared = mapping.sensors.bandwidth, bench.sensors.bandwidth
+    if of_drive is not None and (declared is None or declared > of_drive):
+        raise BenchFileError(
+            f"sensors: the velocity of {mapping.name} is {mapping.sensors} (can.signals.velocity of the mapping), and "
+            f"the bench file declares {bench.sensors}: declare it as the mapping does, or slower"
+        )
     least = 1 if mapping.polled else 0
     low, high = bench.shield.frame_age
     if high < 1 or low != least:

@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 
 from emb_runtime.can.codec import parse
 from emb_runtime.can.messages import load_layout
-from emb_runtime.config.bench import LONGEST_NODE_WATCHDOG, Bitrate
+from emb_runtime.config.bench import LONGEST_NODE_WATCHDOG, Bandwidth, Bitrate, Lag, Sensors
 from emb_runtime.config.typed import MAX_TOML_BYTES, parse_toml, read, shown
 from emb_runtime.drives.dbc import MAX_DBC_BYTES, MessageText, find_messages
 from emb_runtime.drives.mapping import (
@@ -76,6 +76,8 @@ class _Angle(_Signal, kw_only=True):
 class _Velocity(_Signal, kw_only=True):
     unit: Literal["rad/s", "deg/s", "rev/s", "rpm"]
     offset: float = 0.0
+    observer_bandwidth: Bandwidth | None = None
+    velocity_lag: Lag | None = None
 
 
 class _Current(_Signal, kw_only=True):
@@ -212,6 +214,10 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
     reader = _Reader(source, messages, can.protection)
     command = reader.command(signals.command)
     state = None if signals.state is None else reader.state(signals.state)
+    known = signals.velocity.observer_bandwidth, signals.velocity.velocity_lag
+    if None not in known:
+        reason = "does not go with observer_bandwidth: expected one of the two"
+        raise reader.error("can.signals.velocity.velocity_lag", reason)
     made = Mapping(
         name=file.name,
         polled=can.exchange == "poll",
@@ -220,6 +226,7 @@ def _made(file: _File, text: str, dbc_text: str, source: str) -> Mapping:
         messages=reader.used,
         angle=reader.measured(signals.angle, "can.signals.angle"),
         velocity=reader.measured(signals.velocity, "can.signals.velocity"),
+        sensors=Sensors("sensor" if known == (None, None) else "observer", *known),
         current=None if signals.current is None else reader.measured(signals.current, "can.signals.current"),
         command=command,
         state=state,

@@ -6,15 +6,18 @@ import math
 import random
 import re
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from emb_runtime.drives.mapping import PROPERTIES, MappingError
+from emb_runtime.config.bench import Sensors, load_bench
+from emb_runtime.drives.mapping import PROPERTIES, MappingError, require_fit
 from emb_runtime.drives.mapping_file import load_mapping, parse_mapping
 from emb_runtime.drives.signals import make_field, physical_value, raw_value
 from emb_runtime.drives.wire import Encoder, Receiver
 from emb_runtime.drives.wire_guard import WireGuard, WireGuardError
+from emb_runtime.errors import BenchFileError
 from emb_runtime.records import Frame
 from tests.drives import EXAMPLES, LIMIT, SHIPPED, AnyCommand, RandomMapping
 
@@ -117,11 +120,36 @@ def test_a_mistake_is_one_line_that_names_it() -> None:
         ('default = "none"', 'Nothing = {kind = "none"}', "can.protection.Nothing: unknown key"),
         ('default = "none"', 'Axis0_Get_Iq = {kind = "xor"}', "checksum: missing"),
         ("[node]", "[nodes]", "nodes: unknown key"),
+        ("range = [-90, 90]", "range = [-90, 90], observer_bandwidth = 0", "velocity.observer_bandwidth: expected"),
+        ("range = [-90, 90]", "range = [-90, 90], velocity_lag = 2", "velocity_lag: expected"),
+        (
+            "range = [-90, 90]",
+            "range = [-90, 90], observer_bandwidth = 1000, velocity_lag = 0.001",
+            "can.signals.velocity.velocity_lag: does not go with observer_bandwidth",
+        ),
         ("sign = 1, range = [-2, 17]", "sign = 1, sine = 1, range = [-2, 17]", "sine: unknown key"),
     ):  # fmt: skip
         toml, dbc = next(files for files in map(texts, ("odrive", "mit")) if any(old in text for text in files))
         wrong = (toml.replace(old, new, 1), dbc) if old in toml else (toml, dbc.replace(old, new, 1))
         assert reason in refusal(*wrong), old
+
+
+def test_a_bench_file_must_declare_the_observer_of_a_mapping_or_a_slower_one() -> None:
+    toml, dbc = texts("odrive")
+    shipped = load_bench()
+    bench = replace(shipped, shield=shipped.shield._replace(frame_age=(0, 1)))
+    silent = parse_mapping(toml, dbc, "drive.toml")
+    for key, value, slower, faster in (("observer_bandwidth", 1000, 900.0, 1100.0), ("velocity_lag", 9e-4, 1e-3, 8e-4)):
+        drive = parse_mapping(toml.replace("[-90, 90]", f"[-90, 90], {key} = {value}"), dbc, "drive.toml")
+        for declared in (float(value), slower):
+            require_fit(drive, replace(bench, sensors=Sensors("observer", **{key: declared})))
+        require_fit(silent, replace(bench, sensors=Sensors("observer", **{key: faster})))
+        for sensors in (Sensors(), Sensors("observer", **{key: faster})):
+            with pytest.raises(
+                BenchFileError, match=rf"^sensors: .* is {drive.sensors} .* declares {sensors}: declare it"
+            ):
+                require_fit(drive, replace(bench, sensors=sensors))
+    require_fit(silent, bench)
 
 
 def test_the_ranges_of_the_dbc_are_not_used() -> None:
