@@ -75,6 +75,7 @@ def policy_file(
             sample_time=bench.timing.sample_time,
             horizon=bench.timing.horizon,
             vectors=tuple(vectors),
+            velocity=bench.sensors.velocity,
             provenance={**provenance, **versions("emb-excite", "onnx", "numpy")},
             **contract,
         ).to_json()

@@ -113,6 +113,7 @@ def test_the_contract_has_what_the_actor_was_trained_for(run: Path, exported: by
     contract = contract_of(exported)
     ranges: dict[Any, Any] = contract.ranges
     assert (contract.kind, contract.inputs) == ("current", ("angle", "velocity", "time"))
+    assert contract.velocity == bench.sensors.velocity
     assert (contract.sample_time, contract.horizon, contract.limits.current) == (1e-3, HORIZON, 6.0)
     assert ranges["f_v"] == (1e-5, 5e-5)
     assert ranges["k_m"] == (bench.brake.k_m, bench.brake.k_m)

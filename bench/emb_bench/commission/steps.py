@@ -163,6 +163,7 @@ def policy_file(step: Step, bench: Bench) -> bytes:
         limits=PolicyLimits(bench.limits.current, bench.limits.angle, bench.limits.velocity),
         sample_time=bench.timing.sample_time,
         horizon=bench.timing.horizon,
+        velocity=bench.sensors.velocity,
         vectors=tuple(Vector((0.0, 0.0, float(k / rate)), (float(currents[k]),)) for k in places),
         provenance={"commissioning": step.purpose},
     )

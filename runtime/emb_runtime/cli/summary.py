@@ -83,6 +83,7 @@ def header(
             "steps": str(steps),
             "bench_name": bench.name,
             "bench_hash": bench.identity_hash,
+            "velocity": f"{bench.sensors}",
             "dbc_protocol": str(plan.layout.protocol_version),
             "bus_load_worst": f"{planned_load(bench, plan.layout, drive.mapping if drive is not None else None):.4f}",
             "core": compiled_core.running().text,

@@ -67,6 +67,7 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     vectors: Annotated[tuple[Vector, ...], Meta(min_length=MIN_VECTORS, max_length=MAX_VECTORS)]
     ranges: dict[Literal["k_m", "k_1", "T_c", "f_v"], tuple[Positive, Positive]] = {}
     """Lowest and highest value of each parameter that it was made for, SI units; empty for any."""
+    velocity: Literal["sensor", "observer"] = "sensor"  # Origin of the velocity of the bench that it was made for
     gain: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0  # Of the speed loop
     provenance: dict[Name, Text | int | float] = {}
 
@@ -115,6 +116,8 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         found = []
         if self.horizon != bench.timing.horizon:
             found.append(f"horizon of {bench.timing.horizon} samples, made for {self.horizon}")
+        if self.velocity != bench.sensors.velocity:
+            found.append(f"velocity by {bench.sensors.velocity}, made for one by {self.velocity}")
         box = bench.range_set(bench.prior)
         for name, (low, high) in self.ranges.items():
             lowest, highest = getattr(box.low, name), getattr(box.high, name)

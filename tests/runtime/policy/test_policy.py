@@ -21,7 +21,7 @@ import onnxruntime as ort
 import pytest
 from onnx import TensorProto, helper
 
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench, load_bench
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Sensors, load_bench
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.kalman import believed
@@ -175,6 +175,18 @@ def test_wider_ranges_and_another_horizon_are_a_warning_and_all_else_of_a_bench_
     )
     for quick in (False, True):
         assert load_policy(shipped_actor_path(quick), other).warnings == []
+
+
+def test_a_policy_that_was_made_for_another_origin_of_the_velocity_is_a_warning() -> None:
+    observed = dataclasses.replace(BENCH, sensors=Sensors("observer", 1520.0))
+    for bench, made_for, warned in (
+        (BENCH, "sensor", []),
+        (BENCH, "observer", ["velocity by sensor, made for one by observer"]),
+        (observed, "sensor", ["velocity by observer, made for one by sensor"]),
+        (observed, "observer", []),
+    ):
+        assert load_policy(constant_actor(BENCH, 2.0, velocity=made_for), bench).warnings == warned
+    assert load_policy(shipped_actor_path(), observed).warnings == ["velocity by observer, made for one by sensor"]
 
 
 # What it computes -----------------------------------------------------------------------------------------------------
