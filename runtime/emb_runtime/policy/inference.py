@@ -76,4 +76,6 @@ def open_session(data: bytes) -> ort.InferenceSession:
 
 
 def _first_line(err: Exception) -> str:
-    return re.sub(r"[^ -~]", " ", str(err).strip().split("\n")[0])[:300]
+    """The reason in ONNX Runtime's message, behind the function in its source that found it."""
+    line = re.sub(r"[^ -~]", " ", str(err).strip().split("\n")[0])
+    return re.sub(r"/\S*\.(?:cc|h):\d+ .*?\) (?:\[\w+\] )?(?=\S)", "", line, count=1)[:600]

@@ -160,11 +160,16 @@ def _of(names: str, inputs: slice) -> dict[str, slice]:
 
 
 FIXED: Mapping[str, slice] = MappingProxyType(
-    _of("Abs Add And Cast Clip Concat Constant Cos Div Elu Equal Erf Exp Gather Gelu Gemm Greater", slice(0, 0))
-    | _of("GreaterOrEqual Identity LayerNormalization LeakyRelu Less LessOrEqual Log MatMul Max Min", slice(0, 0))
-    | _of("Mul Neg Not Or Pow Reciprocal Relu Round Selu Sigmoid Sign Sin Softmax Softplus Softsign", slice(0, 0))
-    | _of("Sqrt Sub Tanh Transpose Where", slice(0, 0))
-    | _of("Expand ReduceMax ReduceMean ReduceMin ReduceSum Reshape Slice Split Squeeze Unsqueeze", slice(1, None))
+    _of("Abs Acos Acosh Add And Asin Asinh Atan Atanh Cast Ceil Celu Clip Concat Constant Cos Cosh", slice(0, 0))
+    | _of("Div Elu Equal Erf Exp Flatten Floor Gather Gelu Gemm Greater GreaterOrEqual HardSigmoid", slice(0, 0))
+    | _of("HardSwish Identity IsInf IsNaN LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax", slice(0, 0))
+    | _of("MatMul Max Mean Min Mish Mul Neg Not Or PRelu Pow Reciprocal Relu Round Selu Shrink Sigmoid", slice(0, 0))
+    | _of("Sign Sin Sinh Softmax Softplus Softsign Sqrt Sub Sum Swish Tan Tanh ThresholdedRelu", slice(0, 0))
+    | _of("Transpose Where Xor", slice(0, 0))
+    | _of(
+        "Expand ReduceL1 ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare", slice(1, None)
+    )
+    | _of("Reshape Slice Split Squeeze Unsqueeze", slice(1, None))
 )
 """By operator: which of its inputs must be numbers in the file: none, or all but the first."""
 

@@ -450,6 +450,36 @@ def test_sizes_that_stand_in_the_file_are_taken_whether_as_initializers_or_as_co
     assert asked(load_policy(model_of(text), BENCH), 1.0, 2.0, 3.0) == 2.0
 
 
+NAMED = {
+    "of torch": "Flatten HardSwish HardSigmoid Celu Mish Softplus LeakyRelu Selu Elu Gelu Erf LogSoftmax",
+    "of each element": "Acos Acosh Asin Asinh Atan Atanh Ceil Cosh Floor Sinh Tan Shrink Softsign Sum Mean",
+    "of a row": "ThresholdedRelu ReduceL1 ReduceL2 ReduceProd ReduceSumSquare",
+}
+"""Operators that the page on the contract allows, by their kinds."""
+
+
+def test_the_operators_that_the_page_names_are_accepted() -> None:
+    for operator in " ".join(NAMED.values()).split():
+        body = f"a = {operator}(inputs) b = Mul(a, zero) c = ReduceSum<keepdims=1>(b, axis) outputs = Add(c, two)"
+        tensors = "float[1] zero = {0.0}, float[1,1] two = {2.0}, int64[1] axis = {1}"
+        inside = ((1.5 if operator == "Acosh" else 0.5,) * 3,) * MIN_VECTORS  # where it is defined
+        vectors = tuple(Vector(inputs, (2.0,)) for inputs in inside)
+        policy = load_policy(model_of(f"{HEAD} <{tensors}> {{ {body} }}", vectors=vectors), BENCH)
+        assert asked(policy, 0.0, 0.0, 0.0) == 2.0 or operator == "Acosh", operator
+
+
+def test_the_reason_of_onnx_runtime_is_said_whole() -> None:
+    model = parsed(f"{HEAD} <float[3,1] w = {{0.0, 0.0, 0.0}}> {{ outputs = MatMul(inputs, w) }}")
+    for version, opset, reason in (
+        (99, 17, "IR version: 99, max supported"),
+        (8, 99, "support for domain ai.onnx is till"),
+    ):
+        model.ir_version, model.opset_import[0].version = version, opset
+        said = refused(with_contract(model, GOOD))
+        assert reason in said
+        assert "onnxruntime::" not in said
+
+
 INTEGERS = {f"tensor({sign}int{bits})" for sign in ("", "u") for bits in (2, 4, 8, 16, 32, 64)}
 WHICH = {"indices"}  # Which numbers are taken; how many is in the shape of this input
 
