@@ -133,7 +133,9 @@ class Gateway:
             if self.node.may_arm and self._clock.now_ns() > listened_ns:
                 break
             if self._clock.now_ns() > silent_ns:
-                raise BusError("no samples of the drive: check that it is on, on this bus, with this DBC")
+                raise BusError(
+                    f"no samples of the drive: check that it is on, on this bus, with this DBC{self.node.heard}"
+                )
             self.step()
             if self._is_commanded:
                 raise BusError(f"cannot arm the drive: {INTRUDED}")
@@ -145,8 +147,8 @@ class Gateway:
             if stop_requested():
                 self.node.disarm()
         if self.node.phase is Phase.FAILED:
-            problem = self._release_problem()
-            raise BusError(f"cannot arm the drive: {self.node.failure}{problem and f'; {problem}'}")
+            heard, problem = self.node.heard, self._release_problem()
+            raise BusError(f"cannot arm the drive: {self.node.failure}{heard}{problem and f'; {problem}'}")
         return True
 
     def step(self) -> None:

@@ -129,6 +129,13 @@ class DriveNode:
         return self._receiver.rejected
 
     @property
+    def heard(self) -> str:
+        """State that the drive reports, and its latest frame that was not believed, at the end of a sentence."""
+        receiver, count = self._receiver, sum(self.rejected.values())
+        refused = f"{count} frames were not believed, the last one {receiver.refusal}" if count else ""
+        return "".join(f"; {text}" for text in (receiver.reported, refused) if text)
+
+    @property
     def may_arm(self) -> bool:
         """True if the drive has been heard, or sends only what it is asked for."""
         return self._mapping.polled or self.counts.samples >= READY_SAMPLES

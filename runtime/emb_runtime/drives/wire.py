@@ -118,6 +118,9 @@ class Receiver:
         """Arrival of the latest message with the state [ns]."""
         self.rejected: dict[str, int] = {}
         """Number of frames that were not believed, by reason."""
+        self.refusal = ""
+        """Latest frame that was not believed, with what it had and what it should have; empty if all were."""
+        self.reported = ""  # What the latest message with the state says, and what it should
 
     @property
     def frames_missing(self) -> str:
@@ -153,13 +156,14 @@ class Receiver:
             if frame.remote or len(frame.data) != info.length
             else info.protection.fault(frame.data)
         ):
-            self._reject(why)
+            lengths = f": {len(frame.data)} bytes came, the DBC says {info.length}" if why == "wrong length" else ""
+            self._reject(why, f"{info.name}: {why}{lengths}")
             return None
         counter = info.protection.counter
         if counter is not None:
             count = raw_value(counter, frame.data)
             if self._counters.get(info.name) == count:
-                self._reject("repeated")
+                self._reject("repeated", f"{info.name}: repeated")
                 return None
             self._missing[info.name].forgive()
             if info.name in self._counters:
@@ -173,19 +177,24 @@ class Receiver:
             if measured is not None and measured.message == info.name:
                 value = values[measured.field.name]
                 if not measured.low <= value <= measured.high:  # this way round, NaN is refused
-                    self._reject(f"{measured.field.name} out of range")
+                    name, ends = measured.field.name, f"{measured.low:g} to {measured.high:g}"
+                    self._reject(f"{name} out of range", f"{info.name}.{name} out of range: {value:g}, not {ends}")
                     return None
         return values
 
-    def _reject(self, reason: str) -> None:
+    def _reject(self, reason: str, refusal: str) -> None:
         self.rejected[reason] = self.rejected.get(reason, 0) + 1
+        self.refusal = refusal
 
     def _take_state(self, values: dict[str, float], time_ns: int) -> None:
         state = self._mapping.state
         assert state is not None
         value = values[state.field.name]
+        known = f"idle is {', '.join(map(str, state.idle))}, active {', '.join(map(str, state.active))}"
+        self.reported = f"{state.message}.{state.field.name} is {value:.0f}; {known}"
         if state.error is not None and values[state.error.name] != 0.0:
             self.said = DriveState.FAULT
+            self.reported = f"{state.message}.{state.error.name} is {values[state.error.name]:.0f}, not 0"
         elif value in state.idle:
             self.said = DriveState.IDLE
         else:

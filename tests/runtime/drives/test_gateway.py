@@ -523,15 +523,47 @@ def test_a_drive_that_is_silent_or_cannot_be_armed_is_an_error_and_nothing_is_co
     silent = Played()
     silent.drive.passes = lambda: silent.clock.advance_to(silent.clock.now_ns() + MS)
     begin_ns = silent.clock.now_ns()
-    with pytest.raises(BusError, match="no samples of the drive"):
+    with pytest.raises(BusError, match=r"no samples of the drive.*with this DBC$"):
         silent.gateway.run(lambda: False, lambda: None, arms=True)
     assert silent.drive.sent == []
     assert silent.clock.now_ns() - begin_ns == 5_001 * MS
     deaf = Played()
     deaf.ignores = True
-    with pytest.raises(BusError, match="cannot arm the drive: the drive did not become active"):
+    said = "did not become active within 0.5 s; Axis0_Heartbeat.Axis_State is 1; idle is 1, active 8$"
+    with pytest.raises(BusError, match=f"cannot arm the drive: the drive {said}"):
         run(deaf, 5000)
     assert set(deaf.torques) == {0.0}
+
+
+def test_who_cannot_arm_a_drive_says_which_frames_were_not_believed() -> None:
+    """A signal that the DBC takes for a float, and a message with a byte more than it says."""
+    for identifier, data, reason in (
+        (
+            0x009,
+            b"\xff\xff\x7f\x4e" * 2,
+            "no samples.*; {n} frames were .*, the last one .*Pos_Estimate out of range: 1",
+        ),
+        (
+            0x001,
+            bytes(7),
+            "did not become active.*; {n} frames were .*, the last one Axis0_Heartbeat: wrong length: 7 ",
+        ),
+    ):
+        it = Played()
+        receive = it.drive.receive
+
+        def changed(
+            wait_ns: int,
+            receive: Callable[[int], Frame | None] = receive,
+            of: int = identifier,
+            data: bytes = data,
+        ) -> Frame | None:
+            frame = receive(wait_ns)
+            return frame._replace(data=data) if frame is not None and frame.identifier == of else frame
+
+        it.drive.receive = changed  # type: ignore[method-assign,assignment]
+        with pytest.raises(BusError, match=reason.format(n=r"\d+")):
+            run(it, 6000)
 
 
 def test_after_a_frame_of_the_arming_sequence_that_the_second_guard_refused_only_the_disarming_leaves() -> None:

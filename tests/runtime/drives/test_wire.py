@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 
+import numpy as np
 import pytest
 
 from emb_runtime.drives.mapping import Mapping
@@ -56,6 +57,8 @@ def test_a_value_that_cannot_be_believed_makes_no_sample(value: float) -> None:
     receiver.take(encoder(value, 0.0, MS))
     assert receiver.take(iq(0.0, MS)) is None
     assert receiver.rejected == {"Pos_Estimate out of range": 1}
+    message = "Axis0_Get_Encoder_Estimates.Pos_Estimate out of range"
+    assert receiver.refusal == f"{message}: {np.float32(value):g}, not -2 to 17"
 
 
 def test_frames_of_the_wrong_length_and_of_others_make_no_sample() -> None:
@@ -72,20 +75,24 @@ def test_frames_of_the_wrong_length_and_of_others_make_no_sample() -> None:
         receiver.take(wrong)
     assert receiver.take(iq(0.0, MS)) is None
     assert receiver.rejected == {"wrong length": 2}
+    assert receiver.refusal == "Axis0_Get_Encoder_Estimates: wrong length: 0 bytes came, the DBC says 8"
 
 
 def test_the_state_is_what_the_heartbeat_says_until_it_is_too_old() -> None:
     receiver = Receiver(odrive(), 20)
     assert receiver.state(0) is DriveState.UNKNOWN
-    for frame, state in (
-        (heartbeat(1, MS), DriveState.IDLE),
-        (heartbeat(8, 2 * MS), DriveState.ACTIVE),
-        (heartbeat(8, 3 * MS, error=0x40), DriveState.FAULT),
-        (heartbeat(3, 4 * MS), DriveState.FAULT),
-        (heartbeat(1, 5 * MS), DriveState.IDLE),
+    assert receiver.reported == ""
+    known = "; idle is 1, active 8"
+    for frame, state, reported in (
+        (heartbeat(1, MS), DriveState.IDLE, f"Axis_State is 1{known}"),
+        (heartbeat(8, 2 * MS), DriveState.ACTIVE, f"Axis_State is 8{known}"),
+        (heartbeat(8, 3 * MS, error=0x40), DriveState.FAULT, "Axis_Error is 64, not 0"),
+        (heartbeat(3, 4 * MS), DriveState.FAULT, f"Axis_State is 3{known}"),
+        (heartbeat(1, 5 * MS), DriveState.IDLE, f"Axis_State is 1{known}"),
     ):
         receiver.take(frame)
         assert receiver.state(frame.time_ns) is state
+        assert receiver.reported == f"Axis0_Heartbeat.{reported}"
     assert receiver.state(255 * MS) is DriveState.IDLE
     assert receiver.state(256 * MS) is DriveState.UNKNOWN
 
@@ -118,6 +125,7 @@ def test_a_protected_message_is_checked_and_a_repeated_one_is_none() -> None:
         receiver.take(encoder(0.0, 0.0, frame.time_ns))
         assert (receiver.take(frame) is not None) is whole
     assert receiver.rejected == {"repeated": 1, "wrong checksum": 1, "invalid counter": 1}
+    assert receiver.refusal.endswith(": invalid counter")
 
 
 @pytest.mark.parametrize(("step", "missing"), [(1, False), (2, True), (14, True)])
