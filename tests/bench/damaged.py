@@ -142,17 +142,23 @@ def rewritten(
     runs: int = 1,
     chunk_size: int = 1 << 20,
     library: str = "emb-excite/0.1.0",
+    among_equals: Callable[[str], float] = lambda _topic: 0.0,
+    **options: Any,
 ) -> None:
-    """Write a log anew with the plain MCAP library: other fields, values or times, or the whole of it again."""
+    """Write a log anew with the plain MCAP library: other fields, values or times, or the whole of it again.
+
+    Messages of equal ``log_time`` are put in the order ``among_equals`` of their topics, and ``options`` are the
+    library's.
+    """
     with path.open("rb") as file:
         reader = NonSeekingReader(file, validate_crcs=True)
-        rows = list(reader.iter_messages())
+        rows = sorted(reader.iter_messages(), key=lambda row: (row[2].log_time, among_equals(row[1].topic)))
     with path.open("rb") as file:
         metadata = list(NonSeekingReader(file).iter_metadata())
     with path.open("rb") as file:
         attachments = list(NonSeekingReader(file).iter_attachments())
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=chunk_size, enable_data_crcs=True)
+        writer = Writer(file, chunk_size=chunk_size, enable_data_crcs=True, **options)
         writer.start(profile="", library=library)
         for entry in metadata:
             writer.add_metadata(entry.name, entry.metadata)

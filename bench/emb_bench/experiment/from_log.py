@@ -340,7 +340,7 @@ class _Reports:
         self.found = False  # There was a report for any of the cycles
         if self.topic in log.topics:
             log.require(self.topic, self.columns)
-        self._recent = dict.fromkeys((*self.columns, "order", "publish_time"), np.empty(0, np.int64))
+        self._recent = dict.fromkeys((*self.columns, "publish_time"), np.empty(0, np.int64))
 
     def of_the_cycles(self, part: dict[str, Table]) -> NDArray[Any]:
         """The reports of each control cycle of a batch."""
@@ -350,7 +350,7 @@ class _Reports:
             return told
         known = {name: np.concatenate([old, part[self.topic][name]]) for name, old in self._recent.items()}
         self._recent = {name: column[-_RECENT:] for name, column in known.items()}
-        before = np.searchsorted(known["order"], cycles["order"])
+        before = np.searchsorted(known["publish_time"], cycles["publish_time"], side="right")  # a file has any order
         left = np.arange(len(told))  # nearly always it is the last message before the cycle
         for back in range(1, _RECENT + 1):
             left = left[before[left] >= back]
@@ -376,7 +376,7 @@ def samples_before(log: RunLog, bench: Bench, count: int) -> list[SensorSample]:
         cycles = part["/cycle"]
         first = np.flatnonzero(in_experiment(cycles))[:1]
         if "/can/rx" in part:
-            end = int(cycles["order"][first[0]]) if len(first) else None
+            end = int(cycles["publish_time"][first[0]]) if len(first) else None
             frames += _frames(part["/can/rx"], layout, end, 4 * count)
         if len(first):
             step, device_time_ns = (int(cycles[name][first[0]]) for name in ("step", "device_time_ns"))
@@ -390,10 +390,10 @@ def samples_before(log: RunLog, bench: Bench, count: int) -> list[SensorSample]:
 
 
 def _frames(received: Table, layout: Layout, end: int | None, count: int) -> list[Frame]:
-    """The last frames of samples before a place in the log's order."""
+    """The last frames of samples up to a time in the log."""
     chosen = np.isin(received["id"], (layout.angle.identifier, layout.velocity.identifier))
     if end is not None:
-        chosen &= received["order"] < end
+        chosen &= received["publish_time"] <= end
     at = np.flatnonzero(chosen)[-count:]
     rows = (received[name][at].tolist() for name in ("id", "data", "publish_time", "is_extended", "is_rtr", "is_error"))
     return [Frame(*row) for row in zip(*rows, strict=True)]

@@ -193,10 +193,15 @@ class RunLog:
             own = np.flatnonzero(chunk.headers["channel"] == channel)
             headers.append(chunk.headers[own])
             orders.append(before + own)
-        times = np.concatenate(headers)
+        times, order = np.concatenate(headers), np.concatenate(orders)
+        payloads = [data for _, chunk in held for data in chunk.payloads(channel)]
+        log_time, sequence = times["log"].astype(np.int64), times["sequence"].astype(np.int64)
+        if ((np.diff(log_time) == 0) & (np.diff(sequence) < 0)).any():  # equal times in an order of another tool's
+            right = np.lexsort((sequence, np.cumsum(np.diff(log_time, prepend=0) != 0)))
+            times, payloads = times[right], [payloads[i] for i in right.tolist()]
         try:
-            fields = columns(factory, [data for _, chunk in held for data in chunk.payloads(channel)])
-            return _times(times["publish"], times["log"]) | {"order": np.concatenate(orders)} | fields
+            fields = columns(factory, payloads)
+            return _times(times["publish"], times["log"]) | {"order": order} | fields
         except UNREADABLE as err:
             raise LogError(f"{self.path}: the messages of {topic} are not readable: {message_of(err)}") from err
 

@@ -63,6 +63,10 @@ _NAMES = {int(opcode): opcode.name.lower().replace("_", " ") for opcode in Opcod
 Integers = NDArray[np.int64]
 
 
+class OtherFormError(ValueError):
+    """A record that is whole, and of a form that MCAP allows and that is not read."""
+
+
 class Chunk(NamedTuple):
     """One chunk, unpacked."""
 
@@ -131,6 +135,9 @@ class McapFile:
                 body = self._file.read(length)
                 try:
                     chunk = self._take(opcode, body)
+                except OtherFormError as err:
+                    if str(err) not in self.missing:
+                        self.name_missing(str(err))
                 except DAMAGE as err:
                     self.name_missing(f"{name} is damaged ({message_of(err)}) and left out")
                 else:
@@ -185,7 +192,10 @@ class McapFile:
                 covered = zlib.crc32(RECORD.pack(opcode, len(body)) + body[:16], self._crc or 0)
                 _require(self._crc is None or expected in (0, covered), "the checksum over the summary is wrong")
             case Opcode.MESSAGE:
-                raise ValueError("it lies outside of a chunk, where it has no checksum")
+                raise OtherFormError(
+                    "messages outside of chunks, where they have no checksum, are left out: mcap compress writes them "
+                    "into chunks"
+                )
             case _:
                 _require(opcode in _NAMES or opcode >= 0x80, "no such record exists")
         return chunk
@@ -256,6 +266,8 @@ def unpack_chunk(body: bytes) -> Chunk:
 def _decompressed(packed: memoryview, compression: str, size: int) -> bytes:
     if not compression:
         return bytes(packed)
+    if compression == "lz4":
+        raise OtherFormError("chunks compressed with lz4 are left out: mcap compress writes them again with zstd")
     _require(compression == "zstd", f"expected zstd, got the compression {compression!r}")
     # zstd takes the frame's own word for its size before the caller's.
     claimed = zstandard.frame_content_size(packed)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import time
 from collections.abc import Callable
@@ -10,8 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
+from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.can_files import McapReader
 from emb_bench.logs.log import end_detail, read_log
 from emb_runtime.can.messages import load_layout
@@ -166,6 +168,44 @@ def test_a_log_that_another_program_has_copied_is_read_as_ours(path: Path) -> No
     assert found.cycles["angle"].tolist() == angles
     with McapReader(path) as frames:
         assert len([*frames]) == whole.counts["/can/rx"] + whole.counts["/can/tx"]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_messages_of_equal_log_time_may_come_in_any_order(path: Path, seed: int) -> None:
+    """MCAP leaves their order open: by channel, against it, at random."""
+    own = read_experiment(read_log(path))
+    rng = random.Random(seed)
+    orders: tuple[Callable[[str], float], ...] = (
+        lambda topic: topic == "/cycle",
+        lambda topic: topic != "/cycle",
+        lambda topic: topic != "/can/rx",
+        lambda _topic: rng.random(),
+    )
+    rewritten(path, among_equals=orders[seed])
+    found = read_experiment(read_log(path))
+    np.testing.assert_array_equal(found.currents, own.currents)
+    np.testing.assert_array_equal(found.samples, own.samples)
+    assert (found.angle, found.slack, found.lacks) == (own.angle, own.slack, own.lacks)
+
+
+@pytest.mark.parametrize(
+    ("options", "form"),
+    [
+        ({"compression": CompressionType.LZ4}, "chunks compressed with lz4 are left out: mcap compress"),
+        (
+            {"use_chunking": False},
+            "messages outside of chunks, where they have no checksum, are left out: mcap compress",
+        ),
+    ],
+)
+def test_a_form_of_mcap_that_is_not_read_is_named_once_and_is_no_damage(
+    path: Path, options: dict[str, Any], form: str
+) -> None:
+    rewritten(path, **options)
+    with pytest.raises(LogError) as refused:
+        read_log(path)
+    assert str(refused.value).count(form) == 1
+    assert "damaged" not in str(refused.value)
 
 
 def test_dropped_records_make_a_log_incomplete(tmp_path: Path) -> None:
