@@ -32,7 +32,7 @@ from emb_runtime.drives.signals import DATA_IDS, MODULI, Field, Protection, make
 from emb_runtime.drives.wire import Encoder
 from emb_runtime.drives.wire_guard import WireGuard, WireGuardError
 from emb_runtime.errors import FrameError
-from emb_runtime.system.input_file import read_text
+from emb_runtime.system.input_file import decode, read_bytes
 
 if TYPE_CHECKING:
     from cantools.database.can import Message as DbcMessage
@@ -172,7 +172,7 @@ def load_mapping(path: str | Path) -> Mapping:
     Raises:
         MappingError: a file cannot be read, or is refused; the message has the file, the key and the reason.
     """
-    text = _text(path, MAX_TOML_BYTES)
+    text = _text(path, MAX_TOML_BYTES, "utf-8-sig")
     file = _file(text, str(path))
     return _made(file, text, _text(Path(path).parent / file.can.dbc, MAX_DBC_BYTES), str(path))
 
@@ -194,11 +194,11 @@ def _file(text: str, source: str) -> _File:
     return read(_File, document, source, MappingError)
 
 
-def _text(path: str | Path, most: int) -> str:
+def _text(path: str | Path, most: int, encoding: str = "") -> str:
     try:
-        return read_text(path, most)
+        return decode(read_bytes(path, most), encoding)
     except (OSError, UnicodeDecodeError) as err:
-        reason = err.strerror if isinstance(err, OSError) else "not UTF-8 text"
+        reason = err.strerror if isinstance(err, OSError) else f"not text in UTF-8{'' if encoding else ' or cp1252'}"
         raise MappingError(f"{path}: cannot read it: {reason}") from err
 
 

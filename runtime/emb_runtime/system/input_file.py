@@ -6,6 +6,7 @@ being opened. What is judged is what was opened, so nothing can be put in its pl
 
 from __future__ import annotations
 
+import codecs
 import errno
 import functools
 import io
@@ -91,5 +92,21 @@ def read_bytes(path: str | Path, most: int) -> bytes:
 
 
 def read_text(path: str | Path, most: int) -> str:
-    """Text of a regular file in UTF-8; see :func:`read_bytes`."""
-    return read_bytes(path, most).decode("utf-8")
+    """Text of a regular file in UTF-8, with a mark or without; see :func:`read_bytes`."""
+    return read_bytes(path, most).decode("utf-8-sig")
+
+
+def decode(data: bytes, encoding: str = "") -> str:
+    """Text of a tool that does not say its encoding: by its mark, else in UTF-8, else in cp1252, that of Windows.
+
+    Raises:
+        UnicodeDecodeError: it is in none of them, or not in the ``encoding`` that is given.
+    """
+    if encoding:
+        return data.decode(encoding).removeprefix("\ufeff")
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252")

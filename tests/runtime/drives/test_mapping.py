@@ -266,6 +266,15 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
         load_mapping(path)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252", "utf-16"])
+def test_a_dbc_is_read_in_the_encodings_that_its_tools_write(tmp_path: Path, encoding: str) -> None:
+    dbc = (EXAMPLES / "odrive.dbc").read_text(encoding="utf-8") + 'CM_ "Temperatur in °C, Spannung ±5 %";\n'
+    toml = (EXAMPLES / "odrive.toml").read_text(encoding="utf-8")
+    (tmp_path / "drive.toml").write_text(toml, encoding="utf-8-sig")
+    (tmp_path / "odrive.dbc").write_text(dbc, encoding=encoding)
+    assert load_mapping(tmp_path / "drive.toml").sha256 == parse_mapping(toml, dbc, "drive.toml").sha256
+
+
 def test_the_hash_follows_both_files() -> None:
     toml, dbc = texts("odrive")
     first = parse_mapping(toml, dbc, "drive.toml").sha256
