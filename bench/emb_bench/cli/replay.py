@@ -58,7 +58,13 @@ def _estimate(args: argparse.Namespace) -> int:
     from emb_bench.report.estimate import document, text
 
     answer(args, lambda: document(study), lambda verbose: text(study, verbose=verbose))
-    return _strict(study) if args.strict else EXIT_DONE
+    return _strict(study) if args.strict else _recorded(study)
+
+
+def _recorded(study: Study | None) -> int:
+    """Exit code without ``--strict``: only of a recording of others, whose faults a map may hold, is a misfit one."""
+    recorded = study is not None and study.estimate.bench.machine is not None
+    return EXIT_CHECK_FAILED if study is not None and recorded and not study.model_fits else EXIT_DONE
 
 
 def _strict(study: Study | None) -> int:
@@ -83,7 +89,7 @@ def _accepted(content: Content, *, strict: bool) -> int:
     if content.without_part:
         return EXIT_CHECK_FAILED
     if not strict:
-        return EXIT_DONE
+        return _recorded(content.study)
     if content.acceptance is not None:
         codes = {"pass": EXIT_DONE, "fail": EXIT_CHECK_FAILED, "cannot tell": EXIT_CANNOT_TELL}
         return codes[content.acceptance.result.value]
@@ -154,7 +160,7 @@ class Command(NamedTuple):
 
 MEANINGS: Mapping[int, str] = {
     EXIT_DONE: "done",
-    EXIT_CHECK_FAILED: "a check failed, or a log could not be used (it is named)",
+    EXIT_CHECK_FAILED: "a check failed, a log could not be used (it is named), or a recording with --map does not fit",
     EXIT_USAGE: "usage: wrong argument, a file that cannot be read or written, or a missing library",
     EXIT_POLICY_REFUSED: "the policy in the log is refused",
     EXIT_LOG: "not a log, or too damaged or too short for a result",

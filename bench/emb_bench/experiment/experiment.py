@@ -34,6 +34,9 @@ class Lack(Enum):
     NO_COMMANDS = auto()
     NO_TIMES = auto()
     LOST_OF_RECORDING = auto()  # Samples
+    HEAD = auto()  # Line of a file that was taken for its head
+    OTHER_FRAMES = auto()  # CAN frames that were skipped, and their identifiers
+    BAD_FRAMES = auto()  # CAN frames that do not fit the DBC
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +65,7 @@ class Experiment:
     braked: int = 0  # Periods that the node braked by itself because no command came in time
     command_delay: int = 0  # Samples by which commands acted late, by the node's reports
     lacks: Mapping[Lack, tuple[float, ...]] = field(default_factory=dict)  # With the numbers that belong to each
+    faults: tuple[str, ...] = ()  # What of its map a recording of others contradicts, in words
     within: float | None = None
     """Of a mapped drive: difference between command and report up to which the command acted [A], NaN if its mapping is
     not readable, so that reports alone count; None of other nodes."""

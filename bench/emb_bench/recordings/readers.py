@@ -1,16 +1,20 @@
-"""Columns of foreign files (CSV, Parquet, MATLAB, MDF) as an experiment in our units, and what it lacks.
+"""Columns of foreign files (CSV, Parquet, MATLAB, MDF, CAN frames) as an experiment in our units, and what it lacks.
 
 Each library is imported when it is needed.
 """
 
 from __future__ import annotations
 
+import csv
 import gc
+import re
 import sys
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,15 +22,26 @@ from numpy.typing import NDArray
 
 from emb_bench.config.plants import Instruments
 from emb_bench.experiment.experiment import Experiment, Lack
-from emb_bench.recordings.map_file import TIMED, RecordingMap, Signal, Source
+from emb_bench.recordings.faults import Motion, Series, contradictions, require_angle, require_times, require_values
+from emb_bench.recordings.map_file import TIME, TIMED, Place, RecordingMap, Signal, Source
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
-from emb_runtime.errors import EmbError, UsageError, needs
-from emb_runtime.system.input_file import open_regular
+from emb_runtime.can.codec import parse
+from emb_runtime.drives.dbc import MAX_DBC_BYTES, find_messages
+from emb_runtime.errors import EmbError, FrameError, UsageError, needs
+from emb_runtime.system.input_file import decode, open_regular, read_bytes
 
 Floats = NDArray[np.float64]
+Lacks = Mapping[Lack, tuple[float, ...]]
+Entered = dict[Lack, tuple[float, ...]]
+Read = tuple[Place, Any, Any]
 
 MOST = 5_000_000  # Most rows of a recording
+MOST_BYTES = 2 << 30  # Largest CSV file
 NAMED = 12  # Most columns that a message names
+HEADS = 1000  # First lines of a CSV file among which its head is looked for
+DELIMITERS: Mapping[str, str] = {",": ",", ";": ";", "|": "|", "tab": "\t", " ": " "}
+MISSING = ("", "nan", "NaN", "NAN", "-nan", "null", "NULL", "None", "NA", "N/A", "n/a", "#N/A")
+"""Texts that stand for a missing number in any CSV file."""
 
 
 class Column(NamedTuple):
@@ -36,14 +51,19 @@ class Column(NamedTuple):
     time: Floats | None  # Of each value [s], shape (n,); None where the format has no times of its own
 
 
-def read_columns(path: Path, kind: str, source: Source, names: Sequence[str]) -> dict[str, Column]:
-    """Named columns of a file of a kind; ``struct.field`` inside MATLAB structures."""
-    names = list(dict.fromkeys(names))
-    readers: Mapping[str, tuple[str, Callable[[], Iterator[tuple[str, Any, Any]]]]] = {
-        "csv": ("CSV", lambda: _csv(path, source, names)),
-        "parquet": ("Parquet", lambda: _parquet(path, names)),
-        "matlab": ("MATLAB", lambda: _matlab(path, names)),
-        "mdf": ("MDF", lambda: _mdf(path, names)),
+def read_columns(
+    path: Path, kind: str, source: Source, places: Sequence[Place], lacks: Entered, folder: Path = Path()
+) -> dict[Place, Column]:
+    """Columns of a file of a kind; ``struct.field`` and ``matrix(:,1)`` inside MATLAB structures.
+
+    Enters in ``lacks`` what was left out on the way. The DBC of CAN frames lies in the ``folder``.
+    """
+    readers: Mapping[str, tuple[str, Callable[[], Iterator[Read]]]] = {
+        "csv": ("CSV", lambda: _csv(path, source, places, lacks)),
+        "parquet": ("Parquet", lambda: _parquet(path, source, places)),
+        "matlab": ("MATLAB", lambda: _matlab(path, places)),
+        "mdf": ("MDF", lambda: _mdf(path, places)),
+        "can": ("CAN frames", lambda: _can(path, source, places, lacks, folder)),
     }
     title, read = readers[kind]
     found = {}
@@ -51,12 +71,16 @@ def read_columns(path: Path, kind: str, source: Source, names: Sequence[str]) ->
         open_regular(path).close()
     except OSError as err:
         raise UsageError(f"{path}: cannot read the recording: {err.strerror}") from err
+    if kind != "mdf" and (numbered := [place.column for place in places if place.group is not None]):
+        raise UsageError(f"{path}: {numbered[0]}: only an MDF has groups: leave group out")
+    first, last = source.rows or (1, MOST + 1)
     with _errors_in_one_line(path, title):
-        for name, values, time in read():
-            found[name] = Column(_numbers(path, name, values), None if time is None else _numbers(path, name, time))
-    for name, column in found.items():
+        for place, values, time in read():
+            row = _numbers(path, place.column, values)[first - 1 : last]
+            found[place] = Column(row, None if time is None else _numbers(path, place.column, time)[first - 1 : last])
+    for place, column in found.items():
         if not 2 <= len(column.values) <= MOST:
-            raise UsageError(f"{path}: {name}: expected 2 to {MOST} values, got {len(column.values)}")
+            raise UsageError(f"{path}: {place.column}: expected 2 to {MOST} values, got {len(column.values)}")
     return found
 
 
@@ -86,12 +110,12 @@ def _let_go(err: Exception) -> None:
         sys.unraisablehook = hook
 
 
-def _require_one(path: Path, name: str, places: Sequence[Any], known: Sequence[str]) -> None:
+def _require_one(path: Path, name: str, places: Sequence[Any], known: Sequence[str], more: str = "") -> None:
     if not places:
         others = ", ".join(known[:NAMED]) + (", ..." if len(known) > NAMED else "")
-        raise UsageError(f"{path}: no column is called {name!r}; it has: {others or 'none'}")
+        raise UsageError(f"{path}: no column is called {name!r}; it has: {others or 'none'}{more}")
     if len(places) > 1:
-        raise UsageError(f"{path}: {len(places)} columns are called {name!r}: expected one")
+        raise UsageError(f"{path}: {len(places)} columns are called {name!r}: expected one{more}")
 
 
 def _numbers(path: Path, name: str, values: Any) -> Floats:
@@ -99,67 +123,268 @@ def _numbers(path: Path, name: str, values: Any) -> Floats:
         row: Floats = np.squeeze(np.asarray(values, dtype=np.float64))
     except (TypeError, ValueError) as err:
         raise UsageError(f"{path}: {name}: expected numbers") from err
+    if row.ndim == 2:
+        ends = f"{name}(:,1) to {name}(:,{row.shape[1]})"
+        raise UsageError(f"{path}: {name}: a matrix of {row.shape[0]} x {row.shape[1]}: name a column of it, {ends}")
     if row.ndim != 1:
         raise UsageError(f"{path}: {name}: expected one row of numbers, got an array of shape {np.shape(values)}")
     return row
 
 
-def _csv(path: Path, source: Source, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
-    from pyarrow import csv
+# ---- tables ----
 
-    table = csv.read_csv(
-        path,
-        csv.ReadOptions(skip_rows_after_names=source.skip),
-        csv.ParseOptions(delimiter="\t" if source.delimiter == "tab" else source.delimiter),
-        csv.ConvertOptions(decimal_point=source.decimal, null_values=["", "nan", "NaN", "NAN", "null"]),
+
+def _csv(path: Path, source: Source, places: Sequence[Place], lacks: Entered) -> Iterator[Read]:
+    import pyarrow as pa
+    from pyarrow.csv import ConvertOptions, ParseOptions, ReadOptions, read_csv
+
+    content = read_bytes(path, MOST_BYTES)
+    try:
+        text = decode(content, source.encoding)
+    except UnicodeDecodeError as err:
+        line = content.count(b"\n", 0, err.start) + 1
+        tried = source.encoding or "UTF-8 or cp1252"
+        raise UsageError(f"{path}: line {line}: not text in {tried}: [file] encoding names another one") from err
+    delimiter = DELIMITERS[source.delimiter]
+    if delimiter == " ":  # columns may be aligned by several
+        text = re.sub(r"(?m)^ +| +(?= |$)", "", text)
+    line, titles = _head(path, text, source, places)
+    if line > 1 and source.head is None:
+        lacks[Lack.HEAD] = (line,)
+    table = read_csv(
+        pa.BufferReader(text.encode()),
+        ReadOptions(skip_rows=line + source.skip, column_names=titles, use_threads=False),
+        ParseOptions(
+            delimiter=delimiter, invalid_row_handler=lambda row: "skip" if text.endswith(row.text) else "error"
+        ),
+        ConvertOptions(decimal_point=source.decimal, null_values=[*MISSING, *source.missing], strings_can_be_null=True),
     )
-    return _arrow(path, table, names)
+    return _arrow(path, table, source, places)
 
 
-def _parquet(path: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
+def _split(line: str, delimiter: str) -> list[str]:
+    """Names or numbers of a line, without the mark of a comment before it and a semicolon behind it."""
+    plain = line.strip("\r").lstrip("%# ").removesuffix("" if delimiter == ";" else ";")
+    return [part.strip() for part in next(csv.reader([plain], delimiter=delimiter), [])]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.strip(" \t;\"'"))
+    except ValueError:
+        return False
+    return True
+
+
+def _head(path: Path, text: str, source: Source, places: Sequence[Place]) -> tuple[int, list[str]]:
+    """Line of the head, the first being 1, and the name of each column; 0 and numbers where there is none."""
+    lines = re.split(r"\r\n|\n|\r", text[: 1 << 20])[: max(HEADS, source.head or 0)]
+    delimiter, wanted = DELIMITERS[source.delimiter], {place.column for place in places}
+    if source.head == 0:
+        at, titles = -1, [str(n + 1) for n, _ in enumerate(_split(lines[0], delimiter))]
+    else:
+        among = range(len(lines)) if source.head is None else range(source.head - 1, min(source.head, len(lines)))
+        at = max(among, key=lambda i: len(wanted & {*_split(lines[i], delimiter)}), default=0)
+        titles = _split(lines[at], delimiter)
+    if lost := [place.column for place in places if place.column not in titles]:
+        _require_one(path, lost[0], (), titles, _remedy(lines, at, titles, delimiter, wanted))
+    first = next((line for line in lines[at + 1 + source.skip :] if line.strip()), "")
+    width = len(_split(first, delimiter))  # some put a delimiter at the end of a head or of each row
+    return at + 1, titles[:width] if not any(titles[width:]) else titles + [""] * (width - len(titles))
+
+
+def _remedy(lines: Sequence[str], at: int, titles: Sequence[str], delimiter: str, wanted: set[str]) -> str:
+    """Key of the map that may find the columns of a CSV file; else the line that was taken for its head."""
+    if at >= 0 and titles and all(map(_is_number, titles)):
+        return f". No head: its first line is numbers; with [file] head = 0 columns are 1 to {len(titles)}"
+    for name, other in DELIMITERS.items():
+        fits = [i for i, line in enumerate(lines) if wanted <= {*_split(line, other)}]
+        if fits and other != delimiter:
+            return f'. With [file] delimiter = "{name}" line {fits[0] + 1} has them'
+    return f" in line {at + 1}, taken for the head: [file] head names another line" if at > 0 else ""
+
+
+def _parquet(path: Path, source: Source, places: Sequence[Place]) -> Iterator[Read]:
     from pyarrow import parquet
 
+    names = {place.column for place in places}
     with parquet.ParquetFile(path) as file:
         known = file.schema_arrow.names
-        return _arrow(path, file.read(columns=[name for name in known if name.strip() in names]), names, known)
+        return _arrow(path, file.read(columns=[name for name in known if name.strip() in names]), source, places, known)
 
 
 def _arrow(
-    path: Path, table: Any, names: Sequence[str], known: Sequence[str] | None = None
-) -> Iterator[tuple[str, Any, Any]]:
-    for name in names:
-        places = [i for i, own in enumerate(table.column_names) if own.strip() == name]
-        _require_one(path, name, places, known or table.column_names)
-        column = table.column(places[0])
-        if str(column.type).startswith("timestamp"):
-            column = column.cast("timestamp[ns]").cast("int64")
-            yield name, (column.to_numpy() - column[0].as_py()) * 1e-9, None
+    path: Path, table: Any, source: Source, places: Sequence[Place], known: Sequence[str] | None = None
+) -> Iterator[Read]:
+    for place in places:
+        name = place.column
+        at = [i for i, own in enumerate(table.column_names) if own.strip() == name]
+        _require_one(path, name, at, known or table.column_names)
+        column, kind = table.column(at[0]), str(table.column(at[0]).type)
+        if kind.startswith(("timestamp", "time")):
+            whole = column.cast("timestamp[ns]" if kind.startswith("timestamp") else "time64[ns]").cast("int64")
+            yield (
+                place,
+                (whole.to_numpy() - (whole.drop_null()[0].as_py() if whole.null_count < len(whole) else 0)) * 1e-9,
+                None,
+            )
+        elif kind in ("string", "large_string"):
+            yield place, _of_texts(path, name, column.to_pylist(), source), None
         else:
-            yield name, column.to_numpy(), None
+            yield place, column.to_numpy(), None
 
 
-def _matlab(path: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
+def _of_texts(path: Path, name: str, texts: Sequence[str | None], source: Source) -> Floats:
+    """Numbers of a column that has texts, too."""
+    values = np.full(len(texts), np.nan)
+    for i, text in enumerate(texts):
+        plain = (text or "").strip(" \t;\"'")
+        if plain in MISSING or plain in source.missing:
+            continue
+        number = plain.replace(",", ".") if source.decimal == "," else plain
+        if not _is_number(number):
+            remedy = (
+                '[file] decimal = "," reads it' if _is_number(plain.replace(",", "."))
+                else "[file] skip = 1 leaves out a line of units" if i == 0
+                else f"[file] missing = [{plain!r}] leaves such out"
+            )  # fmt: skip
+            raise UsageError(f"{path}: {name}: row {i + 1}: expected a number, got {plain[:40]!r}: {remedy}")
+        values[i] = float(number)
+    return values
+
+
+# ---- MATLAB, MDF ----
+
+_INDEX = re.compile(r"(.*?)\(\s*(:|\d+)\s*(?:,\s*(:|\d+)\s*)?\)")
+
+
+def _matlab(path: Path, places: Sequence[Place]) -> Iterator[Read]:
     from scipy import io
 
     content = io.loadmat(path, squeeze_me=True, struct_as_record=False, simplify_cells=True)
-    for name in names:
+    known = [text for key, value in content.items() if not key.startswith("__") for text in _inside(key, value)]
+    for place in places:
         value: Any = content
-        for part in name.split("."):
-            found = [value[part]] if isinstance(value, Mapping) and part in value else []
-            _require_one(path, name, found, [key for key in content if not key.startswith("__")])
+        for part in place.column.split("."):
+            indexed = _INDEX.fullmatch(part)
+            name = part if indexed is None else indexed[1]
+            found = [value[name]] if isinstance(value, Mapping) and name in value else []
+            _require_one(path, place.column, found, known)
             value = found[0]
-        yield name, value, None
+            if indexed is not None:
+                value = _part(path, indexed, value)
+        yield place, value, None
 
 
-def _mdf(path: Path, names: Sequence[str]) -> Iterator[tuple[str, Any, Any]]:
+def _inside(name: str, value: Any) -> Iterator[str]:
+    """Names of what a variable of MATLAB has inside."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _inside(f"{name}.{key}", inner)
+    elif isinstance(value, list):
+        for i, inner in enumerate(value):
+            yield from _inside(f"{name}({i + 1})", inner)
+    else:
+        yield f"{name}(:,1..{np.shape(value)[1]})" if np.ndim(value) == 2 else name
+
+
+def _part(path: Path, indexed: re.Match[str], value: Any) -> Any:
+    """Part of an array by an index as MATLAB has it, ``name(1)`` or ``name(:,2)``."""
+    numbers = [slice(None) if index == ":" else int(index) - 1 for index in indexed.groups()[1:] if index]
+    try:
+        if isinstance(value, Mapping) and numbers == [0]:  # one structure is an array of one
+            return value
+        return value[tuple(numbers)] if isinstance(value, np.ndarray) else value[numbers[0]]
+    except (IndexError, KeyError, TypeError) as err:
+        raise UsageError(f"{path}: {indexed[0]}: beyond what {indexed[1]} has: {np.shape(value)}") from err
+
+
+def _mdf(path: Path, places: Sequence[Place]) -> Iterator[Read]:
     from asammdf import MDF
 
     with MDF(path) as file:
         known = sorted(name for name in file.channels_db if name not in ("time", "t"))
-        for name in names:
-            _require_one(path, name, file.channels_db.get(name, ()), known)
-            signal = file.get(name)
-            yield name, signal.samples, signal.timestamps
+        for place in places:
+            every = file.channels_db.get(place.column, ())
+            found = [at for at in every if place.group in (None, at[0])]
+            groups = [f"{number} ({file.groups[number].channel_group.cycles_nr} values)" for number, _ in every]
+            more = f"; it is in the groups {', '.join(groups)}: group = N of the signal names one" if groups else ""
+            _require_one(path, place.column, found, known, more)
+            signal = file.get(group=found[0][0], index=found[0][1])
+            yield place, signal.samples, signal.timestamps
+
+
+# ---- CAN frames ----
+
+
+def _can(path: Path, source: Source, places: Sequence[Place], lacks: Entered, folder: Path) -> Iterator[Read]:
+    import can
+
+    signals = _signals(folder / source.dbc, places)
+    of = dict[tuple[bool, int], dict[str, Any]]()
+    for message, _ in signals.values():
+        of.setdefault((message.is_extended_frame, message.frame_id), {})[message.name] = message
+    rows, channels = dict[tuple[str, str], list[tuple[float, Any]]](), dict[tuple[bool, int], Any]()
+    others, unread = Counter[str](), 0
+    with can.LogReader(path) as frames:
+        for frame in frames:
+            if source.channel not in ("", str(frame.channel)):
+                continue
+            key, shown = (frame.is_extended_id, frame.arbitration_id), f"{frame.arbitration_id:#x}"
+            if key not in of or frame.is_error_frame or frame.is_remote_frame:
+                others["error frames" if frame.is_error_frame else shown] += 1
+                continue
+            if (first := channels.setdefault(key, frame.channel)) != frame.channel:
+                where = f"channels {first} and {frame.channel}"
+                raise UsageError(f"{path}: {shown} comes on {where}: [file] channel names one")
+            for message in of[key].values():
+                values = _decoded(message, frame.data)
+                unread += values is None
+                for name, value in (values or {}).items():
+                    rows.setdefault((message.name, name), []).append((frame.timestamp, value))
+    if others:
+        lacks[Lack.OTHER_FRAMES] = (others.total(), len(others))
+    if unread:
+        lacks[Lack.BAD_FRAMES] = (unread,)
+    came = ", ".join(f"{key} ({count})" for key, count in others.most_common(NAMED)) or "none"
+    for place, (message, name) in signals.items():
+        if not (found := rows.get((message.name, name), [])):
+            why = f"{unread} frames do not fit the DBC, and others are {came}"
+            raise UsageError(f"{path}: {place.column}: no frame {message.frame_id:#x} has it; {why}")
+        yield place, [value for _, value in found], [time for time, _ in found]
+
+
+def _decoded(message: Any, data: Any) -> Mapping[str, Any] | None:
+    """Values of a frame; None if it does not fit the DBC."""
+    try:
+        found: Mapping[str, Any] = message.decode(bytes(data), decode_choices=False)
+    except Exception:  # of several kinds, by what does not fit
+        return None
+    return found
+
+
+def _signals(dbc: Path, places: Sequence[Place]) -> dict[Place, tuple[Any, str]]:
+    """Message of cantools, and name of the signal, of each column."""
+    try:
+        messages = find_messages(decode(read_bytes(dbc, MAX_DBC_BYTES)))
+    except (OSError, UnicodeDecodeError, FrameError) as err:
+        reason = err.strerror if isinstance(err, OSError) else err
+        raise UsageError(f"{dbc}: cannot read the DBC: {reason}") from err
+    names = [(of, name) for of, found in messages.items() for name in re.findall(r"(?m)^ SG_ (\w+)", found.text)]
+    faults = "".join(f"; {of} is not readable: {found.fault}" for of, found in messages.items() if found.fault)
+    made, result = dict[str, Any](), dict[Place, tuple[Any, str]]()
+    for place in places:
+        of, _, signal = place.column.rpartition(".")
+        known = [f"{message}.{name}" for message, name in names]
+        found = [(message, name) for message, name in names if name == signal and of in ("", message)]
+        several = f": {', '.join('.'.join(pair) for pair in found)}" if found else faults
+        _require_one(dbc, place.column, found, known, several)
+        try:
+            made[found[0][0]] = made.get(found[0][0]) or parse(messages[found[0][0]].text).messages[0]
+        except FrameError as err:
+            raise UsageError(f"{dbc}: {found[0][0]}: {err}") from err
+        result[place] = made[found[0][0]], signal
+    return result
 
 
 SLOWEST, FASTEST = 300.0, 2000.0  # Bandwidths of the observer that derives a velocity [rad/s]
@@ -178,16 +403,27 @@ class Found(NamedTuple):
     bandwidth: float  # Of the observer that made the velocity [rad/s]; 0 if it was measured
 
 
-def experiment_of(columns: Mapping[str, Column], wanted: RecordingMap, kind: str, source: str) -> Found:
-    """Columns, by their names, as an experiment; messages call the file ``source``."""
-    given, timing = wanted.signals.given, wanted.timing
-    clock = columns[timing.column].values * wanted.time_unit if timing.column else None
-    signals = {name: _signal(columns, signal, wanted, clock, source) for name, signal in given.items()}
+def experiment_of(
+    columns: Mapping[Place, Column], wanted: RecordingMap, kind: str, source: str, lacks: Lacks = MappingProxyType({})
+) -> Found:
+    """Columns, by their places, as an experiment that ``lacks`` this already; messages call the file ``source``.
+
+    Raises:
+        UsageError: the columns have faults, see :mod:`emb_bench.recordings.faults`, or are too short.
+    """
+    given, timing, name = wanted.signals.given, wanted.timing, Path(source).name
+    source += f" (head in line {lacks[Lack.HEAD][0]})" if Lack.HEAD in lacks else ""
+    read = _read(columns, wanted, source)
+    signals = {
+        name: (series.times + given[name].delay, _in_si(series.values, given[name])) for name, series in read.items()
+    }
     times, angles = signals["angle"]
-    t_s = timing.sample_time or float(np.median(np.diff(times)))
+    t_s = timing.sample_time or _sample_time(times)
     if not 1e-4 <= t_s <= 0.1:
+        units = [unit for unit, seconds in TIME.items() if 1e-4 <= t_s / wanted.time_unit * seconds <= 0.1]
+        hint = f"; with unit = {' or '.join(map(repr, units))} it is" if timing.column and units else ""
         raise UsageError(
-            f"{source}: expected a sample time from 0.0001 to 0.1 s, got {t_s:g} s: see [timing] in the map"
+            f"{source}: expected a sample time from 0.0001 to 0.1 s, got {t_s:g} s: see [timing] in the map{hint}"
         )
     step, index = _on_grid(times - times[0], t_s)
     if len(step) < FEWEST or step[-1] > LONGEST:
@@ -215,9 +451,23 @@ def experiment_of(columns: Mapping[str, Column], wanted: RecordingMap, kind: str
     whole = slice(int(np.argmax(received)), int(np.flatnonzero(received)[-1]) + 1)
     samples = np.where(received[:, None], np.stack([angle, velocity], axis=1), np.nan)[whole]
     received, late, currents = received[whole], late[whole] - late[whole.start], applied[whole][1:]
+    by, machine = "current" if "current" in given else "command", wanted.machine
+    faults = contradictions(
+        Motion(
+            angle=samples[:, 0],
+            velocity=None if bandwidth else samples[:, 1],
+            currents=currents,
+            sample_time=t_s,
+            noise=angle_noise,
+            by=by,
+            delay=given[by].delay,
+            known=machine.known.given,
+            guess=machine.guess.given,
+        )
+    )
     first = float(samples[0, 0]), float(samples[0, 1])
     experiment = Experiment(
-        name=Path(source).name,
+        name=name,
         currents=currents,
         samples=samples[1:],
         angle=first[0],
@@ -228,32 +478,83 @@ def experiment_of(columns: Mapping[str, Column], wanted: RecordingMap, kind: str
         assumed=None if received.all() else np.where(received[1:], np.nan, currents),
         first=first,
         planned=len(currents),
-        lacks=_lacks(wanted, kind, bandwidth, int((~received).sum())),
+        lacks=_lacks(wanted, kind, bandwidth, int((~received).sum())) | {**lacks},
+        faults=faults,
     )
     return Found(experiment, t_s, (angle_noise, velocity_noise), bandwidth)
 
 
-def _signal(
-    columns: Mapping[str, Column],
-    signal: Signal,
-    wanted: RecordingMap,
-    clock: Floats | None,
-    source: str,
-) -> tuple[Floats, Floats]:
-    """Times [s] and values in our units of what was recorded of a signal."""
-    column = columns[signal.column]
-    values = (column.values - signal.offset) * signal.scale * signal.sign
-    rows = np.asarray(np.arange(len(values)) * wanted.timing.sample_time, dtype=np.float64) if clock is None else clock
-    time: Floats = rows if column.time is None else column.time
-    if len(time) != len(values):
-        raise UsageError(f"{source}: {signal.column}: {len(values)} values and {len(time)} times: expected as many")
-    kept = np.isfinite(values) & np.isfinite(time)
-    time, values = time[kept], values[kept]
-    if len(time) < FEWEST:
-        raise UsageError(f"{source}: {signal.column}: {len(time)} values are numbers, expected at least {FEWEST}")
-    if (back := np.flatnonzero(np.diff(time) < 0.0)).size:
-        raise UsageError(f"{source}: the time runs backwards after row {int(back[0]) + 1}, at {time[back[0]]:g} s")
-    return time + signal.delay, values
+def _read(columns: Mapping[Place, Column], wanted: RecordingMap, source: str) -> dict[str, Series]:
+    """The signals without faults, angles continued over their period; rows that repeat the one before are left out."""
+    given, clock = wanted.signals.given, _clock(columns, wanted)
+    first = wanted.file.rows[0] if wanted.file.rows else 1
+    repeated: NDArray[np.bool_] = np.zeros(1, np.bool_)
+    if clock is not None and len({len(column.values) for column in columns.values()}) == 1:
+        table = np.stack([column.values for column in columns.values()])
+        repeated = np.append([False], (table[:, 1:] == table[:, :-1]).all(axis=0))
+    found = dict[str, Series]()
+    for name, signal in given.items():
+        values, own = columns[signal.place]
+        rows = np.arange(len(values))
+        time: Floats = np.asarray(rows * wanted.timing.sample_time if clock is None else clock, np.float64)
+        time = time if own is None else own
+        if len(time) != len(values):
+            raise UsageError(f"{source}: {signal.column}: {len(values)} values and {len(time)} times: expected as many")
+        low, high = signal.range
+        kept = np.isfinite(values) & np.isfinite(time) & (low <= values) & (values <= high) & ~repeated
+        kept &= ~np.isin(values, signal.special)
+        if kept.sum() < FEWEST:
+            raise UsageError(f"{source}: {signal.column}: {kept.sum()} values are numbers, expected at least {FEWEST}")
+        found[name] = series = Series(
+            name=f"{signal.column} ([signals.{name}])",
+            rows=rows[kept] + first,
+            times=time[kept],
+            values=values[kept],
+            tick=wanted.time_unit,
+            sample_time=wanted.timing.sample_time if name == "angle" else 0.0,
+            noise=signal.noise / signal.scale,
+        )
+        require_times(series, source)
+    for name, series in found.items():
+        if given[name].wrap:
+            found[name] = series._replace(values=np.unwrap(series.values, period=given[name].wrap))
+            continue
+        require_values(series, source)
+    angle, velocity = found["angle"], found.get("velocity")
+    if velocity is not None:
+        factor = given["velocity"].scale * given["velocity"].sign / (given["angle"].scale * given["angle"].sign)
+        rates = (np.interp(angle.times, velocity.times, velocity.values) - given["velocity"].offset) * factor
+        angle = angle._replace(rates=rates)
+    require_angle(angle, source)
+    return found
+
+
+def _clock(columns: Mapping[Place, Column], wanted: RecordingMap) -> Floats | None:
+    """Time of each row [s]; None where the format, or a sample time, says it."""
+    timing = wanted.timing
+    if not timing.column:
+        return None
+    counts = columns[Place(timing.column)].values
+    there = np.isfinite(counts)
+    if timing.wrap:
+        turns = np.cumsum(np.diff(counts[there], prepend=counts[there][:1]) < -0.5 * timing.wrap)
+        counts = counts.copy()
+        counts[there] += timing.wrap * turns
+    seconds = counts * wanted.time_unit
+    if timing.fraction:
+        seconds = seconds + columns[Place(timing.fraction)].values * TIME[timing.fraction_unit]
+    return seconds
+
+
+def _in_si(values: Floats, signal: Signal) -> Floats:
+    return (values - signal.offset) * signal.scale * signal.sign
+
+
+def _sample_time(times: Floats) -> float:
+    """Mean distance of samples, of which some may be lost [s]; a single one is as coarse as a time stamp."""
+    steps = np.diff(times)
+    count = float(np.rint(steps / max(float(np.median(steps)), 1e-9)).sum())
+    return round(float(times[-1] - times[0]) / max(count, 1.0), 9)
 
 
 def _on_grid(times: Floats, t_s: float) -> tuple[Integers, Integers]:
@@ -319,7 +620,7 @@ def _lacks(wanted: RecordingMap, kind: str, bandwidth: float, lost: int) -> dict
         found[Lack.NO_CURRENT] = ()
     if wanted.signals.command is None:
         found[Lack.NO_COMMANDS] = ()
-    if not wanted.timing.column and kind != TIMED:
+    if not wanted.timing.column and kind not in TIMED:
         found[Lack.NO_TIMES] = ()
     if lost:
         found[Lack.LOST_OF_RECORDING] = (lost,)

@@ -9,6 +9,7 @@ import tomlkit
 
 from emb_bench.config.bench import parse_bench
 from emb_bench.config.plants import RECORDED_PLANT
+from emb_bench.experiment.experiment import Lack
 from emb_bench.experiment.from_log import Recording
 from emb_bench.logs.log import Chunks
 from emb_bench.recordings.map_file import RecordingMap, read_map
@@ -26,9 +27,9 @@ def open_recording(path: Path, map_path: Path) -> Recording:
         UsageError: a file cannot be read, the map does not fit the recording, or a library is missing.
     """
     wanted, map_text = read_map(map_path)
-    kind, timing = wanted.kind_of(path), wanted.timing
-    names = [signal.column for signal in wanted.signals.given.values()] + ([timing.column] if timing.column else [])
-    found = experiment_of(read_columns(path, kind, wanted.file, names), wanted, kind, str(path))
+    kind, lacks = wanted.kind_of(path), dict[Lack, tuple[float, ...]]()
+    columns = read_columns(path, kind, wanted.file, wanted.places, lacks, map_path.parent)
+    found = experiment_of(columns, wanted, kind, str(path), lacks)
     text = bench_of(found, wanted)
     parse_bench(text, f"{map_path}: the bench file made of it", analysis=True)
     return Recording(

@@ -86,6 +86,9 @@ LACKS = {
     Lack.NO_COMMANDS: "the recording has no commands: what acted is the mean of the measured current over each period",
     Lack.NO_TIMES: "the recording has no times: its rows are taken to be one sample time apart",
     Lack.LOST_OF_RECORDING: "{} samples are lost: what acted in the periods before them is not known to have acted",
+    Lack.HEAD: "line {} of the file is taken for its head, and the lines before it are left out",
+    Lack.OTHER_FRAMES: "{} frames were skipped, of {} identifiers that the map does not name",
+    Lack.BAD_FRAMES: "{} frames do not fit the DBC and were skipped",
 }
 """Parts of an experiment that are missing, with places for their numbers."""
 
@@ -297,8 +300,11 @@ def limit(effect: Contribution, e: Estimate) -> str:
 
 def alarms(e: Estimate) -> list[str]:
     """Reasons for which the model does not fit, an effect that explains it first; empty if it may fit."""
-    m, found, scored = e.validation, list[str](), any(name.startswith("score of") for name in e.validation.alarming)
-    if m.suspected and m.suspected[0].observer:
+    m, scored = e.validation, any(name.startswith("score of") for name in e.validation.alarming)
+    found = [] if m.fits else faults(e)
+    if found:
+        pass
+    elif m.suspected and m.suspected[0].observer:
         found.append(explained(m.suspected[0], e.bench.machine))
     elif left := left_fixed(e):
         names = ", ".join(left)
@@ -327,6 +333,11 @@ def alarms(e: Estimate) -> list[str]:
     if any(f"whiteness of {name}" in m.alarming for name in m.coloured):
         found.append(f"{_coloured(m)}: the disturbance of the brake or its sensors is not white, or the model is wrong")
     return found
+
+
+def faults(e: Estimate) -> list[str]:
+    """Faults of recordings of others and their maps."""
+    return [fault for record in e.records for fault in record.faults]
 
 
 def left_fixed(e: Estimate) -> list[str]:
@@ -395,7 +406,12 @@ def explained(s: Suspect, machine: Machine | None = None) -> str:
     said = effect.effect
     for parameter in PARAMETER_NAMES:
         said = said.replace(parameter, quantity(machine, parameter).name)
-    return f"{said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma); remedy: {effect.remedy}"
+    remedy = effect.remedy
+    if machine is not None and "--model" in remedy:  # the plant of a recording is that of its map
+        along = "break_away,stribeck_velocity" if s.name == "break_away" else s.name
+        without = "leave [signals.velocity] out of the map"
+        remedy = without if s.name == "velocity_lag" else f"estimate it as well: --nuisance {along}"
+    return f"{said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma); remedy: {remedy}"
 
 
 def derived_velocity(observer: Derived, machine: Machine | None) -> str:
@@ -531,6 +547,8 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
             return []
         weak = [c.label for c in study.conclusions if not (c.of_interest or c.identified)]
         return [f"estimate without {', '.join(weak)}: not determined by the record"] if weak else [MORE]
+    if faults(e):
+        return ["correct the map as the first line says, and estimate again: no value holds before"]
     found = []
     if left_fixed(e):
         found.append(f"estimate {_every(e)}: {again}{_options(study)}")
@@ -538,7 +556,7 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
     if e.bench.machine is None:
         found.append(f"{otherwise}find a model that explains it: {again} --model all")
     else:
-        found.append(f"{otherwise}check signs, units and times in the map")
+        found.append(f"{otherwise}estimate what the model lacks, too: {again} --nuisance NAME")
     if e.method == "oem":
         found.append(f"if that does not help, allow for a disturbance: {again} --method pem")
     return found

@@ -12,7 +12,7 @@ from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.estimate.windows import Cut, by_windows, predict_windows, window_of
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.recordings.map_file import parse_map
+from emb_bench.recordings.map_file import Place, parse_map
 from emb_bench.recordings.readers import Column, experiment_of
 from emb_bench.recordings.recording import bench_of
 from emb_runtime.errors import UsageError
@@ -25,7 +25,7 @@ ASKED = EstimationProblem(("T_c", "f_v", "J"), ("current_offset",))
 def made(found: Recording, text: str = MAP) -> tuple[Bench, Experiment]:
     """Bench and record of a recording, without a file between."""
     wanted = parse_map(text, "map")
-    columns = {name: Column(c, None) for name, c in zip(("t", "x", "F"), found, strict=True)}
+    columns = {Place(name): Column(c, None) for name, c in zip(("t", "x", "F"), found, strict=True)}
     ours = experiment_of(columns, wanted, "csv", "r.csv")
     return parse_bench(bench_of(ours, wanted), "made", analysis=True), ours.experiment
 

@@ -1,0 +1,436 @@
+"""Faults of a recording and its map, looked for before anything is estimated: each a row of a table.
+
+Times that make no grid, an angle that begins anew and special values are refused, with the row of the file. What
+contradicts the equations of the machine, whatever its friction is, is kept, and named first where the model does not
+fit. Pure: of arrays.
+
+The equations are taken over spans of a few samples, as second differences of the angle and of the double integrals of
+what acts: they are exact for any course between the samples, and linear in all that is unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emb_runtime.errors import UsageError
+
+Floats = NDArray[np.float64]
+
+EQUAL = 0.05  # Share of rows with the time of the row before from which on the times do not tell the samples apart
+SPARSE = 1.5  # Distance of the rows, in sample times that the map gives, from which on the two contradict each other
+FAR = 20.0  # Distance of a special value from the others, in their spread
+SHORT = 10  # Most rows in a row that have a special value
+MOST_VALUES = 20  # Numbers that come again after a jump, which are tried as special values
+RARE = 0.05  # Largest share of special values
+ALIKE = 0.05  # Relative difference of jumps of one period
+PERIODS = (2.0 * math.pi, math.pi, 360.0, 180.0, 1.0, 256.0, 1024.0, 4096.0, 8192.0, 16384.0, 65536.0)
+"""Usual ones, which a jump says less exactly."""
+SPANS = (5, 10, 20, 40)  # Samples of a span: the shortest whose changes the noise does not hide
+TOLD = 30.0  # Change over a span, in standard deviations of the sensor
+MOST = 100_000  # Samples that the equations are tried on
+LATEST = 20  # Largest delay that is looked for [samples]
+EARLY, LATE = -0.1, 0.9  # Delays that can be estimated [samples]
+BETTER = 0.5  # Share of the squares that another delay must leave
+SURE = 10.0  # Standard deviations by which a coefficient is no zero
+FACTOR = 10.0  # Values beyond a guess by this factor are not searched
+SPECIAL = (-32768.0, 32767.0, 65535.0, -2147483648.0, 2147483647.0, 4294967295.0, -999.0, -9999.0, 9999.0, 99999.0)
+"""Numbers with which a recorder says that it has none, besides those beyond all others."""
+
+
+class Check(NamedTuple):
+    """One fault."""
+
+    name: str
+    finds: Callable[[Any], tuple[float | str, ...] | None]  # Numbers and texts of what was found
+    says: str  # With places for them
+
+
+def _found(checks: tuple[Check, ...], of: Any) -> Iterator[str]:
+    for check in checks:
+        if (numbers := check.finds(of)) is not None:
+            yield check.says.format(*numbers)
+
+
+# ---- times and values ----
+
+
+class Series(NamedTuple):
+    """One signal as it was read; row 1 is the first after the head."""
+
+    name: str
+    rows: NDArray[np.int64]
+    times: Floats  # [s]
+    values: Floats  # In the unit of the column
+    tick: float = 1.0  # Time of one count of the column of times [s]
+    sample_time: float = 0.0  # As the map gives it [s]
+    noise: float = 0.0  # Standard deviation, in the unit of the column
+    rates: Floats | None = None  # Velocity of an angle at its samples, in units of the column per second
+
+
+def _equal(s: Series) -> tuple[float | str, ...] | None:
+    same = np.flatnonzero(np.diff(s.times) == 0.0)
+    return (len(same), len(s.times), s.rows[same[0] + 1]) if len(same) > EQUAL * len(s.times) else None
+
+
+def _back(s: Series) -> tuple[int, Floats] | None:
+    back = np.flatnonzero(np.diff(s.times) < 0.0)
+    return (int(back[0]), s.times[back[0] + 1 : back[0] + 1 + SHORT]) if len(back) else None
+
+
+def _begins_anew(s: Series) -> tuple[float | str, ...] | None:
+    if (found := _back(s)) is None or found[1].max() >= s.times[found[0]] or found[1].max() == found[1].min():
+        return None
+    k, row = found[0], s.rows[found[0]]
+    period = (s.times[k] - s.times[k + 1] + np.median(np.abs(np.diff(s.times)))) / s.tick
+    return row, f"{s.times[k]:.10g}", f"{period:.10g}", row, row + 1, s.rows[-1]
+
+
+def _runs_backwards(s: Series) -> tuple[float | str, ...] | None:
+    if (found := _back(s)) is None:
+        return None
+    k = found[0]
+    return s.rows[k], f"{s.times[k]:.10g}", f"{s.times[k + 1]:.10g}", s.rows[k]
+
+
+def _jumps(s: Series) -> tuple[float | str, ...] | None:
+    steps = np.diff(s.times)
+    k = int(np.argmax(steps))
+    rest = s.times[-1] - s.times[0] - steps[k]
+    row = s.rows[k]
+    apart = steps[k] > max(rest, 100.0 * float(np.median(steps)))
+    return (f"{steps[k]:.6g}", row, row, row + 1, s.rows[-1]) if apart else None
+
+
+def _sparse(s: Series) -> tuple[float | str, ...] | None:
+    apart = float(np.median(np.diff(s.times)))
+    return (f"{apart:.6g}", f"{s.sample_time:g}") if 0.0 < s.sample_time * SPARSE < apart else None
+
+
+TIMES = (
+    Check(
+        "time begins anew",
+        _begins_anew,
+        "the time begins anew after row {}, at {} s: of a counter, [timing] wrap = {} continues it; of two recordings, "
+        "[file] rows = [1, {}] or [{}, {}] is one of them",
+    ),
+    Check(
+        "time runs backwards",
+        _runs_backwards,
+        "the time runs backwards after row {}, from {} to {} s: sort the rows, or read those before with [file] "
+        "rows = [1, {}]",
+    ),
+    Check(
+        "equal times",
+        _equal,
+        "{} of {} rows have the same time as the row before, the first one row {}, and it does not tell them apart: "
+        "where the rows are evenly apart, leave [timing] column out and give sample_time",
+    ),
+    Check(
+        "time jumps",
+        _jumps,
+        "the time jumps by {} s after row {}: [file] rows = [1, {}] or [{}, {}] is one recording",
+    ),
+    Check("sparse rows", _sparse, "the rows are {} s apart, where [timing] sample_time says {} s"),
+)
+
+
+def require_times(s: Series, source: str) -> None:
+    """Refuse times that make no grid; messages call the file ``source``."""
+    for said in _found(TIMES, s):
+        raise UsageError(f"{source}: {said}")
+
+
+def _special(s: Series) -> tuple[float | str, ...] | None:
+    """Values beyond all others, or numbers known as special, or the same number now and then between others."""
+    low, middle, high = np.percentile(s.values, (5.0, 50.0, 95.0))
+    spreads = np.abs(s.values - middle) / max(high - low, 10.0 * s.noise, 1e-300)
+    if not s.noise:  # a command may jump
+        far = (spreads > 1000.0) | (spreads > 0.25 * FAR) & np.isin(s.values, SPECIAL)
+    else:
+        far = spreads > FAR
+        steps = np.abs(np.diff(s.values))
+        after, counts = np.unique(s.values[1:][steps > FAR * np.percentile(steps, 80.0)], return_counts=True)
+        for value in (0.0, *SPECIAL, *after[counts > 1][:MOST_VALUES]):
+            far |= _between(s, s.values == value)
+    count = int(far.sum())
+    if not 0 < count <= RARE * len(far) or high == low:
+        return None
+    k = int(np.argmax(far))
+    low, high = s.values[~far].min() - 0.1 * (high - low), s.values[~far].max() + 0.1 * (high - low)
+    first = f"{s.values[k]:.10g}"
+    return count, s.name, first, s.rows[k], first, f"{low:.4g}", f"{high:.4g}"
+
+
+def _between(s: Series, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Those of the chosen samples that lie apart from the ones before and after their short run, which agree."""
+    found, edges = np.zeros(len(chosen), np.bool_), np.flatnonzero(np.diff(np.pad(chosen, 1).astype(np.int8)))
+    usual = 10.0 * s.noise + 3.0 * float(np.percentile(np.abs(np.diff(s.values)), 80.0))
+    for begin, end in edges.reshape(-1, 2).tolist():
+        if begin > 0 and end < len(chosen) and end - begin <= SHORT:
+            before, after, value = s.values[begin - 1], s.values[end], s.values[begin]
+            away = min(abs(before - value), abs(after - value))
+            found[begin:end] = away > 5.0 * max(usual * (end - begin + 1), abs(after - before))
+    return found
+
+
+def _off(s: Series) -> Floats:
+    """Step of the angle from each sample to the next beyond that of its velocity, measured or of the steps around."""
+    steps, apart = np.diff(s.values), np.diff(s.times)
+    if s.rates is not None:
+        expected = 0.5 * (s.rates[1:] + s.rates[:-1])
+    else:
+        rates = np.pad(steps / np.where(apart > 0.0, apart, np.inf), 2, mode="edge")
+        expected = np.median(np.lib.stride_tricks.sliding_window_view(rates, 5), axis=1)
+    result: Floats = np.where(apart < 1.5 * np.median(apart), steps - expected * apart, 0.0)  # none over a gap
+    return result
+
+
+def _wraps(s: Series) -> tuple[float | str, ...] | None:
+    off = np.abs(_off(s))
+    far = off > 0.5 * off.max()
+    if far.sum() < 2:
+        return None
+    period, extent = float(np.median(off[far])), float(np.ptp(s.values))
+    period = next((p for p in PERIODS if abs(p - period) < 1e-3 * p), period)
+    alike = (np.abs(off[far] - period) < ALIKE * period).all() and (off[~far] < 0.4 * period).all()
+    usual = float(np.median(np.abs(np.diff(s.values)))) + 10.0 * s.noise
+    if not (alike and period > 5.0 * usual and 0.8 * period < extent < 1.05 * period):
+        return None
+    return s.name, f"{period:.10g}", s.rows[int(np.argmax(far))], int(far.sum()), f"{period:.10g}"
+
+
+def _is_set(s: Series) -> tuple[float | str, ...] | None:
+    off = np.abs(_off(s))
+    far = off > max(20.0 * float(np.percentile(off, 99.0)), 0.05 * float(np.ptp(s.values)), 20.0 * s.noise)
+    if not far.any():
+        return None
+    k = int(np.argmax(far))
+    row = s.rows[k]
+    return s.name, f"{s.values[k]:.6g}", f"{s.values[k + 1]:.6g}", row, int(far.sum()), row, row + 1, s.rows[-1]
+
+
+VALUES = (
+    Check(
+        "special values",
+        _special,
+        "{} values of {} are apart from all others, the first one {} in row {}: where they say that there is no value, "
+        "special = [{}], or range = [{}, {}], of the signal leaves them out",
+    ),
+)
+ANGLES = (
+    Check(
+        "wrapped angle",
+        _wraps,
+        "{} jumps by {} after row {}, {} times in all: it begins anew after a period; wrap = {} of the signal "
+        "continues it",
+    ),
+    Check(
+        "set angle",
+        _is_set,
+        "{} jumps from {} to {} after row {}, {} times in all, as no motion does: was it set anew? [file] rows = "
+        "[1, {}] or [{}, {}] is one recording; range = [LOW, HIGH] of the signal leaves single values out",
+    ),
+)
+
+
+def require_values(s: Series, source: str) -> None:
+    """Refuse values that are none; see :func:`require_times`."""
+    for said in _found(VALUES, s):
+        raise UsageError(f"{source}: {said}")
+
+
+def require_angle(s: Series, source: str) -> None:
+    """Refuse jumps of an angle; see :func:`require_times`."""
+    for said in _found(ANGLES, s):
+        raise UsageError(f"{source}: {said}")
+
+
+# ---- the equations ----
+
+
+class Motion(NamedTuple):
+    """A recording on its grid, and what its map says of it; NaN where a sample is lost."""
+
+    angle: Floats  # Shape (n + 1,)
+    velocity: Floats | None  # As measured, shape (n + 1,); None where it was derived
+    currents: Floats  # What acted in each period, as the map says, shape (n,)
+    sample_time: float  # [s]
+    noise: float  # Standard deviation of the angle
+    by: str  # Signal that says what acted: ``command`` or ``current``
+    delay: float  # That the map gives it [s]
+    known: Mapping[str, float]  # Parameters by their place in the equations
+    guess: Mapping[str, float]
+
+
+class Equation(NamedTuple):
+    """Second differences of the angle over spans of a recording, and of the double integrals of its torques."""
+
+    motion: Motion
+    left: Floats  # Second differences of the angle, shape (m,)
+    loads: Mapping[str, Floats]  # Those of friction, spring and a constant, by the parameter that they belong to
+    drive: Floats  # Double integral of what acts, at each sample, shape (n + 1,)
+    span: int  # [samples]
+    kept: NDArray[np.bool_]  # Spans without a lost sample
+
+    def driven(self, delay: float) -> Floats:
+        """Double integral of what acts ``delay`` samples late, over each span."""
+        at = np.arange(len(self.drive), dtype=np.float64)
+        return _second(np.interp(at - delay, at, self.drive), self.span)[self.kept]
+
+    def correlation(self, delay: float) -> float:
+        """Partial correlation of the angle with what acts, ``delay`` samples late, beside all loads."""
+        others = np.linalg.qr(np.stack([*self.loads.values()], axis=1))[0]
+        left, right = (row - others @ (others.T @ row) for row in (self.left, self.driven(delay)))
+        size = float(np.linalg.norm(left) * np.linalg.norm(right))
+        return float(left @ right) / size if size > 0.0 else 0.0
+
+
+def equation_of(motion: Motion) -> Equation | None:
+    """The equation of a recording; None where nothing moves by more than its noise, or too little of it is left."""
+    n = min(len(motion.currents), MOST)
+    t_s, raw = motion.sample_time, motion.angle[: n + 1]
+    there = np.isfinite(raw)
+    angle = np.interp(np.arange(n + 1), np.flatnonzero(there), raw[there])
+    for span in SPANS:
+        left = _second(angle, span)
+        kept = ~np.isnan(_second(raw, span))
+        if kept.sum() > 10 * span and math.sqrt(float(np.mean(left[kept] ** 2))) > TOLD * motion.noise:
+            break
+    else:
+        return None
+    travel = np.diff(angle)
+    half = span // 2
+    around = np.convolve(travel, np.ones(2 * half + 1), "same")
+    turning = np.where(np.abs(around) > 5.0 * motion.noise, np.sign(around), 0.0)
+    middle = 0.5 * (angle[1:] + angle[:-1])
+    loads = {
+        "T_c": _double(-turning, t_s),
+        "f_v": np.concatenate([[0.0], np.cumsum(-(middle - angle[0]) * t_s)]),
+        "offset": _double(np.ones(n), t_s),
+    }
+    if "k_1" in motion.known or "k_1" in motion.guess:
+        loads["k_1"] = _double(-np.maximum(middle, 0.0), t_s)
+    kept[:LATEST] = kept[-LATEST:] = False  # what acts late there is not in the recording
+    second = {name: _second(load, span)[kept] for name, load in loads.items()}
+    drive = _double(np.nan_to_num(motion.currents[:n]), t_s)
+    return Equation(motion, left[kept], second, drive, span, kept)
+
+
+def _second(row: Floats, span: int) -> Floats:
+    return row[2 * span :] - 2.0 * row[span:-span] + row[: -2 * span]
+
+
+def _double(rate: Floats, t_s: float) -> Floats:
+    """Double integral at each sample of what is constant within each period."""
+    first = np.cumsum(rate) * t_s
+    result: Floats = np.concatenate([[0.0], np.cumsum(first - 0.5 * rate * t_s) * t_s])
+    return result
+
+
+def _velocity(e: Equation) -> tuple[float, float] | None:
+    """Correlation of the way that the angle goes with that of the velocity, and their ratio."""
+    velocity, span = e.motion.velocity, e.span
+    if velocity is None:
+        return None
+    ways = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * e.motion.sample_time)])
+    said = (ways[span:] - ways[:-span])[: len(e.kept)]
+    seen = (e.motion.angle[span:] - e.motion.angle[:-span])[: len(e.kept)]
+    there = np.isfinite(said) & np.isfinite(seen)
+    size = float(said[there] @ said[there])
+    if not size > 0.0:
+        return None
+    ratio = float(said[there] @ seen[there]) / size
+    return ratio * math.sqrt(size / float(seen[there] @ seen[there])), ratio
+
+
+def _velocity_against(e: Equation) -> tuple[float | str, ...] | None:
+    found = _velocity(e)
+    return () if found is not None and found[0] < -0.9 else None
+
+
+def _velocity_scaled(e: Equation) -> tuple[float | str, ...] | None:
+    found = _velocity(e)
+    if found is None or found[0] < 0.95 or 1.0 / SCALED < found[1] < SCALED:
+        return None
+    return f"{found[1]:.4g}", f"{found[1]:.4g}"
+
+
+def _driven_against(e: Equation) -> tuple[float | str, ...] | None:
+    return (e.motion.by,) if e.correlation(0.0) < -0.5 and _best(e)[1] < 0.8 else None
+
+
+def _best(e: Equation) -> tuple[float, float]:
+    """Delay of what acts with which the equation holds best [samples], and the correlation there."""
+    whole = max(range(-LATEST, LATEST + 1), key=e.correlation)
+    return max(((d, e.correlation(d)) for d in np.linspace(whole - 1.0, whole + 1.0, 21).tolist()), key=lambda p: p[1])
+
+
+def _late(e: Equation) -> tuple[float | str, ...] | None:
+    best, correlation = _best(e)
+    rest, now = 1.0 - correlation**2, 1.0 - max(e.correlation(0.0), 0.0) ** 2
+    if EARLY < best < LATE or abs(best) > LATEST or correlation < 0.8 or rest > BETTER * now:
+        return None
+    delay = e.motion.delay + best * e.motion.sample_time
+    how = "late" if best > 0.0 else "early"
+    return e.motion.by, f"{abs(best):.1f}", how, f"{delay:.2g}", e.motion.by
+
+
+def _guess(e: Equation) -> tuple[float | str, ...] | None:
+    """Guesses that are beyond the search, from the coefficients of the equation at the best delay."""
+    names = ["k_m", *e.loads]
+    columns = np.stack([e.driven(_best(e)[0]), *e.loads.values()], axis=1)
+    found = np.linalg.lstsq(columns, e.left, rcond=None)[0]
+    sigma = np.sqrt(
+        np.diag(np.linalg.pinv(columns.T @ columns)) * np.sum((e.left - columns @ found) ** 2) / len(e.left)
+    )
+    told = {n: c for n, c, s in zip(names, found.tolist(), (SURE * sigma).tolist(), strict=True) if c > s}
+    known = {"k_m": 1.0} | dict(e.motion.known) if "k_m" not in e.motion.guess else dict(e.motion.known)
+    inertia = known.get("J") or next((known[n] / c for n, c in told.items() if n in known), math.nan)
+    gears = {"k_1": known.get("gamma", 1.0)}
+    values = {"J": inertia} | {name: share * inertia / gears.get(name, 1.0) for name, share in told.items()}
+    wrong = {
+        name: values[name]
+        for name, guess in e.motion.guess.items()
+        if name in values and abs(math.log(values[name] / guess)) > math.log(FACTOR)
+    }
+    if not wrong:
+        return None
+    return " and ".join(wrong), f"{FACTOR:g}", ", ".join(f"{name} = {value:.2g}" for name, value in wrong.items())
+
+
+SCALED = 1.2  # Ratio of the ways of angle and velocity from which on their scales contradict each other
+EQUATIONS = (
+    Check("sign of the velocity", _velocity_against, "the velocity is against the angle: sign = -1 for one of the two"),
+    Check(
+        "scale of the velocity",
+        _velocity_scaled,
+        "the angle goes {} times as far as the velocity says: check unit, scale and the times; scale of "
+        "[signals.velocity] times {} agrees",
+    ),
+    Check(
+        "sign of what acts",
+        _driven_against,
+        "the motion is against the {}: sign = -1 for it, or for angle and velocity",
+    ),
+    Check(
+        "delay of what acts",
+        _late,
+        "the {} acts {} samples {}, more than is searched: delay = {} in [signals.{}] says so",
+    ),
+    Check(
+        "guess",
+        _guess,
+        "the guess of {} is too far off: only a factor of {} about it is searched; the recording says about {}",
+    ),
+)
+
+
+def contradictions(motion: Motion) -> tuple[str, ...]:
+    """Contradictions of a map by its recording, the cause of others first."""
+    equation = equation_of(motion)
+    return () if equation is None else tuple(_found(EQUATIONS, equation))
