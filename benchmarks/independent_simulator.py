@@ -66,6 +66,23 @@ class Brake:
     encoder_step: float = 0.0
     """Step of the angle that an encoder shows, its noise before the rounding; an observer sees it too [rad]."""
     angle_scale: float = 0.0  # Relative error of the angle's scale
+    ripple: float = 0.0  # Torque over the angle, as a share of T_c
+    ripple_period: float = 2.0 * math.pi  # Of the torque, and of the stiffness [rad]
+    stiffness_ripple: float = 0.0  # Periodic share of the clamping force
+    current_gain: float = 0.0  # Share by which k_m is larger at 6 A, linearly with the size of the current
+    dead_current: float = 0.0  # Current below which none acts [A]
+    drag: float = 0.0  # Share by which f_v is larger at 500 rad/s, linearly with the speed
+    thinning: float = 0.0  # Power of 250 rad/s over the speed by which f_v is larger
+    f_v_asymmetry: float = 0.0  # Share by which f_v is larger in the positive direction, smaller in the other
+    load_friction: float = 0.0  # Friction that grows with the load at any speed [m]
+    place_friction: float = 0.0  # Share by which T_c is larger at 100 rad, linearly with the angle
+    t_c_settling: float = 0.0  # Share by which T_c is larger at the start; it decays in 0.1 s
+    k_m_settling: float = 0.0
+    offset_drift: float = 0.0  # Change of the current's offset to the end of the experiment [A]
+    eccentricity: float = 0.0  # Periodic error of the encoder [rad]
+    velocity_asymmetry: float = 0.0  # Share by which the velocity is shown too large in the positive direction
+    velocity_lag: float = 0.0  # Of the velocity that is shown [s]
+    clock_scale: float = 0.0  # Share by which a period is longer than it is said to be
 
     def numbers(self) -> Floats:
         """All of them in one row, as the integration takes them."""
@@ -75,6 +92,8 @@ class Brake:
 # Places in ``Brake.numbers``.
 _KM, _K1, _TC, _FV, _J, _GAMMA, _, _BIAS, _, _, _QUAD, _CUBE, _PLAY, _STRIBECK, _HYST, _LAG, _ASYM = range(17)
 _VS, _FL, _TRAVEL, _KM_DRIFT, _K1_DRIFT, _TC_DRIFT, _FV_DRIFT = range(17, 24)
+_RIPPLE, _PERIOD, _K1_RIPPLE, _GAIN, _DEAD, _DRAG, _THIN, _FV_ASYM, _MU, _PLACE = range(32, 42)
+SETTLING = 0.1  # Time in which what settles has decayed to 1/e [s]
 
 
 def brake_of(bench: Bench, plant: Plant, factors: Floats) -> Brake:
@@ -111,7 +130,8 @@ def _force(b, x, z, w):  # type: ignore[no-untyped-def]
     travel = x if b[_PLAY] == 0.0 else z
     if travel <= 0.0:
         return 0.0
-    return b[_K1] * travel * (1.0 + b[_QUAD] * travel + b[_CUBE] * travel * travel) * (1.0 + b[_HYST] * w)
+    periodic = 1.0 + b[_K1_RIPPLE] * math.sin(2.0 * math.pi * travel / b[_PERIOD])
+    return b[_K1] * travel * (1.0 + b[_QUAD] * travel + b[_CUBE] * travel * travel) * (1.0 + b[_HYST] * w) * periodic
 
 
 @numba.njit(cache=False)
@@ -124,17 +144,35 @@ def _follow(b, x, z, w, moved):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=False)
-def _friction(b, v, force, sign):  # type: ignore[no-untyped-def]
+def _friction(b, x, v, force, sign):  # type: ignore[no-untyped-def]
     """Friction but the viscous one: Coulomb's, and what is static beyond it as far as it is left at a speed."""
     left = math.exp(-((v / b[_VS]) ** 2))
-    return b[_TC] * (1.0 + b[_ASYM] * sign) * (1.0 + b[_STRIBECK] * left) + b[_FL] * force * left
+    coulomb = b[_TC] * (1.0 + b[_ASYM] * sign) * (1.0 + 0.01 * b[_PLACE] * x)
+    return coulomb * (1.0 + b[_STRIBECK] * left) + (b[_FL] * left + b[_MU]) * force
+
+
+@numba.njit(cache=False)
+def _viscous(b, v, sign):  # type: ignore[no-untyped-def]
+    """Viscous friction [N·m]."""
+    size = abs(v)
+    thinned = (250.0 / size) ** b[_THIN] if b[_THIN] != 0.0 and size > 0.0 else 1.0
+    return b[_FV] * v * (1.0 + b[_DRAG] * size / 500.0) * (1.0 + b[_FV_ASYM] * sign) * thinned
+
+
+@numba.njit(cache=False)
+def _drive(b, x, i):  # type: ignore[no-untyped-def]
+    """Torque of the motor [N·m]."""
+    if abs(i) < b[_DEAD]:
+        i = 0.0
+    ripple = b[_RIPPLE] * b[_TC] * math.sin(2.0 * math.pi * x / b[_PERIOD])
+    return b[_KM] * i * (1.0 + b[_GAIN] * abs(i) / 6.0) + ripple
 
 
 @numba.njit(cache=False)
 def _slope(b, x, v, i, z0, w0, x0, sign):  # type: ignore[no-untyped-def]
     z, w = _follow(b, x, z0, w0, x - x0)
     force = _force(b, x, z, w)
-    torque = b[_KM] * i - b[_GAMMA] * force - b[_FV] * v - sign * _friction(b, v, force, sign)
+    torque = _drive(b, x, i) - b[_GAMMA] * force - _viscous(b, v, sign) - sign * _friction(b, x, v, force, sign)
     return torque / b[_J]
 
 
@@ -167,9 +205,9 @@ def _move(b, state, command, duration):  # type: ignore[no-untyped-def]
         h = min(STEP, left)
         if v == 0.0:
             force = _force(b, x, z, w)
-            drive = b[_KM] * _current(b, i, u, h) - b[_GAMMA] * force
+            drive = _drive(b, x, _current(b, i, u, h)) - b[_GAMMA] * force
             sign = 1.0 if drive > 0.0 else -1.0
-            if abs(drive) <= _friction(b, 0.0, force, sign):
+            if abs(drive) <= _friction(b, x, 0.0, force, sign):
                 i = _current(b, i, u, h)
                 left -= h
                 continue
@@ -213,14 +251,18 @@ class _Sensors:
         self.sigma = np.array([bench.noise.angle, bench.noise.velocity])
         self.line = [np.array([brake.encoder_offset, 0.0])] * brake.measurement_delay
         self.tracked = np.array([brake.encoder_offset, 0.0])
+        self.lagged = 0.0
         pole = np.exp(complex(-0.7, math.sqrt(1.0 - 0.7**2)) * brake.observer_bandwidth * self.t_s)
         # The poles of the filter that adds (α, β/T) times the surprise to what it tracks.
         self.gains = np.array([1.0 - abs(pole) ** 2, (1.0 + abs(pole) ** 2 - 2.0 * pole.real) / self.t_s])
 
     def shown(self, x: float, v: float) -> Floats:
-        true = np.array(
-            [x * (1.0 + self.brake.angle_scale) + self.brake.encoder_offset, v * (1.0 + self.brake.velocity_gain)]
-        )
+        b = self.brake
+        left = math.exp(-self.t_s / b.velocity_lag) if b.velocity_lag > 0.0 else 0.0
+        self.lagged = v + (self.lagged - v) * left
+        angle = x * (1.0 + b.angle_scale) + b.encoder_offset + b.eccentricity * math.sin(x)
+        gain = 1.0 + b.velocity_gain + (b.velocity_asymmetry if v > 0.0 else 0.0)
+        true = np.array([angle, self.lagged * gain])
         sample = true + self.sigma * self.rng.standard_normal(2)
         if self.brake.encoder_step > 0.0:
             sample[0] = round(sample[0] / self.brake.encoder_step) * self.brake.encoder_step
@@ -262,7 +304,7 @@ def simulate(
     braking from the last velocity that arrived. With ``charge`` the samples on both sides of a single lost one carry
     the integral of the current, whose difference is the sum of two currents, of which the later one is reported.
     """
-    n, t_s, b = bench.timing.horizon, bench.timing.sample_time, brake.numbers()
+    n, t_s, b = bench.timing.horizon, bench.timing.sample_time * (1.0 + brake.clock_scale), brake.numbers()
     constant = b[_KM : _FV + 1].copy()
     wanted = excitation(rng, n, bench.limits.current)
     state, before = (0.0, 0.0, brake.current_offset, 0.0, 0.0), 0.0
@@ -282,6 +324,10 @@ def simulate(
         said = round(float(u), 3) if heard else braking(bench, float(velocity))
         u = said if heard and not (losses and losses.commands[k]) else braking(bench, state[1])
         b[_KM : _FV + 1] = constant * (1.0 + b[_KM_DRIFT : _FV_DRIFT + 1] * (k + 0.5) / n)
+        settling = math.exp(-k * t_s / SETTLING)
+        b[_KM] *= 1.0 + brake.k_m_settling * settling
+        b[_TC] *= 1.0 + brake.t_c_settling * settling
+        b[_BIAS] = brake.current_offset + brake.offset_drift * (k + 0.5) / n
         if brake.delay > 0.0:
             state = _move(b, state, before, brake.delay * t_s)
         late = brake.clock_jitter * rng.standard_normal() if brake.clock_jitter > 0.0 else 0.0

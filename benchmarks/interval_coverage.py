@@ -47,6 +47,7 @@ from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.records import NORMAL_95, EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.numbers import in_percent
 
 FAR = 3.0  # Stated deviations; a value further off that is said to be usable is wrong
 BURST = 20  # Samples in a burst of losses
@@ -92,6 +93,30 @@ KINDS: Mapping[str, Kind] = {
     "drift of T_c": Kind("t_c_drift", (0.003, 0.03, 0.1), "1", ("T_c_drift",)),
     "drift of f_v": Kind("f_v_drift", (0.003, 0.03, 0.1), "1", ("f_v_drift",)),
 }
+
+UNLISTED: tuple[tuple[str, dict[str, float], str, tuple[float, float, float]], ...] = (
+    ("ripple, once a turn", {}, "ripple", (0.01, 0.05, 0.2)),
+    ("ripple, seven times a turn", {"ripple_period": 0.9}, "ripple", (0.01, 0.05, 0.2)),
+    ("friction decaying over 120 rad/s", {"stribeck_velocity": 120.0}, "stribeck", (0.003, 0.02, 0.1)),
+    ("friction decaying over 180 rad/s", {"stribeck_velocity": 180.0}, "stribeck", (0.003, 0.02, 0.1)),
+    ("gain of the current over its size", {}, "current_gain", (1e-4, 1e-3, 1e-2)),
+    ("dead zone of the current", {}, "dead_current", (0.003, 0.02, 0.1)),
+    ("drag", {}, "drag", (0.001, 0.01, 0.1)),
+    ("shear thinning", {}, "thinning", (0.0003, 0.003, 0.03)),
+    ("viscous friction by direction", {}, "f_v_asymmetry", (0.001, 0.01, 0.1)),
+    ("friction by load at any speed", {}, "load_friction", (1e-9, 1e-8, 1e-7)),
+    ("friction by place", {}, "place_friction", (0.003, 0.02, 0.1)),
+    ("periodic stiffness, once a turn", {}, "stiffness_ripple", (1e-4, 1e-3, 1e-2)),
+    ("periodic stiffness, every 3 turns", {"ripple_period": 20.0}, "stiffness_ripple", (1e-4, 1e-3, 1e-2)),
+    ("friction that settles", {}, "t_c_settling", (0.003, 0.02, 0.1)),
+    ("k_m that settles", {}, "k_m_settling", (1e-4, 1e-3, 1e-2)),
+    ("drift of the current's offset", {}, "offset_drift", (0.002, 0.01, 0.05)),
+    ("eccentric encoder", {}, "eccentricity", (3e-4, 3e-3, 3e-2)),
+    ("velocity's gain by direction", {}, "velocity_asymmetry", (3e-4, 3e-3, 3e-2)),
+    ("lag of the velocity", {}, "velocity_lag", (1e-5, 1e-4, 5e-4)),
+    ("clock", {}, "clock_scale", (1e-6, 5e-6, 2e-5)),
+)
+"""Errors of the model for many of which no score test is made: name, what is given with it, number and sizes."""
 
 
 ERRORS = {
@@ -141,6 +166,20 @@ def near_misses(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
                 right = brake_of(bench, plant, rng.uniform(0.5, 1.5, 4))
                 yield Drawn("right", bench, plant, simulate(right, bench, rng, f"seed {seed + 1}"), right)
                 seed += 2
+
+
+def unlisted(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
+    """Wrong models of the kinds in ``UNLISTED``, ``draws`` of each size."""
+    plant = bench.plant("exact")
+    for name, given, error, sizes in UNLISTED:
+        for at in range(seed, seed + draws * len(sizes)):
+            rng = np.random.default_rng(at)
+            sign = 1.0 if error in {"dead_current", "velocity_lag", "load_friction"} else float(rng.choice((-1.0, 1.0)))
+            right = brake_of(bench, plant, rng.uniform(0.5, 1.5, 4))
+            wrong = Brake(**(vars(right) | given | {error: sign * sizes[at % len(sizes)]}))
+            record = simulate(wrong, bench, rng, f"seed {at}")
+            yield Drawn(name, bench, plant, record, wrong)
+        seed += draws * len(sizes)
 
 
 WALKS: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -227,6 +266,7 @@ CASES: Mapping[str, Callable[[Bench, int, int], Iterator[Drawn]]] = {
     "inertia": partial(right, errors=("inertia",)),
     "angle_scale": partial(right, errors=("angle_scale",)),
     "near-misses": near_misses,
+    "unlisted": unlisted,
     "disturbance": disturbance,
     "losses": partial(losses, charge=False),
     "charge": partial(losses, charge=True),
@@ -240,6 +280,8 @@ class Outcome(NamedTuple):
     drawn: Drawn
     fits: bool
     errors: Floats  # Of the parameters [total deviations]
+    totals: Floats  # Half of their 95 % intervals, relative
+    largest: float  # Of their errors, relative
     over_bound: Floats  # The same [Cramér-Rao bounds]
     covered: NDArray[np.bool_]  # By total
     repeats: NDArray[np.bool_]  # By repeatability
@@ -272,6 +314,8 @@ def judge(drawn: Drawn, method: str, *, systematic: bool) -> Outcome:
         drawn,
         e.validation.fits,
         errors / e.deviations()[index],
+        NORMAL_95 * e.deviations()[index],
+        float(np.max(np.abs(errors))),
         errors / e.cramer_rao()[index],
         (low <= truths) & (truths <= high),
         repeats,
@@ -296,6 +340,7 @@ def report(row: str, outcomes: list[Outcome]) -> None:
     print("  fits                            ", share(len(fits), len(outcomes)))
     print("  covered by total                ", share(int(covered.sum()), covered.size))
     print("  covered by repeatability        ", share(int(repeats.sum()), repeats.size))
+    print("  median of the largest error      ", in_percent(np.median([o.largest for o in outcomes])))
     print("  fits, a parameter beyond 3 dev. ", share(sum(o.far for o in outcomes), len(fits)))
     if fits:
         print(f"  largest error of those that fit  {max(np.max(np.abs(o.errors)) for o in fits):.1f} deviations")
@@ -308,6 +353,8 @@ def report(row: str, outcomes: list[Outcome]) -> None:
         half = 1.96 * errors.std(axis=0, ddof=1) / math.sqrt(len(errors))
         pairs = zip(params, errors.mean(axis=0), half, strict=True)
         print("  mean error [deviations]         ", ", ".join(f"{name} {m:+.2f} ± {h:.2f}" for name, m, h in pairs))
+        totals = zip(params, np.median([o.totals for o in outcomes], axis=0), strict=True)
+        print("  median total (k = 2)            ", ", ".join(f"{name} {in_percent(t)}" for name, t in totals))
         squares = zip(params, np.mean([o.over_bound**2 for o in outcomes], axis=0), strict=True)
         print("  mean square error over the bound", ", ".join(f"{name} {s:.3g}" for name, s in squares))
     print(f"  seconds of an estimate           median {np.median([o.seconds for o in outcomes]):.3f}")

@@ -14,7 +14,9 @@ name. All values are in SI units.
 from __future__ import annotations
 
 import inspect
+import math
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
@@ -31,6 +33,7 @@ from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_bench.output import progress, replacing, require_place, say_if_compiling
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import LogError, UsageError, needs
+from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.system.terminal import as_json, mention
 
 if TYPE_CHECKING:  # scipy, numba, matplotlib and pyarrow come with the extra [bench]
@@ -331,6 +334,7 @@ def estimate(
     model: str | None = None,
     systematic: Literal["bench", "none"] = "bench",
     prior: str | None = None,
+    known: Names | None = None,
     window: float = 0.0,
     starts: int = STARTS,
     seed: int = 0,
@@ -354,6 +358,8 @@ def estimate(
         systematic: 'bench' also estimates sensor offsets, gain and delay, with priors from [systematic] of the bench
             file; 'none' assumes ideal sensors (default: bench).
         prior: name of ranges in the bench file in which the parameters are known to lie (default: none).
+        known: parameters that were measured otherwise, such as k_m=0.0217±0.1%; J is then estimated (default: none, or
+            k_m where [systematic] of the bench file says how well it is known).
         window: length of the windows [s], with method windows (default: what the map says, or 0.5).
         starts: local searches (default: 8).
         seed: seed of the starts of these searches (default: 0).
@@ -643,9 +649,9 @@ def _study_options(given: Mapping[str, Any]) -> Callable[[Bench], StudyOptions]:
     _check({f"--{name}": (given[name], least) for name, least in (("starts", 1), ("seed", 0))})
     if not (given["window"] == 0.0 or 1e-3 <= given["window"] <= 3600.0):
         raise UsageError(f"--window: expected a time from 0.001 to 3600 s, got {given['window']:g}")
-    from emb_bench.estimate.records import EstimationProblem
+    from emb_bench.estimate.records import EstimationProblem, freed
 
-    unknowns = given["params"], given["nuisance"]
+    unknowns, known = (given["params"], given["nuisance"]), _known(given["known"])
     EstimationProblem(*_unknowns(*unknowns, None), window=given["window"])
     with needs("an estimate", "bench"):
         import numba  # noqa: F401
@@ -657,8 +663,11 @@ def _study_options(given: Mapping[str, Any]) -> Callable[[Bench], StudyOptions]:
         method = given["method"] or ("oem" if bench.machine is None else "windows")
         if given["window"] and method != "windows":
             raise UsageError(f"--window: the method {method} has no windows; leave it out, or add --method windows")
+        asked = EstimationProblem(*_unknowns(*unknowns, bench), prior, known=known, window=given["window"])
+        if unasked := [name for name in known if name not in asked.names]:
+            raise UsageError(f"--known {', '.join(unasked)}: expected one of {', '.join(asked.names)}")
         return StudyOptions(
-            EstimationProblem(*_unknowns(*unknowns, bench), prior, window=given["window"]),
+            freed(asked, bench),
             method,
             given["model"],
             given["starts"],
@@ -668,6 +677,23 @@ def _study_options(given: Mapping[str, Any]) -> Callable[[Bench], StudyOptions]:
         )
 
     return of
+
+
+NUMBER = r"[0-9.]+(?:[eE][-+]?[0-9]+)?"  # Without a sign
+
+
+def _known(given: Names | None) -> dict[str, tuple[float, float]]:
+    """Value and standard deviation of each known parameter, SI units, as ``--known`` has them."""
+    found = {}
+    for text in () if given is None else _names(given):
+        parts = re.fullmatch(rf"(\w+)=({NUMBER})(?:±|\+-)({NUMBER})(%?)", text)
+        value, half = (float(parts[2]), float(parts[3])) if parts else (0.0, 0.0)
+        if parts is None or not (0.0 < value < math.inf and 0.0 < half < math.inf):
+            raise UsageError(
+                f"--known: expected a parameter with half of its 95 % interval, as k_m=0.0217±0.1%, got '{text}'"
+            )
+        found[parts[1]] = value, half * (0.01 * value if parts[4] else 1.0) / NORMAL_95
+    return found
 
 
 def _last(path: str | Path | None) -> Earlier | None:

@@ -138,14 +138,14 @@ def _range_left(e: Estimate, unknown: Unknown, interval: tuple[float, float]) ->
 def noise_deviations(e: Estimate) -> Floats:
     """Standard deviations by the sensors' noise alone, relative or in the unknown's unit; inf if not identified.
 
-    With the information M of samples and prior, of which P is the prior's, noise moves the estimate by the covariance
-    M⁻¹ (M − P) M⁻¹: what the prior is about is the same in every run.
+    With the covariance C of the estimate and the information Λ of the samples, noise moves the estimate by the
+    covariance C Λ C: what a prior is about is the same in every run. No more than C, which is of the errors as well.
     """
     spectrum = Spectrum(e.information)
     inverse = spectrum.inverse()
     inverse[spectrum.lost, spectrum.lost] = 0.0
-    covariance = inverse if e.prior is None else inverse - inverse @ e.prior @ inverse
-    deviations: Floats = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    variances = np.diag(inverse @ e.samples @ inverse)
+    deviations: Floats = np.sqrt(np.clip(variances, 0.0, np.diag(inverse)))
     deviations[spectrum.lost] = math.inf
     return deviations
 

@@ -1,7 +1,8 @@
 """Change of the parameters since an earlier estimate.
 
 Two estimates differ by chance, by as much as their deviations, of which errors that both share (inertia, scale of the
-angle) are no part; a parameter has drifted if it differs by more. With
+angle, effects of the brake as far as they move both values alike) are no part; a parameter has drifted if it differs by
+more. With
 k parameters compared at once each has to pass the quantile for 1 - 0.05/k (Bonferroni), so that nothing is called a
 drift in 95 % of campaigns in which nothing has changed. A model that did not fit, or another one, moves parameters too:
 then the change is reported as one that may be the model's.
@@ -17,6 +18,7 @@ from typing import Annotated
 import msgspec
 from scipy import special
 
+from emb_bench.analysis.several_runs import apart_by
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.experiment.theta import MAX_JSON_BYTES
 from emb_runtime.errors import UsageError
@@ -35,6 +37,8 @@ class Entry(msgspec.Struct, frozen=True):
     deviation_relative: bool
     deviation_between_runs: Annotated[float, msgspec.Meta(ge=0.0)] | None = None
     """Relative or in the value's unit; None: unknown."""
+    effects: dict[str, float] = msgspec.field(default_factory=dict)
+    """Biases that are part of it, by effect, in the same unit."""
 
     def __post_init__(self) -> None:
         """Refuse a share of nothing."""
@@ -45,7 +49,12 @@ class Entry(msgspec.Struct, frozen=True):
     def absolute(self) -> float:
         """Standard deviation in the value's unit; inf if it was not identified."""
         spread = math.inf if self.deviation_between_runs is None else self.deviation_between_runs
-        return spread * abs(self.value) if self.deviation_relative else spread
+        return spread * self.unit
+
+    @property
+    def unit(self) -> float:
+        """Unit of its deviation and biases, in the value's unit."""
+        return abs(self.value) if self.deviation_relative else 1.0
 
 
 class Named(msgspec.Struct, frozen=True):
@@ -123,7 +132,11 @@ def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
         value = float(now.values[i])
         deviation = float(deviations[i]) * (abs(value) if relative else 1.0)
         before, deviation_before = then[name].value, then[name].absolute
-        both, change = math.hypot(deviation_before, deviation), value - before
+        own = {effect: float(now.scale[i]) * bias for effect, bias in now.effects(i).items()}
+        other = {effect: then[name].unit * bias for effect, bias in then[name].effects.items()}
+        in_both = {effect: bias for effect, bias in other.items() if effect in own}
+        both = math.hypot(apart_by(deviation, own, other), apart_by(deviation_before, other, in_both))
+        change = value - before
         size = abs(before) if relative else 1.0
         sigmas = change / both if 0.0 < both < math.inf else 0.0
         drifted = abs(sigmas) > limit

@@ -233,7 +233,7 @@ def fit_from(problem: Problem, near: Estimate | Fit, *, follow: bool = False) ->
 def candidate(name: str, e: Estimate) -> Candidate:
     """A fitted model with its criteria."""
     samples = sum(int(record.measured.sum()) for record in e.records) * 2
-    deviance, count = _deviance(e.problem, e.z), len(e.wanted())
+    deviance, count = _deviance(e.problem, e.fit), len(e.wanted())
     return Candidate(name, e, deviance, deviance + count * math.log(samples), held_out_score(e, deviance))
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from emb_bench.brake.parameters import quantity
 from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.records import DRIFTS
 
 DIFFERENT = 0.01  # Significance level of the test: with a smaller p-value, the number is not the same in all runs
 APART = 0.001  # Chance that a parameter of one and the same brake is said to differ, for all parameters together
@@ -45,35 +46,56 @@ def constancy(values: Sequence[float], deviations: Sequence[float]) -> Constancy
     return Constancy(len(v), mean, float(weights.sum() ** -0.5), chi2, p_value, scatter, p_value >= DIFFERENT)
 
 
+def apart_by(deviation: float, effects: Mapping[str, float], other: Mapping[str, float]) -> float:
+    """Part of a deviation between runs of one brake that another run, with biases by ``other`` effects, does not share.
+
+    An effect of the brake is the same in each run: it moves them apart by the difference of its biases. What changes in
+    a run is another one in each. ``effects`` are the biases that are part of the ``deviation``.
+    """
+    alone = max(deviation**2 - sum(bias**2 for bias in effects.values()), 0.0)
+    return math.sqrt(
+        alone + sum(bias**2 if name in DRIFTS else (bias - other.get(name, 0.0)) ** 2 for name, bias in effects.items())
+    )
+
+
 @dataclass(frozen=True)
 class Differing:
     """A parameter that differs between records."""
 
     name: str
-    values: tuple[float, ...]  # By each record alone, in their order, in the unit that they are shown in
+    values: tuple[float, ...]
+    """By each record alone, in their order, in the unit that they are shown in; NaN by one that does not fit."""
     p_value: float  # Chance of such differences if it is the same (χ² of the values around their weighted mean)
 
 
 def apart(e: Estimate) -> tuple[Differing, ...]:
     """Parameters in which the records of an estimate differ that each fit alone; the most different first.
 
-    Empty if they fit together, if one does not fit alone, or if no parameter differs.
+    Empty if they fit together, if no more than half of them fit alone, or if no parameter differs. A record that does
+    not fit alone is not compared: of many right ones, one raises a false alarm.
     """
     if len(e.records) < 2 or e.validation.fits:
         return ()
     from emb_bench.estimate.methods import method_of
 
-    alone = [method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit([record]) for record in e.records]
-    if not all(one.validation.fits for one in alone):
+    every = [method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit([record]) for record in e.records]
+    alone = [one for one in every if one.validation.fits]
+    if 2 * len(alone) <= max(len(every), 2):
         return ()
     found = []
     for name in e.asked.params:
         at = [next(i for i, u in enumerate(one.unknowns) if u.name == name) for one in alone]
-        values = [float(one.values[i]) for one, i in zip(alone, at, strict=True)]
-        deviations = [float((one.between_runs() * one.scale)[i]) for one, i in zip(alone, at, strict=True)]
-        if not np.isfinite(deviations).all():
+        values = np.array([one.values[i] for one, i in zip(alone, at, strict=True)])
+        effects = [one.effects(i) for one, i in zip(alone, at, strict=True)]
+        mean = {effect: sum(one[effect] for one in effects) / len(effects) for effect in effects[0]}
+        between = [float(one.between_runs()[i]) for one, i in zip(alone, at, strict=True)]
+        if not np.isfinite(between).all():
             continue
-        p_value = constancy(values, deviations).p_value
+        deviations = [apart_by(d, own, mean) for d, own in zip(between, effects, strict=True)]
+        scale = float(np.mean([one.scale[i] for one, i in zip(alone, at, strict=True)]))
+        p_value = constancy(values.tolist(), [scale * d for d in deviations]).p_value
         if p_value < APART / len(e.asked.params):
-            found.append(Differing(quantity(e.bench.machine, name).name, tuple(values), p_value))
+            in_order = iter(values.tolist())
+            by_record = tuple(next(in_order) if one.validation.fits else math.nan for one in every)
+            found.append(Differing(quantity(e.bench.machine, name).name, by_record, p_value))
     return tuple(sorted(found, key=lambda one: one.p_value))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,9 +25,18 @@ from emb_bench.estimate.records import (
 )
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
-from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 
 OF_THE_BENCH = ("J", ANGLE_SCALE)  # Effects that all runs on one bench share
+
+
+class Ratio(NamedTuple):
+    """Ratio of a parameter to J."""
+
+    name: str
+    value: float
+    unit: str
+    interval: tuple[float, float]  # 95 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +45,11 @@ class Estimate:
 
     problem: Problem  # Its plant has the features that were estimated
     z: Floats  # The unknowns, in the coordinates of ``problem``
-    information: Floats  # Physical FIM at the estimate, prior included, relative parameters
-    prior: Floats | None  # The prior's part of it
+    information: Floats
+    """Physical FIM at the estimate, relative parameters, with the priors, and with what averaging says of the
+    systematic errors (:mod:`emb_bench.estimate.average`): the inverse covariance of the estimate."""
+    samples: Floats  # Information of the samples alone
+    prior: Floats | None  # That of the priors in full
     sandwich: Floats
     """Covariance from the residuals, relative parameters: right too if the noise differs from the bench's."""
     validation: ModelValidation
@@ -82,6 +95,11 @@ class Estimate:
         return self.problem.theta(self.z)
 
     @property
+    def fit(self) -> Floats:
+        """The unknowns that fit best with all priors in full, in the coordinates of ``problem``."""
+        return self.ends[0].z
+
+    @property
     def values(self) -> Floats:
         """The unknowns in SI units."""
         return self.problem.values(self.z)
@@ -89,7 +107,7 @@ class Estimate:
     @property
     def at_bound(self) -> tuple[str, ...]:
         """Labels of the unknowns that ended at the border of what is searched."""
-        return tuple(label for label, at in zip(self.labels, self.problem.at_border(self.z), strict=True) if at)
+        return tuple(label for label, at in zip(self.labels, self.problem.at_border(self.fit), strict=True) if at)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -124,10 +142,34 @@ class Estimate:
         parts = [one.bias for one in self.validation.budget if one.name not in shared]
         return unnoticed(np.array(parts).reshape(-1, len(self.unknowns)))
 
+    def ratios(self) -> list[Ratio]:
+        """Ratios of the parameters to J: no error of J is in them."""
+        inertia = [i for i, unknown in enumerate(self.unknowns) if unknown.name == "J"]
+        over, found = quantity(self.bench.machine, "J"), []
+        for i, name in enumerate(unknown.name for unknown in self.unknowns):
+            if name not in PARAMETER_NAMES:
+                continue
+            at, signs = [i, *inertia], np.array([1.0, -1.0])[: 1 + len(inertia)]
+            biases = np.array([[one.bias[k] for k in at] for one in self.validation.budget if one.name != "J"])
+            covariances = (Spectrum(self.information).inverse(), self.sandwich)
+            bound, robust = (np.sqrt(signs @ c[np.ix_(at, at)] @ signs) for c in covariances)
+            open_by = unnoticed(biases.reshape(-1, len(at)) @ signs)
+            deviation = float(deviations(bound, open_by, robust, fits=self.validation.fits))
+            of, value = quantity(self.bench.machine, name), float(self.values[i] / self.theta.J)
+            half = NORMAL_95 * deviation * value
+            found.append(
+                Ratio(f"{of.name}/{over.name}", value, f"{of.unit}/({over.unit})", (value - half, value + half))
+            )
+        return found
+
     def left_open_by(self, i: int) -> Contribution | None:
         """The largest entry of the uncertainty budget of unknown ``i``; None without any."""
-        found = [one for one in self.validation.budget if one.bias[i] > 0.0]
-        return max(found, key=lambda one: one.bias[i], default=None)
+        found = [one for one in self.validation.budget if one.bias[i] != 0.0]
+        return max(found, key=lambda one: abs(one.bias[i]), default=None)
+
+    def effects(self, i: int) -> dict[str, float]:
+        """Biases of unknown ``i`` by effects, but those that move all runs on one bench alike."""
+        return {one.name: one.bias[i] for one in self.validation.budget if one.name not in OF_THE_BENCH}
 
     def intervals(self) -> Floats:
         """Gaussian 95 % intervals in SI units, shape (unknowns, 2)."""

@@ -86,6 +86,7 @@ class RecursiveLeastSquares(Method):
             problem.weights(z),
             (End(z, cost, problem.nominal(), True, used),),
             information=information,
+            samples=relative.T @ relative,
             sandwich=spread,
             method="rls",
         )

@@ -31,6 +31,11 @@ class Method(ABC):
     def fit(self, experiments: Sequence[Experiment]) -> Estimate:
         """Estimate from one experiment, or from several of the same brake."""
         asked, ideal_sensors = self.asked, False
+        if asked.known and not self.systematic:
+            raise UsageError(
+                f"this method takes no parameter as known ({', '.join(asked.known)}): leave out --known, and k_m in "
+                "[systematic]; or use --method oem"
+            )
         if (asked.systematic or asked.allowed) and not self.systematic:
             asked, ideal_sensors = replace(asked, systematic={}, allowed={}), True
         if absent := [name for name in asked.names if getattr(self.bench.brake, name, 1.0) == 0.0]:

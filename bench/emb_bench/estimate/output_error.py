@@ -20,8 +20,9 @@ samples are than ``MOST`` of all, none is left out: then the noise or the model 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from emb_bench.brake.motion import Floats
+from emb_bench.estimate.average import average
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import LEVEL, examine
@@ -209,36 +211,47 @@ def finished(
     z: Floats,
     weights: Sequence[Floats],
     ends: tuple[End, ...],
-    found: tuple[Floats, Floats] | None = None,
+    linearised: Callable[[Floats], tuple[Floats, Floats]] | None = None,
     validation: ModelValidation | None = None,
     **more: Any,
 ) -> Estimate:
-    """Estimate with all that follows from its values: information, covariance, validation.
+    """Estimate with all that follows from the fit ``z``: averaged values, information, covariance, validation.
 
-    Residuals and derivatives ``found`` at ``z`` are those of the simulation, if no others are given; ``more`` are
+    Residuals and derivatives ``linearised`` at a z are those of the simulation, if no others are given; ``more`` are
     further fields.
     """
-    found = found or problem.jacobian(z, weights)
+    linearised = linearised or partial(problem.jacobian, weights=weights)
+    found = linearised(z)
     every, jacobian = found
     residuals, information = by_record(every, weights), jacobian.T @ jacobian
+    prior = np.diag((problem.prior[1] * problem.scale(z)) ** 2)
+    averaged, near = average(problem, z, found), z
+    if averaged.errors:
+        near = np.clip(z + averaged.step, *problem.bounds)
+        averaged = average(problem, near, linearised(near))
+        near = np.clip(near + averaged.step, *problem.bounds)
+    added = averaged.added()
     fields = {
-        "information": information,
-        "prior": np.diag((problem.prior[1] * problem.scale(z)) ** 2) if problem.prior[1].any() else None,
-        "sandwich": sandwich(information, jacobian, every, [len(r) for r in residuals]),
+        "information": information + added,
+        "samples": information - prior,
+        "prior": prior if prior.any() else None,
+        "sandwich": sandwich(information + added, jacobian, every, [len(r) for r in residuals], added),
         "validation": validation or examine(problem, z, weights, found),
         "ends": ends,
         "residuals": tuple(np.where(root > 0.0, r, np.nan) for r, root in zip(residuals, weights, strict=True)),
     }
-    return Estimate(problem.solved(z), z, **fields | more)
+    return Estimate(problem.solved(near), near, **fields | more)
 
 
-def sandwich(information: Floats, jacobian: Floats, errors: Floats, lengths: Sequence[int]) -> Floats:
+def sandwich(
+    information: Floats, jacobian: Floats, errors: Floats, lengths: Sequence[int], added: Floats | float = 0.0
+) -> Floats:
     """Covariance of an estimate from its own residuals: H⁻¹ (Σ g g^T) H⁻¹ with the scores g of samples, shape (p, p).
 
     Scores of neighbouring samples count together (Newey and West 1987, Bartlett weights up to 4 (n/100)^(2/9) lags), so
-    that residuals that follow from each other widen it. What is no sample, a start or a prior, has its own information.
-    The residuals, shape (m,), are two for each sample of records of these lengths, then those of what is no sample. The
-    diagonal is inf for unknowns that the data do not identify.
+    that residuals that follow from each other widen it. What is no sample, a start or a prior, has its own information,
+    as has what is ``added`` to that of the jacobian. The residuals, shape (m,), are two for each sample of records of
+    these lengths, then those of what is no sample. The diagonal is inf for unknowns that the data do not identify.
     """
     scores, meat, used = jacobian * errors[:, None], np.zeros_like(information), 0
     for n in lengths:
@@ -249,5 +262,5 @@ def sandwich(information: Floats, jacobian: Floats, errors: Floats, lengths: Seq
         for lag in range(1, min(reach, n - 1) + 1):
             cross = g[lag:].T @ g[:-lag]
             meat += (1.0 - lag / (reach + 1.0)) * (cross + cross.T)
-    meat += jacobian[used:].T @ jacobian[used:]
+    meat += jacobian[used:].T @ jacobian[used:] + added
     return Spectrum(information).sandwich(meat)

@@ -81,6 +81,9 @@ class Problem:
             for name in self.asked.varied:
                 i, low, high = self.unknowns.index(Unknown(name)), getattr(prior.low, name), getattr(prior.high, name)
                 mean[i], inverse[i] = 0.5 * (low + high), math.sqrt(information_of_range(low, high))
+        for name, (value, deviation) in self.asked.known.items():
+            i = self.unknowns.index(Unknown(name))
+            mean[i], inverse[i] = value, 1.0 / deviation
         for i, unknown in enumerate(self.unknowns):
             if unknown.name in self.asked.systematic:
                 mean[i] = self.plant.instruments.encoder_offset if unknown.name == "offset" else 0.0

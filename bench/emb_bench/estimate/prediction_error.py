@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -66,7 +67,7 @@ class PredictionError(Method):
             best,
             weights,
             tuple(ends),
-            innovations,
+            partial(found.jacobian, weights=weights, gains=gains),
             validation,
             method="pem",
             process_noise=found.walk,

@@ -20,7 +20,14 @@ SYSTEMATIC = SystematicErrors._fields
 """Systematic errors that are estimated too by default, each with the prior of the bench file."""
 DRIFTS = tuple(f"{name}_drift" for name in PARAMETER_NAMES)
 """Linear changes of the parameters, as shares of them from the begin of a run to its end."""
+SEVERAL: Mapping[str, tuple[str, ...]] = {
+    "slow_friction": ("friction_100", "friction_200"),
+    "ripple": ("ripple_sine", "ripple_cosine"),
+    "stiffness_ripple": ("stiffness_sine", "stiffness_cosine"),
+}
+"""Keys of ``[systematic]`` that stand for several effects."""
 ANGLE_SCALE = "angle_scale"  # Relative error of the angle's scale
+FREE = 0.05  # Standard deviation of J, as a share of it, where a parameter tells it that is known beforehand
 FACTOR = 10.0  # Brakes beyond nominal by this factor are not searched
 METHODS: Mapping[str, str] = {
     "oem": "output error",
@@ -54,6 +61,8 @@ class EstimationProblem(Question):
     """Systematic errors that are estimated too: standard deviation of the prior, by name; inf without a prior."""
     allowed: Mapping[str, float] = field(default_factory=dict)
     """Effects that are not estimated and that the total allows for: standard deviation of the prior, by name."""
+    known: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Value and standard deviation of parameters that are known beforehand, SI units, by name."""
     window: float = 0.0
     """Length of the windows of the method ``windows`` [s]; 0 for what the bench says."""
 
@@ -90,20 +99,34 @@ def has_time_for_a_delay(plant: Plant) -> bool:
     return plant.mechanics.solver == EXACT and plant.mechanics.current_lag == 0.0
 
 
+def freed(asked: EstimationProblem, bench: Bench) -> EstimationProblem:
+    """The problem with J unknown too, where a parameter is known that tells it; else the same."""
+    if not asked.known or "J" in asked.names:
+        return asked
+    inertia = bench.brake.J
+    known = {**asked.known, "J": (inertia, max(FREE, bench.systematic.inertia) * inertia)}
+    return replace(asked, nuisances=(*asked.nuisances, "J"), known=known)
+
+
 def with_systematic(asked: EstimationProblem, bench: Bench, plant: Plant) -> EstimationProblem:
     """The problem with what the bench cannot exclude and the plant can have: estimated too, or allowed for."""
     known: dict[str, float] = asdict(bench.systematic)
+    if (measured := known.pop("k_m")) is not None and "k_m" in asked.names and not asked.known:
+        k_m = bench.brake.k_m
+        asked = freed(replace(asked, known={"k_m": (k_m, measured * k_m)}), bench)
     timed = has_time_for_a_delay(plant) and "current_lag" not in asked.names
     observed = plant.instruments.observer_bandwidth > 0.0  # its velocity is no measurement of its own
     excluded = (set() if timed else {"delay"}) | ({"velocity_gain"} if observed else set())
     possible = {name: known[name] for name in SYSTEMATIC if known[name] > 0.0 and name not in excluded}
     known |= dict.fromkeys(PARAMETER_NAMES, known["held"]) | dict.fromkeys(DRIFTS, known["drift"])
-    known["J"] = known["inertia"]
-    effects = {*PARAMETERS, *DRIFTS, ANGLE_SCALE}
+    known["J"] = known.pop("inertia")
+    del known["held"], known["drift"]
+    for name, rows in SEVERAL.items():
+        known |= dict.fromkeys(rows, known.pop(name))
     return replace(
         asked,
         systematic={n: d for n, d in possible.items() if n not in asked.names},
-        allowed={n: d for n, d in known.items() if d > 0.0 and n in effects and n not in {*possible, *asked.names}},
+        allowed={n: d for n, d in known.items() if d > 0.0 and n not in {*SYSTEMATIC, *asked.names}},
     )
 
 
@@ -208,7 +231,9 @@ class Contribution:
     """Entry of the uncertainty budget: an effect that is not estimated."""
 
     name: str
-    bias: tuple[float, ...]  # Root mean square of the bias of each unknown: relative, or in the unknown's unit
+    bias: tuple[float, ...]
+    """Root mean square of the bias of each unknown, with its sign for a positive effect: relative, or in the unknown's
+    unit."""
 
 
 class Disturbance(NamedTuple):

@@ -14,9 +14,9 @@ disturbance, drifts may be larger, by ``DISTURBED``.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy import special
@@ -26,6 +26,7 @@ from emb_bench.brake.parameters import CURVED, PARAMETERS, SI, Parameter, Quanti
 from emb_bench.config.bench import Bench
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import EXACT, Mechanics
+from emb_bench.estimate.average import SHARES, Effect, average, unaveraged
 from emb_bench.estimate.derived_velocity import derived
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import (
@@ -39,14 +40,14 @@ from emb_bench.estimate.records import (
     has_time_for_a_delay,
     searched,
 )
-from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Limits
 
 SLOW = 30.0  # Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]
 
 _PLANT = PARAMETERS["play"].remedy
 
 NEVER_EXACT = ("J", ANGLE_SCALE, *PARAMETER_NAMES)  # Constants that are wrong by something in every brake
-PRESENT = 1.0 / 6.0  # Probability, before any record, that a brake has a certain one of all other effects
+PRESENT = 0.5  # Probability, before any record, that a brake has a certain one of all other effects
 
 DISTURBED = 10.0
 """Factor of what is known of drifts before a record in which something disturbs the brake: it may be a drift, which the
@@ -54,7 +55,7 @@ random walk of a filter follows without an alarm."""
 
 ALIKE = 2.0  # Difference of two suspects' squared scores below which they are hardly distinguished
 
-DRIFT_STEP = 1e-4  # Step of the secant of a drift
+STEP = 1e-4  # Of the secant of an effect that is proportional to its size
 
 DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
 
@@ -102,6 +103,10 @@ class Simulated:
         return self.problem.predict(self.z, record).samples
 
 
+_STRIBECK = "--nuisance break_away,stribeck_velocity"
+_SLOWER = "lower the velocity in [limits] of the bench file, and excite again"
+_WALKS = "allow for a disturbance: --method pem"
+_CALIBRATE = "calibrate the current of the drive"
 _COOL = "keep the motor cool, or use a shorter run"
 _CLAMP = "clamp some times before the run, or use a shorter one"
 _WARM = "begin when all that moves is warm, or use a shorter run"
@@ -115,21 +120,37 @@ EFFECTS: Mapping[str, Parameter] = {
         name: Parameter("", effect=f"a change of {name.removesuffix('_drift')} over the run", remedy=remedy)
         for name, remedy in zip(DRIFTS, (_COOL, _CLAMP, _WARM, _WARM), strict=True)
     },
+    "friction_100": Parameter("", effect="a friction that decays over about 100 rad/s", remedy=_STRIBECK),
+    "friction_200": Parameter("", effect="a friction that decays over about 200 rad/s", remedy=_STRIBECK),
+    "drag": Parameter("", effect="a viscous friction that grows faster than the speed", remedy=_SLOWER),
+    "ripple_sine": Parameter("", effect="a torque that changes over a turn", remedy=_WALKS),
+    "ripple_cosine": Parameter("", effect="a torque that changes over a turn", remedy=_WALKS),
+    "stiffness_sine": Parameter("", effect="a stiffness that changes over a turn", remedy=_WALKS),
+    "stiffness_cosine": Parameter("", effect="a stiffness that changes over a turn", remedy=_WALKS),
+    "current_gain": Parameter("", effect="a k_m that depends on the current", remedy=_CALIBRATE),
+    "dead_current": Parameter("A", effect="a current that is smaller than the drive reports", remedy=_CALIBRATE),
 }
 """Effects that a plant may lack, in the order of their tests."""
-ALONE = DRIFTS[1:]
+ALONE = (
+    *DRIFTS[1:],
+    *("friction_100", "friction_200", "drag", "ripple_sine", "ripple_cosine", "stiffness_sine", "stiffness_cosine"),
+    *("current_gain", "dead_current"),
+)
 """Effects that are no part of the test of all together, which noise with a slow colour would fail by them."""
-OF_THE_SPRING = ("k_1", "k_1_drift", "contact", "play", "f_l", "quadratic", "cubic", "hysteresis")
+OF_THE_SPRING = (
+    *("k_1", "k_1_drift", "contact", "play", "f_l", "quadratic", "cubic", "hysteresis"),
+    *("stiffness_sine", "stiffness_cosine"),
+)
 """Effects that a machine without a spring cannot have."""
 
 
 def possible(name: str, bench: Bench) -> tuple[float, float]:
     """Least and greatest amount of an effect that a brake can have.
 
-    No constant changes its sign or by more than is searched, nor does any drift over a run by more than its size. No
+    No constant changes its sign or by more than is searched, nor is any other torque larger than what it changes. No
     curvature lets the clamp pull. Whole samples of a delay are not searched, yet possible.
     """
-    if name in DRIFTS:
+    if name in TORQUES and name != "play":
         return -1.0, 1.0
     row, farthest = EFFECTS[name], max(map(abs, bench.limits.angle))
     if name in CURVED:
@@ -151,7 +172,7 @@ def held(problem: Problem) -> tuple[str, ...]:
         name
         for name, effect in EFFECTS.items()
         if effect.step == 0.0
-        and name not in estimated | {LAGGING, *DRIFTS}
+        and name not in estimated | {LAGGING, *TORQUES}
         and (name != "delay" or timed)
         and (name != "velocity_gain" or not observed)
     )
@@ -172,13 +193,13 @@ def secants(problem: Problem, z: Floats, model: Shown) -> dict[str, list[Floats]
                 if reference is None:
                     reference = model.shown(i, mechanics._replace(stribeck_velocity=changed.stribeck_velocity))
                 found.setdefault(name, []).append((model.shown(i, changed) - reference) / effect.step)
-        if mechanics.play == 0.0 and mechanics.solver == EXACT:
-            step = EFFECTS["play"].step
-            lagging = _clearance(problem, z, i, motion, step)
-            found.setdefault("play", []).append((model.shown(i, mechanics, lagging) - base) / step)
-        for name, drifting in zip(DRIFTS, _drifts(problem, z, i, motion), strict=True):
-            column = (model.shown(i, mechanics, DRIFT_STEP * drifting) - base) / DRIFT_STEP
-            found.setdefault(name, []).append(column)
+        at = _path(problem, z, i, motion)
+        for name, torque in TORQUES.items():
+            if name == "play" and (mechanics.play > 0.0 or mechanics.solver != EXACT):
+                continue
+            step = EFFECTS[name].step or STEP
+            added = torque(at, step) / at.brake.k_m
+            found.setdefault(name, []).append((model.shown(i, mechanics, added) - base) / step)
         if not observed:
             slope = np.diff(motion[:, 1], prepend=record.velocity) / problem.bench.timing.sample_time
             lag = np.stack([np.zeros_like(slope), -slope], axis=1)
@@ -186,41 +207,79 @@ def secants(problem: Problem, z: Floats, model: Shown) -> dict[str, list[Floats]
     return found
 
 
-def _drifts(problem: Problem, z: Floats, record: int, shown: Floats) -> tuple[Floats, ...]:
-    """Currents that turn the motor as linear drifts of the parameters do, in the order of ``DRIFTS`` [A].
+class Path(NamedTuple):
+    """Means of the periods of a record as the model moves, each shape (n,)."""
 
-    Each is a drift by the whole parameter from the first period to the last, zero in the middle. In a period in which
-    the brake turns around, the friction acts one way and then the other, as if the velocity changed evenly.
-    """
+    brake: BrakeParameters
+    limits: Limits
+    share: Floats  # Of the record that has passed, -½ to ½
+    current: Floats  # [A]
+    angles: Floats  # From contact, at the ends of the periods, shape (n + 1,) [rad]
+    velocity: Floats  # [rad/s]
+    direction: Floats
+    """Of the motion, -1 to 1: the friction acts one way and then the other in a period in which the brake turns."""
+
+    @property
+    def angle(self) -> Floats:
+        """Angle from contact [rad]."""
+        return 0.5 * (self.angles[1:] + self.angles[:-1])
+
+    @property
+    def clamping(self) -> Floats:
+        """Torque of the clamping force against the motor [N·m]."""
+        clamped = np.maximum(self.angles, 0.0)
+        return self.brake.gamma * self.brake.k_1 * 0.5 * (clamped[1:] + clamped[:-1])
+
+
+def _path(problem: Problem, z: Floats, record: int, shown: Floats) -> Path:
+    """The motion that is shown, by periods, as if the velocity changed evenly in each."""
     at, data = problem.at(z, record), problem.records[record]
     n, delay = len(shown), problem.plant.instruments.measurement_delay
     ends = np.concatenate([shown[delay:], np.repeat(shown[-1:], min(delay, n), axis=0)])[:n]
-    angle = np.append(at.start[0], ends[:, 0] - at.offset(problem.plant)) - at.contact
+    angles = np.append(at.start[0], ends[:, 0] - at.offset(problem.plant)) - at.contact
     velocity = np.append(at.start[1], ends[:, 1])
     speed = np.abs(velocity[1:]) + np.abs(velocity[:-1])
-    direction = (velocity[1:] + velocity[:-1]) / np.where(speed > 0.0, speed, 1.0)
-    clamped = np.maximum(angle, 0.0)
-    p, share = at.brake, (np.arange(n) + 0.5) / n - 0.5
-    torques = (
-        p.k_m * (data.currents + at.errors.current_offset),
-        -p.gamma * p.k_1 * 0.5 * (clamped[1:] + clamped[:-1]),
-        -p.T_c * direction,
-        -p.f_v * 0.5 * (velocity[1:] + velocity[:-1]),
+    return Path(
+        at.brake,
+        problem.bench.limits,
+        (np.arange(n) + 0.5) / n - 0.5,
+        data.currents + at.errors.current_offset,
+        angles,
+        0.5 * (velocity[1:] + velocity[:-1]),
+        (velocity[1:] + velocity[:-1]) / np.where(speed > 0.0, speed, 1.0),
     )
-    return tuple(share * torque / p.k_m for torque in torques)
 
 
-def _clearance(problem: Problem, z: Floats, record: int, shown: Floats, play: float) -> Floats:
-    """Current that turns the motor as a clearance of the gear does: nut and force lag behind the screw [A]."""
-    at = problem.at(z, record)
-    angles = np.append(at.start[0], shown[:, 0] - at.offset(problem.plant)) - at.contact
-    nut, behind = float(angles[0]), np.empty(len(angles))
-    for k, angle in enumerate(angles.tolist()):
+def _clearance(at: Path, play: float) -> Floats:
+    """Torque by which the clamp acts less on the motor behind a clearance: nut and force lag behind the screw [N·m]."""
+    nut, behind = float(at.angles[0]), np.empty(len(at.angles))
+    for k, angle in enumerate(at.angles.tolist()):
         nut = min(max(nut, angle - 0.5 * play), angle + 0.5 * play)
         behind[k] = max(angle, 0.0) - max(nut, 0.0)
-    torque = at.brake.gamma * at.brake.k_1 * 0.5 * (behind[1:] + behind[:-1])
-    result: Floats = torque / at.brake.k_m
+    result: Floats = at.brake.gamma * at.brake.k_1 * 0.5 * (behind[1:] + behind[:-1])
     return result
+
+
+TORQUES: Mapping[str, Callable[[Path, float], Floats]] = {
+    "play": _clearance,
+    "k_m_drift": lambda at, a: a * at.share * at.brake.k_m * at.current,
+    "k_1_drift": lambda at, a: -a * at.share * at.clamping,
+    "T_c_drift": lambda at, a: -a * at.share * at.brake.T_c * at.direction,
+    "f_v_drift": lambda at, a: -a * at.share * at.brake.f_v * at.velocity,
+    "friction_100": lambda at, a: -a * at.brake.T_c * at.direction * np.exp(-((at.velocity / 100.0) ** 2)),
+    "friction_200": lambda at, a: -a * at.brake.T_c * at.direction * np.exp(-((at.velocity / 200.0) ** 2)),
+    "drag": lambda at, a: -a * at.brake.f_v * at.velocity * np.abs(at.velocity) / at.limits.velocity,
+    "ripple_sine": lambda at, a: a * at.brake.T_c * np.sin(at.angle),
+    "ripple_cosine": lambda at, a: a * at.brake.T_c * np.cos(at.angle),
+    "current_gain": lambda at, a: a * at.brake.k_m * at.current * np.abs(at.current) / at.limits.current,
+    "dead_current": lambda at, a: -a * at.brake.k_m * np.sign(at.current),
+    "stiffness_sine": lambda at, a: -a * at.clamping * np.sin(at.angle),
+    "stiffness_cosine": lambda at, a: -a * at.clamping * np.cos(at.angle),
+}
+"""Torques that turn the motor as effects of a size do that the brake has no sensitivity to, by name [N·m].
+
+A drift is by the whole parameter from the first period to the last, zero in the middle.
+"""
 
 
 def _with(m: Mechanics, name: str, step: float) -> Mechanics | None:
@@ -261,6 +320,8 @@ def score(
         every = {name: column for name, column in every.items() if name not in OF_THE_SPRING}
     pseudo = np.linalg.pinv(jacobian / _lengths(jacobian)) / _lengths(jacobian)[:, None]
     priors = _priors(problem, DISTURBED if disturbed else 1.0)
+    averaged = average(problem, z, left)
+    in_full = unaveraged(averaged.step)
     found, beside_all, budget = [], [], []
     untested = {ANGLE_SCALE: _angle_scaled(problem, z, shown)} if ANGLE_SCALE in priors else {}
     for name, column in (every | untested).items():
@@ -273,7 +334,16 @@ def score(
         if name in priors:
             # What drifts is fitted as it is in the middle of a run, and meant from the begin to the end.
             ends = np.array([0.5 if f"{u.name}_drift" == name else 0.0 for u in problem.unknowns])
-            bias = (np.abs(pseudo @ whole) + ends) * _size(name, priors[name], length, float(beside @ errors))
+            certain = name in NEVER_EXACT
+            effect = Effect(
+                pseudo @ whole,
+                length**2,
+                float(beside @ errors),
+                priors[name] * np.array([1.0] if certain else SHARES),
+                1.0 if certain else PRESENT,
+                ends,
+            )
+            bias = (in_full if name in untested else averaged).bias(effect)
             budget.append(Contribution(name, tuple(bias.tolist())))
         if length == 0.0 or name in untested:
             continue
@@ -343,17 +413,6 @@ def _angle_scaled(problem: Problem, z: Floats, shown: Shown) -> Floats:
 def _priors(problem: Problem, drifting: float) -> dict[str, float]:
     """Standard deviations before any record of what the total allows for; drifts ``drifting`` times the bench's."""
     return {n: d * (drifting if n in DRIFTS else 1.0) for n, d in problem.asked.allowed.items()}
-
-
-def _size(name: str, prior: float, length: float, score: float) -> float:
-    """Root mean square of an effect by its posterior.
-
-    From its prior deviation, the root ``length`` of the information on it beside all that is estimated, and the product
-    ``score`` of its column there with the residuals.
-    """
-    variance = 1.0 / (prior**-2 + length**2)
-    probability = 1.0 if name in NEVER_EXACT else PRESENT
-    return float((probability * (variance + (variance * score) ** 2)) ** 0.5)
 
 
 def shown_as(s: Suspect | Contribution, machine: Machine | None) -> Quantity:

@@ -266,6 +266,7 @@ def _finished(cut: Cut, at: Point, ends: tuple[End, ...], moved: Floats) -> Esti
         problem.solved(at.shared),
         at.shared,
         information=information,
+        samples=information,
         prior=None,
         sandwich=covariance + np.outer(moved, moved),
         validation=_validated(cut, at),

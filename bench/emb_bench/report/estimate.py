@@ -21,6 +21,7 @@ from emb_bench.report.caveats import caveats
 from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.numbers import plain
 
+SCALE = "below that: docs/howto/below-two-percent.md"  # What to do where J limits
 NOTICED = 2.0  # Standard deviations from which on an effect that is no alarm is named
 
 
@@ -87,7 +88,8 @@ def _limits(study: Study) -> Iterator[str]:
         if (suspect := e.left_open_by(i)) is not None and e.open()[i] > e.cramer_rao()[i]:
             by.setdefault(say.limit(suspect, e), []).append(e.labels[i])
     if by:
-        yield "limited by  " + "; ".join(f"{name} ({', '.join(labels)})" for name, labels in by.items())
+        more = [SCALE] if any(name.startswith("J, known to") for name in by) else []
+        yield "limited by  " + "; ".join([*(f"{name} ({', '.join(labels)})" for name, labels in by.items()), *more])
     if tested := e.validation.suspects:
         hints = [
             f"{s.name} {signed(s.sigmas, '+.1f')}"
@@ -127,7 +129,7 @@ def _evidence(study: Study) -> Iterator[str]:
     yield ""
     correlation, pairs = tables.correlation(e)
     found: list[Table | None] = [
-        *(tables.models(study), tables.errors(study), tables.budget(study)),
+        *(tables.models(study), tables.errors(study), tables.budget(study), tables.ratios(e)),
         *(tables.residual_tests(study), tables.suspects(e), tables.systematic(e), tables.predicted(study)),
         correlation,
     ]
@@ -162,6 +164,7 @@ def document(study: Study) -> dict[str, Any]:
             "notes": say.residual_notes(e),
         },
         "parameters": _parameters(study),
+        "ratios": {one.name: _fields(one, "value", "unit") | {"interval_95": one.interval} for one in e.ratios()},
         "models": [
             _fields(c, "fits", "deviance", "bic", "weight")
             | {"model": c.name, "held_out_log_density": c.held_out, "changes": choice.changes(c)}
@@ -231,6 +234,7 @@ def _parameters(study: Study) -> dict[str, dict[str, Any]]:
             "deviation": used,
             "deviation_relative": unknown.relative,
             "deviation_between_runs": e.between_runs()[i],
+            "effects": e.effects(i),
             "cramer_rao": bound,
             "sandwich": robust,
             "left_open": model,

@@ -203,9 +203,11 @@ def outside(study: Study) -> list[str]:
 
 
 def apart(study: Study) -> str:
-    """Parameters in which logs differ that each fit alone."""
+    """Parameters in which logs differ that fit alone."""
     values = "; ".join(f"{d.name}: {', '.join(plain(value, 5) for value in d.values)}" for d in study.apart)
-    return f"each log fits alone, but not with the others: two brakes, or one that changed. By each log: {values}."
+    alone, every = sum(map(math.isfinite, study.apart[0].values)), len(study.apart[0].values)
+    which = "each log fits alone, but not with the others" if alone == every else f"{alone} of {every} logs fit alone"
+    return f"{which}: two brakes, or one that changed. By each log: {values}."
 
 
 def changed_model(study: Study) -> str:

@@ -134,6 +134,20 @@ def budget(study: Study) -> Table | None:
     return Table(title, header, rows, words=(0, 7))
 
 
+def ratios(e: Estimate) -> Table | None:
+    """Ratios of the parameters to the inertia."""
+    rows = [
+        [
+            one.name,
+            amount(one.value, one.interval, one.unit),
+            relative(0.5 * (one.interval[1] - one.interval[0]), one.value),
+        ]
+        for one in e.ratios()
+    ]
+    title = "Ratios, in which an error of the inertia has no part; ± is the total (95 %, k=2)"
+    return Table(title, ["ratio", "value ± total", "total"], rows) if rows else None
+
+
 def residual_tests(study: Study) -> Table:
     """Tests of the residuals."""
     m = study.estimate.validation

@@ -214,6 +214,7 @@ class Systematic:
     """Current that acts beyond what the node reports; a friction that depends on the direction looks the same [A]."""
     delay: NotNegative = 0.3  # By which commands act late, or samples early [samples]
     velocity_gain: NotNegative = 0.02  # Relative error of the velocity's scale
+    k_m: NotNegative | None = None  # Relative error of k_m in [brake], where it was measured; J is then estimated
     inertia: NotNegative = 0.01  # Relative error of J, which all four parameters share
     angle_scale: NotNegative = 0.003  # Relative error of the angle's scale, which k_m and T_c share
     held: NotNegative = 0.02  # Relative error of each parameter that is held at its nominal value
@@ -224,6 +225,12 @@ class Systematic:
     break_away: NotNegative = 0.1  # Static friction beyond the plant's, as a share of T_c
     f_l: NotNegative = 1e-7  # Load-dependent static friction beyond the plant's [m]
     current_lag: NotNegative = 5e-4  # Time constant of the current loop beyond the plant's [s]
+    slow_friction: NotNegative = 0.1  # Friction that decays over 100 or 200 rad/s, as a share of T_c
+    drag: NotNegative = 0.02  # Share by which f_v is larger at the limit of the velocity
+    ripple: NotNegative = 0.1  # Torque that changes once a turn of the motor, as a share of T_c
+    stiffness_ripple: NotNegative = 0.003  # Share of the stiffness that changes once a turn of the motor
+    current_gain: NotNegative = 0.01  # Share by which k_m is larger at the limit of the current
+    dead_current: NotNegative = 0.01  # Current by which less acts than the node reports, in either direction [A]
     drift: NotNegative = 0.003  # Change of each parameter from the begin of a run to its end, as a share of it
 
 

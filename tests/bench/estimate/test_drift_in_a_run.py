@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -8,11 +8,11 @@ import pytest
 from emb_bench.brake.motion import Floats, advance, no_sensitivity, rest
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.records import EstimationProblem, with_systematic
+from emb_bench.estimate.records import SYSTEMATIC, EstimationProblem, with_systematic
 from emb_bench.estimate.suspects import Simulated, secants
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.report.sentences import explained
-from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.config.bench import PARAMETER_NAMES, Systematic
 
 from tests.bench.measurements import currents_of, errors_in_sigmas, fit, problem_of, record  # isort: skip
 
@@ -95,10 +95,11 @@ def test_the_interval_holds_what_a_drift_that_a_walk_followed_began_and_ended_wi
 @pytest.mark.parametrize("seed", [3, 4])
 def test_the_interval_allows_for_a_drift_that_is_too_small_to_be_noticed(bench: Bench, seed: int) -> None:
     data = drifting(bench, "square:period=0.2", "T_c", 3e-4, seed=seed)
-    scaled = replace(bench.systematic, inertia=0.0, angle_scale=0.0)
+    errors_of_sensors = {name: getattr(bench.systematic, name) for name in SYSTEMATIC}
+    others = dict.fromkeys(asdict(bench.systematic), 0.0) | errors_of_sensors
     asked = [
-        with_systematic(EstimationProblem(), replace(bench, systematic=known), bench.plant("exact"))
-        for known in (replace(scaled, drift=0.0), scaled)
+        with_systematic(EstimationProblem(), replace(bench, systematic=Systematic(**known)), bench.plant("exact"))
+        for known in (others, others | {"drift": bench.systematic.drift})
     ]
     found = [fit(bench, "exact", [data], one) for one in asked]
     errors = [errors_in_sigmas(e, bench.brake)[0] for e in found]

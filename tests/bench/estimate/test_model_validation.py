@@ -158,13 +158,15 @@ def test_an_interval_says_what_it_allows_for_most_and_holds_the_truth_where_fish
     plant = bench.plant("exact")
     loose = replace(plant, mechanics=plant.mechanics._replace(play=0.05))
     data = record(bench, loose, currents_of(bench, "chirp"), seed=1)
-    e = fit(bench, plant, [data], with_systematic(EstimationProblem(), scaled(bench, 0.0, 0.0), plant), method=method)
+    known = scaled(bench, 0.0, 0.0)
+    known = replace(known, systematic=replace(known.systematic, slow_friction=0.0))
+    e = fit(bench, plant, [data], with_systematic(EstimationProblem(), known, plant), method=method)
     i = e.labels.index("T_c")
     assert e.validation.fits
     effect = e.left_open_by(i)
     assert effect is not None
     assert effect.name == "play"
-    assert e.open()[i] >= effect.bias[i] > 3.0 * e.cramer_rao()[i]
+    assert e.open()[i] >= abs(effect.bias[i]) > 3.0 * e.cramer_rao()[i]
     error = abs(e.theta.T_c / bench.brake.T_c - 1.0)
     assert NORMAL_95 * e.cramer_rao()[i] < error < NORMAL_95 * e.deviations()[i]
     trusted = fit(bench, plant, [data], method=method)
@@ -190,7 +192,7 @@ def test_what_no_record_can_know_enters_the_total_as_the_equation_of_motion_says
         | ({"velocity_gain": 0.005} if plant == "exact" else {}),
     }.items():
         for label, bias in expected.items():
-            assert found[name][label] == pytest.approx(bias, rel=0.05, abs=2e-5), (name, label)
+            assert abs(found[name][label]) == pytest.approx(bias, rel=0.05, abs=2e-5), (name, label)
     known = [i for i, label in enumerate(e.labels) if label in PARAMETER_NAMES]
     both = [math.hypot(found["J"][name], found["angle_scale"][name]) for name in PARAMETER_NAMES]
     assert e.deviations()[known] == pytest.approx(np.hypot(e.between_runs()[known], both), rel=1e-6)
