@@ -679,7 +679,7 @@ def _study_options(given: Mapping[str, Any]) -> Callable[[Bench], StudyOptions]:
     return of
 
 
-NUMBER = r"[0-9.]+(?:[eE][-+]?[0-9]+)?"  # Without a sign
+NUMBER = r"(?:[0-9]+[.]?[0-9]*|[.][0-9]+)(?:[eE][-+]?[0-9]+)?"  # Without a sign
 
 
 def _known(given: Names | None) -> dict[str, tuple[float, float]]:

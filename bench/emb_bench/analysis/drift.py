@@ -37,8 +37,8 @@ class Entry(msgspec.Struct, frozen=True):
     deviation_relative: bool
     deviation_between_runs: Annotated[float, msgspec.Meta(ge=0.0)] | None = None
     """Relative or in the value's unit; None: unknown."""
-    effects: dict[str, float] = msgspec.field(default_factory=dict)
-    """Biases that are part of it, by effect, in the same unit."""
+    effects: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
+    """Biases that are part of it, in the same unit, and sizes of the effects, by name."""
 
     def __post_init__(self) -> None:
         """Refuse a share of nothing."""
@@ -132,9 +132,9 @@ def drifts(now: Estimate, last: Earlier) -> tuple[Drift, ...]:
         value = float(now.values[i])
         deviation = float(deviations[i]) * (abs(value) if relative else 1.0)
         before, deviation_before = then[name].value, then[name].absolute
-        own = {effect: float(now.scale[i]) * bias for effect, bias in now.effects(i).items()}
-        other = {effect: then[name].unit * bias for effect, bias in then[name].effects.items()}
-        in_both = {effect: bias for effect, bias in other.items() if effect in own}
+        own = {effect: (float(now.scale[i]) * bias, size) for effect, (bias, size) in now.effects(i).items()}
+        other = {effect: (then[name].unit * bias, size) for effect, (bias, size) in then[name].effects.items()}
+        in_both = {effect: one for effect, one in other.items() if effect in own}
         both = math.hypot(apart_by(deviation, own, other), apart_by(deviation_before, other, in_both))
         change = value - before
         size = abs(before) if relative else 1.0

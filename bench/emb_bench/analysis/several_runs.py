@@ -46,16 +46,21 @@ def constancy(values: Sequence[float], deviations: Sequence[float]) -> Constancy
     return Constancy(len(v), mean, float(weights.sum() ** -0.5), chi2, p_value, scatter, p_value >= DIFFERENT)
 
 
-def apart_by(deviation: float, effects: Mapping[str, float], other: Mapping[str, float]) -> float:
+Effects = Mapping[str, tuple[float, float]]
+"""Biases by effects, and the sizes of these."""
+
+
+def apart_by(deviation: float, effects: Effects, other: Effects) -> float:
     """Part of a deviation between runs of one brake that another run, with biases by ``other`` effects, does not share.
 
-    An effect of the brake is the same in each run: it moves them apart by the difference of its biases. What changes in
-    a run is another one in each. ``effects`` are the biases that are part of the ``deviation``.
+    An effect of the brake has one size in both runs: it moves them apart as far as the same size moves both otherwise.
+    What changes in a run is another one in each. The biases by ``effects`` are part of the ``deviation``.
     """
-    alone = max(deviation**2 - sum(bias**2 for bias in effects.values()), 0.0)
-    return math.sqrt(
-        alone + sum(bias**2 if name in DRIFTS else (bias - other.get(name, 0.0)) ** 2 for name, bias in effects.items())
-    )
+    square = max(deviation**2 - sum(bias**2 for bias, _ in effects.values()), 0.0)
+    for name, (bias, size) in effects.items():
+        shared = name not in DRIFTS and name in other and other[name][1] > 0.0
+        square += (bias - (size / other[name][1] * other[name][0] if shared else 0.0)) ** 2
+    return math.sqrt(square)
 
 
 @dataclass(frozen=True)
@@ -87,7 +92,7 @@ def apart(e: Estimate) -> tuple[Differing, ...]:
         at = [next(i for i, u in enumerate(one.unknowns) if u.name == name) for one in alone]
         values = np.array([one.values[i] for one, i in zip(alone, at, strict=True)])
         effects = [one.effects(i) for one, i in zip(alone, at, strict=True)]
-        mean = {effect: sum(one[effect] for one in effects) / len(effects) for effect in effects[0]}
+        mean = {effect: tuple(np.mean([one[effect] for one in effects], axis=0).tolist()) for effect in effects[0]}
         between = [float(one.between_runs()[i]) for one, i in zip(alone, at, strict=True)]
         if not np.isfinite(between).all():
             continue

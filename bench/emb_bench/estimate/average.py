@@ -47,8 +47,8 @@ class Average(NamedTuple):
         found[np.ix_(self.errors, self.errors)] = np.linalg.inv(self.covariance) - self.full
         return found
 
-    def bias(self, effect: Effect) -> Floats:
-        """Root mean square bias of each unknown by an effect, with the sign of that by a positive one, shape (p,)."""
+    def bias(self, effect: Effect) -> tuple[Floats, float]:
+        """Root mean squares of an effect's bias of each unknown, with the sign of a positive one's, and of its size."""
         own = self.full @ effect.moved[self.errors]
         seen = own @ effect.moved[self.errors] - np.einsum("i,cij,j->c", own, self.covariances, own)
         information = effect.information + np.maximum(seen, 0.0)[:, None]
@@ -60,9 +60,9 @@ class Average(NamedTuple):
         logs += self.chances[:, None] + math.log(effect.present / len(effect.deviations))
         most = max(float(logs.max()), float(self.chances.max()))
         weights, absent = np.exp(logs - most), (1.0 - effect.present) * float(np.exp(self.chances - most).sum())
-        squares = (weights * (variances + (variances * score) ** 2)).sum(axis=1) @ moved**2
-        sizes: Floats = np.sqrt(squares / (float(weights.sum()) + absent))
-        return np.copysign(sizes, np.exp(self.chances) @ moved)
+        squares = (weights * (variances + (variances * score) ** 2)).sum(axis=1) / (float(weights.sum()) + absent)
+        bias: Floats = np.copysign(np.sqrt(squares @ moved**2), np.exp(self.chances) @ moved)
+        return bias, float(squares.sum() ** 0.5)
 
 
 class Effect(NamedTuple):

@@ -167,9 +167,9 @@ class Estimate:
         found = [one for one in self.validation.budget if one.bias[i] != 0.0]
         return max(found, key=lambda one: abs(one.bias[i]), default=None)
 
-    def effects(self, i: int) -> dict[str, float]:
-        """Biases of unknown ``i`` by effects, but those that move all runs on one bench alike."""
-        return {one.name: one.bias[i] for one in self.validation.budget if one.name not in OF_THE_BENCH}
+    def effects(self, i: int) -> dict[str, tuple[float, float]]:
+        """Biases of unknown ``i`` by effects, with their sizes; not by those that move all runs on one bench alike."""
+        return {one.name: (one.bias[i], one.size) for one in self.validation.budget if one.name not in OF_THE_BENCH}
 
     def intervals(self) -> Floats:
         """Gaussian 95 % intervals in SI units, shape (unknowns, 2)."""

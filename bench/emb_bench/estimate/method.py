@@ -33,8 +33,7 @@ class Method(ABC):
         asked, ideal_sensors = self.asked, False
         if asked.known and not self.systematic:
             raise UsageError(
-                f"this method takes no parameter as known ({', '.join(asked.known)}): leave out --known, and k_m in "
-                "[systematic]; or use --method oem"
+                "this method takes no known parameter: leave out --known, or k_m in [systematic]; or use --method oem"
             )
         if (asked.systematic or asked.allowed) and not self.systematic:
             asked, ideal_sensors = replace(asked, systematic={}, allowed={}), True

@@ -234,6 +234,7 @@ class Contribution:
     bias: tuple[float, ...]
     """Root mean square of the bias of each unknown, with its sign for a positive effect: relative, or in the unknown's
     unit."""
+    size: float = 0.0  # Root mean square of its size
 
 
 class Disturbance(NamedTuple):

@@ -343,8 +343,8 @@ def score(
                 1.0 if certain else PRESENT,
                 ends,
             )
-            bias = (in_full if name in untested else averaged).bias(effect)
-            budget.append(Contribution(name, tuple(bias.tolist())))
+            bias, size = (in_full if name in untested else averaged).bias(effect)
+            budget.append(Contribution(name, tuple(bias.tolist()), size))
         if length == 0.0 or name in untested:
             continue
         if name not in ALONE:

@@ -127,7 +127,7 @@ def test_a_bias_is_that_of_all_combinations_of_errors_and_effect(bench: Bench, s
     none = np.zeros(len(its.names))
     effect = Effect(pseudo @ whole, length**2, float(beside @ shifted), np.array(SHARES), HALF, none)
     names, z = [*its.names, "effect"], np.append(its.estimate.fit, 0.0)
-    logs, squares = [], []
+    logs, squares, sizes = [], [], []
     for deviations, one in answers(names, z, -shifted[: len(y)], np.column_stack([a, -column])):
         known = [i for i in range(len(none)) if deviations.get(names[i], 1.0) > 0.0]
         priors = np.array([1.0 / deviations[names[i]] if names[i] in deviations else 0.0 for i in known])
@@ -135,8 +135,10 @@ def test_a_bias_is_that_of_all_combinations_of_errors_and_effect(bench: Bench, s
         moved = none.copy()
         moved[known] = np.linalg.lstsq(rows, np.append(column, np.zeros(len(known))), rcond=None)[0] / unit[known]
         logs.append(one.logarithm)
-        squares.append(moved**2 * (one.covariance[-1, -1] + one.mean[-1] ** 2))
+        sizes.append(one.covariance[-1, -1] + one.mean[-1] ** 2)
+        squares.append(moved**2 * sizes[-1])
     weights = np.exp(np.array(logs) - max(logs))
     expected = np.sqrt(weights @ np.array(squares) / weights.sum())
-    found = averaged.bias(effect)
+    found, size = averaged.bias(effect)
+    assert size == pytest.approx(float(np.sqrt(weights @ np.array(sizes) / weights.sum())), rel=0.01)
     assert np.abs(found[:4]) == pytest.approx(expected[:4], rel=0.01)
