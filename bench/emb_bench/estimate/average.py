@@ -61,7 +61,9 @@ class Average(NamedTuple):
         most = max(float(logs.max()), float(self.chances.max()))
         weights, absent = np.exp(logs - most), (1.0 - effect.present) * float(np.exp(self.chances - most).sum())
         squares = (weights * (variances + (variances * score) ** 2)).sum(axis=1) / (float(weights.sum()) + absent)
-        bias: Floats = np.copysign(np.sqrt(squares @ moved**2), np.exp(self.chances) @ moved)
+        bias: Floats = np.copysign(
+            np.sqrt(np.einsum("c,ci->i", squares, moved**2)), np.einsum("c,ci->i", np.exp(self.chances), moved)
+        )
         return bias, float(squares.sum() ** 0.5)
 
 
@@ -96,9 +98,9 @@ def average(problem: Problem, z: Floats, found: tuple[Floats, Floats]) -> Averag
     groups = [list(priors).index(names[i]) for i in at]
     chances, means, covariances = _combinations(full, full @ there, np.array([priors[names[i]] for i in at]), groups)
     weights = np.exp(chances)
-    mean = weights @ means
+    mean = np.einsum("c,ci->i", weights, means)  # not by a product of matrices, whose last digit depends on threads
     away = means - mean
-    covariance = np.einsum("c,cij->ij", weights, covariances) + (weights[:, None] * away).T @ away
+    covariance = np.einsum("c,cij->ij", weights, covariances) + np.einsum("c,ci,cj->ij", weights, away, away)
     return Average(step + gain @ (mean - there), at, gain, full, covariance, chances, means - there, covariances)
 
 

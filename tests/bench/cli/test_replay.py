@@ -20,6 +20,7 @@ from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import Layout
 from emb_runtime.config.bench import shipped_bench_text
+from emb_runtime.numbers import plain
 from emb_runtime.records import CycleRecord
 
 from tests.bench.conftest import Log, Replay  # isort: skip
@@ -184,7 +185,7 @@ def test_the_fit_at_an_estimate_is_judged_with_its_systematic_errors(log: Log, r
     assert found["warnings"] == []
     values = {name: entry["value"] for name, entry in said["systematic"].items()}
     assert found["systematic"] == values
-    assert f"{values['current_offset']:.3g}" in found["notes"][0]
+    assert plain(values["current_offset"]) in found["notes"][0]
     several = replay.document("estimate", log("other.mcap", "plant=exact,seed=5"), path, "--starts", "1")
     assert several["model_fits"]
     for document, offset in (
