@@ -8,6 +8,8 @@ no code with the estimators. The cases are ``CASES``:
 - ``repeatability``: a right model without systematic errors;
 - ``total``: a right model, all systematic errors drawn from their priors in the bench file;
 - ``inertia``, ``angle_scale``: only that one drawn;
+- ``unlisted``: a small error of the model of one of ``UNLISTED``;
+- ``prior``: errors and effects drawn from all priors;
 - ``near-misses``: a small error of the model of one of ``KINDS`` in one of three sizes, in turns with a right model;
 - ``disturbance``: the velocity or the load walks at random, and the estimator does not know;
 - ``losses``: 2, 5 and 10 % of the samples are lost, one by one or in bursts of 20 ms, and a fifth as many commands;
@@ -43,6 +45,7 @@ from benchmarks.independent_simulator import Brake, Floats, Losses, brake_of, si
 from emb_bench.analysis.conclusion import noise_deviations
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Plant
+from emb_bench.estimate.average import SHARES
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.records import NORMAL_95, EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Experiment
@@ -182,6 +185,35 @@ def unlisted(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
         seed += draws * len(sizes)
 
 
+EXPECTED = 1.0 / 6.0  # Share of the brakes that have a certain effect
+ALWAYS_POSITIVE = {"delay", "hysteresis", "play", "f_l", "current_lag", "dead_current", "break_away"}
+
+
+def prior(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
+    """Brakes as we expect them: each error and effect is there in one of six, at any of the sizes of its prior."""
+    plant, known = bench.plant("exact"), bench.systematic
+    same = ("quadratic", "cubic", "hysteresis", "play", "f_l", "current_lag", "ripple", "stiffness_ripple", "drag")
+    fields = {name: name for name in (*same, "current_gain", "dead_current")}
+    fields |= {name: ERRORS[name] for name in ("offset", "current_offset", "delay", "velocity_gain")}
+    for at in range(seed, seed + draws):
+        rng = np.random.default_rng(at)
+        brake = brake_of(bench, plant, rng.uniform(0.5, 1.5, 4))
+
+        def size(name: str, deviation: float, rng: np.random.Generator = rng) -> float:
+            drawn = float(deviation * rng.choice(SHARES) * rng.standard_normal() * (rng.random() < EXPECTED))
+            return abs(drawn) if name in ALWAYS_POSITIVE else drawn
+
+        drawn = {field: size(name, getattr(known, name)) for name, field in fields.items()}
+        drawn |= {f"{name.lower()}_drift": size("drift", known.drift) for name in PARAMETER_NAMES}
+        friction, speed = [("break_away", 30.0), ("slow_friction", 100.0), ("slow_friction", 200.0)][rng.integers(3)]
+        drawn |= {"stribeck": size(friction, getattr(known, friction)), "stribeck_velocity": speed}
+        drawn["delay"] = min(drawn["delay"], LATEST)
+        drawn["inertia"] = brake.inertia * (1.0 + known.inertia * rng.standard_normal())
+        drawn["angle_scale"] = known.angle_scale * rng.standard_normal()
+        brake = Brake(**(vars(brake) | drawn))
+        yield Drawn("prior", bench, plant, simulate(brake, bench, rng, f"seed {at}"), brake)
+
+
 WALKS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("nothing", {}),
     ("velocity, 3 rad/s per √s", {"velocity_walk": 3.0}),
@@ -267,6 +299,7 @@ CASES: Mapping[str, Callable[[Bench, int, int], Iterator[Drawn]]] = {
     "angle_scale": partial(right, errors=("angle_scale",)),
     "near-misses": near_misses,
     "unlisted": unlisted,
+    "prior": prior,
     "disturbance": disturbance,
     "losses": partial(losses, charge=False),
     "charge": partial(losses, charge=True),
@@ -372,7 +405,7 @@ def main() -> None:
     print(f"{args.case}: seeds from {args.seed}, method {args.method}, systematic errors {args.systematic}")
     outcomes: dict[str, list[Outcome]] = {}
     bench = load_bench()
-    if args.case not in {"total", "inertia", "angle_scale"}:
+    if args.case not in {"total", "inertia", "angle_scale", "prior"}:
         bench = replace(bench, systematic=replace(bench.systematic, inertia=0.0, angle_scale=0.0))
     for drawn in CASES[args.case](bench, args.draws, args.seed):
         outcomes.setdefault(drawn.row, []).append(judge(drawn, args.method, systematic=args.systematic == "bench"))

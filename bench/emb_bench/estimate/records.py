@@ -26,7 +26,7 @@ SEVERAL: Mapping[str, tuple[str, ...]] = {
     "stiffness_ripple": ("stiffness_sine", "stiffness_cosine"),
 }
 """Keys of ``[systematic]`` that stand for several effects."""
-ANGLE_SCALE = "angle_scale"  # Relative error of the angle's scale
+ANGLE_SCALE, CURRENT_SCALE = "angle_scale", "current_scale"  # Relative errors of their scales
 FREE = 0.05  # Standard deviation of J, as a share of it, where a parameter tells it that is known beforehand
 FACTOR = 10.0  # Brakes beyond nominal by this factor are not searched
 METHODS: Mapping[str, str] = {

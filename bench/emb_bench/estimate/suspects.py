@@ -31,6 +31,7 @@ from emb_bench.estimate.derived_velocity import derived
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import (
     ANGLE_SCALE,
+    CURRENT_SCALE,
     DRIFTS,
     FACTOR,
     Contribution,
@@ -46,7 +47,12 @@ SLOW = 30.0  # Stribeck velocity with which friction at rest is suspected, where
 
 _PLANT = PARAMETERS["play"].remedy
 
-NEVER_EXACT = ("J", ANGLE_SCALE, *PARAMETER_NAMES)  # Constants that are wrong by something in every brake
+NEVER_EXACT = (
+    "J",
+    ANGLE_SCALE,
+    CURRENT_SCALE,
+    *PARAMETER_NAMES,
+)  # Constants that are wrong by something in every brake
 PRESENT = 0.5  # Probability, before any record, that a brake has a certain one of all other effects
 
 DISTURBED = 10.0
@@ -324,6 +330,9 @@ def score(
     in_full = unaveraged(averaged.step)
     found, beside_all, budget = [], [], []
     untested = {ANGLE_SCALE: _angle_scaled(problem, z, shown)} if ANGLE_SCALE in priors else {}
+    if CURRENT_SCALE in priors:  # a larger current acts as a larger k_m does
+        own, count = [u.name for u in problem.unknowns], sum(record.samples.size for record in problem.records)
+        untested[CURRENT_SCALE] = every["k_m"] if "k_m" in every else -jacobian[:count, own.index("k_m")]
     for name, column in (every | untested).items():
         whole = np.zeros(len(errors))
         whole[: len(column)] = column
@@ -343,6 +352,9 @@ def score(
                 1.0 if certain else PRESENT,
                 ends,
             )
+            if name == "J":  # all torques scale with it, those that are held as well: no trace is left
+                together = np.array([float(u.name in PARAMETER_NAMES) for u in problem.unknowns])
+                effect = effect._replace(moved=together, information=0.0, score=0.0)
             bias, size = (in_full if name in untested else averaged).bias(effect)
             budget.append(Contribution(name, tuple(bias.tolist()), size))
         if length == 0.0 or name in untested:
@@ -417,8 +429,8 @@ def _priors(problem: Problem, drifting: float) -> dict[str, float]:
 
 def shown_as(s: Suspect | Contribution, machine: Machine | None) -> Quantity:
     """Name and unit of an effect as they are shown; no unit for what is relative."""
-    if s.name == ANGLE_SCALE:
-        return Quantity("angle scale", "")
+    if s.name in (ANGLE_SCALE, CURRENT_SCALE):
+        return Quantity(s.name.replace("_", " "), "")
     if s.name in DRIFTS:
         parameter = s.name.removesuffix("_drift")
         return Quantity(f"{quantity(machine, parameter).name}_drift", "")

@@ -125,10 +125,10 @@ def budget(study: Study) -> Table | None:
         rows.append(
             [c.label, *(relative(half, size) for half in halves), NOTHING if largest is None else limit(largest, e)]
         )
-    header = ["parameter", "noise", "sensors", "J, angle", "effects", "total", "by residuals", "largest"]
+    header = ["parameter", "noise", "sensors", "J, scales", "effects", "total", "by residuals", "largest"]
     title = (
         "Uncertainty budget of the total, each half of a 95 % interval (k=2). Noise and systematic errors of the "
-        "sensors; inertia and scale of the angle; effects that the record cannot exclude. For comparison: by the "
+        "sensors; inertia, scales of angle and current; effects that the record cannot exclude. For comparison: by the "
         "scatter of the residuals"
     )
     return Table(title, header, rows, words=(0, 7))

@@ -217,6 +217,7 @@ class Systematic:
     k_m: NotNegative | None = None  # Relative error of k_m in [brake], where it was measured; J is then estimated
     inertia: NotNegative = 0.01  # Relative error of J, which all four parameters share
     angle_scale: NotNegative = 0.003  # Relative error of the angle's scale, which k_m and T_c share
+    current_scale: NotNegative = 0.0  # Relative error of the current's scale, where k_m is meant per true ampere
     held: NotNegative = 0.02  # Relative error of each parameter that is held at its nominal value
     quadratic: NotNegative = 1e-4  # Quadratic share of the stiffness that the plant lacks [1/rad]
     cubic: NotNegative = 1e-6  # Cubic share of the stiffness that the plant lacks [1/rad²]

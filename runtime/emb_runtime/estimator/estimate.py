@@ -26,11 +26,16 @@ def known_before(errors: Systematic) -> dict[str, float]:
     """Part of each parameter's total that is known before a run, as a share of the parameter.
 
     If all torques and J are scaled alike, the motion is the same: each parameter has the relative error of J. An angle
-    that is shown too large by some share makes k_m and T_c too large by it. No record determines either, so both add
-    to the total with their priors, in quadrature.
+    that is shown too large by some share makes k_m and T_c too large by it, and a current k_m too small. No record
+    determines any of them, so all add to the total with their priors, in quadrature.
     """
     return {
-        name: NORMAL_95 * math.hypot(errors.inertia, errors.angle_scale if name in SCALED else 0.0)
+        name: NORMAL_95
+        * math.hypot(
+            errors.inertia,
+            errors.angle_scale if name in SCALED else 0.0,
+            errors.current_scale if name == "k_m" else 0.0,
+        )
         for name in PARAMETER_NAMES
     }
 
@@ -61,7 +66,9 @@ def total(repeatability: Mapping[str, float], errors: Systematic) -> str:
     """
     before = known_before(errors)
     shares = [math.hypot(own, before[name]) for name, own in repeatability.items() if math.isfinite(own)]
-    prior, cause = max((errors.inertia, "J"), (errors.angle_scale, "the angle's scale"))
+    prior, cause = max(
+        (errors.inertia, "J"), (errors.angle_scale, "the angle's scale"), (errors.current_scale, "the current's scale")
+    )
     if not (shares and prior):
         return ""
     ends = dict.fromkeys(in_percent(share).removesuffix(" %") for share in (min(shares), max(shares)))

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from emb_bench.config.bench import Bench, load_bench
-from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
 from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
 from emb_bench.estimate.records import DRIFTS, NORMAL_95, EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import planned
@@ -183,20 +183,24 @@ def test_what_no_record_can_know_enters_the_total_as_the_equation_of_motion_says
 ) -> None:
     """J ω' = k_m i - γ k_1 x - T_c - f_v ω: only ratios to J show; with angles a times as large, k_m/a and T_c/a."""
     model, bench = bench.plant(plant), scaled(bench, 0.02, 0.005)
+    bench = replace(bench, systematic=replace(bench.systematic, current_scale=0.01))
     data = record(bench, model, currents_of(bench, "chirp"), seed=1)
     e = fit(bench, model, [data], with_systematic(EstimationProblem(), bench, model), method=method)
     found = {one.name: dict(zip(e.labels, one.bias, strict=True)) for one in e.validation.budget}
     for name, expected in {
         "J": {"k_m": 0.02, "k_1": 0.02, "T_c": 0.02, "f_v": 0.02},
+        "current_scale": {"k_m": 0.01, "k_1": 0.0, "T_c": 0.0, "f_v": 0.0},
         "angle_scale": {"k_m": 0.005, "k_1": 0.0, "T_c": 0.005, "f_v": 0.0}
         | ({"velocity_gain": 0.005} if plant == "exact" else {}),
     }.items():
         for label, bias in expected.items():
             assert abs(found[name][label]) == pytest.approx(bias, rel=0.05, abs=2e-5), (name, label)
     known = [i for i, label in enumerate(e.labels) if label in PARAMETER_NAMES]
-    both = [math.hypot(found["J"][name], found["angle_scale"][name]) for name in PARAMETER_NAMES]
+    both = [math.hypot(*(found[one][name] for one in OF_THE_BENCH)) for name in PARAMETER_NAMES]
     assert e.deviations()[known] == pytest.approx(np.hypot(e.between_runs()[known], both), rel=1e-6)
     assert [finding.name for finding in e.verdict().findings] == list(PARAMETER_NAMES)
+    held = fit(bench, model, [data], with_systematic(EstimationProblem(("f_v",)), bench, model), method=method)
+    assert held.deviations()[0] > 0.02, "held torques scale with J as well"
     trusted = fit(bench, model, [data], method=method)
     assert trusted.validation.budget == ()
     assert trusted.values[known] == pytest.approx(e.values[known], rel=2e-3)

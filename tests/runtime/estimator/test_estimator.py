@@ -96,20 +96,26 @@ def test_an_estimate_is_told_in_as_many_digits_as_its_repeatability_allows() -> 
 
 
 @pytest.mark.parametrize(
-    ("repeatability", "inertia", "angle_scale", "said"),
+    ("repeatability", "known", "said"),
     [
-        ({"k_m": 1e-5, "f_v": 1e-5}, 0.01, 0.003, "total about 2 %, as J is known to 1 %"),
-        ({"k_1": 0.012, "f_v": math.inf}, 0.01, 0.003, "total about 2.3 %, as J is known to 1 %"),
-        ({"k_1": 1e-5, "T_c": 0.012}, 0.01, 0.003, "total about 2 to 2.4 %, as J is known to 1 %"),
-        ({"k_1": 1e-5}, 0.5, 0.0, "total about 98 %, as J is known to 50 %"),
-        ({"k_1": 1e-5}, 0.001, 0.0, "total at least 0.2 %, as J is known to 0.1 %"),
-        ({"k_m": 1e-5}, 0.0, 0.003, "total at least 0.59 %, as the angle's scale is known to 0.3 %"),
-        ({"k_m": 1e-5}, 0.0, 0.0, ""),
-        ({"k_m": math.inf}, 0.01, 0.003, ""),
-        ({}, 0.01, 0.003, ""),
+        ({"k_m": 1e-5, "f_v": 1e-5}, (0.01, 0.003, 0.0), "total about 2 %, as J is known to 1 %"),
+        ({"k_1": 0.012, "f_v": math.inf}, (0.01, 0.003, 0.0), "total about 2.3 %, as J is known to 1 %"),
+        ({"k_1": 1e-5, "T_c": 0.012}, (0.01, 0.003, 0.0), "total about 2 to 2.4 %, as J is known to 1 %"),
+        ({"k_1": 1e-5}, (0.5, 0.0, 0.0), "total about 98 %, as J is known to 50 %"),
+        ({"k_1": 1e-5}, (0.001, 0.0, 0.0), "total at least 0.2 %, as J is known to 0.1 %"),
+        ({"k_m": 1e-5}, (0.0, 0.003, 0.0), "total at least 0.59 %, as the angle's scale is known to 0.3 %"),
+        ({"k_m": 1e-5}, (0.0, 0.0, 0.0), ""),
+        ({"k_m": math.inf}, (0.01, 0.003, 0.0), ""),
+        ({}, (0.01, 0.003, 0.0), ""),
+        (
+            {"k_m": 1e-5, "T_c": 1e-5},
+            (0.0, 0.0, 0.01),
+            "total at least 0.001 to 2 %, as the current's scale is known to 1 %",
+        ),
     ],
 )
 def test_the_total_is_told_by_what_is_known_before_a_run(
-    repeatability: dict[str, float], inertia: float, angle_scale: float, said: str
+    repeatability: dict[str, float], known: tuple[float, float, float], said: str
 ) -> None:
-    assert total(repeatability, Systematic(inertia=inertia, angle_scale=angle_scale)) == said
+    inertia, angle, current = known
+    assert total(repeatability, Systematic(inertia=inertia, angle_scale=angle, current_scale=current)) == said
