@@ -32,6 +32,7 @@ from emb_bench.brake.parameters import (
     K_1,
     K_M,
     T_C,
+    VISCOUS_ASYMMETRY,
     J,
 )
 from emb_runtime.config.bench import BrakeParameters
@@ -43,10 +44,15 @@ _ITERATIONS = 60  # of a root search; Newton needs 3 to 5, bisection alone 55
 _ROUNDING = 1e-15  # of a segment's length: no time within it can be told more exactly
 
 
-def advance_exact(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any) -> None:
-    """One sample period, in place; arguments are those of :func:`emb_bench.brake.motion.advance`."""
+def advance_exact(
+    p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any, s: Any, viscous_asymmetry: float = 0.0
+) -> None:
+    """One sample period, in place; arguments are those of :func:`emb_bench.brake.motion.advance`.
+
+    Friction depends on the direction d = ±1 of motion: T_c + f_v (1 + d viscous_asymmetry) |x2|.
+    """
     drive, spring = p.k_m * u / p.J, p.gamma * p.k_1 / p.J
-    coulomb, damping = p.T_c / p.J, p.f_v / p.J
+    coulomb, viscous = p.T_c / p.J, p.f_v / p.J
     _delayed_switch(p, x, u, t_s, chosen, s)
     x1, x2 = float(x[0]), float(x[1])
     left = t_s
@@ -54,6 +60,7 @@ def advance_exact(p: BrakeParameters, x: Any, u: float, t_s: float, chosen: Any,
         pull = drive - spring * max(x1, 0.0)
         ahead = x2 if x2 != 0.0 else pull
         direction = 1.0 if ahead > 0.0 else -1.0
+        damping = viscous * (1.0 + direction * viscous_asymmetry)
         if x2 == 0.0 and abs(pull) <= coulomb:
             for j in range(chosen.shape[0]):
                 s[j, 1] = 0.0
@@ -137,6 +144,8 @@ def _glide_sensitivity(
         constant = w
     elif i in (CURRENT_OFFSET, COMMAND):
         constant = p.k_m / p.J
+    elif i == VISCOUS_ASYMMETRY:
+        velocity_share = -direction * p.f_v / p.J
     first, second = x2, a
     s_first = s2
     s_second = constant + angle_share * x1 + velocity_share * x2 + acceleration_share * a - damping * s2 - w * s1

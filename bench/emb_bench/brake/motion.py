@@ -36,8 +36,8 @@ def advance(
     """
     if mechanics.solver == EULER:
         advance_euler(p, x, u, t_s, chosen, s)
-    elif is_plain(mechanics):
-        advance_exact(p, x, u, t_s, chosen, s)
+    elif is_plain(mechanics) or mechanics.viscous_asymmetry != 0.0:  # which goes with no other feature
+        advance_exact(p, x, u, t_s, chosen, s, mechanics.viscous_asymmetry)
     else:
         advance_extended(mechanics, p, x, u, t_s, chosen, s)
 
@@ -47,7 +47,7 @@ PLAIN = Mechanics()
 
 def is_plain(m: Mechanics) -> bool:
     """Returns True if a brake solved exactly has none of the features beyond the thesis's equations."""
-    return m[1:] == PLAIN[1:]  # but for the solver
+    return m[1:-1] == PLAIN[1:-1]  # but for the solver, and the tolerance with which features are integrated
 
 
 def rest() -> Floats:

@@ -108,6 +108,15 @@ PARAMETERS: Mapping[str, Parameter] = {
         effect="an error of the velocity's scale",
         remedy="calibrate it, or --nuisance velocity_gain",
     ),
+    "viscous_asymmetry": Parameter(
+        "1",
+        False,
+        "share by which f_v is larger in the positive direction and smaller in the negative",
+        -0.9,
+        0.9,
+        effect="a viscous friction that depends on the direction, f_v (1 ± it),",
+        remedy="--nuisance viscous_asymmetry",
+    ),
     "quadratic": Parameter(
         "1/rad",
         about="curvature of the clamping force, k_1 x (1 + quadratic x + cubic x²) [1/rad]",
@@ -232,6 +241,7 @@ HYSTERESIS = _index("hysteresis")
 CURRENT_LAG = _index("current_lag")
 CURRENT_OFFSET = _index("current_offset")
 VELOCITY_GAIN = _index("velocity_gain")
+VISCOUS_ASYMMETRY = _index("viscous_asymmetry")
 PLAY = _index("play")
 COMMAND = len(PARAMETERS)
 """Current that is commanded in the period at hand, and in no other [A]: what is unknown where a report was lost."""

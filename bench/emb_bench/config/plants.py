@@ -49,6 +49,8 @@ class Mechanics(NamedTuple):
     current_lag: Annotated[float, Meta(ge=SHORTEST_LAG, le=0.1)] = 0.0  # Time constant of the current [s]; 0: none
     play: Annotated[float, Meta(ge=0, le=10)] = 0.0
     """Travel of the motor after a turn until the clamp, and with it the clamping force, follows it [rad]."""
+    viscous_asymmetry: Annotated[float, Meta(ge=-0.9, le=0.9)] = 0.0
+    """Share by which f_v is larger in the positive direction and smaller in the negative; with no other feature."""
     tolerance: Annotated[float, Meta(gt=0, le=1e-8)] = 1e-8
     """Local error of the velocity per step, where features are integrated [rad/s], [m/s] of a linear machine."""
 
@@ -78,6 +80,7 @@ class Plant:
 DEFAULT_PLANT = "exact"  # Plant where none is named: it sticks at rest, as a real brake does
 THESIS_PLANT = "euler"  # The thesis's plant; that of logs and trainings of versions that knew no other
 RECORDED_PLANT = "recorded"  # Name of the machine in the bench file of a recording of others
+DIRECTED = "viscous_asymmetry"
 BUILT_IN = {
     THESIS_PLANT: Plant(THESIS_PLANT, Mechanics(solver=EULER), Instruments()),
     DEFAULT_PLANT: Plant(DEFAULT_PLANT, Mechanics(solver=EXACT), Instruments()),
@@ -120,6 +123,8 @@ def _contradictions(given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     for key in features:
         if (solver := given.get("solver", "exact")) != "exact":
             yield key, f'goes with solver = "exact", not with "{solver}"'
+        if DIRECTED in given and key != DIRECTED:
+            yield key, f"does not go with {DIRECTED}: expected one of the two"
         if (needed := _NEEDED.get(key, key)) not in given:
             yield key, f"has no effect without {needed}"
     if {"play", "hysteresis"} <= {*given}:

@@ -39,7 +39,7 @@ def derived(records: Sequence[Experiment], t_s: float) -> Derived | None:
         angle, velocity = record.all_samples[:LONGEST].T
         lag, deviation = _lag(angle, velocity, t_s)
         if lag > max(SURE * deviation, LEAST * t_s):
-            return Derived(*_bandwidth(angle, velocity, t_s), float(special.ndtr(-lag / deviation)))
+            return Derived(*_bandwidth(angle, velocity, t_s), float(special.ndtr(-lag / max(deviation, 1e-300))))
     return None
 
 

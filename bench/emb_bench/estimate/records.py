@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import NamedTuple
 
-from emb_bench.brake.motion import Floats
+from emb_bench.brake.motion import Floats, is_plain
 from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS
 from emb_bench.config.bench import Bench
-from emb_bench.config.plants import EXACT, Plant
+from emb_bench.config.plants import DIRECTED, EXACT, Plant
 from emb_bench.experiment.simulate import SystematicErrors
 from emb_bench.information.evaluation import Question
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -144,6 +144,10 @@ def check_model(plant: Plant, names: Sequence[str]) -> None:
             "have it"
         )
     m = plant.mechanics
+    if DIRECTED in names and (m.solver != EXACT or features or not is_plain(m._replace(viscous_asymmetry=0.0))):
+        raise UsageError(
+            f"plant '{plant.name}': {DIRECTED}: expected a plant that is solved exactly and has no other feature"
+        )
     with_play, with_hysteresis = (getattr(m, name) > 0.0 or name in features for name in ("play", "hysteresis"))
     if with_play and with_hysteresis and {"play", "hysteresis"} & {*features}:
         raise UsageError(

@@ -21,11 +21,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy import special
 
-from emb_bench.brake.motion import Floats
-from emb_bench.brake.parameters import CURVED, PARAMETERS, SI, Parameter, Quantity, quantity
+from emb_bench.brake.motion import Floats, is_plain
+from emb_bench.brake.parameters import CURVED, FEATURES, PARAMETERS, SI, Parameter, Quantity, quantity
 from emb_bench.config.bench import Bench
 from emb_bench.config.machine import Machine
-from emb_bench.config.plants import EXACT, Mechanics
+from emb_bench.config.plants import DIRECTED, EXACT, Mechanics
 from emb_bench.estimate.average import SHARES, Effect, average, unaveraged
 from emb_bench.estimate.derived_velocity import derived
 from emb_bench.estimate.prediction import Problem
@@ -174,6 +174,7 @@ def held(problem: Problem) -> tuple[str, ...]:
     timed = has_time_for_a_delay(problem.plant)
     estimated = {u.name for u in problem.unknowns}
     observed = problem.plant.instruments.observer_bandwidth > 0.0
+    directed = problem.bench.machine is not None and is_plain(problem.plant.mechanics) and not estimated & {*FEATURES}
     return tuple(
         name
         for name, effect in EFFECTS.items()
@@ -181,6 +182,7 @@ def held(problem: Problem) -> tuple[str, ...]:
         and name not in estimated | {LAGGING, *TORQUES}
         and (name != "delay" or timed)
         and (name != "velocity_gain" or not observed)
+        and (name != DIRECTED or directed)
     )
 
 

@@ -558,6 +558,8 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
     if e.bench.machine is None:
         found.append(f"{otherwise}find a model that explains it: {again} --model all")
     else:
+        if border := [c.label for c in study.conclusions if Doubt.AT_BORDER in c.finding.doubts]:
+            found.append(f"enter another guess of {', '.join(border)} in the map: a factor of 10 about it is searched")
         found.append(f"{otherwise}estimate what the model lacks, too: {again} --nuisance NAME")
     if e.method == "oem":
         found.append(f"if that does not help, allow for a disturbance: {again} --method pem")

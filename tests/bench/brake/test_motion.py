@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from emb_bench.brake.motion import SENSITIVE, STATES, Floats, advance, no_sensit
 from emb_bench.brake.parameters import FEATURES as NAMED
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import load_bench
-from emb_bench.config.plants import EULER, EXACT, Mechanics
+from emb_bench.config.plants import DIRECTED, EULER, EXACT, Mechanics
 
 BENCH = load_bench()
 P = BENCH.brake
@@ -28,11 +29,16 @@ FEATURES = {
     "hysteresis": 0.1,
     "current_lag": 0.002,
     "play": 0.3,
+    "viscous_asymmetry": -0.2,
 }
 
 
 def start() -> Floats:
     return np.array([5.0, 20.0, 0.0, 1.0])
+
+
+def advance_directed(m: Mechanics, p: Any, x: Floats, u: float, t_s: float, chosen: Any, s: Floats) -> None:
+    advance_exact(p, x, u, t_s, chosen, s, m.viscous_asymmetry)
 
 
 def moved(m: Mechanics) -> tuple[Floats, Floats]:
@@ -50,7 +56,9 @@ def with_feature(name: str) -> Mechanics:
     [
         (Mechanics(EULER), lambda _, *arguments: advance_euler(*arguments)),
         (Mechanics(EXACT), lambda _, *arguments: advance_exact(*arguments)),
-        *((with_feature(name), advance_extended) for name in FEATURES),
+        *((with_feature(name), advance_extended) for name in FEATURES if name != DIRECTED),
+        (with_feature(DIRECTED), advance_directed),
+        (Mechanics(EXACT, tolerance=1e-11), lambda _, *arguments: advance_exact(*arguments)),
     ],
 )
 def test_each_brake_is_moved_by_its_own_solver(m: Mechanics, solver: Callable[..., None]) -> None:
@@ -58,6 +66,24 @@ def test_each_brake_is_moved_by_its_own_solver(m: Mechanics, solver: Callable[..
     solver(m, P, x, 2.0, T_S, chosen, s)
     assert_array_equal(moved(m)[0], x)
     assert_array_equal(moved(m)[1], s)
+
+
+def test_friction_by_direction_has_the_sensitivities_of_central_differences() -> None:
+    """Over turns of the motion, each way of which has a viscous friction of its own."""
+
+    def run(asymmetry: float, names: tuple[str, ...] = ()) -> tuple[Floats, Floats]:
+        x, (chosen, s), seen = start(), no_sensitivity(names), []
+        for k in range(60):
+            current = 2.0 if k % 20 < 10 else -2.0
+            advance(Mechanics(EXACT, viscous_asymmetry=asymmetry), P, x, current, T_S, chosen, s)
+            seen.append(x[:2].copy())
+        return np.array(seen), s
+
+    (_, s), step = run(0.3, ("viscous_asymmetry", "f_v")), 1e-6
+    difference = (run(0.3 + step)[0][-1] - run(0.3 - step)[0][-1]) / (2.0 * step)
+    np.testing.assert_allclose(s[0, :2], difference, rtol=1e-5, atol=1e-6)
+    slower, faster = run(0.5)[0], run(-0.5)[0]
+    assert slower[9, 1] < run(0.0)[0][9, 1] < faster[9, 1]  # tightening has more friction, or less
 
 
 def test_at_the_start_only_the_initial_state_is_sensitive_to_itself() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from emb_bench.config.bench import Bench, parse_bench
-from emb_bench.config.plants import EXACT, Instruments, Mechanics, Plant
+from emb_bench.config.plants import DIRECTED, EXACT, Instruments, Mechanics, Plant
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import BenchFileError
 
@@ -32,7 +32,7 @@ def test_the_shipped_bench_has_a_plant_for_every_feature(bench: Bench) -> None:
         if value != ideal[key]
     }
     # 2 and 1 rad are both the default and the sources' values.
-    assert changed == set(ideal) - {"stribeck_exponent", "hysteresis_travel", "tolerance"}
+    assert changed == set(ideal) - {"stribeck_exponent", "hysteresis_travel", "tolerance", DIRECTED}
     assert all(name == plant.name for name, plant in bench.plants.items())
 
 
@@ -76,6 +76,7 @@ def test_what_makes_no_plant_is_refused_with_file_key_and_reason() -> None:
         (["hysteresis = 0.1", "hysteresis_travel = 0"], "hysteresis_travel", "from 0.01 to 100"),
         (["play = 11"], "play", "0 to 10"),
         (["play = 0.1", "hysteresis = 0.1"], "play", "does not go with hysteresis"),
+        (["viscous_asymmetry = 0.1", "play = 0.1"], "play", "does not go with viscous_asymmetry"),
         (["current_lag = 0"], "current_lag", "1e-05 to 0.1"),
         (["current_lag = true"], "current_lag", "got true"),
         (["command_delay = 11"], "command_delay", "from 0 to 10"),

@@ -52,9 +52,16 @@ def test_a_machine_that_is_known_only_by_position_and_force_is_found(plain: Esti
         assert found[name][0] == pytest.approx(true, rel=0.01)
 
 
-@pytest.mark.slow
-def test_a_machine_whose_friction_depends_on_the_direction_does_not_fit() -> None:
-    assert not fitted(record(BY_DIRECTION)).validation.fits
+def test_friction_by_direction_is_named_and_found() -> None:
+    data = record(BY_DIRECTION, 4.0)
+    symmetric = fitted(data, replace(ASKED, window=0.1))
+    assert not symmetric.validation.fits
+    assert symmetric.validation.suspects[0].name == "viscous_asymmetry"
+    asked = EstimationProblem(("T_c", "f_v", "J"), ("current_offset", "viscous_asymmetry"), window=0.1)
+    found = of_machine(fitted(data, asked))
+    f_v, share = found["f_v"][0], found["viscous_asymmetry"][0]
+    assert f_v * (1.0 + share) == pytest.approx(160.0, rel=0.02)
+    assert f_v * (1.0 - share) == pytest.approx(240.0, rel=0.02)
 
 
 @pytest.mark.slow
@@ -143,5 +150,7 @@ def test_too_few_windows_and_starts_that_are_asked_for_are_refused() -> None:
     data = record(Machine(), 3.0)
     with pytest.raises(UsageError, match=r"6 windows of 0\.5 s are too few for 4 unknowns"):
         fitted(data)
+    with pytest.raises(UsageError, match="no other feature"):
+        fitted(data, EstimationProblem(("T_c",), ("viscous_asymmetry", "break_away"), window=0.1))
     with pytest.raises(UsageError, match="a start of its own"):
         fitted(data, EstimationProblem(("T_c", "f_v", "J"), ("x1_0",), window=0.1))
