@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,23 +37,30 @@ LATEST = 20  # Largest delay that is looked for [samples]
 EARLY, LATE = -0.1, 0.9  # Delays that can be estimated [samples]
 BETTER = 0.5  # Share of the squares that another delay must leave
 SURE = 10.0  # Standard deviations by which a coefficient is no zero
+SCALED = 1.2  # Ratio of the ways of angle and velocity from which on their scales contradict each other
 FACTOR = 10.0  # Values beyond a guess by this factor are not searched
 SPECIAL = (-32768.0, 32767.0, 65535.0, -2147483648.0, 2147483647.0, 4294967295.0, -999.0, -9999.0, 9999.0, 99999.0)
 """Numbers with which a recorder says that it has none, besides those beyond all others."""
 
 
-class Check(NamedTuple):
-    """One fault."""
+Of = TypeVar("Of")
+Found = Mapping[str, object] | None
+"""Numbers and texts of a fault, by their places in its sentence; None where there is none."""
+Checks = Mapping[Callable[[Of], Found], str]
+"""The faults that are looked for: what finds each, and the sentence that names it. The first one counts most."""
 
-    name: str
-    finds: Callable[[Any], tuple[float | str, ...] | None]  # Numbers and texts of what was found
-    says: str  # With places for them
+
+def found_by(checks: Checks[Of], of: Of) -> Iterator[str]:
+    """Each fault in words."""
+    for finds, says in checks.items():
+        if (found := finds(of)) is not None:
+            yield says.format(**found)
 
 
-def _found(checks: tuple[Check, ...], of: Any) -> Iterator[str]:
-    for check in checks:
-        if (numbers := check.finds(of)) is not None:
-            yield check.says.format(*numbers)
+def require(checks: Checks[Series], s: Series, source: str) -> None:
+    """Refuse the first fault of a signal; messages call the file ``source``."""
+    for said in found_by(checks, s):
+        raise UsageError(f"{source}: {said}")
 
 
 # ---- times and values ----
@@ -71,81 +78,58 @@ class Series(NamedTuple):
     noise: float = 0.0  # Standard deviation, in the unit of the column
     rates: Floats | None = None  # Velocity of an angle at its samples, in units of the column per second
 
+    def at(self, k: int) -> dict[str, object]:
+        """Places of a fault between the samples k and k + 1."""
+        return {"name": self.name, "row": self.rows[k], "next": self.rows[k] + 1, "last": self.rows[-1]}
 
-def _equal(s: Series) -> tuple[float | str, ...] | None:
-    same = np.flatnonzero(np.diff(s.times) == 0.0)
-    return (len(same), len(s.times), s.rows[same[0] + 1]) if len(same) > EQUAL * len(s.times) else None
 
-
-def _back(s: Series) -> tuple[int, Floats] | None:
+def _begins_anew(s: Series) -> Found:
     back = np.flatnonzero(np.diff(s.times) < 0.0)
-    return (int(back[0]), s.times[back[0] + 1 : back[0] + 1 + SHORT]) if len(back) else None
-
-
-def _begins_anew(s: Series) -> tuple[float | str, ...] | None:
-    if (found := _back(s)) is None or found[1].max() >= s.times[found[0]] or found[1].max() == found[1].min():
+    if not len(back):
         return None
-    k, row = found[0], s.rows[found[0]]
+    k, after = int(back[0]), s.times[back[0] + 1 : back[0] + 1 + SHORT]
+    if after.max() >= s.times[k] or after.max() == after.min():
+        return None
     period = (s.times[k] - s.times[k + 1] + np.median(np.abs(np.diff(s.times)))) / s.tick
-    return row, f"{s.times[k]:.10g}", f"{period:.10g}", row, row + 1, s.rows[-1]
+    return s.at(k) | {"time": s.times[k], "period": period}
 
 
-def _runs_backwards(s: Series) -> tuple[float | str, ...] | None:
-    if (found := _back(s)) is None:
-        return None
-    k = found[0]
-    return s.rows[k], f"{s.times[k]:.10g}", f"{s.times[k + 1]:.10g}", s.rows[k]
+def _runs_backwards(s: Series) -> Found:
+    back = np.flatnonzero(np.diff(s.times) < 0.0)
+    return s.at(back[0]) | {"time": s.times[back[0]], "then": s.times[back[0] + 1]} if len(back) else None
 
 
-def _jumps(s: Series) -> tuple[float | str, ...] | None:
+def _is_equal(s: Series) -> Found:
+    same = np.flatnonzero(np.diff(s.times) == 0.0)
+    return s.at(same[0]) | {"same": len(same), "all": len(s.times)} if len(same) > EQUAL * len(s.times) else None
+
+
+def _jumps(s: Series) -> Found:
     steps = np.diff(s.times)
     k = int(np.argmax(steps))
     rest = s.times[-1] - s.times[0] - steps[k]
-    row = s.rows[k]
-    apart = steps[k] > max(rest, 100.0 * float(np.median(steps)))
-    return (f"{steps[k]:.6g}", row, row, row + 1, s.rows[-1]) if apart else None
+    return s.at(k) | {"by": steps[k]} if steps[k] > max(rest, 100.0 * float(np.median(steps))) else None
 
 
-def _sparse(s: Series) -> tuple[float | str, ...] | None:
+def _is_sparse(s: Series) -> Found:
     apart = float(np.median(np.diff(s.times)))
-    return (f"{apart:.6g}", f"{s.sample_time:g}") if 0.0 < s.sample_time * SPARSE < apart else None
+    return {"apart": apart, "given": s.sample_time} if 0.0 < s.sample_time * SPARSE < apart else None
 
 
-TIMES = (
-    Check(
-        "time begins anew",
-        _begins_anew,
-        "the time begins anew after row {}, at {} s: of a counter, [timing] wrap = {} continues it; of two recordings, "
-        "[file] rows = [1, {}] or [{}, {}] is one of them",
-    ),
-    Check(
-        "time runs backwards",
-        _runs_backwards,
-        "the time runs backwards after row {}, from {} to {} s: sort the rows, or read those before with [file] "
-        "rows = [1, {}]",
-    ),
-    Check(
-        "equal times",
-        _equal,
-        "{} of {} rows have the same time as the row before, the first one row {}, and it does not tell them apart: "
-        "where the rows are evenly apart, leave [timing] column out and give sample_time",
-    ),
-    Check(
-        "time jumps",
-        _jumps,
-        "the time jumps by {} s after row {}: [file] rows = [1, {}] or [{}, {}] is one recording",
-    ),
-    Check("sparse rows", _sparse, "the rows are {} s apart, where [timing] sample_time says {} s"),
-)
+TIMES: Checks[Series] = {
+    _begins_anew: "the time begins anew after row {row}, at {time:.10g} s: of a counter, [timing] wrap = {period:.10g} "
+    "continues it; of two recordings, [file] rows = [1, {row}] or [{next}, {last}] is one of them",
+    _runs_backwards: "the time runs backwards after row {row}, from {time:.10g} to {then:.10g} s: sort the rows, or "
+    "read those before with [file] rows = [1, {row}]",
+    _is_equal: "{same} of {all} rows have the same time as the row before, the first one row {next}, and it does not "
+    "tell them apart: where the rows are evenly apart, leave [timing] column out and give sample_time",
+    _jumps: "the time jumps by {by:.6g} s after row {row}: [file] rows = [1, {row}] or [{next}, {last}] is one "
+    "recording",
+    _is_sparse: "the rows are {apart:.6g} s apart, where [timing] sample_time says {given:g} s",
+}
 
 
-def require_times(s: Series, source: str) -> None:
-    """Refuse times that make no grid; messages call the file ``source``."""
-    for said in _found(TIMES, s):
-        raise UsageError(f"{source}: {said}")
-
-
-def _special(s: Series) -> tuple[float | str, ...] | None:
+def _is_special(s: Series) -> Found:
     """Values beyond all others, or numbers known as special, or the same number now and then between others."""
     low, middle, high = np.percentile(s.values, (5.0, 50.0, 95.0))
     spreads = np.abs(s.values - middle) / max(high - low, 10.0 * s.noise, 1e-300)
@@ -157,13 +141,11 @@ def _special(s: Series) -> tuple[float | str, ...] | None:
         after, counts = np.unique(s.values[1:][steps > FAR * np.percentile(steps, 80.0)], return_counts=True)
         for value in (0.0, *SPECIAL, *after[counts > 1][:MOST_VALUES]):
             far |= _between(s, s.values == value)
-    count = int(far.sum())
-    if not 0 < count <= RARE * len(far) or high == low:
+    if not 0 < far.sum() <= RARE * len(far) or high == low:
         return None
-    k = int(np.argmax(far))
-    low, high = s.values[~far].min() - 0.1 * (high - low), s.values[~far].max() + 0.1 * (high - low)
-    first = f"{s.values[k]:.10g}"
-    return count, s.name, first, s.rows[k], first, f"{low:.4g}", f"{high:.4g}"
+    k, others, margin = int(np.argmax(far)), s.values[~far], 0.1 * (high - low)
+    ends = {"low": others.min() - margin, "high": others.max() + margin}
+    return s.at(k) | ends | {"count": far.sum(), "value": s.values[k]}
 
 
 def _between(s: Series, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -178,20 +160,26 @@ def _between(s: Series, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return found
 
 
+VALUES: Checks[Series] = {
+    _is_special: "{count} values of {name} are apart from all others, the first one {value:.10g} in row {row}: where "
+    "they say that there is no value, special = [{value:.10g}], or range = [{low:.4g}, {high:.4g}], of the signal "
+    "leaves them out",
+}
+
+
 def _off(s: Series) -> Floats:
-    """Step of the angle from each sample to the next beyond that of its velocity, measured or of the steps around."""
+    """Distance of each step of the angle from that of its velocity, measured or of steps around; none over a gap."""
     steps, apart = np.diff(s.values), np.diff(s.times)
     if s.rates is not None:
         expected = 0.5 * (s.rates[1:] + s.rates[:-1])
     else:
         rates = np.pad(steps / np.where(apart > 0.0, apart, np.inf), 2, mode="edge")
         expected = np.median(np.lib.stride_tricks.sliding_window_view(rates, 5), axis=1)
-    result: Floats = np.where(apart < 1.5 * np.median(apart), steps - expected * apart, 0.0)  # none over a gap
-    return result
+    return np.where(apart < 1.5 * np.median(apart), np.abs(steps - expected * apart), 0.0)
 
 
-def _wraps(s: Series) -> tuple[float | str, ...] | None:
-    off = np.abs(_off(s))
+def _wraps(s: Series) -> Found:
+    off = _off(s)
     far = off > 0.5 * off.max()
     if far.sum() < 2:
         return None
@@ -201,53 +189,23 @@ def _wraps(s: Series) -> tuple[float | str, ...] | None:
     usual = float(np.median(np.abs(np.diff(s.values)))) + 10.0 * s.noise
     if not (alike and period > 5.0 * usual and 0.8 * period < extent < 1.05 * period):
         return None
-    return s.name, f"{period:.10g}", s.rows[int(np.argmax(far))], int(far.sum()), f"{period:.10g}"
+    return s.at(int(np.argmax(far))) | {"period": period, "count": far.sum()}
 
 
-def _is_set(s: Series) -> tuple[float | str, ...] | None:
-    off = np.abs(_off(s))
+def _is_set(s: Series) -> Found:
+    off = _off(s)
     far = off > max(20.0 * float(np.percentile(off, 99.0)), 0.05 * float(np.ptp(s.values)), 20.0 * s.noise)
-    if not far.any():
-        return None
     k = int(np.argmax(far))
-    row = s.rows[k]
-    return s.name, f"{s.values[k]:.6g}", f"{s.values[k + 1]:.6g}", row, int(far.sum()), row, row + 1, s.rows[-1]
+    return s.at(k) | {"value": s.values[k], "then": s.values[k + 1], "count": far.sum()} if far.any() else None
 
 
-VALUES = (
-    Check(
-        "special values",
-        _special,
-        "{} values of {} are apart from all others, the first one {} in row {}: where they say that there is no value, "
-        "special = [{}], or range = [{}, {}], of the signal leaves them out",
-    ),
-)
-ANGLES = (
-    Check(
-        "wrapped angle",
-        _wraps,
-        "{} jumps by {} after row {}, {} times in all: it begins anew after a period; wrap = {} of the signal "
-        "continues it",
-    ),
-    Check(
-        "set angle",
-        _is_set,
-        "{} jumps from {} to {} after row {}, {} times in all, as no motion does: was it set anew? [file] rows = "
-        "[1, {}] or [{}, {}] is one recording; range = [LOW, HIGH] of the signal leaves single values out",
-    ),
-)
-
-
-def require_values(s: Series, source: str) -> None:
-    """Refuse values that are none; see :func:`require_times`."""
-    for said in _found(VALUES, s):
-        raise UsageError(f"{source}: {said}")
-
-
-def require_angle(s: Series, source: str) -> None:
-    """Refuse jumps of an angle; see :func:`require_times`."""
-    for said in _found(ANGLES, s):
-        raise UsageError(f"{source}: {said}")
+ANGLES: Checks[Series] = {
+    _wraps: "{name} jumps by {period:.10g} after row {row}, {count} times in all: it begins anew after a period; "
+    "wrap = {period:.10g} of the signal continues it",
+    _is_set: "{name} jumps from {value:.6g} to {then:.6g} after row {row}, {count} times in all, as no motion does: "
+    "was it set anew? [file] rows = [1, {row}] or [{next}, {last}] is one recording; range = [LOW, HIGH] of the signal "
+    "leaves single values out",
+}
 
 
 # ---- the equations ----
@@ -332,36 +290,31 @@ def _double(rate: Floats, t_s: float) -> Floats:
     return result
 
 
-def _velocity(e: Equation) -> tuple[float, float] | None:
-    """Correlation of the way that the angle goes with that of the velocity, and their ratio."""
+def _ways(e: Equation) -> tuple[float, float]:
+    """Correlation of the ways of the angle with those that the velocity says, and their ratio; zeros without one."""
     velocity, span = e.motion.velocity, e.span
     if velocity is None:
-        return None
+        return 0.0, 0.0
     ways = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * e.motion.sample_time)])
-    said = (ways[span:] - ways[:-span])[: len(e.kept)]
-    seen = (e.motion.angle[span:] - e.motion.angle[:-span])[: len(e.kept)]
-    there = np.isfinite(said) & np.isfinite(seen)
-    size = float(said[there] @ said[there])
-    if not size > 0.0:
-        return None
-    ratio = float(said[there] @ seen[there]) / size
-    return ratio * math.sqrt(size / float(seen[there] @ seen[there])), ratio
+    said, seen = (row[span:] - row[:-span] for row in (ways, e.motion.angle))
+    said, seen = (row[np.isfinite(said) & np.isfinite(seen)] for row in (said, seen))
+    moved, size = float(seen @ seen), float(said @ said)
+    return (
+        (float(said @ seen) / math.sqrt(moved * size), float(said @ seen) / size) if moved * size > 0.0 else (0.0, 0.0)
+    )
 
 
-def _velocity_against(e: Equation) -> tuple[float | str, ...] | None:
-    found = _velocity(e)
-    return () if found is not None and found[0] < -0.9 else None
+def _velocity_against(e: Equation) -> Found:
+    return {} if _ways(e)[0] < -0.9 else None
 
 
-def _velocity_scaled(e: Equation) -> tuple[float | str, ...] | None:
-    found = _velocity(e)
-    if found is None or found[0] < 0.95 or 1.0 / SCALED < found[1] < SCALED:
-        return None
-    return f"{found[1]:.4g}", f"{found[1]:.4g}"
+def _velocity_scaled(e: Equation) -> Found:
+    correlation, ratio = _ways(e)
+    return {"ratio": ratio} if correlation > 0.95 and not 1.0 / SCALED < ratio < SCALED else None
 
 
-def _driven_against(e: Equation) -> tuple[float | str, ...] | None:
-    return (e.motion.by,) if e.correlation(0.0) < -0.5 and _best(e)[1] < 0.8 else None
+def _driven_against(e: Equation) -> Found:
+    return {"by": e.motion.by} if e.correlation(0.0) < -0.5 and _best(e)[1] < 0.8 else None
 
 
 def _best(e: Equation) -> tuple[float, float]:
@@ -370,27 +323,24 @@ def _best(e: Equation) -> tuple[float, float]:
     return max(((d, e.correlation(d)) for d in np.linspace(whole - 1.0, whole + 1.0, 21).tolist()), key=lambda p: p[1])
 
 
-def _late(e: Equation) -> tuple[float | str, ...] | None:
+def _is_late(e: Equation) -> Found:
     best, correlation = _best(e)
     rest, now = 1.0 - correlation**2, 1.0 - max(e.correlation(0.0), 0.0) ** 2
     if EARLY < best < LATE or abs(best) > LATEST or correlation < 0.8 or rest > BETTER * now:
         return None
-    delay = e.motion.delay + best * e.motion.sample_time
-    how = "late" if best > 0.0 else "early"
-    return e.motion.by, f"{abs(best):.1f}", how, f"{delay:.2g}", e.motion.by
+    delay, how = e.motion.delay + best * e.motion.sample_time, "late" if best > 0.0 else "early"
+    return {"by": e.motion.by, "samples": abs(best), "how": how, "delay": delay}
 
 
-def _guess(e: Equation) -> tuple[float | str, ...] | None:
+def _is_far(e: Equation) -> Found:
     """Guesses that are beyond the search, from the coefficients of the equation at the best delay."""
-    names = ["k_m", *e.loads]
-    columns = np.stack([e.driven(_best(e)[0]), *e.loads.values()], axis=1)
+    names, columns = ["k_m", *e.loads], np.stack([e.driven(_best(e)[0]), *e.loads.values()], axis=1)
     found = np.linalg.lstsq(columns, e.left, rcond=None)[0]
-    sigma = np.sqrt(
-        np.diag(np.linalg.pinv(columns.T @ columns)) * np.sum((e.left - columns @ found) ** 2) / len(e.left)
-    )
-    told = {n: c for n, c, s in zip(names, found.tolist(), (SURE * sigma).tolist(), strict=True) if c > s}
-    known = {"k_m": 1.0} | dict(e.motion.known) if "k_m" not in e.motion.guess else dict(e.motion.known)
-    inertia = known.get("J") or next((known[n] / c for n, c in told.items() if n in known), math.nan)
+    spread = float(np.mean((e.left - columns @ found) ** 2))
+    sure = SURE * np.sqrt(np.diag(np.linalg.pinv(columns.T @ columns)) * spread)
+    told = {name: c for name, c, least in zip(names, found.tolist(), sure.tolist(), strict=True) if c > least}
+    known = ({} if "k_m" in e.motion.guess else {"k_m": 1.0}) | dict(e.motion.known)
+    inertia = known.get("J") or next((known[name] / c for name, c in told.items() if name in known), math.nan)
     gears = {"k_1": known.get("gamma", 1.0)}
     values = {"J": inertia} | {name: share * inertia / gears.get(name, 1.0) for name, share in told.items()}
     wrong = {
@@ -398,39 +348,23 @@ def _guess(e: Equation) -> tuple[float | str, ...] | None:
         for name, guess in e.motion.guess.items()
         if name in values and abs(math.log(values[name] / guess)) > math.log(FACTOR)
     }
-    if not wrong:
-        return None
-    return " and ".join(wrong), f"{FACTOR:g}", ", ".join(f"{name} = {value:.2g}" for name, value in wrong.items())
+    shown = ", ".join(f"{name} = {value:.2g}" for name, value in wrong.items())
+    return {"names": " and ".join(wrong), "values": shown} if wrong else None
 
 
-SCALED = 1.2  # Ratio of the ways of angle and velocity from which on their scales contradict each other
-EQUATIONS = (
-    Check("sign of the velocity", _velocity_against, "the velocity is against the angle: sign = -1 for one of the two"),
-    Check(
-        "scale of the velocity",
-        _velocity_scaled,
-        "the angle goes {} times as far as the velocity says: check unit, scale and the times; scale of "
-        "[signals.velocity] times {} agrees",
-    ),
-    Check(
-        "sign of what acts",
-        _driven_against,
-        "the motion is against the {}: sign = -1 for it, or for angle and velocity",
-    ),
-    Check(
-        "delay of what acts",
-        _late,
-        "the {} acts {} samples {}, more than is searched: delay = {} in [signals.{}] says so",
-    ),
-    Check(
-        "guess",
-        _guess,
-        "the guess of {} is too far off: only a factor of {} about it is searched; the recording says about {}",
-    ),
-)
+EQUATIONS: Checks[Equation] = {
+    _velocity_against: "the velocity is against the angle: sign = -1 for one of the two",
+    _velocity_scaled: "the angle goes {ratio:.4g} times as far as the velocity says: check unit, scale and the times; "
+    "scale of [signals.velocity] times {ratio:.4g} agrees",
+    _driven_against: "the motion is against the {by}: sign = -1 for it, or for angle and velocity",
+    _is_late: "the {by} acts {samples:.1f} samples {how}, more than is searched: delay = {delay:.2g} in [signals.{by}] "
+    "says so",
+    _is_far: f"the guess of {{names}} is too far off: only a factor of {FACTOR:g} about it is searched; the recording "
+    "says about {values}",
+}
 
 
 def contradictions(motion: Motion) -> tuple[str, ...]:
     """Contradictions of a map by its recording, the cause of others first."""
     equation = equation_of(motion)
-    return () if equation is None else tuple(_found(EQUATIONS, equation))
+    return () if equation is None else tuple(found_by(EQUATIONS, equation))

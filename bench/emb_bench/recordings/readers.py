@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from emb_bench.config.plants import Instruments
 from emb_bench.experiment.experiment import Experiment, Lack
-from emb_bench.recordings.faults import Motion, Series, contradictions, require_angle, require_times, require_values
+from emb_bench.recordings.faults import ANGLES, TIMES, VALUES, Motion, Series, contradictions, require
 from emb_bench.recordings.map_file import TIME, TIMED, Place, RecordingMap, Signal, Source
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_runtime.can.codec import parse
@@ -514,18 +514,18 @@ def _read(columns: Mapping[Place, Column], wanted: RecordingMap, source: str) ->
             sample_time=wanted.timing.sample_time if name == "angle" else 0.0,
             noise=signal.noise / signal.scale,
         )
-        require_times(series, source)
+        require(TIMES, series, source)
     for name, series in found.items():
         if given[name].wrap:
             found[name] = series._replace(values=np.unwrap(series.values, period=given[name].wrap))
             continue
-        require_values(series, source)
+        require(VALUES, series, source)
     angle, velocity = found["angle"], found.get("velocity")
     if velocity is not None:
         factor = given["velocity"].scale * given["velocity"].sign / (given["angle"].scale * given["angle"].sign)
         rates = (np.interp(angle.times, velocity.times, velocity.values) - given["velocity"].offset) * factor
         angle = angle._replace(rates=rates)
-    require_angle(angle, source)
+    require(ANGLES, angle, source)
     return found
 
 
