@@ -40,7 +40,10 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.control.actor import Actor
 from emb_runtime.errors import UsageError, near
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.safety.sensor_monitor import CONFIRMED, MEMORY, begin, judge, largest_current
+from emb_runtime.safety.response import MEMORY as RESPONSE
+from emb_runtime.safety.response import OPEN, PROVEN, VERDICT, response_model, take, unproven_law
+from emb_runtime.safety.response import begin as begin_response
+from emb_runtime.safety.sensor_monitor import CONFIRMED, MEMORY, OBEYS, begin, judge, largest_current
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current
 from emb_runtime.safety.shield_design import make_law
@@ -188,6 +191,7 @@ def run_excitation(
     limit, t_s = bench.limits.current, bench.timing.sample_time
     law = make_law(bench) if shielded else None
     thresholds, monitor = None if law is None else sensor_thresholds(bench, law), [0.0] * MEMORY
+    proof = None if law is None else (response_model(bench, law), unproven_law(bench, law), [0.0] * RESPONSE)
     states = np.zeros((count + 1, 2))
     wanted, currents = np.empty(count), np.empty(count)
     reasons, obeyed = np.zeros(count, np.int64), np.ones(count, np.bool_)
@@ -198,15 +202,20 @@ def run_excitation(
         y1, y2 = x1 + float(errors[k, 0]), x2 + float(errors[k, 1])
         estimator.take(y1, y2, k, float(currents[k - 1]) if k else 0.0)
         wanted[k] = excited.act(y1, y2, k, estimator)
-        if law is None or thresholds is None:
+        if law is None or thresholds is None or proof is None:
             u = clipped(float(wanted[k]), limit)
         else:
+            model, slow, response = proof
             if k == 0:
                 begin(monitor, y1, y2)
-            elif monitor[CONFIRMED] == 0.0:
+                begin_response(model, response, y1, y2)
+            elif response[VERDICT] == OPEN:
+                take(model, response, bool(obeyed[k - 1]), y1, y2, past[0])
+            if k > 0 and monitor[CONFIRMED] == 0.0:
                 judge(law, thresholds, monitor, t_s, y1, y2, bool(obeyed[k - 1]), past[0], float(currents[k - 1]))
             most = largest_current(law, thresholds, monitor, limit)
-            u, reasons[k] = sent_current(law, True, y1, y2, float(wanted[k]), past, k, most)
+            allowed = slow if monitor[OBEYS] != 0.0 and response[VERDICT] != PROVEN else law
+            u, reasons[k] = sent_current(allowed, True, y1, y2, float(wanted[k]), past, k, most)
         obeyed[k] = not math.isnan(u)
         past = (u if obeyed[k] else 0.0, *past[:4])
         return u if obeyed[k] else damped_current(x2, limit, bench.node.damping_velocity)

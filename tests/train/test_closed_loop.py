@@ -21,6 +21,7 @@ from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.safety.command_limits import LEFT
+from emb_runtime.safety.response import begin as begin_response
 from emb_runtime.safety.sensor_monitor import OBEYS, largest_current
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
@@ -142,6 +143,7 @@ def test_a_batch_that_hears_what_a_run_heard_sends_what_that_sent(plant: str, tm
     batch.experiments.noise[:] = 0.0
     batch.y[0] = heard[0]
     begin_monitor(batch.experiments.monitor[0], *heard[0].tolist())
+    begin_response(batch.setup.response, batch.experiments.response[0], *heard[0].tolist())
     for k in range(HORIZON - 1):
         # The noise that makes the batch's next measurement the run's.
         asked = float(of["policy_current"][active[k]])

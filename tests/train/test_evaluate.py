@@ -73,7 +73,8 @@ def test_a_draw_depends_on_the_seed_and_its_number_alone() -> None:
 
 
 def test_an_experiment_that_leaves_the_limits_keeps_what_it_had_and_is_not_home() -> None:
-    strong = Draw(0, BENCH.brake._replace(k_m=3.0 * BENCH.brake.k_m))  # far outside of what the shield covers
+    p = BENCH.brake  # its braking is outside of what the shield covers, its motor is not
+    strong = Draw(0, p._replace(k_m=0.55 * p.k_m, k_1=-2.0 * p.k_1))
     outcome = play(BENCH, WIDE, ("f_v",), constant(6.0), [strong])
     batch = Batch(BENCH, WIDE, ("f_v",), 1)
     batch.begin(0, np.random.default_rng(0), strong.brake)

@@ -97,7 +97,8 @@ def test_a_reference_as_an_excitation_is_the_trial() -> None:
 
 
 def test_an_experiment_that_leaves_the_limits_keeps_its_information_until_then() -> None:
-    strong = BENCH.brake._replace(k_m=4.0 * BENCH.brake.k_m)  # far outside of the shield's set
+    p = BENCH.brake  # its braking is outside of what the shield covers, its motor is not
+    strong = p._replace(k_m=0.55 * p.k_m, k_1=-2.0 * p.k_1)
     trials = Trials(BENCH, PM50, PARAMETER_NAMES, [Draw(0, strong), Draw(1, BENCH.brake)])
     (outcome,) = trials.play(SCALE, [OUT_AND_BACK])
     assert (outcome.left.tolist(), outcome.home.tolist()) == ([True, False], [False, True])

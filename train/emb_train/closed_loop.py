@@ -28,7 +28,10 @@ from emb_bench.sim.instruments import MEMORY, command, measure, settle
 from emb_bench.sim.simulated_brake import pass_period, sent_current
 from emb_runtime.config.bench import OLDEST_FRAME, PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import UsageError
-from emb_runtime.safety.sensor_monitor import CONFIRMED, judge, largest_current
+from emb_runtime.safety.response import MEMORY as RESPONSE
+from emb_runtime.safety.response import OPEN, PROVEN, VERDICT, ResponseModel, response_model, take, unproven_law
+from emb_runtime.safety.response import begin as begin_response
+from emb_runtime.safety.sensor_monitor import CONFIRMED, OBEYS, judge, largest_current
 from emb_runtime.safety.sensor_monitor import MEMORY as MONITOR
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
@@ -114,6 +117,8 @@ class Setup(NamedTuple):
     """Constants that experiments side by side share; it compiles."""
 
     law: ShieldLaw  # Law of the shield; its limit of the current holds also without a shield
+    unproven: ShieldLaw  # Law until the response is proven
+    response: ResponseModel
     thresholds: SensorThresholds
     """Of the sensor monitor: until the motion has shown its sign, it limits the current to a first move."""
     rules: Rules
@@ -138,7 +143,10 @@ def make_setup(
         damping,
     )
     thresholds = sensor_thresholds(bench, law)
-    return Setup(law, thresholds, rules, plant.mechanics, plant.instruments, no_sensitivity(parameters)[0])
+    slow, response = unproven_law(bench, law), response_model(bench, law)
+    return Setup(
+        law, slow, response, thresholds, rules, plant.mechanics, plant.instruments, no_sensitivity(parameters)[0]
+    )
 
 
 class Experiments(NamedTuple):
@@ -165,6 +173,7 @@ class Experiments(NamedTuple):
     violated: Bools  # Mask of the brakes outside their limits, shape [N]
     monitor: Floats
     """Memory of the sensor monitor, which is asked only until it confirms the polarity, shape [N, MONITOR]."""
+    response: Floats  # Memory of the proof of the response, until it is proven, shape [N, RESPONSE]
 
 
 def no_experiments(count: int, n: int, steps: int) -> Experiments:
@@ -185,6 +194,7 @@ def no_experiments(count: int, n: int, steps: int) -> Experiments:
         reasons=np.zeros(count, np.int64),
         violated=np.zeros(count, np.bool_),
         monitor=np.zeros((count, MONITOR)),
+        response=np.zeros((count, RESPONSE)),
     )
 
 
@@ -207,7 +217,7 @@ def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
 
 def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -> None:
     """One sample period of experiment ``i``, in place; arguments as for :func:`advance`."""
-    brakes, delay, x, s, m, memory, y, applied, past, k, noise, late, reasons, violated, monitor = experiments
+    brakes, delay, x, s, m, memory, y, applied, past, k, noise, late, reasons, violated, monitor, response = experiments
     rules = setup.rules
     p = BrakeParameters(
         float(brakes[i, 0]),
@@ -221,7 +231,9 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     y1, y2 = float(y[i, 0]), float(y[i, 1])
     u1, u2, u3, u4, u5 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2]), float(past[i, 3]), float(past[i, 4])
     most = largest_current(setup.law, setup.thresholds, monitor[i], setup.law.current)
-    asked, reasons[i] = sent_current(setup.law, rules.shielded, y1, y2, wanted, (u1, u2, u3, u4, u5), int(k[i]), most)
+    unproven = monitor[i, OBEYS] != 0.0 and response[i, VERDICT] != PROVEN
+    law = setup.unproven if unproven else setup.law
+    asked, reasons[i] = sent_current(law, rules.shielded, y1, y2, wanted, (u1, u2, u3, u4, u5), int(k[i]), most)
     sent = 0.0 if math.isnan(asked) else asked
     current = command(instruments, memory[i], asked)
     if math.isnan(current):
@@ -234,8 +246,10 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
     past[i, 0], past[i, 1], past[i, 2], past[i, 3], past[i, 4] = sent, u1, u2, u3, u4
     y[i, 0], y[i, 1], applied[i] = y1, y2, current
+    obeyed = not math.isnan(asked)
+    if response[i, VERDICT] == OPEN:
+        take(setup.response, response[i], obeyed, y1, y2, sent)
     if monitor[i, CONFIRMED] == 0.0:
-        obeyed = not math.isnan(asked)
         judge(setup.law, setup.thresholds, monitor[i], rules.sample_time, y1, y2, obeyed, sent, current)
     inside = rules.angle_low <= x[i, 0] <= rules.angle_high and abs(x[i, 1]) <= rules.velocity
     violated[i] = not inside
@@ -334,6 +348,7 @@ class Batch:
         for of_the_past in (e.applied, e.s, e.m, e.past, e.k, e.reasons, e.violated):
             of_the_past[i] = 0
         begin_monitor(e.monitor[i], *e.y[i].tolist())
+        begin_response(self.setup.response, e.response[i], *e.y[i].tolist())
 
     def advance(self, wanted: Floats) -> None:
         """One sample period with the requested currents [A], shape [N]; one that is not finite counts as 0 A.

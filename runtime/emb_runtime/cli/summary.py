@@ -176,6 +176,7 @@ def facts(outcome: Outcome) -> dict[str, Any]:
         "bus_error_classes": dict(outcome.bus_errors),
         "model_fits": outcome.model_fits,
         "unexplained": outcome.unexplained if judged else None,  # by any one brake [rad/s]
+        "response": outcome.response or None,  # how late the velocity follows the commands, once proven
         "unexplained_allowed": outcome.allowed if judged else None,
         "goal_reached": outcome.goal_reached,
         "home": outcome.home,

@@ -35,6 +35,8 @@ from emb_runtime.records import CycleRecord, Frame, NodeState, Reason, RunState,
 from emb_runtime.safety.command_limits import CommandLimits, Decision, checked, decide
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS, Guard
 from emb_runtime.safety.motion_balance import REST_SAMPLES, MotionBalance, unheld_motion
+from emb_runtime.safety.response import Response
+from emb_runtime.safety.response_cause import cause
 from emb_runtime.safety.sensor_monitor import SensorMonitor
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
@@ -56,6 +58,14 @@ IDLE: Final = NodeState.IDLE
 OBEYING: Final = NodeState.ACTIVE
 UNFIT: Final = (NodeState.STOPPING, NodeState.FAULT)
 PAIR: Final = Event.PAIR
+OF_RESPONSE: Final = (
+    Fault.RESPONSE_LATE,
+    Fault.SENSORS_CONTRADICT,
+    Fault.MOTION_OUTSIDE_SET,
+    Fault.WRONG_POLARITY,
+    Fault.OUT_OF_LIMITS,
+)
+"""Faults as which an undeclared response may end a run."""
 COVERAGE: Final = 0.8
 """Share of an experiment's periods that must have had a sample and a command that acted: the rest may be what the leaky
 counts let pass."""
@@ -102,6 +112,7 @@ class Core:
         limit = self.layout.current_within(min(self.limit, bench.limits.current))
         self._limits = CommandLimits(limit, bench.guard.slew * bench.timing.sample_time)
         self._monitor = SensorMonitor(self.law, sensor_thresholds(bench, self.law))
+        self._response = Response(bench, self.law)
         self._balance = MotionBalance(bench)
         self._unbalanced: tuple[SensorSample, bool] | None = (
             None  # the newest sample, not yet in it; it follows the last
@@ -276,6 +287,9 @@ class Core:
     def end(self, now_ns: int) -> None:
         """Judge how the node came to rest; the run is over."""
         self._now_ns = now_ns
+        if self.fault in OF_RESPONSE and not self._response.proven:
+            named = cause(self._response.model, self._response.rows, self.bench.sensors.bandwidth)
+            self._detail = "; ".join(filter(None, (self._detail, named)))
         speed = unheld_motion(self.bench, self._stopping)
         if self.fault is None and not self._rests:
             self.fail(
@@ -317,6 +331,7 @@ class Core:
             goal_ns=self._met_ns,
             unexplained=self._unexplained[0],
             allowed=self._unexplained[1],
+            response=self._response.text if self._response.proven else "",
         )
 
     # --- in every state: what the bus says --------------------------------------------------------------------------
@@ -426,6 +441,9 @@ class Core:
         with contextlib.suppress(StopError):
             self._monitor.check(self.law.sample_time, sample, True, 0.0)
         self._monitor.largest_current(self._limits.current)
+        self._response.begin(sample)
+        with contextlib.suppress(StopError):
+            self._response.take(sample, True, 0.0)
         self._balance.begin(sample)
         self._balance.take(sample, True)
         self._balance.judge()
@@ -461,6 +479,7 @@ class Core:
         self._start_ns = sample.device_time_ns
         self._machine.handle_event(Event.BEGIN_HOMING if self.homing else Event.BEGIN, self._now_ns)
         self._monitor.begin(sample)
+        self._response.begin(sample)
         self._balance.begin(sample)
         self._estimator.begin()
         self.counters.pairs = 1
@@ -556,7 +575,9 @@ class Core:
         limits = self._limits
         if (most := self._monitor.largest_current(limits.current)) < limits.current:
             limits = limits._replace(current=max(most, abs(last) - limits.slew))  # down to it as fast as may be
-        decision = decide(self.law, limits, sample.angle, sample.velocity, wanted, self._past, last, step)
+        # Before the sign is shown the current is limited to what friction can stop: a way home may need it all.
+        law = self._response.law if self._monitor.obeys else self.law
+        decision = decide(law, limits, sample.angle, sample.velocity, wanted, self._past, last, step)
         return decision._replace(reasons=decision.reasons | Reason.RETURNING) if self._condition_met else decision
 
     def _may_answer(self, sample: SensorSample, decision: Decision, decide_ns: int) -> bool:
@@ -637,7 +658,7 @@ class Core:
                 self.counters.not_obeyed += 1
                 self._unobeyed.reject()
         self._sent_counter = None
-        self._judge_sensors(elapsed_ns * 1e-9, sample, sent and obeyed, self._past[0] if sent else 0.0)
+        self._judge_sensors(elapsed_ns * 1e-9, sample, sent and obeyed, self._past[0] if sent else 0.0, gap)
         if not self.homing and self._reversed is None:
             self._unbalanced = sample, sent and obeyed and gap == 1
 
@@ -647,7 +668,7 @@ class Core:
             (sample, follows), self._unbalanced = self._unbalanced, None
             self._balance.take(sample, follows)
 
-    def _judge_sensors(self, elapsed: float, sample: SensorSample, obeyed: bool, command: float) -> None:
+    def _judge_sensors(self, elapsed: float, sample: SensorSample, obeyed: bool, command: float, gap: int) -> None:
         """End the run if the sensors cannot be right.
 
         With a wrong sign the node's own stop would drive the brake on: where the sign is not known to be right and
@@ -661,6 +682,8 @@ class Core:
             return
         try:
             self._monitor.check(elapsed, sample, obeyed, command)
+            if not self._response.proven:
+                self._response.take(sample, obeyed and gap == 1, command)
         except StopError as stop:
             self._coasting = self._monitor.coasting_time(sample)
             if self._coasting == 0.0:

@@ -82,6 +82,7 @@ class Outcome:
     unexplained: float = math.nan
     """Velocity that no one brake explains, see :mod:`emb_runtime.safety.motion_balance`; NaN of a run that was not
     completed [rad/s]."""
+    response: str = ""  # How late the velocity follows the commands, and what is declared; "" if nothing was proven
     allowed: float = math.inf  # What of it is allowed; infinite where nothing was judged [rad/s]
     goal_reached: bool = False  # The experiment ended early because the stop condition was met
     goal_ns: int = 0  # Time from the first sample to the one at which it was met, device time [ns]; 0 if it was not

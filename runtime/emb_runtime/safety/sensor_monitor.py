@@ -343,9 +343,14 @@ class SensorMonitor:
         """Largest current that may be sent, at most ``limit`` [A]."""
         return largest_current(self._law, self._limits, self._memory, limit)
 
+    @property
+    def obeys(self) -> bool:
+        """Returns True if the motion has shown its sign."""
+        return bool(self._memory[OBEYS] != 0.0)
+
     def coasting_time(self, sample: SensorSample) -> float:
         """Time for which friction alone is to stop the brake, as its node might drive it [s]."""
-        if self._memory[OBEYS] != 0.0:
+        if self.obeys:
             return 0.0
         law, limits, memory = self._law, self._limits, self._memory
         return coasting_time(law, sample.angle, sample.velocity, unseen_speed(law, limits, memory))

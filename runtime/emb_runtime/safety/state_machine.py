@@ -60,6 +60,7 @@ class Fault(IntEnum):
     NODE_CHANGED = 24
     MOTION_UNEXPLAINED = 26
     NOT_AT_REST = 27
+    RESPONSE_LATE = 28
     SENSOR_LATE = 101
     SEND_QUEUE_FULL = 102
     FRAMES_DROPPED = 103
@@ -258,6 +259,10 @@ FAULTS: dict[Fault, FaultInfo] = {
     Fault.NOT_AT_REST: FaultInfo(
         "the node did not report rest after the stop frames",
         "switch the drive off before anybody comes near; then check its stop (of a mapped drive, its disarming)",
+    ),
+    Fault.RESPONSE_LATE: FaultInfo(
+        "the velocity does not follow the commands as the bench file declares",
+        "declare what is named above in the bench file, or make it faster; --limit and a slower policy do not help",
     ),
     Fault.BUS_LOST: FaultInfo("the bus was lost", "check the interface and its cable", EXIT_BUS),
     Fault.INTERRUPTED: FaultInfo(

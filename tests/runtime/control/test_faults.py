@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
 import pytest
 
+from emb_bench.config.bench import load_bench as load_with_plants
 from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.can.transport import TransmitQueueFullError
-from emb_runtime.config.bench import load_bench
+from emb_runtime.config.bench import Sensors, load_bench
 from emb_runtime.errors import BusError
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 from emb_runtime.safety.guard import Guard
@@ -227,6 +230,7 @@ INJECTIONS: dict[Fault, Callable[[Simulate], SimRun]] = {
         lambda _x, _v, step: 6.0 if step // 60 % 2 == 0 else -6.0,
         on_receive=later(VELOCITY, 0, AppliedCurrent=lambda current: current + 0.4),
     ),
+    Fault.RESPONSE_LATE: lambda run: run(options="plant=observer"),
     Fault.NOT_AT_REST: lambda run: run(on_receive=later(VELOCITY, 520, NodeState=NodeState.FAULT)),
     # What passes by itself.
     Fault.SENSOR_LATE: lambda run: run(on_receive=dropping(VELOCITY, range(100, 106))),
@@ -386,3 +390,41 @@ def test_a_node_whose_status_says_fault_is_not_armed(simulate: Simulate) -> None
     outcome = simulate(on_receive=changing(saying(NodeState=int(NodeState.FAULT)), STATUS)).outcome
     assert (outcome.fault, outcome.armed) == (Fault.NODE_NOT_READY, False)
     assert outcome.detail == "its status says FAULT"
+
+
+@pytest.mark.parametrize(
+    ("plant", "key"),
+    [
+        ("observer", "observer_bandwidth = 1"),
+        ("lag", "[shield] current_lag = 0.002"),
+        ("late", "[shield] frame_age = [0, 2]"),
+    ],
+)
+def test_an_undeclared_response_ends_the_run_below_every_limit_and_the_detail_names_the_key(
+    plant: str, key: str, simulate: Simulate
+) -> None:
+    ran = simulate(options=f"plant={plant}")
+    assert ran.outcome.fault in (Fault.RESPONSE_LATE, Fault.MOTION_OUTSIDE_SET, Fault.WRONG_POLARITY)
+    assert key in ran.outcome.detail
+    assert ran.outcome.response == ""
+    assert max(abs(cycle.velocity) for cycle in ran.journal.cycles) < 250.0
+
+
+@pytest.mark.parametrize(
+    ("plant", "declared"),
+    [
+        ("exact", {}),
+        ("observer", {"sensors": Sensors("observer", 1480.0)}),
+        ("lag", {"shield": load_with_plants().shield._replace(current_lag=0.002)}),
+        ("late", {"shield": load_with_plants().shield._replace(frame_age=(0, 2))}),
+    ],
+)
+def test_a_response_that_is_declared_is_proven_and_the_outcome_says_so(
+    plant: str, declared: dict[str, Any], simulate: Simulate
+) -> None:
+    ran = simulate(options=f"plant={plant}", on_bench=dataclasses.replace(load_with_plants(), **declared))
+    assert ran.outcome.fault is None, ran.outcome.detail
+    assert re.fullmatch(
+        r"the velocity follows the commands -?\d\.\d ± \d\.\d samples late, at most [\d.]+ are declared",
+        ran.outcome.response,
+    )
