@@ -47,10 +47,10 @@ def cause(model: ResponseModel, rows: Sequence[Row], bandwidth: float | None) ->
     found = observer_bandwidth(model, rows)
     if found and (bandwidth is None or found < 0.9 * bandwidth):
         alpha, beta = _gains(model, found)
-        lag = f"{(alpha / beta - 0.5) * model.sample_time * 1e3:.1f} ms"
+        behind = f"{(alpha / beta - 0.5) * model.sample_time * 1e3:.1f} ms"
         least = round(BELOW * found, -1)
         key = f'[sensors] velocity = "observer", observer_bandwidth = {least:g} at most'
-        return f"the velocity lags the angle by {lag}, as that of an observer does: {key}"
+        return f"the velocity lags the angle by {behind}, as that of an observer does: {key}"
     declared = likelihood(model, rows, model.age, 0.0)
     ages = {age: likelihood(model, rows, age, 0.0) for age in range(OLDEST_FRAME + 1) if age != model.age}
     flows = {lag: likelihood(model, rows, model.age, lag * model.sample_time) for lag in LAGS}

