@@ -1,0 +1,191 @@
+"""One run: its log, topics, pictures and exports, its rerun and its timing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from emb_bench.api.arguments import Source, listed, opened, text_of
+from emb_bench.figures import for_notebook
+from emb_bench.logs.log import RunLog, read_log
+from emb_runtime.errors import needs
+
+if TYPE_CHECKING:  # matplotlib and pyarrow come with the extra [bench]
+    from matplotlib.axes import Axes
+    from pyarrow import Table
+
+    from emb_bench.report.runs import RunTiming
+    from emb_bench.rerun import Rerun
+
+CYCLE = "/cycle"
+
+
+class Run(RunLog):
+    """An opened log, with what a notebook shows of it."""
+
+    def __getitem__(self, topic: str) -> Mapping[str, Any]:
+        """Columns of a topic as arrays, by name."""
+        return self.tables[topic]
+
+    def to_dataframe(self, name: str = CYCLE) -> Any:
+        """One topic as a pandas frame, see :func:`topic`.
+
+        Raises:
+            UsageError: the run has no such topic, or pyarrow or pandas is missing.
+            LogError: the topic cannot be decoded.
+        """
+        with needs("a frame", "notebook"):
+            import pandas  # noqa: F401
+
+            return topic(self, name).to_pandas()
+
+    def plot(self) -> Any:
+        """A figure of matplotlib, see :func:`draw`.
+
+        Raises:
+            UsageError: matplotlib is missing.
+            LogError: the run has no control cycles.
+        """
+        figure, axes = for_notebook(5, (8.0, 9.5), sharex=True)
+        draw(self, axes)
+        return figure
+
+
+def open_run(log: str | Path) -> Run:
+    """Open a log.
+
+    Raises:
+        UsageError: the file cannot be read.
+        LogError: it is not a log, or too damaged.
+    """
+    opened = read_log(log)
+    return Run(**{field.name: getattr(opened, field.name) for field in fields(RunLog)})
+
+
+def topic(run: Source, name: str) -> Table:
+    """One topic of a run as an Arrow table; enumerated values are names, a value that does not exist is null.
+
+    ``.to_pandas()`` makes a pandas frame of it, ``polars.from_arrow(...)`` one of polars, ``.column(name).to_numpy()``
+    an array. ``run.counts`` has the names; ``run.tables[name]`` the plain columns without any further library.
+
+    Args:
+        run: the run.
+        name: of the topic: ``/cycle``, ``/estimate``, ``/emb/EMB_ANGLE``, ...
+
+    Raises:
+        UsageError: the run has no such topic, or pyarrow is missing.
+        LogError: the topic cannot be decoded.
+    """
+    from emb_bench.export.export import arrow_batches
+
+    schema, tables = arrow_batches(opened(run), name)
+    import pyarrow as pa
+
+    parts = list(tables)
+    return cast("Table", pa.concat_tables(parts) if parts else schema.empty_table())
+
+
+def draw(run: Source, axes: Sequence[Axes]) -> None:
+    """Draw a run on five axes of matplotlib: angle, velocity, currents, why currents were changed, states.
+
+    Args:
+        run: the run.
+        axes: five, one above the other: ``plt.subplots(5, sharex=True)[1]``.
+
+    Raises:
+        UsageError: there are not five.
+        LogError: the run has no control cycles.
+    """
+    from emb_bench.export.picture import draw_on
+
+    draw_on(opened(run), axes)
+
+
+def export(
+    run: Source,
+    output: str | Path,
+    *,
+    topic: str | None = None,
+    theta: str | Path | Mapping[str, float] | None = None,
+) -> str:
+    """A part of a run for another tool: a picture, one topic as a table with units, or the brake as a MuJoCo model.
+
+    The frames on the bus go to BLF, ASC and others by can_logconvert RUN FILE.
+
+    Args:
+        run: MCAP file of emb-run.
+        output: file to write: a picture (.png, .svg, .pdf), a table (.csv, .parquet) or a model (.xml) by its ending.
+        topic: of a table (default: /cycle, the control cycles).
+        theta: parameters of a model, as for fim (default: log, and nominal where it has no estimate).
+
+    Returns:
+        A description of what the file holds.
+
+    Raises:
+        UsageError: an argument is wrong, a library is missing, or the file cannot be written.
+        LogError: the topic cannot be decoded, or the run has no control cycles.
+    """
+    from emb_bench.export.export import write
+
+    return write(opened(run), Path(output), topic, text_of(theta))
+
+
+def rerun(run: Source) -> Rerun:
+    """Run the loop again from the log of a run, and compare what it decides.
+
+    The control loop runs again with the policy, bench file and DBC of the log. Bus and clock give the frames and times
+    that the log recorded. Each decision (policy, clip, shield, sent current, its reason), each estimate, each sent
+    frame, each safety event and the outcome must be the same, numbers to the last bit. A cut log is compared up to its
+    end. Rounding may differ with another ONNX Runtime, numpy, Python or processor. If a decision differs, the versions
+    of the log are printed too.
+
+    Args:
+        run: MCAP file of emb-run.
+
+    Returns:
+        The differences, and how much was compared.
+
+    Raises:
+        UsageError: the run only listened.
+        LogError: the log does not begin with its run, or carries no policy.
+        PolicyError: the policy in the log is refused.
+    """
+    from emb_bench.rerun import rerun_as_recorded
+
+    return rerun_as_recorded(opened(run))
+
+
+def info(run: Source) -> dict[str, Any]:
+    """Summary of a run: end, counts, largest values, completeness.
+
+    Args:
+        run: MCAP file of emb-run.
+
+    Raises:
+        UsageError: the file cannot be read.
+        LogError: it is not a log, or too damaged.
+    """
+    from emb_bench.logs.info import info_document
+
+    return info_document(opened(run))
+
+
+def timing(runs: Source | Sequence[Source]) -> list[RunTiming]:
+    """Timing of runs, judged by the budgets of their bench.
+
+    How long each part of a control cycle took, by the time stamps in the log: sample to sample, sample to loop,
+    decision, sending, sensor to command, and the time left before the answer would have been late. The times are
+    compared with [budgets] of the bench file in the log. Simulated time is not judged.
+
+    Args:
+        runs: MCAP files of emb-run.
+
+    Raises:
+        UsageError: a file cannot be read.
+        LogError: a log has no control cycles.
+    """
+    from emb_bench.report.runs import run_timing
+
+    return [run_timing(opened(run)) for run in listed(runs)]
