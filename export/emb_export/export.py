@@ -84,7 +84,8 @@ def _export(arguments: argparse.Namespace) -> str:
         data, what = network_file(source)
     else:
         with needs("an export", "bench"):
-            from emb_export.file import read_sequence, reference_file, sequence_file
+            from emb_bench.export.policy_file import sequence_file
+            from emb_export.file import read_sequence, reference_file
 
         bench = load_bench(arguments.bench)
         make_law(bench)  # where no shield can be made, emb-run would refuse the bench

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from torch import nn
 
 from emb_bench.config.bench import Bench
-from emb_export.file import OPSET, bounds, policy_file, versions
+from emb_bench.export.policy_file import OPSET, policy_file, versions
+from emb_export.file import bounds
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import SAMPLE
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME

@@ -20,9 +20,10 @@ import torch
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.excitation import excitation
+from emb_bench.export.policy_file import sequence_file
 from emb_export import emb_export
 from emb_export.export import main
-from emb_export.file import reference_file, sequence_file
+from emb_export.file import reference_file
 from emb_export.network import network_file, observations
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError
