@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -63,6 +65,19 @@ def test_gymnasium_finds_nothing_wrong_with_the_registered_environment() -> None
     observation, _ = env.reset(seed=1)
     assert env.observation_space.contains(observation)
     assert env.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.SAME_STEP
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import gymnasium; gymnasium.make('emb_train:EmbExcitation-v0')",
+        "import gymnasium, emb_train; gymnasium.make('EmbExcitation-v0')",
+        "import gymnasium; gymnasium.make('emb_train.env:EmbExcitation-v0')",
+        "import emb_train.env, gymnasium; gymnasium.make_vec('emb_train:EmbExcitation-v0', num_envs=2)",
+    ],
+)
+def test_gymnasium_finds_the_environment_by_its_name(code: str) -> None:
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
 
 
 def compare_infos(vector: dict[str, Any], row: int, scalar: dict[str, Any]) -> None:

@@ -8,6 +8,8 @@
 * **End**: leaving the limits and reaching the horizon are both terminal. The experiment is the horizon long by design
   and the step is observed, so nothing is truncated and nothing is bootstrapped there.
 
+``gymnasium.make("emb_train:EmbExcitation-v0")`` makes it; after ``import emb_train`` the name alone does.
+
 Equal seeds give equal episodes, bit for bit: row i of ``make_vec`` after ``reset(seed=s)`` is ``make`` after
 ``reset(seed=s + i)``, and its automatic resets are resets without a seed.
 """
@@ -20,7 +22,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import register
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
+from emb_train import register_environments
 from emb_train.closed_loop import BENCH_CONDITIONS, MEASURED, Batch, Conditions
 from emb_train.rewards import OUTWARD, Reward, Transition, Turn, information_increment, require_defined
 
@@ -223,4 +225,4 @@ def _observation_space(batch: Batch) -> gymnasium.spaces.Box[Any]:
     return gymnasium.spaces.Box(np.array(least, np.float32), np.array(greatest, np.float32), dtype=np.float32)
 
 
-register(id=ENV_ID, entry_point=f"{__name__}:EmbExcitationEnv", vector_entry_point=f"{__name__}:EmbExcitationVectorEnv")
+register_environments()
