@@ -1,4 +1,4 @@
-"""JSON documents of records: the names of the fields are the keys."""
+"""Records by name: JSON documents, whose keys are the names of the fields, and mappings that know what was meant."""
 
 from __future__ import annotations
 
@@ -6,9 +6,20 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+from emb_runtime.errors import UnknownNameError, near
+
+Entry = TypeVar("Entry")
+
+
+class ByName(dict[str, Entry]):
+    """Records by their names; a name that is none of them is refused with those that are."""
+
+    def __missing__(self, name: object) -> Entry:
+        raise UnknownNameError(f"expected one of {', '.join(self)}, got {name!r}{near(str(name), self)}")
 
 
 def to_json(value: Any) -> Any:

@@ -45,6 +45,12 @@ class UsageError(EmbError):
     """The command was given a request that it cannot meet: wrong argument, missing file, missing extra."""
 
 
+class UnknownNameError(UsageError, KeyError):
+    """A name that is none of a record's; also a KeyError, as of any mapping."""
+
+    __str__ = Exception.__str__  # a KeyError shows its message in quotes
+
+
 @contextmanager
 def needs(purpose: str, extra: str) -> Iterator[None]:
     """Imports for a purpose; a library that is missing is a UsageError that says how its extra is installed."""

@@ -14,6 +14,7 @@ from numpy.testing import assert_array_equal
 
 from emb_bench import api
 from emb_bench.cli import design, replay
+from emb_bench.information.evaluation import Evaluation
 from emb_runtime.cli import main as emb_run
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import UsageError
@@ -74,6 +75,7 @@ def test_fisher_information_is_that_of_emb_replay_fim(log: Path, capsys: pytest.
     e = api.fisher_information(
         api.open_run(log), model="lag", params=("k_1", "f_v"), nuisance=["delay"], prior="pm50", theta={"f_v": 3e-5}
     )
+    assert isinstance(e, Evaluation)
     assert e.plant.name == found["model"] == "lag"
     assert [e.fit.angle, e.fit.velocity] == [found["fit_sigmas"]["angle"], found["fit_sigmas"]["velocity"]]
     for kind in ("physical", "weighted"):

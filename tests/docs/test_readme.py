@@ -22,10 +22,11 @@ def test_the_example_of_the_readme_runs(tmp_path: Path) -> None:
         [sys.executable, "-W", "error", "-c", example], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    reason, bound, fitted, currents = done.stdout.split("\n", 3)
+    reason, bound, fitted, planned, currents = done.stdout.split("\n", 4)
     fits, f_v = fitted.split()
     assert (reason, fits) == ("DONE", "True")
     assert abs(float(f_v) / 3e-5 - 1.0) < 5.0 * float(bound) < 1e-4
+    assert planned.endswith(" (20, 4, 2)")
     assert len(currents.strip("[]\n").split()) > 100 or "..." in currents
 
 

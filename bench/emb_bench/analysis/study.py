@@ -18,9 +18,11 @@ from emb_bench.analysis.held_out import HeldOut, leave_one_out
 from emb_bench.analysis.model_choice import ModelChoice, choose_model
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.several_runs import Differing, apart
+from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import least
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY, Plant
+from emb_bench.documents import ByName
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.intervals import bounded, union
 from emb_bench.estimate.methods import method_of
@@ -104,24 +106,33 @@ class Study:
 
     def __repr__(self) -> str:
         """Verdict and values in one line."""
-        values = ", ".join(f"{c.label} = {amount(c.value, c.interval, c.unit)}" for c in self.conclusions)
-        model = f"model '{self.estimate.plant.name}' {self.standing}"
-        return f"<Study of {', '.join(self.names)}: {model}; ± total (95 %, k=2): {values}>"
+        values = ", ".join(f"{name} = {value}" for name, value, _ in self._cells)
+        return f"<Study of {', '.join(self.names)}: {self._verdict}; ± total (95 %, k=2): {values}>"
 
     def _repr_html_(self) -> str:
         """Verdict and values as a table of a notebook."""
-        cells = ((c.label, amount(c.value, c.interval, c.unit), c.standing) for c in self.conclusions)
-        rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in cells)
+        rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in self._cells)
         head = "<tr><th></th><th>value &pm; total (95 %, k=2)</th><th></th></tr>"
-        verdict = f"model '{self.estimate.plant.name}' {self.standing}"
-        return f"<p>{escape(verdict)}</p><table>{head}{rows}</table>"
+        return f"<p>{escape(self._verdict)}</p><table>{head}{rows}</table>"
+
+    def summary(self) -> str:
+        """Verdict, then a line for each parameter: value ± total (95 %, k=2), and whether it is identified."""
+        return "\n".join([self._verdict, *(f"  {name} = {value}  {standing}" for name, value, standing in self._cells)])
+
+    @property
+    def _verdict(self) -> str:
+        return f"model '{self.estimate.plant.name}' {self.standing}"
+
+    @property
+    def _cells(self) -> list[tuple[str, str, str]]:
+        return [(c.label, amount(c.value, c.interval, c.unit), c.standing) for c in self.conclusions]
 
     def __getitem__(self, label: str) -> Conclusion:
         """Conclusion on a parameter, by its label."""
-        return self._by_label[label]
+        return self.params[label]
 
     def __contains__(self, label: object) -> bool:
-        return label in self._by_label
+        return label in self.params
 
     def __iter__(self) -> Iterator[Conclusion]:
         return iter(self.conclusions)
@@ -130,8 +141,33 @@ class Study:
         return len(self.conclusions)
 
     @property
-    def _by_label(self) -> dict[str, Conclusion]:
-        return {c.label: c for c in self.conclusions}
+    def params(self) -> dict[str, Conclusion]:
+        """Conclusions on the parameters by their labels: ``params["f_v"].value``, ``.interval``, ``.unit``."""
+        return ByName({c.label: c for c in self.conclusions})
+
+    parameters = params  # As the JSON of an estimate calls them
+
+    @property
+    def covariance(self) -> Floats:
+        """Covariance of the values by all that the total has, in their units, in the order of ``params``."""
+        e, wanted = self.estimate, self.estimate.wanted()
+        covariance: Floats = (e.covariance() * np.outer(e.scale, e.scale))[np.ix_(wanted, wanted)]
+        return covariance
+
+    @property
+    def correlation(self) -> Floats:
+        """Correlations by the covariance; an error of J, with which all torques scale, makes them large."""
+        covariance = self.covariance
+        deviations = np.sqrt(np.diag(covariance))
+        with np.errstate(invalid="ignore"):  # inf of what is not identified
+            correlation: Floats = covariance / np.outer(deviations, deviations)
+        np.fill_diagonal(correlation, 1.0)
+        return correlation
+
+    @property
+    def residuals(self) -> tuple[Floats, ...]:
+        """Measured less predicted angle and velocity of each run, in standard deviations, NaN where lost; (n, 2)."""
+        return self.estimate.residuals
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
         """Value, ends of the 95 % interval, unit and repeatability of each parameter, by its label."""

@@ -2,8 +2,8 @@
 
 Each function is the command of that name, and its arguments are the command's options: :func:`simulate` is ``emb-run
 --iface sim``, :func:`fisher_information` is ``emb-replay fim``, :func:`design` is ``emb-design``, the others are
-``emb-replay``'s. A run is an opened log, or the path of one. Parameters are given as a sequence of names, or as one
-name. All values are in SI units.
+``emb-replay``'s. A run is an opened log, or the path of one; with a map also a table in memory. Parameters are given as
+a sequence of names, or as one name. All values are in SI units.
 
     from emb_bench import api
 
@@ -13,30 +13,28 @@ name. All values are in SI units.
 
 from __future__ import annotations
 
+from typing import NoReturn
+
 from emb_bench.api.campaigns import campaign
 from emb_bench.api.designs import design
 from emb_bench.api.estimates import estimate, report
-from emb_bench.api.information import fisher_information
-from emb_bench.api.runs import Run, draw, export, info, open_run, rerun, timing, topic
+from emb_bench.api.information import fisher_information, sensitivities
+from emb_bench.api.runs import Run, draw, export, info, open_run, rerun, timing, topic, topics
 from emb_bench.api.simulation import simulate
+from emb_runtime.errors import near
 
 __all__ = [
-    "Run",
-    "campaign",
-    "design",
-    "draw",
-    "estimate",
-    "export",
-    "fisher_information",
-    "info",
-    "open_run",
-    "report",
-    "rerun",
-    "simulate",
-    "timing",
-    "topic",
-]
+    "Run", "campaign", "design", "draw", "estimate", "export", "fisher_information", "info", "open_run", "report",
+    "rerun", "sensitivities", "simulate", "timing", "topic", "topics",
+]  # fmt: skip
+_MEANT = {"load": "open_run", "read": "open_run", "fim": "fisher_information", "fit": "estimate", "plot": "draw"}
+"""Names of other libraries for what is here."""
 
 
 def __dir__() -> list[str]:
     return __all__
+
+
+def __getattr__(name: str) -> NoReturn:
+    meant = f"; did you mean {_MEANT[name]}?" if name in _MEANT else near(name, __all__)
+    raise AttributeError(f"module 'emb_bench.api' has no attribute {name!r}{meant}")

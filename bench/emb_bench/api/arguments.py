@@ -4,23 +4,35 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from numbers import Real
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, TypeGuard
+from weakref import finalize
 
 from emb_bench.config.bench import Bench
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, needs
 from emb_runtime.system.terminal import mention
 
-Source = RunLog | str | Path
+Source = RunLog | str | Path | Mapping[str, Any]
 Names = str | Sequence[str]
 
 
-def opened(run: Source, map_path: str | Path | None = None) -> RunLog:
-    """The log of a run; with a map, a recording of others."""
+def is_table(run: Any) -> bool:
+    """True for a table of pandas, polars or Arrow, and for arrays by their names."""
+    return not isinstance(run, RunLog) and (hasattr(run, "columns") or isinstance(run, Mapping))
+
+
+def opened(run: Any, map_path: str | Path | None = None) -> RunLog:
+    """The log of a run; with a map, a recording of others: a file, or a table."""
     if isinstance(run, RunLog):
         return run
+    if is_table(run):
+        return _recorded(run, map_path)
     if map_path is None:
         from emb_bench.recordings.map_file import KINDS
 
@@ -32,6 +44,29 @@ def opened(run: Source, map_path: str | Path | None = None) -> RunLog:
     return open_recording(Path(run), Path(map_path))
 
 
+def _recorded(table: Any, map_path: str | Path | None) -> RunLog:
+    """A recording of others in memory, read as the Parquet file that it would be."""
+    if map_path is None:
+        raise UsageError("a table needs a map file, which says what its columns are: map='map.toml'")
+    from emb_bench.recordings.map_file import read_map
+    from emb_bench.recordings.recording import open_recording
+
+    if (kind := read_map(Path(map_path))[0].file.kind) not in ("", "parquet"):
+        raise UsageError(f"{map_path}: [file] kind: expected none for a table in memory, got {kind}")
+    with needs("a table", "bench"):
+        import pyarrow as pa
+        from pyarrow import parquet
+    with ExitStack() as kept:
+        path = Path(kept.enter_context(TemporaryDirectory()), "table.parquet")
+        try:
+            parquet.write_table(pa.table(dict(table) if isinstance(table, Mapping) else table), path)
+        except (pa.ArrowException, TypeError, ValueError) as err:
+            raise UsageError(f"expected columns of numbers, all as long: {' '.join(str(err).split())}") from err
+        recording = open_recording(path, Path(map_path))
+        finalize(recording, kept.pop_all().close)  # a report identifies its files
+    return recording
+
+
 def driven(run: Source, map_path: str | Path | None) -> RunLog:
     """As :func:`opened`, of a run in which something was driven."""
     log = opened(run, map_path)
@@ -39,13 +74,24 @@ def driven(run: Source, map_path: str | Path | None) -> RunLog:
     return log
 
 
-def listed(runs: Source | Sequence[Source]) -> list[Source]:
-    """The runs one by one; UsageError if one comes twice, under whatever name."""
-    found = [runs] if isinstance(runs, RunLog | str | Path) else list(runs)
-    real = [os.path.realpath(run.path if isinstance(run, RunLog) else run) for run in found]
+def listed(runs: Any) -> list[Any]:
+    """The runs one by one; UsageError if one comes twice, under whatever name, or is none."""
+    alone = isinstance(runs, RunLog | str | Path) or is_table(runs) or not isinstance(runs, Iterable)
+    found = [runs] if alone else list(runs)
+    for run in found:
+        if not (isinstance(run, RunLog | str | Path) or is_table(run)):
+            raise UsageError(f"expected a run: an opened log, its path, or a table with a map; got {run!r:.40}")
+    real = [id(run) if is_table(run) else os.path.realpath(getattr(run, "path", run)) for run in found]
     if twice := [run for n, run in enumerate(found) if real[n] in real[:n]]:
-        raise UsageError(f"{getattr(twice[0], 'path', twice[0])} comes twice: expected each run once")
+        name = "a table" if is_table(twice[0]) else getattr(twice[0], "path", twice[0])
+        raise UsageError(f"{name} comes twice: expected each run once")
     return found
+
+
+def is_row(run: Any) -> TypeGuard[Sequence[float]]:
+    """True for currents: an array, or a sequence of numbers."""
+    numbers = isinstance(run, Sequence) and len(run) > 0 and all(isinstance(value, Real) for value in run)
+    return numbers or (hasattr(run, "__array__") and not is_table(run))
 
 
 def names_of(names: Names) -> tuple[str, ...]:
@@ -66,7 +112,7 @@ def unknowns(
 def text_of(theta: str | Path | Mapping[str, float] | None) -> str:
     """Parameters as the option ``--theta`` has them."""
     if isinstance(theta, Mapping):
-        return ",".join(f"{name}={float(value)!r}" for name, value in theta.items()) or "nominal"
+        return ",".join(f"{name}={value}" for name, value in theta.items()) or "nominal"
     return "" if theta is None else str(theta)
 
 

@@ -11,7 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from emb_bench.api.arguments import Names, Source, check, driven, listed, names_of, opened, say, unknowns
+from emb_bench.api.arguments import Names, Source, check, driven, is_table, listed, names_of, opened, say, unknowns
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.estimate.records import STARTS, EstimationProblem, freed
 from emb_bench.logs.log import RunLog
@@ -126,8 +126,8 @@ def report(
     bound = inspect.signature(estimate).bind(runs, **options | {"profile": True})
     bound.apply_defaults()
     given = bound.arguments
-    files = [*listed(runs), given["last"], given["map"], acceptance]
-    for path in (entry.path if isinstance(entry, RunLog) else Path(entry) for entry in files if entry):
+    files = [*(run for run in listed(runs) if not is_table(run)), given["last"], given["map"], acceptance]
+    for path in (Path(getattr(entry, "path", entry)) for entry in files if entry is not None):
         if path.resolve() in (page.resolve(), beside.resolve()):
             raise UsageError(f"--output {page}: would write over {path}, which is read: choose another name")
     require_place("--output", page, PAGES)
@@ -250,7 +250,7 @@ def _usable(runs: Sequence[Source], map_path: str | Path | None) -> tuple[list[R
         except LogError as err:
             if len(runs) == 1:
                 raise
-            path = run.path if isinstance(run, RunLog) else Path(run)
+            path = Path(str(getattr(run, "path", run)))
             left_out.append((path, str(err).removeprefix(f"{path}: ")))
     if not logs:
         raise LogError("not one of these logs can be used: " + "; ".join(f"{path}: {why}" for path, why in left_out))

@@ -1,19 +1,24 @@
-"""Fisher information."""
+"""Fisher information of runs and of currents, and the sensitivities behind it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from emb_bench.api.arguments import Names, Source, driven, text_of, unknowns
+from emb_bench.api.arguments import Names, Source, driven, is_row, listed, text_of, unknowns
+from emb_bench.config.bench import load_bench
+from emb_bench.config.plants import DEFAULT_PLANT
+from emb_bench.experiment.experiment import planned
+from emb_runtime.errors import UsageError
 
 if TYPE_CHECKING:
-    from emb_bench.information.evaluation import Evaluation
+    from emb_bench.experiment.simulate import Trajectory
+    from emb_bench.information.evaluation import Information
 
 
 def fisher_information(
-    run: Source,
+    run: Source | Sequence[Source] | Sequence[float] | Any,
     *,
     model: str | None = None,
     params: Names | None = None,
@@ -22,7 +27,9 @@ def fisher_information(
     theta: str | Path | Mapping[str, float] | None = None,
     bench: str | Path | None = None,
     map: str | Path | None = None,  # noqa: A002  # as the option is called
-) -> Evaluation:
+    plant: str | None = None,
+    parameters: Mapping[str, float] | None = None,
+) -> Information:
     """Fisher information of a run: how precisely its parameters can be known at best.
 
     Intervals are the Cramer-Rao bound for sensors with noise and without systematic errors: no method can do better.
@@ -41,9 +48,14 @@ def fisher_information(
             nominal where it has no estimate).
         bench: bench file (default: the one in the log).
         map: map file of a recording of others: which column of it is what, and what is known of the machine.
+        plant: the model, by the name that :func:`simulate` has for it.
+        parameters: the parameters by name, as :func:`simulate` has them, in place of ``theta``.
 
     Returns:
-        The evaluation: ``fisher("physical")`` and ``fisher("weighted")``, the fit of the model, and warnings.
+        ``matrix``, ``covariance``, ``correlation`` and ``sensitivities`` of relative parameters; ``fisher("physical")``
+        and ``fisher("weighted")``. Of one run also the fit of the model. In place of a run there may be several of one
+        brake, whose informations add, or an array of planned currents [A], one per sample period, from rest at the
+        origin.
 
     Raises:
         UsageError: a name is unknown, or the run only listened.
@@ -51,12 +63,54 @@ def fisher_information(
     """
     from emb_bench.experiment.from_log import read_experiment
     from emb_bench.experiment.theta import read_theta
-    from emb_bench.information.evaluation import Question, bench_for, default_model, evaluate
+    from emb_bench.information.evaluation import Question, bench_for, default_model, evaluate, expected, together
 
+    for name, one, other in (("model", model, plant), ("theta", theta, parameters)):
+        if one is not None and other is not None:
+            raise UsageError(f"{'plant' if name == 'model' else 'parameters'} is {name}: expected one of the two")
+    model, choice = model or plant, text_of(parameters if theta is None else theta)
     Question(*unknowns(params, nuisance, None))  # a wrong name needs no log to be refused
-    log = driven(run, map)
-    its = bench_for(log, bench)
-    question = Question(*unknowns(params, nuisance, its), None if prior is None else its.range_set(prior))
-    plant = its.model(model or default_model(log)[0])
-    name, brake, errors = read_theta(text_of(theta), log, its)
-    return evaluate(log, read_experiment(log, its), its, [plant], question, name, brake, errors)[0]
+    if is_row(run):
+        its = load_bench(bench, analysis=True)
+        question = Question(*unknowns(params, nuisance, its), None if prior is None else its.range_set(prior))
+        _, brake, errors = read_theta(choice, None, its)
+        return expected(its, its.model(model or DEFAULT_PLANT), question, brake, errors, run)
+    found = []
+    for entry in listed(run):
+        log = driven(entry, map)
+        its = bench_for(log, bench)
+        question = Question(*unknowns(params, nuisance, its), None if prior is None else its.range_set(prior))
+        its_plant = its.model(model or default_model(log)[0])
+        name, brake, errors = read_theta(choice, log, its)
+        found += evaluate(log, read_experiment(log, its), its, [its_plant], question, name, brake, errors)
+    if not found:
+        raise UsageError("expected at least one run, or one current")
+    return found[0] if len(found) == 1 else together(found)
+
+
+def sensitivities(
+    currents: Sequence[float] | Any,
+    *,
+    params: Names | None = None,
+    plant: str = DEFAULT_PLANT,
+    parameters: Mapping[str, float] | None = None,
+    bench: str | Path | None = None,
+) -> Trajectory:
+    """Motion of a brake under currents from rest at the origin, and how it depends on the parameters.
+
+    Args:
+        currents: one per sample period [A]; limits are not applied.
+        params: names of the parameters (default: the four of the brake).
+        plant: name of one of the bench's plants.
+        parameters: parameters by name; the others are nominal.
+        bench: bench file (default: the shipped one).
+
+    Returns:
+        ``states`` and ``samples`` (angle [rad], velocity [rad/s]) and ``sensitivities`` θ ∂y/∂θ of the n samples, shape
+        (n, p, 2).
+
+    Raises:
+        UsageError: a name is unknown, or the currents are no row of finite numbers.
+    """
+    row = planned(currents).currents
+    return fisher_information(row, params=params, plant=plant, parameters=parameters, bench=bench).trajectory

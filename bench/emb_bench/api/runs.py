@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
+from weakref import WeakKeyDictionary, finalize
+
+from numpy.typing import NDArray
 
 from emb_bench.api.arguments import Source, listed, opened, text_of
 from emb_bench.figures import for_notebook
 from emb_bench.logs.log import RunLog, read_log
-from emb_runtime.errors import needs
+from emb_runtime.errors import near, needs
 
 if TYPE_CHECKING:  # matplotlib and pyarrow come with the extra [bench]
     from matplotlib.axes import Axes
@@ -28,6 +32,19 @@ class Run(RunLog):
     def __getitem__(self, topic: str) -> Mapping[str, Any]:
         """Columns of a topic as arrays, by name."""
         return self.tables[topic]
+
+    def __getattr__(self, column: str) -> NDArray[Any]:
+        """A column of the control cycles: ``run.angle``, ``run.sent_current``."""
+        known = {} if column.startswith("_") or CYCLE not in self.topics else self.tables[CYCLE]
+        if column in known:
+            return known[column]
+        raise AttributeError(f"a run has no {column!r}, and no such column in {CYCLE}{near(column, known)}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy in another process reads the file again; a temporary one stays for it."""
+        if (deletion := _TEMPORARY.pop(self, None)) is not None:
+            deletion.detach()
+        return open_run, (self.path,)
 
     def to_dataframe(self, name: str = CYCLE) -> Any:
         """One topic as a pandas frame, see :func:`topic`.
@@ -53,6 +70,15 @@ class Run(RunLog):
         return figure
 
 
+_TEMPORARY: WeakKeyDictionary[Run, finalize[..., Run]] = WeakKeyDictionary()
+"""Deletions of temporary logs, by their runs."""
+
+
+def delete_with(run: Run, folder: Path) -> None:
+    """Delete the folder of a temporary log when its run is not used any more."""
+    _TEMPORARY[run] = finalize(run, shutil.rmtree, folder, ignore_errors=True)
+
+
 def open_run(log: str | Path) -> Run:
     """Open a log.
 
@@ -62,6 +88,11 @@ def open_run(log: str | Path) -> Run:
     """
     opened = read_log(log)
     return Run(**{field.name: getattr(opened, field.name) for field in fields(RunLog)})
+
+
+def topics(run: Source) -> dict[str, int]:
+    """Names of the topics of a run, each with its number of messages."""
+    return opened(run).counts
 
 
 def topic(run: Source, name: str) -> Table:

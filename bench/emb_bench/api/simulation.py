@@ -2,35 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
+from typing import Any
 
-from emb_bench.api.runs import Run, open_run
+from emb_bench.api.arguments import is_row
+from emb_bench.api.runs import Run, delete_with, open_run
+from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
+from emb_bench.experiment.experiment import planned
+from emb_bench.sim.simulated_brake import NOISES
+from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.errors import UsageError, near, needs
 
 
 def simulate(
-    log: str | Path,
+    log: str | Path | None = None,
     *,
     plant: str = DEFAULT_PLANT,
     parameters: Mapping[str, float] | None = None,
     seed: int = 1,
-    policy: str | Path | None = None,
+    currents: Sequence[float] | Any | None = None,
+    policy: str | Path | Any | None = None,
     quick: bool = False,
     bench: str | Path | None = None,
     duration: float | None = None,
+    **more_parameters: float,
 ) -> Run:
     """Run one experiment on the simulated bench, behind the same shield and guard as on a real one.
 
     Args:
-        log: MCAP file to write; must not exist.
+        log: MCAP file to write; must not exist (default: a temporary one, which is deleted with the run).
         plant: name of one of the bench's plants.
-        parameters: true parameters by name; the others are nominal.
+        parameters: true parameters by name; the others are nominal. So are ``angle_noise`` [rad] and
+            ``velocity_noise`` [rad/s].
         seed: of the sensors' noise.
-        policy: ONNX file (default: the shipped actor).
+        currents: requested in place of a policy, one per sample period [A].
+        policy: ONNX file, or currents (default: the shipped actor).
         quick: the shipped actor for a short experiment, until all four parameters are known to about 1 %.
         bench: bench file (default: the shipped one).
-        duration: of the experiment [s] (default: the policy's horizon).
+        duration: of the experiment [s] (default: that of the currents, or the policy's horizon).
+        more_parameters: true parameters as keywords: ``f_v=3e-5``.
 
     Returns:
         The run, opened; :attr:`~emb_bench.logs.log.RunLog.exit_reason` says how it ended.
@@ -42,14 +57,47 @@ def simulate(
     from emb_runtime.cli.options import parser, prepare
     from emb_runtime.cli.session import Console
 
-    options = {"plant": plant, "seed": seed, **(parameters or {})}
+    if currents is None and is_row(policy):
+        currents, policy = policy, None
+    if currents is not None and (policy is not None or quick):
+        raise UsageError("currents: expected them without policy and without quick")
+    names = (*PARAMETER_NAMES, *NOISES, *inspect.signature(simulate).parameters)
+    for name in more_parameters:
+        if name not in names:
+            raise UsageError(f"simulate has no option and no parameter '{name}'{near(name, names)}")
+    options = {"plant": plant, "seed": seed, **(parameters or {}), **more_parameters}
     iface = "sim:" + ",".join(f"{name}={value}" for name, value in options.items())
-    arguments = ["--iface", iface, "--log", str(log)]
-    for option, value in (("--policy", policy), ("--bench", bench), ("--duration", duration)):
-        if value is not None:
-            arguments += [option, str(value)]
-    if quick:
-        arguments.append("--quick")
-    plan = prepare(parser().parse_args(arguments))
-    experiment(plan, Path(log), Console())
-    return open_run(log)
+    own = Path(mkdtemp(prefix="emb-run-")) if log is None else None
+    path = Path(log or f"{own}/run.mcap")
+    try:
+        with TemporaryDirectory() as folder:
+            if currents is not None:
+                policy, duration = _policy_of(currents, bench, Path(folder), duration)
+            arguments = ["--iface", iface, "--log", str(path)]
+            for option, value in (("--policy", policy), ("--bench", bench), ("--duration", duration)):
+                if value is not None:
+                    arguments += [option, str(value)]
+            if quick:
+                arguments.append("--quick")
+            plan = prepare(parser().parse_args(arguments))
+        experiment(plan, path, Console())
+        run = open_run(path)
+    except BaseException:
+        if own is not None:
+            shutil.rmtree(own)
+        raise
+    if own is not None:
+        delete_with(run, own)
+    return run
+
+
+def _policy_of(currents: Any, bench: str | Path | None, folder: Path, duration: float | None) -> tuple[Path, float]:
+    """A policy file that requests currents [A], and how long they last [s]."""
+    its, row = load_bench(bench), planned(currents).currents
+    if not 1 <= len(row) <= its.timing.horizon:
+        raise UsageError(f"expected 1 to {its.timing.horizon} currents, as the bench file's horizon, got {len(row)}")
+    with needs("a run with own currents", "bench"):
+        from emb_bench.export.policy_file import sequence_file
+    path = folder / "currents.onnx"
+    path.write_bytes(sequence_file(row, "own currents", its))
+    return path, len(row) * its.timing.sample_time if duration is None else duration

@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from emb_bench import api
 from emb_bench.brake.parameters import PARAMETERS
@@ -31,6 +31,7 @@ from emb_runtime.system.terminal import Parser, complain
 
 if TYPE_CHECKING:
     from emb_bench.analysis.study import Study
+    from emb_bench.information.evaluation import Evaluation
     from emb_bench.report.content import Content
 
 METHODS = """\
@@ -48,7 +49,7 @@ UNKNOWNS = METHODS + "\nThe names of unknowns are in the help of emb-replay esti
 
 
 def _fim(args: argparse.Namespace) -> int:
-    found = api.fisher_information(**given(args, api.fisher_information))
+    found = cast("Evaluation", api.fisher_information(**given(args, api.fisher_information)))  # of one log
     answer(args, lambda: fim.document(found), lambda verbose: fim.text(found, verbose=verbose))
     return EXIT_DONE
 
@@ -240,7 +241,7 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
             epilog=f"example:\n  emb-replay {name} {EXAMPLES[name]}\n\n{epilog(codes)}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        add(command, found.function)
+        add(command, found.function, leave_out=("plant", "parameters"))
         if name == "report":
             add(command, api.estimate, leave_out=("runs", "profile"))
         elif name != "live":

@@ -134,6 +134,18 @@ class Estimate:
         """Total standard deviations, by the rules of :mod:`emb_bench.estimate.intervals`."""
         return deviations(self.cramer_rao(), self.open(), self.robust(), fits=self.validation.fits)
 
+    def covariance(self) -> Floats:
+        """Total covariance, whose diagonal has the squares of :meth:`deviations`; in the same units.
+
+        By the information, and by each effect of the budget, which moves all unknowns together.
+        """
+        biases = np.array([one.bias for one in self.validation.budget]).reshape(-1, len(self.unknowns))
+        covariance = Spectrum(self.information).inverse() + biases.T @ biases
+        variance = np.diag(covariance)
+        grown = np.where(np.isfinite(variance), self.deviations() / np.sqrt(variance), 1.0)
+        total: Floats = covariance * np.outer(grown, grown)
+        return total
+
     def between_runs(self) -> Floats:
         """Deviations of values that are compared: the total without errors that all runs on one bench share."""
         return deviations(self.cramer_rao(), self.open(OF_THE_BENCH), self.robust(), fits=self.validation.fits)

@@ -164,7 +164,10 @@ class Experiment:
 
 def planned(currents: Sequence[float] | Floats) -> Experiment:
     """An experiment that is to be: currents [A] of its periods, from rest at the origin, no samples."""
-    row = np.asarray(currents, dtype=np.float64)
+    try:
+        row = np.asarray(currents, dtype=np.float64)
+    except (TypeError, ValueError) as err:
+        raise UsageError(f"expected currents [A] as numbers: {err}") from err
     if row.ndim != 1:
         raise UsageError(f"expected one row of currents, got an array of shape {row.shape}")
     if not np.isfinite(row).all():

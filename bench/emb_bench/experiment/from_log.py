@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import LONGEST_DELAY
 from emb_bench.experiment.experiment import REST_SIGMAS, Booleans, Experiment, Floats, Integers, Lack
-from emb_bench.logs.log import RunLog, Table
+from emb_bench.logs.log import RunLog, Table, once
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER
 from emb_runtime.can.messages import CHARGE, Layout
 from emb_runtime.can.receiver import Reception, fresh_ns
@@ -60,8 +60,20 @@ def read_experiment(log: RunLog, bench: Bench | None = None, name: str = "") -> 
         LogError: the log has no experiment, or none of which a whole period is left, or contradicts itself.
     """
     if isinstance(log, Recording):
-        return replace(log.experiment, name=name or log.path.name)
-    bench = log.bench if "bench.toml" in log.attachments or bench is None else bench
+        found = log.experiment
+    elif "bench.toml" in log.attachments or bench is None:
+        found = _of_its_bench(log)
+    else:
+        found = _read(log, bench)
+    return replace(found, name=name or log.path.name)
+
+
+@once
+def _of_its_bench(log: RunLog) -> Experiment:
+    return _read(log, log.bench)
+
+
+def _read(log: RunLog, bench: Bench) -> Experiment:
     planned = _planned(log, bench)
     samples = samples_on_grid(log, bench, planned)
     received, within = samples.received, match_tolerance(log.drive, log.layout)
@@ -76,7 +88,7 @@ def read_experiment(log: RunLog, bench: Bench | None = None, name: str = "") -> 
     reported = counted | np.isfinite(by_charge[1:])
     told = int(np.isfinite(by_charge).sum())
     return Experiment(
-        name=name or log.path.name,
+        name=log.path.name,
         currents=currents,
         samples=np.stack([samples.angle[1:], samples.velocity[1:]], axis=1),
         angle=angle,

@@ -20,22 +20,22 @@ LOG = "log"  # Name of the last running estimate in the log
 MAX_JSON_BYTES = 64 * 2**20  # Size limit of the JSON of an estimate or a report
 
 
-def read_theta(choice: str, log: RunLog, bench: Bench) -> tuple[str, BrakeParameters, SystematicErrors]:
+def read_theta(choice: str, log: RunLog | None, bench: Bench) -> tuple[str, BrakeParameters, SystematicErrors]:
     """The name of the parameters to evaluate at, the parameters, and the systematic errors estimated with them.
 
     The choice is ``log`` for the last running estimate in the log, empty for that or nominal where there is none,
     ``nominal``, ``true``, ``name=value,name=value``, or the JSON of an estimate or a report; the others are nominal.
+    Planned currents have no log.
     """
     if choice in ("", LOG):
-        values = _running(log, bench)
-        if values:
+        if log is not None and (values := _running(log, bench)):
             return LOG, bench.brake._replace(**values), NO_ERRORS
         if choice:
             raise UsageError("--theta log: expected a running estimate in the log, and there is none")
     if choice in ("", "nominal"):
         return "nominal", bench.brake, NO_ERRORS
     if choice == "true":
-        if log.truth is None:
+        if log is None or log.truth is None:
             raise UsageError("--theta true: this log does not know the brake's true parameters, only a simulated one's")
         for name, value in log.truth._asdict().items():
             check_near_nominal(bench, name, value, "--theta true: ")
@@ -80,7 +80,7 @@ class _Report(msgspec.Struct, frozen=True):
     estimate: _Estimate | None = None
 
 
-def _from_file(path: str, log: RunLog, bench: Bench) -> tuple[dict[str, float], SystematicErrors]:
+def _from_file(path: str, log: RunLog | None, bench: Bench) -> tuple[dict[str, float], SystematicErrors]:
     """Parameters in the document of an estimate or a report [SI], and systematic errors of the log there.
 
     Parameters and systematic errors trade off with each other: only together do they explain the record.
@@ -103,12 +103,12 @@ def _from_file(path: str, log: RunLog, bench: Bench) -> tuple[dict[str, float], 
     return values, _errors(found, path, log, bench)
 
 
-def _errors(found: _Estimate, path: str, log: RunLog, bench: Bench) -> SystematicErrors:
+def _errors(found: _Estimate, path: str, log: RunLog | None, bench: Bench) -> SystematicErrors:
     """Systematic errors of a log in an estimate of some records; the encoder's offset is each record's own."""
     limits = {"current_offset": bench.limits.current, "delay": 1.0, "velocity_gain": 1.0}
     labels = {name: quantity(bench.machine, name).name for name in limits}
     records = [Path(record.name).name for record in found.records]
-    if log.path.name in records:
+    if log is not None and log.path.name in records:
         limits["offset"] = bench.limits.angle[1] - bench.limits.angle[0]
         labels["offset"] = f"offset[{records.index(log.path.name)}]" if len(records) > 1 else "offset"
     values = {n: _number(found.systematic[label]) for n, label in labels.items() if label in found.systematic}

@@ -6,23 +6,27 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from emb_bench.brake.parameters import PARAMETERS
+from emb_bench.brake.parameters import OF_A_RECORD, PARAMETERS
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT, RECORDED_PLANT, THESIS_PLANT, Plant
-from emb_bench.experiment.experiment import Experiment
-from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors, Theta, simulate_parts
+from emb_bench.documents import ByName
+from emb_bench.experiment.experiment import Experiment, planned
+from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors, Theta, Trajectory, simulate, simulate_parts
+from emb_bench.experiment.theta import LOG
 from emb_bench.information.fisher import Fisher, Kind, information_over_time, uniform_prior, weights_along
-from emb_bench.information.identifiability import Identifiability
+from emb_bench.information.identifiability import Identifiability, schur_complement
 from emb_bench.information.symmetric import Floats
 from emb_bench.logs.log import RunLog
 from emb_bench.numbers import relative
 from emb_bench.sim.open_loop import check_unknowns, fast_loop
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
-from emb_runtime.errors import LogError, UsageError
+from emb_runtime.errors import LogError, UsageError, needs
 from emb_runtime.estimator.estimate import NORMAL_95
 
 KINDS: tuple[Kind, ...] = ("physical", "weighted")
@@ -139,36 +143,91 @@ class Question:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Evaluation:
-    """The Fisher information of one recorded experiment, and how well the model fits."""
+class Information:
+    """Fisher information about one brake, and how it grew: of a record, of planned currents, or of several together."""
 
-    log: RunLog
     bench: Bench
-    experiment: Experiment
     plant: Plant  # The model
-    theta_name: str
     theta: BrakeParameters  # Parameters at which the information was computed, and to which relative values refer
     errors: SystematicErrors  # Systematic errors that were known besides
     question: Question
-    fit: Fit
+    experiment: Experiment | None  # None of several together
     instants: Sequence[int]
     """Periods after which the information was kept, the last one among them; all of them if they are not too many."""
     histories: Mapping[Kind, Floats]
     """The FIM after each of them, shape (instants, p, p), by kind; the physical one begins at the prior."""
 
     def __repr__(self) -> str:
-        """Log, model and bounds in one line."""
+        """Model and bounds in one line."""
         bounds = ", ".join(
             f"{name} ± {relative(NORMAL_95 * bound, PARAMETERS[name].relative)}"
             for name, bound in self.fisher("physical").cramer_rao().items()
         )
-        return (
-            f"<Evaluation of {self.log.path.name}: model '{self.plant.name}'; smallest possible repeatability {bounds}>"
-        )
+        return f"<{self.title}: model '{self.plant.name}'; smallest possible repeatability {bounds}>"
+
+    @property
+    def title(self) -> str:
+        """Kind of information, and of what it is."""
+        return f"Information of {'several runs' if self.experiment is None else 'planned currents'}"
 
     def __getitem__(self, name: str) -> float:
         """Smallest possible standard deviation of a parameter, relative or in its unit (Cramér-Rao)."""
-        return self.fisher("physical").cramer_rao()[name]
+        return ByName(self.fisher("physical").cramer_rao())[name]
+
+    def __add__(self, other: Information) -> Information:
+        """The information of both together, see :func:`together`."""
+        return together([self, other])
+
+    def __radd__(self, zero: int) -> Information:
+        """The begin of ``sum()``."""
+        return self if zero == 0 else NotImplemented
+
+    @property
+    def params(self) -> tuple[str, ...]:
+        """Names of the rows of ``matrix``: the parameters, then the nuisances."""
+        return self.question.names
+
+    @property
+    def matrix(self) -> Floats:
+        """The physical FIM with the prior, in relative parameters or the units of the others, shape (p, p)."""
+        return self.fisher("physical").matrix
+
+    @property
+    def covariance(self) -> Floats:
+        """Inverse of ``matrix``, the smallest possible covariance; inf on the diagonal of what is not identified."""
+        return self.fisher("physical").covariance()
+
+    cov = covariance  # As numpy calls it
+
+    @property
+    def correlation(self) -> Floats:
+        """Correlations of the estimates, shape (p, p)."""
+        return self.fisher("physical").correlation()
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """Motion of the brake under the currents, samples without noise, and their sensitivities.
+
+        Raises:
+            UsageError: these are several runs, each of which has its own.
+        """
+        if self.experiment is None:
+            raise UsageError("each run has a trajectory of its own: expected the information of one of them")
+        return _motion(self.bench, self.plant, self.theta, self.errors, self.experiment, self.params)
+
+    @property
+    def sensitivities(self) -> Floats:
+        """Derivatives of the n samples to the unknowns, relative (θ ∂y/∂θ) or per unit, shape (n, p, 2).
+
+        The last axis is angle [rad] and velocity [rad/s].
+        """
+        return self.trajectory.sensitivities
+
+    def to_dataframe(self) -> Any:
+        """The matrix as a pandas frame with the names of its rows and columns."""
+        with needs("a frame", "notebook"):
+            import pandas as pd
+        return pd.DataFrame(self.matrix, self.params, self.params)
 
     def fisher(self, kind: Kind) -> Fisher:
         """The Fisher information of the whole experiment."""
@@ -188,6 +247,104 @@ class Evaluation:
         return tuple(name for name in self.question.names if has.get(name) == 0.0)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Evaluation(Information):
+    """The Fisher information of one recorded experiment, and how well the model fits."""
+
+    log: RunLog
+    experiment: Experiment
+    theta_name: str
+    fit: Fit
+
+    @property
+    def title(self) -> str:
+        """Kind of information, and of what it is."""
+        return f"Evaluation of {self.log.path.name}"
+
+
+def together(parts: Sequence[Information]) -> Information:
+    """The information of several experiments with one brake: they add, at the parameters of the first.
+
+    Those that were evaluated at their own running estimates are evaluated again there. Unknowns that each record has
+    of its own are eliminated from each before. A prior counts once.
+
+    Raises:
+        UsageError: they are of other parameters, models or unknowns, or about what each record has of its own.
+    """
+    first, names = parts[0], parts[0].params
+    if own := [name for name in first.question.params if name in OF_A_RECORD]:
+        raise UsageError(f"each run has its own {own[0]}: expected it as a nuisance of several runs")
+    parts = [
+        evaluate(p.log, p.experiment, p.bench, [p.plant], p.question, LOG, first.theta, p.errors)[0]
+        if isinstance(p, Evaluation) and p.theta_name == LOG
+        else p
+        for p in parts
+    ]
+    for part in parts:
+        for what in ("plant", "theta", "question"):
+            if getattr(part, what) != getattr(first, what):
+                option = {"plant": "model", "question": "params, nuisance and prior"}.get(what, what)
+                raise UsageError(f"informations add if they are about one brake: expected the same {option} of all")
+    shared = [i for i, name in enumerate(names) if name not in OF_A_RECORD]
+    question = replace(first.question, nuisances=tuple(names[i] for i in shared[len(first.question.params) :]))
+    start, found = question.start(first.theta), {}
+    for kind in KINDS:
+        matrix = np.sum([schur_complement(part.histories[kind][-1], shared) for part in parts], axis=0)
+        if start is not None and kind == "physical":
+            matrix -= (len(parts) - 1) * start
+        found[kind] = matrix[None]
+    last = sum(part.instants[-1] + 1 for part in parts) - 1
+    return Information(first.bench, first.plant, first.theta, first.errors, question, None, [last], found)
+
+
+def expected(
+    bench: Bench,
+    plant: Plant,
+    question: Question,
+    theta: BrakeParameters,
+    errors: SystematicErrors,
+    currents: Sequence[float] | Floats,
+) -> Information:
+    """Both Fisher informations of a planned experiment: currents [A], from rest at the origin; each sample counts.
+
+    Raises:
+        UsageError: the currents are no row of finite numbers.
+    """
+    experiment = planned(currents)
+    if not experiment.periods:
+        raise UsageError("expected at least one current")
+    shown = _motion(bench, plant, theta, errors, experiment, question.names)
+    starts: Mapping[Kind, Floats | None] = {"physical": question.start(theta), "weighted": None}
+    histories = {
+        kind: information_over_time(
+            shown.sensitivities, weights_along(bench, kind, plant.instruments, shown.states), start
+        )
+        for kind, start in starts.items()
+    }
+    instants = range(experiment.periods)
+    return Information(bench, plant, theta, errors, question, experiment, instants, histories)
+
+
+def _motion(
+    bench: Bench,
+    plant: Plant,
+    theta: BrakeParameters,
+    errors: SystematicErrors,
+    experiment: Experiment,
+    names: Sequence[str],
+) -> Trajectory:
+    """Motion and sensitivities of an experiment; samples as on the grid, what acted as it is assumed in gaps."""
+    experiment = replace(experiment, late=None, assumed=None, places=None)
+    at, loop = _placed(theta, errors, experiment, plant), fast_loop(experiment.periods)
+    return simulate(plant, at, experiment, bench.timing.sample_time, names, loop)
+
+
+def _placed(theta: BrakeParameters, errors: SystematicErrors, experiment: Experiment, plant: Plant) -> Theta:
+    """All that the motion depends on, with the start of an experiment."""
+    at = Theta(theta, errors=errors)
+    return at._replace(start=experiment.x0(at.offset(plant)))
+
+
 def evaluate(
     log: RunLog,
     experiment: Experiment,
@@ -205,13 +362,12 @@ def evaluate(
     instants = evenly(experiment.periods, INSTANTS)
     found = []
     for plant in plants:
-        at = Theta(theta, errors=errors)
-        at = at._replace(start=experiment.x0(at.offset(plant)))
+        at = _placed(theta, errors, experiment, plant)
         histories, fit = information_and_fit(
             bench, plant, at, experiment, question.names, question.start(theta), instants
         )
         found.append(
-            Evaluation(log, bench, experiment, plant, theta_name, theta, errors, question, fit, instants, histories)
+            Evaluation(bench, plant, theta, errors, question, experiment, instants, histories, log, theta_name, fit)
         )
     return found
 

@@ -151,9 +151,13 @@ class Fisher:
         Relative, or in the unknown's unit; inf if the data do not identify it. With a
         prior it is the spread after a Gaussian one of the same variance, to first order, and no bound.
         """
-        self._physical()
-        deviations = np.sqrt(np.diag(Spectrum(self.matrix).inverse()))
+        deviations = np.sqrt(np.diag(self.covariance()))
         return dict(zip(self.params, deviations.tolist(), strict=True))
+
+    def covariance(self) -> Floats:
+        """M⁻¹, see :meth:`Spectrum.inverse`; its diagonal has the squares of :meth:`cramer_rao`."""
+        self._physical()
+        return Spectrum(self.matrix).inverse()
 
     def correlation(self) -> Floats:
         """Correlations of the estimates, shape (len(params), len(params)), see :meth:`Spectrum.correlation`."""

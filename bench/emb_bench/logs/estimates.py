@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from emb_bench.logs.log import RunLog
+from emb_bench.logs.log import RunLog, once
 from emb_runtime.config.bench import Systematic
 from emb_runtime.errors import LogError
 from emb_runtime.estimator.estimate import LOST, UNKNOWN, by_name
@@ -18,6 +18,7 @@ def by_step(log: RunLog) -> dict[int, tuple[float, ...]]:
     return {step: tuple(numbers) for step, *numbers in log.rows("/estimate", _STEP, *_ESTIMATE)}
 
 
+@once
 def last_estimate(log: RunLog) -> dict[str, dict[str, Any]]:
     """The estimate at the end by name, see :func:`emb_runtime.estimator.estimate.by_name`; empty if there was none."""
     lost = any(event.code == LOST for event in log.events)

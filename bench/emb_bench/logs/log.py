@@ -9,17 +9,19 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, wraps
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from emb_bench.config.bench import Bench, parse_bench
+from emb_bench.documents import ByName
 from emb_bench.logs.mcap_file import (
     DAMAGE,
     HEADER,
@@ -122,6 +124,7 @@ class _Tables(Mapping[str, Table]):
 
     def __getitem__(self, topic: str) -> Table:
         if topic not in self._decoded:
+            ByName(self._log.topics)[topic]  # or says what was meant
             self._decoded[topic] = self._log.table(topic)
         return self._decoded[topic]
 
@@ -387,6 +390,22 @@ class RunLog:
             return self.attachments[name].decode()
         except UnicodeDecodeError as err:
             raise LogError(f"{self.path}: {name} inside the log is not UTF-8 text") from err
+
+
+Found = TypeVar("Found")
+
+
+def once(read: Callable[[RunLog], Found]) -> Callable[[RunLog], Found]:
+    """A function of a log that is called once for each opened log; what it gives must not be changed."""
+    known: WeakKeyDictionary[RunLog, Found] = WeakKeyDictionary()
+
+    @wraps(read)
+    def found(log: RunLog) -> Found:
+        if log not in known:
+            known[log] = read(log)
+        return known[log]
+
+    return found
 
 
 def read_log(path: str | Path) -> RunLog:

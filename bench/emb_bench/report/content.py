@@ -110,7 +110,7 @@ class Run:
         return datetime.fromtimestamp(first // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Content:
     """Content of a report."""
 
@@ -120,6 +120,10 @@ class Content:
     why_not: str  # Reason that there is no estimate; empty if there is one
     made_by: str  # Name and version of the tool that made the report
     acceptance: Acceptance | None = None  # Results of the acceptance criteria; None if none were given
+
+    def __repr__(self) -> str:
+        """The verdict in one line."""
+        return f"<Report on {', '.join(run.name for run in self.reported)}: {self.verdict}>"
 
     @property
     def estimated(self) -> tuple[Run, ...]:

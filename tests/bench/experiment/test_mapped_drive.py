@@ -12,6 +12,7 @@ import simulated_drives
 from emb_bench import api
 from emb_bench.experiment.experiment import Floats
 from emb_bench.experiment.from_log import read_experiment
+from emb_bench.information.evaluation import Evaluation
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.numbers import in_samples
 from emb_bench.report import estimate as report
@@ -75,7 +76,9 @@ def test_parameters_are_known_from_a_log_of_a_drive_that_tells_its_current_coars
     (note,) = assumptions(study)
     assert f"the command as its bus carried it, {in_samples(late)} late" in note
     assert f"NOTE: {note}" in " ".join(report.text(study).split())
-    assert note in notes(api.fisher_information(log, model="exact"))
+    information = api.fisher_information(log, model="exact")
+    assert isinstance(information, Evaluation)
+    assert note in notes(information)
 
 
 def test_of_a_mapping_that_is_not_readable_what_was_told_acted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
