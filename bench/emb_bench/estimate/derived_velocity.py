@@ -12,7 +12,7 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import optimize, signal, special
+from scipy import optimize, special
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.records import Derived
@@ -59,6 +59,8 @@ def _lag(angle: Floats, velocity: Floats, t_s: float) -> tuple[float, float]:
 
 def _bandwidth(angle: Floats, velocity: Floats, t_s: float) -> tuple[float, float, bool]:
     """Best bandwidth, the least that is not told apart from it [rad/s], and whether the others are near."""
+    from scipy.signal import lfilter  # slow to import, and for a velocity that lags only
+
     at, received = np.arange(len(angle)), np.isfinite(angle) & np.isfinite(velocity)
     every = np.interp(at, at[received], angle[received]) - angle[received][0]
     settled = received.copy()
@@ -74,7 +76,7 @@ def _bandwidth(angle: Floats, velocity: Floats, t_s: float) -> tuple[float, floa
             scaled, damping = at
             alpha, beta = observer_gains(scaled / parts, 1.0, damping)
             ahead = np.array([1.0, alpha + beta - 2.0, 1.0 - alpha])
-            shown = signal.lfilter([beta, -beta], ahead, finer)[::parts] * parts / t_s
+            shown = lfilter([beta, -beta], ahead, finer)[::parts] * parts / t_s
             return float(np.mean((velocity - shown)[counted] ** 2))
 
         row = sorted((square(at), at) for at in itertools.product(SCALED.tolist(), DAMPINGS))
