@@ -21,6 +21,7 @@ from emb_runtime.errors import UsageError
 
 Floats = NDArray[np.float64]
 
+HUGE = 1e30  # In any unit
 EQUAL = 0.05  # Share of rows with the time of the row before from which on the times do not tell the samples apart
 SPARSE = 1.5  # Distance of the rows, in sample times that the map gives, from which on the two contradict each other
 FAR = 20.0  # Distance of a special value from the others, in their spread
@@ -129,6 +130,12 @@ TIMES: Checks[Series] = {
 }
 
 
+def _is_huge(s: Series) -> Found:
+    huge = np.abs(s.values) > HUGE
+    k = int(np.argmax(huge))
+    return s.at(k) | {"value": s.values[k]} if huge.any() else None
+
+
 def _is_special(s: Series) -> Found:
     """Values beyond all others, or numbers known as special, or the same number now and then between others."""
     low, middle, high = np.percentile(s.values, (5.0, 50.0, 95.0))
@@ -161,6 +168,8 @@ def _between(s: Series, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 VALUES: Checks[Series] = {
+    _is_huge: "{name} is {value:.4g} in row {row}, beyond any measurement: range = [LOW, HIGH] of the signal leaves "
+    "such out",
     _is_special: "{count} values of {name} are apart from all others, the first one {value:.10g} in row {row}: where "
     "they say that there is no value, special = [{value:.10g}], or range = [{low:.4g}, {high:.4g}], of the signal "
     "leaves them out",
@@ -337,7 +346,7 @@ def _is_far(e: Equation) -> Found:
     names, columns = ["k_m", *e.loads], np.stack([e.driven(_best(e)[0]), *e.loads.values()], axis=1)
     found = np.linalg.lstsq(columns, e.left, rcond=None)[0]
     spread = float(np.mean((e.left - columns @ found) ** 2))
-    sure = SURE * np.sqrt(np.diag(np.linalg.pinv(columns.T @ columns)) * spread)
+    sure = SURE * np.sqrt(np.abs(np.diag(np.linalg.pinv(columns.T @ columns))) * spread)
     told = {name: c for name, c, least in zip(names, found.tolist(), sure.tolist(), strict=True) if c > least}
     known = ({} if "k_m" in e.motion.guess else {"k_m": 1.0}) | dict(e.motion.known)
     inertia = known.get("J") or next((known[name] / c for name, c in told.items() if name in known), math.nan)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from emb_bench.config.plants import Instruments
 from emb_bench.experiment.experiment import Experiment, Lack
-from emb_bench.recordings.faults import ANGLES, TIMES, VALUES, Motion, Series, contradictions, require
+from emb_bench.recordings.faults import ANGLES, HUGE, TIMES, VALUES, Motion, Series, contradictions, require
 from emb_bench.recordings.map_file import TIME, TIMED, Place, RecordingMap, Signal, Source
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_runtime.can.codec import parse
@@ -502,7 +502,7 @@ def _read(columns: Mapping[Place, Column], wanted: RecordingMap, source: str) ->
             raise UsageError(f"{source}: {signal.column}: {len(values)} values and {len(time)} times: expected as many")
         low, high = signal.range
         kept = np.isfinite(values) & np.isfinite(time) & (low <= values) & (values <= high) & ~repeated
-        kept &= ~np.isin(values, signal.special)
+        kept &= ~np.isin(values, signal.special) & (np.abs(time) < HUGE)
         if kept.sum() < FEWEST:
             raise UsageError(f"{source}: {signal.column}: {kept.sum()} values are numbers, expected at least {FEWEST}")
         found[name] = series = Series(

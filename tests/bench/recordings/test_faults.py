@@ -66,6 +66,9 @@ REFUSED = {
     "one among others": Fault(with_value("angle", 0.0), f"{SPECIAL} 0 in row 301", {"angle": "special = [0]"}),
     "a velocity": Fault(with_value("velocity", 32767.0), f"{SPECIAL} 32767 in", {"velocity": "special = [32767]"}),
     "a command": Fault(with_value("current", 65535.0), f"{SPECIAL} 65535 in", {"command": "special = [65535]"}),
+    "the largest float": Fault(
+        with_value("current", 1.797e308), "is 1.797e+308 in row 301", {"command": "range = [-10, 10]"}
+    ),
     "an encoder set anew": Fault(
         {"angle": RIGHT["angle"] - 9.0 * (K >= 600)}, "after row 600, 1 times", {"file": "rows = [1, 600]"}
     ),
