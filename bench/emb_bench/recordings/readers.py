@@ -154,8 +154,9 @@ def _csv(path: Path, source: Source, places: Sequence[Place], lacks: Entered) ->
     table = read_csv(
         pa.BufferReader(text.encode()),
         ReadOptions(skip_rows=line + source.skip, column_names=titles, use_threads=False),
+        # A last row that is cut is left out.
         ParseOptions(
-            delimiter=delimiter, invalid_row_handler=lambda row: "skip" if text.endswith(row.text) else "error"
+            delimiter=delimiter, invalid_row_handler=lambda row: "skip" if text.endswith(f"\n{row.text}") else "error"
         ),
         ConvertOptions(decimal_point=source.decimal, null_values=[*MISSING, *source.missing], strings_can_be_null=True),
     )
@@ -222,12 +223,10 @@ def _arrow(
         _require_one(path, name, at, known or table.column_names)
         column, kind = table.column(at[0]), str(table.column(at[0]).type)
         if kind.startswith(("timestamp", "time")):
-            whole = column.cast("timestamp[ns]" if kind.startswith("timestamp") else "time64[ns]").cast("int64")
-            yield (
-                place,
-                (whole.to_numpy() - (whole.drop_null()[0].as_py() if whole.null_count < len(whole) else 0)) * 1e-9,
-                None,
+            whole = (
+                column.cast("timestamp[ns]" if kind.startswith("timestamp") else "time64[ns]").cast("int64").to_numpy()
             )
+            yield place, (whole - whole[np.isfinite(whole)][:1].sum()) * 1e-9, None
         elif kind in ("string", "large_string"):
             yield place, _of_texts(path, name, column.to_pylist(), source), None
         else:

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
-from emb_bench.brake.parameters import UNITS, quantity
+from emb_bench.brake.parameters import PARAMETERS, UNITS, quantity
 from emb_bench.experiment.experiment import Experiment, Lack
 from emb_bench.information.identifiability import Border, Doubt, combination
 from emb_bench.numbers import amount, in_samples, p_value, percent
@@ -94,6 +94,7 @@ LACKS = {
 
 
 LONGEST_NAME = 80  # Characters of a name from another file
+ALIKE = 0.8  # Ratio of the sigmas of two suspects from which on both are about as sure
 EXPLAINS = 3.0  # Standard deviations from which on a parameter that is held fixed may explain a misfit
 
 
@@ -313,7 +314,8 @@ def alarms(e: Estimate) -> list[str]:
         one = f"{names}, which is held fixed," if len(left) == 1 else f"one of {names}, which are held fixed,"
         found.append(f"{one} may explain it; remedy: estimate {_every(e)}: leave --params out")
     elif m.suspected:
-        found.append(explained(m.suspected[0], e.bench.machine))
+        said = explained(_first(m.suspected, e.bench.machine), e.bench.machine)
+        found.append(said + (_window(e) if "--nuisance" in said else ""))
     elif scored:
         found.append("no effect explains it in an amount that is possible: look for a fault in the data")
     elif m.together is not None and "scores" in m.alarming:
@@ -335,6 +337,23 @@ def alarms(e: Estimate) -> list[str]:
     if any(f"whiteness of {name}" in m.alarming for name in m.coloured):
         found.append(f"{_coloured(m)}: the disturbance of the brake or its sensors is not white, or the model is wrong")
     return found
+
+
+def _window(e: Estimate) -> str:
+    """Option with which a recording has windows enough for two unknowns more; empty where it has, or has none."""
+    from emb_bench.estimate.windows import FEWEST
+
+    machine, needed = e.bench.machine, FEWEST * (len(e.unknowns) + 2)
+    if machine is None or not 0 < e.windows < needed:
+        return ""
+    longest = (e.asked.window or machine.window) * e.windows / (needed + 1)
+    return f" --window {math.floor(1e3 * longest) / 1e3:g}"
+
+
+def _first(suspected: Sequence[Suspect], machine: Machine | None) -> Suspect:
+    """Suspect that is named: of a recording, which is not made again, one that can be estimated and is as sure."""
+    sure = ALIKE * abs(suspected[0].sigmas) if machine is not None else math.inf
+    return next((s for s in suspected if s.name in PARAMETERS and abs(s.sigmas) >= sure), suspected[0])
 
 
 def faults(e: Estimate) -> list[str]:

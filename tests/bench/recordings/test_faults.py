@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -146,6 +147,21 @@ def test_a_fault_comes_before_any_suspect_and_has_an_exit_code(
         assert fault.said in said
         assert "correct the map as the first line says" in said
         assert "explains it" not in said
+
+
+def test_the_remedy_for_what_the_model_lacks_works_as_it_is_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, map_path = put(tmp_path, csv_text(columns(static=1.6)))
+    command = ["estimate", str(source), "--map", str(map_path), "--window", "0.25"]
+    assert main(command) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    remedy = re.search(
+        r"remedy: (?:estimate it as well: )?(--nuisance break_away,stribeck_velocity --window [\d.]+) ", said
+    )
+    assert remedy is not None, said
+    assert main([*command[:-2], *remedy[1].split()]) in (0, 1)
+    assert "break_away 1." in " ".join(capsys.readouterr().out.split())
 
 
 STEPS = {

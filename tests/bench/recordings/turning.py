@@ -45,15 +45,18 @@ f_v = {f_v}
 TIMED = 'column = "t"'
 
 
-def columns(seed: int = 1, periods: int = 1000) -> dict[str, Floats]:
-    """Time [s], angle [rad], velocity [rad/s] and commanded current [A], held from each sample to the next."""
+def columns(seed: int = 1, periods: int = 1000, static: float = 1.0) -> dict[str, Floats]:
+    """Time [s], angle [rad], velocity [rad/s] and commanded current [A], held from each sample to the next.
+
+    At rest the friction is ``static`` times T_c.
+    """
     rng, t = np.random.default_rng(seed), T_S * np.arange(periods)
     u = 1.1 * np.sin(5.0 * t) * (1.0 + 0.3 * np.sin(19.5 * t)) + 0.35 * np.sin(39.6 * t)
     motion, x, v = np.empty((periods, 2)), 0.0, 0.0
     for k, torque in enumerate((K_M * u).tolist()):
         motion[k], left = (x, v), T_S
         while left > 1e-15:
-            sign = np.sign(v) or (np.sign(torque) if abs(torque) > T_C else 0.0)
+            sign = np.sign(v) or (np.sign(torque) if abs(torque) > static * T_C else 0.0)
             if sign == 0.0:
                 break
             last, rate, h = (torque - sign * T_C) / F_V, F_V / J, left
