@@ -35,7 +35,6 @@ class Parameter(NamedTuple):
 
 
 _HELD = "estimate it as well: --params"
-_PLANT = "estimate with a plant that has it: --model"
 
 PARAMETERS: Mapping[str, Parameter] = {
     "k_m": Parameter("N·m/A", effect="a change of k_m, which is held fixed,", remedy=_HELD),
@@ -124,7 +123,7 @@ PARAMETERS: Mapping[str, Parameter] = {
         high=0.1,
         start=1e-4,
         effect="a quadratic stiffness",
-        remedy=_PLANT,
+        remedy="estimate it as well: --nuisance quadratic,cubic",
         step=1e-5,
         addition="curved stiffness",
     ),
@@ -135,7 +134,7 @@ PARAMETERS: Mapping[str, Parameter] = {
         high=1e-2,
         start=1e-6,
         effect="a cubic stiffness",
-        remedy=_PLANT,
+        remedy="estimate it as well: --nuisance quadratic,cubic",
         step=1e-7,
         addition="curved stiffness",
     ),
@@ -146,7 +145,7 @@ PARAMETERS: Mapping[str, Parameter] = {
         high=0.5,
         start=1e-2,
         effect="a hysteresis of the clamping force",
-        remedy=_PLANT,
+        remedy="estimate it as well: --nuisance hysteresis",
         step=1e-3,
         positive=True,
         addition="hysteresis",
@@ -158,7 +157,7 @@ PARAMETERS: Mapping[str, Parameter] = {
         high=10.0,
         start=0.1,
         effect="play of the gear",
-        remedy=_PLANT,
+        remedy="estimate it as well: --nuisance play",
         step=0.02,
         positive=True,
         addition="play",
@@ -170,7 +169,7 @@ PARAMETERS: Mapping[str, Parameter] = {
         high=5.0,
         start=1.1,
         effect="a static friction beyond T_c",
-        remedy=_PLANT,
+        remedy="estimate it as well: --nuisance break_away,stribeck_velocity",
         step=1e-2,
         positive=True,
         addition="static friction",
@@ -190,7 +189,7 @@ PARAMETERS: Mapping[str, Parameter] = {
         high=1e-4,
         start=1e-6,
         effect="a static friction that grows with the load",
-        remedy=_PLANT,
+        remedy="estimate it as well: --nuisance break_away,f_l,stribeck_velocity",
         step=1e-9,
         positive=True,
         addition="static friction by load",
@@ -202,7 +201,7 @@ PARAMETERS: Mapping[str, Parameter] = {
         high=0.1,
         start=1e-3,
         effect="a lag of the current",
-        remedy=_PLANT,
+        remedy="estimate it as well: --nuisance current_lag",
         step=2e-5,
         positive=True,
         addition="lag of the current",

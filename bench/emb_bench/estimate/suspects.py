@@ -45,7 +45,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Limits
 
 SLOW = 30.0  # Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]
 
-_PLANT = PARAMETERS["play"].remedy
+_OBSERVER = "estimate with a plant that has it: --model"
 
 NEVER_EXACT = (
     "J",
@@ -109,8 +109,8 @@ class Simulated:
         return self.problem.predict(self.z, record).samples
 
 
-_STRIBECK = "--nuisance break_away,stribeck_velocity"
-_SLOWER = "lower the velocity in [limits] of the bench file, and excite again"
+_STRIBECK = PARAMETERS["break_away"].remedy
+_SLOWER = f"{_STRIBECK}, or lower the velocity in [limits] of the bench file and excite again"
 _WALKS = "allow for a disturbance: --method pem"
 _CALIBRATE = "calibrate the current of the drive"
 _COOL = "keep the motor cool, or use a shorter run"
@@ -120,7 +120,7 @@ LAGGING = "velocity_lag"  # Explains a misfit if the velocity itself shows an ob
 EFFECTS: Mapping[str, Parameter] = {
     **{name: row for name, row in PARAMETERS.items() if row.effect},
     LAGGING: Parameter(
-        "s", high=0.1, effect="a velocity that lags, as an observer's does", remedy=_PLANT, positive=True
+        "s", high=0.1, effect="a velocity that lags, as an observer's does", remedy=_OBSERVER, positive=True
     ),
     **{
         name: Parameter("", effect=f"a change of {name.removesuffix('_drift')} over the run", remedy=remedy)

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
-from emb_bench.brake.parameters import PARAMETERS, UNITS, quantity
+from emb_bench.brake.parameters import CURVED, PARAMETERS, UNITS, quantity
 from emb_bench.experiment.experiment import Experiment, Lack
 from emb_bench.information.identifiability import Border, Doubt, combination
 from emb_bench.numbers import amount, in_samples, p_value, percent
@@ -35,6 +35,7 @@ INTERVALS = (
     "that the record cannot exclude."
 )
 
+SOFTENING = "no model has a clamp that becomes softer: allow for a disturbance, --method pem"
 NOISE_ALONE = "± repeatability (95 %, k=2), by sensor noise alone: no systematic or other error is allowed for."
 
 TERMS = {
@@ -427,11 +428,9 @@ def explained(s: Suspect, machine: Machine | None = None) -> str:
     said = effect.effect
     for parameter in PARAMETER_NAMES:
         said = said.replace(parameter, quantity(machine, parameter).name)
-    remedy = effect.remedy
+    remedy = SOFTENING if s.name in CURVED and s.value < 0.0 else effect.remedy
     if machine is not None and "--model" in remedy:  # the plant of a recording is that of its map
-        along = "break_away,stribeck_velocity" if s.name == "break_away" else s.name
-        without = "leave [signals.velocity] out of the map"
-        remedy = without if s.name == "velocity_lag" else f"estimate it as well: --nuisance {along}"
+        remedy = "leave [signals.velocity] out of the map"
     return f"{said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma); remedy: {remedy}"
 
 

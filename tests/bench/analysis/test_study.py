@@ -231,3 +231,21 @@ def test_every_effect_has_possible_amounts_on_both_sides_or_is_positive(bench: B
         low, high = possible(name, bench)
         assert high > 0.0
         assert low == 0.0 if row.positive else low < 0.0
+
+
+REMEDIES = {name: row.remedy.partition("--nuisance ")[2].partition(" ")[0] for name, row in EFFECTS.items()}
+
+
+@pytest.mark.parametrize("plant", ["cubic", "hysteresis", "stribeck"])
+def test_the_remedy_of_the_first_suspect_gives_a_model_that_fits(plant: str, log: Log, replay: Replay) -> None:
+    run = log(f"plant={plant},seed=7")
+    first = replay.document("estimate", run.path, "--model", "exact")["misfit"]["suspected"][0]["name"]
+    names = REMEDIES[first].rstrip(",")
+    said = replay.document("estimate", run.path, "--model", "exact", "--nuisance", names)
+    assert said["model_fits"], names
+
+
+def test_every_nuisance_of_a_remedy_can_be_asked_for() -> None:
+    assert {name: names for name, names in REMEDIES.items() if names}.keys() >= {"quadratic", "play", "drag", "f_l"}
+    for names in filter(None, REMEDIES.values()):
+        EstimationProblem(nuisances=tuple(names.rstrip(",").split(",")))
