@@ -97,7 +97,8 @@ def conclude(
             continue
         one, interval = of_profile.get(label), (low, high)
         if one is not None:
-            holds, biased = e.validation.fits and e.method == "oem", bool(e.open().any())
+            averaged = bool(e.asked.systematic) and one.agrees  # over errors that the profile has in full
+            holds, biased = e.validation.fits and e.method == "oem" and not averaged, bool(e.open().any())
             interval = with_profile(interval, one.interval, closed=one.doubt is None, holds=holds, biased=biased)
         interval = bounded(interval, value, least(unknown.name))
         gross = GROSS.get(unknown.name, 1.0)

@@ -4,7 +4,7 @@ The Fisher information is a parabola at the estimate; a profile follows the like
 the border of what is searched (Raue et al., Structural and practical identifiability analysis of partially observed
 dynamical models by exploiting the profile likelihood, Bioinformatics 25, 2009, section 2.2). The unknown is held at
 points of a grid that begins at the minimum and widens while the rise is small; at each the others are refitted, from an
-extrapolation of the last points. The likelihood is that of output error, prior included, for an estimate by any
+extrapolation of the last points. The likelihood is that of output error, all priors in full, for an estimate by any
 method.
 """
 
@@ -134,7 +134,7 @@ def profile(e: Estimate, label: str) -> Profile:
     if doubt is not None and all(side.closed or side.points[-1].rise >= LEVEL for side in sides):
         doubt = Doubt.CUT
     minimum = value(end.z)
-    half = NORMAL_95 * float(e.cramer_rao()[i] * e.scale[i])
+    half = NORMAL_95 * float(e.with_full_priors()[i] * e.scale[i])
     return Profile(
         label=label,
         values=np.array([value(point.z) for point in points]),
@@ -149,7 +149,7 @@ def profile(e: Estimate, label: str) -> Profile:
 
 def _sides(e: Estimate, problem: Problem, weights: Sequence[Floats], i: int, minimum: End) -> tuple[_Side, _Side]:
     z, cost = minimum.z, minimum.cost
-    deviation = float(e.cramer_rao()[i])
+    deviation = float(e.with_full_priors()[i])
     low, high = (float(border[i]) for border in problem.bounds)
     below = _walk(problem, weights, i, z, cost, low, min(STEP * deviation, SHARE * (z[i] - low)))
     above = _walk(problem, weights, i, z, cost, high, min(STEP * deviation, SHARE * (high - z[i])))

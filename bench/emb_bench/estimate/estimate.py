@@ -121,8 +121,14 @@ class Estimate:
         return self.problem.scale(self.z)
 
     def cramer_rao(self) -> Floats:
-        """Least standard deviations by the physical FIM: relative or in the unknown's unit, inf if not identified."""
+        """Standard deviations by the information: relative or in the unknown's unit, inf if not identified."""
         bounds: Floats = np.sqrt(np.diag(Spectrum(self.information).inverse()))
+        return bounds
+
+    def with_full_priors(self) -> Floats:
+        """Standard deviations with all priors in full, those of systematic errors as well; in the same units."""
+        full = self.samples if self.prior is None else self.samples + self.prior
+        bounds: Floats = np.sqrt(np.diag(Spectrum(full).inverse()))
         return bounds
 
     def robust(self) -> Floats:

@@ -1,6 +1,6 @@
 """Rules by which an interval of an estimate is made, in the order in which they apply (docs/explanation/estimation.md).
 
-1. *The information*: a Gaussian interval with the Cramér-Rao bound as its deviation.
+1. *The information*: a Gaussian interval with the covariance that is averaged over whether systematic errors are there.
 2. *What may have gone unnoticed*: the largest bias that one unmodelled effect may have caused is added in quadrature.
 3. *A model that does not fit*: the deviation is at least that of the sandwich, which the residuals give.
 4. *The likelihood profile*, where one was made, takes the interval's place if it is not closed, or if its assumptions

@@ -5,10 +5,10 @@ is estimated, are standard normal if the model is right. What an effect adds is 
 and a secant from its null value where it has a threshold there. An effect that can only be positive is suspected on
 that side only.
 
-The same numbers give the uncertainty budget: what an effect that is not estimated may have moved each unknown by. Its
-size has a Gaussian posterior, from the prior of the bench file and the residuals. A constant that is never exact counts
-in full; an effect that a brake may not have at all, with the probability ``PRESENT``. Where a filter found a
-disturbance, drifts may be larger, by ``DISTURBED``.
+The same numbers give the uncertainty budget: what an effect that is not estimated may have moved each unknown by, given
+the prior of the bench file and the residuals (:mod:`emb_bench.estimate.average`). A constant that is never exact is
+there with certainty; an effect that a brake may not have at all, with the probability ``PRESENT``. Where a filter found
+a disturbance, drifts may be larger, by ``DISTURBED``.
 """
 
 from __future__ import annotations

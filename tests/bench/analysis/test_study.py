@@ -249,3 +249,14 @@ def test_every_nuisance_of_a_remedy_can_be_asked_for() -> None:
     assert {name: names for name, names in REMEDIES.items() if names}.keys() >= {"quadratic", "play", "drag", "f_l"}
     for names in filter(None, REMEDIES.values()):
         EstimationProblem(nuisances=tuple(names.rstrip(",").split(",")))
+
+
+def test_profiles_with_all_priors_in_full_do_not_widen_averaged_intervals(bench: Bench, log: Log) -> None:
+    run = log("plant=exact,seed=7")
+    plain, profiled = (
+        make_study(bench, [run], StudyOptions(EstimationProblem(), starts=1, profiles=profiles))
+        for profiles in (False, True)
+    )
+    agreeing = [profile.label for profile in profiled.profiles if profile.agrees]
+    assert len(agreeing) >= 3
+    assert [profiled[label].interval for label in agreeing] == [plain[label].interval for label in agreeing]
