@@ -23,6 +23,7 @@ Function = Callable[..., Any]
 METAVARS = {
     "bench": "FILE",
     "last": "FILE",
+    "known": "NAME=VALUE±HALF",
     "acceptance": "FILE",
     "junit": "FILE",
     "plot": "FILE",
@@ -94,8 +95,7 @@ def _form(name: str, parameter: inspect.Parameter, kind: Any) -> dict[str, Any]:
             return {**form, "type": number, "metavar": word}
     if Path in parts and Mapping[str, float] not in parts:
         return {**form, "type": Path, "metavar": METAVARS.get(name, "RUN")}
-    names = "NAMES" if Sequence[str] in parts else METAVARS.get(name, name.upper())
-    return {**form, "metavar": names}
+    return {**form, "metavar": METAVARS.get(name, "NAMES" if Sequence[str] in parts else name.upper())}
 
 
 def _described(function: Function) -> dict[str, str]:

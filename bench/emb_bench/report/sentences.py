@@ -12,6 +12,7 @@ from emb_bench.experiment.experiment import Experiment, Lack
 from emb_bench.information.identifiability import Border, Doubt, combination
 from emb_bench.numbers import amount, in_samples, p_value, percent
 from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.numbers import between, in_percent, plain
 from emb_runtime.system.terminal import one_line
 
@@ -555,7 +556,7 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
 
     Where a run was ``stopped`` no further one is named: its cause comes first.
     """
-    e, again = study.estimate, f"emb-replay estimate {logs_of(study)}"
+    e, again = study.estimate, f"emb-replay estimate {logs_of(study)}{_known(study)}"
     if study.biased:
         return [f"use another method: {again} --method oem"]
     if study.model_fits and not study.predicts:
@@ -582,6 +583,13 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
     if e.method == "oem":
         found.append(f"if that does not help, allow for a disturbance: {again} --method pem")
     return found
+
+
+def _known(study: Study) -> str:
+    """The option of a study for parameters that are known beforehand."""
+    known = ((name, one) for name, one in study.options.asked.known.items() if name != "J")
+    said = ",".join(f"{name}={value:.6g}±{NORMAL_95 * deviation:.3g}" for name, (value, deviation) in known)
+    return f" --known {said}" if said else ""
 
 
 def _options(study: Study) -> str:
