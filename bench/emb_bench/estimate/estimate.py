@@ -133,7 +133,7 @@ class Estimate:
 
     def robust(self) -> Floats:
         """Standard deviations from the residuals, in the same units."""
-        deviations: Floats = np.sqrt(np.diag(self.sandwich))
+        deviations: Floats = np.sqrt(np.maximum(np.diag(self.sandwich), 0.0))  # which averaging can leave below zero
         return deviations
 
     def deviations(self) -> Floats:
@@ -171,7 +171,7 @@ class Estimate:
             at, signs = [i, *inertia], np.array([1.0, -1.0])[: 1 + len(inertia)]
             biases = np.array([[one.bias[k] for k in at] for one in self.validation.budget if one.name != "J"])
             covariances = (Spectrum(self.information).inverse(), self.sandwich)
-            bound, robust = (np.sqrt(signs @ c[np.ix_(at, at)] @ signs) for c in covariances)
+            bound, robust = (np.sqrt(max(float(signs @ c[np.ix_(at, at)] @ signs), 0.0)) for c in covariances)
             open_by = unnoticed(biases.reshape(-1, len(at)) @ signs)
             deviation = float(deviations(bound, open_by, robust, fits=self.validation.fits))
             of, value = quantity(self.bench.machine, name), float(self.values[i] / self.theta.J)
