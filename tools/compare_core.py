@@ -35,6 +35,7 @@ from emb_runtime.records import CurrentCommand, Frame, NodeState, RunState, Sens
 from emb_runtime.safety import (
     command_limits,
     drive_monitor,
+    response,
     sensor_monitor,
     sensor_thresholds,
     shield,
@@ -283,6 +284,27 @@ def _sensors(dice: random.Random) -> Iterator[Any]:
             yield verdict, list(memory), monitor.largest_current(law, limits, memory, 6.0)
 
 
+def _response(dice: random.Random) -> Iterator[Any]:
+    """Proofs of brakes about the set's, whose commands act as declared, later, or not at all."""
+    proof, laws = response, _laws()
+    models = [proof.response_model(_bench(), law) for law in laws]
+    yield models, [proof.unproven_law(_bench(), law) for law in laws]
+    while True:
+        model, memory = dice.choice(models), [0.0] * proof.MEMORY
+        angle, velocity, command = dice.uniform(-5.0, 20.0), dice.uniform(-9.0, 9.0), 0.0
+        motor, past = dice.uniform(0.8 * model.motor_low, 1.2 * model.motor_high), [0.0] * dice.randrange(1, 5)
+        proof.begin(model, memory, angle, velocity)
+        for _ in range(40):
+            if dice.random() < 0.3:
+                command = dice.choice((0.0, model.holds, model.moves, _number(dice, 6.0), 6.0, -6.0))
+            past = [command, *past[:-1]]
+            velocity += model.sample_time * motor * past[-1] + dice.gauss(0.0, 1.0)
+            angle += model.sample_time * velocity
+            measured = (_number(dice, 100.0), _number(dice, 500.0)) if dice.random() < 0.02 else (angle, velocity)
+            verdict = _tried(proof.take, model, memory, dice.random() < 0.95, *measured, command)
+            yield verdict, list(memory), proof.overshoot(model, memory, model.extra), proof.fits(model, memory)
+
+
 def _guard(dice: random.Random) -> Iterator[Any]:
     bench, layout = _bench(), load_layout()
     while True:
@@ -359,6 +381,7 @@ COMPARISONS: dict[str, Callable[[random.Random], Iterator[Any]]] = {
     "drive monitor": _drive,
     "guard": _guard,
     "sensor monitor": _sensors,
+    "response": _response,
     "state machine": _states,
     "bounds and counters": _bounds,
     "estimator": _estimator,

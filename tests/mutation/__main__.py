@@ -47,6 +47,7 @@ TESTS = {
     "safety.sensor_thresholds": ("test_sensor_monitor_reference.py",),
     "safety.sensor_monitor": ("test_sensor_monitor.py", "test_sensor_monitor_reference.py"),
     "safety.motion_balance": ("test_motion_balance.py",),
+    "safety.response": ("test_response_reference.py", "test_response.py"),
     "estimator.kalman": ("test_frozen.py", "test_kalman.py"),
     "estimator.stick_slip": ("test_frozen.py", "test_stick_slip.py"),
     "estimator.speed_loop": ("test_frozen.py", "test_speed_loop.py"),

@@ -137,7 +137,7 @@ def unproven_law(bench: Bench, law: ShieldLaw) -> ShieldLaw:
     What is faster than its speed by the strongest motor at full current for that time, less what is declared, which the
     law covers itself.
     """
-    unknown = max(LONGEST * law.sample_time - law.age_low * law.sample_time - declared_response(bench, law), 0.0)
+    unknown = LONGEST * law.sample_time - law.age_low * law.sample_time - declared_response(bench, law)
     fastest = max(bench.limits.velocity - unknown * law.motor_high * law.current, SLOWEST * law.homeward_speed)
     homeward = min(math.sqrt(STROKE) * law.homeward_speed, fastest)  # from it a brake stops within that share
     return law._replace(
@@ -193,7 +193,7 @@ def _predict(model: ResponseModel, memory: Any, follows: bool, angle: float, vel
         before = u
     memory[FLOWING] = flowing
     memory[LARGEST] = max(memory[LARGEST], abs(flowing))
-    current, friction, noise = _driven(model, u, before, _transient(model, u, flowing), v, velocity)
+    current, friction, noise = _driven(model, u, before, _transient(model, memory), v, velocity)
     memory[SLIDES] += 1.0 if min(abs(v), abs(velocity)) > model.slides and friction != 0.0 else 0.0
     if not follows:
         memory[DOUBTS] = model.doubts
@@ -252,15 +252,22 @@ def _driven(
     return 0.5 * u, 0.0, turned + 0.5 * model.sample_time * model.motor_high * abs(u) + transient  # it may stick
 
 
-def _transient(model: ResponseModel, u: float, flowing: float) -> float:
-    """Deviation of what a response shows that is shorter than the longest declared one [rad/s]."""
-    return model.transient * model.motor_high * abs(u - flowing)
+def _transient(model: ResponseModel, memory: Any) -> float:
+    """Deviation of what a response shows that is shorter than the longest declared one [rad/s].
+
+    After a change of the current it lasts as long as any response may take: a later one looks like it at first.
+    """
+    u = memory[COMMANDS + model.age]
+    changed: float = abs(u - memory[FLOWING])
+    for i in range(model.age, OLDEST_FRAME + 1):
+        changed = max(changed, abs(u - memory[COMMANDS + i]))
+    return model.transient * model.motor_high * changed
 
 
 def _correct(model: ResponseModel, memory: Any, velocity: float) -> None:
     """Take in the measured velocity: that of the state, less the overshoot's share of the current."""
     share = -memory[FLOWING] / model.current
-    transient = _transient(model, memory[COMMANDS + model.age], memory[FLOWING])
+    transient = _transient(model, memory)
     variance = model.deviation * model.deviation + transient * transient
     last = MATRIX + OVERSHOOT
     r0 = memory[MATRIX] + share * memory[last]
@@ -314,9 +321,9 @@ def _verdict(model: ResponseModel, memory: Any) -> int:
     if memory[SLIDES] < LEAST_SLIDES or not fits(model, memory):
         return OPEN
     least, least_error = overshoot(model, memory, 0.0)
-    if late + PROVES * late_error < covered and least - PROVES * least_error > -covered:
-        return PROVEN
-    return OPEN
+    # No command acts before it is sent: where the least declared age is 0, a low estimate is an error of the model.
+    follows = model.age == 0 or least - PROVES * least_error > -covered
+    return PROVEN if follows and late + PROVES * late_error < covered else OPEN
 
 
 class Row(NamedTuple):

@@ -187,6 +187,36 @@ def test_what_is_declared_is_no_contradiction(bench: Bench, response: dict[str, 
         assert judged(bench, rows)[0] == PROVEN
 
 
+@pytest.mark.parametrize(
+    ("bench", "response"),
+    [
+        (declaring(frame_age=(0, 1)), {"late": 2}),
+        (declaring(frame_age=(0, 2)), {"late": 3}),
+        (declaring(frame_age=(0, 2)), {"late": 5}),
+        (declaring(frame_age=(1, 2)), {"late": 3}),
+        (declaring(frame_age=(0, 1)), {"lag": 0.002}),
+        (declaring(current_lag=0.002), {"lag": 0.004}),
+        (declaring(frame_age=(0, 1)), {"bandwidth": 800.0}),
+    ],
+)
+def test_right_after_a_change_of_the_current_a_later_response_than_the_longest_declared_one_is_not_proven(
+    bench: Bench, response: dict[str, float]
+) -> None:
+    for seed in range(60):
+        dice = np.random.default_rng(seed)
+        levels = [0.0, dice.uniform(-1.0, 1.0), 6.0, -6.0, dice.uniform(-6.0, 6.0)]
+        commands = [u for _ in range(9) for u in [float(dice.choice(levels))] * int(dice.integers(2, 20))]
+        rows = moved(commands[:60], motor=dice.uniform(0.55, 1.5), noise=seed, **response)  # type: ignore[arg-type]
+        assert judged(bench, rows)[0] != PROVEN
+
+
+@pytest.mark.parametrize("bench", [declaring(frame_age=(0, 2)), declaring(current_lag=0.002), declaring(800.0)])
+def test_a_velocity_that_follows_at_once_is_proven_soon_where_a_longer_response_is_declared(bench: Bench) -> None:
+    found = [judged(bench, moved(REVERSING, motor=motor, noise=4)) for motor in (0.6, 0.8, 1.0, 1.2, 1.5)]
+    assert [verdict for verdict, _ in found] == [PROVEN] * 5
+    assert max(samples for _, samples in found) <= 15
+
+
 def test_frames_that_are_younger_than_the_least_declared_age_contradict() -> None:
     bench = declaring(frame_age=(2, 2))
     rows = moved(REVERSING, noise=1)
