@@ -351,6 +351,14 @@ def test_a_lag_late_frames_and_coasting_are_covered_one_at_a_time(lag: float, la
         make_law(bench)
 
 
+def test_an_observer_that_is_too_slow_is_told_as_a_bandwidth_and_as_a_lag() -> None:
+    bench = taken(drawn_bench(Random(5)), observer=450.0)
+    ts = bench.timing.sample_time
+    least = f"{0.75 / ts:g} rad/s at least, or a sensors.velocity_lag of {0.9 * ts / 0.75:g} s at most"
+    with pytest.raises(BenchFileError, match=f"{least}, got 450 rad/s, or 0.002 s;"):
+        make_law(bench)
+
+
 @pytest.mark.parametrize(
     "beside", [{"current_lag": 1e-3}, {"frame_age": (0, 2)}, {"envelope": "coasting", "angle_margin": 0.9}]
 )
