@@ -288,7 +288,8 @@ class Core:
         """Judge how the node came to rest; the run is over."""
         self._now_ns = now_ns
         if self.fault in OF_RESPONSE and not self._response.proven:
-            named = cause(self._response.model, self._response.rows, self.bench.sensors.bandwidth)
+            response = self._response
+            named = cause(response.model, response.rows, response.stop, self.bench.sensors.bandwidth)
             self._detail = "; ".join(filter(None, (self._detail, named)))
         speed = unheld_motion(self.bench, self._stopping)
         if self.fault is None and not self._rests:
@@ -387,6 +388,7 @@ class Core:
             self._machine.note(Fault.BUS_ERRORS, ", ".join(self._reception.bus_errors), frame.time_ns)
 
     def _watch_rest(self, sample: SensorSample) -> None:
+        self._response.watch(sample)
         if sample.node_state is not OBEYING and not self._stopped:
             self._stopped = True
             self._reception.status = None  # its reason was that of another stop
@@ -676,6 +678,7 @@ class Core:
         the sensors' sums is judged as ever.
         """
         if self._reversed is not None:
+            self._response.watch(sample)
             self._coasting -= elapsed
             if self._coasting <= 0.0:
                 raise self._reversed
@@ -685,6 +688,8 @@ class Core:
             if not self._response.proven:
                 self._response.take(sample, obeyed and gap == 1, command)
         except StopError as stop:
+            if stop.fault is not Fault.RESPONSE_LATE:  # which has taken it
+                self._response.watch(sample)
             self._coasting = self._monitor.coasting_time(sample)
             if self._coasting == 0.0:
                 raise

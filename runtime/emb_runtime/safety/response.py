@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from typing import Any, Final, NamedTuple
 
+from emb_runtime.can.e2e import next_counter
 from emb_runtime.config.bench import OLDEST_FRAME, Bench
 from emb_runtime.records import SensorSample
 from emb_runtime.safety.shield_design import ShieldLaw
@@ -42,7 +43,7 @@ LEAST_SLIDES: Final = 2.0  # Periods in which the brake slid, below which nothin
 SETTLES: Final = 4.0  # More of these after a command that was not obeyed
 LEAST_FIT: Final = 3.0  # Mean square of the normalised innovations beyond which the filter's model does not hold
 LEAST_ERROR: Final = 0.02  # Of the brake's equation, as a share of what full current adds in a sample
-ROWS: Final = 64  # Samples of a run that are kept to find the cause of a contradiction
+ROWS: Final = 64  # Newest samples that are kept to find the cause of a contradiction, those of the stop included
 OUTSIDE: Final = 0.1  # Share by which the estimated motor may lie outside the set
 
 # Places in the row of memory.
@@ -336,26 +337,29 @@ class Row(NamedTuple):
 
 
 class Response:
-    """The response of one run: the law that it may rely on, and its first samples.
+    """The response of one run: the law that it may rely on, and its samples until it is proven.
 
     Attributes:
         law: of the shield, :func:`unproven_law` until the response is proven.
-        rows: the first samples, until it is proven.
+        rows: the newest samples.
+        stop: the first samples of the node's own stop; their command is the current by the node's account [A].
     """
 
-    __slots__ = ("_full", "_memory", "_slow", "law", "model", "rows")
+    __slots__ = ("_counter", "_full", "_memory", "_slow", "law", "model", "rows", "stop")
 
     def __init__(self, bench: Bench, law: ShieldLaw) -> None:
         self._full = law
         self._slow = self.law = unproven_law(bench, law)
         self.model = response_model(bench, law)
         self._memory = [0.0] * MEMORY
+        self._counter = 0
         self.rows: list[Row] = []
+        self.stop: list[Row] = []
 
     def begin(self, sample: SensorSample) -> None:
         """Begin a run with its first sample."""
         begin(self.model, self._memory, sample.angle, sample.velocity)
-        self.rows = [Row(False, sample.angle, sample.velocity, 0.0)]
+        self.rows, self._counter = [Row(False, sample.angle, sample.velocity, 0.0)], sample.counter
         self.law = self._slow
 
     @property
@@ -368,13 +372,20 @@ class Response:
 
         Raises StopError if the velocity follows the commands later, or earlier, than declared.
         """
-        if len(self.rows) < ROWS:
-            self.rows.append(Row(follows, sample.angle, sample.velocity, command))
+        self.rows = [*self.rows[1 - ROWS // 2 :], Row(follows, sample.angle, sample.velocity, command)]
+        self._counter = sample.counter
         verdict = take(self.model, self._memory, follows, sample.angle, sample.velocity, command)
         if verdict == CONTRADICTED:
             raise StopError(Fault.RESPONSE_LATE, self.text)
         if verdict == PROVEN:
             self.law = self._full
+
+    def watch(self, sample: SensorSample) -> None:
+        """Keep one sample of the stop."""
+        if len(self.stop) < ROWS // 2:
+            follows = sample.counter == next_counter(self._counter)
+            self.stop.append(Row(follows, sample.angle, sample.velocity, sample.applied_current))
+            self._counter = sample.counter
 
     @property
     def text(self) -> str:

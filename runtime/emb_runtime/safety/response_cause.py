@@ -27,50 +27,67 @@ from emb_runtime.safety.response import (
     fits,
     take,
 )
+from emb_runtime.safety.shield_design import LONGEST_LAG
 
 LEADS: Final = 0.3  # Samples by which a sensor's velocity leads the mean of the last period, at least: in truth 0.5
-MOVES: Final = 20.0  # Change of the velocity that shows that, in its standard deviations
+MOVES: Final = 14.0  # Change of the velocity that shows that, in its standard deviations
 BANDWIDTHS: Final = tuple(round(200.0 * 1.04**i, -1) for i in range(77))  # Of an observer, to 4,000 [rad/s]
 BELOW: Final = 0.96  # Share of it that is named, as the true one must not be less
 DAMPING: Final = 0.7  # Of an observer: with a greater one the same lag is that of a faster observer
-LAGS: Final = (0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0)  # Of the current [samples]
+LAGS: Final = tuple(2.5e-4 * 1.08**i for i in range(40))  # Of the current, to 5 ms [s]
 LIKER: Final = 0.25  # Share of the squares that an observer must leave, of those that a sensor leaves
-ALIKE: Final = 6.0  # The same by which frames must be likelier than a lag
+BRAKES: Final = 16  # Samples of the stop that tell a lag; later the brake rests
 LIKELIER: Final = 9.0  # Twice the logarithm of the ratio of likelihoods that names a cause
+ERRORS: Final = 9.0  # The same within which a value may be the true one: three standard deviations
 
 
-def cause(model: ResponseModel, rows: Sequence[Row], bandwidth: float | None) -> str:
-    """Quantity, measured value, and key of the bench file to change; "" if nothing explains the first samples.
+def cause(model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row], bandwidth: float | None) -> str:
+    """Quantity, measured value, and key of the bench file to change; "" if nothing explains the samples.
 
-    ``bandwidth`` is the declared one of an observer, None where none is declared [rad/s].
+    ``stop`` are the samples after ``rows`` in which the node brakes by itself, ``bandwidth`` is the declared one of an
+    observer, None where none is declared [rad/s].
     """
-    found = observer_bandwidth(model, rows)
+    found = observer_bandwidth(model, [*rows, *stop])
     if found and (bandwidth is None or found < 0.9 * bandwidth):
         alpha, beta = _gains(model, found)
         behind = f"{(alpha / beta - 0.5) * model.sample_time * 1e3:.1f} ms"
-        least = round(BELOW * found, -1)
+        least = math.floor(BELOW * found / 10.0) * 10.0
         key = f'[sensors] velocity = "observer", observer_bandwidth = {least:g} at most'
         return f"the velocity lags the angle by {behind}, as that of an observer does: {key}"
-    declared = likelihood(model, rows, model.age, 0.0)
-    ages = {age: likelihood(model, rows, age, 0.0) for age in range(OLDEST_FRAME + 1) if age != model.age}
-    flows = {lag: likelihood(model, rows, model.age, lag * model.sample_time) for lag in LAGS}
-    age, lag = min(ages, key=ages.__getitem__), min(flows, key=flows.__getitem__)
-    if not min(ages[age], flows[lag]) < declared - LIKELIER:  # this way round, nothing fits where both are infinite
-        return ""
-    if ages[age] < flows[lag] - ALIKE:
-        when = f"commands act {age} periods after the sample that they answer"
-        return f"{when}: [shield] frame_age = [{min(age, model.age)}, {max(age, model.age)}]"
-    seconds = lag * model.sample_time
-    return f"the current lags by {seconds * 1e3:g} ms: [shield] current_lag = {seconds:g}"
+    braked, later = stop[:BRAKES], [age for age in range(OLDEST_FRAME + 1) if age != model.age]
+    declared = likelihood(model, rows, braked, model.age, 0.0)
+    ages = {age: min(likelihood(model, rows, braked, age, 0.0, seen) for seen in range(age + 1)) for age in later}
+    flows = {lag: likelihood(model, rows, braked, model.age, lag) for lag in LAGS}
+    aged, lagged = min(ages.values()), min(flows.values())
+    if not min(aged, lagged) < declared - LIKELIER:  # this way round, nothing fits where both are infinite
+        return "" if not stop else cause(model, rows, (), bandwidth)
+    if aged < lagged:
+        likely = [age for age in ages if ages[age] < aged + ERRORS]
+        when = f"commands act {min(ages, key=ages.__getitem__)} periods after the sample that they answer"
+        return f"{when}: [shield] frame_age = [{min(*likely, model.age)}, {max(*likely, model.oldest)}]"
+    return _of_lag(model, flows)
 
 
-def likelihood(model: ResponseModel, rows: Sequence[Row], age: int, lag: float) -> float:
+def _of_lag(model: ResponseModel, flows: dict[float, float]) -> str:
+    """The likeliest lag, and the key with the longest that is likely; the longest that is covered if that is likely."""
+    likely = [lag for lag in flows if flows[lag] < min(flows.values()) + ERRORS]
+    most, longest = math.ceil(max(likely) * 1e4) * 1e-4, LONGEST_LAG * model.sample_time
+    if min(likely) <= longest <= most:
+        most = longest
+    lag = min(flows, key=flows.__getitem__)
+    return f"the current lags by {lag * 1e3:.1f} ms: [shield] current_lag = {most:g}"
+
+
+def likelihood(
+    model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row], age: int, lag: float, seen: int = 0
+) -> float:
     """Minus twice the log-likelihood of frames of one age and a current with one lag [s]; infinite if they do not fit.
 
-    The overshoot is then that of the lag, and no unknown.
+    The overshoot is then that of the lag, and no unknown. The measurements are late by ``seen`` periods of the age, the
+    commands by the others: they wait, and the node's own current does not.
     """
     doubts = age + 1.0 + math.ceil(3.0 * lag / model.sample_time)
-    tried = model._replace(age=age, oldest=age, lag=lag, extra=0.0, transient=0.0, doubts=doubts)
+    tried = model._replace(age=0, oldest=0, lag=lag, extra=0.0, transient=0.0, doubts=doubts)
     memory = [0.0] * MEMORY
     begin(tried, memory, rows[0].angle, rows[0].velocity)
     share = model.current * lag
@@ -78,8 +95,10 @@ def likelihood(model: ResponseModel, rows: Sequence[Row], age: int, lag: float) 
     memory[STATE + OVERSHOOT] = share * memory[STATE + MOTOR]
     memory[MATRIX + SIZE * MOTOR + OVERSHOOT] = memory[MATRIX + SIZE * OVERSHOOT + MOTOR] = share * variance
     memory[MATRIX + (SIZE + 1) * OVERSHOOT] = share * share * variance
-    for row in rows[1:]:
-        take(tried, memory, *row)
+    commands = [0.0] * (age - seen) + [row.command for row in rows[1:]]
+    acting = [0.0] * seen + commands[: len(rows) - 1] + [row.command for row in stop]
+    for row, current in zip([*rows[1:], *stop], acting, strict=False):
+        take(tried, memory, row.follows, row.angle, row.velocity, current)
     return memory[LIKELIHOOD] if fits(tried, memory) else math.inf
 
 
@@ -101,18 +120,23 @@ def observer_bandwidth(model: ResponseModel, rows: Sequence[Row]) -> float:
 
 
 def _unlike(model: ResponseModel, rows: Sequence[Row], bandwidth: float) -> float:
-    """Sum of the squared differences of the velocities from those of an observer of the angles [rad²/s²]."""
-    ts = model.sample_time
+    """Sum of the squared differences of the velocities from those of an observer of the angles [rad²/s²].
+
+    The observer's angle follows from two velocities: at the begin and where a sample is missing it is not known.
+    """
+    ts, known = model.sample_time, False
     alpha, beta = _gains(model, bandwidth)
-    angle, velocity, squares = rows[0].angle, rows[0].velocity, 0.0
-    for row in rows[1:]:
+    angle = velocity = squares = 0.0
+    for before, row in pairwise(rows):
         if not row.follows:
-            angle, velocity = row.angle, row.velocity
+            known = False
             continue
         ahead = angle + ts * velocity
-        angle = ahead + alpha * (row.angle - ahead)
-        velocity += beta / ts * (row.angle - ahead)
+        surprise = row.angle - ahead if known else ts / beta * (row.velocity - before.velocity)
+        angle = row.angle - (1.0 - alpha) * surprise
+        velocity = velocity + beta / ts * surprise if known else row.velocity
         squares += (row.velocity - velocity) ** 2
+        known = True
     return squares
 
 

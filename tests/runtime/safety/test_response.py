@@ -56,8 +56,12 @@ def moved(
     bandwidth: float = 0.0,
     motor: float = 1.0,
     noise: int | None = None,
+    stop: int | None = None,
 ) -> list[Row]:
-    """Samples of a brake at rest in the free stroke, in small steps of constant acceleration."""
+    """Samples of a brake at rest in the free stroke, in small steps of constant acceleration.
+
+    After so many samples the node brakes by itself (``stop``), and its current takes the command's place.
+    """
     p, h = BENCH.brake, TS / PIECES
     rng = np.random.default_rng(noise)
     x = v = i = tracked = seen = 0.0
@@ -66,6 +70,8 @@ def moved(
     rows = [Row(False, 0.0, 0.0, 0.0)]
     for k, command in enumerate(commands):
         u = commands[k - late] if k >= late else 0.0
+        if stop is not None and k >= stop:
+            u = command = max(min(-0.1 * v, 6.0), -6.0)
         for _ in range(PIECES):
             i = u + (i - u) * math.exp(-h / lag) if lag else u
             drive = motor * p.k_m * i - p.gamma * p.k_1 * max(x, 0.0)
@@ -135,35 +141,55 @@ def test_a_velocity_that_follows_at_once_is_proven_within_twenty_samples(
     assert samples <= 20
 
 
-RESPONSES: dict[str, tuple[dict[str, float], str | tuple[float, float]]] = {
-    "observer 800": ({"bandwidth": 800.0}, (700.0, 800.0)),
-    "observer 1520": ({"bandwidth": 1520.0}, (1350.0, 1520.0)),
-    "lag 1 ms": ({"lag": 0.001}, "current_lag = 0.0"),
-    "lag 2 ms": ({"lag": 0.002}, "current_lag = 0.00"),
-    "late 1": ({"late": 1}, "frame_age = [0, 1]"),
-    "late 2": ({"late": 2}, "frame_age = [0, 2]"),
-    "late 5": ({"late": 5}, "frame_age = [0, 5]"),
+OBSERVER = r"observer_bandwidth = (\d+) at most"
+LAG = r"current_lag = ([\d.]+)$"
+RESPONSES: dict[str, tuple[dict[str, float], str, float, float]] = {
+    "observer 300": ({"bandwidth": 300.0}, OBSERVER, 270.0, 300.0),
+    "observer 800": ({"bandwidth": 800.0}, OBSERVER, 740.0, 800.0),
+    "observer 1520": ({"bandwidth": 1520.0}, OBSERVER, 1400.0, 1520.0),
+    "lag 0.5 ms": ({"lag": 0.0005}, LAG, 0.0005, 0.001),
+    "lag 1 ms": ({"lag": 0.001}, LAG, 0.001, 0.002),
+    "lag 2 ms": ({"lag": 0.002}, LAG, 0.002, 0.002),
+    "late 1": ({"late": 1}, r"frame_age = \[0, (\d)\]", 1.0, 1.0),
+    "late 2": ({"late": 2}, r"frame_age = \[0, (\d)\]", 2.0, 2.0),
+    "late 5": ({"late": 5}, r"frame_age = \[0, (\d)\]", 5.0, 5.0),
 }
+"""What is undeclared, and the key and the values that cover it."""
 
 
 @pytest.mark.parametrize("commands", [FULL, REVERSING])
 @pytest.mark.parametrize("motor", [0.6, 1.0, 1.5])
 @pytest.mark.parametrize("name", RESPONSES)
-def test_a_later_response_contradicts_and_its_cause_names_the_key(
+def test_a_later_response_contradicts_and_its_cause_names_the_key_with_a_value_that_covers_it(
     name: str, motor: float, commands: list[float]
 ) -> None:
-    response, key = RESPONSES[name]
-    rows = moved(commands, motor=motor, noise=3, **response)  # type: ignore[arg-type]
-    verdict, samples = judged(BENCH, rows)
+    response, key, least, most = RESPONSES[name]
+    verdict, n = judged(BENCH, moved(commands, motor=motor, noise=3, **response))  # type: ignore[arg-type]
     assert verdict == CONTRADICTED
-    assert samples <= 30
-    named = cause(MODEL, rows[: max(samples, 12) + 1], None)
-    if isinstance(key, str):
-        assert key in named
-    else:
-        found = re.search(r"observer_bandwidth = (\d+) at most", named)
-        assert found is not None
-        assert key[0] <= float(found[1]) <= key[1]
+    assert n <= 30
+    rows = moved([*commands[:n], *[0.0] * 32], motor=motor, noise=3, stop=n, **response)  # type: ignore[arg-type]
+    named = cause(MODEL, rows[: n + 1], rows[n + 1 :], None)
+    found = re.search(key, named)
+    assert found is not None, named
+    assert least <= float(found[1]) <= most
+
+
+def test_measurements_that_are_late_are_named_as_late_frames() -> None:
+    rows = moved([*[6.0] * 5, *[0.0] * 32], noise=3, stop=5)
+    late = [Row(row.follows, seen.angle, seen.velocity, row.command) for seen, row in pairwise([rows[0], *rows])]
+    assert "frame_age = [0, 1]" in cause(MODEL, late[:6], late[6:], None)
+
+
+def test_without_a_stop_that_fits_the_samples_before_it_tell() -> None:
+    rows = moved([6.0] * 6, noise=3, late=2)
+    stop = [row._replace(velocity=-3.0 * row.velocity) for row in rows]
+    assert "frame_age = [0, 2]" in cause(MODEL, rows, stop, None)
+
+
+def test_a_missing_sample_does_not_change_the_bandwidth_that_is_found() -> None:
+    rows = moved(REVERSING, bandwidth=1000.0, noise=1)
+    rows[8:10] = [rows[9]._replace(follows=False)]
+    assert observer_bandwidth(MODEL, rows) == pytest.approx(1000.0, rel=0.04)
 
 
 @pytest.mark.parametrize(
@@ -221,7 +247,7 @@ def test_frames_that_are_younger_than_the_least_declared_age_contradict() -> Non
     bench = declaring(frame_age=(2, 2))
     rows = moved(REVERSING, noise=1)
     assert judged(bench, rows)[0] == CONTRADICTED
-    assert "frame_age = [0, 2]" in cause(response_model(bench, make_law(bench)), rows, None)
+    assert "frame_age = [0, 2]" in cause(response_model(bench, make_law(bench)), rows, (), None)
 
 
 def test_what_does_not_move_proves_nothing() -> None:
@@ -257,20 +283,20 @@ def test_until_then_the_speed_leaves_room_for_six_samples_of_full_current() -> N
 
 
 def test_no_cause_is_named_where_none_explains_the_samples() -> None:
-    assert cause(MODEL, moved(REVERSING, noise=1), None) == ""
+    assert cause(MODEL, moved(REVERSING, noise=1), (), None) == ""
     opposite = [row._replace(angle=-row.angle, velocity=-row.velocity) for row in moved(REVERSING, noise=1)]
-    assert cause(MODEL, opposite, None) == ""
+    assert cause(MODEL, opposite, (), None) == ""
     scaled = [row._replace(velocity=0.5 * row.velocity) for row in moved(REVERSING, noise=1)]
     assert observer_bandwidth(MODEL, scaled) == 0.0
-    assert cause(MODEL, moved([0.0] * 20, noise=1), None) == ""
+    assert cause(MODEL, moved([0.0] * 20, noise=1), (), None) == ""
 
 
 def test_a_slower_observer_than_the_declared_one_is_named_and_a_faster_one_is_not() -> None:
     rows = moved(REVERSING, bandwidth=800.0, noise=1)
     bench = declaring(1520.0)
     model = response_model(bench, make_law(bench))
-    assert "observer_bandwidth = 7" in cause(model, rows, 1520.0)
-    assert cause(model, moved(REVERSING, bandwidth=1520.0, noise=1), 800.0) == ""
+    assert "observer_bandwidth = 7" in cause(model, rows, (), 1520.0)
+    assert cause(model, moved(REVERSING, bandwidth=1520.0, noise=1), (), 800.0) == ""
 
 
 def test_a_sample_that_does_not_follow_begins_the_observer_anew() -> None:
