@@ -195,7 +195,8 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
     """A run's outcome as plain data."""
     outcome, fault = ran.outcome, ran.outcome.fault
     assert plan.policy is not None
-    beyond = outside(plan.bench, outcome.estimate)
+    # An estimate relies on the response: before it is proven, a run that ended says nothing about the brake.
+    beyond = outside(plan.bench, outcome.estimate) if fault is None or outcome.response else {}
     exit_code = EXIT_OUTSIDE if plan.strict and beyond and ran.exit_code == EXIT_DONE else ran.exit_code
     result = result_facts(fault, exit_code, outcome.detail)
     if fault is None and not ran.log.complete:
@@ -279,6 +280,8 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
         lines += _counts(s)
     if completed and (details or s["unexplained"] is None):
         lines.append(f"  motion     {_motion(s)}")
+    if completed and s["limit"] > 0.0:
+        lines.append(f"  response   {s['response'] or 'NOT PROVEN: too little motion, so the speed stayed low'}")
     lines += _unusual(s)
     if s["estimate"] and (details or s["result"] in ("done", LOG_INCOMPLETE)):
         lines += estimate.words(s["estimate"], s["total"], fits=s["model_fits"])

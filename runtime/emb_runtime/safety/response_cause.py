@@ -14,6 +14,7 @@ from typing import Final
 
 from emb_runtime.config.bench import OLDEST_FRAME
 from emb_runtime.safety.response import (
+    BEYOND,
     LIKELIHOOD,
     MATRIX,
     MEMORY,
@@ -38,7 +39,7 @@ LAGS: Final = tuple(2.5e-4 * 1.08**i for i in range(40))  # Of the current, to 5
 LIKER: Final = 0.25  # Share of the squares that an observer must leave, of those that a sensor leaves
 BRAKES: Final = 16  # Samples of the stop that tell a lag; later the brake rests
 LIKELIER: Final = 9.0  # Twice the logarithm of the ratio of likelihoods that names a cause
-ERRORS: Final = 9.0  # The same within which a value may be the true one: three standard deviations
+ERRORS: Final = 16.0  # The same within which a lag may be the true one: four standard deviations
 
 
 def cause(model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row], bandwidth: float | None) -> str:
@@ -62,19 +63,19 @@ def cause(model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row], bandwi
     if not min(aged, lagged) < declared - LIKELIER:  # this way round, nothing fits where both are infinite
         return "" if not stop else cause(model, rows, (), bandwidth)
     if aged < lagged:
-        likely = [age for age in ages if ages[age] < aged + ERRORS]
+        likely = [age for age in ages if ages[age] < aged + LIKELIER]
         when = f"commands act {min(ages, key=ages.__getitem__)} periods after the sample that they answer"
         return f"{when}: [shield] frame_age = [{min(*likely, model.age)}, {max(*likely, model.oldest)}]"
     return _of_lag(model, flows)
 
 
 def _of_lag(model: ResponseModel, flows: dict[float, float]) -> str:
-    """The likeliest lag, and the key with the longest that is likely; the longest that is covered if that is likely."""
+    """The likeliest lag, and the key with the longest that may be there, or the longest covered if it may be that."""
     likely = [lag for lag in flows if flows[lag] < min(flows.values()) + ERRORS]
-    most, longest = math.ceil(max(likely) * 1e4) * 1e-4, LONGEST_LAG * model.sample_time
-    if min(likely) <= longest <= most:
-        most = longest
-    lag = min(flows, key=flows.__getitem__)
+    lag, longest = min(flows, key=flows.__getitem__), LONGEST_LAG * model.sample_time
+    most = math.ceil(max(likely) * 1e4) * 1e-4
+    if lag <= BEYOND * longest:
+        most = min(most, longest)
     return f"the current lags by {lag * 1e3:.1f} ms: [shield] current_lag = {most:g}"
 
 

@@ -92,6 +92,8 @@ def test_every_count_and_every_trouble_has_its_words_and_an_undisturbed_run_few(
             "THE MODEL DOES NOT FIT",
         ),
         ({"unexplained": 3.6, "allowed": 28.4}, "unexplained velocity 4 rad/s, limit 28 rad/s"),
+        ({"response": "0.1 samples late"}, "  response   0.1 samples late\n"),
+        ({"response": ""}, "  response   NOT PROVEN: too little motion, so the speed stayed low\n"),
     )
     for changes, part in rows:
         changes |= {"counters": RunCounters(pairs=1, answered=490, unanswered=10, bus_errors=4)}
@@ -116,6 +118,12 @@ def test_an_estimate_at_the_border_of_the_ranges_or_beyond_is_said_first_and_wit
             assert ("OUTSIDE" in first, "the limits were not guaranteed" in second) == (outside, outside)
             stopped = replace(known, fault=Fault.INTERRUPTED)
             assert document(plan, "can0", replace(ran, outcome=stopped))["exit_code"] == 3  # type: ignore[arg-type]
+
+
+def test_an_estimate_of_a_run_that_ended_before_its_response_was_proven_says_nothing_of_the_ranges(told: Any) -> None:
+    estimate = (0.02, 11.0, 0.01, 2e-5, 1e-5, 0.0004, 1e-5, 1e-7)
+    assert not told(fault=Fault.RESPONSE_LATE, estimate=estimate)["outside"]
+    assert list(told(fault=Fault.INTERRUPTED, estimate=estimate, response="on time")["outside"]) == ["k_1"]
 
 
 @pytest.mark.parametrize("fault", Fault)

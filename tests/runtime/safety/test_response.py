@@ -150,6 +150,7 @@ RESPONSES: dict[str, tuple[dict[str, float], str, float, float]] = {
     "lag 0.5 ms": ({"lag": 0.0005}, LAG, 0.0005, 0.001),
     "lag 1 ms": ({"lag": 0.001}, LAG, 0.001, 0.002),
     "lag 2 ms": ({"lag": 0.002}, LAG, 0.002, 0.002),
+    "lag 3 ms": ({"lag": 0.003}, LAG, 0.003, 0.0051),
     "late 1": ({"late": 1}, r"frame_age = \[0, (\d)\]", 1.0, 1.0),
     "late 2": ({"late": 2}, r"frame_age = \[0, (\d)\]", 2.0, 2.0),
     "late 5": ({"late": 5}, r"frame_age = \[0, (\d)\]", 5.0, 5.0),
