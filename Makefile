@@ -94,6 +94,7 @@ night: $(VENV)/.dev
 	$(BIN)/python -m tests.searches.shield --episodes 20000
 	$(BIN)/python -m tests.searches.sensor_monitor --experiments 100000
 	$(BIN)/python -m tests.searches.motion_balance --experiments 60000
+	$(BIN)/python -m tests.searches.response --runs 100
 	$(BIN)/python -m tests.searches.lies
 	$(BIN)/python -m tests.searches.kills
 	$(BIN)/python -m tests.searches.fuzz
