@@ -113,7 +113,8 @@ def test_estimate_report_and_campaign_agree_on_what_is_identified(
     bench: Bench, log: Log, tmp_path: Path, simulate: Simulate
 ) -> None:
     calls = iter(range(10**6))
-    stopped = simulate(square, options="plant=lag,seed=1", stop_requested=lambda: next(calls) > 545)
+    lagging = replace(bench, shield=bench.shield._replace(current_lag=0.002))
+    stopped = simulate(square, options="plant=lag,seed=1", on_bench=lagging, stop_requested=lambda: next(calls) > 545)
     logs = [
         log("plant=exact,seed=5"),
         read_log(write_log(tmp_path / "short.mcap", simulate(square, options="plant=exact", steps=12), steps=12)),

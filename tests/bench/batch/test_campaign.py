@@ -9,7 +9,7 @@ import math
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,14 +48,19 @@ class Said:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate, bench: Bench) -> Path:
+    lagging = replace(bench, shield=bench.shield._replace(current_lag=0.002))
     root = tmp_path_factory.mktemp("campaign")
     for day in ("monday", "tuesday", "friday", "broken", "broken/folder.mcap"):
         (root / day).mkdir()
     write_log(root / "monday/a.mcap", simulate(square, options="plant=exact,seed=1"))
     write_log(root / "monday/b.mcap", simulate(square, options="plant=exact,seed=2"))
     write_log(root / "tuesday/c.mcap", simulate(square, options="plant=exact,f_v=3e-5,T_c=1.2e-2,seed=3"))
-    write_log(root / "tuesday/lag.mcap", simulate(square, options="plant=lag,seed=4"), metadata={"emb.run": {}})
+    write_log(
+        root / "tuesday/lag.mcap",
+        simulate(square, options="plant=lag,seed=4", on_bench=lagging),
+        metadata={"emb.run": {}},
+    )
     calls = iter(range(10**6))
     early = simulate(square, options="plant=exact,seed=5", stop_requested=lambda: next(calls) > 1000)
     write_log(root / "friday/early.mcap", early)

@@ -43,7 +43,7 @@ def test_a_run_on_a_mapped_drive_is_a_run_and_its_information_that_of_our_node(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # At 6 A the shield chatters at the limits as the noise has it, and two runs of one node differ by more.
-    bus, emb_run = runner(name, tmp_path, capsys, monkeypatch, current=2.0)
+    bus, emb_run = runner(name, tmp_path, capsys, monkeypatch, current=3.0)
     document = emb_run.document()
     assert (document["result"], document["answered"], document["not_obeyed"]) == ("done", 500, 0)
     node = bus.transport.node
@@ -60,7 +60,8 @@ def test_a_run_on_a_mapped_drive_is_a_run_and_its_information_that_of_our_node(
         )[1]
         for log, model in (("run", "late-command" if name == "mit" else "exact"), ("node", None))
     )
-    assert math.expm1((mapped - ours) / 4.0) == pytest.approx(0.0, abs=0.01)  # per parameter
+    # Per parameter. The sample at which the response is proven, and so the slower law ends, has a part in it.
+    assert math.expm1((mapped - ours) / 4.0) == pytest.approx(0.0, abs=0.02)
 
 
 def test_the_log_has_the_mapping_and_reruns_and_another_mapping_in_it_is_found(
