@@ -386,9 +386,15 @@ def test_the_delay_that_is_told_is_known_once_the_current_has_changed(
     assert least <= error < most
 
 
-def test_the_first_64_samples_are_kept() -> None:
+def test_the_newest_samples_of_a_run_and_the_first_of_its_stop_are_kept() -> None:
     response = Response(BENCH, SHIPPED)
     response.begin(sample(Row(False, 0.0, 0.0, 0.0)))
     for k in range(80):
-        response.take(sample(Row(True, 0.0, 0.0, 0.0)), True, 0.0)
-        assert len(response.rows) == min(k + 2, 64)
+        row = Row(True, 1e-3 * k, 0.0, 0.0)
+        response.take(sample(row), True, 0.0)
+        assert len(response.rows) == min(k + 2, 32)
+        assert response.rows[-1] == row
+    for k in range(80):
+        response.watch(sample(Row(True, 1e-3 * k, 0.0, 0.0)))
+        assert len(response.stop) == min(k + 1, 32)
+        assert (response.stop[0].angle, response.stop[-1].angle) == (0.0, 1e-3 * min(k, 31))
