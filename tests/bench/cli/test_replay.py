@@ -19,7 +19,7 @@ from emb_bench.information.fisher import fisher
 from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import Layout
-from emb_runtime.config.bench import shipped_bench_text
+from emb_runtime.config.bench import Sensors, shipped_bench_text
 from emb_runtime.numbers import plain
 from emb_runtime.records import CycleRecord
 
@@ -106,8 +106,12 @@ def test_nuisances_cost_information_and_a_prior_gives_some(log: Log, replay: Rep
     assert (known["prior"], known["physical"]["identified"]) == ("pm50", True)
 
 
+OBSERVED = Sensors("observer", 760.0)
+"""With another declaration, a run of plant ``observer`` ends before it tells anything."""
+
+
 def test_an_observer_s_velocity_counts_for_nothing_and_that_is_said(bench: Bench, log: Log, replay: Replay) -> None:
-    path = log("observer.mcap", "plant=observer")
+    path = log("observer.mcap", "plant=observer", on_bench=replace(bench, sensors=OBSERVED))
     assert len(replay.document("fim", path)["notes"]) == 1
     observed, direct = (replay.document("fim", path, "--model", name)["physical"] for name in ("observer", "exact"))
     assert observed["log_det"] < direct["log_det"]
@@ -117,7 +121,8 @@ def test_an_observer_s_velocity_counts_for_nothing_and_that_is_said(bench: Bench
 def test_of_a_bench_that_declares_an_observer_every_command_counts_the_angle_alone(
     bench: Bench, log: Log, replay: Replay, tmp_path: Path, plant: str
 ) -> None:
-    path, declared = log("run.mcap", f"plant={plant}"), tmp_path / "declared.toml"
+    driven = replace(bench, sensors=OBSERVED) if plant == "observer" else bench
+    path, declared = log("run.mcap", f"plant={plant}", on_bench=driven), tmp_path / "declared.toml"
     declared.write_text(f'{shipped_bench_text()}\n[sensors]\nvelocity = "observer"\nobserver_bandwidth = 760\n')
     told = replay.document("fim", path, "--theta", "true", "--bench", declared)
     measured = replay.document("fim", path, "--theta", "true", "--model", "exact" if plant == "observer" else plant)

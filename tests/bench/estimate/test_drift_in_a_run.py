@@ -96,7 +96,7 @@ def test_the_interval_holds_what_a_drift_that_a_walk_followed_began_and_ended_wi
 def test_the_interval_allows_for_a_drift_that_is_too_small_to_be_noticed(bench: Bench, seed: int) -> None:
     data = drifting(bench, "square:period=0.2", "T_c", 3e-4, seed=seed)
     errors_of_sensors = {name: getattr(bench.systematic, name) for name in SYSTEMATIC}
-    others = dict.fromkeys(asdict(bench.systematic), 0.0) | errors_of_sensors
+    others = dict.fromkeys(asdict(bench.systematic), 0.0) | {"k_m": None} | errors_of_sensors
     asked = [
         with_systematic(EstimationProblem(), replace(bench, systematic=Systematic(**known)), bench.plant("exact"))
         for known in (others, others | {"drift": bench.systematic.drift})
