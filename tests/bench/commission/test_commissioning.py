@@ -175,11 +175,12 @@ def test_once_the_velocity_is_known_the_steps_go_on_with_it(tmp_path: Path, band
 def test_an_observer_that_the_data_sheet_denies_ends_it_at_low_speed(tmp_path: Path) -> None:
     bench = parse_bench(f'{sheet("[0, 0]").text}\n[sensors]\nvelocity = "sensor"\n', "sheet")
     with pytest.raises(
-        EmbError, match=r"observer's, bandwidth 15\d\d rad/s.* observer_bandwidth = 14\d\d in \[sensors\]"
+        EmbError,
+        match=r'4-first-move .*RESPONSE_LATE: .*\[sensors\] velocity = "observer", observer_bandwidth = 14\d\d',
     ):
         commissioning(tmp_path, in_process, bench, "sim:plant=observer").run()
-    assert float(read_log(tmp_path / "5-free-stroke.mcap").end["top_speed"]) < 60.0
-    assert not (tmp_path / "6-small.mcap").exists()
+    assert float(read_log(tmp_path / "4-first-move.mcap").end["top_speed"]) < 60.0
+    assert not (tmp_path / "5-free-stroke.mcap").exists()
 
 
 @pytest.mark.slow
