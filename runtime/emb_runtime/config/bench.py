@@ -214,7 +214,7 @@ class Systematic:
     """Current that acts beyond what the node reports; a friction that depends on the direction looks the same [A]."""
     delay: NotNegative = 0.3  # By which commands act late, or samples early [samples]
     velocity_gain: NotNegative = 0.02  # Relative error of the velocity's scale
-    k_m: NotNegative | None = None  # Relative error of k_m in [brake], where it was measured; J is then estimated
+    k_m: Positive | None = None  # Relative error of k_m in [brake], where it was measured; J is then estimated
     inertia: NotNegative = 0.01  # Relative error of J, which all four parameters share
     angle_scale: NotNegative = 0.003  # Relative error of the angle's scale, which k_m and T_c share
     current_scale: NotNegative = 0.0  # Relative error of the current's scale, where k_m is meant per true ampere

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +85,9 @@ def test_a_column_that_an_observer_derives_is_told_and_without_it_the_machine_is
     said = []
     for given in (text.replace("[signals.command]", f"{own}noise = 1e-4\n\n[signals.command]"), text):
         (tmp_path / "map.toml").write_text(given)
-        assert main(["estimate", str(tmp_path / "r.csv"), "--map", str(tmp_path / "map.toml")]) == 0
+        assert main(["estimate", str(tmp_path / "r.csv"), "--map", str(tmp_path / "map.toml")]) == 1, (
+            "the simulation's steps show"
+        )
         said.append(" ".join(capsys.readouterr().out.split()))
     told = "the velocity is derived from the angle, bandwidth about 800 rad/s: leave its column out of the map"
     assert [told in out for out in said] == [True, False]
@@ -195,6 +198,10 @@ def test_k_m_and_inertia_without_a_known_load_are_only_a_ratio(
     assert "scale together" in said
     held = text.replace("mass = 70.0\n", "") + "[machine.known]\nmass = 95.0\n"
     assert opened(tmp_path, tmp_path / "r.csv", held).bench.machine.unknown == ("k_m", "T_c", "f_v")  # type: ignore[union-attr]
+    (tmp_path / "map.toml").write_text(held.replace("k_m = 0.02", "k_m = 1.1"))
+    asked = ("estimate", str(tmp_path / "r.csv"), "--map", str(tmp_path / "map.toml"), "--window", "0.02", "--json")
+    assert main(asked) in (0, 1)
+    assert json.loads(capsys.readouterr().out)["parameters"]["k_m"]["value"] == pytest.approx(1.0, rel=0.01)
 
 
 FILES_REFUSED = (

@@ -94,6 +94,7 @@ def test_what_is_wrong_is_refused_with_file_key_and_reason() -> None:
         ("J     = 4.624e-6", "J     = 1" + "0" * 400, "brake.J", "finite"),
         ("J     = 4.624e-6", "J     = 1" + "0" * 5000, "", "not valid TOML"),
         ("k_m   = 2.170e-2", "k_m   = 9.0e-2", "shield.ranges", "leaves out the nominal k_m = 0.09"),
+        ("inertia        = 0.01 ", "k_m = 0.0\ninertia = 0.01 ", "systematic.k_m", "above 0"),
         ("[can]\nbitrate = 1000000", "can = 3", "can", "expected a table"),
         *(
             ("[timing]", f"[sensors]\n{wrong}\n[timing]", f"sensors.{key}".rstrip("."), reason)
