@@ -29,7 +29,7 @@ from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.e2e import NO_COUNTER
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.receiver import Reception
-from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.bench import BrakeParameters, Sensors
 from emb_runtime.errors import LogError
 from emb_runtime.log.ring_buffer import FrameRecord
 from emb_runtime.records import CycleRecord, Frame, RunState, SensorSample
@@ -190,7 +190,8 @@ def test_a_brake_that_rests_off_the_origin_starts_where_it_rests(tmp_path: Path,
 def test_a_record_fits_the_plant_that_was_simulated_and_its_instruments(
     tmp_path: Path, simulate: Simulate, bench: Bench, plant: str
 ) -> None:
-    log, experiment = recorded(tmp_path, simulate(square, options=f"plant={plant},f_v=3e-5"))
+    told = replace(bench, sensors=Sensors("observer", 1520.0)) if plant == "observer" else bench
+    log, experiment = recorded(tmp_path, simulate(square, options=f"plant={plant},f_v=3e-5", on_bench=told))
     assert log.true_plant == plant
     assert log.truth is not None
     right = fit(experiment, bench, log.truth, bench.plant(plant))
