@@ -199,7 +199,7 @@ def test_k_m_and_inertia_without_a_known_load_are_only_a_ratio(
     held = text.replace("mass = 70.0\n", "") + "[machine.known]\nmass = 95.0\n"
     assert opened(tmp_path, tmp_path / "r.csv", held).bench.machine.unknown == ("k_m", "T_c", "f_v")  # type: ignore[union-attr]
     (tmp_path / "map.toml").write_text(held.replace("k_m = 0.02", "k_m = 1.1"))
-    asked = ("estimate", str(tmp_path / "r.csv"), "--map", str(tmp_path / "map.toml"), "--window", "0.02", "--json")
+    asked = ["estimate", str(tmp_path / "r.csv"), "--map", str(tmp_path / "map.toml"), "--window", "0.02", "--json"]
     assert main(asked) in (0, 1)
     assert json.loads(capsys.readouterr().out)["parameters"]["k_m"]["value"] == pytest.approx(1.0, rel=0.01)
 
