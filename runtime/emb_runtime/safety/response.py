@@ -43,7 +43,7 @@ LEAST_SLIDES: Final = 2.0  # Periods in which the brake slid, below which nothin
 SETTLES: Final = 4.0  # More of these after a command that was not obeyed
 LEAST_FIT: Final = 3.0  # Mean square of the normalised innovations beyond which the filter's model does not hold
 LEAST_ERROR: Final = 0.02  # Of the brake's equation, as a share of what full current adds in a sample
-ROWS: Final = 64  # Newest samples that are kept to find the cause of a contradiction, those of the stop included
+KEPT: Final = 32  # Samples of a run, and of its stop, that are kept to find the cause of a contradiction
 OUTSIDE: Final = 0.1  # Share by which the estimated motor may lie outside the set
 
 # Places in the row of memory.
@@ -352,7 +352,6 @@ class Response:
         self._slow = self.law = unproven_law(bench, law)
         self.model = response_model(bench, law)
         self._memory = [0.0] * MEMORY
-        self._counter = 0
         self.rows: list[Row] = []
         self.stop: list[Row] = []
 
@@ -372,7 +371,7 @@ class Response:
 
         Raises StopError if the velocity follows the commands later, or earlier, than declared.
         """
-        self.rows = [*self.rows[1 - ROWS // 2 :], Row(follows, sample.angle, sample.velocity, command)]
+        self.rows = [*self.rows[1 - KEPT :], Row(follows, sample.angle, sample.velocity, command)]
         self._counter = sample.counter
         verdict = take(self.model, self._memory, follows, sample.angle, sample.velocity, command)
         if verdict == CONTRADICTED:
@@ -382,7 +381,7 @@ class Response:
 
     def watch(self, sample: SensorSample) -> None:
         """Keep one sample of the stop."""
-        if len(self.stop) < ROWS // 2:
+        if len(self.stop) < KEPT:
             follows = sample.counter == next_counter(self._counter)
             self.stop.append(Row(follows, sample.angle, sample.velocity, sample.applied_current))
             self._counter = sample.counter

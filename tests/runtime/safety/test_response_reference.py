@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from emb_bench.config.bench import load_bench
+from emb_runtime.can.e2e import COUNTER_MODULUS
 from emb_runtime.config.bench import Sensors
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.response import (
@@ -391,10 +392,12 @@ def test_the_newest_samples_of_a_run_and_the_first_of_its_stop_are_kept() -> Non
     response.begin(sample(Row(False, 0.0, 0.0, 0.0)))
     for k in range(80):
         row = Row(True, 1e-3 * k, 0.0, 0.0)
-        response.take(sample(row), True, 0.0)
+        response.take(sample(row)._replace(counter=4), True, 0.0)
         assert len(response.rows) == min(k + 2, 32)
         assert response.rows[-1] == row
+    rows = []
     for k in range(80):
-        response.watch(sample(Row(True, 1e-3 * k, 0.0, 0.0)))
-        assert len(response.stop) == min(k + 1, 32)
-        assert (response.stop[0].angle, response.stop[-1].angle) == (0.0, 1e-3 * min(k, 31))
+        rows.append(Row(k != 7, 1e-3 * k, 2e-3 * k, 0.5))  # a sample is lost before the eighth
+        counter = (5 + k + (k >= 7)) % COUNTER_MODULUS
+        response.watch(sample(rows[-1])._replace(counter=counter))
+        assert response.stop == rows[:32]
