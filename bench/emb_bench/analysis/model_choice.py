@@ -41,7 +41,7 @@ from emb_bench.estimate.prediction import Problem, make_problem
 from emb_bench.estimate.records import NORMAL_95, End, EstimationProblem, Unknown, has_time_for_a_delay, with_systematic
 from emb_bench.estimate.search import released
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.sim.instruments import observer_gains
+from emb_runtime.estimator.observer import observer_gains
 
 NEGLIGIBLE = 0.01  # Weight below which a model adds nothing to an interval
 WRONG = 25  # Simulations after which the search of a model that does not explain the records ends

@@ -17,7 +17,7 @@ from scipy import optimize, special
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.records import Derived
 from emb_bench.experiment.experiment import Experiment
-from emb_bench.sim.instruments import observer_gains
+from emb_runtime.estimator.observer import observer_gains
 
 SURE = 10.0  # Standard deviations by which the lag differs from zero
 LEAST = 0.1  # Lag [samples]: no observer has less

@@ -23,8 +23,7 @@ from typing import Any
 
 from emb_bench.brake.parameters import OFFSET, VELOCITY_GAIN
 from emb_bench.config.plants import LONGEST_DELAY, Instruments
-
-DAMPING = 0.7
+from emb_runtime.estimator.observer import observer_gains
 
 _COMMANDS = 0
 _ANGLES = LONGEST_DELAY
@@ -105,16 +104,6 @@ def observe(instruments: Instruments, memory: Any, t_s: float, y1: float) -> flo
     memory[_TRACKED_ANGLE] = ahead + alpha * surprise
     memory[_TRACKED_VELOCITY] += beta / t_s * surprise
     return float(memory[_TRACKED_VELOCITY])
-
-
-def observer_gains(bandwidth: float, t_s: float, damping: float = DAMPING) -> tuple[float, float]:
-    """α and β of the observer of a bandwidth ω_o [rad/s].
-
-    The filter's poles solve z² − (2 − α − β) z + (1 − α) = 0, so that α = 1 − |z|² and β = 1 + |z|² − 2 Re z.
-    """
-    radius = math.exp(-damping * bandwidth * t_s)
-    real = radius * math.cos(math.sqrt(1.0 - damping * damping) * bandwidth * t_s)
-    return 1.0 - radius * radius, 1.0 + radius * radius - 2.0 * real
 
 
 def observer_noise(bandwidth: float, t_s: float, angle_noise: float) -> float:

@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import Final
 
 from emb_runtime.config.bench import OLDEST_FRAME
+from emb_runtime.estimator.observer import observer_gains
 from emb_runtime.safety.response import (
     BEYOND,
     LIKELIHOOD,
@@ -34,7 +35,6 @@ LEADS: Final = 0.3  # Samples by which a sensor's velocity leads the mean of the
 MOVES: Final = 14.0  # Change of the velocity that shows that, in its standard deviations
 BANDWIDTHS: Final = tuple(round(200.0 * 1.04**i, -1) for i in range(77))  # Of an observer, to 4,000 [rad/s]
 BELOW: Final = 0.96  # Share of it that is named, as the true one must not be less
-DAMPING: Final = 0.7  # Of an observer: with a greater one the same lag is that of a faster observer
 LAGS: Final = tuple(2.5e-4 * 1.08**i for i in range(40))  # Of the current, to 5 ms [s]
 LIKER: Final = 0.25  # Share of the squares that an observer must leave, of those that a sensor leaves
 BRAKES: Final = 16  # Samples of the stop that tell a lag; later the brake rests
@@ -50,7 +50,7 @@ def cause(model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row], bandwi
     """
     found = observer_bandwidth(model, [*rows, *stop])
     if found and (bandwidth is None or found < 0.9 * bandwidth):
-        alpha, beta = _gains(model, found)
+        alpha, beta = observer_gains(found, model.sample_time)
         behind = f"{(alpha / beta - 0.5) * model.sample_time * 1e3:.1f} ms"
         least = math.floor(BELOW * found / 10.0) * 10.0
         key = f'[sensors] velocity = "observer", observer_bandwidth = {least:g} at most'
@@ -126,7 +126,7 @@ def _unlike(model: ResponseModel, rows: Sequence[Row], bandwidth: float) -> floa
     The observer's angle follows from two velocities: at the begin and where a sample is missing it is not known.
     """
     ts, known = model.sample_time, False
-    alpha, beta = _gains(model, bandwidth)
+    alpha, beta = observer_gains(bandwidth, model.sample_time)
     angle = velocity = squares = 0.0
     for before, row in pairwise(rows):
         if not row.follows:
@@ -139,10 +139,3 @@ def _unlike(model: ResponseModel, rows: Sequence[Row], bandwidth: float) -> floa
         squares += (row.velocity - velocity) ** 2
         known = True
     return squares
-
-
-def _gains(model: ResponseModel, bandwidth: float) -> tuple[float, float]:
-    """α and β of a sampled observer of second order with its poles at this bandwidth [rad/s]."""
-    radius = math.exp(-DAMPING * bandwidth * model.sample_time)
-    real = radius * math.cos(math.sqrt(1.0 - DAMPING * DAMPING) * bandwidth * model.sample_time)
-    return 1.0 - radius * radius, 1.0 + radius * radius - 2.0 * real

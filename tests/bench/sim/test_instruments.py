@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import LONGEST_DELAY, Instruments
-from emb_bench.sim.instruments import DAMPING, MEMORY, command, measure, observe, observer_gains, observer_noise, settle
+from emb_bench.sim.instruments import MEMORY, command, measure, observe, observer_noise, settle
+from emb_runtime.estimator.observer import DAMPING, observer_gains
 
 T_S = 1e-3
 finite = st.floats(-1e3, 1e3)
