@@ -287,9 +287,9 @@ class Core:
     def end(self, now_ns: int) -> None:
         """Judge how the node came to rest; the run is over."""
         self._now_ns = now_ns
-        if self.fault in OF_RESPONSE and not self._response.proven:
+        if self.fault in OF_RESPONSE:
             response = self._response
-            named = cause(response.model, response.rows, response.stop, self.bench.sensors.bandwidth)
+            named = cause(self.bench, response.model, response.rows, response.stop, response.proven)
             self._detail = "; ".join(filter(None, (self._detail, named)))
         speed = unheld_motion(self.bench, self._stopping)
         if self.fault is None and not self._rests:
@@ -685,8 +685,7 @@ class Core:
             return
         try:
             self._monitor.check(elapsed, sample, obeyed, command)
-            if not self._response.proven:
-                self._response.take(sample, obeyed and gap == 1, command)
+            self._response.take(sample, obeyed and gap == 1, command)
         except StopError as stop:
             if stop.fault is not Fault.RESPONSE_LATE:  # which has taken it
                 self._response.watch(sample)

@@ -337,7 +337,7 @@ class Row(NamedTuple):
 
 
 class Response:
-    """The response of one run: the law that it may rely on, and its samples until it is proven.
+    """The response of one run: the law that it may rely on, and its newest samples.
 
     Attributes:
         law: of the shield, :func:`unproven_law` until the response is proven.
@@ -367,12 +367,14 @@ class Response:
         return self._memory[VERDICT] == PROVEN
 
     def take(self, sample: SensorSample, follows: bool, command: float) -> None:
-        """Take one more sample, as :func:`take`.
+        """Take one more sample, as :func:`take`; once the response is proven it is only kept.
 
         Raises StopError if the velocity follows the commands later, or earlier, than declared.
         """
         self.rows = [*self.rows[1 - KEPT :], Row(follows, sample.angle, sample.velocity, command)]
         self._counter = sample.counter
+        if self.proven:
+            return
         verdict = take(self.model, self._memory, follows, sample.angle, sample.velocity, command)
         if verdict == CONTRADICTED:
             raise StopError(Fault.RESPONSE_LATE, self.text)

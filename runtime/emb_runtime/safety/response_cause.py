@@ -2,7 +2,8 @@
 
 Called once a run has ended. The angle tells whether the velocity is an observer's: that of a sensor leads the mean
 velocity of the last period, an observer's lags it. Late frames and lags of the current are tried one after the other
-with the filter of the proof; the likeliest counts.
+with the filter of the proof; the likeliest counts. An observer's velocity lags as well: the angles give mean
+velocities in its place.
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final
 
-from emb_runtime.config.bench import OLDEST_FRAME
+from emb_runtime.config.bench import OLDEST_FRAME, Bench
 from emb_runtime.estimator.observer import observer_gains
 from emb_runtime.safety.response import (
     BEYOND,
+    DOUBTS,
+    LAGGING,
     LIKELIHOOD,
     MATRIX,
     MEMORY,
@@ -38,16 +41,18 @@ BELOW: Final = 0.96  # Share of it that is named, as the true one must not be le
 LAGS: Final = tuple(2.5e-4 * 1.08**i for i in range(40))  # Of the current, to 5 ms [s]
 LIKER: Final = 0.25  # Share of the squares that an observer must leave, of those that a sensor leaves
 BRAKES: Final = 16  # Samples of the stop that tell a lag; later the brake rests
+MEAN_NOISE: Final = 1.73  # Deviation of the change of a mean velocity over √2, in that of the angle
 LIKELIER: Final = 9.0  # Twice the logarithm of the ratio of likelihoods that names a cause
 ERRORS: Final = 16.0  # The same within which a lag may be the true one: four standard deviations
 
 
-def cause(model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row], bandwidth: float | None) -> str:
+def cause(bench: Bench, model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row], proven: bool = False) -> str:
     """Quantity, measured value, and key of the bench file to change; "" if nothing explains the samples.
 
-    ``stop`` are the samples after ``rows`` in which the node brakes by itself, ``bandwidth`` is the declared one of an
-    observer, None where none is declared [rad/s].
+    ``stop`` are the samples after ``rows`` in which the node brakes by itself. Where the response is ``proven``, the
+    commands act as declared, and an observer alone is looked for.
     """
+    bandwidth = bench.sensors.bandwidth
     found = observer_bandwidth(model, [*rows, *stop])
     if found and (bandwidth is None or found < 0.9 * bandwidth):
         alpha, beta = observer_gains(found, model.sample_time)
@@ -55,23 +60,42 @@ def cause(model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row], bandwi
         least = math.floor(BELOW * found / 10.0) * 10.0
         key = f'[sensors] velocity = "observer", observer_bandwidth = {least:g} at most'
         return f"the velocity lags the angle by {behind}, as that of an observer does: {key}"
+    if proven:
+        return ""
+    if found:
+        model = model._replace(deviation=max(MEAN_NOISE * bench.noise.angle / model.sample_time, model.deviation))
+        means = mean_velocities(model.sample_time, [*rows, *stop])
+        rows, stop = means[: len(rows)], means[len(rows) :]
+    return _of_commands(model, rows, stop, found > 0.0)
+
+
+def _of_commands(model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row], means: bool) -> str:
+    """The likeliest age of the frames, or lag of the current."""
     braked, later = stop[:BRAKES], [age for age in range(OLDEST_FRAME + 1) if age != model.age]
-    declared = likelihood(model, rows, braked, model.age, 0.0)
-    ages = {age: min(likelihood(model, rows, braked, age, 0.0, seen) for seen in range(age + 1)) for age in later}
-    flows = {lag: likelihood(model, rows, braked, model.age, lag) for lag in LAGS}
+
+    def unlike(age: int, lag: float, seen: int = 0) -> float:
+        return likelihood(model, rows, braked, age, lag, seen, means)
+
+    declared = unlike(model.age, 0.0)
+    ages = {age: min(unlike(age, 0.0, seen) for seen in range(age + 1)) for age in later}
+    flows = {lag: unlike(model.age, lag) for lag in LAGS}
     aged, lagged = min(ages.values()), min(flows.values())
     if not min(aged, lagged) < declared - LIKELIER:  # this way round, nothing fits where both are infinite
-        return "" if not stop else cause(model, rows, (), bandwidth)
-    if aged < lagged:
-        likely = [age for age in ages if ages[age] < aged + LIKELIER]
-        when = f"commands act {min(ages, key=ages.__getitem__)} periods after the sample that they answer"
-        return f"{when}: [shield] frame_age = [{min(*likely, model.age)}, {max(*likely, model.oldest)}]"
-    return _of_lag(model, flows)
+        return "" if not stop else _of_commands(model, rows, (), means)
+    likely = sorted([(aged, _of_ages(model, ages)), (lagged, _of_lag(model, flows))])
+    return ", or ".join(named for value, named in likely if value < likely[0][0] + LIKELIER)
+
+
+def _of_ages(model: ResponseModel, ages: dict[int, float]) -> str:
+    """The likeliest age, and the key with all that are likely."""
+    likely = [age for age in ages if ages[age] <= min(ages.values()) + LIKELIER]
+    when = f"commands act {min(ages, key=ages.__getitem__)} periods after the sample that they answer"
+    return f"{when}: [shield] frame_age = [{min(*likely, model.age)}, {max(*likely, model.oldest)}]"
 
 
 def _of_lag(model: ResponseModel, flows: dict[float, float]) -> str:
     """The likeliest lag, and the key with the longest that may be there, or the longest covered if it may be that."""
-    likely = [lag for lag in flows if flows[lag] < min(flows.values()) + ERRORS]
+    likely = [lag for lag in flows if flows[lag] <= min(flows.values()) + ERRORS]
     lag, longest = min(flows, key=flows.__getitem__), LONGEST_LAG * model.sample_time
     most = math.ceil(max(likely) * 1e4) * 1e-4
     if lag <= BEYOND * longest:
@@ -80,15 +104,23 @@ def _of_lag(model: ResponseModel, flows: dict[float, float]) -> str:
 
 
 def likelihood(
-    model: ResponseModel, rows: Sequence[Row], stop: Sequence[Row], age: int, lag: float, seen: int = 0
+    model: ResponseModel,
+    rows: Sequence[Row],
+    stop: Sequence[Row],
+    age: int,
+    lag: float,
+    seen: int = 0,
+    means: bool = False,
 ) -> float:
     """Minus twice the log-likelihood of frames of one age and a current with one lag [s]; infinite if they do not fit.
 
     The overshoot is then that of the lag, and no unknown. The measurements are late by ``seen`` periods of the age, the
-    commands by the others: they wait, and the node's own current does not.
+    commands by the others: they wait, and the node's own current does not. With ``means`` the velocities are means
+    of the periods before: these change by the mean of two currents.
     """
     doubts = age + 1.0 + math.ceil(3.0 * lag / model.sample_time)
-    tried = model._replace(age=0, oldest=0, lag=lag, extra=0.0, transient=0.0, doubts=doubts)
+    none = model._replace(age=0, oldest=0, extra=0.0, transient=0.0, slides=6.0 * model.deviation)
+    tried = none._replace(lag=lag, doubts=doubts)
     memory = [0.0] * MEMORY
     begin(tried, memory, rows[0].angle, rows[0].velocity)
     share = model.current * lag
@@ -96,11 +128,24 @@ def likelihood(
     memory[STATE + OVERSHOOT] = share * memory[STATE + MOTOR]
     memory[MATRIX + SIZE * MOTOR + OVERSHOOT] = memory[MATRIX + SIZE * OVERSHOOT + MOTOR] = share * variance
     memory[MATRIX + (SIZE + 1) * OVERSHOOT] = share * share * variance
-    commands = [0.0] * (age - seen) + [row.command for row in rows[1:]]
-    acting = [0.0] * seen + commands[: len(rows) - 1] + [row.command for row in stop]
+    flowing = rows[0].command  # the run's first sample has none
+    if rows[0].follows:  # the commands before it are not known
+        memory[DOUBTS], memory[LAGGING] = doubts, flowing
+    commands = [flowing] * (age - seen) + [row.command for row in rows[1:]]
+    acting = [flowing] * seen + commands[: len(rows) - 1] + [row.command for row in stop]
+    if means:
+        acting = [0.5 * (u + before) for before, u in pairwise([flowing, *acting])]
     for row, current in zip([*rows[1:], *stop], acting, strict=False):
         take(tried, memory, row.follows, row.angle, row.velocity, current)
     return memory[LIKELIHOOD] if fits(tried, memory) else math.inf
+
+
+def mean_velocities(sample_time: float, rows: Sequence[Row]) -> list[Row]:
+    """The rows with the mean velocity of the period before, which the angles give, in place of an observer's."""
+    return [
+        row._replace(velocity=(row.angle - before.angle) / sample_time) if row.follows else row
+        for before, row in pairwise([rows[0], *rows])
+    ]
 
 
 def observer_bandwidth(model: ResponseModel, rows: Sequence[Row]) -> float:

@@ -169,7 +169,34 @@ def test_a_later_response_contradicts_and_its_cause_names_the_key_with_a_value_t
     assert verdict == CONTRADICTED
     assert n <= 30
     rows = moved([*commands[:n], *[0.0] * 32], motor=motor, noise=3, stop=n, **response)  # type: ignore[arg-type]
-    named = cause(MODEL, rows[: n + 1], rows[n + 1 :], None)
+    named = cause(BENCH, MODEL, rows[: n + 1], rows[n + 1 :])
+    found = re.search(key, named)
+    assert found is not None, named
+    assert least <= float(found[1]) <= most
+
+
+@pytest.mark.parametrize("motor", [0.6, 1.0, 1.5])
+@pytest.mark.parametrize("levels", [[6.0], [6.0] * 14 + [1.5] * 40 + [-2.0] * 6 + [1.5] * 6])
+@pytest.mark.parametrize(
+    ("response", "key", "least", "most"),
+    [
+        ({"lag": 0.002}, LAG, 0.002, 0.0026),
+        ({"late": 2}, r"frame_age = \[0, (\d)\]", 2.0, 2.0),
+        ({"late": 3}, r"frame_age = \[0, (\d)\]", 3.0, 3.0),
+        ({"lag": 0.002, "bandwidth": 1520.0}, LAG, 0.002, 0.0026),
+        ({"late": 2, "bandwidth": 1520.0}, r"frame_age = \[0, (\d)\]", 2.0, 2.0),
+        ({"late": 3, "bandwidth": 2000.0}, r"frame_age = \[0, (\d)\]", 3.0, 3.0),
+        ({"bandwidth": 800.0}, OBSERVER, 740.0, 800.0),
+    ],
+)
+def test_where_an_observer_is_declared_the_newest_samples_and_the_stop_tell_what_else_is_late(
+    response: dict[str, float], key: str, least: float, most: float, levels: list[float], motor: float
+) -> None:
+    bench, n = declaring(1520.0), max(len(levels), 16)
+    commands = [*levels, *levels[-1:] * (n - len(levels)), *[0.0] * 32]
+    rows = moved(commands, motor=motor, noise=3, stop=n, **response)  # type: ignore[arg-type]
+    kept = rows[max(n - 31, 0) : n + 1]
+    named = cause(bench, response_model(bench, make_law(bench)), kept, rows[n + 1 :])
     found = re.search(key, named)
     assert found is not None, named
     assert least <= float(found[1]) <= most
@@ -178,13 +205,13 @@ def test_a_later_response_contradicts_and_its_cause_names_the_key_with_a_value_t
 def test_measurements_that_are_late_are_named_as_late_frames() -> None:
     rows = moved([*[6.0] * 5, *[0.0] * 32], noise=3, stop=5)
     late = [Row(row.follows, seen.angle, seen.velocity, row.command) for seen, row in pairwise([rows[0], *rows])]
-    assert "frame_age = [0, 1]" in cause(MODEL, late[:6], late[6:], None)
+    assert "frame_age = [0, 1]" in cause(BENCH, MODEL, late[:6], late[6:])
 
 
 def test_without_a_stop_that_fits_the_samples_before_it_tell() -> None:
     rows = moved([6.0] * 6, noise=3, late=2)
     stop = [row._replace(velocity=-3.0 * row.velocity) for row in rows]
-    assert "frame_age = [0, 2]" in cause(MODEL, rows, stop, None)
+    assert "frame_age = [0, 2]" in cause(BENCH, MODEL, rows, stop)
 
 
 def test_a_missing_sample_does_not_change_the_bandwidth_that_is_found() -> None:
@@ -248,7 +275,7 @@ def test_frames_that_are_younger_than_the_least_declared_age_contradict() -> Non
     bench = declaring(frame_age=(2, 2))
     rows = moved(REVERSING, noise=1)
     assert judged(bench, rows)[0] == CONTRADICTED
-    assert "frame_age = [0, 2]" in cause(response_model(bench, make_law(bench)), rows, (), None)
+    assert "frame_age = [0, 2]" in cause(bench, response_model(bench, make_law(bench)), rows, ())
 
 
 def test_what_does_not_move_proves_nothing() -> None:
@@ -284,20 +311,21 @@ def test_until_then_the_speed_leaves_room_for_six_samples_of_full_current() -> N
 
 
 def test_no_cause_is_named_where_none_explains_the_samples() -> None:
-    assert cause(MODEL, moved(REVERSING, noise=1), (), None) == ""
+    assert cause(BENCH, MODEL, moved(REVERSING, noise=1), ()) == ""
     opposite = [row._replace(angle=-row.angle, velocity=-row.velocity) for row in moved(REVERSING, noise=1)]
-    assert cause(MODEL, opposite, (), None) == ""
+    assert cause(BENCH, MODEL, opposite, ()) == ""
     scaled = [row._replace(velocity=0.5 * row.velocity) for row in moved(REVERSING, noise=1)]
     assert observer_bandwidth(MODEL, scaled) == 0.0
-    assert cause(MODEL, moved([0.0] * 20, noise=1), (), None) == ""
+    assert cause(BENCH, MODEL, moved([0.0] * 20, noise=1), ()) == ""
 
 
 def test_a_slower_observer_than_the_declared_one_is_named_and_a_faster_one_is_not() -> None:
     rows = moved(REVERSING, bandwidth=800.0, noise=1)
     bench = declaring(1520.0)
     model = response_model(bench, make_law(bench))
-    assert "observer_bandwidth = 7" in cause(model, rows, (), 1520.0)
-    assert cause(model, moved(REVERSING, bandwidth=1520.0, noise=1), (), 800.0) == ""
+    assert "observer_bandwidth = 7" in cause(bench, model, rows, ())
+    assert "observer_bandwidth = 7" in cause(bench, model, rows, (), proven=True)
+    assert "observer" not in cause(declaring(800.0), model, moved(REVERSING, bandwidth=1520.0, noise=1), ())
 
 
 def test_a_sample_that_does_not_follow_begins_the_observer_anew() -> None:
