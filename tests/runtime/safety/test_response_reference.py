@@ -387,6 +387,18 @@ def test_the_delay_that_is_told_is_known_once_the_current_has_changed(
     assert least <= error < most
 
 
+def test_once_proven_the_samples_are_only_kept() -> None:
+    response = Response(BENCH, SHIPPED)
+    response.begin(sample(Row(False, 0.0, 0.0, 0.0)))
+    rows = iter(sliding(0))
+    while not response.proven:
+        response.take(sample(row := next(rows)), row.follows, row.command)
+    told, still = response.text, Row(True, 1.0, 0.0, 6.0)
+    for _ in range(20):
+        response.take(sample(still), True, 6.0)
+    assert (response.proven, response.text, response.rows[-1]) == (True, told, still)
+
+
 def test_the_newest_samples_of_a_run_and_the_first_of_its_stop_are_kept() -> None:
     response = Response(BENCH, SHIPPED)
     response.begin(sample(Row(False, 0.0, 0.0, 0.0)))
