@@ -28,6 +28,7 @@ import numpy as np
 
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import OF_A_RECORD
+from emb_bench.compiled import compiled
 from emb_bench.config.machine import WINDOW
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.method import Method
@@ -36,8 +37,10 @@ from emb_bench.estimate.output_error import start_points
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import End, ModelValidation
 from emb_bench.estimate.search import EVALUATIONS, minimise
-from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.experiment import Booleans, Experiment, Integers
+from emb_bench.experiment.simulate import Trajectory, simulate_apart
 from emb_bench.information.identifiability import Spectrum
+from emb_bench.sim.open_loop import march
 from emb_runtime.errors import UsageError
 
 SHORTEST = 10  # Fewest samples of a window
@@ -54,6 +57,7 @@ FEWEST = 3  # Fewest windows for each unknown that they share: with fewer their 
 JUDGED = 5000  # Samples, in whole windows, that the model is validated on: an hour has millions, and these see as much
 OTHER = 4.0  # Ratio of the lengths of the windows in two estimates whose difference is counted
 REFINED = 2  # Searches that are carried to their ends: those whose first steps led lowest
+BATCH = 20_000  # Samples of windows that are simulated together
 SHORT = 6  # Simulations of a search that is only begun
 
 
@@ -80,23 +84,46 @@ class Point(NamedTuple):
     starts: Floats  # Angle and velocity at the start of each window, shape (m, 2)
 
 
-class Window(NamedTuple):
-    """One window at a point: what it adds to the normal equations once its start is eliminated."""
+class Rows(NamedTuple):
+    """Some windows at a point: what they add to the normal equations once their starts are eliminated.
 
-    errors: Floats  # Of its samples in standard deviations, shape (m,)
-    shared: Floats  # Derivatives of what is shown to the shared unknowns, shape (m, p)
-    inverse: Floats  # Pseudo-inverse of the derivatives to the start, shape (2, m)
-    own: Floats  # Derivatives to the start, shape (m, 2)
+    The m rows of a window are its samples; those that do not count, or that a shorter window lacks, are zero.
+    """
+
+    errors: Floats  # Of the samples in standard deviations, shape (w, m)
+    shared: Floats  # Derivatives of what is shown to the shared unknowns, shape (w, m, p)
+    own: Floats  # Derivatives to the starts, shape (w, m, 2)
+    inverse: Floats  # Pseudo-inverses of those, shape (w, 2, m)
 
     @property
-    def cost(self) -> float:
-        """Weighted sum of squares."""
-        return float(self.errors @ self.errors)
+    def costs(self) -> Floats:
+        """Weighted sum of squares of each."""
+        costs: Floats = np.einsum("wm,wm->w", self.errors, self.errors)
+        return costs
+
+    @property
+    def steps(self) -> Floats:
+        """Gauss-Newton step of each start, shape (w, 2)."""
+        return _times(self.inverse, self.errors)
 
     def projected(self) -> tuple[Floats, Floats]:
-        """Errors and derivatives beside what the start takes up."""
-        errors = self.errors - self.own @ (self.inverse @ self.errors)
-        return errors, self.shared - self.own @ (self.inverse @ self.shared)
+        """Errors and derivatives beside what the starts take up."""
+        return self.errors - _times(self.own, self.steps), self.shared - self.own @ (self.inverse @ self.shared)
+
+    def at(self, chosen: Integers | Booleans) -> Rows:
+        """Some of them."""
+        return Rows(*(rows[chosen] for rows in self))
+
+    def put(self, chosen: Integers | Booleans, others: Rows) -> None:
+        """Put others in the place of some."""
+        for rows, new in zip(self, others, strict=True):
+            rows[chosen] = new
+
+
+def _times(matrices: Floats, vectors: Floats) -> Floats:
+    """Product of each matrix with its vector."""
+    products: Floats = (matrices @ vectors[:, :, None])[:, :, 0]
+    return products
 
 
 class Cut:
@@ -115,6 +142,12 @@ class Cut:
             window.weights(np.append(shared, start))[0]
             for window, start in zip(self.windows, self.begun.starts, strict=True)
         ]
+        size = max(BATCH // length, 1)
+        self.batches = [np.arange(i, min(i + size, len(self.windows))) for i in range(0, len(self.windows), size)]
+        self.inside = np.arange(length) < np.array([[end - begin] for _, begin, end in self.spans])
+        self.outputs = [n for n in range(2) if any(root[:, n].any() for root in self.weights)]
+        self.roots = self._below(self.inside, np.concatenate(self.weights))
+        self.samples = self._below(self.inside, np.concatenate([w.records[0].samples for w in self.windows]))
 
     def searches(self, values: Sequence[Floats]) -> list[tuple[Point, End]]:
         """Searches from shared unknowns, best first; of several most are only begun."""
@@ -151,9 +184,14 @@ class Cut:
 
         def residuals(shared: Floats) -> tuple[Floats, Floats]:
             nonlocal at
-            at, windows = self.settled(at._replace(shared=shared))
-            parts = [window.projected() for window in windows]
-            return np.concatenate([errors for errors, _ in parts]), -np.concatenate([columns for _, columns in parts])
+            at, found = self.settled(at._replace(shared=shared))
+            parts = [
+                np.concatenate([columns, errors[:, :, None]], axis=2) for errors, columns in map(Rows.projected, found)
+            ]
+            # A search asks for the squares alone: their triangular root says the same in a few rows.
+            rows: Floats = np.concatenate([part.reshape(-1, part.shape[2]) for part in parts])
+            root: Floats = np.asarray(np.linalg.qr(rows, "r"))
+            return root[:, -1], -root[:, :-1]
 
         end = minimise(self.problem, begun.shared, residuals, evaluations)
         return self.settled(at._replace(shared=end.z))[0], end
@@ -163,56 +201,75 @@ class Cut:
 
         A window may have come to stick, or to move where the machine stuck, and nothing at its own start leads it back.
         """
-        fresh, windows = self.settled(Point(at.shared, self.begun.starts))
-        better = np.array([new.cost < old.cost for old, new in zip(self.linearised(at), windows, strict=True)])
+        fresh, found = self.settled(Point(at.shared, self.begun.starts))
+        pairs = zip(found, self.linearised(at), strict=True)
+        better = np.concatenate([new.costs < old.costs for new, old in pairs])
         return Point(at.shared, np.where(better[:, None], fresh.starts, at.starts))
 
-    def linearised(self, at: Point) -> list[Window]:
-        """Contribution of each window at a point."""
-        return [self._linearised(i, at.shared, start) for i, start in enumerate(at.starts)]
+    def linearised(self, at: Point) -> list[Rows]:
+        """Contributions of the windows at a point, in batches."""
+        return [self._linearised(chosen, at.shared, at.starts[chosen]) for chosen in self.batches]
 
-    def _linearised(self, i: int, shared: Floats, start: Floats) -> Window:
-        window, root, z = self.windows[i], self.weights[i], np.append(shared, start)
-        said, counts = window.predict(z, 0), root.ravel() > 0.0
-        errors = (np.nan_to_num(window.records[0].samples - said.samples) * root).ravel()[counts]
-        rows = (said.sensitivities * root[:, None]).transpose(0, 2, 1).reshape(-1, len(z))[counts]
-        own = rows[:, -len(START) :]
-        lengths = np.linalg.norm(own, axis=0)
+    def _linearised(self, chosen: Integers, shared: Floats, starts: Floats) -> Rows:
+        said, inside, roots = self._predicted(chosen, shared, starts), self.inside[chosen], self.roots[chosen]
+        errors = np.nan_to_num(self.samples[chosen] - self._below(inside, said.samples)) * roots
+        rows = self._below(inside, said.sensitivities.transpose(0, 2, 1)) * roots[..., None]
+        rows = rows.reshape(len(chosen), -1, rows.shape[-1])
+        own = rows[:, :, -len(START) :]
+        lengths = np.linalg.norm(own, axis=1, keepdims=True)
         unit = np.where(lengths > 0.0, lengths, 1.0)
-        inverse = np.linalg.pinv(own / unit, rcond=_LOST) / unit[:, None]
-        return Window(errors, rows[:, : -len(START)], inverse, own)
+        inverse = np.linalg.pinv(own / unit, rcond=_LOST) / unit.transpose(0, 2, 1)
+        return Rows(errors.reshape(len(chosen), -1), rows[:, :, : -len(START)], own, inverse)
 
-    def settled(self, at: Point) -> tuple[Point, list[Window]]:
+    def _predicted(self, chosen: Integers, shared: Floats, starts: Floats) -> Trajectory:
+        """Predicts windows from their starts, the samples of one below those of the other."""
+        one, z = self.windows[0], np.append(shared, starts[0])
+        plant = replace(one.plant, mechanics=one.mechanics(z))
+        parts = [self.windows[i].records[0] for i in chosen]
+        t_s = one.bench.timing.sample_time
+        return simulate_apart(plant, one.at(z, 0), parts, starts, t_s, one.names(0), compiled(march))
+
+    def _below(self, inside: Booleans, rows: Floats) -> Floats:
+        """Rows of outputs that count, one window below the other, apart: shape (w, m, outputs, ...)."""
+        apart = np.zeros((*inside.shape, len(self.outputs), *rows.shape[2:]))
+        apart[inside] = rows[:, self.outputs]
+        return apart
+
+    def settled(self, at: Point) -> tuple[Point, list[Rows]]:
         """The starts moved to where they fit best, the shared unknowns as they are; and the windows there."""
-        found = [self._settled(i, at.shared, start) for i, start in enumerate(at.starts)]
-        return Point(at.shared, np.array([start for start, _ in found])), [window for _, window in found]
+        found = [self._settled(chosen, at.shared, at.starts[chosen]) for chosen in self.batches]
+        return Point(at.shared, np.concatenate([starts for starts, _ in found])), [rows for _, rows in found]
 
-    def _settled(self, i: int, shared: Floats, start: Floats) -> tuple[Floats, Window]:
-        """Start of one window after damped Gauss-Newton steps, none of which raises the squares.
+    def _settled(self, chosen: Integers, shared: Floats, starts: Floats) -> tuple[Floats, Rows]:
+        """Starts of windows after damped Gauss-Newton steps, none of which raises the squares of a window.
 
         Near rest a step may be far too long: the samples of a brake that friction holds hardly depend on its start.
         """
-        window = self._linearised(i, shared, start)
+        rows, going = self._linearised(chosen, shared, starts), np.arange(len(chosen))
         for _ in range(SETTLED):
-            step = window.inverse @ window.errors
+            left, steps, costs, gained = going, rows.at(going).steps, rows.costs, np.zeros(len(chosen))
             for _ in range(HALVINGS):
-                trial = self._linearised(i, shared, start + step)
-                if trial.cost <= window.cost:
+                trial = self._linearised(chosen[left], shared, starts[left] + steps)
+                lower = trial.costs <= costs[left]
+                moved = left[lower]
+                starts[moved] += steps[lower]
+                rows.put(moved, trial.at(lower))
+                gained[moved] = costs[moved] - trial.costs[lower]
+                left, steps = left[~lower], 0.5 * steps[~lower]
+                if not len(left):
                     break
-                step = 0.5 * step
-            else:
+            going = going[gained[going] > STILL * costs[going]]
+            if not len(going):
                 break
-            gained = window.cost - trial.cost
-            start, window = start + step, trial
-            if gained <= STILL * window.cost:
-                break
-        return start, window
+        return starts, rows
 
     def residuals(self, at: Point) -> Iterator[tuple[Span, Floats, Floats]]:
         """Span, errors of the samples [rad, rad/s] and their weights of each window, shapes (n, 2)."""
-        for window, start, span, root in zip(self.windows, at.starts, self.spans, self.weights, strict=True):
-            shown = window.predict(np.append(at.shared, start), 0).samples
-            yield span, window.records[0].samples - shown, root
+        shown = [self._predicted(chosen, at.shared, at.starts[chosen]).samples for chosen in self.batches]
+        ends = np.cumsum([end - begin for _, begin, end in self.spans])
+        apart = np.split(np.concatenate(shown), ends[:-1])
+        for window, said, span, root in zip(self.windows, apart, self.spans, self.weights, strict=True):
+            yield span, window.records[0].samples - said, root
 
     @property
     def follows(self) -> list[bool]:
@@ -247,11 +304,12 @@ def predict_windows(problem: Problem, values: Floats) -> tuple[float, float, int
     return math.sqrt(squares / samples), chi2, freedom
 
 
-def _sums(windows: Sequence[Window]) -> tuple[Floats, Floats]:
+def _sums(found: Sequence[Rows]) -> tuple[Floats, Floats]:
     """Information of the shared unknowns, and the score of each window."""
-    parts = [window.projected() for window in windows]
-    information = np.sum([columns.T @ columns for _, columns in parts], axis=0)
-    return information, np.array([columns.T @ errors for errors, columns in parts])
+    parts = [rows.projected() for rows in found]
+    information = np.sum([np.einsum("wmp,wmq->pq", columns, columns) for _, columns in parts], axis=0)
+    scores = [np.einsum("wmp,wm->wp", columns, errors) for errors, columns in parts]
+    return information, np.concatenate(scores)
 
 
 def _finished(cut: Cut, at: Point, ends: tuple[End, ...], moved: Floats) -> Estimate:

@@ -21,7 +21,7 @@ from emb_bench.brake.parameters import COMMAND, DELAY
 from emb_bench.config.plants import Instruments, Plant
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.instruments import reading, sensor_share
-from emb_bench.sim.open_loop import Input, check_unknowns, delay_share, march, trajectory
+from emb_bench.sim.open_loop import Input, check_unknowns, delay_share, held, march, trajectory
 from emb_runtime.config.bench import BrakeParameters
 
 
@@ -132,6 +132,42 @@ def simulate_parts(
         if early:
             shown = shown._replace(sensitivities=np.delete(shown.sensitivities, len(params), axis=1))
         yield shown
+
+
+def simulate_apart(
+    plant: Plant,
+    theta: Theta,
+    windows: Sequence[Experiment],
+    starts: Floats,
+    t_s: float,
+    params: Sequence[str],
+    loop: Callable[..., None],
+) -> Trajectory:
+    """As :func:`simulate`, experiments without gaps that do not follow from each other, their rows one below the other.
+
+    Each has its own of the ``starts``, angle [rad] and velocity [rad/s], shape (m, 2).
+    """
+    errors, delay = theta.errors, plant.instruments.measurement_delay
+    early = ("delay",) if errors.delay < 0.0 and "delay" not in params else ()
+    ends = np.cumsum([window.periods + 1 for window in windows])
+    first = np.append(0, ends[:-1])
+    origin, chosen, s = theta.begin(0.0, (*params, *early))
+    states, moved = np.zeros((ends[-1], len(origin))), np.zeros((ends[-1], *s.shape))
+    states[first], moved[first] = origin, s
+    states[first, :2] = starts - [theta.contact, 0.0]
+    states[first, 3] += [window.before for window in windows]
+    late, late_by = np.zeros(ends[-1]), max(errors.delay, 0.0)
+    for window, a, b in zip(windows, first.tolist(), ends.tolist(), strict=True):
+        acting = held(window.currents + errors.current_offset, t_s, late_by)
+        loop(plant.mechanics, theta.brake, acting, chosen, states[a:b], moved[a:b])
+        if window.late is not None:
+            late[a + 1 : b] = window.late
+    if delay:
+        seen = np.maximum(np.arange(ends[-1]) - delay, np.repeat(first, np.diff(ends, prepend=0)))
+        states, moved = states[seen], moved[seen]
+    shown = _shown(states, moved, chosen, theta, theta.offset(plant), late[1:], t_s)
+    real = np.delete(np.arange(ends[-1]), first) - 1  # no sample is between the end of one and the start of the next
+    return Trajectory(shown.states, shown.samples[real], shown.sensitivities[real, : len(params)])
 
 
 def gap_ends(experiment: Experiment, instruments: Instruments) -> tuple[Integers, Floats]:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ import pytest
 from emb_bench.brake.euler import step
 from emb_bench.config.bench import load_bench
 from emb_bench.experiment.experiment import planned
-from emb_bench.experiment.simulate import Theta, simulate
+from emb_bench.experiment.simulate import SystematicErrors, Theta, simulate, simulate_apart
 from emb_bench.information.symmetric import Floats
+from emb_bench.sim.open_loop import march
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 from tests.bench.flows import ALL, difference, euler_states, of_euler, square
@@ -101,3 +103,24 @@ def test_through_a_reversal_euler_sensitivities_are_wrong_by_tens_of_percent_and
         worst[plant.name] = max(errors)
     assert worst["euler"] > 0.8
     assert worst["exact"] < 1e-6
+
+
+@pytest.mark.parametrize("delay", [-0.3, 0.0, 0.4])
+@pytest.mark.parametrize("plant", ["exact", "late"])
+def test_experiments_simulated_together_are_each_as_alone(plant: str, delay: float) -> None:
+    late = BENCH.plant(plant)
+    rng = np.random.default_rng(1)
+    windows = [
+        replace(planned(rng.normal(size=n)), before=0.5 * n, late=None if n == 7 else 1e-4 * rng.random(n))
+        for n in (5, 7, 5)
+    ]
+    starts = np.array([[0.1, 3.0], [-0.2, -8.0], [0.0, 0.0]])
+    names = ("k_m", "f_v", "x1_0", "x2_0")
+    theta = Theta(BRAKE, errors=SystematicErrors(0.01, 0.2, delay, 0.03), contact=0.05)
+    together = simulate_apart(late, theta, windows, starts, T_S, names, march)
+    alone = [
+        simulate(late, theta._replace(start=(x1, x2)), window, T_S, names)
+        for window, (x1, x2) in zip(windows, starts.tolist(), strict=True)
+    ]
+    np.testing.assert_array_equal(together.samples, np.concatenate([one.samples for one in alone]))
+    np.testing.assert_array_equal(together.sensitivities, np.concatenate([one.sensitivities for one in alone]))
