@@ -163,6 +163,11 @@ WORKING: dict[str, Case] = {
         ),
         lambda found: close(found[0].matrix, found[1][0] + found[1][1]),
     ),
+    "fisher_information(run + second)": (
+        lambda s: (api.fisher_information(s.run + s.second), api.fisher_information([s.run, s.second])),
+        lambda found: close(found[0].matrix, found[1].matrix),
+    ),
+    "run + second + third": (lambda s: s.run + s.second + s.run, lambda runs: len(runs) == 3),
     "information + other": (
         lambda s: (s.information + s.other, api.fisher_information([s.path, s.second])),
         lambda found: close(found[0].matrix, found[1].matrix) and found[0]["f_v"] > 0.0,
@@ -279,6 +284,27 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], type[Exception], str]] = {
         UsageError,
         "no column is called 'x'; it has: t, y, F",
     ),
+    "estimate(t=, y=, u=)": (
+        lambda s: api.estimate(t=CURRENTS, y=CURRENTS, u=CURRENTS),  # type: ignore[call-arg]
+        UsageError,
+        "arrays are a table: estimate({'t': t, 'y': y, 'u': u}, map='map.toml')",
+    ),
+    "estimate(run, parameters=)": (
+        lambda s: api.estimate(s.run, parameters="f_v"),  # type: ignore[call-arg]
+        UsageError,
+        "estimate has no option 'parameters'; did you mean params?",
+    ),
+    "report(run, 'page.html', pram=)": (
+        lambda s: api.report(s.run, s.folder / "page.html", pram="f_v"),
+        UsageError,
+        "report has no option 'pram'; did you mean params?",
+    ),
+    "fisher_information(run, thta=)": (
+        lambda s: api.fisher_information(s.run, thta="nominal"),  # type: ignore[call-arg]
+        UsageError,
+        "did you mean theta?",
+    ),
+    "simulate(u)": (lambda s: api.simulate(CURRENTS), UsageError, "simulate(currents=...)"),  # type: ignore[arg-type]
     "timing(DataFrame)": (lambda s: api.timing(s.frame), UsageError, "map='map.toml'"),
     "fisher_information([])": (lambda s: api.fisher_information([]), UsageError, "at least one run"),
     "fisher_information(empty array)": (lambda s: api.fisher_information(np.zeros(0)), UsageError, "one current"),

@@ -4,22 +4,50 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import wraps
+from inspect import signature
 from numbers import Real
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeGuard
+from typing import Any, ParamSpec, TypeGuard, TypeVar
 from weakref import finalize
 
 from emb_bench.config.bench import Bench
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.errors import UsageError, needs
+from emb_runtime.errors import UsageError, near, needs
 from emb_runtime.system.terminal import mention
 
 Source = RunLog | str | Path | Mapping[str, Any]
 Names = str | Sequence[str]
+MEANT: Mapping[str, str] = {"plant": "model", "parameters": "params"}
+"""Options of one function by the names that others have for them."""
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def refuses(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, which says what was meant by an option that it does not have."""
+    known = [*signature(function).parameters]
+
+    @wraps(function)
+    def checked(*runs: P.args, **options: P.kwargs) -> R:
+        require_options(function.__name__, options, known)
+        return function(*runs, **options)
+
+    return checked
+
+
+def require_options(function: str, options: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Refuse an option that a function does not have."""
+    for name in options:
+        if name not in known:
+            arrays = ", ".join(f"'{name}': {name}" for name, value in options.items() if is_row(value))
+            meant = f"; did you mean {MEANT[name]}?" if MEANT.get(name) in known else near(name, known)
+            table = f"; arrays are a table: {function}({{{arrays}}}, map='map.toml')" if arrays else ""
+            raise UsageError(f"{function} has no option '{name}'{table or meant}")
 
 
 def is_table(run: Any) -> bool:

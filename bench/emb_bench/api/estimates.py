@@ -11,7 +11,20 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from emb_bench.api.arguments import Names, Source, check, driven, is_table, listed, names_of, opened, say, unknowns
+from emb_bench.api.arguments import (
+    Names,
+    Source,
+    check,
+    driven,
+    is_table,
+    listed,
+    names_of,
+    opened,
+    refuses,
+    require_options,
+    say,
+    unknowns,
+)  # fmt: skip
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.estimate.records import STARTS, EstimationProblem, freed
 from emb_bench.logs.log import RunLog
@@ -28,6 +41,7 @@ if TYPE_CHECKING:  # scipy, numba and matplotlib come with the extra [bench]
 PAGES = (".html", ".htm")  # Endings of a report's page
 
 
+@refuses
 def estimate(
     runs: Source | Sequence[Source],
     *,
@@ -123,7 +137,9 @@ def report(
     """
     page = Path(output)
     beside = page.parent / f"{page.stem}.json"
-    bound = inspect.signature(estimate).bind(runs, **options | {"profile": True})
+    own_options = inspect.signature(estimate)
+    require_options("report", options, [*own_options.parameters])
+    bound = own_options.bind(runs, **options | {"profile": True})
     bound.apply_defaults()
     given = bound.arguments
     files = [*(run for run in listed(runs) if not is_table(run)), given["last"], given["map"], acceptance]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emb_bench.api.arguments import Names, Source, driven, is_row, listed, text_of, unknowns
+from emb_bench.api.arguments import Names, Source, driven, is_row, listed, refuses, text_of, unknowns
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.experiment.experiment import planned
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from emb_bench.information.evaluation import Information
 
 
+@refuses
 def fisher_information(
     run: Source | Sequence[Source] | Sequence[float] | Any,
     *,

@@ -40,6 +40,14 @@ class Run(RunLog):
             return known[column]
         raise AttributeError(f"a run has no {column!r}, and no such column in {CYCLE}{near(column, known)}")
 
+    def __add__(self, other: Run) -> list[Run]:
+        """Runs of one brake, to be taken together: ``estimate(first + second)``."""
+        return [self, other]
+
+    def __radd__(self, others: list[Run]) -> list[Run]:
+        """One run more."""
+        return [*others, self]
+
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy in another process reads the file again; a temporary one stays for it."""
         if (deletion := _TEMPORARY.pop(self, None)) is not None:

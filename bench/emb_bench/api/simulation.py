@@ -9,14 +9,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any
 
-from emb_bench.api.arguments import is_row
+from emb_bench.api.arguments import is_row, require_options
 from emb_bench.api.runs import Run, delete_with, open_run
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.experiment.experiment import planned
 from emb_bench.sim.simulated_brake import NOISES
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.errors import UsageError, near, needs
+from emb_runtime.errors import UsageError, needs
 
 
 def simulate(
@@ -57,14 +57,14 @@ def simulate(
     from emb_runtime.cli.options import parser, prepare
     from emb_runtime.cli.session import Console
 
+    if is_row(log):
+        raise UsageError("log: expected a file to write, got currents: simulate(currents=...)")
     if currents is None and is_row(policy):
         currents, policy = policy, None
     if currents is not None and (policy is not None or quick):
         raise UsageError("currents: expected them without policy and without quick")
     names = (*PARAMETER_NAMES, *NOISES, *inspect.signature(simulate).parameters)
-    for name in more_parameters:
-        if name not in names:
-            raise UsageError(f"simulate has no option and no parameter '{name}'{near(name, names)}")
+    require_options("simulate", more_parameters, names)
     options = {"plant": plant, "seed": seed, **(parameters or {}), **more_parameters}
     iface = "sim:" + ",".join(f"{name}={value}" for name, value in options.items())
     own = Path(mkdtemp(prefix="emb-run-")) if log is None else None
