@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -25,23 +27,36 @@ HUGE = 1e30  # In any unit
 EQUAL = 0.05  # Share of rows with the time of the row before from which on the times do not tell the samples apart
 SPARSE = 1.5  # Distance of the rows, in sample times that the map gives, from which on the two contradict each other
 FAR = 20.0  # Distance of a special value from the others, in their spread
+APART = 3.0  # Distance of a number from all others, in their width, from which on it is a special one
 SHORT = 10  # Most rows in a row that have a special value
 MOST_VALUES = 20  # Numbers that come again after a jump, which are tried as special values
 RARE = 0.05  # Largest share of special values
 ALIKE = 0.05  # Relative difference of jumps of one period
-PERIODS = (2.0 * math.pi, math.pi, 360.0, 180.0, 1.0, 256.0, 1024.0, 4096.0, 8192.0, 16384.0, 65536.0)
-"""Usual ones, which a jump says less exactly."""
+PERIODS = (*(2.0 * math.pi / n for n in range(1, 13)), *(2.0**bits for bits in range(8, 33)))
+"""Usual ones besides those of two digits, which a jump says less exactly."""
 SPANS = (5, 10, 20, 40)  # Samples of a span: the shortest whose changes the noise does not hide
 TOLD = 30.0  # Change over a span, in standard deviations of the sensor
 MOST = 100_000  # Samples that the equations are tried on
-LATEST = 20  # Largest delay that is looked for [samples]
+LATEST = 100  # Largest delay that is looked for [samples], in a recording that is ten times as long
 EARLY, LATE = -0.1, 0.9  # Delays that can be estimated [samples]
 BETTER = 0.5  # Share of the squares that another delay must leave
 SURE = 10.0  # Standard deviations by which a coefficient is no zero
+WRONG = 3.0  # Ratio of what is driven and what is known from which on a unit is wrong
 SCALED = 1.2  # Ratio of the ways of angle and velocity from which on their scales contradict each other
 FACTOR = 10.0  # Values beyond a guess by this factor are not searched
-SPECIAL = (-32768.0, 32767.0, 65535.0, -2147483648.0, 2147483647.0, 4294967295.0, -999.0, -9999.0, 9999.0, 99999.0)
-"""Numbers with which a recorder says that it has none, besides those beyond all others."""
+SPECIAL = tuple(
+    sign * number / unit
+    for number in (
+        99.0,
+        999.0,
+        9999.0,
+        99999.0,
+        *(2.0**bits - k for bits in (7, 8, 10, 12, 15, 16, 31, 32) for k in (0, 1)),
+    )
+    for unit in ((1.0, 10.0, 100.0, 1000.0) if number > 5000.0 else (1.0,))
+    for sign in (1.0, -1.0)
+)
+"""Numbers with which a recorder says that it has none, besides those beyond all others: all nines, the ends of bits."""
 
 
 Of = TypeVar("Of")
@@ -77,6 +92,7 @@ class Series(NamedTuple):
     tick: float = 1.0  # Time of one count of the column of times [s]
     sample_time: float = 0.0  # As the map gives it [s]
     noise: float = 0.0  # Standard deviation, in the unit of the column
+    wrap: float = 0.0  # Period of an angle, as the map gives it
     rates: Floats | None = None  # Velocity of an angle at its samples, in units of the column per second
 
     def at(self, k: int) -> dict[str, object]:
@@ -84,12 +100,22 @@ class Series(NamedTuple):
         return {"name": self.name, "row": self.rows[k], "next": self.rows[k] + 1, "last": self.rows[-1]}
 
 
+def _is_apart(s: Series) -> Found:
+    """A time that neither goes on from the one before nor leads to the one after it, which follow each other."""
+    steps = np.diff(s.times)
+    back = int(np.argmax(steps < 0.0)) if (steps < 0.0).any() else 0
+    for k in (back, back + 1):  # the one before the step back is too late, or the one after it too early
+        if 0 < k < len(steps) and 0.0 < s.times[k + 1] - s.times[k - 1] < abs(min(steps[k - 1], steps[k])):
+            return s.at(k) | {"time": s.times[k], "before": s.times[k - 1], "after": s.times[k + 1]}
+    return None
+
+
 def _begins_anew(s: Series) -> Found:
     back = np.flatnonzero(np.diff(s.times) < 0.0)
     if not len(back):
         return None
     k, after = int(back[0]), s.times[back[0] + 1 : back[0] + 1 + SHORT]
-    if after.max() >= s.times[k] or after.max() == after.min():
+    if after.max() >= s.times[k] or after.max() == after.min() or (np.diff(after[:3]) < 0.0).any():
         return None
     period = (s.times[k] - s.times[k + 1] + np.median(np.abs(np.diff(s.times)))) / s.tick
     return s.at(k) | {"time": s.times[k], "period": period}
@@ -118,6 +144,8 @@ def _is_sparse(s: Series) -> Found:
 
 
 TIMES: Checks[Series] = {
+    _is_apart: "the time is {time:.10g} s in row {row}, between {before:.10g} and {after:.10g} s: leave that row out "
+    "of the file",
     _begins_anew: "the time begins anew after row {row}, at {time:.10g} s: of a counter, [timing] wrap = {period:.10g} "
     "continues it; of two recordings, [file] rows = [1, {row}] or [{next}, {last}] is one of them",
     _runs_backwards: "the time runs backwards after row {row}, from {time:.10g} to {then:.10g} s: sort the rows, or "
@@ -136,20 +164,35 @@ def _is_huge(s: Series) -> Found:
     return s.at(k) | {"value": s.values[k]} if huge.any() else None
 
 
+def _is_alone(s: Series) -> Found:
+    """The lowest or the highest number, where it lies apart from all others. A command, without noise, may jump."""
+    for value in (s.values.min(), s.values.max()):
+        alone = s.values == value
+        if s.noise and alone.sum() <= 0.5 * len(alone):
+            low, high = s.values[~alone].min(), s.values[~alone].max()
+            if min(abs(value - low), abs(value - high)) > APART * max(high - low, 10.0 * s.noise):
+                return _told(s, alone, low, high)
+    return None
+
+
 def _is_special(s: Series) -> Found:
     """Values beyond all others, or numbers known as special, or the same number now and then between others."""
     low, middle, high = np.percentile(s.values, (5.0, 50.0, 95.0))
     spreads = np.abs(s.values - middle) / max(high - low, 10.0 * s.noise, 1e-300)
     if not s.noise:  # a command may jump
-        far = (spreads > 1000.0) | (spreads > 0.25 * FAR) & np.isin(s.values, SPECIAL)
+        far = (spreads > 1000.0) | (spreads > FAR) & np.isin(s.values, SPECIAL)
     else:
         far = spreads > FAR
         steps = np.abs(np.diff(s.values))
         after, counts = np.unique(s.values[1:][steps > FAR * np.percentile(steps, 80.0)], return_counts=True)
-        for value in (0.0, *SPECIAL, *after[counts > 1][:MOST_VALUES]):
+        known = np.unique(s.values[np.isin(s.values, (0.0, *SPECIAL))])
+        for value in (*known, *after[counts > 1][:MOST_VALUES]):
             far |= _between(s, s.values == value)
-    if not 0 < far.sum() <= RARE * len(far) or high == low:
-        return None
+    return _told(s, far, low, high) if 0 < far.sum() <= RARE * len(far) and high > low else None
+
+
+def _told(s: Series, far: NDArray[np.bool_], low: float, high: float) -> Found:
+    """Values that are apart from the others, most of which are between low and high."""
     k, others, margin = int(np.argmax(far)), s.values[~far], 0.1 * (high - low)
     ends = {"low": others.min() - margin, "high": others.max() + margin}
     return s.at(k) | ends | {"count": far.sum(), "value": s.values[k]}
@@ -167,33 +210,45 @@ def _between(s: Series, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return found
 
 
+SPECIAL_SAID = (
+    "{count} values of {name} are apart from all others, the first one {value:.10g} in row {row}: where "
+    "they say that there is no value, special = [{value:.10g}], or range = [{low:.4g}, {high:.4g}], of the signal "
+    "leaves them out"
+)
 VALUES: Checks[Series] = {
     _is_huge: "{name} is {value:.4g} in row {row}, beyond any measurement: range = [LOW, HIGH] of the signal leaves "
     "such out",
-    _is_special: "{count} values of {name} are apart from all others, the first one {value:.10g} in row {row}: where "
-    "they say that there is no value, special = [{value:.10g}], or range = [{low:.4g}, {high:.4g}], of the signal "
-    "leaves them out",
+    _is_alone: SPECIAL_SAID,
+    _is_special: SPECIAL_SAID,
 }
 
 
 def _off(s: Series) -> Floats:
-    """Distance of each step of the angle from that of its velocity, measured or of steps around; none over a gap."""
+    """Distance of each step of the angle from that of steps around, or of its velocity if that says it better."""
     steps, apart = np.diff(s.values), np.diff(s.times)
+    rates = np.pad(steps / np.where(apart > 0.0, apart, np.inf), 2, mode="edge")
+    expected = [np.median(np.lib.stride_tricks.sliding_window_view(rates, 5), axis=1)]
     if s.rates is not None:
-        expected = 0.5 * (s.rates[1:] + s.rates[:-1])
-    else:
-        rates = np.pad(steps / np.where(apart > 0.0, apart, np.inf), 2, mode="edge")
-        expected = np.median(np.lib.stride_tricks.sliding_window_view(rates, 5), axis=1)
-    return np.where(apart < 1.5 * np.median(apart), np.abs(steps - expected * apart), 0.0)
+        expected.append(0.5 * (s.rates[1:] + s.rates[:-1]))
+    off = min((np.abs(steps - rate * apart) for rate in expected), key=lambda row: float(np.median(row)))
+    return np.where(apart < 1.5 * np.median(apart), off, 0.0)
+
+
+def _beyond_period(s: Series) -> Found:
+    low, high = s.values.min(), s.values.max()
+    return {"name": s.name, "low": low, "high": high, "wrap": s.wrap} if 0.0 < 1.1 * s.wrap < high - low else None
 
 
 def _wraps(s: Series) -> Found:
     off = _off(s)
     far = off > 0.5 * off.max()
-    if far.sum() < 2:
+    if not far.any():
         return None
     period, extent = float(np.median(off[far])), float(np.ptp(s.values))
-    period = next((p for p in PERIODS if abs(p - period) < 1e-3 * p), period)
+    exact = next((p for p in (*PERIODS, float(f"{period:.2g}")) if abs(p - period) < 1e-3 * p), 0.0)
+    if not exact and far.sum() < 2:
+        return None
+    period = exact or period
     alike = (np.abs(off[far] - period) < ALIKE * period).all() and (off[~far] < 0.4 * period).all()
     usual = float(np.median(np.abs(np.diff(s.values)))) + 10.0 * s.noise
     if not (alike and period > 5.0 * usual and 0.8 * period < extent < 1.05 * period):
@@ -208,9 +263,17 @@ def _is_set(s: Series) -> Found:
     return s.at(k) | {"value": s.values[k], "then": s.values[k + 1], "count": far.sum()} if far.any() else None
 
 
+WRAPPED: Checks[Series] = {
+    _is_huge: VALUES[_is_huge],
+    _beyond_period: "{name} goes from {low:.6g} to {high:.6g}, further than wrap = {wrap:.6g} says: expected its "
+    "period in the column's unit; range = [LOW, HIGH] leaves single values out",
+}
 ANGLES: Checks[Series] = {
+    _is_huge: VALUES[_is_huge],
+    _is_alone: SPECIAL_SAID,
     _wraps: "{name} jumps by {period:.10g} after row {row}, {count} times in all: it begins anew after a period; "
     "wrap = {period:.10g} of the signal continues it",
+    _is_special: SPECIAL_SAID,
     _is_set: "{name} jumps from {value:.6g} to {then:.6g} after row {row}, {count} times in all, as no motion does: "
     "was it set anew? [file] rows = [1, {row}] or [{next}, {last}] is one recording; range = [LOW, HIGH] of the signal "
     "leaves single values out",
@@ -234,7 +297,8 @@ class Motion(NamedTuple):
     guess: Mapping[str, float]
 
 
-class Equation(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Equation:
     """Second differences of the angle over spans of a recording, and of the double integrals of its torques."""
 
     motion: Motion
@@ -243,6 +307,8 @@ class Equation(NamedTuple):
     drive: Floats  # Double integral of what acts, at each sample, shape (n + 1,)
     span: int  # [samples]
     kept: NDArray[np.bool_]  # Spans without a lost sample
+    others: Floats  # Orthonormal basis of the loads, shape (m, loads)
+    latest: int  # Largest delay that is looked for [samples]
 
     def driven(self, delay: float) -> Floats:
         """Double integral of what acts ``delay`` samples late, over each span."""
@@ -251,10 +317,16 @@ class Equation(NamedTuple):
 
     def correlation(self, delay: float) -> float:
         """Partial correlation of the angle with what acts, ``delay`` samples late, beside all loads."""
-        others = np.linalg.qr(np.stack([*self.loads.values()], axis=1))[0]
-        left, right = (row - others @ (others.T @ row) for row in (self.left, self.driven(delay)))
+        left, right = (row - self.others @ (self.others.T @ row) for row in (self.left, self.driven(delay)))
         size = float(np.linalg.norm(left) * np.linalg.norm(right))
         return float(left @ right) / size if size > 0.0 else 0.0
+
+    @cached_property
+    def best(self) -> tuple[float, float]:
+        """Delay of what acts with which the equation holds best [samples], and the correlation there."""
+        whole = max(range(-self.latest, self.latest + 1), key=self.correlation)
+        near = np.linspace(whole - 1.0, whole + 1.0, 21).tolist()
+        return max(((delay, self.correlation(delay)) for delay in near), key=lambda pair: pair[1])
 
 
 def equation_of(motion: Motion) -> Equation | None:
@@ -282,10 +354,12 @@ def equation_of(motion: Motion) -> Equation | None:
     }
     if "k_1" in motion.known or "k_1" in motion.guess:
         loads["k_1"] = _double(-np.maximum(middle, 0.0), t_s)
-    kept[:LATEST] = kept[-LATEST:] = False  # what acts late there is not in the recording
+    latest = max(min(LATEST, n // 10), 2)
+    kept[:latest] = kept[-latest:] = False  # what acts late there is not in the recording
     second = {name: _second(load, span)[kept] for name, load in loads.items()}
     drive = _double(np.nan_to_num(motion.currents[:n]), t_s)
-    return Equation(motion, left[kept], second, drive, span, kept)
+    others = np.linalg.qr(np.stack([*second.values()], axis=1))[0]
+    return Equation(motion, left[kept], second, drive, span, kept, others, latest)
 
 
 def _second(row: Floats, span: int) -> Floats:
@@ -300,21 +374,27 @@ def _double(rate: Floats, t_s: float) -> Floats:
 
 
 def _ways(e: Equation) -> tuple[float, float]:
-    """Correlation of the ways of the angle with those that the velocity says, and their ratio; zeros without one."""
+    """Correlation of the ways of the angle with those that the velocity says, and their ratio; NaN without any."""
     velocity, span = e.motion.velocity, e.span
     if velocity is None:
-        return 0.0, 0.0
-    ways = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * e.motion.sample_time)])
-    said, seen = (row[span:] - row[:-span] for row in (ways, e.motion.angle))
+        return math.nan, math.nan
+    steps = 0.5 * (velocity[1:] + velocity[:-1]) * e.motion.sample_time
+    said = np.lib.stride_tricks.sliding_window_view(steps, span).sum(axis=1)
+    seen = e.motion.angle[span:] - e.motion.angle[:-span]
     said, seen = (row[np.isfinite(said) & np.isfinite(seen)] for row in (said, seen))
+    if not len(seen):
+        return math.nan, math.nan
     moved, size = float(seen @ seen), float(said @ said)
-    return (
-        (float(said @ seen) / math.sqrt(moved * size), float(said @ seen) / size) if moved * size > 0.0 else (0.0, 0.0)
-    )
+    both = float(said @ seen)
+    return (both / math.sqrt(moved * size), both / size) if moved * size > 0.0 else (0.0, 0.0)
 
 
 def _velocity_against(e: Equation) -> Found:
     return {} if _ways(e)[0] < -0.9 else None
+
+
+def _velocity_differs(e: Equation) -> Found:
+    return {} if abs(_ways(e)[0]) < 0.5 else None
 
 
 def _velocity_scaled(e: Equation) -> Found:
@@ -323,32 +403,39 @@ def _velocity_scaled(e: Equation) -> Found:
 
 
 def _driven_against(e: Equation) -> Found:
-    return {"by": e.motion.by} if e.correlation(0.0) < -0.5 and _best(e)[1] < 0.8 else None
-
-
-def _best(e: Equation) -> tuple[float, float]:
-    """Delay of what acts with which the equation holds best [samples], and the correlation there."""
-    whole = max(range(-LATEST, LATEST + 1), key=e.correlation)
-    return max(((d, e.correlation(d)) for d in np.linspace(whole - 1.0, whole + 1.0, 21).tolist()), key=lambda p: p[1])
+    return {"by": e.motion.by} if e.correlation(0.0) < -0.5 and e.best[1] < 0.8 else None
 
 
 def _is_late(e: Equation) -> Found:
-    best, correlation = _best(e)
+    best, correlation = e.best
     rest, now = 1.0 - correlation**2, 1.0 - max(e.correlation(0.0), 0.0) ** 2
-    if EARLY < best < LATE or abs(best) > LATEST or correlation < 0.8 or rest > BETTER * now:
+    if EARLY < best < LATE or abs(best) > e.latest or correlation < 0.8 or rest > BETTER * now:
         return None
     delay, how = e.motion.delay + best * e.motion.sample_time, "late" if best > 0.0 else "early"
     return {"by": e.motion.by, "samples": abs(best), "how": how, "delay": delay}
 
 
-def _is_far(e: Equation) -> Found:
-    """Guesses that are beyond the search, from the coefficients of the equation at the best delay."""
-    names, columns = ["k_m", *e.loads], np.stack([e.driven(_best(e)[0]), *e.loads.values()], axis=1)
+def _told_shares(e: Equation) -> tuple[dict[str, float], dict[str, float]]:
+    """Coefficients of the equation at the best delay that are no zero, all over J; and what is known of them."""
+    names, columns = ["k_m", *e.loads], np.stack([e.driven(e.best[0]), *e.loads.values()], axis=1)
     found = np.linalg.lstsq(columns, e.left, rcond=None)[0]
     spread = float(np.mean((e.left - columns @ found) ** 2))
     sure = SURE * np.sqrt(np.abs(np.diag(np.linalg.pinv(columns.T @ columns))) * spread)
     told = {name: c for name, c, least in zip(names, found.tolist(), sure.tolist(), strict=True) if c > least}
-    known = ({} if "k_m" in e.motion.guess else {"k_m": 1.0}) | dict(e.motion.known)
+    return told, ({} if "k_m" in e.motion.guess else {"k_m": 1.0}) | dict(e.motion.known)
+
+
+def _driven_scaled(e: Equation) -> Found:
+    told, known = _told_shares(e)
+    if not {"J", "k_m"} <= {*known} or "k_m" not in told:
+        return None
+    ratio = told["k_m"] * known["J"] / known["k_m"]
+    return {"by": e.motion.by, "ratio": ratio} if not 1.0 / WRONG < ratio < WRONG else None
+
+
+def _is_far(e: Equation) -> Found:
+    """Guesses that are beyond the search."""
+    told, known = _told_shares(e)
     inertia = known.get("J") or next((known[name] / c for name, c in told.items() if name in known), math.nan)
     gears = {"k_1": known.get("gamma", 1.0)}
     values = {"J": inertia} | {name: share * inertia / gears.get(name, 1.0) for name, share in told.items()}
@@ -363,11 +450,14 @@ def _is_far(e: Equation) -> Found:
 
 EQUATIONS: Checks[Equation] = {
     _velocity_against: "the velocity is against the angle: sign = -1 for one of the two",
+    _velocity_differs: "the velocity is not that of the angle: check the columns, or leave that of the velocity out",
     _velocity_scaled: "the angle goes {ratio:.4g} times as far as the velocity says: check unit, scale and the times; "
     "scale of [signals.velocity] times {ratio:.4g} agrees",
     _driven_against: "the motion is against the {by}: sign = -1 for it, or for angle and velocity",
     _is_late: "the {by} acts {samples:.1f} samples {how}, more than is searched: delay = {delay:.2g} in [signals.{by}] "
     "says so",
+    _driven_scaled: "the angle moves {ratio:.2g} times as far as the {by} drives it with the known k_m and J: check "
+    "the units and scales of angle and {by}, and [machine.known]",
     _is_far: f"the guess of {{names}} is too far off: only a factor of {FACTOR:g} about it is searched; the recording "
     "says about {values}",
 }

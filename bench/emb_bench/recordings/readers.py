@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from emb_bench.config.plants import Instruments
 from emb_bench.experiment.experiment import Experiment, Lack
-from emb_bench.recordings.faults import ANGLES, HUGE, TIMES, VALUES, Motion, Series, contradictions, require
+from emb_bench.recordings.faults import ANGLES, HUGE, TIMES, VALUES, WRAPPED, Motion, Series, contradictions, require
 from emb_bench.recordings.map_file import TIME, TIMED, Place, RecordingMap, Signal, Source
 from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
 from emb_runtime.can.codec import parse
@@ -145,21 +145,39 @@ def _csv(path: Path, source: Source, places: Sequence[Place], lacks: Entered) ->
         line = content.count(b"\n", 0, err.start) + 1
         tried = source.encoding or "UTF-8 or cp1252"
         raise UsageError(f"{path}: line {line}: not text in {tried}: [file] encoding names another one") from err
+    if text[:2].count("\0") == 1 and not source.encoding:
+        order = "le" if text[1] == "\0" else "be"
+        raise UsageError(f'{path}: UTF-16 without its mark: [file] encoding = "utf-16-{order}" reads it')
     delimiter = DELIMITERS[source.delimiter]
     if delimiter == " ":  # columns may be aligned by several
         text = re.sub(r"(?m)^ +| +(?= |$)", "", text)
     line, titles = _head(path, text, source, places)
     if line > 1 and source.head is None:
         lacks[Lack.HEAD] = (line,)
-    table = read_csv(
-        pa.BufferReader(text.encode()),
-        ReadOptions(skip_rows=line + source.skip, column_names=titles, use_threads=False),
-        # A last row that is cut is left out.
-        ParseOptions(
-            delimiter=delimiter, invalid_row_handler=lambda row: "skip" if text.endswith(f"\n{row.text}") else "error"
-        ),
-        ConvertOptions(decimal_point=source.decimal, null_values=[*MISSING, *source.missing], strings_can_be_null=True),
-    )
+    before, (_, last) = line + source.skip, source.rows or (1, MOST)
+    unfit = list[str]()
+
+    def judged(row: Any) -> str:
+        """A last row that is cut is left out, and so are those after the last that is wanted."""
+        if text.endswith(f"\n{row.text}") or row.number - before > last:
+            return "skip"
+        unfit.append(f"line {row.number}: expected {row.expected_columns} columns, got {row.actual_columns}")
+        unfit.append(f"[file] rows = [1, {row.number - before - 1}] reads those before it")
+        return "error"
+
+    try:
+        table = read_csv(
+            pa.BufferReader(text.encode()),
+            ReadOptions(skip_rows=before, column_names=titles, use_threads=False),
+            ParseOptions(delimiter=delimiter, invalid_row_handler=judged),
+            ConvertOptions(
+                decimal_point=source.decimal, null_values=[*MISSING, *source.missing], strings_can_be_null=True
+            ),
+        )
+    except pa.ArrowInvalid:
+        if unfit:
+            raise UsageError(f"{path}: {': '.join(unfit[:2])}") from None
+        raise
     return _arrow(path, table, source, places)
 
 
@@ -181,6 +199,8 @@ def _head(path: Path, text: str, source: Source, places: Sequence[Place]) -> tup
     """Line of the head, the first being 1, and the name of each column; 0 and numbers where there is none."""
     lines = re.split(r"\r\n|\n|\r", text[: 1 << 20])[: max(HEADS, source.head or 0)]
     delimiter, wanted = DELIMITERS[source.delimiter], {place.column for place in places}
+    if (source.head or 0) > len(lines):
+        raise UsageError(f"{path}: [file] head = {source.head}: expected one of its {len(lines)} lines")
     if source.head == 0:
         at, titles = -1, [str(n + 1) for n, _ in enumerate(_split(lines[0], delimiter))]
     else:
@@ -188,21 +208,24 @@ def _head(path: Path, text: str, source: Source, places: Sequence[Place]) -> tup
         at = max(among, key=lambda i: len(wanted & {*_split(lines[i], delimiter)}), default=0)
         titles = _split(lines[at], delimiter)
     if lost := [place.column for place in places if place.column not in titles]:
-        _require_one(path, lost[0], (), titles, _remedy(lines, at, titles, delimiter, wanted))
+        _require_one(path, lost[0], (), titles, _remedy(lines, at, titles, source, wanted))
     first = next((line for line in lines[at + 1 + source.skip :] if line.strip()), "")
     width = len(_split(first, delimiter))  # some put a delimiter at the end of a head or of each row
-    return at + 1, titles[:width] if not any(titles[width:]) else titles + [""] * (width - len(titles))
+    return at + 1, (titles + [""] * (width - len(titles)))[: None if any(titles[width:]) else width]
 
 
-def _remedy(lines: Sequence[str], at: int, titles: Sequence[str], delimiter: str, wanted: set[str]) -> str:
+def _remedy(lines: Sequence[str], at: int, titles: Sequence[str], source: Source, wanted: set[str]) -> str:
     """Key of the map that may find the columns of a CSV file; else the line that was taken for its head."""
     if at >= 0 and titles and all(map(_is_number, titles)):
         return f". No head: its first line is numbers; with [file] head = 0 columns are 1 to {len(titles)}"
     for name, other in DELIMITERS.items():
         fits = [i for i, line in enumerate(lines) if wanted <= {*_split(line, other)}]
-        if fits and other != delimiter:
+        if fits and name != source.delimiter:
             return f'. With [file] delimiter = "{name}" line {fits[0] + 1} has them'
-    return f" in line {at + 1}, taken for the head: [file] head names another line" if at > 0 else ""
+    if at > 0:
+        return f" in line {at + 1}, taken for the head: [file] head names another line"
+    foreign = not source.encoding and not all(name.isascii() for name in titles)
+    return ". If these names look wrong, [file] encoding names the file's" if foreign else ""
 
 
 def _parquet(path: Path, source: Source, places: Sequence[Place]) -> Iterator[Read]:
@@ -233,19 +256,26 @@ def _arrow(
             yield place, column.to_numpy(), None
 
 
+_CLOCK = re.compile(r"(\d\d?):(\d\d):(\d\d(?:\.\d*)?)")  # Without a fraction it is a time of Arrow's
+
+
 def _of_texts(path: Path, name: str, texts: Sequence[str | None], source: Source) -> Floats:
     """Numbers of a column that has texts, too."""
     values = np.full(len(texts), np.nan)
+    first, last = source.rows or (1, MOST)
     for i, text in enumerate(texts):
         plain = (text or "").strip(" \t;\"'")
-        if plain in MISSING or plain in source.missing:
+        if plain in MISSING or plain in source.missing or not first <= i + 1 <= last:
             continue
-        number = plain.replace(",", ".") if source.decimal == "," else plain
+        if clock := _CLOCK.fullmatch(plain):
+            values[i] = 3600.0 * int(clock[1]) + 60.0 * int(clock[2]) + float(clock[3])
+            continue
+        number = (plain.replace(",", ".") if source.decimal == "," else plain).replace("D", "E")  # of Fortran
         if not _is_number(number):
             remedy = (
                 '[file] decimal = "," reads it' if _is_number(plain.replace(",", "."))
                 else "[file] skip = 1 leaves out a line of units" if i == 0
-                else f"[file] missing = [{plain!r}] leaves such out"
+                else f"[file] missing = [{plain!r}] leaves such out, rows = [1, {i}] all from there on"
             )  # fmt: skip
             raise UsageError(f"{path}: {name}: row {i + 1}: expected a number, got {plain[:40]!r}: {remedy}")
         values[i] = float(number)
@@ -324,12 +354,14 @@ def _can(path: Path, source: Source, places: Sequence[Place], lacks: Entered, fo
     for message, _ in signals.values():
         of.setdefault((message.is_extended_frame, message.frame_id), {})[message.name] = message
     rows, channels = dict[tuple[str, str], list[tuple[float, Any]]](), dict[tuple[bool, int], Any]()
-    others, unread = Counter[str](), 0
+    others, elsewhere, unread = Counter[str](), Counter[str](), Counter[str]()
     with can.LogReader(path) as frames:
         for frame in frames:
             if source.channel not in ("", str(frame.channel)):
+                elsewhere[str(frame.channel)] += 1
                 continue
-            key, shown = (frame.is_extended_id, frame.arbitration_id), f"{frame.arbitration_id:#x}"
+            key = frame.is_extended_id, frame.arbitration_id
+            shown = _identifier(*key)
             if key not in of or frame.is_error_frame or frame.is_remote_frame:
                 others["error frames" if frame.is_error_frame else shown] += 1
                 continue
@@ -338,19 +370,34 @@ def _can(path: Path, source: Source, places: Sequence[Place], lacks: Entered, fo
                 raise UsageError(f"{path}: {shown} comes on {where}: [file] channel names one")
             for message in of[key].values():
                 values = _decoded(message, frame.data)
-                unread += values is None
+                if values is None:
+                    unread[f"{message.name} of {len(frame.data)} bytes, in the DBC {message.length}"] += 1
                 for name, value in (values or {}).items():
                     rows.setdefault((message.name, name), []).append((frame.timestamp, value))
-    if others:
-        lacks[Lack.OTHER_FRAMES] = (others.total(), len(others))
-    if unread:
-        lacks[Lack.BAD_FRAMES] = (unread,)
-    came = ", ".join(f"{key} ({count})" for key, count in others.most_common(NAMED)) or "none"
+    passed = {Lack.OTHER_FRAMES: (others.total(), len(others)), Lack.BAD_FRAMES: (unread.total(),)}
+    lacks.update({lack: numbers for lack, numbers in passed.items() if numbers[0]})
     for place, (message, name) in signals.items():
         if not (found := rows.get((message.name, name), [])):
-            why = f"{unread} frames do not fit the DBC, and others are {came}"
-            raise UsageError(f"{path}: {place.column}: no frame {message.frame_id:#x} has it; {why}")
+            wanted = _identifier(message.is_extended_frame, message.frame_id)
+            why = _passed(
+                {"do not fit the DBC": unread, "have other numbers": others, "have other channels": elsewhere}
+            )
+            raise UsageError(f"{path}: {place.column}: no frame {wanted} has it: {why}")
         yield place, [value for _, value in found], [time for time, _ in found]
+
+
+def _passed(counted: Mapping[str, Counter[str]]) -> str:
+    """Says which frames were passed over, by the reason."""
+    told = [
+        f"{counts.total()} {reason}, {', '.join(f'{key} ({n})' for key, n in counts.most_common(NAMED))}"
+        for reason, counts in counted.items()
+        if counts
+    ]
+    return "; ".join(told) or "the file has none"
+
+
+def _identifier(extended: bool, number: int) -> str:
+    return f"{number:#x} of 29 bits" if extended else f"{number:#x}"
 
 
 def _decoded(message: Any, data: Any) -> Mapping[str, Any] | None:
@@ -424,6 +471,8 @@ def experiment_of(
         raise UsageError(
             f"{source}: expected a sample time from 0.0001 to 0.1 s, got {t_s:g} s: see [timing] in the map{hint}"
         )
+    first = _first(times, t_s)
+    times, angles = times[first:], angles[first:]
     step, index = _on_grid(times - times[0], t_s)
     if len(step) < FEWEST or step[-1] > LONGEST:
         raise UsageError(
@@ -464,18 +513,18 @@ def experiment_of(
             guess=machine.guess.given,
         )
     )
-    first = float(samples[0, 0]), float(samples[0, 1])
+    start = float(samples[0, 0]), float(samples[0, 1])
     experiment = Experiment(
         name=name,
         currents=currents,
         samples=samples[1:],
-        angle=first[0],
-        velocity=first[1],
+        angle=start[0],
+        velocity=start[1],
         slack=0.0,  # nothing is known before the first sample
-        from_origin=first == (0.0, 0.0),
+        from_origin=start == (0.0, 0.0),
         late=late[1:],
         assumed=None if received.all() else np.where(received[1:], np.nan, currents),
-        first=first,
+        first=start,
         planned=len(currents),
         lacks=_lacks(wanted, kind, bandwidth, int((~received).sum())) | {**lacks},
         faults=faults,
@@ -512,20 +561,22 @@ def _read(columns: Mapping[Place, Column], wanted: RecordingMap, source: str) ->
             tick=wanted.time_unit,
             sample_time=wanted.timing.sample_time if name == "angle" else 0.0,
             noise=signal.noise / signal.scale,
+            wrap=signal.wrap,
         )
         require(TIMES, series, source)
-    for name, series in found.items():
-        if given[name].wrap:
-            found[name] = series._replace(values=np.unwrap(series.values, period=given[name].wrap))
-            continue
-        require(VALUES, series, source)
     angle, velocity = found["angle"], found.get("velocity")
+    for name, series in found.items():
+        if name != "angle":
+            require(VALUES, series, source)
+    if wrap := given["angle"].wrap:
+        require(WRAPPED, angle, source)
+        angle = angle._replace(values=np.unwrap(angle.values, period=wrap))
     if velocity is not None:
         factor = given["velocity"].scale * given["velocity"].sign / (given["angle"].scale * given["angle"].sign)
         rates = (np.interp(angle.times, velocity.times, velocity.values) - given["velocity"].offset) * factor
         angle = angle._replace(rates=rates)
     require(ANGLES, angle, source)
-    return found
+    return found | {"angle": angle}
 
 
 def _clock(columns: Mapping[Place, Column], wanted: RecordingMap) -> Floats | None:
@@ -550,10 +601,22 @@ def _in_si(values: Floats, signal: Signal) -> Floats:
 
 
 def _sample_time(times: Floats) -> float:
-    """Mean distance of samples, of which some may be lost [s]; a single one is as coarse as a time stamp."""
-    steps = np.diff(times)
-    count = float(np.rint(steps / max(float(np.median(steps)), 1e-9)).sum())
-    return round(float(times[-1] - times[0]) / max(count, 1.0), 9)
+    """Distance of samples, of which some may be lost [s]; a single one is as coarse as a time stamp."""
+    found, count = float(np.median(np.diff(times))), FEWEST
+    while found > 0.0:
+        near = times[:count] - times[0]
+        found = float(np.polyfit(np.rint(near / found), near, 1)[0])
+        if count >= len(times):
+            break
+        count *= 2
+    return round(found, 9)
+
+
+def _first(times: Floats, t_s: float) -> int:
+    """The sample to begin with: the first, unless its stamp is far from the grid of the others."""
+    turns = np.exp(2j * np.pi * times / t_s)
+    away = np.abs(np.angle(turns * np.conj(turns.sum())))
+    return 0 if away[0] < 0.2 * np.pi else int(np.argmin(away[:FEWEST]))
 
 
 def _on_grid(times: Floats, t_s: float) -> tuple[Integers, Integers]:

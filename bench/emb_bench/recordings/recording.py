@@ -15,6 +15,7 @@ from emb_bench.logs.log import Chunks
 from emb_bench.recordings.map_file import RecordingMap, read_map
 from emb_bench.recordings.readers import Found, experiment_of, read_columns
 from emb_runtime.config.bench import Systematic
+from emb_runtime.errors import UsageError
 
 ACCURACY = 4e-11  # Local error of the velocity, as a share of the largest one: that of a brake at 250 rad/s
 LOOSEST = 1e-8  # Largest local error [rad/s], [m/s] of a linear machine
@@ -31,7 +32,12 @@ def open_recording(path: Path, map_path: Path) -> Recording:
     columns = read_columns(path, kind, wanted.file, wanted.places, lacks, map_path.parent)
     found = experiment_of(columns, wanted, kind, str(path), lacks)
     text = bench_of(found, wanted)
-    parse_bench(text, f"{map_path}: the bench file made of it", analysis=True)
+    try:
+        parse_bench(text, f"{map_path}: the bench file made of it", analysis=True)
+    except UsageError:
+        if found.experiment.faults:  # the cause of a guess that no bench file takes
+            raise UsageError(f"{map_path}: {found.experiment.faults[0]}") from None
+        raise
     return Recording(
         path=path,
         complete=True,

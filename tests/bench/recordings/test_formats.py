@@ -167,11 +167,15 @@ FRAMES_REFUSED = (
     (
         '"State.Position"',
         '"Other.Position"',
-        "no frame 0x12d has it; 0 frames do not fit the DBC, and others are 0x100 (301), 0x55 (301)",
+        "no frame 0x12d has it: 602 have other numbers, 0x100 (301), 0x55 (301)",
     ),
     ('"servo.dbc"', '"none.dbc"', "none.dbc: cannot read the DBC: No such file"),
     ('dbc = "servo.dbc"', "", "[file] dbc: expected for CAN frames"),
-    ('dbc = "servo.dbc"', 'dbc = "servo.dbc"\nchannel = "7"', "State.Position: no frame 0x100 has it"),
+    (
+        'dbc = "servo.dbc"',
+        'dbc = "servo.dbc"\nchannel = "7"',
+        "no frame 0x100 has it: 903 have other channels, can0 (903)",
+    ),
     ('unit = "m"', 'unit = "m"\ngroup = 1', "State.Position: only an MDF has groups"),
 )
 

@@ -60,6 +60,11 @@ READ = {
         PLAIN.replace(",", ";").replace(".", ","), {"file": 'delimiter = ";"\ndecimal = ","'}
     ),
     "units below the head": Form(PLAIN.replace("\n", "\ns,rad,rad/s,A\n", 1), {"file": "skip = 1"}),
+    "a delimiter behind each row but the head": Form(PLAIN.replace("\n", ",\n").replace(",\n", "\n", 1)),
+    "lines behind the rows": Form(PLAIN + "end of\nrecord\n", {"file": f"rows = [1, {len(RIGHT['t'])}]"}),
+    "texts behind the rows": Form(PLAIN + "end,of,the,record\n", {"file": f"rows = [1, {len(RIGHT['t'])}]"}),
+    "exponents of Fortran": Form(re.sub(r"-?\d[-.\de]*", lambda m: f"{float(m[0]):.9e}".replace("e", "D"), PLAIN)),
+    "times of day with fractions": Form(re.sub(r"(?m)^([\d.]+),", lambda m: f"10:00:{float(m[1]):06.3f},", PLAIN)),
     "a row that is cut": Form(PLAIN + "0.2,3.4"),
     "a usual text": Form(at_row(50, "N/A"), lost=1),
     "a text of the map": Form(at_row(50, "---"), {"file": 'missing = ["---"]'}, lost=1),
@@ -77,6 +82,19 @@ READ = {
 }
 REFUSED = {
     "no head": Form(PLAIN.partition("\n")[2], {}, "No head: its first line is numbers; with [file] head = 0"),
+    "a line that is no line": Form(PLAIN, {"file": "head = 4000"}, "[file] head = 4000: expected one of its"),
+    "UTF-16 without its mark": Form(
+        PLAIN.encode("utf-16-le"), {}, 'UTF-16 without its mark: [file] encoding = "utf-16-le"'
+    ),
+    "lines behind the rows": Form(
+        PLAIN + "end of record\n", {}, f"[file] rows = [1, {len(RIGHT['t'])}] reads those before"
+    ),
+    "texts behind the rows": Form(
+        PLAIN + "end,of,the,record\n", {}, f"rows = [1, {len(RIGHT['t'])}] all from there on"
+    ),
+    "names in another encoding": Form(
+        PLAIN.replace("angle", "角度").encode("shift_jis"), {}, "If these names look wrong, [file] encoding names"
+    ),
     "another delimiter": Form(PLAIN.replace(",", ";"), {}, 'With [file] delimiter = ";" line 1 has them'),
     "another name": Form(PLAIN.replace("angle", "Winkel"), {}, "no column is called 'angle'; it has: t, Winkel"),
     "the same behind a preamble": Form("x\n\n" + PLAIN.replace("angle", "W"), {}, "in line 3, taken for the head"),
@@ -85,7 +103,9 @@ REFUSED = {
     "a fault of a table": Form(at_row(99, "#DIV/0!", 3), {}, "current: row 99: expected a number, got '#DIV/0!'"),
     "units": Form(PLAIN.replace("\n", "\ns,rad,rad/s,A\n", 1), {}, "[file] skip = 1 leaves out a line of units"),
     "a comma": Form(PLAIN.replace(",", ";").replace(".", ","), {"file": 'delimiter = ";"'}, '[file] decimal = ","'),
-    "a short row": Form(PLAIN.replace("\n0.1,", "\n0.1\n0.1,"), {}, "Row #52: Expected 4 columns, got 1"),
+    "a short row": Form(
+        PLAIN.replace("\n0.1,", "\n0.1\n0.1,"), {}, "line 52: expected 4 columns, got 1: [file] rows = [1, 50] reads"
+    ),
     "not the encoding": Form("t,\xff".encode("latin-1"), {"file": 'encoding = "utf-8"'}, "line 1: not text in utf-8"),
     "no encoding": Form(PLAIN, {"file": 'encoding = "rot13"'}, "file.encoding: expected one such as utf-8"),
     "rows the wrong way": Form(PLAIN, {"file": "rows = [9, 3]"}, "file.rows: expected the first row, then the last"),
