@@ -179,3 +179,10 @@ def test_a_run_is_drawn_on_axes_of_the_caller(log: Path) -> None:
     assert_array_equal(axes[0].lines[0].get_ydata(), run.cycles["angle"])
     with pytest.raises(UsageError, match="5 axes"):
         api.draw(run, axes[:4])
+
+
+def test_the_interval_of_an_information_is_that_of_fim(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = printed(capsys, replay.main(["fim", str(log), "--json"]))["estimate"]
+    interval = api.interval(api.fisher_information(log))
+    assert dict(zip(interval.names, interval.between_runs.tolist(), strict=True)) == found["between_runs"]
+    assert (interval.of_comparison, interval.of_repeatability) == (found["T"], found["I"])

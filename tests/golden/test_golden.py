@@ -32,7 +32,7 @@ UNIQUE = re.compile(
 """Hashes, numbers of reports, dates and the version."""
 RELATIVE, ABSOLUTE = 0.02, 1e-9
 SHORT = {
-    "fim": 14,
+    "fim": 21,
     "estimate-good": 16,
     "estimate-misfit": 18,
     "estimate-aborted": 16,

@@ -18,14 +18,14 @@ from typing import NoReturn
 from emb_bench.api.campaigns import campaign
 from emb_bench.api.designs import design
 from emb_bench.api.estimates import estimate, report
-from emb_bench.api.information import fisher_information, sensitivities
+from emb_bench.api.information import fisher_information, interval, sensitivities
 from emb_bench.api.runs import Run, draw, export, info, open_run, rerun, timing, topic, topics
 from emb_bench.api.simulation import simulate
 from emb_runtime.errors import near
 
 __all__ = [
-    "Run", "campaign", "design", "draw", "estimate", "export", "fisher_information", "info", "open_run", "report",
-    "rerun", "sensitivities", "simulate", "timing", "topic", "topics",
+    "Run", "campaign", "design", "draw", "estimate", "export", "fisher_information", "info", "interval", "open_run",
+    "report", "rerun", "sensitivities", "simulate", "timing", "topic", "topics",
 ]  # fmt: skip
 _MEANT = {"load": "open_run", "read": "open_run", "fim": "fisher_information", "fit": "estimate", "plot": "draw"}
 """Names of other libraries for what is here."""

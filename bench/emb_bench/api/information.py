@@ -10,9 +10,10 @@ from emb_bench.api.arguments import Names, Source, driven, is_row, listed, refus
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.experiment.experiment import planned
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import UsageError, needs
 
 if TYPE_CHECKING:
+    from emb_bench.estimate.expected import Interval
     from emb_bench.experiment.simulate import Trajectory
     from emb_bench.information.evaluation import Information
 
@@ -87,6 +88,28 @@ def fisher_information(
     if not found:
         raise UsageError("expected at least one run, or one current")
     return found[0] if len(found) == 1 else together(found)
+
+
+def interval(information: Information) -> Interval:
+    """The interval that an estimate will have: of the run or the currents of an information, with its unknowns.
+
+    It has the unknowns of :func:`estimate`, the systematic errors of the bench among them, and its budget.
+
+    Args:
+        information: what :func:`fisher_information` returned of one run, or of planned currents.
+
+    Returns:
+        ``repeatability``, ``between_runs`` and ``total``, standard deviations in the order of ``names``, relative or in
+        the unknown's unit; ``largest(i)`` is the largest entry of the budget; ``of_comparison`` and
+        ``of_repeatability`` are T and I [nat].
+
+    Raises:
+        UsageError: it is of several runs, the model cannot estimate the unknowns, or scipy and numba are missing.
+        LogError: the record is too short for them.
+    """
+    with needs("the interval of an estimate", "bench"):
+        from emb_bench.estimate.expected import of_information
+    return of_information(information)
 
 
 def sensitivities(

@@ -14,6 +14,7 @@ from emb_bench.batch.row import NONE, Options, Row, Source, failed
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.estimate import Estimate
+from emb_bench.estimate.expected import of_information
 from emb_bench.estimate.records import EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
@@ -63,6 +64,9 @@ def _steps(source: Source, options: Options) -> Iterator[Row]:
 
     (evaluation,) = evaluate(log, experiment, bench, [plant], question, "nominal", bench.brake)
     yield _of_the_information(evaluation)
+    with suppress(EmbError):  # of unknowns that the model cannot estimate
+        interval = of_information(evaluation)
+        yield {"T": interval.of_comparison, "I": interval.of_repeatability}
     if options.method == NONE:
         return
     from emb_bench.estimate.methods import method_of

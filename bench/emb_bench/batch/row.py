@@ -100,6 +100,8 @@ COLUMNS = {
     "log_det": Column("number", "log det of the physical Fisher information, relative parameters", "1"),
     "lambda_min": Column("number", "its smallest eigenvalue", "1"),
     "trace_inverse": Column("number", "trace of its inverse", "1"),
+    "T": Column("number", "interval between runs that is expected of an estimate: sum of -2 ln of it", "1"),
+    "I": Column("number", "the same of the repeatability", "1"),
     "fits": Column("truth", "the model with the estimated parameters explains the record; null without an estimate"),
     "chi2_per_freedom": Column("number", "chi2/n of the residuals at the estimate", "1"),
     "alarms": Column("texts", "why the model does not explain the record"),

@@ -14,7 +14,7 @@ a disturbance, drifts may be larger, by ``DISTURBED``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
@@ -188,31 +188,42 @@ def held(problem: Problem) -> tuple[str, ...]:
 
 def secants(problem: Problem, z: Floats, model: Shown) -> dict[str, list[Floats]]:
     """Columns of the effects without a sensitivity: samples per unit in standard deviations, by record."""
-    mechanics, found = problem.mechanics(z), dict[str, list[Floats]]()
+    mechanics, found = problem.mechanics(z), features(problem, z, model)
     observed = problem.plant.instruments.observer_bandwidth > 0.0
-    estimated = {unknown.name for unknown in problem.unknowns}
     for i, record in enumerate(problem.records):
         base, motion = model.shown(i, mechanics), model.motion(i)
-        for name, effect in EFFECTS.items():
-            lacking = effect.step > 0.0 and name not in estimated
-            changed = _with(mechanics, name, effect.step) if lacking else None
-            if changed is not None:
-                reference = base if changed.stribeck_velocity == mechanics.stribeck_velocity else None
-                if reference is None:
-                    reference = model.shown(i, mechanics._replace(stribeck_velocity=changed.stribeck_velocity))
-                found.setdefault(name, []).append((model.shown(i, changed) - reference) / effect.step)
-        at = _path(problem, z, i, motion)
-        for name, torque in TORQUES.items():
-            if name == "play" and (mechanics.play > 0.0 or mechanics.solver != EXACT):
-                continue
-            step = EFFECTS[name].step or STEP
-            added = torque(at, step) / at.brake.k_m
+        for name, (added, step) in turning(problem, z, i, motion).items():
             found.setdefault(name, []).append((model.shown(i, mechanics, added) - base) / step)
         if not observed:
             slope = np.diff(motion[:, 1], prepend=record.velocity) / problem.bench.timing.sample_time
             lag = np.stack([np.zeros_like(slope), -slope], axis=1)
             found.setdefault(LAGGING, []).append(model.whitened(i, 1e-6 * lag) / 1e-6)
     return found
+
+
+def features(problem: Problem, z: Floats, model: Shown) -> dict[str, list[Floats]]:
+    """Columns of the features that the mechanics lack, as :func:`secants`."""
+    mechanics, found = problem.mechanics(z), dict[str, list[Floats]]()
+    estimated = {unknown.name for unknown in problem.unknowns}
+    for i in range(len(problem.records)):
+        shown = {mechanics.stribeck_velocity: model.shown(i, mechanics)}
+        for name, effect in EFFECTS.items():
+            lacking = effect.step > 0.0 and name not in estimated
+            changed = _with(mechanics, name, effect.step) if lacking else None
+            if changed is None:
+                continue
+            if (slow := changed.stribeck_velocity) not in shown:
+                shown[slow] = model.shown(i, mechanics._replace(stribeck_velocity=slow))
+            found.setdefault(name, []).append((model.shown(i, changed) - shown[slow]) / effect.step)
+    return found
+
+
+def turning(problem: Problem, z: Floats, record: int, motion: Floats) -> dict[str, tuple[Floats, float]]:
+    """Currents that turn the motor as effects of some sizes do [A], with these sizes, by name; ``motion`` is shown."""
+    mechanics, at = problem.mechanics(z), _path(problem, z, record, motion)
+    lacking = mechanics.play == 0.0 and mechanics.solver == EXACT
+    steps = {name: EFFECTS[name].step or STEP for name in TORQUES if name != "play" or lacking}
+    return {name: (TORQUES[name](at, step) / at.brake.k_m, step) for name, step in steps.items()}
 
 
 class Path(NamedTuple):
@@ -326,37 +337,19 @@ def score(
     } | {name: np.concatenate([column.ravel() for column in parts]) for name, parts in added.items()}
     if problem.bench.brake.k_1 == 0.0:
         every = {name: column for name, column in every.items() if name not in OF_THE_SPRING}
-    pseudo = np.linalg.pinv(jacobian / _lengths(jacobian)) / _lengths(jacobian)[:, None]
+    pseudo = pseudo_inverse(jacobian)
     priors = _priors(problem, DISTURBED if disturbed else 1.0)
     averaged = average(problem, z, left)
     in_full = unaveraged(averaged.step)
     found, beside_all, budget = [], [], []
-    untested = {ANGLE_SCALE: _angle_scaled(problem, z, shown)} if ANGLE_SCALE in priors else {}
-    if CURRENT_SCALE in priors:  # a larger current acts as a larger k_m does
-        own, count = [u.name for u in problem.unknowns], sum(record.samples.size for record in problem.records)
-        untested[CURRENT_SCALE] = every["k_m"] if "k_m" in every else -jacobian[:count, own.index("k_m")]
+    untested = scales(problem, z, left[1], shown, every, priors)
     for name, column in (every | untested).items():
-        whole = np.zeros(len(errors))
-        whole[: len(column)] = column
-        beside = whole - model @ (model.T @ whole)
+        whole, beside = beside_model(column, model)
         length = float(np.linalg.norm(beside))
         if length <= DEPENDENT * float(np.linalg.norm(whole)):
             length, beside = 0.0, np.zeros(len(errors))
         if name in priors:
-            # What drifts is fitted as it is in the middle of a run, and meant from the begin to the end.
-            ends = np.array([0.5 if f"{u.name}_drift" == name else 0.0 for u in problem.unknowns])
-            certain = name in NEVER_EXACT
-            effect = Effect(
-                pseudo @ whole,
-                length**2,
-                float(beside @ errors),
-                priors[name] * np.array([1.0] if certain else SHARES),
-                1.0 if certain else PRESENT,
-                ends,
-            )
-            if name == "J":  # all torques scale with it, those that are held as well: no trace is left
-                together = np.array([float(u.name in PARAMETER_NAMES) for u in problem.unknowns])
-                effect = effect._replace(moved=together, information=0.0, score=0.0)
+            effect = effect_of(problem, name, priors[name], pseudo @ whole, length**2, float(beside @ errors))
             bias, size = (in_full if name in untested else averaged).bias(effect)
             budget.append(Contribution(name, tuple(bias.tolist()), size))
         if length == 0.0 or name in untested:
@@ -375,6 +368,42 @@ def score(
     statistic, rank = float(np.sum((kept.T @ errors) ** 2)), kept.shape[1]
     p_value = float(special.chdtrc(rank, statistic / max(ratio, 1.0)))
     return _with_observer(_ranked(found), problem), tuple(budget), JointScore(statistic, rank, p_value)
+
+
+def scales(
+    problem: Problem, z: Floats, jacobian: Floats, shown: Shown, every: Mapping[str, Floats], priors: Container[str]
+) -> dict[str, Floats]:
+    """Columns of the scales of the sensors that the total allows for, beside ``every`` other effect's."""
+    found = {ANGLE_SCALE: _angle_scaled(problem, z, shown)} if ANGLE_SCALE in priors else {}
+    if CURRENT_SCALE in priors:  # a larger current acts as a larger k_m does
+        own, count = [u.name for u in problem.unknowns], sum(record.samples.size for record in problem.records)
+        found[CURRENT_SCALE] = every["k_m"] if "k_m" in every else -jacobian[:count, own.index("k_m")]
+    return found
+
+
+def beside_model(column: Floats, model: Floats) -> tuple[Floats, Floats]:
+    """The column of an effect as long as all residuals, and what of it the ``model``, an orthonormal basis, lacks."""
+    whole = np.zeros(len(model))
+    whole[: len(column)] = column
+    return whole, whole - model @ (model.T @ whole)
+
+
+def pseudo_inverse(jacobian: Floats) -> Floats:
+    """Pseudo-inverse of a matrix whose columns differ in scale."""
+    lengths = np.linalg.norm(jacobian, axis=0)
+    lengths = np.where(lengths > 0.0, lengths, 1.0)
+    result: Floats = np.linalg.pinv(jacobian / lengths) / lengths[:, None]
+    return result
+
+
+def effect_of(problem: Problem, name: str, prior: float, moved: Floats, information: float, score: float) -> Effect:
+    """An effect with the deviation ``prior`` of its size: what it moves the unknowns by, per unit, and its score."""
+    # What drifts is fitted as it is in the middle of a run, and meant from the begin to the end.
+    ends = np.array([0.5 if f"{u.name}_drift" == name else 0.0 for u in problem.unknowns])
+    if name == "J":  # all torques scale with it, those that are held as well: no trace is left
+        moved, information, score = np.array([float(u.name in PARAMETER_NAMES) for u in problem.unknowns]), 0.0, 0.0
+    sizes, present = (np.array([1.0]), 1.0) if name in NEVER_EXACT else (np.array(SHARES), PRESENT)
+    return Effect(moved, information, score, prior * sizes, present, ends)
 
 
 def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
@@ -402,12 +431,6 @@ def _with_observer(found: tuple[Suspect, ...], problem: Problem) -> tuple[Suspec
         replace(s, p_value=observer.p_value, possible=True, observer=observer) if s.name == LAGGING else s
         for s in ordered
     )
-
-
-def _lengths(jacobian: Floats) -> Floats:
-    lengths = np.linalg.norm(jacobian, axis=0)
-    result: Floats = np.where(lengths > 0.0, lengths, 1.0)
-    return result
 
 
 def _angle_scaled(problem: Problem, z: Floats, shown: Shown) -> Floats:

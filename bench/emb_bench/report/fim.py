@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from emb_bench.brake.parameters import quantity
+from emb_bench.brake.parameters import UNITS, quantity
 from emb_bench.config.machine import LOADS
 from emb_bench.documents import to_json
 from emb_bench.information.criteria import criteria_series
 from emb_bench.information.evaluation import KINDS, Evaluation, Question, default_model, evenly
-from emb_bench.information.identifiability import Finding, combination
+from emb_bench.information.identifiability import combination
 from emb_bench.numbers import in_samples, relative
 from emb_bench.report import sentences as say
 from emb_bench.report.text import Table, facts, listed, wrapped
 from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.errors import EmbError, needs
 from emb_runtime.estimator.estimate import NORMAL_95, total
 from emb_runtime.numbers import NOTHING, plain
 
+if TYPE_CHECKING:  # the base install has no scipy
+    from emb_bench.estimate.expected import Interval
+
+LONGEST = 60_000  # Periods of a record whose interval is computed, which takes memory for all of them
 INSTANTS = 10  # Rows of the table over time; the document has more
 CRITERIA = {
     "log det M": "log_det",
@@ -66,8 +71,31 @@ def document(e: Evaluation) -> dict[str, Any]:
         "findings": [to_json(finding) | {"identified": finding.identified} for finding in verdict.findings],
         "directions": verdict.directions,
     }
-    document: dict[str, Any] = to_json(found)
+    interval = expected_interval(e)
+    if not isinstance(interval, str):
+        deviations = {key: getattr(interval, key).tolist() for key in ("repeatability", "between_runs", "total")}
+        found["estimate"] = {
+            **{key: dict(zip(interval.names, row, strict=True)) for key, row in deviations.items()},
+            "T": interval.of_comparison,
+            "I": interval.of_repeatability,
+            "budget": {one.name: dict(zip(interval.names, one.bias, strict=True)) for one in interval.budget},
+        }
+    document: dict[str, Any] = to_json({"estimate": None} | found)
     return document
+
+
+def expected_interval(e: Evaluation) -> Interval | str:
+    """The interval that an estimate from the record will have, or the reason that there is none."""
+    if e.absent:
+        return f"{', '.join(e.absent)}: zero in the model"
+    if e.experiment.periods > LONGEST:
+        return f"the record has more than {LONGEST} periods"
+    try:
+        with needs("the interval of an estimate", "bench"):
+            from emb_bench.estimate.expected import of_information
+        return of_information(e)
+    except EmbError as err:
+        return str(err)
 
 
 def text(e: Evaluation, *, verbose: bool = False) -> str:
@@ -80,8 +108,8 @@ def text(e: Evaluation, *, verbose: bool = False) -> str:
         return "\n".join([*doubts, "no information: the record does not depend on any of these parameters", *lines])
     verdict = e.verdict().shown(e.bench.machine)
     prior = "" if e.question.prior is None else ", with the prior"
-    head = wrapped(f"smallest possible repeatability ± 95 % (k=2){prior}, of ideal sensors")
-    rows = [[f.name, _half(f), say.finding(f)] for f in verdict.findings]
+    head = [*_expected(e, prior), *wrapped(f"smallest possible repeatability ± 95 % (k=2){prior}, of ideal sensors")]
+    rows = [[f.name, _half(f.deviation, f.unit), say.finding(f)] for f in verdict.findings]
     head += [*(row.rstrip() for row in Table("", ("", "", ""), rows, words=(0, 2)).lines("  ")[1:])]
     if e.bench.machine is None:
         bounds = {f.name: NORMAL_95 * f.deviation for f in verdict.findings if f.name in PARAMETER_NAMES}
@@ -94,16 +122,34 @@ def text(e: Evaluation, *, verbose: bool = False) -> str:
     return "\n".join([*doubts, *lines, *(_details(e) if verbose else ())])
 
 
+def _expected(e: Evaluation, prior: str) -> list[str]:
+    """What an estimate from the record can tell, with the effect that leaves most of each interval."""
+    interval = expected_interval(e)
+    if isinstance(interval, str):
+        return listed("no interval of an estimate: ", [interval])
+    from emb_bench.estimate.suspects import shown_as
+
+    machine, rows = e.bench.machine, []
+    for i, name in enumerate(interval.names):
+        shown, most = quantity(machine, name), interval.largest(i)
+        kinds = (interval.repeatability, interval.between_runs, interval.total)
+        halves = [_half(float(kind[i]), shown.unit if name in UNITS else "") for kind in kinds]
+        rows.append([shown.name, *halves, "" if most is None else shown_as(most, machine).name])
+    header = ("", "repeatability", "between runs", "total", "most between runs by")
+    title = f"possible for emb-replay estimate, ± 95 % (k=2){prior}"
+    return [title, *Table("", header, rows, words=(0, 4)).lines("  "), ""]
+
+
 def _why(e: Evaluation) -> str:
     """Reason for the model."""
     name, why = default_model(e.log)
     return why if name == e.plant.name else "asked for"
 
 
-def _half(f: Finding) -> str:
-    """The repeatability that a bound allows."""
-    half = relative(NORMAL_95 * f.deviation, not f.unit)
-    return half if half == NOTHING else f"± {half} {f.unit}".rstrip()
+def _half(deviation: float, unit: str) -> str:
+    """Half an interval, in percent without a unit."""
+    half = relative(NORMAL_95 * deviation, not unit)
+    return half if half == NOTHING else f"± {half} {unit}".rstrip()
 
 
 def _details(e: Evaluation) -> list[str]:

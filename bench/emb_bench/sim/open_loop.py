@@ -107,6 +107,44 @@ def march(mechanics: Mechanics, p: BrakeParameters, acting: Input, chosen: Integ
             broken += 1
 
 
+def march_beside(mechanics: Mechanics, p: BrakeParameters, acting: Input, rows: Floats, x: Floats, s: Floats) -> None:
+    """Fills states ``x``, and sensitivities ``s`` to currents that act beside those of an input without gaps.
+
+    Such a current is a row's number times its current in each period [A], ``rows`` of shape (n, m). A period's map of a
+    sensitivity is affine, s → A s + b with the command's b: a current w takes it to w (A s/w + b). Runs as it is or
+    compiled.
+    """
+    every, t_s, late, before = np.full(s.shape[1], PAST_COMMAND), acting.t_s, acting.late, float(x[0, 3])
+    for k in range(acting.currents.shape[0]):
+        _carry(x, s, k)
+        u = float(acting.currents[k])
+        if late > 0.0:
+            if k > 0:
+                _over(rows[k - 1], every, s[k + 1])
+            advance(mechanics, p, x[k + 1], before, late * t_s, every, s[k + 1])
+            if k > 0:
+                _times(rows[k - 1], s[k + 1])
+        _over(rows[k], every, s[k + 1])
+        advance(mechanics, p, x[k + 1], u, (1.0 - late) * t_s, every, s[k + 1])
+        _times(rows[k], s[k + 1])
+        before = u
+
+
+def _over(row: Floats, every: Integers, s: Floats) -> None:
+    """Sensitivities over a period's currents; where there is none, no command acts."""
+    for j in range(s.shape[0]):
+        every[j] = PAST_COMMAND if row[j] == 0.0 else COMMAND
+        for i in range(SENSITIVE):
+            s[j, i] /= row[j] if row[j] != 0.0 else 1.0
+
+
+def _times(row: Floats, s: Floats) -> None:
+    """The inverse of :func:`_over`."""
+    for j in range(s.shape[0]):
+        for i in range(SENSITIVE):
+            s[j, i] *= row[j] if row[j] != 0.0 else 1.0
+
+
 def _carry(x: Floats, s: Floats, k: int) -> None:
     """Row k into the next one; an assignment of rows would take numba seconds to compile."""
     for i in range(STATES):

@@ -134,6 +134,7 @@ def test_rows_say_what_fim_says_of_the_log_alone(folder: Path, said: Said, repla
             assert row[name] == its["samples"][name]
         for name in ("log_det", "lambda_min", "trace_inverse"):
             assert finite(row[name]) == its["physical"][name]
+        assert {name: finite(row[name]) for name in ("T", "I")} == {name: its["estimate"][name] for name in ("T", "I")}
         told = {finding["name"]: finding["identified"] for finding in its["physical"]["findings"]}
         assert {name: finite(row[f"{name}_cramer_rao"]) for name in told} == its["physical"]["cramer_rao"]
         assert (row["nominal_angle_sigmas"], row["nominal_velocity_sigmas"], row["nominal_fits"]) == (

@@ -1,0 +1,199 @@
+"""Expected interval of an estimate, before there is a record: by the rules of the estimator.
+
+The unknowns are those of ``estimate``: the parameters and the systematic errors of the bench with their priors, and the
+start of the brake, whose angle at rest is a measurement. The estimate is averaged over whether each error is there
+(:mod:`emb_bench.estimate.average`), and the other effects of ``[systematic]`` move it as the budget of the uncertainty
+says (:mod:`emb_bench.estimate.suspects`). The brake has none of them: the score of an effect is Gaussian with the
+variance of its information, and its square counts with its mean.
+
+Two numbers count a whole experiment [nat], more is better. They add −2 ln of the relative deviations of the parameters:
+I of the repeatability, T of the interval between runs, which is wider by all effects but those that all runs on one
+bench share.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from emb_bench.brake.motion import SENSITIVE, STATES, Floats
+from emb_bench.compiled import compiled
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import Plant
+from emb_bench.estimate.average import average, unaveraged
+from emb_bench.estimate.estimate import OF_THE_BENCH
+from emb_bench.estimate.intervals import unnoticed
+from emb_bench.estimate.prediction import Problem, make_problem
+from emb_bench.estimate.records import Contribution, EstimationProblem, with_systematic
+from emb_bench.estimate.suspects import (
+    OF_THE_SPRING,
+    Simulated,
+    beside_model,
+    effect_of,
+    features,
+    pseudo_inverse,
+    scales,
+    secants,
+    turning,
+)
+from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.from_log import REST_SAMPLES
+from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors, Theta, simulate
+from emb_bench.information.evaluation import Evaluation, Information, Question
+from emb_bench.information.identifiability import Spectrum
+from emb_bench.sim.open_loop import held, march, march_beside
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
+from emb_runtime.errors import UsageError
+
+
+@dataclass(frozen=True, eq=False)
+class Interval:
+    """Standard deviations of the estimates of some unknowns, relative or in their units."""
+
+    names: tuple[str, ...]
+    count: int  # Of the first of them, the parameters that are of interest
+    covariance: Floats  # Of the noise alone, averaged over systematic errors, shape (p, p)
+    budget: tuple[Contribution, ...]  # Root mean square biases by effects that are not estimated
+
+    @cached_property
+    def repeatability(self) -> Floats:
+        """Deviations by the noise alone, inf where nothing is known."""
+        deviations: Floats = np.sqrt(np.diag(self.covariance))
+        return deviations
+
+    @cached_property
+    def between_runs(self) -> Floats:
+        """Deviations of values that are compared, without errors that all runs on one bench share."""
+        return self._with(OF_THE_BENCH)
+
+    @cached_property
+    def total(self) -> Floats:
+        """Deviations with all effects."""
+        return self._with(())
+
+    @property
+    def of_repeatability(self) -> float:
+        """I [nat]; −inf where nothing is known of a parameter."""
+        return -2.0 * float(np.log(self.repeatability[: self.count]).sum())
+
+    @property
+    def of_comparison(self) -> float:
+        """T [nat]; −inf where nothing is known of a parameter."""
+        return -2.0 * float(np.log(self.between_runs[: self.count]).sum())
+
+    def largest(self, i: int, shared: Sequence[str] = OF_THE_BENCH) -> Contribution | None:
+        """The largest entry of the budget of an unknown, without those ``shared``; None without any."""
+        found = [one for one in self.budget if one.bias[i] != 0.0 and one.name not in shared]
+        return max(found, key=lambda one: abs(one.bias[i]), default=None)
+
+    def _with(self, without: Sequence[str]) -> Floats:
+        biases = [one.bias for one in self.budget if one.name not in without]
+        together: Floats = np.hypot(self.repeatability, unnoticed(np.array(biases).reshape(-1, len(self.names))))
+        return together
+
+
+def of_information(e: Information) -> Interval:
+    """The interval that the experiment of an information leads to, at its parameters and with its unknowns.
+
+    Of planned currents each sample counts; of a recorded experiment those that were received.
+
+    Raises:
+        UsageError: the information is of several runs, or the model cannot estimate these unknowns.
+        LogError: the experiment is too short for them.
+    """
+    if e.experiment is None:
+        raise UsageError("each run has an interval of its own: expected the information of one of them")
+    experiment = replace(e.experiment, late=None, places=None)
+    if not isinstance(e, Evaluation):
+        offset, rested = e.plant.instruments.encoder_offset, e.bench.noise.angle / math.sqrt(REST_SAMPLES)
+        experiment = replace(experiment, samples=np.zeros_like(experiment.samples), angle=offset, slack=rested)
+    return of_experiment(e.bench, e.plant, e.theta, experiment, e.question, e.errors)
+
+
+def of_experiment(
+    bench: Bench,
+    plant: Plant,
+    brake: BrakeParameters,
+    experiment: Experiment,
+    question: Question,
+    errors: SystematicErrors = NO_ERRORS,
+) -> Interval:
+    """The interval of an experiment with a brake; its samples say no more than which of them were received."""
+    bench = replace(bench, brake=brake)
+    asked = with_systematic(EstimationProblem(question.params, question.nuisances, question.prior), bench, plant)
+    at = Theta(brake, errors=errors)
+    at = at._replace(start=experiment.x0(at.offset(plant)))
+    shown = simulate(plant, at, experiment, bench.timing.sample_time, (), compiled(march)).samples
+    samples = np.where(experiment.measured[:, None], shown, np.nan)
+    problem = make_problem(bench, plant, [replace(experiment, samples=samples).seen_by(plant)], asked)
+    z, known = problem.nominal(), {name: value for name, value in errors._asdict().items() if value is not None}
+    for i, unknown in enumerate(problem.unknowns):
+        z[i] = known.get(unknown.name, z[i])
+    return of_problem(problem, z)
+
+
+def of_problem(problem: Problem, z: Floats) -> Interval:
+    """The interval of a problem of one record, without noise, that is explained by ``z``."""
+    weights = problem.weights(z)
+    shown = Simulated(problem, z, weights)
+    errors, jacobian = problem.jacobian(z, weights)
+    errors = np.zeros(len(errors))  # of records without noise
+    averaged = average(problem, z, (errors, jacobian))
+    in_full = unaveraged(averaged.step)
+    pseudo = pseudo_inverse(jacobian)
+    basis = np.linalg.qr(jacobian)[0]
+    if any(record.gap_unknowns for record in problem.records):
+        basis = np.concatenate([basis, problem.gap_basis(z, weights)], axis=1)
+    allowed, every = problem.asked.allowed, columns(problem, z, shown)
+    untested = scales(problem, z, jacobian, shown, every, allowed)
+    budget = []
+    for name, column in (every | untested).items():
+        if name in allowed:
+            whole, beside = beside_model(column, basis)
+            information = float(beside @ beside)
+            effect = effect_of(problem, name, allowed[name], pseudo @ whole, information, math.sqrt(information))
+            bias, size = (in_full if name in untested else averaged).bias(effect)
+            budget.append(Contribution(name, tuple(bias.tolist()), size))
+    covariance = Spectrum(jacobian.T @ jacobian + averaged.added()).inverse()
+    wanted = [i for i, unknown in enumerate(problem.unknowns) if unknown.name not in problem.asked.along]
+    own = tuple(replace(one, bias=tuple(one.bias[i] for i in wanted)) for one in budget)
+    names = tuple(problem.unknowns[i].name for i in wanted)
+    return Interval(names, len(problem.asked.params), covariance[np.ix_(wanted, wanted)], own)
+
+
+def columns(problem: Problem, z: Floats, shown: Simulated) -> dict[str, Floats]:
+    """Columns of the effects that the total allows for: samples per unit, in standard deviations."""
+    names = tuple(name for name in problem.asked.allowed if name in ("J", *PARAMETER_NAMES))
+    found = {name: [shown.columns(0, names)[:, k]] for k, name in enumerate(names)}
+    if any(record.gap_unknowns for record in problem.records):
+        found |= secants(problem, z, shown)
+    else:
+        found |= features(problem, z, shown)
+        turned = turning(problem, z, 0, shown.motion(0))
+        rows = np.stack([current / step for current, step in turned.values()], axis=1)
+        moved = beside_currents(problem, z, rows) * shown.weights[0][:, None]
+        found |= {name: [moved[:, j]] for j, name in enumerate(turned)}
+    if problem.bench.brake.k_1 == 0.0:
+        found = {name: parts for name, parts in found.items() if name not in OF_THE_SPRING}
+    return {name: np.concatenate([part.ravel() for part in parts]) for name, parts in found.items()}
+
+
+def beside_currents(problem: Problem, z: Floats, rows: Floats) -> Floats:
+    """Changes of angle [rad] and velocity [rad/s] that are shown, per unit of currents that act besides.
+
+    Shapes (n, m), of the currents [A], to (n, m, 2). The record has no gaps.
+    """
+    at, record = problem.at(z, 0), problem.records[0]
+    x, _, _ = at.begin(record.before, ())
+    late, delay = max(at.errors.delay, 0.0), problem.plant.instruments.measurement_delay
+    acting = held(record.currents + at.errors.current_offset, problem.bench.timing.sample_time, late)
+    states, s = np.empty((record.periods + 1, STATES)), np.zeros((record.periods + 1, rows.shape[1], SENSITIVE))
+    states[0] = x
+    compiled(march_beside)(problem.mechanics(z), at.brake, acting, np.ascontiguousarray(rows), states, s)
+    moved: Floats = np.concatenate([s[:1].repeat(delay, axis=0), s[1:]])[: record.periods, :, :2].copy()
+    moved[:, :, 1] *= 1.0 + at.errors.velocity_gain
+    return moved

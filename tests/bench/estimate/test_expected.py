@@ -1,0 +1,152 @@
+"""Interval that is expected of an experiment, beside estimates from its noisy logs and the estimator's simulation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from emb_bench.api import fisher_information
+from emb_bench.config.bench import Bench
+from emb_bench.estimate.expected import Interval, beside_currents, of_experiment, of_information
+from emb_bench.estimate.prediction import make_problem
+from emb_bench.estimate.records import EstimationProblem, with_systematic
+from emb_bench.estimate.suspects import TORQUES, Simulated, turning
+from emb_bench.experiment.simulate import SystematicErrors
+from emb_bench.information.evaluation import Question, expected
+from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.errors import UsageError
+
+from tests.bench.measurements import Floats, fit, record  # isort: skip
+
+CURRENTS = np.repeat(np.random.default_rng(3).uniform(-2.5, 3.0, 25), 12)
+
+
+def interval(bench: Bench, plant: str = "exact", currents: Floats = CURRENTS) -> Interval:
+    """Of planned currents with the four parameters."""
+    model = bench.plant(plant)
+    return of_information(expected(bench, model, Question(), bench.brake, SystematicErrors(), currents))
+
+
+def without_systematic(bench: Bench, **but: float) -> Bench:
+    """The bench whose instruments are certain, and whose brake has no effect besides."""
+    none = {field.name: 0.0 for field in fields(bench.systematic) if field.name != "k_m"}
+    return replace(bench, systematic=type(bench.systematic)(**none | but))
+
+
+PLANTS = ("exact", "euler", "stribeck", "load", "hysteresis", "cubic", "play", "observer", "offset", "late")
+
+
+@pytest.mark.parametrize("late", [0.0, 0.3])
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_row_beside_the_currents_sums_the_estimator_s_derivatives_to_single_currents(
+    bench: Bench, name: str, late: float
+) -> None:
+    """An estimate has these derivatives for reports that were lost; its effects are differences along such rows."""
+    plant = bench.plant(name)
+    shown = record(bench, plant, CURRENTS, seed=None)
+    problem = make_problem(bench, plant, [shown], with_systematic(EstimationProblem(), bench, plant))
+    z = problem.nominal()
+    for i, unknown in enumerate(problem.unknowns):
+        z[i] = late if unknown.name == "delay" else z[i]
+    model = Simulated(problem, z, [np.ones((len(CURRENTS), 2))])
+    turned = turning(problem, z, 0, model.motion(0))
+    rows = np.stack([current / step for current, step in turned.values()], axis=1)
+    found, wanted = beside_currents(problem, z, rows), np.zeros((len(CURRENTS), rows.shape[1], 2))
+    for odd in range(2):
+        lost = np.arange(len(CURRENTS)) % 2 == odd
+        gaps = replace(problem, records=(replace(shown, assumed=np.where(lost, CURRENTS, np.nan)),))
+        single = gaps.predict(z, 0).sensitivities[:, len(z) :]
+        wanted += np.einsum("kgo,gj->kjo", single, rows[lost])
+    assert {*turned} == {*TORQUES} - ({"play"} if name in ("play", "euler") else set())
+    assert (np.abs(found - wanted).max(axis=0) <= 1e-8 * np.abs(wanted).max(axis=0)).all()
+    if name == "exact":  # and differences, as the estimator takes them
+        mechanics, base = problem.mechanics(z), model.shown(0, problem.mechanics(z))
+        for j, row in enumerate(rows.T):
+            h = 1e-5 / float(np.abs(row).max())
+            secant = (model.shown(0, mechanics, h * row) - base) / h
+            assert np.abs(found[:, j] - secant).max() <= 1e-3 * np.abs(secant).max()
+
+
+@pytest.mark.parametrize("name", ["exact", "stribeck"])
+def test_estimates_of_noisy_logs_state_the_interval_that_was_expected(bench: Bench, name: str) -> None:
+    plant, wanted = bench.plant(name), interval(bench, name)
+    found = []
+    for seed in range(12):
+        asked = with_systematic(EstimationProblem(), bench, plant)
+        estimate = fit(bench, plant, [record(bench, plant, CURRENTS, seed=seed)], asked, starts=1)
+        own = estimate.wanted()
+        found.append([estimate.cramer_rao()[own], estimate.between_runs()[own], estimate.deviations()[own]])
+    ratios = np.median(found, axis=0) / [wanted.repeatability, wanted.between_runs, wanted.total]
+    assert (np.abs(np.log(ratios)) < math.log(1.35)).all(), ratios
+
+
+def test_with_certain_instruments_the_repeatability_is_that_of_ideal_sensors(bench: Bench) -> None:
+    certain = without_systematic(bench)
+    found = interval(certain)
+    bounds = expected(certain, certain.plant("exact"), Question(), certain.brake, SystematicErrors(), CURRENTS)
+    np.testing.assert_allclose(found.repeatability, [bounds[name] for name in PARAMETER_NAMES], rtol=1e-9)
+    np.testing.assert_array_equal(found.total, found.repeatability)
+    assert found.of_repeatability == pytest.approx(-float(np.log(np.diag(bounds.covariance)).sum()))
+    assert found.of_comparison == found.of_repeatability
+    assert found.largest(0) is None
+
+
+def test_an_error_of_the_inertia_is_in_the_total_and_not_between_runs(bench: Bench) -> None:
+    found = interval(without_systematic(bench, inertia=0.01))
+    np.testing.assert_allclose(found.total, np.hypot(found.repeatability, 0.01), rtol=1e-9)
+    np.testing.assert_array_equal(found.between_runs, found.repeatability)
+    assert [one.name for one in found.budget] == ["J"]
+
+
+def test_one_effect_moves_the_parameters_by_regression(bench: Bench) -> None:
+    """A change of k_m over the run that is certain to be there, against the normal equations."""
+    certain = without_systematic(bench, drift=0.01)
+    found = interval(certain)
+    problem = make_problem(
+        certain, certain.plant("exact"), [record(bench, certain.plant("exact"), CURRENTS, seed=None)],
+        with_systematic(EstimationProblem(), certain, certain.plant("exact")),
+    )  # fmt: skip
+    z = problem.nominal()
+    weights = problem.weights(z)
+    jacobian = problem.jacobian(z, weights)[1]
+    ones = Simulated(problem, z, weights)
+    current, step = turning(problem, z, 0, ones.motion(0))["k_m_drift"]
+    column = (beside_currents(problem, z, (current / step)[:, None])[:, 0] * weights[0]).ravel()
+    moved, square, *_ = np.linalg.lstsq(jacobian, column, rcond=None)
+    information, squares, weights_of = float(square[0]), 0.0, 0.5  # half the brakes have none
+    for share in (1e-3, 1e-2, 0.1, 1.0):
+        variance = 1.0 / ((share * 0.01) ** -2 + information)
+        weight = math.exp(0.5 * variance * information) / math.sqrt(1.0 + (share * 0.01) ** 2 * information) / 8.0
+        squares, weights_of = squares + weight * (variance + variance**2 * information), weights_of + weight
+    wanted = np.abs(moved[:4])
+    wanted[0] += 0.5  # it is meant from the begin of a run to its end
+    (own,) = [one for one in found.budget if one.name == "k_m_drift"]
+    np.testing.assert_allclose(np.abs(own.bias), wanted * math.sqrt(squares / weights_of), rtol=1e-9)
+
+
+def test_lost_samples_widen_the_interval(bench: Bench) -> None:
+    plant = bench.plant("exact")
+    whole = record(bench, plant, CURRENTS, seed=None)
+    lost = whole.lose(np.arange(len(CURRENTS)) > 200)
+    wide, narrow = (of_experiment(bench, plant, bench.brake, one, Question()) for one in (lost, whole))
+    assert wide.of_repeatability < narrow.of_repeatability - 0.1
+    assert wide.of_comparison < narrow.of_comparison
+
+
+def test_a_gap_in_the_reports_widens_it(bench: Bench) -> None:
+    plant = bench.plant("exact")
+    whole = record(bench, plant, CURRENTS, seed=None)
+    assumed = np.where(np.isin(np.arange(len(CURRENTS)), [40, 90, 91, 92]), 0.0, np.nan)
+    gap = replace(whole, assumed=assumed)
+    wide, narrow = (of_experiment(bench, plant, bench.brake, one, Question()) for one in (gap, whole))
+    assert wide.of_repeatability < narrow.of_repeatability
+    assert [one.name for one in wide.budget] == [one.name for one in narrow.budget]
+
+
+def test_several_runs_have_no_interval_together(bench: Bench) -> None:
+    one = fisher_information(CURRENTS)
+    with pytest.raises(UsageError, match="each run has an interval of its own"):
+        of_information(one + one)
