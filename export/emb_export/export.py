@@ -1,4 +1,4 @@
-"""``emb-export``: a reference, a sequence of currents, or a training's actor, as one ONNX file under the contract.
+"""``emb-export``: a reference, currents, a training's actor, or a network of others, as one ONNX file with a contract.
 
 What needs torch is imported inside functions, so that ``--help`` is quick and a missing extra is one line.
 """
@@ -27,8 +27,9 @@ tuned references:
 
 example:
   emb-export chirp:f1=20,amplitude=0.5 -o chirp.onnx
+  emb-export mine.onnx -o actor.onnx && emb-run --iface sim --policy actor.onnx
 
-exit codes: 0 done, 2 usage, 5 the exported file does not compute what it was made of,
+exit codes: 0 done, 2 usage, 5 the network is refused, or the exported file does not compute what it was made of,
 130 Ctrl-C: nothing is written
 """
 
@@ -38,22 +39,24 @@ def parser() -> argparse.ArgumentParser:
     p = Parser(
         prog="emb-export",
         description="Write a policy for emb-run as one ONNX file with its contract, and check that the file computes\n"
-        "the same as its source: a reference, a sequence of currents, a design, or the actor of a training.",
+        "the same as its source: a reference, currents, a design, the actor of a training, or a network of your own.",
         epilog=EPILOG.format(sequences=wrapped(list(EXCITATIONS)), references=wrapped(reference_names())),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument(
         "source",
-        metavar="REFERENCE|EXCITATION|DESIGN|DIR",
+        metavar="REFERENCE|EXCITATION|CSV|ONNX|DIR",
         help="a tuned reference, one of those below or the reference.json of emb-train reference; a sequence: "
-        "step:amplitude=1.5, chirp:f1=20, ..., or the .csv file of emb-design; or a directory that emb-train wrote",
+        "step:amplitude=1.5, chirp:f1=20, ..., the .csv file of emb-design, or your own with the columns current, or "
+        "time,current; your network as .onnx: a current [A] of angle, velocity and time, or of these and the running "
+        "estimate; or a directory that emb-train wrote",
     )
     p.add_argument("-o", "--output", type=Path, metavar="FILE", help="the ONNX file (default: DIR/actor.onnx)")
     p.add_argument(
         "--bench",
         type=Path,
         metavar="FILE",
-        help="bench of a reference or a sequence (default: the shipped drum brake); a training has its own",
+        help="bench that it is for (default: the shipped drum brake); a training has its own",
     )
     return p
 
@@ -84,17 +87,21 @@ def _export(arguments: argparse.Namespace) -> str:
         data, what = network_file(source)
     else:
         with needs("an export", "bench"):
+            from emb_bench.export.own_policy import onnx_policy
             from emb_bench.export.policy_file import sequence_file
-            from emb_export.file import read_sequence, reference_file
+            from emb_bench.export.sequence import read_sequence
+            from emb_export.file import reference_file
 
         bench = load_bench(arguments.bench)
         make_law(bench)  # where no shield can be made, emb-run would refuse the bench
         if source.suffix == ".json" or arguments.source in reference_names():
             data, what = reference_file(arguments.source, bench), "the reference"
-        elif (name := arguments.source.partition(":")[0]) not in EXCITATIONS and source.suffix != ".csv":
+        elif source.suffix.lower() == ".onnx":
+            data, what = onnx_policy(source, bench)
+        elif (name := arguments.source.partition(":")[0]) not in EXCITATIONS and source.suffix.lower() != ".csv":
             hint = near(name, (*EXCITATIONS, *reference_names())) or near_file(source)
             named = "a reference or a sequence (emb-export --help lists them)"
-            raise UsageError(f"{source}: expected {named}, a .csv of emb-design or a .json of emb-train{hint}")
+            raise UsageError(f"{source}: expected {named}, a .csv, an .onnx or a .json of emb-train{hint}")
         else:
             currents, what = read_sequence(arguments.source, bench)
             data = sequence_file(currents, what, bench)

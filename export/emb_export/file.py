@@ -1,4 +1,4 @@
-"""Policy files of references, and the sequences of currents that become one."""
+"""Policy files of references."""
 
 from __future__ import annotations
 
@@ -9,11 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emb_bench.config.bench import Bench
-from emb_bench.excitation import parse_excitation
 from emb_bench.export.policy_file import model_of, policy_file
-from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES, Ranges
-from emb_runtime.errors import UsageError
 from emb_runtime.policy.contract import MIN_VECTORS
 from emb_train.reference import FEATURES, box_of, features, set_reference, stored
 from emb_train.trial import Task
@@ -72,19 +69,3 @@ def reference_file(source: str, bench: Bench) -> bytes:
     model = model_of(REFERENCE % (FEATURES, len(table)), constants)
     fields = {"kind": "reference", "inputs": PARAMETER_NAMES, "ranges": bounds(ranges), "gain": kept.gain}
     return policy_file(model, bench, seen * nominal, wanted, provenance, **fields)
-
-
-def read_sequence(text: str, bench: Bench) -> tuple[Floats, str]:
-    """The currents [A], shape [horizon], of an excitation or of a ``.csv`` file of ``emb-design``; and their name.
-
-    Raises:
-        UsageError: there is no such excitation or file, it is for another bench, or it is a feedback law.
-    """
-    if Path(text).suffix == ".csv":
-        from emb_bench.design.report import read_design  # scipy takes its time
-
-        return read_design(Path(text), bench)
-    excited = parse_excitation(text, bench)
-    if excited.currents is None:
-        raise UsageError(f"{excited.name} is a feedback law: expected an excitation that is a sequence of currents")
-    return excited.currents, excited.text

@@ -20,11 +20,12 @@ import torch
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.excitation import excitation
+from emb_bench.export.own_policy import observations
 from emb_bench.export.policy_file import sequence_file
 from emb_export import emb_export
 from emb_export.export import main
 from emb_export.file import reference_file
-from emb_export.network import network_file, observations
+from emb_export.network import network_file
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.estimator.estimator import Estimator

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
@@ -115,4 +116,10 @@ def sequence_file(currents: Floats, what: str, bench: Bench) -> bytes:
     model = model_of(SEQUENCE, constants)
     seen = np.zeros((len(currents), len(SAMPLE)))
     seen[:, 2] = t_s * np.arange(len(currents))
-    return policy_file(model, bench, seen, currents[:, None], {"sequence": what}, kind="current", inputs=SAMPLE)
+    provenance = {"sequence": printable(what)}
+    return policy_file(model, bench, seen, currents[:, None], provenance, kind="current", inputs=SAMPLE)
+
+
+def printable(text: str) -> str:
+    """A text of others as a contract takes it."""
+    return re.sub(r"[^ -~]", "?", text)[:200]

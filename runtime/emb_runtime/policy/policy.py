@@ -140,6 +140,7 @@ def _contract_text(graph: Graph) -> str:
     texts = [value for key, value in graph.texts if key == CONTRACT_KEY]
     if len(texts) != 1:
         raise PolicyRefusedError(
-            f"expected one '{CONTRACT_KEY}' in the ONNX metadata, got {len(texts)}: not exported by emb-export"
+            f"expected one '{CONTRACT_KEY}' in the ONNX metadata, got {len(texts)}: export it first, "
+            "by emb-export FILE --output policy.onnx"
         )
     return texts[0]
