@@ -296,6 +296,7 @@ def ppo(arguments: argparse.Namespace) -> int:
     """
     import msgspec
 
+    from emb_train.closed_loop import EVERYTHING
     from emb_train.ppo import Metrics
     from emb_train.training import ACTOR, begin_training, load_preset, run_training
 
@@ -304,6 +305,11 @@ def ppo(arguments: argparse.Namespace) -> int:
     training = load_preset(arguments.preset, **{k: v for k, v in changes.items() if v is not None})
     conditions = msgspec.structs.replace(training.conditions, command_delay=tuple(arguments.command_delay))
     training = msgspec.structs.replace(training, conditions=conditions)
+    if conditions.observes == EVERYTHING:
+        raise UsageError(
+            f"{training.preset}: its actor observes the parameters and the information, which no bench measures: it "
+            "could be neither exported nor evaluated; python -m studies.thesis fig-5.2 fig-5.4 trains it and shows it"
+        )
     begin_training(folder, training, bench)
     with progress(training.preset, training.ppo.iterations) as advance:
 
@@ -315,10 +321,8 @@ def ppo(arguments: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             kept = f"the best actor so far is in {folder}" if (folder / ACTOR).exists() else "nothing was trained"
             raise KeyboardInterrupt(f"emb-train: interrupted; {kept}") from None
-    if not conditions.shielded:
-        show(f"{folder}: trained without a shield, which no bench runs; the study of the thesis shows what it does")
-        return EXIT_DONE
-    show(f"{folder}: export it with emb-export {folder}; emb-train evaluate {folder} compares it")
+    alone = "" if conditions.shielded else "; trained without a shield, which changes its currents on a bench"
+    show(f"{folder}: export it with emb-export {folder}; emb-train evaluate {folder} compares it{alone}")
     return EXIT_DONE
 
 
