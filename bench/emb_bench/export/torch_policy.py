@@ -135,6 +135,10 @@ def _deployed(model: Any, bench: Bench) -> tuple[nn.Module, tuple[int, ...]]:
     bounded = getattr(acts, "shape", None) == (1,) and hasattr(acts, "low") and (acts.low, acts.high) == (-1.0, 1.0)
     if not bounded or seen not in [(width,) for width in WIDTHS]:
         raise UsageError(f"{SPACE}; got {printable(str(model.observation_space))}, {printable(str(acts))}")
+    if model.get_env() is None:
+        raise UsageError(
+            "expected the model with its environment, which may scale observations: PPO.load(FILE, env=env)"
+        )
     kept = io.BytesIO()  # as its library copies a policy: copy.deepcopy cannot
     model.policy.save(kept)
     kept.seek(0)

@@ -12,6 +12,9 @@ import onnx
 import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from emb_bench import api
 from emb_bench.config.bench import load_bench
@@ -20,6 +23,7 @@ from emb_runtime.cli.main import main as run_main
 from emb_runtime.errors import EmbError, PolicyRefusedError, UsageError
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.policy.policy import load_policy
+from emb_train.env import EmbExcitationEnv
 
 BENCH = load_bench()
 FLOAT, DOUBLE, HALF, INT64 = TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16, TensorProto.INT64
@@ -237,6 +241,41 @@ def test_what_is_no_policy_is_refused(policy: Any, words: str, tmp_path: Path) -
         api.export_policy(policy, tmp_path / "x.onnx")
     assert words in str(refusal.value)
     assert not list(tmp_path.iterdir())
+
+
+# Stable-Baselines3 ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def normalised() -> tuple[PPO, VecNormalize]:
+    """A model that was trained for a moment, and the environment that scales its observations."""
+    env = VecNormalize(make_vec_env(EmbExcitationEnv, n_envs=2))
+    return PPO("MlpPolicy", env, n_steps=64, batch_size=64, seed=0).learn(128), env
+
+
+def test_a_model_requests_what_it_predicts_for_the_scaled_observation(
+    normalised: tuple[PPO, VecNormalize], tmp_path: Path
+) -> None:
+    model, env = normalised
+    policy = exported(model, tmp_path)
+    for angle, velocity, step in ((0.0, 0.0, 0), (3.0, -40.0, 17), (60.0, 300.0, 200), (95.0, -480.0, 499)):
+        seen = env.normalize_obs(np.array([[angle, velocity, step]], np.float32))
+        action, _ = model.predict(seen, deterministic=True)
+        wanted = 6.0 * np.clip(action, -1.0, 1.0).item()
+        assert current(policy, angle, velocity, step) == pytest.approx(wanted, abs=1e-4)
+    assert policy.contract.provenance["module"] == "PPO"
+
+
+def test_a_model_without_its_environment_or_with_other_spaces_is_refused(
+    normalised: tuple[PPO, VecNormalize], tmp_path: Path
+) -> None:
+    model, _ = normalised
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(UsageError, match="with its environment"):
+        api.export_policy(PPO.load(tmp_path / "model.zip"), tmp_path / "x.onnx")
+    for name in ("Pendulum-v1", "CartPole-v1"):
+        with pytest.raises(UsageError, match="expected the spaces of EmbExcitation-v0"):
+            api.export_policy(PPO("MlpPolicy", name), tmp_path / "x.onnx")
 
 
 # Tables ---------------------------------------------------------------------------------------------------------------
