@@ -110,8 +110,7 @@ class Reception:
         self._period_ns = bench.timing.sample_time_ns
         top_acceleration = _top_acceleration(bench)
         self._half_top_acceleration = 0.5 * top_acceleration
-        if (bandwidth := bench.sensors.bandwidth) is not None:  # whose lag L13 of docs/explanation/shield.md bounds
-            self._velocity_noise += 2.25 / min(bandwidth, 3.0 / bench.timing.sample_time) * top_acceleration
+        self._velocity_noise += bench.sensors.longest_lag(bench.timing.sample_time) * top_acceleration
         self._angle, self._velocity, self._status = (
             MessageState(m.name, m.identifier, fresh_ns(m), CounterCheck(bench.watch.rejected))
             for m in (layout.angle, layout.velocity, layout.status)

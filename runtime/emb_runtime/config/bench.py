@@ -36,6 +36,9 @@ FAR = 1e9  # of a machine that is never driven, in SI units
 SHORTEST_SAMPLE = 1e-4  # s
 PER_LAG = 0.9
 """Bandwidth of the second order that covers an observer, times the lag of that observer: L13 of the shield."""
+LONGEST_PER_BANDWIDTH = 2.25  # Longest lag of an observer, and twice what its response overshoots, times its bandwidth
+FASTEST_OBSERVER = 3.0
+"""Bandwidth times sample time beyond which a sampled observer lags no less: it begins with two angles."""
 
 # Ceilings of what is armed on a bus with a brake; up to those above, a file can be read and a bus without one driven.
 LONGEST_MISSED = 20  # periods
@@ -114,6 +117,12 @@ class Sensors:
     def bandwidth(self) -> float | None:
         """Least bandwidth of an observer of second order that covers the declared one [rad/s]; None of a sensor."""
         return self.observer_bandwidth if self.velocity_lag is None else PER_LAG / self.velocity_lag
+
+    def longest_lag(self, sample_time: float) -> float:
+        """Change of the velocity that is not shown yet, at most, over the acceleration that it is due to [s]."""
+        if self.bandwidth is None:
+            return 0.0
+        return LONGEST_PER_BANDWIDTH / min(self.bandwidth, FASTEST_OBSERVER / sample_time)
 
     def __str__(self) -> str:
         if self.velocity_lag is not None:

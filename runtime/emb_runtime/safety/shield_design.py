@@ -12,7 +12,7 @@ import math
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from emb_runtime.config.bench import OLDEST_FRAME, PER_LAG, Bench
+from emb_runtime.config.bench import FASTEST_OBSERVER, OLDEST_FRAME, PER_LAG, Bench
 from emb_runtime.errors import BenchFileError
 
 VELOCITY_PAD: Final = 0.3
@@ -40,7 +40,6 @@ CREEPS: Final = 3.0  # Coasting: speed allowed at the largest angle, as a multip
 LONGEST_LAG: Final = 2.0  # Samples. With a slower current loop the limits would hold, but the landing would not.
 OVERSHOOT: Final = 0.125  # Observer: what its response exceeds that of a critically damped one by, over its bandwidth
 SHARPEST: Final = 1.5  # Bandwidth times sample time beyond which the overshoot of a sampled observer falls no further
-FASTEST_OBSERVER: Final = 3.0  # The same beyond which a sampled observer lags no less: it begins with two angles
 SLOWEST_OBSERVER: Final = 0.75  # The same below which the way home was not searched
 LATEST_OBSERVED: Final = 1  # Frame age; with older frames and an observer the limits would hold, but not the landing.
 COMMITTED: Final = 16  # Samples before the reserve in which the policy does not get control back
@@ -362,7 +361,7 @@ def _uncovered(law: ShieldLaw) -> str:
             return (
                 f"an observer's velocity is covered with frames of age {LATEST_OBSERVED} at most, and neither with a "
                 "lag of the current nor with the coasting envelope; change shield.frame_age, shield.current_lag or "
-                "shield.envelope"
+                "shield.envelope, or delete [sensors] where a sensor measures the velocity"
             )
         if law.observer < SLOWEST_OBSERVER:
             least, got = SLOWEST_OBSERVER / ts, law.observer / ts
