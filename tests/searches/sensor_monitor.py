@@ -26,7 +26,7 @@ from emb_bench.config.plants import Instruments, Mechanics
 from emb_bench.sim.instruments import MEMORY as INSTRUMENTS_MEMORY
 from emb_bench.sim.instruments import command, settle
 from emb_bench.sim.simulated_brake import pass_period, sent_current
-from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.bench import BrakeParameters, Sensors
 from emb_runtime.safety.sensor_monitor import (
     DOWN_FROM,
     HONEST,
@@ -41,6 +41,7 @@ from emb_runtime.safety.sensor_monitor import (
     begin,
     coasting_time,
     judge,
+    lag_angle,
     largest_current,
     unseen_speed,
 )
@@ -206,8 +207,8 @@ def fly(
             verdict = judge(law, limits, memory, periods * ts, told[0], told[1], obeyed and periods == 1, sent, felt)
             periods = 0
             travel = max(
-                memory[TRAVEL_UP] - limits.lag * abs(memory[VELOCITY] - memory[UP_FROM]),
-                memory[TRAVEL_DOWN] - limits.lag * abs(memory[VELOCITY] - memory[DOWN_FROM]),
+                memory[TRAVEL_UP] - lag_angle(limits, memory[VELOCITY] - memory[UP_FROM]),
+                memory[TRAVEL_DOWN] - lag_angle(limits, memory[DOWN_FROM] - memory[VELOCITY]),
             )
             row[TRAVEL] = max(row[TRAVEL], travel / limits.travel)
             row[MOTION] = max(row[MOTION], max(memory[MOTION_UP], memory[MOTION_DOWN]) / limits.motion)
@@ -318,8 +319,10 @@ WEIGHT = {"euler": 4, "exact": 2}  # Shares of the experiments; one for the othe
 
 
 def covered(bench: Bench, plant: str) -> Bench:
-    """The bench with a shield that covers a plant."""
-    return replace(bench, shield=bench.shield._replace(**COVERED[plant]))
+    """The bench with a shield that covers a plant; a lag, or frames two samples late, leave no observer."""
+    declared = COVERED[plant]
+    sensors = Sensors() if {"current_lag", "frame_age"} & declared.keys() else bench.sensors
+    return replace(bench, shield=bench.shield._replace(**declared), sensors=sensors)
 
 
 def tail(values: Floats, rate: float = 1e-6) -> float:

@@ -233,9 +233,14 @@ def _sum_travel(
         down, memory[DOWN_FROM] = 0.0, velocity
     memory[TRAVEL_UP], memory[TRAVEL_DOWN] = up, down
     return bool(
-        up > limits.travel + limits.lag * abs(velocity - memory[UP_FROM])
-        or down > limits.travel + limits.lag * abs(velocity - memory[DOWN_FROM])
+        up > limits.travel + lag_angle(limits, velocity - memory[UP_FROM])
+        or down > limits.travel + lag_angle(limits, memory[DOWN_FROM] - velocity)
     )
+
+
+def lag_angle(limits: SensorThresholds, gained: float) -> float:
+    """Angle beyond the integral of a velocity that has gained so much, by its lag; by its lead if it has lost [rad]."""
+    return max(limits.lag * gained, -limits.lead * gained)
 
 
 def _gain(law: ShieldLaw, slowest: float, drive: float) -> float:

@@ -27,7 +27,8 @@ class SensorThresholds(NamedTuple):
 
     travel: float  # Angle travelled beyond the integral of the velocity [rad]
     offset: float  # Difference between the rate of the angle and the velocity that does not count [rad/s]
-    lag: float  # Time by which the velocity may lag the angle, or lead it [s]
+    lag: float  # Time by which the velocity may lag the angle [s]
+    lead: float  # Time by which it may lead the angle [s]
     motion: float  # Change of the velocity beyond that of any brake of the set [rad/s]
     current_error: float  # By which a reported current may differ from the command [A]
     first_current: float  # Largest current until the motion has confirmed the polarity [A]
@@ -46,6 +47,7 @@ def sensor_thresholds(bench: Bench, law: ShieldLaw) -> SensorThresholds:
         travel=2.0 * law.angle_noise + noise,
         offset=offset,
         lag=max(LAG, 2.0 / law.observer) * ts if law.observer > 0.0 else LAG * ts,
+        lead=LAG * ts,
         motion=2.0 * law.velocity_noise + mistaken,
         current_error=bench.guard.current_error,
         first_current=min(FIRST_MOVE * law.friction_high / law.motor_low, law.current),

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import pytest
 
-from emb_runtime.config.bench import OLDEST_FRAME, load_bench
+from emb_runtime.config.bench import OLDEST_FRAME
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.sensor_monitor import (
     ANGLE,
@@ -49,8 +49,9 @@ from emb_runtime.safety.sensor_monitor import (
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, make_law
 from emb_runtime.safety.state_machine import Fault, StopError
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 SHIPPED = make_law(BENCH)
 SUMS = (
     TRAVEL_UP, TRAVEL_DOWN, MOTION_UP, MOTION_DOWN, OPPOSED_UP, OPPOSED_DOWN, OPPOSED_TRAVEL, INTEGRAL, CONFIRMED,
@@ -108,7 +109,8 @@ class Reference:
             self.travel[way] = max(self.travel[way] + sign * (moved - integral) - slack, 0.0)
             if self.travel[way] == 0.0:
                 self.travel_from[way] = s.velocity
-            contradicts |= self.travel[way] > limits.travel + limits.lag * abs(s.velocity - self.travel_from[way])
+            gained = sign * (s.velocity - self.travel_from[way])
+            contradicts |= self.travel[way] > limits.travel + (limits.lag if gained > 0 else limits.lead) * abs(gained)
 
         aside = law.angle_noise + missing * law.reach
         beyond = law.velocity_noise + missing * law.change
@@ -245,6 +247,7 @@ def drawn_limits(rng: Random) -> SensorThresholds:
         travel=rng.uniform(0.02, 0.3),
         offset=rng.uniform(0.2, 2.0),
         lag=rng.uniform(2e-4, 2e-3),
+        lead=rng.uniform(2e-4, 2e-3),
         motion=rng.uniform(2.0, 20.0),
         current_error=rng.uniform(0.1, 1.0),
         first_current=rng.uniform(1.0, 3.0),
@@ -313,7 +316,9 @@ def memory_after(law: ShieldLaw, samples: Iterable[Sample], limits: SensorThresh
     return memory, last
 
 
-SILENT = SensorThresholds(travel=NEVER, offset=0.5, lag=0.0, motion=NEVER, current_error=0.5, first_current=2.0)
+SILENT = SensorThresholds(
+    travel=NEVER, offset=0.5, lag=0.0, lead=0.0, motion=NEVER, current_error=0.5, first_current=2.0
+)
 
 
 def found(fits: Callable[[list[float]], bool], confirmed: float = 0.0) -> tuple[ShieldLaw, Memory, list[float]]:
@@ -400,7 +405,7 @@ def test_the_opposite_sign_of_the_angle_fits_if_the_velocity_says_half_the_thres
 def test_a_travel_of_exactly_zero_begins_anew() -> None:
     ts = 2.0**-10
     law = SHIPPED._replace(sample_time=ts)
-    limits = SILENT._replace(offset=0.0, lag=0.5)
+    limits = SILENT._replace(offset=0.0, lag=0.5, lead=0.5)
     for sign in (-1.0, 1.0):
         memory = [0.0] * MEMORY
         begin(memory, 0.0, 0.0)
@@ -456,11 +461,13 @@ def test_the_thresholds_are_those_of_the_page() -> None:
         law = drawn_law(rng)._replace(observer=0.0)
         t = law.sample_time
         for observer, samples in ((0.5, 4.0), (2.0, 1.0), (3.0, 0.75)):
-            assert sensor_thresholds(bench, law._replace(observer=observer)).lag == pytest.approx(samples * t)
+            observed = sensor_thresholds(bench, law._replace(observer=observer))
+            assert observed.lag == pytest.approx(samples * t)
+            assert observed.lead == pytest.approx(0.75 * t)
         found = sensor_thresholds(bench, law)
         assert found.offset == pytest.approx(sigma / 2)
         assert found.travel == pytest.approx(2 * law.angle_noise + 4 * t * sigma * math.log(2 * horizon / 1e-9))
-        assert found.lag == pytest.approx(0.75 * t)
+        assert found.lag == found.lead == pytest.approx(0.75 * t)
         assert found.motion == pytest.approx(2 * law.velocity_noise + t * (law.friction_low + law.friction_high))
         assert found.current_error == tolerated
         gentle = 1.5 * law.friction_high / law.motor_low
