@@ -91,7 +91,8 @@ def sheet_text(plant: str, generator: np.random.Generator, polled: bool = False)
     """The data sheet's bench file, with the plant ``drawn`` that stands on the bench."""
     brake = load_bench().brake
     rows = [f"{n} = [{getattr(brake, n) / FACTOR!r}, {getattr(brake, n) * FACTOR!r}]" for n in PARAMETER_NAMES]
-    text = shipped_bench_text().replace("[limits] ", "\n".join(["[ranges.sheet]", *rows, "", "[limits] "]), 1)
+    text = re.sub(r"(?ms)^\[sensors\].*?(?=^\[)", "", shipped_bench_text())  # the sheet does not say it
+    text = text.replace("[limits] ", "\n".join(["[ranges.sheet]", *rows, "", "[limits] "]), 1)
     text = text.replace('ranges        = "envelope"', 'ranges = "sheet"', 1)
     drawn = "[plants.drawn]\n"
     if plant == "observer":

@@ -63,6 +63,7 @@ def contract_for(bench: Bench, current: float, **changes: Any) -> Contract:
         "horizon": bench.timing.horizon,
         "vectors": tuple(Vector((float(n), -3.0 * n, n * t_s), (answer,)) for n in range(MIN_VECTORS)),
         "ranges": {name: (getattr(box.low, name), getattr(box.high, name)) for name in PARAMETER_NAMES},
+        "velocity": bench.sensors.velocity,
     }
     return Contract(**(fields | changes))
 

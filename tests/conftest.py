@@ -162,6 +162,7 @@ def make_loop(
 class SimRun:
     """A run on the simulated bus, and all that can be looked at afterwards."""
 
+    bench: Bench
     outcome: Outcome
     journal: Journal
     transport: SimTransport
@@ -174,6 +175,10 @@ Simulate = Callable[..., SimRun]
 
 @pytest.fixture(scope="session")
 def simulate(bench: Bench) -> Simulate:
+    return simulating(bench)
+
+
+def simulating(bench: Bench) -> Simulate:
     """Runs the loop on ``--iface sim``; ``on_receive`` may change, drop or add what the loop receives.
 
     ``angle``: where a hand has turned the brake before [rad].
@@ -214,6 +219,6 @@ def simulate(bench: Bench) -> Simulate:
             "push": journal.push,
         } | replaced
         loop = make_loop(on_bench, actor or FunctionActor(law), steps or on_bench.timing.horizon, **driven)
-        return SimRun(loop.run(), journal, transport, loop.core.guard, sent)
+        return SimRun(on_bench, loop.run(), journal, transport, loop.core.guard, sent)
 
     return run

@@ -6,9 +6,11 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from emb_bench.config.bench import Bench, load_bench
+from emb_runtime.config.bench import Sensors
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError, needs
 from emb_runtime.system.terminal import complain, mention, show
 from studies.thesis.determinant_facts import protected_facts, unprotected_facts
@@ -85,7 +87,8 @@ def _run(args: argparse.Namespace) -> str:
     if min(args.seeds, 1 if args.steps is None else args.steps) < 1 or args.seed < 0:
         raise UsageError("expected --seeds and --steps of at least 1, and a --seed of at least 0")
     bench = load_bench()
-    facts = [Fact(name, *statement) for name in names if name in ANALYSIS for statement in ANALYSIS[name](bench)]
+    measured = replace(bench, sensors=Sensors())  # with white noise, R = diag(1e-6, 1)
+    facts = [Fact(name, *statement) for name in names if name in ANALYSIS for statement in ANALYSIS[name](measured)]
     if trained := [name for name in names if name in TRAININGS]:
         from studies.thesis.agents import agent_facts
         from studies.thesis.trainings import Trainings

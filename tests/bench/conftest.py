@@ -11,9 +11,11 @@ from typing import Any
 import pytest
 
 from emb_bench.cli.replay import main
+from emb_bench.config.bench import Bench
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
-from tests.conftest import Simulate  # isort: skip
+from tests.benches import SENSOR_BENCH  # isort: skip
+from tests.conftest import Simulate, simulating  # isort: skip
 
 Log = Callable[..., Path]
 
@@ -52,6 +54,17 @@ class Replay:
         self.capsys.readouterr()  # what fixtures printed
         assert main([*self.first, *map(str, arguments)]) == code
         return self.capsys.readouterr()
+
+
+@pytest.fixture(scope="session")
+def bench() -> Bench:
+    """One whose velocity is measured: with an observer, a record has its angles alone."""
+    return SENSOR_BENCH
+
+
+@pytest.fixture(scope="session")
+def simulate(bench: Bench) -> Simulate:
+    return simulating(bench)
 
 
 @pytest.fixture

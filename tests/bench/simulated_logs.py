@@ -9,7 +9,6 @@ from typing import Any
 
 from emb_runtime.can.messages import load_layout
 from emb_runtime.cli.summary import trailer
-from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.log.ring_buffer import (
     Attachment,
@@ -49,7 +48,7 @@ def write_log(
             "emb.run": {"steps": str(steps), "iface": "sim", "purpose": "experiment", "limit": "6.0"},
             "emb.truth": {name: str(value) for name, value in run.transport.truth.items()},
         },
-        attachments=[Attachment("bench.toml", "application/toml", shipped_bench_text().encode())],
+        attachments=[Attachment("bench.toml", "application/toml", run.bench.text.encode())],
     )
     header = replace(header, **changes)
     with path.open("wb") as file:

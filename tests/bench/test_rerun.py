@@ -16,7 +16,7 @@ from emb_bench.logs.log import read_log
 from emb_bench.rerun import Rerun, carried_policy, rerun
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.cli.main import main as emb_run
-from emb_runtime.config.bench import Bench, load_bench, parse_bench
+from emb_runtime.config.bench import Bench, parse_bench
 from emb_runtime.log.ring_buffer import EventRecord, FrameRecord, Record
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import CycleRecord, Reason, RunState
@@ -25,6 +25,7 @@ from tests.actors import constant_actor
 from tests.bench.conftest import Replay
 from tests.bench.hostile import Driven, HostileBus, Thoughtful, drive, write_trace
 from tests.bench.simulated_logs import square
+from tests.benches import SENSOR_BENCH
 from tests.runtime.control.test_faults import INJECTIONS
 
 from tests.conftest import Journal, SimRun, Simulate  # isort: skip
@@ -119,7 +120,7 @@ MISBEHAVIOUR: dict[str, dict[str, Any]] = {
 @cache
 def hostile_runs(name: str) -> tuple[Driven, ...]:
     """A few runs with one misbehaviour."""
-    buses = (HostileBus(load_bench(), load_layout(), random.Random(n), **MISBEHAVIOUR[name]) for n in range(5))
+    buses = (HostileBus(SENSOR_BENCH, load_layout(), random.Random(n), **MISBEHAVIOUR[name]) for n in range(5))
     return tuple(drive(bus, square, 150) for bus in buses)
 
 

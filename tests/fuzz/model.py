@@ -108,9 +108,12 @@ class ReceptionModel:
             + worst.high.T_c
             + worst.high.f_v * bench.limits.velocity
         )
+        acceleration = force / worst.low.J
+        observer = bench.sensors.bandwidth
+        late = acceleration * 2.25 / min(observer, 3000.0) if observer else 0.0  # one sampled each 1 ms, by L13
         noise = bench.shield.noise_sigmas * (1.5 * bench.noise.angle + elapsed * bench.noise.velocity)
         mean = (last.velocity + sample.velocity) / 2
-        return abs(sample.angle - last.angle - mean * elapsed) <= noise + force / worst.low.J * elapsed**2 / 2
+        return abs(sample.angle - last.angle - mean * elapsed) <= noise + elapsed * late + acceleration * elapsed**2 / 2
 
     def _bad(self, which: int) -> None:
         self.rejected += 1

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from emb_bench.config.bench import load_bench
 from emb_runtime.safety.response import CONTRADICTED
+from tests.benches import SENSOR_BENCH
 from tests.searches.response import DISHONEST, MUST, VERDICT, beyond, honest, undeclared
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 
 
 @pytest.mark.parametrize("name", MUST)

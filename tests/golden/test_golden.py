@@ -57,7 +57,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path
         """An hour after the one before."""
         write_log(folder / f"{name}.mcap", run, begun_ns=WALL + HOUR * len(list(folder.glob("*.mcap"))))
 
-    write("good", simulate(square, options="plant=exact,f_v=3e-5,seed=5"))
+    write("good", simulate(square, options="plant=exact,f_v=3e-5,seed=11"))
     write("again", simulate(square, options="plant=exact,f_v=3e-5,seed=6"))
     write("third", simulate(square, options="plant=exact,f_v=3e-5,seed=7"))
     write("worn", simulate(square, options="plant=exact,f_v=3.3e-5,seed=8"))

@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 from emb_bench.brake.euler import step as euler_step
 from emb_bench.brake.motion import SENSITIVE, STATES, advance
 from emb_bench.compiled import compiled
-from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters, Ranges, Sensors
 from emb_runtime.safety.shield import NO_PAST, PAST, shield
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
+from tests.benches import SENSOR_BENCH
 
 Floats = NDArray[np.float64]
 Codes = NDArray[np.int64]
@@ -77,8 +78,8 @@ PLANTS: dict[str, dict[str, Any]] = {
 
 
 def bench_with(**declared: Any) -> Bench:
-    """The shipped bench with other settings of its shield, and with an ``observer`` of that bandwidth [rad/s]."""
-    bench = load_bench()
+    """The shipped bench with other settings of its shield, and a sensor or an ``observer`` of a bandwidth [rad/s]."""
+    bench = SENSOR_BENCH
     if bandwidth := declared.pop("observer", None):
         bench = replace(bench, sensors=Sensors("observer", bandwidth))
     return replace(bench, shield=bench.shield._replace(**declared))

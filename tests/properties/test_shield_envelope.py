@@ -16,11 +16,12 @@ from hypothesis import strategies as st
 
 from emb_bench.brake.euler import step as euler_step
 from emb_bench.compiled import compiled
-from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.bench import Bench
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Limits, Noise, Ranges
 from emb_runtime.errors import BenchFileError
 from emb_runtime.safety.shield import shield, successor, window
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
+from tests.benches import SENSOR_BENCH
 from tests.properties.shield_climb import climb
 from tests.properties.shield_search import (
     COASTING,
@@ -44,7 +45,7 @@ from tests.properties.shield_search import (
     search,
 )
 
-SHIPPED = load_bench()
+SHIPPED = SENSOR_BENCH
 
 
 def assert_held_and_home(found: Found, home: bool = True) -> None:

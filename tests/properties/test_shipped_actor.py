@@ -98,7 +98,7 @@ def test_it_runs_with_the_bench_file_that_a_commissioning_writes(tmp_path: Path)
     push = Played(np.full(bench.timing.horizon, bench.limits.current))
     for quick in (False, True):
         policy = load_policy(shipped_actor_path(quick), bench)
-        assert policy.warnings == []
+        assert policy.warnings == ["velocity by sensor, made for one by observer"]
         both = [
             play(bench, ranges, PARAMETER_NAMES, e, fresh_draws(ranges, 5, 4), conditions=PHYSICAL)
             for e in (PolicyFile(policy, bench), push)

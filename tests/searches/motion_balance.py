@@ -26,7 +26,7 @@ from scipy import stats
 
 from emb_bench.brake.motion import SENSITIVE, STATES
 from emb_bench.compiled import compiled
-from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Instruments, Mechanics
 from emb_bench.sim.instruments import MEMORY as INSTRUMENTS_MEMORY
 from emb_bench.sim.instruments import command, settle
@@ -57,6 +57,7 @@ from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresh
 from emb_runtime.safety.shield import NO_PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from emb_train.reference import Box, box_of, stored, wanted_current
+from tests.benches import SENSOR_BENCH
 from tests.searches.sensor_monitor import COMMAND_LOST, COVERED, SAMPLE_LOST, Script, covered, draw, tail
 
 Floats = NDArray[np.float64]
@@ -273,7 +274,7 @@ def main() -> int:
     p.add_argument("--experiments", type=int, default=300_000, help="over all plants (default: %(default)s)")
     p.add_argument("--seed", type=int, default=1, help="0 is the one that the thresholds were chosen with")
     arguments = p.parse_args()
-    bench, rng = load_bench(), np.random.default_rng(arguments.seed)
+    bench, rng = SENSOR_BENCH, np.random.default_rng(arguments.seed)
     each, totals = (
         max(arguments.experiments // len(names := (*PLANTS, *DECLARED)), 1),
         dict.fromkeys(("unexplained", "too fast", "not home", "not at rest", "in motion", "model does not fit"), 0),

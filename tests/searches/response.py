@@ -5,10 +5,11 @@
 First, responses that the bench file does not declare: observers, lags of the current, late frames and combinations. For
 each, brakes of the shield's set (half of them its corners) under the shipped actor and under the other policies of
 tests/searches/sensor_monitor.py, half of the experiments with lost samples and commands: how many pass a limit, how
-many the proof or the sensor monitor ends, how many are proven. Then honest experiments with every plant of the bench
-and what it must declare: how many the proof ends; when it has proven the response; in how many periods its slower law
-changes a command. Last, whole runs of ``emb-run`` with drawn brakes and the shipped actor: how many end naming the
-right key with a value that covers what is there.
+many the proof or the sensor monitor ends, how many are proven. The same for declared observers, of the bandwidth that
+is declared and of twice that. Then honest experiments with every plant of the bench and what it must declare, half on a
+bench with a sensor and half with the shipped observer, where the plant permits one: how many the proof ends; when it
+has proven the response; in how many periods its slower law changes a command. Last, whole runs of ``emb-run`` with
+drawn brakes and the shipped actor: how many end naming the right key with a value that covers what is there.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import itertools
 import json
 import math
 import re
@@ -58,6 +60,7 @@ from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresh
 from emb_runtime.safety.shield import NO_PAST, Past, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from emb_train.reference import Box, box_of, stored, wanted_current
+from tests.benches import SENSOR_BENCH
 from tests.searches.sensor_monitor import COMMAND_LOST, COVERED, MOVING, SAMPLE_LOST, Script, covered, draw
 
 Floats = NDArray[np.float64]
@@ -85,6 +88,8 @@ GRID: Final[dict[str, Undeclared]] = {
     "late 1 + 0, observer 1520": (1520.0, 0.0, 1, 0),
     "lag 1 ms, observer 1000": (1000.0, 1e-3, 0, 0),
 }
+OBSERVERS: Final = 800.0, 1520.0, 3040.0
+"""Least bandwidths that are declared [rad/s]"""
 
 
 def fly(
@@ -302,6 +307,15 @@ def named(bench: Bench, name: str, count: int, rng: np.random.Generator) -> tupl
     return counts[0], counts[1], counts[2]
 
 
+def cases(bench: Bench) -> list[tuple[str, Undeclared, Bench]]:
+    """Name of each response of the first table, the response, and the bench that flies it."""
+    found = [(name, case, bench) for name, case in {**MUST, **GRID}.items()]
+    for w in OBSERVERS:
+        of = replace(bench, sensors=Sensors("observer", w))
+        found += [(f"observer {f * w:g}, declared {w:g}", (f * w, 0.0, 0, 0), of) for f in (1.0, 2.0)]
+    return found
+
+
 def share(count: int, total: int) -> str:
     """Count of a total, with the 95 % interval of the share."""
     low, high = stats.binomtest(count, total).proportion_ci(method="exact")
@@ -316,14 +330,14 @@ def main() -> int:
     p.add_argument("--runs", type=int, default=500, help="whole runs of each of four responses (default: %(default)s)")
     p.add_argument("--seed", type=int, default=1)
     arguments = p.parse_args()
-    bench, rng = load_bench(), np.random.default_rng(arguments.seed)
+    bench, rng = SENSOR_BENCH, np.random.default_rng(arguments.seed)
     fails = False
     if arguments.brakes:
-        print("| undeclared | policy | beyond the limits | ended by the proof | by the monitor | proven | fastest |")
+        print("| response | policy | beyond the limits | ended by the proof | by the monitor | proven | fastest |")
         print("|---" * 7 + "|", flush=True)
-    for name, case in {**MUST, **GRID}.items() if arguments.brakes else ():
+    for name, case, of in cases(bench) if arguments.brakes else ():
         for scripted in (False, True):
-            r = undeclared(bench, case, arguments.brakes, scripted, rng)
+            r = undeclared(of, case, arguments.brakes, scripted, rng)
             out = int(np.count_nonzero(beyond(bench, r)))
             fails |= out > 0
             late, proven = r[:, VERDICT] == CONTRADICTED, r[:, VERDICT] == PROVEN
@@ -334,7 +348,7 @@ def main() -> int:
                 flush=True,
             )
     if arguments.experiments:
-        fails |= show_honest(bench, arguments.experiments, rng)
+        fails |= show_honest((bench, load_bench()), arguments.experiments, rng)
     for name in NAMES if arguments.runs else ():
         ended, found, right = named(bench, name, arguments.runs, rng)
         fails |= right < 0.95 * arguments.runs
@@ -346,20 +360,21 @@ def main() -> int:
     return int(fails)
 
 
-def show_honest(bench: Bench, count: int, rng: np.random.Generator) -> bool:
+def show_honest(benches: tuple[Bench, Bench], count: int, rng: np.random.Generator) -> bool:
     """Print how honest experiments fare; whether more of them are ended than the page says."""
     print(
         "\n| plant | experiments | ended by the proof | beyond | proven after: median | 95 % | 99 % | never | slower |"
     )
     print("|---" * 9 + "|", flush=True)
-    ended, total, ms = 0, 0, bench.timing.sample_time * 1e3
-    for plant in COVERED:
-        r = honest(bench, plant, max(count // len(COVERED), 1), rng)
+    ended, total, ms = 0, 0, benches[0].timing.sample_time * 1e3
+    for plant, bench in itertools.product(COVERED, benches):
+        r = honest(bench, plant, max(count // len(benches) // len(COVERED), 1), rng)
         alarms, at = int(np.count_nonzero(r[:, VERDICT] == CONTRADICTED)), r[r[:, PROVEN_AT] > 0.0, PROVEN_AT] * ms
         ended, total = ended + alarms, total + len(r)
         times = " | ".join(f"{q:.0f} ms" for q in np.quantile(at, (0.5, 0.95, 0.99))) if len(at) else "– | – | –"
+        origin = declared(bench, plant).sensors.velocity
         print(
-            f"| {plant} | {len(r)} | {alarms} | {np.count_nonzero(beyond(bench, r))} | {times} | "
+            f"| {plant}, {origin} | {len(r)} | {alarms} | {np.count_nonzero(beyond(bench, r))} | {times} | "
             f"{1.0 - len(at) / len(r):.1%} | {r[:, CHANGED].mean() * ms:.1f} ms |",
             flush=True,
         )

@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.bench import Bench
 from emb_runtime.config.bench import Ranges
 from emb_runtime.safety.shield_design import make_law
+from tests.benches import SENSOR_BENCH
 from tests.properties.shield_climb import climb
 from tests.properties.shield_search import (
     DROPS,
@@ -38,8 +39,8 @@ from tests.properties.shield_search import (
 
 
 def bench_for(ranges: str = "envelope", **declared: Any) -> Bench:
-    """The shipped bench with another set and other bounds for its shield; ``known`` is the nominal brake alone."""
-    bench = load_bench()
+    """The shipped bench with a sensor, another set and other bounds of its shield; ``known`` is the nominal brake."""
+    bench = SENSOR_BENCH
     known = Ranges("known", bench.brake, bench.brake)
     return replace(
         bench,

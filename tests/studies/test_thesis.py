@@ -14,15 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.brake.euler import stiffness
-from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.bench import Bench
 from emb_bench.information.symmetric import Floats
 from emb_runtime.errors import EXIT_DONE
 from studies.thesis import oscillator, two_parameters
 from studies.thesis.cli import ANALYSIS, main
 from studies.thesis.determinant import EPSILON, Unprotected, determinant, normalised, unprotected
 from studies.thesis.facts import AGREES, DIFFERS, SUGGESTED, Fact
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,8 @@ import tools.proof.safety as safety_module
 import tools.proof.successors as successors_module
 import tools.proof.windows as windows_module
 from emb_bench.brake.euler import step as euler_step
-from emb_runtime.config.bench import BrakeParameters, Ranges, load_bench
+from emb_runtime.config.bench import BrakeParameters, Ranges
+from tests.benches import SENSOR_BENCH
 from tests.properties.shield_search import bench_with, damped
 from tools.proof.__main__ import main
 from tools.proof.boxes import cover, slack_of
@@ -34,7 +35,7 @@ from tools.proof.lemmas import BRAKING, judge, lemmas
 from tools.proof.safety import Thrown
 from tools.proof.terms import Facts, lifted_law, prove
 
-SHIPPED = case_of(load_bench())
+SHIPPED = case_of(SENSOR_BENCH)
 LEMMAS = {lemma.key: lemma for lemma in BRAKING}
 PROOFS = (successors_module, windows_module, safety_module, exhaustive_module, extensions_module)
 MODULES = (envelope_module, shield_module, cases_module, *PROOFS)

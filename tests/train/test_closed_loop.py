@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench import api
-from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import Instruments, Plant
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.simulated_brake import sent_current
@@ -29,8 +28,9 @@ from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import make_law
 from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Conditions, delayed
 from emb_train.play import Played, fresh_draws, play
+from tests.benches import SENSOR_BENCH, SENSOR_TEXT
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 SHORT = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=60))
 PM50 = BENCH.range_set("pm50")
 OPEN = Conditions(shielded=False)  # So that what is wanted is what is sent
@@ -135,7 +135,8 @@ def begun(plant: str, seed: int, conditions: Conditions = BENCH_CONDITIONS) -> B
 
 @pytest.mark.parametrize("plant", ["exact", "euler"])
 def test_a_batch_that_hears_what_a_run_heard_sends_what_that_sent(plant: str, tmp_path: Path) -> None:
-    cycles = api.simulate(tmp_path / "run.mcap", plant=plant, seed=3).cycles
+    (tmp_path / "bench.toml").write_text(SENSOR_TEXT, encoding="utf-8")
+    cycles = api.simulate(tmp_path / "run.mcap", plant=plant, seed=3, bench=tmp_path / "bench.toml").cycles
     of = {name: np.asarray(cycles[name]) for name in ("step", "angle", "velocity", "policy_current", "sent_current")}
     active = np.flatnonzero(of["step"] >= 0)[:HORIZON]
     heard = np.column_stack([of["angle"], of["velocity"]])[active]

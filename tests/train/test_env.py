@@ -15,7 +15,6 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import Instruments, Plant
 from emb_bench.information.fisher import fisher
 from emb_bench.information.symmetric import unpack
@@ -26,8 +25,9 @@ from emb_train.env import ENV_ID, EmbExcitationEnv, EmbExcitationVectorEnv
 from emb_train.presets import preset_summaries
 from emb_train.rewards import Transition, penalised_increment
 from emb_train.training import load_preset
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 SHORT = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=60))
 
 

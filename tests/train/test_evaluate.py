@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from emb_bench.design.problem import Problem, make_problem
 from emb_bench.excitation import parse_excitation, run_excitation
 from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import fisher
-from emb_runtime.config.bench import PARAMETER_NAMES, Sensors, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError
 from emb_train import optimum
 from emb_train.cli import main
@@ -26,6 +25,7 @@ from emb_train.closed_loop import Batch, Conditions
 from emb_train.evaluate import Settings, Subject, document, evaluate, open_subject, references, text
 from emb_train.optimum import followed, optima, searchable
 from emb_train.play import MEASURES, Draw, Law, Played, fresh_draws, mean_score, play
+from tests.benches import SENSOR_BENCH
 from tests.commands import refused
 from tests.train.trainings import HORIZON
 
@@ -159,8 +159,7 @@ def test_the_known_optimum_is_behind_ideal_instruments_where_the_bench_declares_
     searched: list[float],
 ) -> None:
     brakes = [BENCH.brake._replace(f_v=v) for v in (3e-5, 1e-5)]
-    observed = replace(BENCH, sensors=Sensors("observer", 1520.0))
-    found = [optima(bench, MEASURES["D"], ("f_v",), "exact", brakes, quiet) for bench in (BENCH, observed)]
+    found = [optima(bench, MEASURES["D"], ("f_v",), "exact", brakes, quiet) for bench in (SENSOR_BENCH, BENCH)]
     assert found[0].tolist() == found[1].tolist()
     assert len(searched) == 4
 

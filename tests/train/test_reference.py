@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from emb_bench.config.bench import load_bench
 from emb_bench.excitation import parse_excitation
 from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
@@ -38,8 +37,9 @@ from emb_train.reference import (
     wanted_current,
 )
 from emb_train.trial import Task, Trials
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 PM50 = BENCH.range_set("pm50")
 BOX, SCALE = box_of(BENCH, PM50), scale_of(BENCH)
 NOMINAL = np.array([getattr(BENCH.brake, n) for n in PARAMETER_NAMES])

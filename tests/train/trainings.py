@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from emb_runtime.config.bench import shipped_bench_text
 from emb_train.presets import preset_record
 from emb_train.training import Training, training_from
+from tests.benches import SENSOR_TEXT
 
 HORIZON = 60
 ENVS = 8
@@ -33,8 +33,8 @@ def make_tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def short_bench(directory: Path, old: str = "", new: str = "") -> Path:
-    """A bench file with a short experiment, and ``old`` replaced by ``new``."""
-    text = shipped_bench_text().replace("horizon     = 500", f"horizon     = {HORIZON}")
+    """A bench file with a sensor of the velocity, a short experiment, and ``old`` replaced by ``new``."""
+    text = SENSOR_TEXT.replace("horizon     = 500", f"horizon     = {HORIZON}")
     assert f"= {HORIZON}" in text
     assert old in text
     path = directory / "short.toml"

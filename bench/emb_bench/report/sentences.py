@@ -652,7 +652,7 @@ def notes(e: Evaluation) -> list[str]:
         values = ", ".join(f"{n} = {plain(v)} {UNITS[n]}".removesuffix(" 1") for n, v in known.items())
         found.append(f"systematic errors of this record, from {e.theta_name}, are taken as known: {values}")
     if instruments.observer_bandwidth > 0.0:
-        found.append("the velocity is an observer's, derived from the angle: it adds no physical information")
+        found.append("the velocity is an observer's and adds no physical information")
     if instruments.clock_jitter > 0.0:
         found.append(
             "a sigma includes the motion during the clock's jitter; angle and velocity of a sample count as "

@@ -25,13 +25,14 @@ from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document, text
 from emb_bench.report.sentences import DOUBTS, alarms, apart, remedies
 from emb_bench.report.sentences import profile as sentence
-from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 
 from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.bench.measurements import currents_of, fit, record  # isort: skip
 from tests.conftest import Simulate  # isort: skip
+from tests.benches import SENSOR_TEXT
 
 Log = Callable[[str], RunLog]
 PAIR = EstimationProblem(("k_m", "f_v"))
@@ -69,7 +70,7 @@ def test_logs_have_to_be_of_one_brake_and_time_grid_and_each_run_is_given_once(
     bench: Bench, log: Log, tmp_path: Path
 ) -> None:
     first, other = log("plant=exact"), log("plant=stribeck")
-    slow = parse_bench(shipped_bench_text().replace("sample_time = 1.0e-3", "sample_time = 2.0e-3"), "slow")
+    slow = parse_bench(SENSOR_TEXT.replace("sample_time = 1.0e-3", "sample_time = 2.0e-3"), "slow")
     copy = read_log(shutil.copy(first.path, tmp_path / "copy.mcap"))
     for its, logs, said in (
         (bench, [first, other], "different brakes"),

@@ -15,8 +15,8 @@ from emb_bench.design.report import read_design
 from emb_bench.experiment.experiment import planned
 from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.fisher import fisher
-from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import UsageError
+from tests.benches import SENSOR_TEXT
 
 PERIODS = 50
 QUICK = ["--starts", "1", "--params", "k_m,T_c", "--model", "euler"]
@@ -24,9 +24,9 @@ QUICK = ["--starts", "1", "--params", "k_m,T_c", "--model", "euler"]
 
 @pytest.fixture
 def short(tmp_path: Path) -> Path:
-    """A bench with a short experiment."""
+    """A bench with a sensor of the velocity and a short experiment."""
     path = tmp_path / "short.toml"
-    text = shipped_bench_text().replace("horizon     = 500", f"horizon     = {PERIODS}")
+    text = SENSOR_TEXT.replace("horizon     = 500", f"horizon     = {PERIODS}")
     path.write_text(text, encoding="utf-8")
     return path
 

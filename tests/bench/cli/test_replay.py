@@ -19,13 +19,14 @@ from emb_bench.information.fisher import fisher
 from emb_bench.logs.estimates import last_estimate
 from emb_bench.logs.log import read_log
 from emb_runtime.can.messages import Layout
-from emb_runtime.config.bench import Sensors, shipped_bench_text
+from emb_runtime.config.bench import Sensors
 from emb_runtime.numbers import plain
 from emb_runtime.records import CycleRecord
 
 from tests.bench.conftest import Log, Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import SimRun, Simulate  # isort: skip
+from tests.benches import SENSOR_TEXT
 
 
 @pytest.fixture
@@ -123,7 +124,7 @@ def test_of_a_bench_that_declares_an_observer_every_command_counts_the_angle_alo
 ) -> None:
     driven = replace(bench, sensors=OBSERVED) if plant == "observer" else bench
     path, declared = log("run.mcap", f"plant={plant}", on_bench=driven), tmp_path / "declared.toml"
-    declared.write_text(f'{shipped_bench_text()}\n[sensors]\nvelocity = "observer"\nobserver_bandwidth = 760\n')
+    declared.write_text(f'{SENSOR_TEXT}\n[sensors]\nvelocity = "observer"\nobserver_bandwidth = 760\n')
     told = replay.document("fim", path, "--theta", "true", "--bench", declared)
     measured = replay.document("fim", path, "--theta", "true", "--model", "exact" if plant == "observer" else plant)
     assert told["fit_sigmas"] == {"angle": measured["fit_sigmas"]["angle"], "velocity": None, "fits": True}
@@ -210,7 +211,7 @@ def test_another_bench_file_replaces_the_noise_of_the_one_in_the_log(
     tmp_path: Path, path: Path, replay: Replay
 ) -> None:
     file = tmp_path / "bench.toml"
-    text = shipped_bench_text().replace("angle    = 1.0e-3", "angle    = 1.0e-2")
+    text = SENSOR_TEXT.replace("angle    = 1.0e-3", "angle    = 1.0e-2")
     file.write_text(text.replace("velocity = 1.0 ", "velocity = 10.0 "))
     once, ten = replay.document("fim", path), replay.document("fim", path, "--bench", file)
     np.testing.assert_allclose(np.array(ten["physical"]["matrix"]) * 100.0, once["physical"]["matrix"], rtol=1e-9)

@@ -42,12 +42,13 @@ from emb_bench.commission.steps import (
     policy_file,
 )
 from emb_bench.config.bench import Bench, load_bench, parse_bench
-from emb_runtime.config.bench import PARAMETER_NAMES, Noise, Sensors, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, Noise, Sensors
 from emb_runtime.drives.mapping_file import load_mapping
 from emb_runtime.errors import BenchFileError, EmbError
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.policy.policy import Policy, load_policy
 from emb_runtime.safety.shield_design import make_law
+from tests.benches import SENSOR_TEXT
 from tests.drives import EXAMPLES
 
 LOGS = "7-medium.mcap and 8-large.mcap"
@@ -56,7 +57,7 @@ LOGS = "7-medium.mcap and 8-large.mcap"
 def sheet_text(factor: float = 2.0, **changed: str) -> str:
     brake = load_bench().brake
     rows = [f"{n} = [{getattr(brake, n) / factor}, {getattr(brake, n) * factor}]" for n in PARAMETER_NAMES]
-    text = shipped_bench_text().replace("[limits] ", "\n".join(["[ranges.wide]", *rows, "[limits] "]), 1)
+    text = SENSOR_TEXT.replace("[limits] ", "\n".join(["[ranges.wide]", *rows, "[limits] "]), 1)
     text = text.replace('ranges        = "envelope"', 'ranges = "wide"', 1)
     for key, value in changed.items():
         line = next(line for line in text.splitlines() if line.split("=")[0].strip() == key)

@@ -6,10 +6,10 @@ import pytest
 
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.config.plants import DIRECTED, EXACT, Instruments, Mechanics, Plant
-from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import BenchFileError
+from tests.benches import SENSOR_TEXT
 
-TEXT, _, _ = shipped_bench_text().partition("# Brakes to simulate")
+TEXT, _, _ = SENSOR_TEXT.partition("# Brakes to simulate")
 
 
 def read(*lines: str, name: str = "mine") -> Plant:

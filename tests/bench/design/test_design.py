@@ -12,7 +12,6 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_bench.config.bench import load_bench
 from emb_bench.design import anneal
 from emb_bench.design.anneal import HOPELESS, PRICE, annealed, tracked, vary
 from emb_bench.design.polish import Settings, merit, polish
@@ -26,8 +25,9 @@ from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 from tests.bench.design.bound import ceiling
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 TWO = ("k_m", "T_c")
 GOALS = [Criterion("D"), Criterion("A"), Criterion("E")]
 

@@ -21,6 +21,7 @@ from emb_runtime.cli.main import main
 from emb_runtime.config.bench import PARAMETER_NAMES, parse_bench
 from emb_runtime.records import Frame
 from tests.actors import constant_actor
+from tests.benches import measured
 from tests.drives import EXAMPLES, late_bench
 
 
@@ -36,7 +37,7 @@ def run(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[RunLo
 
     monkeypatch.setattr(simulated_drives.DRIVES[name], "broadcast", watched)
     monkeypatch.setattr("signal.signal", lambda *_: None)
-    text = late_bench(polled=name == "mit").replace("frame_age     = [1, 1]", "frame_age     = [1, 2]")
+    text = measured(late_bench(polled=name == "mit")).replace("frame_age     = [1, 1]", "frame_age     = [1, 2]")
     if name == "mit":  # its angle has steps of 3.4 mrad, which its bench file's noise covers
         text = text.replace("angle    = 1.0e-3", "angle    = 1.7e-3")
     bench, actor, log = (folder / file for file in ("late.toml", "actor.onnx", "run.mcap"))

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import Instruments
 from emb_bench.experiment.experiment import planned
 from emb_bench.experiment.simulate import Theta, simulate
@@ -28,8 +27,9 @@ from emb_bench.information.symmetric import Floats, log_det, pack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 from tests.bench.flows import euler_states, of_euler, square
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 BRAKE = BENCH.brake
 T_S = BENCH.timing.sample_time
 EULER = BENCH.plant("euler")

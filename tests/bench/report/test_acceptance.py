@@ -24,6 +24,7 @@ from emb_runtime.errors import UsageError
 from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import Simulate  # isort: skip
+from tests.benches import SENSOR_BENCH
 
 GOOD = RunFacts("run.mcap", "DONE", complete=True, missing="", missed=0.0, lost=0.002)
 
@@ -43,7 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path
 
 def study_of(path: Path, model: str | None = None, last: Any = None) -> Study:
     options = StudyOptions(EstimationProblem(), starts=1, model=model)
-    return make_study(load_bench(), [read_log(path)], options, last=last)
+    return make_study(SENSOR_BENCH, [read_log(path)], options, last=last)
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,6 @@ from emb_bench.report.content import Content, gather
 from emb_bench.report.figures import applied_as_sent
 from emb_bench.report.page import document, intervals, report_page, with_units
 from emb_bench.report.sentences import MORE, effects
-from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import EXIT_OUTSIDE
 from emb_runtime.log.ring_buffer import Attachment, EventRecord
 from emb_runtime.records import CycleRecord
@@ -44,6 +43,7 @@ from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.bench.report_pages import Report, make, read  # isort: skip
 from tests.bench.experiment.test_experiment import Lose  # isort: skip
 from tests.conftest import Simulate  # isort: skip
+from tests.benches import SENSOR_TEXT
 
 HOSTILE = "</style></title><script>alert(1)</script><img src=x onerror=alert(2)>\"'&amp;\x00\u202e"
 
@@ -76,7 +76,7 @@ def joint(folder: Path, good: Path, simulate: Simulate) -> Report:
 
 
 def test_the_report_says_what_a_loss_of_all_commands_would_do(folder: Path, simulate: Simulate) -> None:
-    lets_go = shipped_bench_text().replace('stop             = "damped"', 'stop             = "freewheel"')
+    lets_go = SENSOR_TEXT.replace('stop             = "damped"', 'stop             = "freewheel"')
     bench = Attachment("bench.toml", "application/toml", lets_go.encode())
     path = write_log(folder / "loose.mcap", simulate(square, options="plant=exact"), attachments=[bench])
     loose = " ".join(make(folder / "loose.html", path, "--starts", "1").reader.texts)
@@ -307,7 +307,7 @@ def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate
     )
     bench = folder / "bench.toml"
     assert main(["info", str(log)]) == 0
-    bench.write_text(shipped_bench_text(), encoding="utf-8")
+    bench.write_text(SENSOR_TEXT, encoding="utf-8")
     made = make(folder / "hostile.html", log, "--bench", bench, code=1)
     assert not {"script", "link", "iframe"} & set(made.reader.tags)
     assert made.reader.tags.count("style") == made.reader.tags.count("title") == 1

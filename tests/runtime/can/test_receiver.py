@@ -336,7 +336,7 @@ def test_pairs_that_are_not_believed_remove_permission_as_if_they_had_not_come(n
     harness.take(*node.pair(), node.status())
     last_ns = START_MS * MS
     for _ in range(3):
-        harness.take(*node.pair(angle_error=0.5))
+        harness.take(*node.pair(angle_error=5.0))
     permitted_until(harness, last_ns + 2 * MS, "pair is overdue")
 
 

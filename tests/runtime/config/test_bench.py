@@ -13,6 +13,7 @@ from emb_bench.config.bench import Bench, parse_bench
 from emb_runtime.config.bench import PARAMETER_NAMES, Sensors, shipped_bench_text
 from emb_runtime.errors import EXIT_USAGE, BenchFileError
 from emb_runtime.safety.shield_design import make_law
+from tests.benches import SENSOR_BENCH, SENSOR_TEXT
 
 TEXT = shipped_bench_text()
 
@@ -115,8 +116,9 @@ def test_what_is_wrong_is_refused_with_file_key_and_reason() -> None:
             )
         ),
     ]:
-        assert old in TEXT
-        broken = TEXT.replace(old, new, 1)
+        text = SENSOR_TEXT if "[sensors]" in new else TEXT
+        assert old in text
+        broken = text.replace(old, new, 1)
         if new == "can = 3":  # a bare key has to stand before the first table
             broken = "can = 3\n" + TEXT.replace(old, "", 1)
         with pytest.raises(BenchFileError) as caught:
@@ -128,22 +130,22 @@ def test_what_is_wrong_is_refused_with_file_key_and_reason() -> None:
         assert caught.value.exit_code == EXIT_USAGE
 
 
-def test_a_declared_observer_belongs_to_the_identity_and_a_declared_sensor_is_what_is_assumed(bench: Bench) -> None:
+def test_a_declared_observer_belongs_to_the_identity_and_a_declared_sensor_is_what_is_assumed() -> None:
     def declaring(text: str) -> Bench:
-        return parse_bench(TEXT.replace("[timing]", f"[sensors]\n{text}\n[timing]"), "t")
+        return parse_bench(SENSOR_TEXT.replace("[timing]", f"[sensors]\n{text}\n[timing]"), "t")
 
     sensor = declaring('velocity = "sensor"')
     observers = [declaring(f'velocity = "observer"\nobserver_bandwidth = {w}') for w in (800.0, 1520.0)]
-    assert (sensor.sensors, sensor.identity_hash) == (bench.sensors, bench.identity_hash)
+    assert (sensor.sensors, sensor.identity_hash) == (SENSOR_BENCH.sensors, SENSOR_BENCH.identity_hash)
     lagging = declaring('velocity = "observer"\nvelocity_lag = 0.0008')
     assert observers[1].sensors == Sensors("observer", 1520.0)
     assert lagging.sensors == Sensors("observer", velocity_lag=8e-4)
-    assert len({b.identity_hash for b in (bench, *observers, lagging)}) == 4
+    assert len({b.identity_hash for b in (sensor, *observers, lagging)}) == 4
 
 
 def test_an_observer_that_is_known_by_its_lag_alone_counts_as_one_of_second_order(bench: Bench) -> None:
     assert [Sensors("observer", velocity_lag=1e-3).bandwidth, Sensors("observer", 800.0).bandwidth] == [900.0, 800.0]
-    assert bench.sensors.bandwidth is None
+    assert (Sensors().bandwidth, bench.sensors.bandwidth) == (None, 1520.0)
     lagging, known = (replace(bench, sensors=s) for s in (Sensors("observer", None, 1e-3), Sensors("observer", 900.0)))
     assert make_law(lagging) == make_law(known)
     with pytest.raises(

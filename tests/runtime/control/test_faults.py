@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from emb_bench.config.bench import load_bench as load_with_plants
 from emb_bench.sim.transport import SimTransport, SteppedClock
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.can.transport import TransmitQueueFullError
@@ -23,6 +22,7 @@ from emb_runtime.safety.heartbeat import STOP_FRAMES, Unwatched
 from emb_runtime.safety.state_machine import FAULTS, Fault
 
 from tests.conftest import SimRun, Simulate  # isort: skip
+from tests.benches import SENSOR_BENCH
 from tests.independent import encoded, read
 
 MS = 1_000_000
@@ -230,7 +230,7 @@ INJECTIONS: dict[Fault, Callable[[Simulate], SimRun]] = {
         lambda _x, _v, step: 6.0 if step // 60 % 2 == 0 else -6.0,
         on_receive=later(VELOCITY, 0, AppliedCurrent=lambda current: current + 0.4),
     ),
-    Fault.RESPONSE_LATE: lambda run: run(options="plant=observer"),
+    Fault.RESPONSE_LATE: lambda run: run(options="plant=lag"),
     Fault.NOT_AT_REST: lambda run: run(on_receive=later(VELOCITY, 520, NodeState=NodeState.FAULT)),
     # What passes by itself.
     Fault.SENSOR_LATE: lambda run: run(on_receive=dropping(VELOCITY, range(100, 106))),
@@ -404,13 +404,13 @@ def test_an_undeclared_response_ends_the_run_below_every_limit_and_with_the_name
     plant: str, named: str, simulate: Simulate
 ) -> None:
     for seed in range(3):
-        ran = simulate(options=f"plant={plant},seed={seed}")
+        ran = simulate(options=f"plant={plant},seed={seed}", on_bench=SENSOR_BENCH)
         assert ran.outcome.fault is Fault.RESPONSE_LATE
         assert ran.outcome.response == ""
         assert max(abs(cycle.velocity) for cycle in ran.journal.cycles) < 250.0
         found = re.search(named, ran.outcome.detail)
         assert found is not None, ran.outcome.detail
-        bench, value = load_with_plants(), float(found[1])
+        bench, value = SENSOR_BENCH, float(found[1])
         keys: dict[str, dict[str, Any]] = {"lag": {"current_lag": value}, "late": {"frame_age": (0, int(value))}}
         shield = keys.get(plant, {})
         sensors = Sensors("observer", value) if plant == "observer" else bench.sensors
@@ -423,14 +423,14 @@ def test_an_undeclared_response_ends_the_run_below_every_limit_and_with_the_name
     [
         ("exact", {}),
         ("observer", {"sensors": Sensors("observer", 1480.0)}),
-        ("lag", {"shield": load_with_plants().shield._replace(current_lag=0.002)}),
-        ("late", {"shield": load_with_plants().shield._replace(frame_age=(0, 2))}),
+        ("lag", {"shield": SENSOR_BENCH.shield._replace(current_lag=0.002)}),
+        ("late", {"shield": SENSOR_BENCH.shield._replace(frame_age=(0, 2))}),
     ],
 )
 def test_a_response_that_is_declared_is_proven_and_the_outcome_says_so(
     plant: str, declared: dict[str, Any], simulate: Simulate
 ) -> None:
-    ran = simulate(options=f"plant={plant}", on_bench=dataclasses.replace(load_with_plants(), **declared))
+    ran = simulate(options=f"plant={plant}", on_bench=dataclasses.replace(SENSOR_BENCH, **declared))
     assert ran.outcome.fault is None, ran.outcome.detail
     assert re.fullmatch(
         r"the velocity follows the commands -?\d\.\d ± \d\.\d samples late, at most [\d.]+ are declared",

@@ -6,6 +6,8 @@ Simulated drives in lock-step. A fault that comes later comes 60 samples into a 
 from __future__ import annotations
 
 import itertools
+import math
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -176,7 +178,7 @@ FAULTS = {
         ("FRAMES_REJECTED", "FRAMES_REJECTED", "SENSOR_LOST"),
         (CONTRADICT,) * 3,
     ),
-    "arming lost": Fault(lambda _: lost_arming, ("MOTION_OUTSIDE_SET", "MOTION_OUTSIDE_SET", "CURRENT_MISMATCH")),
+    "arming lost": Fault(lambda _: lost_arming, ("CURRENT_MISMATCH",) * 3),
     "motor of the wrong sign": Fault(
         lambda drive: edited((COMMAND[drive], backward(COMMAND[drive]))), ("WRONG_POLARITY",) * 3
     ),
@@ -185,19 +187,17 @@ FAULTS = {
         ("WRONG_POLARITY",) * 3,
     ),
     "velocity of the wrong sign": Fault(
-        lambda drive: edited((VELOCITY[drive], backward(VELOCITY[drive]))),
-        ("WRONG_POLARITY", "WRONG_POLARITY", "SENSOR_LOST"),
-        ("", "", CONTRADICT),
+        lambda drive: edited((VELOCITY[drive], backward(VELOCITY[drive]))), ("WRONG_POLARITY",) * 3
     ),
     "angle in another unit": Fault(
         lambda drive: edited((ANGLE[drive], OTHER_ANGLE[drive])),
-        ("NODE_STOPPED", "NODE_NOT_READY", "SENSOR_LOST"),
-        (CONTRADICT,) * 3,
+        ("SENSORS_CONTRADICT", "NODE_NOT_READY", "SENSOR_LOST"),
+        ("", CONTRADICT, CONTRADICT),
     ),
     "velocity in another unit": Fault(
         lambda drive: edited((VELOCITY[drive], OTHER_VELOCITY[drive])),
-        ("NODE_STOPPED", "NODE_STOPPED", "MOTION_OUTSIDE_SET"),
-        (CONTRADICT, CONTRADICT, ""),
+        ("SENSORS_CONTRADICT", "MOTION_OUTSIDE_SET", "MOTION_OUTSIDE_SET"),
+        ("", CONTRADICT, ""),
     ),
     "both in another unit": Fault(
         lambda drive: edited((ANGLE[drive], OTHER_ANGLE[drive]), (VELOCITY[drive], OTHER_VELOCITY[drive])),
@@ -227,6 +227,26 @@ def test_a_fault_ends_the_run_with_its_name_and_the_brake_where_it_may_be(
         rests_below(bus, released_speed(bus.bench, bus.mapping.longest_hold(bus.bench.timing.sample_time)))
     else:
         within_limits(bus)
+
+
+@pytest.mark.parametrize(("factor", "current"), [(-4.0, 6.0), (1.3, -6.0), (1.6, -6.0), (6.283, 6.0)])
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_velocity_with_a_wrong_factor_ends_the_run_with_the_brake_within_its_limits(
+    name: str,
+    factor: float,
+    current: float,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bus, emb_run = runner(name, tmp_path, capsys, monkeypatch, current)
+    line = VELOCITY[name]
+    unit, said = line.split(", ")[0], line[line.index("range") :]
+    given = re.search(r"scale = (\S+),", line)
+    scale = factor * (float(given[1]) if given else 1.0)
+    bus.edit(line, f"{unit}, sign = {math.copysign(1.0, scale):g}, scale = {abs(scale)}, {said}")
+    emb_run.document(code=3)
+    within_limits(bus)
 
 
 @pytest.mark.parametrize("name", OTHER_COMMAND)

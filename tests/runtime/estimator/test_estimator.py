@@ -7,13 +7,14 @@ import math
 
 import pytest
 
-from emb_runtime.config.bench import PARAMETER_NAMES, Systematic, load_bench, parse_bench, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, Systematic, parse_bench, shipped_bench_text
 from emb_runtime.errors import BenchFileError
 from emb_runtime.estimator.estimate import NO_FIT, by_name, total, words
 from emb_runtime.estimator.estimator import Estimator, estimated
 from emb_runtime.estimator.kalman import MISFIT, follow, start
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 SAMPLES = [(0.0, 0.3, 0.0, 0.0), (0.02, 15.0, 1.0, 6.0), (0.4, 80.0, 6.0, 6.0), (0.45, 60.0, 7.0, -6.0)]
 
 

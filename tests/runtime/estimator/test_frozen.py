@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emb_runtime.config.bench import load_bench
 from emb_runtime.estimator.kalman import MISFIT, State, believed, deviations, follow, make_model
 from emb_runtime.estimator.speed_loop import current_for
 from emb_runtime.estimator.stick_slip import Accelerations, contact, move, sign
+from tests.benches import SENSOR_BENCH
 
 FROZEN = json.loads((Path(__file__).parent / "frozen.json").read_text(encoding="utf-8"))
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 
 
 def test_a_period_is_the_frozen_one() -> None:

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from emb_bench.brake import euler
 from emb_bench.brake.motion import advance, no_sensitivity, rest
-from emb_bench.config.bench import load_bench
 from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, Sensors
 from emb_runtime.estimator.kalman import (
@@ -27,8 +26,9 @@ from emb_runtime.estimator.kalman import (
     predict,
     start,
 )
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 PM50 = BENCH.range_set("pm50")
 EULER, EXACT = (make_model(BENCH, PM50, sticks=sticks) for sticks in (False, True))
 OBSERVED = make_model(replace(BENCH, sensors=Sensors("observer", 1520.0)), PM50, sticks=True)

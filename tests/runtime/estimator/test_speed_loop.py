@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench.brake import euler
-from emb_runtime.config.bench import BrakeParameters, load_bench
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.estimator.kalman import State, make_model, start
 from emb_runtime.estimator.speed_loop import current_for, follow_reference, scale_of, share_after
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 MODEL, EXACT = (make_model(BENCH, BENCH.range_set("pm50"), sticks=sticks) for sticks in (False, True))
 SCALE = scale_of(BENCH)
 UNIT = (1.0, 1.0, 1.0, 1.0)

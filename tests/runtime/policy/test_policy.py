@@ -178,15 +178,15 @@ def test_wider_ranges_and_another_horizon_are_a_warning_and_all_else_of_a_bench_
 
 
 def test_a_policy_that_was_made_for_another_origin_of_the_velocity_is_a_warning() -> None:
-    observed = dataclasses.replace(BENCH, sensors=Sensors("observer", 1520.0))
+    measured = dataclasses.replace(BENCH, sensors=Sensors())
     for bench, made_for, warned in (
-        (BENCH, "sensor", []),
-        (BENCH, "observer", ["velocity by sensor, made for one by observer"]),
-        (observed, "sensor", ["velocity by observer, made for one by sensor"]),
-        (observed, "observer", []),
+        (measured, "sensor", []),
+        (measured, "observer", ["velocity by sensor, made for one by observer"]),
+        (BENCH, "sensor", ["velocity by observer, made for one by sensor"]),
+        (BENCH, "observer", []),
     ):
         assert load_policy(constant_actor(BENCH, 2.0, velocity=made_for), bench).warnings == warned
-    assert load_policy(shipped_actor_path(), observed).warnings == ["velocity by observer, made for one by sensor"]
+    assert load_policy(shipped_actor_path(), measured).warnings == ["velocity by sensor, made for one by observer"]
 
 
 # What it computes -----------------------------------------------------------------------------------------------------

@@ -4,11 +4,12 @@ import math
 import random
 from dataclasses import replace
 
-from emb_runtime.config.bench import Bench, load_bench
+from emb_runtime.config.bench import Bench
 from emb_runtime.safety.end_stop import end_stop_speed, released_speed
 from emb_runtime.safety.shield_design import make_law
+from tests.benches import SENSOR_BENCH
 
-SHIPPED = load_bench()
+SHIPPED = SENSOR_BENCH
 FREEWHEEL = replace(SHIPPED, node=replace(SHIPPED.node, stop="freewheel"))
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from emb_runtime.config.bench import Bench, BrakeParameters, Sensors, load_bench
+from emb_runtime.config.bench import Bench, BrakeParameters, Sensors
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety import motion_balance
 from emb_runtime.safety.motion_balance import (
@@ -35,8 +35,9 @@ from emb_runtime.safety.motion_balance import (
     unheld_motion,
 )
 from emb_runtime.safety.state_machine import Fault, StopError
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 OTHER = replace(
     BENCH,
     brake=BrakeParameters(J=5e-6, gamma=2e-5, k_m=0.03, k_1=30.0, T_c=0.012, f_v=3e-5),

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emb_bench.config.bench import load_bench
 from emb_runtime.config.bench import Bench, Sensors
 from emb_runtime.safety.response import (
     CONTRADICTED,
@@ -33,8 +32,9 @@ from emb_runtime.safety.response import (
 )
 from emb_runtime.safety.response_cause import cause, observer_bandwidth
 from emb_runtime.safety.shield_design import make_law
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 LAW = make_law(BENCH)
 MODEL = response_model(BENCH, LAW)
 TS = BENCH.timing.sample_time

@@ -15,7 +15,6 @@ from random import Random
 import numpy as np
 import pytest
 
-from emb_bench.config.bench import load_bench
 from emb_runtime.can.e2e import COUNTER_MODULUS
 from emb_runtime.config.bench import Sensors
 from emb_runtime.records import NodeState, SensorSample
@@ -48,8 +47,9 @@ from emb_runtime.safety.response import (
 )
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from emb_runtime.safety.state_machine import Fault, StopError
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 SHIPPED = make_law(BENCH)
 
 

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emb_runtime.config.bench import load_bench
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.sensor_monitor import (
     CONTRADICTING,
@@ -28,8 +27,9 @@ from emb_runtime.safety.sensor_monitor import (
 )
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield_design import make_law
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
+BENCH = SENSOR_BENCH
 LAW = make_law(BENCH)
 LIMITS = sensor_thresholds(BENCH, LAW)
 TS = 1e-3

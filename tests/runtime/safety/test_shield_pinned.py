@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from emb_runtime.config.bench import load_bench
 from emb_runtime.safety.command_limits import CommandLimits, decide
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
+from tests.benches import SENSOR_BENCH
 
 COASTING = {"envelope": "coasting", "angle_margin": 1.1}
 PINNED: dict[str, tuple[dict[str, Any], str, str]] = {
@@ -35,9 +35,8 @@ def digest(numbers: Iterable[float]) -> str:
 
 
 def law_of(settings: dict[str, Any]) -> ShieldLaw:
-    """Law of the shipped bench with other settings of the shield."""
-    bench = load_bench()
-    return make_law(replace(bench, shield=bench.shield._replace(**settings)))
+    """Law of the shipped bench with a sensor of the velocity and other settings of the shield."""
+    return make_law(replace(SENSOR_BENCH, shield=SENSOR_BENCH.shield._replace(**settings)))
 
 
 @pytest.mark.parametrize("name", PINNED)

@@ -16,13 +16,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emb_runtime.config.bench import load_bench
 from emb_runtime.records import Reason
 from emb_runtime.safety.shield import LIMITED, NO_PAST, RETURNING, Past, _moved_by, shield, successor, window
 from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, make_law
+from tests.benches import SENSOR_BENCH
 
 Box = tuple[float, float, float, float]
-SHIPPED = make_law(load_bench())
+SHIPPED = make_law(SENSOR_BENCH)
 SEEDS = range(10)
 STATES = 80
 CLOSE = 1e-6
