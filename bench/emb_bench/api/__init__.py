@@ -25,8 +25,8 @@ from emb_bench.api.simulation import simulate
 from emb_runtime.errors import near
 
 __all__ = [
-    "Run", "campaign", "design", "draw", "estimate", "export", "export_policy", "fisher_information", "info", "interval",
-    "open_run", "report", "rerun", "sensitivities", "simulate", "timing", "topic", "topics",
+    "Run", "campaign", "design", "draw", "estimate", "export", "export_policy", "fisher_information", "info",
+    "interval", "open_run", "report", "rerun", "sensitivities", "simulate", "timing", "topic", "topics",
 ]  # fmt: skip
 _MEANT = {"load": "open_run", "read": "open_run", "fim": "fisher_information", "fit": "estimate", "plot": "draw"}
 """Names of other libraries for what is here."""

@@ -123,7 +123,7 @@ def text(e: Evaluation, *, verbose: bool = False) -> str:
 
 
 def _expected(e: Evaluation, prior: str) -> list[str]:
-    """What an estimate from the record can tell, with the effect that leaves most of each interval."""
+    """Interval that an estimate of the record will have, with the effect that leaves most of each interval."""
     interval = expected_interval(e)
     if isinstance(interval, str):
         return listed("no interval of an estimate: ", [interval])
