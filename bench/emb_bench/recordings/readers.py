@@ -245,10 +245,9 @@ def _arrow(
         at = [i for i, own in enumerate(table.column_names) if own.strip() == name]
         _require_one(path, name, at, known or table.column_names)
         column, kind = table.column(at[0]), str(table.column(at[0]).type)
-        if kind.startswith(("timestamp", "time")):
-            whole = (
-                column.cast("timestamp[ns]" if kind.startswith("timestamp") else "time64[ns]").cast("int64").to_numpy()
-            )
+        if kind.startswith(("time", "duration")):  # or a timestamp
+            fine = re.sub(r"^time(?:32|64)", "time64", re.sub(r"\[.*", "[ns]", kind))
+            whole = column.cast(fine).cast("int64").to_numpy()
             yield place, (whole - whole[np.isfinite(whole)][:1].sum()) * 1e-9, None
         elif kind in ("string", "large_string"):
             yield place, _of_texts(path, name, column.to_pylist(), source), None
@@ -284,12 +283,15 @@ def _of_texts(path: Path, name: str, texts: Sequence[str | None], source: Source
 
 # ---- MATLAB, MDF ----
 
-_INDEX = re.compile(r"(.*?)\(\s*(:|\d+)\s*(?:,\s*(:|\d+)\s*)?\)")
+_INDEX = re.compile(r"(.*?)[({]\s*(:|[1-9]\d*)\s*(?:,\s*(:|[1-9]\d*)\s*)?[)}]")
 
 
 def _matlab(path: Path, places: Sequence[Place]) -> Iterator[Read]:
     from scipy import io
 
+    with open_regular(path) as file:
+        if file.read(10) == b"MATLAB 7.3":
+            raise UsageError(f"{path}: a file of MATLAB 7.3: save it with -v7")
     content = io.loadmat(path, squeeze_me=True, struct_as_record=False, simplify_cells=True)
     known = [text for key, value in content.items() if not key.startswith("__") for text in _inside(key, value)]
     for place in places:

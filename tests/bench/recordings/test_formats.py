@@ -8,6 +8,8 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from emb_bench.experiment.experiment import Lack
@@ -26,17 +28,13 @@ COLUMNS = {"t": RECORDING.time, "x": RECORDING.position, "F": RECORDING.force}
 
 
 def with_pyarrow_csv(path: Path) -> None:
-    import pyarrow as pa
     from pyarrow import csv
 
     csv.write_csv(pa.table(COLUMNS), path)
 
 
 def with_pyarrow_parquet(path: Path) -> None:
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    parquet.write_table(pa.table(COLUMNS), path)
+    pq.write_table(pa.table(COLUMNS), path)
 
 
 def with_scipy(path: Path) -> None:
@@ -263,12 +261,15 @@ def test_columns_of_matrices_and_structures_of_matlab_are_named_as_matlab_does(t
     matrix = np.stack([*COLUMNS.values()], axis=1)
     signals = np.zeros(2, dtype=[("label", "O"), ("values", "O")])
     signals[0], signals[1] = ("x", COLUMNS["x"]), ("F", COLUMNS["F"])
-    content = {"data": matrix, "out": {"time": COLUMNS["t"], "signals": signals, "one": {"raw": matrix.T}}}
-    io.savemat(tmp_path / "r.mat", content)
+    cells = np.empty(3, dtype=object)
+    cells[:] = [*COLUMNS.values()]
+    out = {"time": COLUMNS["t"], "signals": signals, "one": {"raw": matrix.T}}
+    io.savemat(tmp_path / "r.mat", {"cells": cells, "data": matrix, "out": out})
     for t, x, force in (
         ("data(:,1)", "data(:, 2)", "data(:,3)"),
         ("out.time", "out.signals(1).values", "out.signals(2).values"),
         ("out.one(1).raw(1,:)", "out.one.raw(2,:)", "out.one.raw(3,:)"),
+        ("cells{1}", "cells{2}", "cells(3)"),
     ):
         (tmp_path / "map.toml").write_text(
             MAP.replace('"t"', f'"{t}"').replace('"x"', f'"{x}"').replace('"F"', f'"{force}"')
@@ -277,8 +278,9 @@ def test_columns_of_matrices_and_structures_of_matlab_are_named_as_matlab_does(t
         np.testing.assert_allclose(experiment.all_samples[:, 0], RECORDING.position, rtol=1e-12)
     for place, said in (
         ("data", "a matrix of 301 x 3: name a column of it, data(:,1) to data(:,3)"),
+        ("data(:,0)", "no column is called 'data(:,0)'; it has: cells, data(:,1..3)"),
         ("data(:,4)", "data(:,4): beyond what data has: (301, 3)"),
-        ("out.angle", "it has: data(:,1..3), out.time, out.signals(1).label, out.signals(1).values"),
+        ("out.angle", "it has: cells, data(:,1..3), out.time, out.signals(1).label, out.signals(1).values"),
         ("out.signals(3).values", "signals(3): beyond what signals has"),
     ):
         (tmp_path / "map.toml").write_text(MAP.replace('"t"', '"data(:,1)"').replace('"x"', f'"{place}"'))
@@ -294,3 +296,21 @@ def test_a_file_that_ends_in_dat_is_what_it_begins_as(tmp_path: Path, written: d
     (tmp_path / "map.toml").write_text(WITHOUT_TIMES)
     (tmp_path / "r.dat").write_bytes(written["r.mdf"])
     assert open_recording(tmp_path / "r.dat", tmp_path / "map.toml").experiment.periods == len(RECORDING.time) - 1
+
+
+def test_a_file_of_matlab_7_3_is_named(tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text(MAP)
+    (tmp_path / "r.mat").write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64" + bytes(500))
+    with pytest.raises(UsageError, match=r"a file of MATLAB 7.3: save it with -v7"):
+        open_recording(tmp_path / "r.mat", tmp_path / "map.toml")
+
+
+@pytest.mark.parametrize("kind", [pa.timestamp("us", "UTC"), pa.timestamp("ms"), pa.time64("us"), pa.duration("us")])
+def test_times_of_arrow_have_their_unit(kind: pa.DataType, tmp_path: Path) -> None:
+    times = np.rint(RECORDING.time * (1e3 if kind == pa.timestamp("ms") else 1e6)).astype(np.int64)
+    table = pa.table(COLUMNS | {"t": pa.array(times).cast(kind)})
+    pq.write_table(table, tmp_path / "r.parquet")
+    (tmp_path / "map.toml").write_text(MAP)
+    found = open_recording(tmp_path / "r.parquet", tmp_path / "map.toml")
+    assert found.experiment.periods == len(RECORDING.time) - 1
+    assert found.bench.timing.sample_time == pytest.approx(RECORDING.time[1], rel=1e-6)
