@@ -245,7 +245,9 @@ def _wraps(s: Series) -> Found:
     if not far.any():
         return None
     period, extent = float(np.median(off[far])), float(np.ptp(s.values))
-    exact = next((p for p in (*PERIODS, float(f"{period:.2g}")) if abs(p - period) < 1e-3 * p), 0.0)
+    step = 1.5 * float((s.values == np.rint(s.values)).all())  # Of counts, and half of one for rounding
+    among = (*PERIODS, *([extent + 1.0] if step else []), float(f"{period:.2g}"))
+    exact = next((p for p in among if abs(p - period) < max(1e-3 * p, step)), 0.0)
     if not exact and far.sum() < 2:
         return None
     period = exact or period

@@ -119,6 +119,8 @@ def _require_one(path: Path, name: str, places: Sequence[Any], known: Sequence[s
 
 
 def _numbers(path: Path, name: str, values: Any) -> Floats:
+    if np.iscomplexobj(values):
+        raise UsageError(f"{path}: {name}: expected real numbers, got complex ones")
     try:
         row: Floats = np.squeeze(np.asarray(values, dtype=np.float64))
     except (TypeError, ValueError) as err:

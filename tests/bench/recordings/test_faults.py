@@ -68,6 +68,18 @@ REFUSED = {
         {"angle": f"wrap = 4000\nscale = {TURN / 4000.0}"},
         {"angle": f"scale = {TURN / 4000.0}"},
     ),
+    "signed bytes": Fault(
+        {"angle": (np.floor(RIGHT["angle"] * 20.0) + 128.0) % 256.0 - 128.0},
+        "wrap = 256 ",
+        {"angle": "wrap = 256\nscale = 0.05"},
+        {"angle": "scale = 0.05"},
+    ),
+    "few steps": Fault(
+        {"angle": np.floor(RIGHT["angle"] * 20.0) % 97.0},
+        "wrap = 97 ",
+        {"angle": "wrap = 97\nscale = 0.05"},
+        {"angle": "scale = 0.05"},
+    ),
     "steps that begin anew once": Fault(
         {"angle": (np.floor(RIGHT["angle"] / TURN * 8192.0) + 65500.0) % 65536.0},
         "wrap = 65536 ",

@@ -264,7 +264,7 @@ def test_columns_of_matrices_and_structures_of_matlab_are_named_as_matlab_does(t
     cells = np.empty(3, dtype=object)
     cells[:] = [*COLUMNS.values()]
     out = {"time": COLUMNS["t"], "signals": signals, "one": {"raw": matrix.T}}
-    io.savemat(tmp_path / "r.mat", {"cells": cells, "data": matrix, "out": out})
+    io.savemat(tmp_path / "r.mat", {"cells": cells, "data": matrix, "out": out, "spectrum": COLUMNS["x"] + 1j})
     for t, x, force in (
         ("data(:,1)", "data(:, 2)", "data(:,3)"),
         ("out.time", "out.signals(1).values", "out.signals(2).values"),
@@ -278,6 +278,7 @@ def test_columns_of_matrices_and_structures_of_matlab_are_named_as_matlab_does(t
         np.testing.assert_allclose(experiment.all_samples[:, 0], RECORDING.position, rtol=1e-12)
     for place, said in (
         ("data", "a matrix of 301 x 3: name a column of it, data(:,1) to data(:,3)"),
+        ("spectrum", "spectrum: expected real numbers, got complex ones"),
         ("data(:,0)", "no column is called 'data(:,0)'; it has: cells, data(:,1..3)"),
         ("data(:,4)", "data(:,4): beyond what data has: (301, 3)"),
         ("out.angle", "it has: cells, data(:,1..3), out.time, out.signals(1).label, out.signals(1).values"),
