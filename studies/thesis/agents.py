@@ -221,6 +221,28 @@ def fig_5_9(trainings: Trainings) -> list[Statement]:
     ]
 
 
+def sec_6_2_1(trainings: Trainings) -> list[Statement]:
+    """The step reward of eq. 4.13 as it is, beside method 1."""
+    plain, first = (trainings.first(f"thesis-d-optimal-{name}") for name in ("plain", "1"))
+    draws = fresh_draws(plain.bench.range_set(plain.config.ranges), EVALUATION_SEED, TESTS)
+    runs = [training.run(draws, reward=lambda t: gain(LOG_DET, t, EPSILON)) for training in (plain, first)]
+    (own, other), left = (float(run.returns.mean()) for run in runs), int(runs[0].violated.sum())
+    late = plain.violations[len(plain.violations) // 2 :]
+    return [
+        (
+            "with the plain step reward the agent does not learn to excite the brake",
+            f"log |M| grows by {own:.2f} in the mean of {TESTS} brakes, with method 1 by {other:.2f}",
+            own < other - 1.0,
+        ),
+        (
+            "it leaves the limits frequently",
+            f"in {left} of {TESTS} experiments of the best agent, and {late.mean():.1f} times an iteration in the "
+            "second half of the training",
+            left > 0.1 * TESTS or float(late.mean()) > 1.0,
+        ),
+    ]
+
+
 def fig_6_1(trainings: Trainings) -> list[Statement]:
     """D-optimal rewards 1 and 2 beside the square wave, judged by the step reward of eq. 4.13."""
     first, second = (trainings.first(f"thesis-d-optimal-{i}") for i in (1, 2))
@@ -306,6 +328,7 @@ FIGURES: Mapping[str, tuple[str, Callable[[Trainings], list[Statement]]]] = {
     "fig-5.8": ("5.3.2", fig_5_8),
     "table-5.1": ("5.3.2", table_5_1),
     "fig-5.9": ("5.3.2", fig_5_9),
+    "sec-6.2.1": ("6.2.1", sec_6_2_1),
     "fig-6.1": ("6.2", fig_6_1),
     "fig-6.2": ("6.3.1", fig_6_2),
     "fig-6.3": ("6.3.2", fig_6_3),

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
+import shutil
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,7 +23,7 @@ from emb_train.env import Scoring
 from emb_train.play import Draw, begin_all
 from emb_train.ppo import DeployedActor
 from emb_train.rewards import REWARDS, Reward
-from emb_train.training import METRICS, begin_training, load_preset, load_training, run_training
+from emb_train.training import CONFIGURATION, METRICS, begin_training, load_preset, load_training, run_training
 from emb_train.training import Training as Configuration
 
 Floats = NDArray[np.float64]
@@ -81,18 +86,58 @@ class Training:
         series: tuple[list[Floats], ...] = ([batch.x[:, :2].copy()], [], [], [])
         for _ in range(batch.setup.rules.horizon):
             worth = scoring.advance((wanted or self.agent)(batch))
-            for kept, now in zip(series, (batch.x[:, :2], batch.past[:, 0], worth, batch.m), strict=True):
+            now_all = (batch.x[:, :2], batch.past[:, 0], worth, batch.information())
+            for kept, now in zip(series, now_all, strict=True):
                 kept.append(np.where(over if now.ndim == 1 else over[:, None], np.nan, now))
             over |= batch.violated
         x, current, rewards, information = map(np.array, series)
         return Trajectories(x, current, rewards, information, over)
 
 
+class Choice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Values that the thesis does not print, or prints in two ways; the defaults are those of the presets."""
+
+    deviation: Annotated[float, msgspec.Meta(gt=0.0, le=100.0)] = 1.0  # First standard deviation of the action [A]
+    tracking: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0  # Factor of the weights of the deviation from the quintic
+    draws: Literal["uniform", "normal"] = "uniform"  # Table 6.1 says uniform, the text beside it normal
+    normalised_by: Literal["true", "nominal"] = "true"  # Eq. 4.17 has the nominal values
+
+    def applied(self, config: Configuration, limit: float) -> Configuration:
+        """A preset with these values, for a bench with this largest current [A]."""
+        conditions = msgspec.structs.replace(
+            config.conditions, tracking=self.tracking, draws=self.draws, normalised_by=self.normalised_by
+        )
+        if config.reward not in TRACKING:
+            conditions = msgspec.structs.replace(conditions, tracking=1.0)
+        ppo = msgspec.structs.replace(config.ppo, initial_deviation=self.deviation / limit)
+        return msgspec.structs.replace(config, ppo=ppo, conditions=conditions)
+
+    def folder(self, config: Configuration) -> str:
+        """Name of the folder of the trainings that differ by nothing else."""
+        values = msgspec.structs.asdict(self) | {"tracking": self.tracking if config.reward in TRACKING else 1.0}
+        return ",".join(f"{name}={value}" for name, value in values.items() if value != getattr(PRESETS, name))
+
+
+TRACKING = ("trajectory_return", "hybrid_return")  # Rewards that follow a quintic
+PRESETS = Choice()
+
+
+class SpentError(UsageError):
+    """The time for trainings is over before all are made."""
+
+
 class Trainings:
     """A folder with a training for each preset and seed that was requested."""
 
     def __init__(
-        self, folder: Path, bench: Bench, seeds: Sequence[int], most: int | None, tell: Callable[[str], object]
+        self,
+        folder: Path,
+        bench: Bench,
+        seeds: Sequence[int],
+        most: int | None,
+        tell: Callable[[str], object],
+        choice: Choice = PRESETS,
+        until: float = math.inf,
     ) -> None:
         """Keep trainings in a folder.
 
@@ -102,8 +147,11 @@ class Trainings:
             seeds: of trainings that are repeated; the first is that of all others.
             most: steps of a training, if that is fewer than its preset's.
             tell: called with a line of text before a training begins.
+            choice: values that the thesis leaves open.
+            until: time of :func:`time.monotonic` from which no training begins [s].
         """
         self._folder, self._bench, self._most, self._tell = folder, bench, most, tell
+        self._choice, self._until = choice, until
         self.seeds = tuple(seeds)
 
     def first(self, preset: str) -> Training:
@@ -115,25 +163,53 @@ class Trainings:
         return [self._one(preset, seed) for seed in self.seeds]
 
     def _one(self, preset: str, seed: int) -> Training:
-        folder, config = self._folder / f"{preset}-{seed}", load_preset(preset, seed=seed)
+        config = load_preset(preset, seed=seed)
         if self._most is not None and self._most < config.ppo.total_steps:
             config = load_preset(preset, seed=seed, total_steps=self._most)
+        config = self._choice.applied(config, self._bench.limits.current)
+        folder = self._folder / self._choice.folder(config) / f"{preset}-{seed}"
+        if folder.exists() and _interrupted(folder, config):
+            shutil.rmtree(folder)
         if not folder.exists():
-            self._tell(f"training {preset}, seed {seed}, {config.ppo.iterations * config.ppo.batch} steps")
+            if time.monotonic() > self._until:
+                raise SpentError("--minutes: the time is over before all trainings are made: the next call goes on")
+            self._tell(f"training {folder.relative_to(self._folder)}, {config.ppo.iterations * config.ppo.batch} steps")
             begin_training(folder, config, self._bench)
             run_training(folder, config, self._bench)
         trained = load_training(folder)
         if (trained.training, trained.bench.identity_hash) != (config, self._bench.identity_hash):
             raise UsageError(f"{folder}: holds another training, of other steps or bench: choose another --output")
-        try:
-            records = [json.loads(line) for line in (folder / METRICS).read_text(encoding="utf-8").splitlines()]
-            returns = [(r["mean_return"] * max(r["ended"], 1), r["violations"]) for r in records]
-        except (OSError, ValueError, LookupError, TypeError) as err:
-            raise UsageError(f"{folder}: not a finished training, remove it: {err}") from err
-        if len(records) < config.ppo.iterations:
-            raise UsageError(f"{folder}: not a finished training, remove it: it was interrupted")
+        records = _records(folder)
         horizon = config.conditions.applied(self._bench).timing.horizon
-        rewards, violations = np.array(returns, np.float64).T
+        rewards, violations = np.array(
+            [(r["mean_return"] * max(r["ended"], 1), r["violations"]) for r in records], np.float64
+        ).T
         actor = DeployedActor(trained.actor, self._bench.limits.current)
         curve = rewards * horizon / (config.ppo.batch * config.scale)
         return Training(config, self._bench, actor, curve, violations)
+
+
+def _records(folder: Path) -> list[dict[str, float]]:
+    """Results of the iterations of a training.
+
+    Raises:
+        UsageError: a line of them is none.
+    """
+    wanted = {"mean_return", "ended", "violations"}
+    try:
+        records = [json.loads(line) for line in (folder / METRICS).read_text(encoding="utf-8").splitlines()]
+        if any(not all(isinstance(record[name], int | float) for name in wanted) for record in records):
+            raise ValueError("a line without numbers")
+    except (OSError, ValueError, LookupError, TypeError) as err:
+        raise UsageError(f"{folder}: not a finished training, remove it: {err}") from err
+    return records
+
+
+def _interrupted(folder: Path, config: Configuration) -> bool:
+    """True for a training of this configuration that has begun and was not finished."""
+    try:
+        begun = msgspec.json.decode((folder / CONFIGURATION).read_bytes())
+    except (OSError, msgspec.DecodeError):
+        return False
+    same = begun == msgspec.json.decode(msgspec.json.encode(config))
+    return same and (not (folder / METRICS).exists() or len(_records(folder)) < config.ppo.iterations)

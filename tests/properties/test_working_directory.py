@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from emb_runtime.cli.main import main as emb_run
+
 ROOT = Path(__file__).parents[2]
 PLANTED = (
     *("json", "struct", "socket", "pickle", "selectors", "signal", "runpy", "random", "csv", "logging", "platform"),
@@ -30,6 +32,7 @@ STARTING = {
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found: Path = tmp_path_factory.mktemp("here")
+    assert emb_run(["--iface", "sim", "--log", str(found / "run.mcap")]) == 0
     for name in PLANTED:
         (found / f"{name}.py").write_text(f"open({str(found / 'ran')!r}, 'a').write('{name} ')\nraise SystemExit(77)\n")
     (found / "actor.onnx").write_bytes((ROOT / "runtime/emb_runtime/policy/quick.onnx").read_bytes())

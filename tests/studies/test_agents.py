@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from pathlib import Path
@@ -9,11 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from emb_bench.config.bench import load_bench
+from emb_runtime.safety.shield_design import make_law
 from emb_train.play import Draw
-from emb_train.training import METRICS, Training, load_preset
-from studies.thesis import agents, trainings
+from emb_train.training import ACTOR, CONFIGURATION, METRICS, Training, load_preset
+from studies.thesis import agents, choices, pictures, trainings
 from studies.thesis.agents import (
     FIGURES,
     correlation,
@@ -70,10 +73,10 @@ def test_every_target_has_statements_of_its_own_trainings_which_are_made_once(
 ) -> None:
     assert set(TRAININGS) == set(FIGURES)
     facts = [fact for figure in FIGURES for fact in agents.agent_facts(figure, made)]
-    assert len(facts) == 37 + 7  # those of docs/studies/reproduction.md, and Table 6.2
+    assert len(facts) == 37 + 7 + 2  # those of docs/studies/reproduction.md, Table 6.2, and section 6.2.1
     assert all(fact.found and fact.agrees in (True, False) for fact in facts)
     both = ("e-optimal-hybrid", "e-optimal-trajectory", "trajectory-a", "trajectory-b")
-    once = ("adaptive", "d-optimal-1", "d-optimal-2", "fixed", "random")
+    once = ("adaptive", "d-optimal-1", "d-optimal-2", "d-optimal-plain", "fixed", "random")
     names = [f"thesis-{n}-{s}" for n in both for s in (0, 1)] + [f"thesis-{n}-0" for n in once]
     assert sorted(path.name for path in folder.iterdir()) == sorted(names)
     assert main(["fig-5.2", "fig-4.2", "--output", str(folder)]) == 0
@@ -91,11 +94,114 @@ def test_trainings_that_do_not_belong_to_a_target_are_refused_in_a_line(
     folder: Path, made: Trainings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     refused(lambda: main(["fig-5.2", "--steps", "300", "--output", str(folder)]), capsys)  # of other trainings
-    for content in ("junk\n", '{"steps": 1}\n', "\xff", ""):
+    for content in ("junk\n", '{"steps": 1}\n', "\xff"):
         shutil.rmtree(tmp_path / "thesis-fixed-0", ignore_errors=True)
         copy = shutil.copytree(folder / "thesis-fixed-0", tmp_path / "thesis-fixed-0")
         (copy / METRICS).write_bytes(content.encode("latin-1"))
         refused(lambda: main(["fig-5.3", "--output", str(tmp_path)]), capsys)
+
+
+@pytest.mark.slow
+def test_an_interrupted_training_is_made_anew_and_another_folder_is_left_alone(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(trainings, "load_preset", small)
+    cut = shutil.copytree(folder / "thesis-fixed-0", tmp_path / "thesis-fixed-0")
+    (cut / METRICS).write_text("")
+    (cut / ACTOR).unlink()
+    assert main(["fig-5.2", "--output", str(tmp_path)]) == 0
+    assert (cut / METRICS).read_text()
+    foreign = tmp_path / "other" / "thesis-fixed-0"
+    foreign.mkdir(parents=True)
+    (foreign / "mine.txt").write_text("kept")
+    refused(lambda: main(["fig-5.2", "--output", str(tmp_path / "other")]), capsys)
+    assert (foreign / "mine.txt").read_text() == "kept"
+
+
+@pytest.mark.slow
+def test_choices_are_counted_seed_by_seed_as_far_as_the_time_allows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(trainings, "load_preset", small)
+    arguments = ["fig-5.3", "--choices", "--seeds", "2", "--output", str(tmp_path)]
+    assert main([*arguments, "--minutes", "1e-9"]) == 0
+    assert "more --minutes" in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
+    assert main([*arguments, "--json"]) == 0
+    counts = json.loads(capsys.readouterr().out)
+    assert [(c["seed"], c["deviation"], c["tracking"]) for c in counts] == [
+        (seed, deviation, tracking) for seed in (0, 1) for deviation in (1.0, 6.0) for tracking in (1.0, 0.1)
+    ]
+    # The reward of these agents follows no quintic: both weights have one training.
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("thesis-*")) == [
+        f"{folder}thesis-fixed-{seed}" for folder in ("deviation=6.0/", "") for seed in (0, 1)
+    ]
+    started = json.loads((tmp_path / "deviation=6.0/thesis-fixed-0" / CONFIGURATION).read_text())
+    assert started["ppo"]["initial_deviation"] == 1.0  # of ±6 A
+    assert main([*arguments, "--minutes", "1e-9"]) == 0  # nothing is trained again
+    assert "of 4" in capsys.readouterr().out
+
+
+def test_a_table_of_choices_has_the_share_of_all_and_says_if_they_cannot_be_compared() -> None:
+    counts = [choices.Count(a, w, "fig-5.3", seed, 3 if a > 1.0 else 1, 4) for a in (1.0, 6.0) for w in (1.0, 0.1)
+              for seed in (0, 1)]  # fmt: skip
+    table = choices.text(counts)
+    assert "1, 1 of 4" in table
+    assert "3, 3 of 4" in table
+    assert table.splitlines()[-1].split() == ["agree", "25", "%", "25", "%", "75", "%", "75", "%"]
+    assert "cannot be compared" in choices.text(counts[:-1])
+
+
+def test_a_choice_that_there_is_not_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for said, words in (
+        ("devation=6", "did you mean deviation?"),
+        ("deviation", "as in deviation=6"),
+        ("deviation=0", "deviation"),
+        ("deviation=nan", "deviation"),
+        ("tracking=-1", "tracking"),
+        ("draws=poisson", "draws"),
+    ):
+        line = refused(lambda: main(["fig-5.2", "--set", said, "--output", str(tmp_path)]), capsys)  # noqa: B023
+        assert words in line
+    assert "--choices" in refused(lambda: main(["fig-4.2", "--choices"]), capsys)
+    assert "--minutes" in refused(lambda: main(["fig-5.2", "--minutes", "nan"]), capsys)
+    assert choices.set_choice(["draws=normal", "deviation=6"]) == trainings.Choice(deviation=6.0, draws="normal")
+
+
+def test_figures_that_need_no_training_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--figures", str(tmp_path / "new")]) == 0
+    files = sorted((tmp_path / "new").iterdir())
+    assert [file.stem for file in files] == sorted(pictures.ANALYSIS)
+    assert capsys.readouterr().out.split() == [str(file) for file in files]
+    assert all(file.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" for file in files)
+    assert "fig-6.9" in refused(lambda: main(["fig-6.9", "--figures", str(tmp_path)]), capsys)
+
+
+@pytest.mark.slow
+def test_figures_of_trained_agents_are_drawn(made: Trainings, folder: Path, tmp_path: Path) -> None:
+    assert main(["trainings", "--seeds", "2", "--figures", str(tmp_path), "--output", str(folder)]) == 0
+    assert sorted(file.stem for file in tmp_path.iterdir()) == list(pictures.TRAINED)
+
+
+def test_an_ellipse_is_where_the_deviation_has_its_quantile() -> None:
+    covariance = np.array([[4.0, 1.5], [1.5, 1.0]])
+    edge = pictures.ellipse(covariance)
+    distances = np.einsum("in,ij,jn->n", edge, np.linalg.inv(covariance), edge)
+    np.testing.assert_allclose(distances, scipy.stats.chi2.ppf(0.95, 2), rtol=1e-3)
+
+
+def test_the_bench_of_table_6_1_covers_its_brakes_and_is_else_the_shipped_one(tmp_path: Path) -> None:
+    path = tmp_path / "table-6.1.toml"
+    assert main(["--write-bench", str(path)]) == 0
+    bench = load_bench(path)
+    make_law(bench)
+    drawn = BENCH.range_set("viscous-stiffness")
+    low, high = ({"k_1": end.k_1, "f_v": end.f_v} for end in (drawn.low, drawn.high))
+    for name in (bench.shield.ranges, bench.prior):
+        box = bench.range_set(name)
+        assert not box.uncovered(bench.brake._replace(**low), bench.brake._replace(**high))
+    assert bench.brake == BENCH.brake._replace(k_1=0.5 * (low["k_1"] + high["k_1"]))
+    assert (bench.limits, bench.noise, bench.timing) == (BENCH.limits, BENCH.noise, BENCH.timing)
 
 
 @pytest.mark.slow

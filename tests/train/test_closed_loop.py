@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from emb_bench import api
 from emb_bench.config.plants import Instruments, Plant
+from emb_bench.information.symmetric import unpack
 from emb_bench.sim.node import BrakeNode
 from emb_bench.sim.simulated_brake import sent_current
 from emb_runtime.can.messages import load_layout
@@ -82,6 +83,36 @@ def test_every_delay_comes_equally_often_and_changes_neither_the_brakes_nor_the_
     np.testing.assert_array_equal(batches[0].experiments.noise, batches[1].experiments.noise)
     assert not batches[0].experiments.delay.any()
     assert np.bincount(batches[1].experiments.delay).tolist() == pytest.approx([0, 200, 200, 200], abs=45)
+
+
+def test_normal_draws_lie_around_the_middle_of_their_ranges_and_within_them() -> None:
+    batch = Batch(SHORT, PM50, ("f_v",), 2000, conditions=with_(draws="normal"))
+    for i in range(2000):
+        batch.begin(i, np.random.default_rng(i))
+    low, high = np.array(PM50.low), np.array(PM50.high)
+    assert (batch.brakes >= low).all()
+    assert (batch.brakes <= high).all()
+    free = high > low
+    z = ((batch.brakes - 0.5 * (low + high))[:, free]) / (0.25 * (high - low)[free])
+    # Of a normal distribution that is cut off at two standard deviations.
+    assert np.abs(z.mean(axis=0)).max() < 0.08
+    assert np.abs(z.var(axis=0) - 0.7737).max() < 0.1
+    assert np.abs((np.abs(z) < 1.0).mean(axis=0) - 0.6827 / 0.9545).max() < 0.05
+    assert (batch.brakes[:, ~free] == low[~free]).all()
+
+
+def test_information_over_nominal_values_is_that_of_parameters_in_units_of_them() -> None:
+    names = ("k_1", "f_v")
+    batch = Batch(SHORT, PM50, names, 3, conditions=with_(normalised_by="nominal"))
+    for i in range(3):
+        batch.begin(i, np.random.default_rng(i))
+    for _ in range(40):
+        batch.advance(np.full(3, 5.0))
+    for brake, own, seen in zip(batch.brakes, batch.m, batch.information(), strict=True):
+        true = dict(zip(BrakeParameters._fields, brake.tolist(), strict=True))
+        scale = np.diag([getattr(BENCH.brake, name) / true[name] for name in names])
+        np.testing.assert_allclose(unpack(seen, 2), scale @ unpack(own, 2) @ scale, rtol=1e-12)
+        assert np.abs(scale - np.eye(2)).max() > 0.01
 
 
 def test_the_critic_sees_what_an_experiment_has_of_its_own() -> None:

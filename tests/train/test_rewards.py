@@ -23,6 +23,7 @@ from emb_train.rewards import (
     Turn,
     adaptive_return,
     determinant_gain,
+    determinant_step,
     hybrid_return,
     information_increment,
     log_determinant,
@@ -131,6 +132,13 @@ def test_the_quintic_solves_the_six_equations_of_5_16(
     assert velocity == pytest.approx(solved.deriv()(now), abs=1e-5)
 
 
+def test_the_tracking_weights_have_a_common_factor() -> None:
+    way = step(x=(35.0, -590.0), k=400, turn=FROM_REST)._replace(tracking=0.1)
+    assert worth(trajectory_return, way) == pytest.approx(0.1 * (-10.0 * 9.0 - 0.1 * 100.0))
+    out = step(x=(80.0, 0.0), k=300)._replace(tracking=0.1)
+    assert worth(trajectory_return, out) == pytest.approx(3000.0 - 200.0 * 25.0)
+
+
 def test_the_trajectory_rewards_take_the_smallest_eigenvalue_of_two_parameters() -> None:
     before, after = pack(np.diag([7.0, 900.0])), pack(np.array([[50.0, 30.0], [30.0, 50.0]]))  # λ: 7; 20 and 80
     for reward in (trajectory_return, hybrid_return):
@@ -140,6 +148,9 @@ def test_the_trajectory_rewards_take_the_smallest_eigenvalue_of_two_parameters()
 def test_the_amplified_determinant_rewards() -> None:
     before, after = pack(np.diag([2.0, 3.0])), pack(np.diag([4.0, 6.0]))  # the determinant grows fourfold
     gain = math.log(4.0)
+    assert worth(determinant_step, step(before, after)) == pytest.approx(gain, rel=1e-6)  # eq. 4.13
+    assert worth(determinant_step, step(before, after, x=(77.0, 0.0))) == pytest.approx(gain - 800.0, rel=1e-6)
+    assert worth(determinant_step, step(before, after, violated=True)) == -4e4
     assert worth(determinant_gain, step(before, after)) == pytest.approx(1e4 * gain, rel=1e-6)  # eq. 6.4
     assert worth(squared_determinant_gain, step(before, after)) == pytest.approx(1e4 * gain**2, rel=1e-6)  # eq. 6.5
     assert worth(determinant_gain, step(before, after, x=(77.0, 0.0))) == pytest.approx(1e4 * gain - 800.0, rel=1e-6)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -23,7 +23,7 @@ from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, LONGEST_DELAY, Instruments, Mechanics, Plant
 from emb_bench.information.fisher import Kind, weights_of
-from emb_bench.information.symmetric import Floats, add_increment, packed_size
+from emb_bench.information.symmetric import Floats, add_increment, packed_size, upper
 from emb_bench.sim.instruments import MEMORY, command, measure, settle
 from emb_bench.sim.simulated_brake import pass_period, sent_current
 from emb_runtime.config.bench import OLDEST_FRAME, PARAMETER_NAMES, BrakeParameters, Ranges
@@ -53,6 +53,11 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     observes: Literal["measured", "everything"] = MEASURED
     """Observation of the actor: ``measured`` angle, velocity and step, or ``everything`` (x₁, x₂, k, θ, the FIM)."""
     information: Kind = "weighted"  # Fisher information that is collected: the thesis's, or the physical one
+    draws: Literal["uniform", "normal"] = "uniform"
+    """Distribution of the brakes in their ranges: normal is cut off at both ends, two standard deviations away."""
+    normalised_by: Literal["true", "nominal"] = "true"
+    """Values that the rewards divide the parameters by (eq. 4.17): those of each brake, or those of the bench."""
+    tracking: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0  # Factor of the weights of the deviation from the quintic
     command_delay: tuple[int, int] = (0, 0)
     """Least and most samples that a command waits beside the plant's own delay, drawn for each experiment."""
 
@@ -331,7 +336,7 @@ class Batch:
             brake: the brake to use instead of a drawn one.
         """
         e = self.experiments
-        parameters = rng.uniform(self._ranges.low, self._ranges.high)
+        parameters = drawn(self._ranges, rng, self.conditions.draws)
         e.brakes[i] = parameters if brake is None else brake
         e.noise[i] = rng.standard_normal(e.noise.shape[1:]) * self._deviations
         jitter = self._plant.instruments.clock_jitter
@@ -398,6 +403,15 @@ class Batch:
         """Observation of an excitation: the actor's three and the current that acted in the last period [A], [N, 4]."""
         return np.column_stack((self.y, self.k, self.experiments.applied)).astype(np.float32)
 
+    def information(self) -> Floats:
+        """Packed FIMs as the rewards see them, by the conditions, shape [N, n (n + 1) / 2]; a copy."""
+        if self.conditions.normalised_by == "true":
+            return self.m.copy()
+        nominal = np.array([getattr(self.bench.brake, name) for name in self.parameters])
+        ratio = nominal / self.brakes[:, self._columns]
+        i, j = upper(len(self.parameters))
+        return self.m * ratio[:, i] * ratio[:, j]
+
     def info(self) -> dict[str, NDArray[Any]]:
         """Outputs of an environment beside the observation, each with N as its first dimension; all of them copies."""
         return {
@@ -432,6 +446,18 @@ class Batch:
                 e.past / limits.current,
             ]
         return np.concatenate(parts, axis=1, dtype=np.float32)
+
+
+def drawn(ranges: Ranges, rng: np.random.Generator, distribution: str) -> Floats:
+    """Parameters of one brake, drawn from ranges (thesis 4.7.2, 6.2), shape [6]."""
+    low, high = np.array(ranges.low), np.array(ranges.high)
+    if distribution == "uniform":
+        return rng.uniform(low, high)
+    z = rng.standard_normal(len(low))
+    while (beyond := np.abs(z) > 2.0).any():
+        z[beyond] = rng.standard_normal(int(beyond.sum()))
+    parameters: Floats = 0.5 * (low + high) + 0.25 * (high - low) * z
+    return parameters
 
 
 def require_possible(plant: Plant, conditions: Conditions) -> None:

@@ -58,14 +58,15 @@ class Scoring:
             UsageError: see :meth:`emb_train.closed_loop.Batch.advance`.
         """
         batch, turn, rules = self._batch, self._turn, self._batch.setup.rules
-        before, velocity = batch.m.copy(), batch.x[:, 1].copy()
+        before, velocity = batch.information(), batch.x[:, 1].copy()
         batch.advance(wanted)
+        after, tracking = batch.information(), batch.conditions.tracking
         x, now = batch.x[:, :2], batch.k == OUTWARD
         if now.any():
-            turn.x[now], turn.m[now] = x[now], batch.m[now]
+            turn.x[now], turn.m[now] = x[now], after[now]
             turn.acceleration[now] = (x[now, 1] - velocity[now]) / rules.sample_time
         return self._reward(
-            Transition(before, batch.m, x, batch.k, batch.violated, turn, rules.horizon, rules.sample_time)
+            Transition(before, after, x, batch.k, batch.violated, turn, rules.horizon, rules.sample_time, tracking)
         )
 
 

@@ -50,6 +50,7 @@ class Transition(NamedTuple):
     turn: Turn
     horizon: int  # Steps in one experiment, T
     sample_time: float  # [s]
+    tracking: float = 1.0  # Factor of the weights of the deviation from the quintic, which the thesis does not print
 
 
 Reward = Callable[[Transition], Floats]
@@ -98,6 +99,11 @@ def hybrid_return(t: Transition) -> Floats:
     return _explored(t, -costs + HYBRID_PAID * gathered_at_home(t))
 
 
+def determinant_step(t: Transition) -> Floats:
+    """r_k = log |M_k| − log |M_{k−1}|, as it is (eq. 4.13, 6.2.1), with the penalties of eq. 5.14."""
+    return np.where(t.violated, -UNSAFE, gain(LOG_DET, t, EPSILON) - risk(t))
+
+
 def determinant_gain(t: Transition) -> Floats:
     """r_k = α (log |M_k| − log |M_{k−1}|), method 1 (eq. 6.4), with the penalties of eq. 5.14 (not printed for it)."""
     return np.where(t.violated, -UNSAFE, ALPHA * gain(LOG_DET, t, EPSILON) - risk(t))
@@ -138,7 +144,8 @@ def deviation(t: Transition, end: int) -> Floats:
     time: Floats = t.sample_time * (t.step - OUTWARD).astype(np.float64)
     x1, x2 = t.turn.x[:, 0], t.turn.x[:, 1]
     angle, velocity = quintic(x1, x2, t.turn.acceleration, t.sample_time * (end - OUTWARD), time)
-    return ANGLE_WEIGHT * (t.x[:, 0] - angle) ** 2 + VELOCITY_WEIGHT * (t.x[:, 1] - velocity) ** 2
+    apart = ANGLE_WEIGHT * (t.x[:, 0] - angle) ** 2 + VELOCITY_WEIGHT * (t.x[:, 1] - velocity) ** 2
+    return t.tracking * apart
 
 
 def gathered_at_home(t: Transition) -> Floats:
@@ -184,6 +191,7 @@ REWARDS: Mapping[str, Reward] = {
         *ONE_PARAMETER,
         trajectory_return,
         hybrid_return,
+        determinant_step,
         determinant_gain,
         squared_determinant_gain,
         log_determinant,
