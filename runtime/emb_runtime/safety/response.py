@@ -395,5 +395,5 @@ class Response:
         late, error = overshoot(model, memory, 0.0)
         delay = memory[STATE + MOTOR] * model.current * model.sample_time
         most = model.age + model.extra / model.sample_time
-        found = f"{model.age + late / delay:.1f} ± {error / delay:.1f}"
+        found = f"{model.age + late / delay:z.1f} ± {error / delay:.1f}"
         return f"the velocity follows the commands {found} samples late, at most {most:.3g} are declared"

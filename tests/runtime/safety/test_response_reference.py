@@ -347,6 +347,8 @@ def test_a_run_has_the_slow_law_until_its_response_is_proven_and_again_in_the_ne
         assert response.rows == [Row(False, 0.0, 0.0, 0.0), *sliding(0)[: len(response.rows) - 1]]
         assert response.text.startswith("the velocity follows the commands 0.0 ± 0.")
         assert response.text.endswith(" samples late, at most 0 are declared")
+        response._memory[STATE + OVERSHOOT] = -1e-3
+        assert response.text.startswith("the velocity follows the commands 0.0 ± 0.")
 
 
 def told(text: str) -> tuple[float, float, float]:
