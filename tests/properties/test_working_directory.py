@@ -23,8 +23,8 @@ STARTING = {
     "emb-run --iface nope0 --home": 4,
     "emb-gateway --iface nope0 --drive map.toml": 2,
     "emb-commission brake --bench bench.toml --iface nope0 --yes": 4,
-    "emb-replay campaign run.mcap -o rows.parquet --jobs 2": 0,
-    "emb-replay campaign run.mcap -o ray.parquet --jobs 2 --ray local": 0,
+    "emb-replay campaign made.mcap -o rows.parquet --jobs 2": 0,
+    "emb-replay campaign made.mcap -o ray.parquet --jobs 2 --ray local": 0,
 }
 """Commands that start processes, and their exit codes."""
 
@@ -32,7 +32,7 @@ STARTING = {
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found: Path = tmp_path_factory.mktemp("here")
-    assert emb_run(["--iface", "sim", "--log", str(found / "run.mcap")]) == 0
+    assert emb_run(["--iface", "sim", "--log", str(found / "made.mcap")]) == 0
     for name in PLANTED:
         (found / f"{name}.py").write_text(f"open({str(found / 'ran')!r}, 'a').write('{name} ')\nraise SystemExit(77)\n")
     (found / "actor.onnx").write_bytes((ROOT / "runtime/emb_runtime/policy/quick.onnx").read_bytes())
