@@ -133,14 +133,14 @@ def clamping_slopes(m: Mechanics, p: BrakeParameters, x1: float, w: float) -> tu
 
 
 def clamping_share(m: Mechanics, p: BrakeParameters, x1: float, w: float, i: int) -> float:
-    """θ_i ∂F_cl/∂θ_i for unknown ``i`` at constant angle and w [N]; for the angle of contact ∂F_cl/∂contact [N/rad]."""
+    """θ_i ∂F_cl/∂θ_i for unknown ``i`` at constant angle and w [N]; ∂F_cl/∂θ_i for a curvature and the contact."""
     x, both = travel(m, x1, w), 1.0 + m.hysteresis * w
     if i == K_1:
         return clamping_force(m, p, x1, w)
     if i == QUADRATIC:
-        return p.k_1 * m.quadratic * x * x * both
+        return p.k_1 * x * x * both
     if i == CUBIC:
-        return p.k_1 * m.cubic * x * x * x * both
+        return p.k_1 * x * x * x * both
     if i == HYSTERESIS:
         return p.k_1 * x * (1.0 + x * (m.quadratic + x * m.cubic)) * m.hysteresis * w
     if i == CONTACT:

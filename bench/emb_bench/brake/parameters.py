@@ -118,10 +118,11 @@ PARAMETERS: Mapping[str, Parameter] = {
     ),
     "quadratic": Parameter(
         "1/rad",
-        about="curvature of the clamping force, k_1 x (1 + quadratic x + cubic x²) [1/rad]",
-        low=1e-8,
+        False,
+        "curvature of the clamping force, k_1 x (1 + quadratic x + cubic x²) [1/rad]",
         high=0.1,
         start=1e-4,
+        gross=0.01,
         effect="a quadratic stiffness",
         remedy="estimate it as well: --nuisance quadratic,cubic",
         step=1e-5,
@@ -129,10 +130,11 @@ PARAMETERS: Mapping[str, Parameter] = {
     ),
     "cubic": Parameter(
         "1/rad²",
-        about="the next term of that curve [1/rad²]",
-        low=1e-10,
+        False,
+        "the next term of that curve [1/rad²]",
         high=1e-2,
         start=1e-6,
+        gross=1e-4,
         effect="a cubic stiffness",
         remedy="estimate it as well: --nuisance quadratic,cubic",
         step=1e-7,
@@ -208,14 +210,14 @@ PARAMETERS: Mapping[str, Parameter] = {
     ),
 }
 
-CURVED = ("quadratic", "cubic")
-"""Relative parameters that may be negative."""
+CURVED = {"quadratic": 1, "cubic": 2}
+"""Terms of the clamping force that may be negative, and their powers of the angle."""
 
 
 def least(name: str) -> float:
     """Least value that a brake can have, SI units."""
     row = PARAMETERS[name]
-    if not row.relative or name in CURVED:
+    if not row.relative:
         return -math.inf
     return 1.0 if name == "break_away" else 0.0
 

@@ -40,9 +40,9 @@ class Mechanics(NamedTuple):
     """Speed at which the static friction has decayed, eq. 3.5 [rad/s]; 0: it acts at rest only."""
     stribeck_exponent: Annotated[float, Meta(ge=1, le=4)] = 2.0  # δ_σ of eq. 3.5
     f_l: Annotated[float, Meta(ge=0, le=1e-4)] = 0.0  # Static friction by load, T_s = T_s0 + f_l F_cl, eq. 3.6 [m]
-    quadratic: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    quadratic: Annotated[float, Meta(ge=-1, le=1)] = 0.0
     """F_cl = k_1 x (1 + quadratic x + cubic x²), eq. 3.9 with k_1 as the slope at contact [1/rad]."""
-    cubic: Annotated[float, Meta(ge=0, le=1)] = 0.0  # [1/rad²]
+    cubic: Annotated[float, Meta(ge=-1, le=1)] = 0.0  # [1/rad²]
     hysteresis: Annotated[float, Meta(ge=0, le=0.5)] = 0.0
     """Share by which the clamping force is higher on applying and lower on releasing (section 3.2.1)."""
     hysteresis_travel: Annotated[float, Meta(ge=0.01, le=100)] = 1.0  # From the middle to one side [rad]

@@ -100,7 +100,7 @@ class Problem:
         for i, unknown in enumerate(self.unknowns):
             if unknown.record is None:
                 own, row = of_all.get(unknown.name, 0.0), PARAMETERS[unknown.name]
-                values[i] = row.start if unknown.name in FEATURES and own <= row.low else own
+                values[i] = row.start if unknown.name in FEATURES and own in (0.0, row.low) else own
                 continue
             record = self.records[unknown.record]
             x1, x2 = record.start(record.angle if free else offset)

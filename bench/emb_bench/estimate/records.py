@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import NamedTuple
 
 from emb_bench.brake.motion import Floats, is_plain
-from emb_bench.brake.parameters import FEATURES, OF_A_RECORD, PARAMETERS
+from emb_bench.brake.parameters import CURVED, FEATURES, OF_A_RECORD, PARAMETERS
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DIRECTED, EXACT, Plant
 from emb_bench.experiment.simulate import SystematicErrors
@@ -81,8 +81,10 @@ class EstimationProblem(Question):
 
 
 def searched(bench: Bench, unknown: Unknown) -> tuple[float, float]:
-    """Search range of an unknown: lowest and highest value in SI units."""
+    """Search range of an unknown: lowest and highest value in SI units. No curvature alone lets the clamp pull."""
     row, limits = PARAMETERS[unknown.name], bench.limits
+    if unknown.name in CURVED:
+        return -(max(map(abs, limits.angle)) ** -CURVED[unknown.name]), row.high
     if row.low < row.high:
         return row.low, row.high
     if row.relative:

@@ -22,7 +22,7 @@ import numpy as np
 from scipy import special
 
 from emb_bench.brake.motion import Floats, is_plain
-from emb_bench.brake.parameters import CURVED, FEATURES, PARAMETERS, SI, Parameter, Quantity, quantity
+from emb_bench.brake.parameters import FEATURES, PARAMETERS, SI, Parameter, Quantity, quantity
 from emb_bench.config.bench import Bench
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import DIRECTED, EXACT, Mechanics
@@ -153,14 +153,12 @@ OF_THE_SPRING = (
 def possible(name: str, bench: Bench) -> tuple[float, float]:
     """Least and greatest amount of an effect that a brake can have.
 
-    No constant changes its sign or by more than is searched, nor is any other torque larger than what it changes. No
-    curvature lets the clamp pull. Whole samples of a delay are not searched, yet possible.
+    No constant changes its sign or by more than is searched, nor is any other torque larger than what it changes.
+    Whole samples of a delay are not searched, yet possible.
     """
     if name in TORQUES and name != "play":
         return -1.0, 1.0
-    row, farthest = EFFECTS[name], max(map(abs, bench.limits.angle))
-    if name in CURVED:
-        return -(farthest ** (-1.0 if name == "quadratic" else -2.0)), row.high
+    row = EFFECTS[name]
     if row.positive:
         return 0.0, row.high - row.low
     if row.relative:

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
-from emb_bench.brake.parameters import CURVED, PARAMETERS, UNITS, quantity
+from emb_bench.brake.parameters import PARAMETERS, UNITS, quantity
 from emb_bench.experiment.experiment import Experiment, Lack
 from emb_bench.information.identifiability import Border, Doubt, combination
 from emb_bench.numbers import amount, in_samples, p_value, percent
@@ -36,7 +36,6 @@ INTERVALS = (
     "that the record cannot exclude."
 )
 
-SOFTENING = "no model has a clamp that becomes softer: allow for a disturbance, --method pem"
 NOISE_ALONE = "± repeatability (95 %, k=2), by sensor noise alone: no systematic or other error is allowed for."
 
 TERMS = {
@@ -429,7 +428,7 @@ def explained(s: Suspect, machine: Machine | None = None) -> str:
     said = effect.effect
     for parameter in PARAMETER_NAMES:
         said = said.replace(parameter, quantity(machine, parameter).name)
-    remedy = SOFTENING if s.name in CURVED and s.value < 0.0 else effect.remedy
+    remedy = effect.remedy
     if machine is not None and "--model" in remedy:  # the plant of a recording is that of its map
         remedy = "leave [signals.velocity] out of the map"
     return f"{said} of about {amount} explains it ({abs(s.sigmas):.0f} sigma); remedy: {remedy}"

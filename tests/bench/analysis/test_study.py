@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import shlex
 import shutil
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
@@ -13,6 +14,7 @@ import pytest
 from emb_bench.analysis.conclusion import Standing, conclude
 from emb_bench.analysis.profile import profile
 from emb_bench.analysis.study import ModelStanding, StudyOptions, make_study
+from emb_bench.api import simulate as simulate_run
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
 from emb_bench.config.bench import Bench, parse_bench
@@ -161,13 +163,13 @@ def test_two_brakes_in_one_call_are_said_to_fit_each_alone(bench: Bench, log: Lo
 
 
 def test_a_nuisance_at_the_border_of_its_search_cuts_the_interval_of_a_parameter(bench: Bench, log: Log) -> None:
-    curved = EstimationProblem(nuisances=("quadratic", "cubic"))
-    study = make_study(bench, [log("plant=exact,seed=2")], StudyOptions(curved))
+    sticking = EstimationProblem(nuisances=("break_away", "stribeck_velocity"))
+    study = make_study(bench, [log("plant=exact,seed=2")], StudyOptions(sticking))
     assert study["k_1"].finding.doubts == (Doubt.CUT,)
     (cut,) = (profile for profile in study.profiles if profile.label == "k_1")
     assert DOUBTS[Doubt.CUT] in sentence(cut, study.estimate)
     (remedy,) = remedies(study, stopped=False)
-    assert "quadratic, cubic" in remedy
+    assert "break_away, stribeck_velocity" in remedy
 
 
 SUBSETS = [chosen for count in (1, 2, 3) for chosen in combinations(PARAMETER_NAMES, count)]
@@ -245,6 +247,21 @@ def test_the_remedy_of_the_first_suspect_gives_a_model_that_fits(plant: str, log
     names = REMEDIES[first].rstrip(",")
     said = replay.document("estimate", run.path, "--model", "exact", "--nuisance", names)
     assert said["model_fits"], names
+
+
+@pytest.mark.parametrize("curve", ["quadratic = -2e-3", "cubic = -5e-5", "quadratic = 3e-3\ncubic = -4e-5"])
+def test_a_clamp_that_becomes_softer_is_estimated_by_the_command_that_names_it(
+    curve: str, tmp_path: Path, replay: Replay
+) -> None:
+    (file := tmp_path / "bench.toml").write_text(f"{shipped_bench_text()}\n[plants.softer]\n{curve}\n")
+    run, true = tmp_path / "run.mcap", {"quadratic": 0.0, "cubic": 0.0} | tomllib.loads(curve)
+    simulate_run(run, plant="softer", bench=file, seed=7)
+    suspect = replay.document("estimate", run, "--model", "exact")["misfit"]["suspected"][0]
+    said = replay.document("estimate", run, "--model", "exact", "--nuisance", REMEDIES[suspect["name"]])
+    assert said["model_fits"]
+    for name, value in true.items():
+        low, high = said["parameters"][name]["interval_95"]
+        assert low < value < high, name
 
 
 def test_every_nuisance_of_a_remedy_can_be_asked_for() -> None:
