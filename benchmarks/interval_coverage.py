@@ -17,10 +17,11 @@ no code with the estimators. The cases are ``CASES``:
 - ``sensors``: coarse encoders and slow observers. The bench file states √(σ² + step²/12) as noise of the angle.
 
 Where J and the scale of the angle are right in all records, the bench file says so (``inertia = angle_scale = 0``), for
-their priors are wide beside everything else. A row has the records that are said to fit, the parameters inside their
-95 % intervals by total and by repeatability, the records that are said to fit with a parameter beyond 3 total
-deviations, and the share of noticed errors whose cause is named first. Shares have 95 % intervals (Clopper and Pearson
-1934); parameters of one record are not independent, and count as if they were.
+their priors are wide beside everything else; ``repeatability`` does so with the clock as well. A row has the records
+that are said to fit, the parameters inside their 95 % intervals by total and by repeatability, the records that are
+said to fit with a parameter beyond 3 total deviations, and the share of noticed errors whose cause is named first.
+Shares have 95 % intervals (Clopper and Pearson 1934); parameters of one record are not independent, and count as if
+they were.
 """
 
 from __future__ import annotations
@@ -129,6 +130,7 @@ ERRORS = {
     "velocity_gain": "velocity_gain",
     "inertia": "inertia",
     "angle_scale": "angle_scale",
+    "time_scale": "clock_scale",
 }
 """Systematic errors of a right model, and what they are in the simulator."""
 LATEST = 0.85  # Largest delay that is drawn [samples]; the simulator has none below 0, so its prior is folded there
@@ -210,6 +212,7 @@ def prior(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
         drawn["delay"] = min(drawn["delay"], LATEST)
         drawn["inertia"] = brake.inertia * (1.0 + known.inertia * rng.standard_normal())
         drawn["angle_scale"] = known.angle_scale * rng.standard_normal()
+        drawn["clock_scale"] = known.time_scale * rng.standard_normal()
         brake = Brake(**(vars(brake) | drawn))
         yield Drawn("prior", bench, plant, simulate(brake, bench, rng, f"seed {at}"), brake)
 
@@ -407,6 +410,8 @@ def main() -> None:
     bench = load_bench()
     if args.case not in {"total", "inertia", "angle_scale", "prior"}:
         bench = replace(bench, systematic=replace(bench.systematic, inertia=0.0, angle_scale=0.0))
+    if args.case == "repeatability":
+        bench = replace(bench, systematic=replace(bench.systematic, time_scale=0.0))
     for drawn in CASES[args.case](bench, args.draws, args.seed):
         outcomes.setdefault(drawn.row, []).append(judge(drawn, args.method, systematic=args.systematic == "bench"))
     for row, own in outcomes.items():

@@ -15,9 +15,8 @@ from emb_bench.config.plants import Plant
 from emb_bench.estimate.intervals import deviations, unnoticed
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import (
-    ANGLE_SCALE,
-    CURRENT_SCALE,
     NORMAL_95,
+    SCALES,
     Contribution,
     End,
     EstimationProblem,
@@ -28,7 +27,7 @@ from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 
-OF_THE_BENCH = ("J", ANGLE_SCALE, CURRENT_SCALE)  # Effects that all runs on one bench share
+OF_THE_BENCH = ("J", *SCALES)  # Effects that all runs on one bench share
 
 
 class Ratio(NamedTuple):

@@ -167,7 +167,8 @@ def of_problem(problem: Problem, z: Floats) -> Interval:
 
 def columns(problem: Problem, z: Floats, shown: Simulated) -> dict[str, Floats]:
     """Columns of the effects that the total allows for: samples per unit, in standard deviations."""
-    names = tuple(name for name in problem.asked.allowed if name in ("J", *PARAMETER_NAMES))
+    own = [unknown.name for unknown in problem.unknowns]
+    names = tuple(name for name in ("J", *PARAMETER_NAMES) if name not in own)
     found = {name: [shown.columns(0, names)[:, k]] for k, name in enumerate(names)}
     if any(record.gap_unknowns for record in problem.records):
         found |= secants(problem, z, shown)

@@ -26,7 +26,8 @@ SEVERAL: Mapping[str, tuple[str, ...]] = {
     "stiffness_ripple": ("stiffness_sine", "stiffness_cosine"),
 }
 """Keys of ``[systematic]`` that stand for several effects."""
-ANGLE_SCALE, CURRENT_SCALE = "angle_scale", "current_scale"  # Relative errors of their scales
+ANGLE_SCALE, CURRENT_SCALE, TIME_SCALE = SCALES = "angle_scale", "current_scale", "time_scale"
+"""Relative errors of the scales of angle and current, and of the clock."""
 FREE = 0.05  # Standard deviation of J, as a share of it, where a parameter tells it that is known beforehand
 FACTOR = 10.0  # Brakes beyond nominal by this factor are not searched
 METHODS: Mapping[str, str] = {

@@ -34,6 +34,8 @@ from emb_bench.estimate.records import (
     CURRENT_SCALE,
     DRIFTS,
     FACTOR,
+    SCALES,
+    TIME_SCALE,
     Contribution,
     JointScore,
     Suspect,
@@ -49,8 +51,7 @@ _OBSERVER = "estimate with a plant that has it: --model"
 
 NEVER_EXACT = (
     "J",
-    ANGLE_SCALE,
-    CURRENT_SCALE,
+    *SCALES,
     *PARAMETER_NAMES,
 )  # Constants that are wrong by something in every brake
 PRESENT = 0.5  # Probability, before any record, that a brake has a certain one of all other effects
@@ -371,11 +372,14 @@ def score(
 def scales(
     problem: Problem, z: Floats, jacobian: Floats, shown: Shown, every: Mapping[str, Floats], priors: Container[str]
 ) -> dict[str, Floats]:
-    """Columns of the scales of the sensors that the total allows for, beside ``every`` other effect's."""
+    """Columns of the scales of sensors and clock that the total allows for, beside ``every`` other effect's."""
     found = {ANGLE_SCALE: _angle_scaled(problem, z, shown)} if ANGLE_SCALE in priors else {}
+    own, count = [u.name for u in problem.unknowns], sum(record.samples.size for record in problem.records)
+    known = {name: every[name] if name in every else -jacobian[:count, own.index(name)] for name in ("k_m", "f_v", "J")}
     if CURRENT_SCALE in priors:  # a larger current acts as a larger k_m does
-        own, count = [u.name for u in problem.unknowns], sum(record.samples.size for record in problem.records)
-        found[CURRENT_SCALE] = every["k_m"] if "k_m" in every else -jacobian[:count, own.index("k_m")]
+        found[CURRENT_SCALE] = known["k_m"]
+    if TIME_SCALE in priors:  # torques go with s⁻², which is as a smaller J is, but for f_v, which goes with s⁻¹
+        found[TIME_SCALE] = 2.0 * known["J"] + known["f_v"]
     return found
 
 
@@ -452,7 +456,7 @@ def _priors(problem: Problem, drifting: float) -> dict[str, float]:
 
 def shown_as(s: Suspect | Contribution, machine: Machine | None) -> Quantity:
     """Name and unit of an effect as they are shown; no unit for what is relative."""
-    if s.name in (ANGLE_SCALE, CURRENT_SCALE):
+    if s.name in SCALES:
         return Quantity(s.name.replace("_", " "), "")
     if s.name in DRIFTS:
         parameter = s.name.removesuffix("_drift")

@@ -133,11 +133,11 @@ def intervals(e: Estimate) -> str:
 
 def effects(machine: Machine | None) -> dict[str, str]:
     """Effects of the score tests and of the uncertainty budget by the names that are shown, each in a line."""
-    from emb_bench.estimate.records import ANGLE_SCALE, CURRENT_SCALE, Contribution
+    from emb_bench.estimate.records import SCALES, Contribution
     from emb_bench.estimate.suspects import EFFECTS, shown_as
 
     said = {name: row.effect.removesuffix(",") for name, row in EFFECTS.items()}
-    said |= {ANGLE_SCALE: "an error of the angle's scale", CURRENT_SCALE: "an error of the current's scale"}
+    said |= {name: f"an error of the {name.removesuffix('_scale')}'s scale" for name in SCALES}
     for parameter in PARAMETER_NAMES:
         for name in (parameter, f"{parameter}_drift"):
             said[name] = said[name].replace(parameter, quantity(machine, parameter).name)

@@ -227,6 +227,7 @@ class Systematic:
     inertia: NotNegative = 0.01  # Relative error of J, which all four parameters share
     angle_scale: NotNegative = 0.003  # Relative error of the angle's scale, which k_m and T_c share
     current_scale: NotNegative = 0.0  # Relative error of the current's scale, where k_m is meant per true ampere
+    time_scale: NotNegative = 1e-5  # Relative error of the node's clock, which all four parameters share
     held: NotNegative = 0.02  # Relative error of each parameter that is held at its nominal value
     quadratic: NotNegative = 1e-4  # Quadratic share of the stiffness that the plant lacks [1/rad]
     cubic: NotNegative = 1e-6  # Cubic share of the stiffness that the plant lacks [1/rad²]
@@ -236,7 +237,7 @@ class Systematic:
     f_l: NotNegative = 1e-7  # Load-dependent static friction beyond the plant's [m]
     current_lag: NotNegative = 5e-4  # Time constant of the current loop beyond the plant's [s]
     slow_friction: NotNegative = 0.1  # Friction that decays over 100 or 200 rad/s, as a share of T_c
-    drag: NotNegative = 0.02  # Share by which f_v is larger at the limit of the velocity
+    drag: NotNegative = 0.1  # Share by which f_v is larger at the limit of the velocity
     ripple: NotNegative = 0.1  # Torque that changes once a turn of the motor, as a share of T_c
     stiffness_ripple: NotNegative = 0.003  # Share of the stiffness that changes once a turn of the motor
     current_gain: NotNegative = 0.01  # Share by which k_m is larger at the limit of the current

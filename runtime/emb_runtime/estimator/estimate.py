@@ -18,7 +18,7 @@ NORMAL_95 = 1.959963984540054  # Standard deviations that 95 % of a Gaussian lie
 UNITS = {"k_m": "N·m/A", "k_1": "N/rad", "T_c": "N·m", "f_v": "N·m·s/rad"}  # Of the parameters
 SCALED = ("k_m", "T_c")  # Parameters that an error of the angle's scale moves
 DOMINANT = 0.005  # Error of J, a standard deviation, from which on little else is in a total
-UNKNOWN = Systematic(inertia=0.0, angle_scale=0.0)  # Where no bench file says of what is known before a run
+UNKNOWN = Systematic(inertia=0.0, angle_scale=0.0, time_scale=0.0)  # Where no bench file says what is known beforehand
 NO_FIT = "THE MODEL DOES NOT FIT: friction, a delay or a sensor differs from the model"
 
 
@@ -26,8 +26,9 @@ def known_before(errors: Systematic) -> dict[str, float]:
     """Part of each parameter's total that is known before a run, as a share of the parameter.
 
     If all torques and J are scaled alike, the motion is the same: each parameter has the relative error of J. An angle
-    that is shown too large by some share makes k_m and T_c too large by it, and a current k_m too small. No record
-    determines any of them, so all add to the total with their priors, in quadrature.
+    that is shown too large by some share makes k_m and T_c too large by it, and a current k_m too small. A clock that
+    is slow by some share makes f_v too large by it, and the others by twice of it. No record determines any of them:
+    all add to the total with their priors, in quadrature.
     """
     return {
         name: NORMAL_95
@@ -35,6 +36,7 @@ def known_before(errors: Systematic) -> dict[str, float]:
             errors.inertia,
             errors.angle_scale if name in SCALED else 0.0,
             errors.current_scale if name == "k_m" else 0.0,
+            errors.time_scale * (1.0 if name == "f_v" else 2.0),
         )
         for name in PARAMETER_NAMES
     }
@@ -67,7 +69,10 @@ def total(repeatability: Mapping[str, float], errors: Systematic) -> str:
     before = known_before(errors)
     shares = [math.hypot(own, before[name]) for name, own in repeatability.items() if math.isfinite(own)]
     prior, cause = max(
-        (errors.inertia, "J"), (errors.angle_scale, "the angle's scale"), (errors.current_scale, "the current's scale")
+        (errors.inertia, "J"),
+        (errors.angle_scale, "the angle's scale"),
+        (errors.current_scale, "the current's scale"),
+        (errors.time_scale, "the clock"),
     )
     if not (shares and prior):
         return ""

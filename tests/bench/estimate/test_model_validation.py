@@ -181,15 +181,19 @@ def scaled(bench: Bench, inertia: float, angle: float) -> Bench:
 def test_what_no_record_can_know_enters_the_total_as_the_equation_of_motion_says(
     bench: Bench, method: str, plant: str
 ) -> None:
-    """J ω' = k_m i - γ k_1 x - T_c - f_v ω: only ratios to J show; with angles a times as large, k_m/a and T_c/a."""
+    """J ω' = k_m i - γ k_1 x - T_c - f_v ω: only ratios to J show; with angles a times as large, k_m/a and T_c/a.
+
+    If a period lasts s times as long as it is said to, k_m, k_1 and T_c show s² times as large, f_v s times.
+    """
     model, bench = bench.plant(plant), scaled(bench, 0.02, 0.005)
-    bench = replace(bench, systematic=replace(bench.systematic, current_scale=0.01))
+    bench = replace(bench, systematic=replace(bench.systematic, current_scale=0.01, time_scale=1e-3))
     data = record(bench, model, currents_of(bench, "chirp"), seed=1)
     e = fit(bench, model, [data], with_systematic(EstimationProblem(), bench, model), method=method)
     found = {one.name: dict(zip(e.labels, one.bias, strict=True)) for one in e.validation.budget}
     for name, expected in {
         "J": {"k_m": 0.02, "k_1": 0.02, "T_c": 0.02, "f_v": 0.02},
         "current_scale": {"k_m": 0.01, "k_1": 0.0, "T_c": 0.0, "f_v": 0.0},
+        "time_scale": {"k_m": 2e-3, "k_1": 2e-3, "T_c": 2e-3, "f_v": 1e-3},
         "angle_scale": {"k_m": 0.005, "k_1": 0.0, "T_c": 0.005, "f_v": 0.0}
         | ({"velocity_gain": 0.005} if plant == "exact" else {}),
     }.items():

@@ -210,7 +210,7 @@ def test_every_effect_of_the_tests_and_of_the_budget_is_explained_on_the_page_in
     named = {s["name"] for s in study["misfit"]["suspects"]} | {b["name"] for b in study["misfit"]["budget"]}
     assert {"play", "f_l", "contact", "hysteresis", "T_c_drift", "angle_scale"} <= named
     for name in named:
-        assert f" {name.replace('angle_scale', 'angle scale')} " in words, name
+        assert f" {name.replace('_scale', ' scale')} " in words, name
     assert all(said and not said.endswith(",") for said in effects(None).values())
 
 

@@ -99,6 +99,11 @@ def test_an_estimate_is_told_in_as_many_digits_as_its_repeatability_allows() -> 
 @pytest.mark.parametrize(
     ("repeatability", "known", "said"),
     [
+        (
+            {"k_m": 0.0, "f_v": 0.0},
+            (0.0, 0.0, 0.0, 1e-4),
+            "total at least 0.02 to 0.039 %, as the clock is known to 0.01 %",
+        ),
         ({"k_m": 1e-5, "f_v": 1e-5}, (0.01, 0.003, 0.0), "total about 2 %, as J is known to 1 %"),
         ({"k_1": 0.012, "f_v": math.inf}, (0.01, 0.003, 0.0), "total about 2.3 %, as J is known to 1 %"),
         ({"k_1": 1e-5, "T_c": 0.012}, (0.01, 0.003, 0.0), "total about 2 to 2.4 %, as J is known to 1 %"),
@@ -116,7 +121,9 @@ def test_an_estimate_is_told_in_as_many_digits_as_its_repeatability_allows() -> 
     ],
 )
 def test_the_total_is_told_by_what_is_known_before_a_run(
-    repeatability: dict[str, float], known: tuple[float, float, float], said: str
+    repeatability: dict[str, float], known: tuple[float, ...], said: str
 ) -> None:
-    inertia, angle, current = known
-    assert total(repeatability, Systematic(inertia=inertia, angle_scale=angle, current_scale=current)) == said
+    """By the deviations of J, angle, current and time."""
+    inertia, angle, current, time = (*known, 0.0)[:4]
+    errors = Systematic(inertia=inertia, angle_scale=angle, current_scale=current, time_scale=time)
+    assert total(repeatability, errors) == said
