@@ -31,8 +31,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from emb_bench.config.bench import Bench, load_bench
+from emb_bench.design.kernel import COARSE_SEARCHES
 from emb_bench.design.polish import polish
-from emb_bench.design.problem import COARSE_SEARCHES, Problem, make_problem
+from emb_bench.design.problem import Problem, make_problem
 from emb_bench.design.report import check
 from emb_bench.design.search import LONG, coarse, evolved, search
 from emb_bench.information.criteria import Criterion
@@ -72,8 +73,7 @@ def problem_for(bench: Bench, brake: BrakeParameters, model: str, name: str) -> 
 def leaves(bench: Bench, problem: Problem, currents: Floats, name: str) -> bool:
     """True if the design leaves a limit or is not home when it is simulated once more, in plain Python."""
     kind: Kind = "weighted" if name == "f_v" else "physical"
-    goal = Criterion("E" if name == "E" else "D")
-    again = check(bench, problem, goal, kind, currents, problem.plant.name)
+    again = check(bench, problem, kind, currents, problem.plant.name)
     return not (again.limits_held and again.home)
 
 

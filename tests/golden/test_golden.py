@@ -115,7 +115,22 @@ def alike(expected: str, text: str) -> bool:
     ("name", "arguments"),
     [
         ("info", ["info", "aborted.mcap"]),
-        ("design", ["design", "--bench", "short.toml", "--starts", "1", "--params", "k_m,T_c", "--model", "euler"]),
+        (
+            "design",
+            [
+                "design",
+                "--criterion",
+                "D",
+                "--bench",
+                "short.toml",
+                "--starts",
+                "1",
+                "--params",
+                "k_m,T_c",
+                "--model",
+                "euler",
+            ],
+        ),
         ("fim", ["fim", "good.mcap", "--theta", "true"]),
         ("fim-nominal", ["fim", "good.mcap", "--theta", "nominal", "--nuisance", "x1_0"]),
         ("fim-verbose", ["fim", "good.mcap", "--theta", "true", "-v"]),

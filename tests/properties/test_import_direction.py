@@ -26,8 +26,9 @@ OURS = set.union(*MAY_IMPORT.values())
 ROOMS = {
     "runtime/emb_runtime": "errors records numbers system config can estimator policy log safety drives control cli",
     "bench/emb_bench": "config documents numbers compiled output figures parallel brake sim logs experiment "
-    "information design excitation recordings export hil rerun estimate analysis report commission live batch api cli",
-    "train/emb_train": "presets rewards closed_loop env play reference trial evolve ppo training optimum evaluate cli",
+    "information excitation recordings export hil rerun estimate design analysis report commission live batch api cli",
+    "train/emb_train": "presets rewards closed_loop env intervals play reference trial evolve ppo training optimum "
+    "evaluate cli",
     "export/emb_export": "file network export",
 }
 """Sub-packages and single modules of each package, lowest first: each imports from those before it only."""

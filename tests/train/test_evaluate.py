@@ -12,6 +12,7 @@ import pytest
 import scipy.stats
 from numpy.typing import NDArray
 
+from emb_bench import api
 from emb_bench.config.bench import load_bench, parse_bench
 from emb_bench.design.problem import Problem, make_problem
 from emb_bench.excitation import parse_excitation, run_excitation
@@ -96,7 +97,7 @@ def test_policies_that_cannot_be_played_are_refused(tmp_path: Path) -> None:
 
 def test_the_measures_are_those_of_a_matrix_worked_out_by_hand_and_their_shares_nats_or_ratios() -> None:
     m = np.array([[[88.0, 30.0], [30.0, 8.0]]])  # with the prior [[100, 30], [30, 20]]: eigenvalues 110 and 10
-    values = {name: float(measure.values(m)[0]) for name, measure in MEASURES.items()}
+    values = {name: float(MEASURES[name].values(m)[0]) for name in ("D", "A", "E", "weighted")}
     assert values["D"] == pytest.approx(math.log(1100.0))
     assert values["E"] == pytest.approx(math.log(10.0))
     assert values["A"] == pytest.approx(-math.log(1.0 / 110.0 + 1.0 / 10.0))
@@ -116,6 +117,30 @@ def test_every_reference_asks_for_what_it_asks_for_in_the_runtime() -> None:
             np.testing.assert_allclose(excitation(seen), [excited.law(a, v, int(s)) for a, v, s, _ in seen.tolist()])
     own = Played(np.array([[1.0, 2.0], [3.0, 4.0]]))  # of each experiment its own
     assert own(np.array([[0, 0, 1, 0], [0, 0, 0, 0]], np.float32)).tolist() == [2.0, 3.0]
+
+
+def test_the_interval_is_that_of_the_currents_that_acted_on_each_brake(monkeypatch: pytest.MonkeyPatch) -> None:
+    draws = fresh_draws(WIDE, 3, 3)
+    brakes = [draw.brake for draw in draws]
+    for plant in ("exact", "stribeck"):
+        outcome = play(BENCH, WIDE, PARAMETER_NAMES, constant(3.0), draws, plant)
+        (alone,) = MEASURES["T"].of_outcomes(BENCH, plant, PARAMETER_NAMES, brakes, [outcome])
+        for currents, brake, found in zip(outcome.currents, brakes, alone, strict=True):
+            theta = {name: getattr(brake, name) for name in PARAMETER_NAMES}
+            known = api.fisher_information(currents, parameters=theta, plant=plant)
+            assert found == pytest.approx(api.interval(known).of_comparison, rel=1e-12)
+        (own,) = MEASURES["I"].of_outcomes(BENCH, plant, PARAMETER_NAMES, brakes, [outcome])
+        assert (own > alone).all()
+    monkeypatch.setattr("emb_train.intervals.FEW", 5)  # more than these are shared out to processes
+    both = MEASURES["T"].of_outcomes(BENCH, "stribeck", PARAMETER_NAMES, brakes, [outcome, outcome])
+    assert [values.tolist() for values in both] == 2 * [alone.tolist()]
+
+
+def test_an_experiment_that_tells_nothing_is_worth_nothing() -> None:
+    draws = fresh_draws(WIDE, 3, 1)
+    outcome = play(SHORT, WIDE, PARAMETER_NAMES, constant(0.0), draws)
+    (found,) = MEASURES["T"].of_outcomes(SHORT, "exact", PARAMETER_NAMES, [draws[0].brake], [outcome])
+    assert found.tolist() == [0.0]
 
 
 # Known-parameter optimum

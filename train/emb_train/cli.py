@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from emb_train.evaluate import Settings, Subject
     from emb_train.trial import Task
 
-CRITERIA = ("D", "A", "E", "weighted")
+CRITERIA = ("T", "I", "D", "A", "E", "weighted")
 FORMS = ("blind", "quadratic")
 REFERENCE, BENCH, METRICS = "reference.json", "bench.toml", "metrics.jsonl"  # Files of a folder of results
 EPILOG = """\
@@ -59,8 +59,10 @@ EVALUATE_EPILOG = """\
 POLICY: the folder of a training, an ONNX file, 'actor' for the shipped one, a reference's .json file, or one of
 {references}
 
-criteria: D, A and E of the physical information with the prior of +-50 %; 'weighted' is the smallest eigenvalue of the
-thesis's weighted information. All are relative to the true parameters.
+criteria: T adds -2 ln of the interval between runs of each parameter that an estimate will have, as emb-replay fim
+expects it, and I of its repeatability; D, A and E are those of the physical information of ideal sensors with the
+prior of +-50 %; 'weighted' is the smallest eigenvalue of the thesis's weighted information. All are relative to the
+true parameters.
 
 The optimum is the result of emb-design for the known brake. It exists for the plants euler and exact; a plant that
 differs from exact only in its instruments is compared with exact. It takes minutes for the first brake and 15 s for
@@ -159,9 +161,7 @@ def _add_evaluate(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "policies", nargs="+", metavar="POLICY", help="policies to evaluate; the first is compared with the others"
     )
-    p.add_argument(
-        "--criterion", choices=CRITERIA, default="D", help="measure of the information (default: %(default)s)"
-    )
+    p.add_argument("--criterion", choices=CRITERIA, default="T", help="measure of an experiment (default: %(default)s)")
     p.add_argument(
         "--ranges", metavar="NAME", help="name of the ranges that brakes are drawn from (default: the policy's)"
     )

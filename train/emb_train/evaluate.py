@@ -206,18 +206,21 @@ def evaluate(bench: Bench, settings: Settings, subjects: Sequence[Subject], tell
             model = searchable(bench.plant(plant)) if settings.optimum else ""
             if model not in known:
                 known[model] = optima(bench, measure, names, model, brakes, tell)[1:]
-            found[plant] = result(measure, outcomes, len(subjects), known[model])
+            drawn = [draw.brake for draw in draws]
+            values = measure.of_outcomes(bench, plant, names, drawn, list(outcomes.values()))
+            found[plant] = result(measure, outcomes, values, len(subjects), known[model])
     except KeyboardInterrupt:
         if not found:
             raise
     return found
 
 
-def result(measure: Measure, outcomes: Mapping[str, Outcome], policies: int, best: Floats) -> PlantResult:
-    """The rows of outcomes on one plant, of which the first are those of policies; ``best`` are the optima."""
+def result(
+    measure: Measure, outcomes: Mapping[str, Outcome], of_all: Sequence[Floats], policies: int, best: Floats
+) -> PlantResult:
+    """The rows of outcomes on one plant with their values, the first those of policies; ``best`` are the optima."""
     rows: list[Row] = []
-    for name, o in outcomes.items():
-        values = measure.values(o.matrices)
+    for (name, o), values in zip(outcomes.items(), of_all, strict=True):
         share = mean_score(measure.shares(values[: len(best)], best)) if len(best) else None
         ahead = mean_score((rows[0].values if rows else values) - values)
         learned, left, home = len(rows) < policies, int(o.left.sum()), int(o.home.sum())

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from emb_bench import excitation as reference
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT
+from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.information.criteria import Criterion, Name
 from emb_bench.information.fisher import Kind
 from emb_bench.information.symmetric import Floats, unpack
@@ -25,6 +26,7 @@ from emb_bench.numbers import LEVEL, Score
 from emb_runtime.config.bench import BrakeParameters, Ranges
 from emb_runtime.errors import PolicyRefusedError
 from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Bools, Conditions
+from emb_train.intervals import finite, intervals
 from emb_train.rewards import PRIOR
 
 ANGLE, VELOCITY, STEP, APPLIED = range(4)
@@ -100,6 +102,7 @@ class Outcome:
     the limits: that before it left them."""
     left: Bools  # Mask of the experiments that left the limits, shape [N]
     home: Bools  # Mask of the experiments that ended at home without having left the limits, shape [N]
+    currents: Floats  # Currents that acted in each period, 0 after an early end [A], shape [N, horizon]
 
 
 def play(
@@ -120,10 +123,12 @@ def play(
     batch = Batch(bench, ranges, parameters, len(draws), plant, conditions)
     begin_all(batch, draws)
     m, left = batch.m.copy(), np.zeros(len(draws), np.bool_)
-    for _ in followed(batch, excitation):
+    currents = np.zeros((len(draws), batch.setup.rules.horizon))
+    for k, _ in enumerate(followed(batch, excitation)):
         left |= batch.violated
         m = np.where(left[:, None], m, batch.m)
-    return Outcome(unpack(m, len(parameters)), left, batch.home & ~left)
+        currents[:, k] = np.where(left, 0.0, batch.experiments.applied)
+    return Outcome(unpack(m, len(parameters)), left, batch.home & ~left, currents)
 
 
 def joined(parts: Sequence[Results]) -> Results:
@@ -184,7 +189,7 @@ class Measure:
 
     name: str  # Name on the command line
     label: str  # Formula or description of the number, for people
-    criterion: Name  # Criterion whose optimum is searched for
+    criterion: Name | Literal["T", "I"]  # Criterion whose optimum is searched for
     kind: Kind  # Of Fisher information
     prior: float  # Added to the diagonal
     against: Literal["difference", "log-ratio", "ratio"]
@@ -192,15 +197,34 @@ class Measure:
     by their ratio."""
 
     @property
-    def goal(self) -> Criterion:
+    def goal(self) -> Criterion | IntervalCriterion:
         """Criterion that a design optimises; its φ is the logarithm of what counts here."""
+        if self.criterion == "T" or self.criterion == "I":  # a type checker narrows these alone
+            return IntervalCriterion(self.criterion)
         return Criterion(self.criterion)
 
     def values(self, matrices: Floats) -> Floats:
-        """Of matrices without a prior, shape [N, n, n] to [N]."""
-        size = matrices.shape[-1]
-        phi = self.goal.phi(matrices + self.prior * np.eye(size))
+        """Of matrices without a prior, shape [N, n, n] to [N]; not of an interval."""
+        size, goal = matrices.shape[-1], self.goal
+        assert isinstance(goal, Criterion)
+        phi = goal.phi(matrices + self.prior * np.eye(size))
         return phi if self.against != "ratio" else np.exp(phi)
+
+    def of_outcomes(
+        self,
+        bench: Bench,
+        plant: str,
+        parameters: Sequence[str],
+        brakes: Sequence[BrakeParameters],
+        outcomes: Sequence[Outcome],
+    ) -> list[Floats]:
+        """Of several outcomes of experiments with the same N brakes, each of shape [N]."""
+        goal = self.goal
+        if isinstance(goal, Criterion):
+            return [self.values(outcome.matrices) for outcome in outcomes]
+        currents = np.concatenate([outcome.currents for outcome in outcomes])
+        found = intervals(bench, plant, parameters, [*brakes] * len(outcomes), currents)
+        return np.split(finite([goal.of(one) for one in found]), len(outcomes))
 
     def shares(self, values: Floats, optima: Floats) -> Floats:
         """Of the optimum, for each draw: the difference in nat (0 at the optimum) for D, else the share (1 there)."""
@@ -215,6 +239,8 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
     {
         m.name: m
         for m in (
+            Measure("T", "T (the sum of -2 ln of the interval between runs)", "T", "physical", 0.0, "difference"),
+            Measure("I", "I (the sum of -2 ln of the repeatability)", "I", "physical", 0.0, "difference"),
             Measure("D", "ln det(M + 12 I)", "D", "physical", PRIOR, "difference"),
             Measure("A", "-ln tr (M + 12 I)^-1", "A", "physical", PRIOR, "log-ratio"),
             Measure("E", "ln lambda_min(M + 12 I)", "E", "physical", PRIOR, "log-ratio"),

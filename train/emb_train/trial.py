@@ -101,10 +101,11 @@ class Trials(Batch):
         m, left, reached = np.zeros_like(experiments.m), np.zeros(count, np.bool_), np.zeros(count)
         tables = np.ascontiguousarray(tables)
         used, fixed = np.zeros_like(tables), (self.setup, self.model, scale, self.box, self.precision)
-        compiled(play_trials)(*fixed, experiments, tables, m, left, reached, used)
+        acted = np.zeros((count, self.setup.rules.horizon))
+        compiled(play_trials)(*fixed, experiments, tables, m, left, reached, acted, used)
         home = (np.abs(x[:, 0]) <= shield.home_angle) & (np.abs(x[:, 1]) <= shield.home_velocity) & ~left
         matrices = unpack(m, len(self.parameters))
-        return ReportedOutcome(matrices, left, home, reached, used)
+        return ReportedOutcome(matrices, left, home, acted, reached, used)
 
 
 def play_trials(
@@ -118,6 +119,7 @@ def play_trials(
     informed: Floats,  # Becomes the packed FIM, up to where the limits were left, shape [N, n (n + 1) / 2]
     left: Bools,  # Becomes whether they were, shape [N]
     reached: Floats,  # Becomes the time until the precision was reached [s], shape [N]
+    acted: Floats,  # Becomes the currents that acted, 0 after the end [A], shape [N, horizon]
     used: Floats,  # Becomes the mean features of each row of the table
 ) -> None:
     """N experiments from their first sample to their end, to the precision or out of the limits, in place."""
@@ -141,6 +143,7 @@ def play_trials(
                 left[i] = True
                 break
             informed[i] = experiments.m[i]
+            acted[i, k[i] - 1] = experiments.applied[i]
         if not missing <= 1.0:
             reached[i] = duration * (1.0 + math.log(missing))
         average(used[i], weights)

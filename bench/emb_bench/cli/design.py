@@ -17,7 +17,9 @@ A design is for known parameters: it shows how good an excitation can be. Do not
 a brake with other parameters, which would leave its limits. The result is the best of many
 local optima.
 
-criteria: D log det M, A tr M^-1, E smallest eigenvalue.
+criteria: T, the interval of an estimate between runs; I, its repeatability; or a
+parameter, for its share in T: sums of -2 ln of relative deviations, as emb-replay fim
+expects them. Of ideal sensors: D log det M, A tr M^-1, E smallest eigenvalue.
 
 example:
   emb-design -o design.csv && emb-export design.csv -o design.onnx && emb-run --policy design.onnx

@@ -55,7 +55,7 @@ def annealed(problem: Problem, speeds: Floats, rng: np.random.Generator) -> Floa
     """
     tracks = tracked(problem, np.tile(speeds, (2, 1)))  # the present one and its variation
     best: Floats = tracks.u[0].copy()
-    compiled(anneal)(problem.task, problem.goal.compiled, VARIATIONS * len(speeds), rng, tracks, best)
+    compiled(anneal)(problem.task, problem.criterion.compiled, VARIATIONS * len(speeds), rng, tracks, best)
     return best
 
 

@@ -18,6 +18,7 @@ from emb_bench.config.plants import Mechanics
 from emb_bench.information.symmetric import Floats, add_increment
 from emb_runtime.config.bench import BrakeParameters
 
+COARSE_SEARCHES = 18  # Of one design, if nobody asks for another number; the best of them go on
 STATE_STEP = 1e-5
 """Half width of the differences in state and current [rad, rad/s, 1, A]: the maps are smooth, of order 1."""
 ASIDE = 2e-5

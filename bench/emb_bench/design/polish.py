@@ -88,7 +88,7 @@ class _Step:
 
     def solve(self, radius: float, cuts: int) -> tuple[Floats, float]:
         """Change of the currents within a radius [A], and the gain in :func:`merit` that is promised."""
-        now, phi = self.design, self.problem.goal.phi
+        now, phi = self.design, self.problem.criterion.phi
         change, gain = np.zeros(len(now.currents)), 0.0
         for _ in range(cuts):
             change, bound, slack = self._program(radius)
@@ -111,9 +111,9 @@ class _Step:
         n, kept = len(self.design.currents), self.kept
         rows, right = [], []
         for matrix in self.cuts:  # t <= phi(matrix) + <gradient, M + dM - matrix> - phi
-            slope = self.problem.goal.gradient(matrix)
+            slope = self.problem.criterion.gradient(matrix)
             rows.append(-np.einsum("kij,ij->k", self.slopes, slope))
-            ahead = float(self.problem.goal.phi(matrix)) - self.design.phi
+            ahead = float(self.problem.criterion.phi(matrix)) - self.design.phi
             right.append(ahead + float((slope * (self.design.matrix - matrix)).sum()))
         scale = max(float(np.abs(rows[0]).max()), 1e-12)
         cuts = np.zeros((len(rows), n + kept * n + 1))

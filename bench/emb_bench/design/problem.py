@@ -14,14 +14,16 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, EXACT, Plant
 from emb_bench.design import kernel
 from emb_bench.design.kernel import Box, Task
+from emb_bench.estimate.expected import NUMBERS, IntervalCriterion, of_experiment, sampled
+from emb_bench.estimate.records import check_model
 from emb_bench.information.criteria import Criterion
+from emb_bench.information.evaluation import Question
 from emb_bench.information.fisher import Kind, Weights, weights_along
 from emb_bench.information.symmetric import packed_size, unpack
 from emb_bench.sim.open_loop import check_unknowns, held, march, trajectory
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import EmbError, UsageError
 
-COARSE_SEARCHES = 18  # Of one design, if nobody asks for another number; the best of them go on
 MARGIN = 1e-5  # Margin of the box inside the limits [rad, rad/s]: more than rounding takes
 
 PARTS = 20  # Of a period, at whose ends the limits are checked where the brake moves between samples
@@ -29,12 +31,13 @@ PARTS = 20  # Of a period, at whose ends the limits are checked where the brake 
 
 @dataclass(frozen=True)
 class Problem:
-    """Design problem: a brake, an information criterion, and limits to keep."""
+    """Design problem: a brake, a criterion, and limits to keep."""
 
+    bench: Bench
     plant: Plant
     brake: BrakeParameters
     params: tuple[str, ...]
-    goal: Criterion
+    goal: Criterion | IntervalCriterion
     weights: Weights
     box: Box
     sample_time: float  # [s]
@@ -46,6 +49,23 @@ class Problem:
         chosen, start = no_sensitivity(self.params)
         bias = (chosen == OFFSET).astype(np.float64)
         return Task(self.plant.mechanics, self.brake, self.box, self.sample_time, chosen, start, bias, *self.weights)
+
+    @property
+    def criterion(self) -> Criterion:
+        """The goal, where it is one of the information and has a slope to climb."""
+        assert isinstance(self.goal, Criterion)
+        return self.goal
+
+    def phi(self, currents: Floats, matrix: Floats) -> float:
+        """The goal of currents [A], which have this Fisher information; −inf where they say nothing."""
+        if isinstance(self.goal, Criterion):
+            return float(self.goal.phi(matrix)) if np.isfinite(matrix).all() else -np.inf
+        experiment = sampled(self.bench, self.plant, currents)
+        try:
+            found = self.goal.of(of_experiment(self.bench, self.plant, self.brake, experiment, Question(self.params)))
+        except (EmbError, np.linalg.LinAlgError):
+            return -np.inf
+        return found if np.isfinite(found) else -np.inf
 
     def narrowed(self, angle: float, speed: float) -> Problem:
         """Returns the problem with limits tighter by an angle [rad] and a speed [rad/s]."""
@@ -64,8 +84,7 @@ class Problem:
         scaled = (y * root).transpose(1, 0, 2).reshape(len(task.chosen), -1)
         price, worst = compiled(kernel.excess)(x, self.box)
         matrix = scaled @ scaled.T
-        phi = float(self.goal.phi(matrix)) if np.isfinite(matrix).all() else -np.inf
-        return Design(currents, x, s, matrix, phi, price, worst)
+        return Design(currents, x, s, matrix, self.phi(currents, matrix), price, worst)
 
     def beyond(self, design: Design) -> tuple[float, float]:
         """Largest excess over the box in angle [rad] and speed [rad/s], between samples too.
@@ -99,7 +118,9 @@ class Problem:
         u, m, price = np.empty((count, self.horizon)), np.empty((count, packed_size(size))), np.empty(count)
         compiled(kernel.explore)(self.task, genes, u, m, price)
         matrices = unpack(m, size)
-        return u, matrices, self.goal.phi(matrices), price
+        if isinstance(self.goal, Criterion):
+            return u, matrices, self.goal.phi(matrices), price
+        return u, matrices, np.array([self.phi(*each) for each in zip(u, matrices, strict=True)]), price
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +143,7 @@ class Design:
 
 def make_problem(
     bench: Bench,
-    goal: Criterion,
+    goal: Criterion | IntervalCriterion,
     params: tuple[str, ...],
     *,
     model: str = DEFAULT_PLANT,
@@ -139,7 +160,14 @@ def make_problem(
         raise UsageError(f"plant '{model}': a design is for exact sample times")
     limits, home = bench.limits, bench.shield
     (weights,) = weights_along(bench, kind, plant.instruments, np.zeros((2, STATES)))
+    if not isinstance(goal, Criterion):
+        if kind != "physical":
+            raise UsageError(f"criterion {goal.name}: expected the physical information, got '{kind}'")
+        if goal.name not in (*NUMBERS, *params):
+            raise UsageError(f"criterion {goal.name}: expected {goal.name} among the parameters, {', '.join(params)}")
+        check_model(plant, params)
     return Problem(
+        bench=bench,
         plant=plant,
         brake=bench.brake if brake is None else brake,
         params=params,

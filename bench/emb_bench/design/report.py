@@ -18,6 +18,7 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EXACT
 from emb_bench.design.problem import PARTS, Problem
 from emb_bench.design.search import Found, search
+from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.experiment.experiment import planned
 from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.criteria import Criterion, criteria
@@ -52,7 +53,7 @@ class Check:
     home: bool
 
 
-def check(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, currents: Floats, plant_name: str) -> Check:
+def check(bench: Bench, problem: Problem, kind: Kind, currents: Floats, plant_name: str) -> Check:
     """Checks a sequence of currents on a brake: its criteria, and whether it keeps the bench's limits there."""
     plant = bench.model(plant_name)
     # What the brake does, not what sensors show of it later: the last periods count, too.
@@ -69,7 +70,7 @@ def check(bench: Bench, problem: Problem, criterion: Criterion, kind: Kind, curr
     current = float(np.abs(currents).max(initial=0.0))
     return Check(
         plant=plant_name,
-        value=criterion.value(float(criterion.phi(matrix))),
+        value=problem.goal.value(replace(problem, plant=plant).phi(currents, matrix)),
         log_det=found.log_det,
         lambda_min=found.lambda_min,
         trace_inverse=found.trace_inverse,
@@ -93,13 +94,17 @@ class Report:
 
     bench: Bench
     problem: Problem
-    criterion: Criterion
     kind: Kind
     seed: int
     starts: int
     version: str
     found: Found
     checks: tuple[Check, ...]  # Its own brake first
+
+    @property
+    def criterion(self) -> Criterion | IntervalCriterion:
+        """The criterion that was optimised."""
+        return self.problem.goal
 
     def __repr__(self) -> str:
         """Criterion and value in one line."""
@@ -157,7 +162,6 @@ class Report:
 def make_report(
     bench: Bench,
     problem: Problem,
-    criterion: Criterion,
     kind: Kind,
     *,
     starts: int,
@@ -170,13 +174,12 @@ def make_report(
     return Report(
         bench=bench,
         problem=problem,
-        criterion=criterion,
         kind=kind,
         seed=seed,
         starts=starts,
         version=metadata.version("emb-excite"),
         found=found,
-        checks=tuple(check(bench, problem, criterion, kind, found.best.currents, plant) for plant in plants),
+        checks=tuple(check(bench, problem, kind, found.best.currents, plant) for plant in plants),
     )
 
 

@@ -11,11 +11,13 @@ end.
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,8 +25,9 @@ import numpy as np
 from emb_bench.design.anneal import annealed
 from emb_bench.design.polish import Settings, merit, polish
 from emb_bench.design.problem import MARGIN, Design, Problem
-from emb_bench.information.criteria import distances
+from emb_bench.information.criteria import Criterion, distances
 from emb_bench.information.symmetric import Floats
+from emb_bench.parallel import Lost, shared_out
 from emb_runtime.errors import UsageError
 
 with warnings.catch_warnings():
@@ -35,6 +38,7 @@ JOURNEYS = (3, 4, 5)  # Journeys of a coarse design; the searches take turns
 SHORTEST = 0.003  # Shortest journey, as a share of the longest one
 DRAWN = 400  # Tables drawn at random, of which the best one starts a search
 FIRST = 4000  # Coarse designs that one search simulates
+FEW = 1500  # The same for a criterion of the interval, which takes a hundred times as long
 WIDE = 0.2  # Initial standard deviation of the genes, −1..1
 POPULATION = 24  # Population of CMA-ES
 WAVES = 3  # Batches of coarse searches, each of which keeps away from what the earlier ones found
@@ -46,6 +50,8 @@ ROUNDS = 20  # Most rounds of annealing
 PATIENCE = 4  # Rounds over which the gain is judged
 GAIN = 3e-4  # Gain of φ over these rounds below which the search ends
 SOFT = 0.05  # Share of the price of leaving the box that a coarse design pays: the polish brings it back in
+FIRM = 20.0  # The same where no polish follows
+WORST = -1e3  # Worth of a table that says nothing
 LONG = Settings(steps=80, tolerance=5e-5, cuts=4)  # Polish of every design at first, and of the best one at the end
 AGAIN = Settings(steps=6, tolerance=0.0, cuts=2)  # Polish after each annealing
 SHORT = Settings(steps=20, tolerance=1e-3, cuts=1)  # Polish of a finished design inside tighter limits
@@ -83,6 +89,8 @@ def search(
     ``starts`` are coarse searches, ``workers`` threads, 0 for one per processor, ``warm`` currents to begin with too.
     ``told`` is called after each of at most ``steps_of(starts)`` steps, with what was done.
     """
+    if not isinstance(problem.goal, Criterion):
+        return _best_table(problem, starts, seed, workers, told)
     seeds = np.random.SeedSequence(seed).spawn(starts + LINES)
     draws = [np.random.default_rng(s) for s in seeds[starts:]]
     tables: list[Table] = []
@@ -117,6 +125,29 @@ def search(
         )
     others = sorted((d for d in polished if d.feasible and d.phi < best.phi), key=_rank, reverse=True)
     return Found(best, (best, *others))
+
+
+def _best_table(problem: Problem, starts: int, seed: int, workers: int, told: Callable[[str], object]) -> Found:
+    """The best coarse design for a criterion without a slope to climb, within the limits between samples too."""
+    pieces = list(enumerate(np.random.SeedSequence(seed).spawn(starts)))
+    designs = []
+    for number, found in shared_out(partial(_table, problem), pieces, workers or os.cpu_count() or 1, math.inf):
+        if isinstance(found, Lost):
+            raise UsageError(f"start {number + 1} of the search: {found.why}")
+        told(f"start {number + 1} of {starts} done")
+        design = problem.design(found)
+        if design.feasible and max(problem.beyond(design)) <= MARGIN:
+            designs.append(design)
+    if not designs:
+        raise UsageError(f"no design of {starts} starts keeps the limits: try more starts")
+    designs.sort(key=_rank, reverse=True)
+    return Found(designs[0], tuple(designs))
+
+
+def _table(problem: Problem, piece: tuple[int, np.random.SeedSequence]) -> Floats:
+    """Currents of one coarse search."""
+    number, seed = piece
+    return coarse(problem, JOURNEYS[number % len(JOURNEYS)], seed).currents
 
 
 def steps_of(starts: int) -> int:
@@ -173,7 +204,8 @@ def coarse(problem: Problem, journeys: int, seed: np.random.SeedSequence, far: S
     drawn = low + rng.random((DRAWN, 3 * journeys)) * (high - low)
     near = rng.random((DRAWN, 2 * journeys)) < 0.5  # optima wait near contact, and creep
     drawn[:, : 2 * journeys] *= np.where(near, 0.4, 1.0)
-    return evolved(problem, drawn[np.argmin(_cost(problem, drawn, far))], WIDE, FIRST, rng, far=far)
+    count = FIRST if isinstance(problem.goal, Criterion) else FEW
+    return evolved(problem, drawn[np.argmin(_cost(problem, drawn, far))], WIDE, count, rng, far=far)
 
 
 def evolved(
@@ -219,5 +251,6 @@ def _borders(journeys: int) -> tuple[Floats, Floats]:
 def _cost(problem: Problem, genes: Floats, far: Sequence[Table] = ()) -> Floats:
     _, matrices, phi, price = problem.explore(np.ascontiguousarray(genes))
     nearest = np.min([distances(matrices, table.matrix) for table in far], axis=0, initial=NEAR)
-    cost = SOFT * price - phi + NEARNESS * (1.0 - nearest / NEAR)
+    soft, phi = (SOFT, phi) if isinstance(problem.goal, Criterion) else (FIRM, np.maximum(phi, WORST))
+    cost = soft * price - phi + NEARNESS * (1.0 - nearest / NEAR)
     return np.asarray(np.nan_to_num(cost, nan=1e9, posinf=1e9))

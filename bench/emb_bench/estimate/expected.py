@@ -40,7 +40,7 @@ from emb_bench.estimate.suspects import (
     secants,
     turning,
 )
-from emb_bench.experiment.experiment import Experiment
+from emb_bench.experiment.experiment import Experiment, planned
 from emb_bench.experiment.from_log import REST_SAMPLES
 from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors, Theta, simulate
 from emb_bench.information.evaluation import Evaluation, Information, Question
@@ -48,6 +48,8 @@ from emb_bench.information.identifiability import Spectrum
 from emb_bench.sim.open_loop import held, march, march_beside
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
+
+NUMBERS = ("T", "I")
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +98,28 @@ class Interval:
         return together
 
 
+@dataclass(frozen=True)
+class IntervalCriterion:
+    """Criterion of a search for an experiment [nat]: T, I, or the share in T of one parameter, by its name."""
+
+    name: str
+
+    def of(self, interval: Interval) -> float:
+        """The criterion of an interval; more is better."""
+        if self.name in NUMBERS:
+            return interval.of_comparison if self.name == "T" else interval.of_repeatability
+        return -2.0 * math.log(interval.between_runs[interval.names.index(self.name)])
+
+    def value(self, phi: float) -> float:
+        """The criterion in its own unit."""
+        return phi
+
+    @property
+    def label(self) -> str:
+        """Name of the value."""
+        return self.name if self.name in NUMBERS else f"T of {self.name}"
+
+
 def of_information(e: Information) -> Interval:
     """The interval that the experiment of an information leads to, at its parameters and with its unknowns.
 
@@ -109,9 +133,15 @@ def of_information(e: Information) -> Interval:
         raise UsageError("each run has an interval of its own: expected the information of one of them")
     experiment = replace(e.experiment, late=None, places=None)
     if not isinstance(e, Evaluation):
-        offset, rested = e.plant.instruments.encoder_offset, e.bench.noise.angle / math.sqrt(REST_SAMPLES)
-        experiment = replace(experiment, samples=np.zeros_like(experiment.samples), angle=offset, slack=rested)
+        experiment = sampled(e.bench, e.plant, experiment.currents)
     return of_experiment(e.bench, e.plant, e.theta, experiment, e.question, e.errors)
+
+
+def sampled(bench: Bench, plant: Plant, currents: Sequence[float] | Floats) -> Experiment:
+    """An experiment with planned currents [A] of which each sample is received, after a rest at the origin."""
+    experiment, offset = planned(currents), plant.instruments.encoder_offset
+    rested = bench.noise.angle / math.sqrt(REST_SAMPLES)
+    return replace(experiment, samples=np.zeros_like(experiment.samples), angle=offset, slack=rested)
 
 
 def of_experiment(

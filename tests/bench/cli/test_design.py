@@ -19,7 +19,7 @@ from emb_runtime.errors import UsageError
 from tests.benches import SENSOR_TEXT
 
 PERIODS = 50
-QUICK = ["--starts", "1", "--params", "k_m,T_c", "--model", "euler"]
+QUICK = ["--criterion", "D", "--starts", "1", "--params", "k_m,T_c", "--model", "euler"]
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def test_behind_an_observer_a_design_is_of_the_angle_alone(
         text = short.read_text(encoding="utf-8")
         short.write_text(f'{text}\n[sensors]\nvelocity = "observer"\nobserver_bandwidth = 800\n', encoding="utf-8")
     out, model = tmp_path / "design.csv", "exact" if told == "--bench" else "observer"
-    more = ["--starts", "1", "--params", "k_m,T_c", "--model", model, "--output", str(out)]
+    more = ["--criterion", "D", "--starts", "1", "--params", "k_m,T_c", "--model", model, "--output", str(out)]
     assert main(["--bench", str(short), *more]) == 0
     assert "physical information of the angle alone" in capsys.readouterr().out
     bench = load_bench(short)

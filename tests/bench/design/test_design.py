@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +13,15 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emb_bench import api
 from emb_bench.design import anneal
+from emb_bench.design import search as search_module
 from emb_bench.design.anneal import HOPELESS, PRICE, annealed, tracked, vary
 from emb_bench.design.polish import Settings, merit, polish
 from emb_bench.design.problem import MARGIN, Problem, make_problem
 from emb_bench.design.report import check
 from emb_bench.design.search import NEAR, coarse, search
+from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.information import symmetric
 from emb_bench.information.criteria import Criterion, Name, distances
 from emb_bench.information.fisher import Kind
@@ -162,7 +166,7 @@ def test_a_brake_that_is_tracked_reaches_the_speeds_of_a_design_again(model: str
     np.testing.assert_allclose(tracks.speeds[0], design.states[1:, 1], rtol=0.0, atol=near)
     again = p.design(tracks.u[0])
     np.testing.assert_array_equal(again.states[1:, 1], tracks.speeds[0])
-    assert again.phi == pytest.approx(float(p.goal.phi(unpack(tracks.m[:, -1], 4))[0]))
+    assert again.phi == pytest.approx(float(p.criterion.phi(unpack(tracks.m[:, -1], 4))[0]))
     assert again.price == pytest.approx(tracks.price[0], abs=1e-9)
 
 
@@ -184,7 +188,7 @@ def test_an_annealing_tells_of_its_designs_what_their_currents_are_worth(model: 
     for seed in range(15):
         tracks, best = tracked(p, np.zeros((2, 60))), np.empty(60)
         rng = np.random.default_rng(seed)
-        anneal.anneal(p.task, p.goal.compiled, 20, rng, tracks, best)
+        anneal.anneal(p.task, p.criterion.compiled, 20, rng, tracks, best)
         designs = [p.design(u) for u in tracks.u]
         for design, x, price in zip(designs, tracks.x, tracks.price, strict=True):
             np.testing.assert_array_equal(design.states[:, :2], x[:, :2])
@@ -241,7 +245,7 @@ def test_a_design_from_any_start_for_any_brake_keeps_the_limits_and_comes_home(
     p = replace(make_problem(BENCH, goal, TWO, model=model, brake=brake), horizon=60)
     start = np.random.default_rng(seed).uniform(-20.0, 20.0, 60)
     best = search(p, starts=1, seed=seed, warm=[start]).best
-    again = check(BENCH, p, goal, "physical", best.currents, model)
+    again = check(BENCH, p, "physical", best.currents, model)
     assert (again.limits_held, again.home) == (True, True)
 
 
@@ -265,7 +269,7 @@ def test_an_independent_integrator_finds_the_limits_held_and_the_brake_at_home()
 
 
 def test_check_sees_a_limit_that_is_left_and_a_brake_that_is_not_home() -> None:
-    again = check(BENCH, problem(), Criterion("D"), "physical", np.full(60, 6.0), "exact")
+    again = check(BENCH, problem(), "physical", np.full(60, 6.0), "exact")
     assert not again.limits_held
     assert not again.home
     assert again.largest_speed > 500.0
@@ -273,8 +277,7 @@ def test_check_sees_a_limit_that_is_left_and_a_brake_that_is_not_home() -> None:
 
 def test_check_sees_where_the_brake_is_at_the_end_where_measurements_come_late() -> None:
     late, exact = (
-        check(BENCH, problem(model=model), Criterion("D"), "physical", np.full(60, 2.0), model)
-        for model in ("late", "exact")
+        check(BENCH, problem(model=model), "physical", np.full(60, 2.0), model) for model in ("late", "exact")
     )
     assert replace(late, plant="exact") == exact
 
@@ -318,3 +321,38 @@ def test_no_design_is_above_the_proved_bound(name: Name) -> None:
     _, _, phi, price = p.explore(np.hstack([journeys, np.ones((200, 5))]))
     assert (price == 0.0).sum() > 50
     assert phi[price == 0.0].max() < ceiling(p, goal)
+
+
+@pytest.mark.parametrize("name", ["T", "I", "T_c"])
+def test_a_design_for_the_interval_is_worth_what_an_estimate_is_expected_to_tell(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(search_module, "FEW", 60)
+    monkeypatch.setattr(search_module, "DRAWN", 30)
+    monkeypatch.setattr(search_module, "shared_out", lambda work, pieces, *_: enumerate(map(work, pieces)))
+    p = replace(make_problem(BENCH, IntervalCriterion(name), PARAMETER_NAMES), horizon=120)
+    told: list[str] = []
+    found = search(p, starts=2, seed=1, told=told.append)
+    assert told == ["start 1 of 2 done", "start 2 of 2 done"]
+    interval = api.interval(api.fisher_information(found.best.currents))
+    deviations = interval.repeatability if name == "I" else interval.between_runs
+    wanted = -2.0 * np.log(deviations[2:3] if name == "T_c" else deviations).sum()
+    assert found.best.phi == pytest.approx(float(wanted), rel=1e-9)
+    assert found.best.feasible
+    assert max(p.beyond(found.best)) <= MARGIN
+    assert found.best.phi == max(design.phi for design in found.designs)
+    assert check(BENCH, p, "physical", found.best.currents, "exact").value == found.best.phi
+
+
+def test_currents_that_say_nothing_are_the_worst_design_for_the_interval() -> None:
+    p = replace(make_problem(BENCH, IntervalCriterion("T"), PARAMETER_NAMES), horizon=60)
+    assert p.design(np.zeros(60)).phi == -np.inf
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "words"),
+    [("T", {"kind": "weighted"}, "physical"), ("k_1", {"params": TWO}, "k_1 among the parameters")],
+)
+def test_a_design_for_the_interval_is_refused_where_there_is_none(name: str, more: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        make_problem(BENCH, IntervalCriterion(name), **{"params": PARAMETER_NAMES, **more})
