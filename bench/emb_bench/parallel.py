@@ -16,7 +16,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Future, as_completed
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import chdir, contextmanager, suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -64,6 +64,18 @@ def shared_out(
     finally:
         pool.stop()
         pool.join()
+
+
+@contextmanager
+def processes(jobs: int) -> Iterator[Executor]:
+    """Processes for many small pieces of work: one thread for each library, deaf to Ctrl-C, ended with the context."""
+    pool = ProcessPoolExecutor(jobs, mp_context=_SPAWN)
+    try:
+        with _environment(), _deaf():
+            pool.submit(os.getpid).result()  # which begins all of them
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _result(future: Future[Any], time_limit: float) -> Any:

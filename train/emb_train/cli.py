@@ -45,8 +45,8 @@ tasks:
 {tasks}
 
 DIR contains reference.json (the input of emb-export), bench.toml and metrics.jsonl. The search begins with the task's
-blind reference, with other levels (--begin), or with an earlier reference (--start). Ctrl-C ends it and keeps the best
-reference so far.
+blind reference, with other levels (--begin), or with an earlier reference (--start); that of four-t, which is blind,
+with the best of 800 plans at random. Ctrl-C ends it and keeps the best reference so far.
 """
 PPO_EPILOG = """\
 presets:
@@ -121,16 +121,13 @@ def _add_reference(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--form",
         choices=FORMS,
-        default="quadratic",
-        help="levels and switches that are constant, or quadratic in the estimate (default: %(default)s)",
+        help="levels and switches that are constant, or quadratic in the estimate (default: quadratic; four-t: blind)",
     )
     p.add_argument("--start", metavar="NAME|FILE", help="reference to begin with: a packaged one, or a JSON file")
     p.add_argument(
         "--begin", type=_blind, metavar="NUMBERS", help="levels, then switching times: --begin=1,-1,-0.01,0.3,0.6"
     )
-    p.add_argument(
-        "--steps", type=_at_least(1), default=400, metavar="N", help="steps of the search (default: %(default)s)"
-    )
+    p.add_argument("--steps", type=_at_least(1), metavar="N", help="steps of the search (default: 400; four-t: 80)")
     p.add_argument("--plant", default=DEFAULT_PLANT, metavar="NAME", help="plant of the brakes (default: %(default)s)")
     _add_late(p)
     p.add_argument(
@@ -232,46 +229,57 @@ def reference(arguments: argparse.Namespace) -> int:
         UsageError: the arguments do not go together, or a file cannot be read or written.
         BenchFileError: the bench lacks a set or the plant.
     """
+    from emb_bench.estimate.expected import IntervalCriterion
     from emb_runtime.estimator.speed_loop import scale_of
     from emb_train.evolve import BATCH, Progress, evolve
-    from emb_train.reference import Stored
+    from emb_train.plan import BRAKES, search
+    from emb_train.reference import Form, Stored
     from emb_train.trial import TASKS
 
     bench, (least, most) = load_bench(arguments.bench), arguments.command_delay
     task = replace(TASKS[arguments.task], plant=arguments.plant, command_delay=(least, most))
-    begin, blind = _beginning(arguments, task), arguments.form == "blind"
+    planned = isinstance(task.measure.goal, IntervalCriterion)
+    form: Form = arguments.form or task.form
+    steps = arguments.steps or task.steps
+    if planned and form != "blind":
+        raise UsageError(f"--form: expected blind for {task.name}, whose plan does not depend on the estimate")
+    begin = _beginning(arguments, task, blind=form == "blind")
     task.trials(bench, task.draws(bench, 0, 1))  # what cannot be is refused before there is a folder
     folder = arguments.output
     make_empty_folder(folder)
     (folder / BENCH).write_text(bench.text, encoding="utf-8")
-    with (folder / METRICS).open("a", encoding="utf-8") as metrics, progress(task.name, arguments.steps) as advance:
+    with (folder / METRICS).open("a", encoding="utf-8") as metrics, progress(task.name, steps) as advance:
 
         def note(step: Progress) -> None:
             metrics.write(as_json(step._asdict()) + "\n")
             metrics.flush()
-            advance(f"score {step.score:.6g}, left {step.left}, home {step.home} of {2 * BATCH}")
+            advance(f"score {step.score:.6g}, left {step.left}, home {step.home} of {step.played}")
 
-        scale = scale_of(bench, arguments.gain)
-        found = evolve(task, bench, scale, begin, steps=arguments.steps, seed=arguments.seed, blind=blind, show=note)
+        scale, seed = scale_of(bench, arguments.gain), arguments.seed
+        if planned:
+            at_random = arguments.begin is None and arguments.start is None
+            found = search(task, bench, scale, None if at_random else begin, steps=steps, seed=seed, show=note)
+        else:
+            found = evolve(task, bench, scale, begin, steps=steps, seed=seed, blind=form == "blind", show=note)
     kept = Stored(
         task=task.name,
-        form=arguments.form,
+        form=form,
         plant=task.plant,
         gain=arguments.gain,
         table=tuple(tuple(row) for row in found.table.tolist()),
         seed=arguments.seed,
         score=found.score,
-        draws=found.steps * BATCH,
+        draws=BRAKES if planned else found.steps * BATCH,
         command=typed_command("emb-train", arguments.typed),
         command_delay=task.command_delay,
     )
     with replacing(folder / REFERENCE) as beside:
         beside.write_text(kept.to_json(), encoding="utf-8")
     show(f"{kept.task} {kept.form}: {kept.score:.6g} on brakes that no step had; {folder / REFERENCE}")
-    return EXIT_DONE if found.steps == arguments.steps else EXIT_INTERRUPTED
+    return EXIT_DONE if found.steps == steps else EXIT_INTERRUPTED
 
 
-def _beginning(arguments: argparse.Namespace, task: Task) -> Floats:
+def _beginning(arguments: argparse.Namespace, task: Task, *, blind: bool) -> Floats:
     """The table that the search begins with, shape [2 n − 1, TERMS]."""
     import numpy as np
 
@@ -279,7 +287,7 @@ def _beginning(arguments: argparse.Namespace, task: Task) -> Floats:
 
     if arguments.start is not None:
         table = stored(arguments.start).array()
-        if arguments.form == "blind" and table[:, 1:].any():
+        if blind and table[:, 1:].any():
             raise UsageError("--start: expected a blind reference for --form blind")
         return table
     numbers = arguments.begin or task.begin

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +19,11 @@ from torch import nn
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import EULER
 from emb_bench.documents import to_json
+from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.excitation import ACTOR, COMPARED, parse_excitation
 from emb_bench.information.symmetric import Floats
 from emb_bench.numbers import Score
+from emb_bench.parallel import processes
 from emb_bench.report.text import WIDTH, Table
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import PolicyRefusedError, UsageError, near
@@ -207,7 +211,10 @@ def evaluate(bench: Bench, settings: Settings, subjects: Sequence[Subject], tell
             if model not in known:
                 known[model] = optima(bench, measure, names, model, brakes, tell)[1:]
             drawn = [draw.brake for draw in draws]
-            values = measure.of_outcomes(bench, plant, names, drawn, list(outcomes.values()))
+            with (
+                processes(os.cpu_count() or 1) if isinstance(measure.goal, IntervalCriterion) else nullcontext() as pool
+            ):
+                values = measure.of_outcomes(bench, plant, names, drawn, list(outcomes.values()), pool)
             found[plant] = result(measure, outcomes, values, len(subjects), known[model])
     except KeyboardInterrupt:
         if not found:

@@ -54,6 +54,7 @@ class Progress(NamedTuple):
     score: float  # Mean over the experiments of this step, which are those of a reference that is changed at random
     home: int  # Experiments that ended at home; those that end when a precision is reached are not asked
     left: int  # Experiments that left the limits
+    played: int  # Experiments
 
 
 def evolve(
@@ -117,7 +118,9 @@ def evolve(
                 summed, parts = summed + table, parts + 1
             both = np.concatenate(scores)
             made = k + 1
-            show(Progress(made, float(both.mean()), int(up.home.sum() + down.home.sum()), int(up.left.sum())))
+            show(
+                Progress(made, float(both.mean()), int(up.home.sum() + down.home.sum()), int(up.left.sum()), 2 * batch)
+            )
     fresh = task.trials(bench, task.draws(bench, first - 1, JUDGED))
     found = summed / parts if parts else table
     values = [task.score(outcome) for outcome in fresh.play(scale, [found, begin])]

@@ -1,10 +1,9 @@
-"""Intervals that estimates from played experiments will have, on all processors."""
+"""Intervals that estimates from played experiments will have."""
 
 from __future__ import annotations
 
-import math
-import os
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from functools import partial
 from typing import NamedTuple
 
@@ -15,49 +14,44 @@ from emb_bench.config.plants import Plant
 from emb_bench.estimate.expected import Interval, of_experiment, sampled
 from emb_bench.information.evaluation import Question
 from emb_bench.information.symmetric import Floats
-from emb_bench.parallel import Lost, shared_out
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.errors import UsageError
 
-FEW = 12  # Experiments that take less time than a process does to begin
+PIECE = 8  # Experiments that a process takes at a time
 
 
-class Case(NamedTuple):
-    """Experiments with brakes of one plant."""
+class Conditions(NamedTuple):
+    """Conditions that experiments share."""
 
     bench: Bench
     plant: Plant  # As a record of the bench is evaluated
     parameters: tuple[str, ...]
-    brakes: tuple[BrakeParameters, ...]
-    currents: Floats  # That acted [A], shape [N, horizon]
 
 
 def intervals(
-    bench: Bench, plant: str, parameters: Sequence[str], brakes: Sequence[BrakeParameters], currents: Floats
+    bench: Bench,
+    plant: str,
+    parameters: Sequence[str],
+    brakes: Sequence[BrakeParameters],
+    currents: Floats,
+    pool: Executor | None = None,
 ) -> list[Interval]:
-    """The interval that each experiment will lead to, from its brake and the currents that acted [A].
+    """The interval that each of N experiments will lead to, from its brake and the currents that acted [A].
 
-    Raises:
-        UsageError: a process was lost.
+    Shape (N, horizon). The ``pool`` has processes that share the work.
     """
-    case = Case(bench, bench.model(plant), tuple(parameters), tuple(brakes), currents)
-    jobs = 1 if len(brakes) <= FEW else os.cpu_count() or 1
-    if jobs == 1:
-        return _intervals(case, range(len(brakes)))
-    parts = [range(i, len(brakes), jobs) for i in range(jobs)]
-    found: dict[int, Interval] = {}
-    for number, those in shared_out(partial(_intervals, case), parts, jobs, math.inf):
-        if isinstance(those, Lost):
-            raise UsageError(f"the intervals of {len(brakes)} experiments: {those.why}")
-        found |= dict(zip(parts[number], those, strict=True))
-    return [found[i] for i in range(len(brakes))]
+    alike = Conditions(bench, bench.model(plant), tuple(parameters))
+    pieces = [slice(i, i + PIECE) for i in range(0, len(brakes), PIECE)]
+    work = partial(_intervals, alike)
+    arguments = [brakes[piece] for piece in pieces], [currents[piece] for piece in pieces]
+    done = map(work, *arguments) if pool is None else pool.map(work, *arguments)
+    return [one for those in done for one in those]
 
 
-def _intervals(case: Case, which: Sequence[int]) -> list[Interval]:
-    asked = Question(case.parameters)
+def _intervals(alike: Conditions, brakes: Sequence[BrakeParameters], currents: Floats) -> list[Interval]:
+    bench, plant, asked = alike.bench, alike.plant, Question(alike.parameters)
     return [
-        of_experiment(case.bench, case.plant, case.brakes[i], sampled(case.bench, case.plant, case.currents[i]), asked)
-        for i in which
+        of_experiment(bench, plant, brake, sampled(bench, plant, row), asked)
+        for brake, row in zip(brakes, currents, strict=True)
     ]
 
 

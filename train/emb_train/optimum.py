@@ -19,6 +19,7 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EULER, EXACT, Plant
 from emb_bench.design.problem import Problem, make_problem
 from emb_bench.design.search import search
+from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.information.symmetric import Floats
 from emb_bench.sim.open_loop import feedback
 from emb_runtime.config.bench import BrakeParameters, Sensors
@@ -66,7 +67,7 @@ def optima(
     """
     speeds: Sequence[float] = ()
     values: list[float] = []
-    of_interval = measure.criterion in ("T", "I")  # which an estimate has with the bench's instruments
+    of_interval = isinstance(measure.goal, IntervalCriterion)  # which an estimate has with the bench's instruments
     ideal = bench if of_interval else replace(bench, sensors=Sensors())
     for number, brake in enumerate(brakes, 1):
         tell(f"optimum on {plant}, brake {number} of {len(brakes)}")

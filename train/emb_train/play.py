@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import Literal, NamedTuple, TypeVar
@@ -19,7 +20,7 @@ from emb_bench import excitation as reference
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.estimate.expected import IntervalCriterion
-from emb_bench.information.criteria import Criterion, Name
+from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import Kind
 from emb_bench.information.symmetric import Floats, unpack
 from emb_bench.numbers import LEVEL, Score
@@ -189,19 +190,12 @@ class Measure:
 
     name: str  # Name on the command line
     label: str  # Formula or description of the number, for people
-    criterion: Name | Literal["T", "I"]  # Criterion whose optimum is searched for
+    goal: Criterion | IntervalCriterion  # Criterion that a design optimises; its φ is a logarithm
     kind: Kind  # Of Fisher information
     prior: float  # Added to the diagonal
     against: Literal["difference", "log-ratio", "ratio"]
     """Comparison of a value with the optimum: by a difference in nat, by the ratio of which both are logarithms, or
     by their ratio."""
-
-    @property
-    def goal(self) -> Criterion | IntervalCriterion:
-        """Criterion that a design optimises; its φ is the logarithm of what counts here."""
-        if self.criterion == "T" or self.criterion == "I":  # a type checker narrows these alone
-            return IntervalCriterion(self.criterion)
-        return Criterion(self.criterion)
 
     def values(self, matrices: Floats) -> Floats:
         """Of matrices without a prior, shape [N, n, n] to [N]; not of an interval."""
@@ -217,13 +211,14 @@ class Measure:
         parameters: Sequence[str],
         brakes: Sequence[BrakeParameters],
         outcomes: Sequence[Outcome],
+        pool: Executor | None = None,
     ) -> list[Floats]:
-        """Of several outcomes of experiments with the same N brakes, each of shape [N]."""
+        """Of several outcomes of experiments with the same N brakes, each of shape [N]; a ``pool`` has processes."""
         goal = self.goal
         if isinstance(goal, Criterion):
             return [self.values(outcome.matrices) for outcome in outcomes]
         currents = np.concatenate([outcome.currents for outcome in outcomes])
-        found = intervals(bench, plant, parameters, [*brakes] * len(outcomes), currents)
+        found = intervals(bench, plant, parameters, [*brakes] * len(outcomes), currents, pool)
         return np.split(finite([goal.of(one) for one in found]), len(outcomes))
 
     def shares(self, values: Floats, optima: Floats) -> Floats:
@@ -235,16 +230,24 @@ class Measure:
         return values / optima
 
 
+_T, _I = IntervalCriterion("T"), IntervalCriterion("I")
 MEASURES: Mapping[str, Measure] = MappingProxyType(
     {
         m.name: m
         for m in (
-            Measure("T", "T (the sum of -2 ln of the interval between runs)", "T", "physical", 0.0, "difference"),
-            Measure("I", "I (the sum of -2 ln of the repeatability)", "I", "physical", 0.0, "difference"),
-            Measure("D", "ln det(M + 12 I)", "D", "physical", PRIOR, "difference"),
-            Measure("A", "-ln tr (M + 12 I)^-1", "A", "physical", PRIOR, "log-ratio"),
-            Measure("E", "ln lambda_min(M + 12 I)", "E", "physical", PRIOR, "log-ratio"),
-            Measure("weighted", "lambda_min of the thesis's weighted M", "E", "weighted", 0.0, "ratio"),
+            Measure(
+                "T",
+                "T (sum of -2 ln of the interval between runs)",
+                IntervalCriterion("T"),
+                "physical",
+                0.0,
+                "difference",
+            ),
+            Measure("I", "I (sum of -2 ln of the repeatability)", _I, "physical", 0.0, "difference"),
+            Measure("D", "ln det(M + 12 I)", Criterion("D"), "physical", PRIOR, "difference"),
+            Measure("A", "-ln tr (M + 12 I)^-1", Criterion("A"), "physical", PRIOR, "log-ratio"),
+            Measure("E", "ln lambda_min(M + 12 I)", Criterion("E"), "physical", PRIOR, "log-ratio"),
+            Measure("weighted", "lambda_min of the thesis's weighted M", Criterion("E"), "weighted", 0.0, "ratio"),
         )
     }
 )

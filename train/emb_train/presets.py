@@ -23,6 +23,7 @@ TASKS: Mapping[str, str] = {
     "four-d": "k_m, k_1, T_c, f_v within 50 %, D",
     "four-e": "k_m, k_1, T_c, f_v within 50 %, E",
     "four-a": "k_m, k_1, T_c, f_v within 50 %, A",
+    "four-t": "k_m, k_1, T_c, f_v within 50 %, T: the interval between runs that an estimate will have",
     "four-time": "k_m, k_1, T_c, f_v within 50 %, until 95 % of each are within 1.2 %",
 }
 """Tasks that a reference is learned for."""

@@ -24,7 +24,7 @@ from emb_runtime.estimator.kalman import MISFIT, Four, Model, State, believed, d
 from emb_runtime.estimator.speed_loop import Scale, share_after
 from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Bools, Conditions, Experiments, Setup, advance_one
 from emb_train.play import MEASURES, Draw, Measure, Outcome, begin_all, fresh_draws, joined
-from emb_train.reference import FEATURES, PRODUCTS, Box, Stored, box_of, features, wanted_current
+from emb_train.reference import FEATURES, PRODUCTS, Box, Form, Stored, box_of, features, wanted_current
 
 CHUNK = 64  # Experiments that a thread plays at a time
 ANY_PRECISION: Four = (math.inf, math.inf, math.inf, math.inf)
@@ -206,6 +206,8 @@ class Task:
     ranges: str  # Set of the bench that the brakes are drawn from
     shield_ranges: str  # Set of the bench that the shield covers; it contains ``ranges``
     criterion: str  # Name of a measure, see :data:`emb_train.play.MEASURES`
+    form: Form = "quadratic"  # Of a reference that is learned for it, if nobody asks for another
+    steps: int = 400  # Of that search
     plant: str = DEFAULT_PLANT  # Name of the bench's plant that the brakes are
     command_delay: tuple[int, int] = (0, 0)  # Least and most samples that a command waits, drawn for each experiment
     precision: Four = ANY_PRECISION
@@ -275,6 +277,7 @@ TASKS: Mapping[str, Task] = {
             begin=(1.0, -1.0, -0.007, 0.336, 0.92),
         ),
         _FOUR,
+        replace(_FOUR, name="four-t", criterion="T", form="blind", steps=80),
         replace(_FOUR, name="four-e", criterion="E", begin=_CREEP_FIRST),
         replace(_FOUR, name="four-a", criterion="A", begin=_CREEP_FIRST),
         replace(
