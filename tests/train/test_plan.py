@@ -31,7 +31,8 @@ FOUR, SCALE = TASKS["four-t"], scale_of(BENCH)
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few plans on few brakes, in this process."""
-    for name, value in {"DRAWN": 6, "SCREENED": 1, "KEPT": 3, "BRAKES": 2, "JUDGED": 2, "POPULATION": 4}.items():
+    sizes = {"DRAWN": 6, "SCREENINGS": 2, "SCREENED": 1, "KEPT": 3, "BRAKES": 2, "JUDGED": 2, "POPULATION": 4}
+    for name, value in sizes.items():
         monkeypatch.setattr(plan, name, value)
     monkeypatch.setattr(plan, "processes", lambda jobs: nullcontext())
 
@@ -93,7 +94,7 @@ def test_the_command_finds_a_plan_by_itself(tmp_path: Path, capsys: pytest.Captu
     assert Task.of(kept).measure is MEASURES["T"]
     assert f"{kept.score:.6g}" in capsys.readouterr().out
     metrics = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    assert [line["steps"] for line in metrics] == [1]
+    assert [(line["steps"], line["played"]) for line in metrics] == [(0, 3), (0, 3), (1, 8)]
 
 
 def test_a_plan_that_depends_on_the_estimate_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

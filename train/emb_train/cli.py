@@ -232,7 +232,7 @@ def reference(arguments: argparse.Namespace) -> int:
     from emb_bench.estimate.expected import IntervalCriterion
     from emb_runtime.estimator.speed_loop import scale_of
     from emb_train.evolve import BATCH, Progress, evolve
-    from emb_train.plan import BRAKES, search
+    from emb_train.plan import BRAKES, SCREENINGS, search
     from emb_train.reference import Form, Stored
     from emb_train.trial import TASKS
 
@@ -244,11 +244,15 @@ def reference(arguments: argparse.Namespace) -> int:
     if planned and form != "blind":
         raise UsageError(f"--form: expected blind for {task.name}, whose plan does not depend on the estimate")
     begin = _beginning(arguments, task, blind=form == "blind")
+    at_random = planned and arguments.begin is None and arguments.start is None
     task.trials(bench, task.draws(bench, 0, 1))  # what cannot be is refused before there is a folder
     folder = arguments.output
     make_empty_folder(folder)
     (folder / BENCH).write_text(bench.text, encoding="utf-8")
-    with (folder / METRICS).open("a", encoding="utf-8") as metrics, progress(task.name, steps) as advance:
+    with (
+        (folder / METRICS).open("a", encoding="utf-8") as metrics,
+        progress(task.name, steps + (SCREENINGS if at_random else 0)) as advance,
+    ):
 
         def note(step: Progress) -> None:
             metrics.write(as_json(step._asdict()) + "\n")
@@ -257,7 +261,6 @@ def reference(arguments: argparse.Namespace) -> int:
 
         scale, seed = scale_of(bench, arguments.gain), arguments.seed
         if planned:
-            at_random = arguments.begin is None and arguments.start is None
             found = search(task, bench, scale, None if at_random else begin, steps=steps, seed=seed, show=note)
         else:
             found = evolve(task, bench, scale, begin, steps=steps, seed=seed, blind=form == "blind", show=note)

@@ -32,6 +32,7 @@ with warnings.catch_warnings():
 LEVELS = 9  # Levels of a plan that begins at random
 DRAWN = 800  # Plans drawn at random
 SCREENED = 4  # Brakes on which they are compared
+SCREENINGS = 40  # Parts in which this is done
 KEPT = 20  # Plans that are compared on all brakes
 BRAKES = 16  # Brakes of the search
 JUDGED = 64  # Brakes on which its results are compared, and which it did not have
@@ -98,7 +99,7 @@ def search(
         begin: table to begin with; None for plans at random.
         steps: of CMA-ES.
         seed: of the plans and of the brakes.
-        show: called after each step.
+        show: called after each part of the plans at random, with 0 steps, and after each step.
 
     Returns:
         The better one of the best plan and the mean of the last step, on brakes that no step had; after a Ctrl-C, of
@@ -109,7 +110,7 @@ def search(
         few, many, fresh = (
             Compared(task, bench, scale, pool, first + i, count) for i, count in enumerate((SCREENED, BRAKES, JUDGED))
         )
-        best = drawn(rng, few, many) if begin is None else numbers_of(begin)
+        best = drawn(rng, few, many, show) if begin is None else numbers_of(begin)
         (least,), _ = many.scores(best[None])
         mean = best
         options: dict[str, Any] = {
@@ -125,19 +126,28 @@ def search(
                 made, mean = made + 1, np.array(strategy.mean)
                 if scores.max() > least:
                     best, least = np.array(asked[int(np.argmax(scores))]), float(scores.max())
-                home, left = (sum(int(getattr(o, name).sum()) for o in outcomes) for name in ("home", "left"))
-                show(Progress(made, float(scores.mean()), home, left, POPULATION * BRAKES))
+                show(progress(made, scores, outcomes))
             made = steps  # or it converged
         judged, _ = fresh.scores(np.array([best, mean]))
     chosen = int(np.argmax(judged))
     return Tuned(table_of((best, mean)[chosen]), float(judged[chosen]), made)
 
 
-def drawn(rng: np.random.Generator, few: Compared, many: Compared) -> Floats:
-    """The best of plans at random."""
+def progress(steps: int, scores: Floats, outcomes: list[ReportedOutcome]) -> Progress:
+    """What to show of plans that were played after some steps."""
+    home, left = (sum(int(getattr(o, name).sum()) for o in outcomes) for name in ("home", "left"))
+    return Progress(steps, float(scores.mean()), home, left, sum(len(o.home) for o in outcomes))
+
+
+def drawn(rng: np.random.Generator, few: Compared, many: Compared, show: Callable[[Progress], object]) -> Floats:
+    """The best of plans at random; ``show`` is called ``SCREENINGS`` times."""
     plans = rng.uniform(-1.0, 1.0, (DRAWN, 2 * LEVELS))
     plans[:, :LEVELS] *= np.where(rng.random((DRAWN, LEVELS)) < 0.5, NEAR, 1.0)
-    scores = np.concatenate([few.scores(part)[0] for part in np.array_split(plans, DRAWN // KEPT)])
-    kept = plans[np.argsort(-scores)[:KEPT]]
+    found = []
+    for part in np.array_split(plans, SCREENINGS):
+        scores, outcomes = few.scores(part)
+        found.append(scores)
+        show(progress(0, scores, outcomes))
+    kept = plans[np.argsort(-np.concatenate(found))[:KEPT]]
     best: Floats = kept[int(np.argmax(many.scores(kept)[0]))]
     return best

@@ -27,7 +27,7 @@ from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document, text
 from emb_bench.report.sentences import DOUBTS, alarms, apart, remedies
 from emb_bench.report.sentences import profile as sentence
-from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import UsageError
 
 from tests.bench.conftest import Replay  # isort: skip
