@@ -594,7 +594,7 @@ def of_campaign(checkout: Checkout) -> Mapping[str, Any]:
 def of_design(checkout: Checkout) -> Mapping[str, Any]:
     """Two short searches."""
     points = {
-        "D of two": ["--params", "k_m,T_c", "--model", "euler"],
+        "D of two": ["--criterion", "D", "--params", "k_m,T_c", "--model", "euler"],
         "E of four": ["--criterion", "E", "--theta", "f_v=3e-5"],
     }
     given = ["--bench", "short.toml", "--starts", "2", "--seed", "1", "--json"]

@@ -134,7 +134,7 @@ def search(
 
 
 def progress(steps: int, scores: Floats, outcomes: list[ReportedOutcome]) -> Progress:
-    """What to show of plans that were played after some steps."""
+    """Progress of plans that were played after some steps."""
     home, left = (sum(int(getattr(o, name).sum()) for o in outcomes) for name in ("home", "left"))
     return Progress(steps, float(scores.mean()), home, left, sum(len(o.home) for o in outcomes))
 
