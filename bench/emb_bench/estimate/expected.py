@@ -42,10 +42,10 @@ from emb_bench.estimate.suspects import (
 )
 from emb_bench.experiment.experiment import Experiment, planned
 from emb_bench.experiment.from_log import REST_SAMPLES
-from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors, Theta, simulate
+from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors
 from emb_bench.information.evaluation import Evaluation, Information, Question
 from emb_bench.information.identifiability import Spectrum
-from emb_bench.sim.open_loop import held, march, march_beside
+from emb_bench.sim.open_loop import held, march_beside
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 
@@ -152,14 +152,10 @@ def of_experiment(
     question: Question,
     errors: SystematicErrors = NO_ERRORS,
 ) -> Interval:
-    """The interval of an experiment with a brake; its samples say no more than which of them were received."""
+    """The interval of an experiment with a brake; its samples say which were received, and where a gap ended."""
     bench = replace(bench, brake=brake)
     asked = with_systematic(EstimationProblem(question.params, question.nuisances, question.prior), bench, plant)
-    at = Theta(brake, errors=errors)
-    at = at._replace(start=experiment.x0(at.offset(plant)))
-    shown = simulate(plant, at, experiment, bench.timing.sample_time, (), compiled(march)).samples
-    samples = np.where(experiment.measured[:, None], shown, np.nan)
-    problem = make_problem(bench, plant, [replace(experiment, samples=samples).seen_by(plant)], asked)
+    problem = make_problem(bench, plant, [experiment.seen_by(plant)], asked)
     z, known = problem.nominal(), {name: value for name, value in errors._asdict().items() if value is not None}
     for i, unknown in enumerate(problem.unknowns):
         z[i] = known.get(unknown.name, z[i])
