@@ -18,7 +18,8 @@ from emb_bench.design.problem import Problem, make_problem
 from emb_bench.excitation import parse_excitation, run_excitation
 from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import fisher
-from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
+from emb_bench.parallel import processes
+from emb_runtime.config.bench import PARAMETER_NAMES, Sensors, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError
 from emb_train import optimum
 from emb_train.cli import main
@@ -119,7 +120,7 @@ def test_every_reference_asks_for_what_it_asks_for_in_the_runtime() -> None:
     assert own(np.array([[0, 0, 1, 0], [0, 0, 0, 0]], np.float32)).tolist() == [2.0, 3.0]
 
 
-def test_the_interval_is_that_of_the_currents_that_acted_on_each_brake(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_interval_is_that_of_the_currents_that_acted_on_each_brake() -> None:
     draws = fresh_draws(WIDE, 3, 3)
     brakes = [draw.brake for draw in draws]
     for plant in ("exact", "stribeck"):
@@ -131,8 +132,8 @@ def test_the_interval_is_that_of_the_currents_that_acted_on_each_brake(monkeypat
             assert found == pytest.approx(api.interval(known).of_comparison, rel=1e-12)
         (own,) = MEASURES["I"].of_outcomes(BENCH, plant, PARAMETER_NAMES, brakes, [outcome])
         assert (own > alone).all()
-    monkeypatch.setattr("emb_train.intervals.FEW", 5)  # more than these are shared out to processes
-    both = MEASURES["T"].of_outcomes(BENCH, "stribeck", PARAMETER_NAMES, brakes, [outcome, outcome])
+    with processes(2) as pool:
+        both = MEASURES["T"].of_outcomes(BENCH, "stribeck", PARAMETER_NAMES, brakes, [outcome, outcome], pool)
     assert [values.tolist() for values in both] == 2 * [alone.tolist()]
 
 
