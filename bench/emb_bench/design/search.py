@@ -38,7 +38,7 @@ JOURNEYS = (3, 4, 5)  # Journeys of a coarse design; the searches take turns
 SHORTEST = 0.003  # Shortest journey, as a share of the longest one
 DRAWN = 400  # Tables drawn at random, of which the best one starts a search
 FIRST = 4000  # Coarse designs that one search simulates
-FEW = 1500  # The same for a criterion of the interval, which takes a hundred times as long
+FEW = 600  # The same for a criterion of the interval, which takes a hundred times as long; a fifth is drawn besides
 WIDE = 0.2  # Initial standard deviation of the genes, −1..1
 POPULATION = 24  # Population of CMA-ES
 WAVES = 3  # Batches of coarse searches, each of which keeps away from what the earlier ones found
@@ -201,10 +201,10 @@ def coarse(problem: Problem, journeys: int, seed: np.random.SeedSequence, far: S
     """A table of some journeys that was searched for from random ones; nearness to tables ``far`` costs."""
     rng = np.random.default_rng(seed)
     low, high = _borders(journeys)
-    drawn = low + rng.random((DRAWN, 3 * journeys)) * (high - low)
-    near = rng.random((DRAWN, 2 * journeys)) < 0.5  # optima wait near contact, and creep
+    first, count = (DRAWN, FIRST) if isinstance(problem.goal, Criterion) else (FEW // 5, FEW)
+    drawn = low + rng.random((first, 3 * journeys)) * (high - low)
+    near = rng.random((first, 2 * journeys)) < 0.5  # optima wait near contact, and creep
     drawn[:, : 2 * journeys] *= np.where(near, 0.4, 1.0)
-    count = FIRST if isinstance(problem.goal, Criterion) else FEW
     return evolved(problem, drawn[np.argmin(_cost(problem, drawn, far))], WIDE, count, rng, far=far)
 
 

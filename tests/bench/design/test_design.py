@@ -328,7 +328,6 @@ def test_a_design_for_the_interval_is_worth_what_an_estimate_is_expected_to_tell
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(search_module, "FEW", 60)
-    monkeypatch.setattr(search_module, "DRAWN", 30)
     monkeypatch.setattr(search_module, "shared_out", lambda work, pieces, *_: enumerate(map(work, pieces)))
     p = replace(make_problem(BENCH, IntervalCriterion(name), PARAMETER_NAMES), horizon=120)
     told: list[str] = []
