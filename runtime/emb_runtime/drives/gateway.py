@@ -11,7 +11,8 @@ from emb_runtime.can.messages import load_layout
 from emb_runtime.can.transport import TransmitQueueFullError, Transport
 from emb_runtime.config.bench import Bench
 from emb_runtime.drives.mapping import Mapping
-from emb_runtime.drives.node import INTRUDED, DriveNode, Phase
+from emb_runtime.drives.node import INTRUDED, DriveNode
+from emb_runtime.drives.phases import Arming, Failed, Off, Ready
 from emb_runtime.errors import BusError, SafetyStopError
 from emb_runtime.records import Frame
 from emb_runtime.system.clock import Clock
@@ -84,16 +85,16 @@ class Gateway:
 
     def _serve(self, stop_requested: Callable[[], bool], ready: Callable[[], None], *, arms: bool) -> None:
         sent = arms and self.arm(stop_requested)
-        if not arms or self.node.phase is Phase.READY:
+        if not arms or isinstance(self.node.phase, Ready):
             ready()
         ended_ns = None
         while ended_ns is None or self._clock.now_ns() < ended_ns:
             self.step()
             if stop_requested() or self._node_lost is not None:
                 self.node.disarm()
-                if self.node.phase in (Phase.OFF, Phase.FAILED):
+                if isinstance(self.node.phase, Off | Failed):
                     break
-            elif arms and ended_ns is None and self.node.phase in (Phase.OFF, Phase.FAILED):
+            elif arms and ended_ns is None and isinstance(self.node.phase, Off | Failed):
                 ended_ns = self._after(LINGER)
         problem = self._release_problem() if sent else ""
         failure = self._failure(stopped=not stop_requested())
@@ -134,7 +135,7 @@ class Gateway:
                 break
             if self._clock.now_ns() > silent_ns:
                 raise BusError(
-                    f"no samples of the drive: check that it is on, on this bus, with this DBC{self.node.heard}"
+                    f"no samples of the drive: check that it is on, on this bus, with this DBC{self.node.reported}"
                 )
             self.step()
             if self._is_commanded:
@@ -142,13 +143,13 @@ class Gateway:
         else:
             return False
         self.node.arm(self._clock.now_ns())
-        while self.node.phase is Phase.ARMING:
+        while isinstance(self.node.phase, Arming):
             self.step()
             if stop_requested():
                 self.node.disarm()
-        if self.node.phase is Phase.FAILED:
-            heard, problem = self.node.heard, self._release_problem()
-            raise BusError(f"cannot arm the drive: {self.node.failure}{heard}{problem and f'; {problem}'}")
+        if isinstance(self.node.phase, Failed):
+            reported, problem = self.node.reported, self._release_problem()
+            raise BusError(f"cannot arm the drive: {self.node.failure}{reported}{problem and f'; {problem}'}")
         return True
 
     def step(self) -> None:
@@ -163,13 +164,13 @@ class Gateway:
             if (frame := self._received()) is None:
                 break
             if not (frame.own or frame.error):
-                self.node.take_host(frame, self._clock.now_ns())
+                self.node.handle_host(frame, self._clock.now_ns())
         for _ in range(MOST_FRAMES):
             if (frame := self._drive_bus.receive(0)) is None:
                 break
             if not (frame.own or frame.error) and (frame.extended, frame.identifier) in self._commands:
                 self._intruded()
-            for ours in self.node.take_drive(frame, self._clock.now_ns()):
+            for ours in self.node.handle_drive(frame, self._clock.now_ns()):
                 self._pass_on(ours)
                 if ours.identifier == self._layout.status.identifier:
                     self._pass_on(self._counts())
@@ -178,7 +179,7 @@ class Gateway:
     def _intruded(self) -> None:
         """Take note of another commander: the node lets go, and the host hears of one as on a bus that they share."""
         self._is_commanded = True
-        if self.node.intruded():  # a disabled command that the host has not sent
+        if self.node.handle_intrusion():  # a disabled command that the host has not sent
             self._pass_on(self._layout.encode_command(0, 0, 0.0, False))
 
     def _after(self, seconds: float) -> int:
@@ -187,11 +188,10 @@ class Gateway:
 
     def _counts(self) -> Frame:
         """The counts for the host's log; they go with each status."""
-        counts, node = self.node.counts, self.node
+        node, not_believed = self.node, sum(self.node.receiver.rejected.values())
         self._counter = (self._counter + 1) % COUNTER_MODULUS
-        not_believed = sum(node.rejected.values())
         return self._layout.encode_gateway(
-            self._counter, counts.not_sent, counts.braked, not_believed, node.guard.rejected
+            self._counter, node.outlet.not_sent, node.answers.braked, not_believed, node.outlet.guard.rejected
         )
 
     def _received(self) -> Frame | None:

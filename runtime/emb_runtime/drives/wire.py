@@ -1,14 +1,20 @@
-"""Translation between a drive's frames and ours: current to bytes, bytes to samples. Pure; cantools does the codec."""
+"""Translation between a drive's frames and ours: current to bytes, bytes to samples. cantools does the codec.
+
+Pure, but for :class:`Outlet`, which hands each frame to the second guard.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from enum import StrEnum
 from typing import NamedTuple
 
 from emb_runtime.can.e2e import LeakyCount
+from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.drives.mapping import ConstantFrame, Mapping, Measured, MessageInfo
 from emb_runtime.drives.signals import raw_value
+from emb_runtime.drives.wire_guard import WireGuard, WireGuardError
 from emb_runtime.errors import FrameError
 from emb_runtime.records import Frame
 
@@ -91,6 +97,51 @@ def frame_of(info: MessageInfo, data: bytes) -> Frame:
     return Frame(info.identifier, data, extended=info.extended)
 
 
+class Outlet:
+    """Sends frames to a drive, with currents up to a limit [A]. One for which the bus has no room is lost, and counted.
+
+    Its methods raise BusError if the bus is lost.
+    """
+
+    def __init__(self, mapping: Mapping, limit: float, send: Callable[[Frame], None]) -> None:
+        self._mapping, self._encoder = mapping, Encoder(mapping)
+        self.guard = WireGuard(mapping, limit, send)
+        self.not_sent = 0
+        self.currents = (0.0, 0.0)
+        """Currents that the last two commands carried, the newest last [A]."""
+        self.largest = 0.0
+        """Largest current of the latest run [A]."""
+
+    def command(self, current: float) -> bool:
+        """Send a current [A]; returns True if it left. One that is refused raises FrameError or WireGuardError."""
+        try:
+            carried = self.guard.command(self._encoder.command(current), current)
+        except TransmitQueueFullError:
+            self.not_sent += 1
+            return False
+        self.currents = self.currents[1], carried
+        self.largest = max(self.largest, abs(current))
+        return True
+
+    def send(self, constant: ConstantFrame) -> str:
+        """Send a frame of a sequence; returns the reason if it is refused, else nothing."""
+        try:
+            self.guard.constant(self._encoder.constant(constant), constant)
+        except TransmitQueueFullError:
+            self.not_sent += 1
+        except WireGuardError as refused:
+            return str(refused)
+        return ""
+
+    def applied(self, sample: DriveSample) -> float:
+        """Current in the period that ended [A]: as measured, or as commanded where the measurement cannot tell them."""
+        measured, commanded = self._mapping.current, self.currents[0 if self._mapping.polled else 1]
+        if measured is None:  # and of a poll the answer is packed before the command is obeyed
+            return commanded
+        step = measured.field.step(sample.current / measured.factor) * abs(measured.factor)
+        return commanded if abs(sample.current - commanded) <= step else sample.current
+
+
 class Receiver:
     """Makes samples of the drive's frames.
 
@@ -104,17 +155,17 @@ class Receiver:
     def __init__(self, mapping: Mapping, tolerated: int) -> None:
         self._mapping = mapping
         self._sensors = mapping.sensor_messages
-        heard = self._sensors | ({mapping.state.message} if mapping.state else set())
+        received = self._sensors | ({mapping.state.message} if mapping.state else set())
         self._infos: dict[tuple[bool, int], list[MessageInfo]] = {}
-        for info in (mapping.messages[name] for name in sorted(heard)):
+        for info in (mapping.messages[name] for name in sorted(received)):
             self._infos.setdefault((info.extended, info.identifier), []).append(info)
         self._counters: dict[str, int] = {}
-        self._missing = {name: LeakyCount(tolerated) for name in heard}
+        self._missing = {name: LeakyCount(tolerated) for name in received}
         self._waiting: dict[str, tuple[dict[str, float], int]] = {}
         self._turns = 0.0
         self._wrapped: float | None = None
-        self.said = DriveState.UNKNOWN  # State by the latest message with it, however old that is
-        self.said_ns = 0
+        self.last_state = DriveState.UNKNOWN  # State by the latest message with it, however old that is
+        self.state_ns = 0
         """Arrival of the latest message with the state [ns]."""
         self.rejected: dict[str, int] = {}
         """Number of frames that were not believed, by reason."""
@@ -130,9 +181,9 @@ class Receiver:
     def state(self, now_ns: int) -> DriveState:
         """State of the drive now (monotonic [ns])."""
         state = self._mapping.state
-        if state is not None and now_ns - self.said_ns > state.timeout * 1e9:
+        if state is not None and now_ns - self.state_ns > state.timeout * 1e9:
             return DriveState.UNKNOWN
-        return self.said
+        return self.last_state
 
     def take(self, frame: Frame) -> DriveSample | None:
         """Take a frame from the bus; gives the sample that it completes.
@@ -193,13 +244,13 @@ class Receiver:
         known = f"idle is {', '.join(map(str, state.idle))}, active {', '.join(map(str, state.active))}"
         self.reported = f"{state.message}.{state.field.name} is {value:.0f}; {known}"
         if state.error is not None and values[state.error.name] != 0.0:
-            self.said = DriveState.FAULT
+            self.last_state = DriveState.FAULT
             self.reported = f"{state.message}.{state.error.name} is {values[state.error.name]:.0f}, not 0"
         elif value in state.idle:
-            self.said = DriveState.IDLE
+            self.last_state = DriveState.IDLE
         else:
-            self.said = DriveState.ACTIVE if value in state.active else DriveState.FAULT
-        self.said_ns = time_ns
+            self.last_state = DriveState.ACTIVE if value in state.active else DriveState.FAULT
+        self.state_ns = time_ns
 
     def _pair(self, name: str, values: dict[str, float], time_ns: int) -> DriveSample | None:
         waiting = self._waiting

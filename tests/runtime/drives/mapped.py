@@ -95,7 +95,7 @@ class MappedBus:
         receive, send = bus.receive, bus.send
 
         def received(deadline_ns: int) -> Frame | None:
-            if self.at is not None and hasattr(self, "transport") and self.transport.node.counts.obeyed >= self.at[0]:
+            if self.at is not None and hasattr(self, "transport") and self.transport.node.answers.obeyed >= self.at[0]:
                 action, self.at = self.at[1], None
                 action(self.drive)
             frame = receive(deadline_ns)

@@ -20,7 +20,7 @@ from emb_runtime.cli.main import main
 from emb_runtime.config.bench import parse_bench
 from emb_runtime.drives.lock_step import open_mapped
 from emb_runtime.drives.mapping import PROPERTIES, require_fit
-from emb_runtime.drives.node import Phase
+from emb_runtime.drives.phases import Off
 from emb_runtime.errors import BusError, UsageError
 from simulated_drives import ODrive
 from tests.actors import constant_actor
@@ -47,8 +47,8 @@ def test_a_run_on_a_mapped_drive_is_a_run_and_its_information_that_of_our_node(
     document = emb_run.document()
     assert (document["result"], document["answered"], document["not_obeyed"]) == ("done", 500, 0)
     node = bus.transport.node
-    assert (node.counts.obeyed, node.guard.rejected, node.times.too_late) == (500, 0, "")
-    assert (node.phase, node.failure) == (Phase.OFF, "")  # at rest, and let go
+    assert (node.answers.obeyed, node.outlet.guard.rejected, node.times.too_late) == (500, 0, "")
+    assert (node.phase, node.failure) == (Off(), "")  # at rest, and let go
     within_limits(bus)
     monkeypatch.undo()
     iface = "sim:plant=late-command" if name == "mit" else "sim"

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from emb_runtime.drives.arming import AIMS
 from emb_runtime.drives.mapping_file import load_mapping
+from emb_runtime.drives.phases import AIMS
 from emb_runtime.drives.time_out_proof import TimeOutProof
 from emb_runtime.drives.wire import DriveState
 from tests.drives import EXAMPLES

@@ -286,14 +286,18 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
         ("safety/watchdog_process.py", "transport.send"),  # the watchdog process, which has stop frames only
         ("safety/watchdog_process.py", "self.send"),
         ("drives/wire_guard.py", "self._send"),  # the second guard
-        ("drives/arming.py", "self._send"),  # the node's own method, which hands each frame to the second guard
+        ("drives/phases.py", "self._outlet.send"),  # a step of a sequence, to the second guard
+        ("drives/phases.py", "self._send"),  # its own method
+        ("drives/node.py", "self.outlet.send"),
         ("drives/gateway.py", "drive_bus.send"),  # handed to the node, and by it to the second guard
         ("drives/lock_step.py", "bus.send"),
         ("drives/gateway.py", "self._node_bus.send"),  # samples and status of the node, to the loop
         ("drives/mapping_file.py", "of.send"),  # a key of the file
     }
-    owner = (folder / "drives" / "node.py").read_text(encoding="utf-8")
-    assert "WireGuard(mapping, bench.limits.current, send)" in owner
+    owner = (folder / "drives" / "wire.py").read_text(encoding="utf-8")
+    assert "WireGuard(mapping, limit, send)" in owner
+    node = (folder / "drives" / "node.py").read_text(encoding="utf-8")
+    assert "Outlet(mapping, bench.limits.current, send)" in node
     opener = (folder / "drives" / "gateway.py").read_text(encoding="utf-8")
     assert "DriveNode(mapping, bench, load_layout(), drive_bus.send)" in opener
     stepper = (folder / "drives" / "lock_step.py").read_text(encoding="utf-8")

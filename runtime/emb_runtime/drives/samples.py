@@ -1,19 +1,25 @@
-"""Times of a drive's samples, which it does not stamp, on a grid that follows their arrivals; the age of answers."""
+"""Samples of a drive: their times on a grid that follows their arrivals, the age of answers, and what they may show."""
 
 from __future__ import annotations
 
 import math
 
+from emb_runtime.can.e2e import NO_COUNTER, LeakyCount
+from emb_runtime.can.messages import Layout
+from emb_runtime.can.receiver import Reception
 from emb_runtime.config.bench import Bench
 from emb_runtime.drives.mapping import Mapping
+from emb_runtime.drives.wire import DriveSample
+from emb_runtime.records import NodeState, SensorSample
 
 AGE_TOLERANCE = 0.1
 """Part of a period by which an answer may act later than ``shield.frame_age`` declares: its clock is the poll's."""
 GRID_GAIN = 1.0 / 32.0  # Part of a sample's deviation from the grid by which the grid follows
+CONTRADICTIONS = 3  # Samples in a row that contradict the one before, or a share of them, by which a drive is let go
 
 
 class SampleTimes:
-    """Times of one drive's samples and of their answers.
+    """Times of one drive's samples, which it does not stamp, and of their answers.
 
     Args:
         mapping: the drive.
@@ -68,3 +74,29 @@ class SampleTimes:
     def acted(self, now_ns: int) -> None:
         """Note that the answer to the newest sample leaves [ns]."""
         self.largest_age_ns = max(self.largest_age_ns, now_ns - self._measured_ns + self._bus_ns)
+
+
+class SensorCheck:
+    """Check that the angle follows from the velocity, and that both are within the bench's limits and noise."""
+
+    def __init__(self, layout: Layout, bench: Bench) -> None:
+        self._bench = bench
+        self._follows = Reception(layout, bench, lambda _frame, _why: None).follows
+        self._last: SensorSample | None = None
+        self.contradictions = LeakyCount(CONTRADICTIONS)
+
+    def update(self, sample: DriveSample, device_ns: int) -> None:
+        """Take a sample and its time since the first [ns]."""
+        angle, velocity, _, time_ns = sample
+        last = self._last
+        self._last = SensorSample(0, angle, velocity, device_ns, time_ns, 0.0, NO_COUNTER, NodeState.IDLE)
+        if last is None or self._follows(last, self._last, (device_ns - last.device_time_ns) * 1e-9):
+            self.contradictions.forgive()
+        else:
+            self.contradictions.reject()
+
+    def is_outside(self, sample: DriveSample) -> bool:
+        """Returns True if the brake has left its limits."""
+        noise, sigmas, (low, high) = self._bench.noise, self._bench.shield.noise_sigmas, self._bench.limits.angle
+        is_inside = low - sigmas * noise.angle <= sample.angle <= high + sigmas * noise.angle
+        return not (is_inside and abs(sample.velocity) <= self._bench.limits.velocity + sigmas * noise.velocity)
