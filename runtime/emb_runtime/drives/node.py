@@ -2,13 +2,12 @@
 
 Pure logic: frames of both sides and times go in, frames come out; no clock, no socket. To the loop it is a node like
 any other, see ``emb.dbc``: it obeys a valid, enabled answer to the newest sample, brakes a period that has none, and
-begins a stop after the bench's ``node.watchdog``. To the drive it is the commander: it arms by the file's sequence,
-sends one current for each sample, and so feeds the drive's own watchdog only as long as samples come and are answered
-or braked. A stop that the host asked for ends armed, at 0 A; after any other stop the drive is let go.
+begins a stop after the bench's ``node.watchdog``. To the drive it is the commander: it sends one current for each
+sample, and so feeds the drive's own watchdog only as long as samples come and are answered or braked.
 
-What differs from a node that measures and acts in one device: a command acts when it arrives, within the period of its
-sample, or of the next one where the drive is polled. The bench says so by ``shield.frame_age``. Nothing here helps when
-this computer or the cable is lost: the drive then holds its last current for its own time-out, and lets go.
+A command acts when it arrives, within the period of its sample, or of the next one where the drive is polled, as
+``shield.frame_age`` of the bench says. Nothing here helps when this computer or the cable is lost: the drive then holds
+its last current for its own time-out, and lets go.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""Phases of a drive: each takes an event and returns the next phase. Pure.
+"""Phases of a drive: each takes an event and returns the next phase.
 
     Off -> Arming -> Ready -> Active -> Stopping -> Ready after a stop of the host, else Off
     Arming, Ready -> Off when nobody wants the drive any more; Arming, Ready, Active, Stopping -> Failed
 
-The node sends nothing in Off and Failed, 0 A while Arming (beside its sequence) and Ready, the host's current while
-Active, that of its own stop while Stopping. On the way to Off and to Failed it lets the drive go.
+Pure, but for Arming, which sends the file's sequence. The node sends nothing in Off and Failed, 0 A while Arming and
+Ready, the host's current while Active, that of its own stop while Stopping. On the way to Off and to Failed it lets the
+drive go.
 """
 
 from __future__ import annotations
