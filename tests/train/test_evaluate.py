@@ -19,7 +19,7 @@ from emb_bench.excitation import parse_excitation, run_excitation
 from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import fisher
 from emb_bench.parallel import processes
-from emb_runtime.config.bench import PARAMETER_NAMES, Sensors, shipped_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError
 from emb_train import optimum
 from emb_train.cli import main

@@ -296,8 +296,8 @@ def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -
     }
     owner = (folder / "drives" / "wire.py").read_text(encoding="utf-8")
     assert "WireGuard(mapping, limit, send)" in owner
-    node = (folder / "drives" / "node.py").read_text(encoding="utf-8")
-    assert "Outlet(mapping, bench.limits.current, send)" in node
+    drive_node = (folder / "drives" / "node.py").read_text(encoding="utf-8")
+    assert "Outlet(mapping, bench.limits.current, send)" in drive_node
     opener = (folder / "drives" / "gateway.py").read_text(encoding="utf-8")
     assert "DriveNode(mapping, bench, load_layout(), drive_bus.send)" in opener
     stepper = (folder / "drives" / "lock_step.py").read_text(encoding="utf-8")
