@@ -51,6 +51,8 @@ from emb_runtime.errors import UsageError
 
 NUMBERS = ("T", "I")
 
+SMALLEST = 1e-12  # Current beside the command's that counts, of an effect's unit [A]; a sensitivity is divided by it
+
 
 @dataclass(frozen=True, eq=False)
 class Interval:
@@ -220,7 +222,8 @@ def beside_currents(problem: Problem, z: Floats, rows: Floats) -> Floats:
     acting = held(record.currents + at.errors.current_offset, problem.bench.timing.sample_time, late)
     states, s = np.empty((record.periods + 1, STATES)), np.zeros((record.periods + 1, rows.shape[1], SENSITIVE))
     states[0] = x
-    compiled(march_beside)(problem.mechanics(z), at.brake, acting, np.ascontiguousarray(rows), states, s)
+    rows = np.where(np.abs(rows) < SMALLEST, 0.0, rows)
+    compiled(march_beside)(problem.mechanics(z), at.brake, acting, rows, states, s)
     moved: Floats = np.concatenate([s[:1].repeat(delay, axis=0), s[1:]])[: record.periods, :, :2].copy()
     moved[:, :, 1] *= 1.0 + at.errors.velocity_gain
     return moved

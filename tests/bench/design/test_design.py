@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emb_bench import api
+from emb_bench.config.bench import load_bench
 from emb_bench.design import anneal
 from emb_bench.design import search as search_module
 from emb_bench.design.anneal import HOPELESS, PRICE, annealed, tracked, vary
@@ -329,7 +330,8 @@ def test_a_design_for_the_interval_is_worth_what_an_estimate_is_expected_to_tell
 ) -> None:
     monkeypatch.setattr(search_module, "FEW", 60)
     monkeypatch.setattr(search_module, "shared_out", lambda work, pieces, *_: enumerate(map(work, pieces)))
-    p = replace(make_problem(BENCH, IntervalCriterion(name), PARAMETER_NAMES), horizon=120)
+    bench = load_bench()
+    p = replace(make_problem(bench, IntervalCriterion(name), PARAMETER_NAMES), horizon=120)
     told: list[str] = []
     found = search(p, starts=2, seed=1, told=told.append)
     assert told == ["start 1 of 2 done", "start 2 of 2 done"]
@@ -340,7 +342,7 @@ def test_a_design_for_the_interval_is_worth_what_an_estimate_is_expected_to_tell
     assert found.best.feasible
     assert max(p.beyond(found.best)) <= MARGIN
     assert found.best.phi == max(design.phi for design in found.designs)
-    assert check(BENCH, p, "physical", found.best.currents, "exact").value == found.best.phi
+    assert check(bench, p, "physical", found.best.currents, "exact").value == found.best.phi
 
 
 def test_currents_that_say_nothing_are_the_worst_design_for_the_interval() -> None:
