@@ -119,8 +119,8 @@ def likelihood(
     of the periods before: these change by the mean of two currents.
     """
     doubts = age + 1.0 + math.ceil(3.0 * lag / model.sample_time)
-    none = model._replace(age=0, oldest=0, extra=0.0, transient=0.0, slides=6.0 * model.deviation)
-    tried = none._replace(lag=lag, doubts=doubts)
+    slides = 6.0 * model.deviation
+    tried = model._replace(age=0, oldest=0, lag=lag, extra=0.0, transient=0.0, doubts=doubts, slides=slides)
     memory = [0.0] * MEMORY
     begin(tried, memory, rows[0].angle, rows[0].velocity)
     share = model.current * lag
