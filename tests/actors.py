@@ -16,7 +16,7 @@ HONEST_STEPS = 100  # Hostile policies behave until this step, so that their tes
 
 
 def constant_actor(bench: Bench, current: float = 6.0, later: float | None = None, **changes: Any) -> bytes:
-    """A policy that always asks for ``current`` [A].
+    """A policy that always asks for ``current`` [A]; with ``kind="speed"`` it is a target speed [rad/s].
 
     Args:
         bench: what its contract is made for.
@@ -66,6 +66,25 @@ def contract_for(bench: Bench, current: float, **changes: Any) -> Contract:
         "velocity": bench.sensors.velocity,
     }
     return Contract(**(fields | changes))
+
+
+def speed_network(bench: Bench, weights: tuple[float, float, float], phase: float) -> bytes:
+    """A policy that jumps from one speed limit to the other with the sine of what it sees; at 0 that of ``phase``."""
+    text = """agent (float[1,3] inputs) => (float[1,1] outputs)
+    <float[3,1] weights = {0., 0., 0.}, float[1,1] phase = {0.0}, float[1,1] loud = {1e6}, float least = {0.0},
+     float most = {0.0}> {
+        product = MatMul(inputs, weights)
+        shifted = Add(product, phase)
+        wave = Sin(shifted)
+        large = Mul(wave, loud)
+        outputs = Clip(large, least, most) }"""
+    model, limit = parsed(text), bench.limits.velocity
+    numbers = {"weights": [[w] for w in weights], "phase": [[phase]], "least": -limit, "most": limit}
+    for tensor in model.graph.initializer:
+        if tensor.name in numbers:
+            tensor.CopyFrom(onnx.numpy_helper.from_array(np.array(numbers[tensor.name], np.float32), tensor.name))
+    vectors = (Vector((0.0, 0.0, 0.0), (float(np.sign(phase)) * limit,)),) * MIN_VECTORS
+    return with_contract(model, contract_for(bench, limit, kind="speed", vectors=vectors))
 
 
 REFERENCE = """agent (double[1,4] inputs) => (double[1,3] outputs)

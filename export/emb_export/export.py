@@ -13,6 +13,7 @@ from emb_bench.config.bench import load_bench
 from emb_bench.excitation import EXCITATIONS
 from emb_bench.output import replacing, require_place
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError, near, needs
+from emb_runtime.policy.contract import UNITS
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.input_file import near_file
 from emb_runtime.system.terminal import Parser, complain, show
@@ -48,10 +49,16 @@ def parser() -> argparse.ArgumentParser:
         metavar="REFERENCE|EXCITATION|CSV|ONNX|DIR",
         help="a tuned reference, one of those below or the reference.json of emb-train reference; a sequence: "
         "step:amplitude=1.5, chirp:f1=20, ..., the .csv file of emb-design, or your own with the columns current, or "
-        "time,current; your network as .onnx: a current [A] of angle, velocity and time, or of these and the running "
+        "time,current; your network as .onnx: one number for angle, velocity and time, or for these and the running "
         "estimate; or a directory that emb-train wrote",
     )
     p.add_argument("-o", "--output", type=Path, metavar="FILE", help="the ONNX file (default: DIR/actor.onnx)")
+    p.add_argument(
+        "--kind",
+        choices=tuple(UNITS),
+        help="what your network gives: a current [A], or a target speed [rad/s] which the runtime's speed loop follows "
+        "(default: current)",
+    )
     p.add_argument(
         "--bench",
         type=Path,
@@ -77,6 +84,10 @@ def _export(arguments: argparse.Namespace) -> str:
     is_training = source.is_dir()
     if is_training and arguments.bench:
         raise UsageError("--bench: a training's actor is for the bench that it was trained on; leave it out")
+    is_graph = not is_training and source.suffix.lower() == ".onnx"
+    if arguments.kind and not is_graph:
+        what = "a training knows its own" if is_training else "a sequence or a reference has its own"
+        raise UsageError(f"--kind {arguments.kind}: is for a network as .onnx; {what}: leave it out")
     if path is None and not is_training:
         raise UsageError(f"{source} is no folder of a training: name the file to write, as in --output actor.onnx")
     path = path or source / "actor.onnx"
@@ -96,8 +107,8 @@ def _export(arguments: argparse.Namespace) -> str:
         make_law(bench)  # where no shield can be made, emb-run would refuse the bench
         if source.suffix == ".json" or arguments.source in reference_names():
             data, what = reference_file(arguments.source, bench), "the reference"
-        elif source.suffix.lower() == ".onnx":
-            data, what = onnx_policy(source, bench)
+        elif is_graph:
+            data, what = onnx_policy(source, bench, arguments.kind or "current")
         elif (name := arguments.source.partition(":")[0]) not in EXCITATIONS and source.suffix.lower() != ".csv":
             hint = near(name, (*EXCITATIONS, *reference_names())) or near_file(source)
             named = "a reference or a sequence (emb-export --help lists them)"

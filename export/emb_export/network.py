@@ -14,7 +14,7 @@ from emb_bench.export.policy_file import policy_file, versions
 from emb_bench.export.torch_policy import torch_graph
 from emb_export.file import bounds
 from emb_runtime.errors import PolicyRefusedError, UsageError
-from emb_runtime.policy.contract import SAMPLE
+from emb_runtime.policy.contract import SAMPLE, greatest_output
 from emb_train.closed_loop import EVERYTHING
 from emb_train.ppo import DeployedActor
 from emb_train.training import load_training
@@ -32,7 +32,8 @@ def network_file(directory: Path) -> tuple[bytes, str]:
     if training.conditions.observes == EVERYTHING:
         raise UsageError(f"{directory}: observes the parameters and the information, which no bench measures")
     torch.set_num_threads(1)
-    actor = DeployedActor(trained.actor, bench.limits.current, bench.timing.sample_time).eval()
+    kind = "current"  # of the environment's action
+    actor = DeployedActor(trained.actor, greatest_output(kind, bench.limits), bench.timing.sample_time).eval()
     seen = observations(bench)
     with torch.no_grad():
         wanted = actor(torch.from_numpy(seen)).numpy().astype(np.float64)
@@ -46,7 +47,7 @@ def network_file(directory: Path) -> tuple[bytes, str]:
         **versions("torch", "onnxscript"),
     }
     ranges = bench.range_set(training.ranges)
-    fields = {"kind": "current", "inputs": SAMPLE, "ranges": bounds(ranges)}
+    fields = {"kind": kind, "inputs": SAMPLE, "ranges": bounds(ranges)}
     data = policy_file(torch_graph(actor, len(SAMPLE)), bench, seen, wanted, provenance, **fields)
     score = f"iteration {trained.iteration} of {training.ppo.iterations}, which returned {trained.score:.6g}"
     return data, f"the trained network, of {score} on brakes that no training draws"

@@ -37,6 +37,7 @@ from emb_train.presets import reference_names
 from emb_train.reference import box_of, features, of_features, set_reference, stored
 from emb_train.training import BENCH as BENCH_FILE
 from emb_train.training import CONFIGURATION, load_training, save_actor
+from tests.actors import parsed
 from tests.commands import refused
 from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench
 
@@ -240,6 +241,17 @@ def test_each_graph_stands_alone_in_a_version_that_the_runtimes_oldest_library_r
         assert not model.functions
         assert all(not n.metadata_props and not n.doc_string for n in model.graph.node)
         assert all(t.data_location == onnx.TensorProto.DEFAULT for t in model.graph.initializer)
+
+
+@pytest.mark.parametrize(("typed", "kind"), [("", "current"), ("--kind current", "current"), ("--kind speed", "speed")])
+def test_a_network_of_others_is_of_the_kind_that_is_typed(
+    typed: str, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph = "agent (float[1,3] seen) => (float[1,1] act) <float[3,1] w = {0.,0.,9.}> { act = MatMul(seen, w) }"
+    onnx.save(parsed(graph), tmp_path / "mine.onnx")
+    assert main([str(tmp_path / "mine.onnx"), *typed.split(), "--output", str(tmp_path / "x.onnx")]) == 0
+    assert f"({kind} of angle, velocity, time)" in capsys.readouterr().out
+    assert load_policy(tmp_path / "x.onnx", BENCH).contract.kind == kind
 
 
 def test_ctrl_c_is_no_traceback_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +40,7 @@ LONGEST = 5.0  # Time that a command may take with a file that it refuses, or th
 MOST_MEMORY = 512 << 20  # Memory of its largest process [bytes]
 TRACEBACK = re.compile(r"Traceback|Error\(|error in the program|\x1b")
 BENCH = load_bench()
+ACTORS = constant_actor, partial(constant_actor, current=300.0, kind="speed"), reference_actor  # One of each kind
 
 JUNK: tuple[Any, ...] = (
     *(
@@ -179,7 +181,7 @@ def bench_file(dice: random.Random) -> Hostile:
 
 def policy_bytes(dice: random.Random) -> bytes:
     """A policy whose graph was changed."""
-    model = onnx.load_from_string(dice.choice((constant_actor, reference_actor))(BENCH))
+    model = onnx.load_from_string(dice.choice(ACTORS)(BENCH))
     graph = model.graph
     for _ in range(dice.choice((1, 1, 2, 4))):
         match dice.randrange(8):
@@ -229,7 +231,7 @@ def policy(dice: random.Random) -> Hostile:
 
 def contract(dice: random.Random) -> Hostile:
     """A policy whose contract was changed."""
-    model = onnx.load_from_string(dice.choice((constant_actor, reference_actor))(BENCH))
+    model = onnx.load_from_string(dice.choice(ACTORS)(BENCH))
     (entry,) = model.metadata_props
     text = entry.value
     if dice.randrange(4):

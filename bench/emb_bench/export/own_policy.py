@@ -1,7 +1,7 @@
 """Policy files of the ONNX graphs of others.
 
 What is exported keeps its function: the graph gets the names, the type and the shape of the contract around it, and a
-clip at the bench's largest current behind it.
+clip at the bench's largest current or speed behind it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,16 @@ from emb_bench.export.policy_file import IR_VERSION, OPSET, Provenance, policy_f
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import PolicyRefusedError, UsageError
-from emb_runtime.policy.contract import CONTRACT_KEY, INPUTS, MIN_VECTORS, ROUNDING, SAMPLE, VECTOR_TOLERANCE
+from emb_runtime.policy.contract import (
+    CONTRACT_KEY,
+    INPUTS,
+    MIN_VECTORS,
+    ROUNDING,
+    SAMPLE,
+    UNITS,
+    VECTOR_TOLERANCE,
+    greatest_output,
+)
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME, open_session
 from emb_runtime.policy.onnx_file import read_graph, require_bounded
 from emb_runtime.policy.policy import MAX_FILE_BYTES
@@ -34,20 +43,20 @@ from emb_runtime.system.input_file import read_bytes
 
 OBSERVATIONS = 2000
 MOST_NUMBERS = 1 << 20  # Of one result inside a graph
-APART = 1e-3  # Most difference by rounding from what a graph is made of, part of the largest current
-WIDTHS = {len(names): names for names in INPUTS["current"]}  # Inputs of a current by their number
+APART = 1e-3  # Most difference by rounding from what a graph is made of, part of the output's limit
+WIDTHS = {len(names): names for names in INPUTS}  # Inputs by their number
 PORT = f"expected {' or '.join(map(str, WIDTHS))} numbers: angle, velocity, time, or these and the running estimate"
 FLOATS = {TensorProto.FLOAT: np.float32, TensorProto.DOUBLE: np.float64, TensorProto.FLOAT16: np.float16}
 INSIDE = "net."  # Before each name of the graph that is wrapped
 
 
-def onnx_policy(path: Path, bench: Bench) -> tuple[bytes, str]:
-    """The policy file of an ONNX file, and its origin in words.
+def onnx_policy(path: Path, bench: Bench, kind: str) -> tuple[bytes, str]:
+    """The policy file of an ONNX file, and its origin in words; ``kind`` is one of :data:`UNITS`.
 
     Raises:
         UsageError: the file cannot be read.
-        PolicyRefusedError: it is not ONNX, has another signature than one current [A] of 3 or 11 numbers, or operators
-            that ``emb-run`` refuses; it is a policy already; or an output is not finite.
+        PolicyRefusedError: it is not ONNX, has another signature than one number of 3 or 11, or operators that
+            ``emb-run`` refuses; it is a policy already; or an output is not finite.
     """
     model = onnx.ModelProto()
     try:
@@ -58,7 +67,7 @@ def onnx_policy(path: Path, bench: Bench) -> tuple[bytes, str]:
         raise PolicyRefusedError(f"{path}: not ONNX, or cut short") from err
     try:
         _take_in(model, path.parent)
-        return own_policy(model, bench, {"graph": printable(path.name)}, f"the graph of {path.name}", None)
+        return own_policy(model, bench, {"graph": printable(path.name)}, f"the graph of {path.name}", None, kind)
     except PolicyRefusedError as err:
         raise PolicyRefusedError(f"{path}: {err}") from err
 
@@ -85,6 +94,7 @@ def own_policy(
     provenance: Provenance,
     what: str,
     source: Callable[[NDArray[np.float32]], Floats] | None,
+    kind: str,
 ) -> tuple[bytes, str]:
     """The policy file of a graph, and its origin in words.
 
@@ -93,7 +103,8 @@ def own_policy(
         bench: limits, sample time and horizon that it is for.
         provenance: its origin, for the contract.
         what: its origin in words.
-        source: gives the currents [A] of inputs, shape [N, width]; without, ONNX Runtime with the graph as it is.
+        source: gives the outputs for inputs, shape [N, width]; without, ONNX Runtime with the graph as it is.
+        kind: of the output, one of :data:`UNITS`.
 
     Raises:
         PolicyRefusedError: see :func:`onnx_policy`.
@@ -104,38 +115,40 @@ def own_policy(
         model = bare(onnx.inliner.inline_local_functions(model))
         require_bounded(read_graph(model.SerializeToString()))
         port, width, answer = _ports(model)
-        seen, limit = observations(bench, width), bench.limits.current
+        seen, limit = observations(bench, width), greatest_output(kind, bench.limits)
         wrapped = _wrapped(model, port, width, answer, limit)
         _require_small(wrapped)
         asked = (source or _evaluated(model, port))(seen)
         if asked.size != len(seen):
             shape = list(asked.shape[1:])
-            raise PolicyRefusedError(f"its output has the shape {shape}: expected one current [A], shape [1, 1]")
+            raise PolicyRefusedError(
+                f"its output has the shape {shape}: expected one {kind} [{UNITS[kind]}], shape [1, 1]"
+            )
         asked = asked.reshape(len(seen), 1)
         for row in seen[~np.isfinite(asked[:, 0])]:
             named = ", ".join(f"{name} {value:.4g}" for name, value in zip(WIDTHS[width], row.tolist(), strict=True))
-            raise PolicyRefusedError(f"its current is not finite for {named}")
+            raise PolicyRefusedError(f"its {kind} is not finite for {named}")
         wanted = np.clip(asked, -limit, limit)
         found = _evaluated(wrapped, wrapped.graph.input[0])(seen).reshape(wanted.shape)
         apart = np.abs(found - wanted)[:, 0] / limit
         if not apart.max() <= APART:
             raise PolicyRefusedError(
-                f"its graph differs from it by {apart.max() * limit:.3g} A, expected rounding alone"
+                f"its graph differs from it by {apart.max() * limit:.3g} {UNITS[kind]}, expected rounding alone"
             )
         alike = apart <= 0.25 * VECTOR_TOLERANCE  # a test vector has to be met on other computers, too
         if alike.sum() < MIN_VECTORS:
             raise PolicyRefusedError(
-                f"its currents round by more than {VECTOR_TOLERANCE * limit:g} A: scale its inputs"
+                f"its {kind}s round by more than {VECTOR_TOLERANCE * limit:g} {UNITS[kind]}: scale its inputs"
             )
-        fields = {"kind": "current", "inputs": WIDTHS[width]}
+        fields = {"kind": kind, "inputs": WIDTHS[width]}
         data = policy_file(wrapped, bench, seen[alike], wanted[alike], provenance, **fields)
     except PolicyRefusedError:
         raise
     except Exception as err:  # the errors of the onnx package share no base class
         raise PolicyRefusedError(f"the onnx package refuses it: {first_line(err)}") from err
     beyond = int((np.abs(asked) > limit * (1.0 + ROUNDING)).sum())
-    clipped = f"; {beyond} of {len(seen)} currents are beyond {limit:g} A: clipped" if beyond else ""
-    return data, f"{what} ({', '.join(WIDTHS[width])}) at {len(seen)} inputs{clipped}"
+    clipped = f"; {beyond} of {len(seen)} {kind}s are beyond {limit:g} {UNITS[kind]}: clipped" if beyond else ""
+    return data, f"{what} ({kind} of {', '.join(WIDTHS[width])}) at {len(seen)} inputs{clipped}"
 
 
 def _take_in(model: onnx.ModelProto, folder: Path) -> None:
@@ -173,7 +186,7 @@ def _ports(model: onnx.ModelProto) -> tuple[Any, int, Any]:
     """The input, its width, and the output.
 
     Raises:
-        PolicyRefusedError: there are several, or of another type or shape than those of one current.
+        PolicyRefusedError: there are several, or of another type or shape than those of one number.
     """
     held = {tensor.name for tensor in model.graph.initializer}
     ports = []
@@ -224,8 +237,8 @@ def _wrapped(model: onnx.ModelProto, port: Any, width: int, answer: Any, limit: 
     ]
     after = [
         helper.make_node("Cast", [INSIDE + answer.name], ["asked"], to=TensorProto.FLOAT),
-        helper.make_node("Reshape", ["asked", "one"], ["current"]),
-        helper.make_node("Clip", ["current", "least", "greatest"], [OUTPUT_NAME]),
+        helper.make_node("Reshape", ["asked", "one"], ["number"]),
+        helper.make_node("Clip", ["number", "least", "greatest"], [OUTPUT_NAME]),
     ]
     nodes = [*before, *graph.node, *after]
     del graph.node[:], graph.input[:], graph.output[:]

@@ -21,18 +21,20 @@ from emb_bench.export.own_policy import PORT, WIDTHS, bare, first_line, own_poli
 from emb_bench.export.policy_file import OPSET, printable, versions
 from emb_bench.information.symmetric import Floats
 from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.policy.contract import greatest_output
 from emb_runtime.policy.inference import INPUT_NAME, OUTPUT_NAME
 
 SPACE = "expected the spaces of EmbExcitation-v0: Box observations of 3 or 11 numbers, one action from -1 to 1"
 
 
-def module_policy(policy: Any, bench: Bench) -> tuple[bytes, str]:
+def module_policy(policy: Any, bench: Bench, kind: str) -> tuple[bytes, str]:
     """The policy file of a torch module, a function of a tensor, or a model of Stable-Baselines3; and its origin.
 
     Args:
-        policy: a module or a function that gives currents [A], shape [N, 1], of inputs, shape [N, 3] or [N, 11]; or a
+        policy: a module or a function that gives outputs, shape [N, 1], for inputs, shape [N, 3] or [N, 11]; or a
             model that was trained on ``EmbExcitation-v0``, with the normalisation of its environment.
         bench: limits, sample time and horizon that it is for.
+        kind: of the output, one of :data:`emb_runtime.policy.contract.UNITS`; an action of 1 is the bench's limit.
 
     Raises:
         UsageError: the model has other spaces than the environment.
@@ -40,7 +42,7 @@ def module_policy(policy: Any, bench: Bench) -> tuple[bytes, str]:
     """
     name = type(policy).__name__
     if hasattr(policy, "policy") and hasattr(policy, "observation_space"):
-        module, widths = _deployed(policy, bench)
+        module, widths = _deployed(policy, bench, kind)
     elif isinstance(policy, torch.nn.Module):
         module, widths = _copied(policy), tuple(WIDTHS)
     else:
@@ -48,14 +50,15 @@ def module_policy(policy: Any, bench: Bench) -> tuple[bytes, str]:
     validates = torch.distributions.Distribution._validate_args
     torch.distributions.Distribution.set_default_validate_args(False)  # its checks cannot be exported
     try:
-        width = _width(module, widths)
+        width = _width(module, widths, kind)
         graph = torch_graph(module, width)
 
         def source(seen: NDArray[np.float32]) -> Floats:
             with torch.no_grad():
                 return np.array([module(torch.from_numpy(row[None])).numpy() for row in seen], np.float64)
 
-        return own_policy(graph, bench, {"module": printable(name), **versions("torch")}, f"the {name}", source)
+        provenance = {"module": printable(name), **versions("torch")}
+        return own_policy(graph, bench, provenance, f"the {name}", source, kind)
     finally:
         torch.distributions.Distribution.set_default_validate_args(validates)
 
@@ -101,12 +104,12 @@ class _Called(nn.Module):
         self._function = function
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Its currents [A]."""
+        """Its outputs."""
         return self._function(inputs)
 
 
 class _Deployed(nn.Module):
-    """A policy of Stable-Baselines3 with the inputs of the contract and currents [A]."""
+    """A policy of Stable-Baselines3 with the inputs and the output of the contract."""
 
     mean: Tensor
     deviation: Tensor
@@ -122,14 +125,14 @@ class _Deployed(nn.Module):
         self.register_buffer("deviation", torch.tensor(deviation, dtype=torch.float32))
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Its currents [A], shape [N, 1]; it was trained on the number of the step in place of the time."""
+        """Its outputs, shape [N, 1]; it was trained on the number of the step in place of the time."""
         seen = torch.cat([inputs[:, :2], inputs[:, 2:3] / self._sample_time, inputs[:, 3:]], 1)
         scaled = torch.clamp((seen - self.mean) / self.deviation, -self._reach, self._reach)
         action: Tensor = self._policy._predict(scaled, deterministic=True)
         return self._limit * torch.clamp(action, -1.0, 1.0)
 
 
-def _deployed(model: Any, bench: Bench) -> tuple[nn.Module, tuple[int, ...]]:
+def _deployed(model: Any, bench: Bench, kind: str) -> tuple[nn.Module, tuple[int, ...]]:
     """A model of Stable-Baselines3 as a module with our inputs, and how many those are."""
     seen, acts = getattr(model.observation_space, "shape", None), model.action_space
     bounded = getattr(acts, "shape", None) == (1,) and hasattr(acts, "low") and (acts.low, acts.high) == (-1.0, 1.0)
@@ -143,11 +146,11 @@ def _deployed(model: Any, bench: Bench) -> tuple[nn.Module, tuple[int, ...]]:
     model.policy.save(kept)
     kept.seek(0)
     policy = type(model.policy).load(kept, device="cpu").eval()
-    limit, sample_time = bench.limits.current, bench.timing.sample_time
+    limit, sample_time = greatest_output(kind, bench.limits), bench.timing.sample_time
     return _Deployed(policy, model.get_vec_normalize_env(), seen[0], limit, sample_time).eval(), seen
 
 
-def _width(module: nn.Module, widths: tuple[int, ...]) -> int:
+def _width(module: nn.Module, widths: tuple[int, ...], kind: str) -> int:
     """Number of inputs that a module takes."""
     said = ""
     for width in widths:
@@ -162,4 +165,4 @@ def _width(module: nn.Module, widths: tuple[int, ...]) -> int:
         if answer.numel() == 1:
             return width
         said = said or f"its output has the shape {list(answer.shape)}"  # a slice of too few numbers is empty
-    raise PolicyRefusedError(f"it gives no current of a row of {' or '.join(map(str, widths))} numbers: {said}: {PORT}")
+    raise PolicyRefusedError(f"it gives no {kind} of a row of {' or '.join(map(str, widths))} numbers: {said}: {PORT}")

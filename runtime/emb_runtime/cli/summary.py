@@ -193,8 +193,9 @@ def log_facts(log: RecorderResult) -> dict[str, Any]:
 
 def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
     """A run's outcome as plain data."""
-    outcome, fault = ran.outcome, ran.outcome.fault
-    assert plan.policy is not None
+    outcome, fault, policy = ran.outcome, ran.outcome.fault, plan.policy
+    assert policy is not None
+    is_experiment = ran.run_type is RunType.EXPERIMENT
     # An estimate relies on the response: before it is proven, a run that ended says nothing about the brake.
     beyond = outside(plan.bench, outcome.estimate) if fault is None or outcome.response else {}
     exit_code = EXIT_OUTSIDE if plan.strict and beyond and ran.exit_code == EXIT_DONE else ran.exit_code
@@ -209,6 +210,8 @@ def document(plan: Plan, iface: str, ran: RunResult) -> dict[str, Any]:
         "limit": plan.limit,
         "iface": iface,
         "bench": plan.bench.name,
+        "policy_kind": policy.contract.kind if is_experiment else None,
+        "policy_sha256": policy.sha256 if is_experiment else None,
         "steps": ran.steps,
         "duration_s": outcome.duration_ns * 1e-9,
         **facts(outcome),
@@ -274,6 +277,8 @@ def text(s: Mapping[str, Any], details: bool = False) -> str:
     lines += [f"  way home   {name} the experiment: {brief(way)}" for name, way in s["homing"].items()]
     if s["stage"] != "full":
         lines.append(f"  stage      {s['stage']}, at most {s['limit']:g} A")
+    if s["policy_kind"]:
+        lines.append(f"  policy     {s['policy_kind']}, sha256 {s['policy_sha256'][:12]}")
     if s["pairs"]:
         lines += _brake(s)
     if s["pairs"] and (details or s["result"] != "done" or s["unanswered"] or s["missed"] or s["rejected"]):

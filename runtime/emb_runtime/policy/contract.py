@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from emb_runtime.config.bench import PARAMETER_NAMES, Bench
+from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Limits
 from emb_runtime.config.typed import Positive, shown
 from emb_runtime.errors import PolicyRefusedError
 
@@ -22,13 +22,15 @@ MIN_VECTORS = 32
 MAX_VECTORS = 4096
 MAX_WIDTH = 64  # Numbers that a graph takes or gives
 VECTOR_TOLERANCE = 1e-5
-"""Largest difference of a replayed test vector from the recorded one: of a current as a part of its limit."""
+"""Largest difference of a replayed test vector from the recorded one, as a part of the output's limit."""
 ROUNDING = 1e-6  # Relative: single precision in the policy may pass the greatest output by so much
 
 SAMPLE = ("angle", "velocity", "time")  # Measured [rad, rad/s], and since the experiment began [s]
 DEVIATIONS = tuple(f"{name}_deviation" for name in PARAMETER_NAMES)
-INPUTS = {"current": (SAMPLE, (*SAMPLE, *PARAMETER_NAMES, *DEVIATIONS)), "reference": (PARAMETER_NAMES,)}
-"""Inputs that a graph of each kind may have. Parameters are the running estimate, in SI units."""
+INPUTS = (SAMPLE, (*SAMPLE, *PARAMETER_NAMES, *DEVIATIONS))
+"""Inputs that a graph may have. Parameters are the running estimate, in SI units."""
+UNITS = {"current": "A", "speed": "rad/s"}
+"""Unit of the one output, by the kind of the graph."""
 
 Name = Annotated[str, Meta(pattern=r"^[ -~]{1,120}\Z")]
 Text = Annotated[str, Meta(pattern=r"^[ -~]{1,500}\Z")]
@@ -53,13 +55,14 @@ class PolicyLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Everything that must fit before a policy may drive a bench.
 
-    A graph of the kind ``current`` gives a current [A]. One of the kind ``reference`` gives n levels of speed, as parts
-    of the limit, then n − 1 switches between them, as parts of the horizon, which the runtime's speed loop follows.
-    All are within ±1; a level whose switch is not above 0 is left out.
+    A graph of the kind ``current`` gives a current [A], one of the kind ``speed`` a target speed [rad/s], which the
+    runtime's speed loop follows. One of the kind ``reference`` sees the parameters only; it gives n levels of speed, as
+    parts of the limit, then n − 1 switches between them, as parts of the horizon. All are within ±1; a level whose
+    switch is not above 0 is left out.
     """
 
     schema: Literal[4] = SCHEMA
-    kind: Literal["current", "reference"]
+    kind: Literal["current", "speed", "reference"]
     inputs: Annotated[tuple[str, ...], Meta(max_length=MAX_WIDTH)]
     limits: PolicyLimits
     sample_time: Positive  # [s]
@@ -72,8 +75,9 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     provenance: dict[Name, Text | int | float] = {}
 
     def __post_init__(self) -> None:
-        if self.inputs not in INPUTS[self.kind]:
-            wanted = " or ".join(f"[{', '.join(names)}]" for names in INPUTS[self.kind])
+        allowed = (PARAMETER_NAMES,) if self.kind == "reference" else INPUTS
+        if self.inputs not in allowed:
+            wanted = " or ".join(f"[{', '.join(names)}]" for names in allowed)
             raise ValueError(f"inputs: expected {wanted}, got {shown(self.inputs)}")
         for name, (low, high) in (("limits.angle", self.limits.angle), *self.ranges.items()):
             if not low <= high:
@@ -85,13 +89,14 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             # This way round, NaN is refused.
             if not all(abs(output) <= self.greatest * (1.0 + ROUNDING) for output in vector.outputs):
                 raise ValueError(f"vectors[{i}]: expected outputs within ±{self.greatest:g}")
-        if width % 2 == 0 or (self.kind == "current" and width > 1):
-            raise ValueError(f"vectors: expected one current, or an odd number of levels and switches, got {width}")
+        if width % 2 == 0 or (self.kind != "reference" and width > 1):
+            wanted = "an odd number of levels and switches" if self.kind == "reference" else f"one {self.kind}"
+            raise ValueError(f"vectors: expected {wanted}, got {width}")
 
     @property
     def greatest(self) -> float:
-        """Greatest output of the graph, both signs, but for its rounding: a current [A], or a level or switch."""
-        return self.limits.current if self.kind == "current" else 1.0
+        """Greatest output of the graph, both signs, but for its rounding; of levels and switches 1."""
+        return 1.0 if self.kind == "reference" else greatest_output(self.kind, self.limits)
 
     def to_json(self) -> str:
         """The contract as JSON; floats keep their full precision."""
@@ -124,6 +129,11 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             if lowest < low or highest > high:
                 found.append(f"{name} in {lowest:g} to {highest:g}, made for {low:g} to {high:g}")
         return found
+
+
+def greatest_output(kind: str, limits: PolicyLimits | Limits) -> float:
+    """Limit of the one output of a graph, both signs: of a current [A], or of a target speed [rad/s]."""
+    return limits.current if kind == "current" else limits.velocity
 
 
 def read_contract(text: str) -> Contract:

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
 INPUT_NAME = "inputs"
 OUTPUT_NAME = "outputs"
-TYPES = {"current": ("f", "tensor(float)"), "reference": ("d", "tensor(double)")}
-"""By the contract's kind: type code and ONNX Runtime's type of inputs and outputs. Both have the shape [1, width]."""
 
 
 class Inference:
@@ -29,7 +27,7 @@ class Inference:
 
     def __init__(self, data: bytes, contract: Contract) -> None:
         self._session = open_session(data)
-        code, kind = TYPES[contract.kind]
+        code, kind = ("d", "tensor(double)") if contract.kind == "reference" else ("f", "tensor(float)")
         self.inputs = array(code, contract.vectors[0].inputs)
         self.outputs = array(code, contract.vectors[0].outputs)
         ports = {INPUT_NAME: self.inputs, OUTPUT_NAME: self.outputs}

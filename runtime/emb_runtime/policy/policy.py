@@ -13,10 +13,10 @@ import math
 from importlib import resources
 from pathlib import Path
 
-from emb_runtime.config.bench import CEILING_CURRENT, Bench
+from emb_runtime.config.bench import CEILING_CURRENT, CEILING_VELOCITY, Bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.estimator.speed_loop import follow_reference, scale_of
+from emb_runtime.estimator.speed_loop import current_for, follow_reference, scale_of
 from emb_runtime.policy.contract import CONTRACT_KEY, ROUNDING, SAMPLE, VECTOR_TOLERANCE, Contract, read_contract
 from emb_runtime.policy.inference import Inference
 from emb_runtime.policy.onnx_file import Graph, read_graph, require_bounded
@@ -46,7 +46,7 @@ class Policy:
         self.sha256 = hashlib.sha256(data).hexdigest()
         self.warnings = contract.warnings(bench)
         self._inference = inference
-        self._is_reference = contract.kind == "reference"
+        self._kind = contract.kind
         self._estimates = len(contract.inputs) > len(SAMPLE)
         self._sample_time = bench.timing.sample_time
         self._scale = scale_of(bench, contract.gain)
@@ -56,8 +56,9 @@ class Policy:
     def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         """Current for the period that begins at a sample [A]; finite and within limits only if the caller checks it.
 
-        The speed loop cuts off every current at the limit. So a reference that is not finite gives NaN, and one beyond
-        ±1 a current beyond the contract's limit. PolicyRefusedError if ONNX Runtime could not evaluate the graph.
+        The speed loop cuts off every current at the limit. So a target speed or a reference that is not finite gives
+        NaN, and one beyond the contract a current beyond its limit. PolicyRefusedError if ONNX Runtime could not
+        evaluate the graph.
 
         Args:
             angle: measured [rad].
@@ -66,23 +67,25 @@ class Policy:
             estimator: with the sample taken in.
         """
         inputs, outputs = self._inference.inputs, self._inference.outputs
-        if self._is_reference:
-            parameters = estimator.relative
-            inputs[0], inputs[1], inputs[2], inputs[3] = estimator.in_si(parameters)
-            self._inference.run()
-            if not all(map(math.isfinite, outputs)):
-                return math.nan
-            if max(map(abs, outputs)) > self._greatest:
-                return 2.0 * self.contract.limits.current
-            levels, switches = outputs[: self._levels], outputs[self._levels :]
-            model, state = estimator.model, estimator.state
-            return follow_reference(model, state, parameters, self._scale, levels, switches, step)
-        inputs[0], inputs[1], inputs[2] = angle, velocity, step * self._sample_time
-        if self._estimates:
-            for i, number in enumerate(estimator.parameters):
-                inputs[len(SAMPLE) + i] = number
+        if self._kind == "reference":
+            inputs[0], inputs[1], inputs[2], inputs[3] = estimator.in_si(estimator.relative)
+        else:
+            inputs[0], inputs[1], inputs[2] = angle, velocity, step * self._sample_time
+            if self._estimates:
+                for i, number in enumerate(estimator.parameters):
+                    inputs[len(SAMPLE) + i] = number
         self._inference.run()
-        return outputs[0]
+        if self._kind == "current":
+            return outputs[0]
+        if not all(map(math.isfinite, outputs)):
+            return math.nan
+        if max(map(abs, outputs)) > self._greatest:
+            return 2.0 * self.contract.limits.current
+        model, state, parameters = estimator.model, estimator.state, estimator.relative
+        if self._kind == "speed":
+            return current_for(model, state, parameters, outputs[0], self._scale.gain)
+        levels, switches = outputs[: self._levels], outputs[self._levels :]
+        return follow_reference(model, state, parameters, self._scale, levels, switches, step)
 
 
 def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
@@ -115,9 +118,9 @@ def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
 def _difference(inference: Inference, contract: Contract) -> str:
     """First output of a test vector that is not reproduced; "" if all are.
 
-    The tolerance of a current is a part of its limit, which a contract cannot widen beyond all currents.
+    The tolerance is a part of the output's limit, which a contract cannot widen beyond all currents or speeds.
     """
-    largest = min(contract.limits.current, CEILING_CURRENT) if contract.kind == "current" else 1.0
+    largest = min(contract.greatest, CEILING_CURRENT if contract.kind == "current" else CEILING_VELOCITY)
     for index, vector in enumerate(contract.vectors):
         inference.inputs[:] = type(inference.inputs)(inference.inputs.typecode, vector.inputs)
         inference.run()

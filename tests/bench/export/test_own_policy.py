@@ -22,6 +22,7 @@ from emb_bench.export.sequence import read_sequence
 from emb_runtime.cli.main import main as run_main
 from emb_runtime.errors import EmbError, PolicyRefusedError, UsageError
 from emb_runtime.estimator.estimator import Estimator
+from emb_runtime.estimator.speed_loop import current_for
 from emb_runtime.policy.policy import load_policy
 from emb_train.env import EmbExcitationEnv
 
@@ -62,14 +63,26 @@ def graph(
     return model
 
 
-def exported(model: Any, folder: Path) -> Any:
+def exported(model: Any, folder: Path, kind: str = "current") -> Any:
     """The policy that becomes of a graph, a module or a table, as the runtime loads it."""
     source: Any = model
     if isinstance(model, onnx.ModelProto):
         source = folder / "mine.onnx"
         onnx.save(model, source)
-    api.export_policy(source, folder / "policy.onnx")
+    api.export_policy(source, folder / "policy.onnx", kind=kind)
     return load_policy(folder / "policy.onnx", BENCH)
+
+
+def followed(policy: Any, speed: float, angle: float, velocity: float, step: int) -> bool:
+    """Whether the policy asks for the current that the speed loop finds for this speed [rad/s].
+
+    The brake is believed to be a little slower, so that the current is within its limits.
+    """
+    estimator = Estimator(BENCH)
+    estimator.state = estimator.state._replace(mean=(angle, speed - 5.0, 1.0, 1.0, 1.0, 1.0))
+    found = policy.act(angle, velocity, step, estimator)
+    wanted = current_for(estimator.model, estimator.state, estimator.relative, speed, 1.0)
+    return bool(found == pytest.approx(wanted, abs=1e-3)) and abs(found) < BENCH.limits.current
 
 
 def current(policy: Any, angle: float, velocity: float, step: int) -> float:
@@ -109,6 +122,24 @@ def test_a_graph_keeps_its_function_under_the_contract_s_names(
         assert current(policy, *sample) == pytest.approx(wanted(*sample), abs=near)
     assert policy.contract.inputs == ("angle", "velocity", "time")
     assert policy.contract.provenance["graph"] == "mine.onnx"
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit", "said"),
+    [
+        ("current", 6.0, "2000 currents are beyond 6 A: clipped"),
+        ("speed", 500.0, "speeds are beyond 500 rad/s: clipped"),
+    ],
+)
+def test_the_kind_says_whether_it_is_a_current_or_a_target_speed(
+    kind: str, limit: float, said: str, tmp_path: Path
+) -> None:
+    onnx.save(graph(weights=1e3 * WEIGHTS), tmp_path / "mine.onnx")
+    assert said in api.export_policy(tmp_path / "mine.onnx", tmp_path / "x.onnx", kind=kind)
+    contract = load_policy(tmp_path / "x.onnx", BENCH).contract
+    assert (contract.kind, contract.greatest, contract.gain) == (kind, limit, 1.0)
+    found = {output for vector in contract.vectors for output in vector.outputs}
+    assert {limit, -limit} < found
 
 
 @pytest.mark.parametrize(
@@ -243,6 +274,34 @@ def test_what_is_no_policy_is_refused(policy: Any, words: str, tmp_path: Path) -
     assert not list(tmp_path.iterdir())
 
 
+def test_a_function_of_a_tensor_may_give_target_speeds(tmp_path: Path) -> None:
+    policy = exported(lambda inputs: 5.0 + 0.1 * inputs[:, :1] + 40.0 * inputs[:, 2:3], tmp_path, kind="speed")
+    assert followed(policy, 5.0 + 0.1 * 3.0 + 40.0 * 0.02, 3.0, 2.0, 20)
+    run = api.simulate(tmp_path / "run.mcap", policy=tmp_path / "policy.onnx")
+    assert run.exit_reason == "DONE"
+    wanted = 5.0 + 0.1 * run.angle + 40.0 * 1e-3 * np.arange(len(run.angle))
+    assert np.abs(run.velocity - wanted)[50:150].max() < 10.0
+
+
+@pytest.mark.parametrize(
+    ("policy", "kind", "words"),
+    [
+        (lambda inputs: inputs[:, :2], "speed", "it gives no speed of a row of 3 or 11 numbers"),
+        (lambda inputs: torch.log(inputs[:, :1]), "speed", "its speed is not finite for angle -"),
+        (lambda inputs: inputs[:, :1], "torque", "kind: expected current or speed, got 'torque'"),
+        (lambda inputs: inputs[:, :1], "reference", "kind: expected current or speed, got 'reference'"),
+        ([0.1] * 500, "speed", "kind: speed is for a network"),
+        ("step", "speed", "kind: speed is for a network"),
+        ("mine.csv", "speed", "kind: speed is for a network"),
+    ],
+)
+def test_a_kind_that_it_cannot_have_is_refused(policy: Any, kind: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(EmbError) as refusal:
+        api.export_policy(policy, tmp_path / "x.onnx", kind=kind)
+    assert words in str(refusal.value)
+    assert not list(tmp_path.iterdir())
+
+
 # Stable-Baselines3 ----------------------------------------------------------------------------------------------------
 
 
@@ -264,6 +323,16 @@ def test_a_model_requests_what_it_predicts_for_the_scaled_observation(
         wanted = 6.0 * np.clip(action, -1.0, 1.0).item()
         assert current(policy, angle, velocity, step) == pytest.approx(wanted, abs=1e-4)
     assert policy.contract.provenance["module"] == "PPO"
+
+
+def test_a_model_that_was_trained_on_target_speeds_requests_them_as_parts_of_the_speed_limit(
+    normalised: tuple[PPO, VecNormalize], tmp_path: Path
+) -> None:
+    model, env = normalised
+    policy = exported(model, tmp_path, kind="speed")
+    sample = (0.0, 0.0, 0)
+    action, _ = model.predict(env.normalize_obs(np.array([sample], np.float32)), deterministic=True)
+    assert followed(policy, 500.0 * action.item(), *sample)
 
 
 def test_a_model_without_its_environment_or_with_other_spaces_is_refused(

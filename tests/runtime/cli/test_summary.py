@@ -29,7 +29,7 @@ class Plan:
 
     def __init__(self, bench: Bench) -> None:
         self.bench, self.stage, self.limit, self.strict = bench, "full", 6.0, False
-        self.policy = SimpleNamespace(contract=contract_for(bench, 1.0))
+        self.policy = SimpleNamespace(contract=contract_for(bench, 300.0, kind="speed"), sha256="0123456789abcdef")
 
 
 @pytest.fixture
@@ -78,6 +78,7 @@ def test_every_count_and_every_trouble_has_its_words_and_an_undisturbed_run_few(
     rows: tuple[tuple[dict[str, Any], str], ...] = (
         ({}, "490 of 500"),
         ({}, "10 without a command"),
+        ({}, "  policy     speed, sha256 0123456789ab\n"),
         ({}, "run.mcap (3787 messages, 146 KiB)"),
         ({"bus_errors": {"no acknowledgement": 3, "bus error": 1}}, "no acknowledgement (3), bus error (1)"),
         ({"rejections": {"EMB_Angle": {"CRC": 2}}}, "EMB_Angle: CRC (2)"),
@@ -140,6 +141,7 @@ def test_the_ways_home_are_told_with_the_experiment(told: Any) -> None:
     said = text(told() | {"homing": {"before": way, "after": gone}})
     assert "way home   before the experiment: done: 490 of 500 answered, home, run.mcap" in said
     assert "way home   after the experiment: NO_NODE: nobody there" in said
+    assert "policy" not in text(told(RunType.HOMING))  # it does not move the brake then
     assert text(told(RunType.HOMING, fault=Fault.NOT_HOME)).startswith("STOPPED on the way home (NOT_HOME)")
 
 

@@ -25,12 +25,13 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Sensors, load_bench
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.kalman import believed
-from emb_runtime.estimator.speed_loop import follow_reference, scale_of
+from emb_runtime.estimator.speed_loop import current_for, follow_reference, scale_of
 from emb_runtime.policy.contract import (
     CONTRACT_KEY,
     INPUTS,
     MAX_VECTORS,
     MIN_VECTORS,
+    UNITS,
     PolicyLimits,
     Vector,
     read_contract,
@@ -104,25 +105,37 @@ def test_what_is_no_contract_is_refused() -> None:
         GOOD.to_json() + " " * 1_000_001,
     ):
         refusal(partial(read_contract, text))
-    even = vectors_of("reference", [0.0, 0.0])  # levels and switches are an odd number
-    assert "vectors" in refusal(partial(read_contract, even))
+    for kind, outputs, expected in (
+        ("current", [0.0] * 3, "one current"),
+        ("speed", [0.0] * 3, "one speed"),
+        ("reference", [0.0] * 2, "an odd number of levels and switches"),
+    ):
+        assert f"expected {expected}, got" in refusal(partial(read_contract, vectors_of(kind, outputs)))
 
 
 def vectors_of(kind: str, outputs: list[float]) -> str:
-    """A contract for 3 A, all of whose test vectors have these outputs."""
-    inputs = list(INPUTS[kind][0])
+    """A contract for 3 A and 300 rad/s, all of whose test vectors have these outputs."""
+    inputs = list(PARAMETER_NAMES if kind == "reference" else INPUTS[0])
     vectors = [{"inputs": [1.0] * len(inputs), "outputs": outputs}] * MIN_VECTORS
     record = json.loads(GOOD.to_json()) | {"kind": kind, "inputs": inputs, "vectors": vectors}
-    record["limits"]["current"] = 3.0
+    record["limits"] |= {"current": 3.0, "velocity": 300.0}
     return json.dumps(record)
 
 
 def test_the_outputs_of_test_vectors_are_within_what_a_policy_may_ask_for() -> None:
-    for kind, outputs in (("current", [3.0]), ("current", [-3.0 * (1.0 + 0.5e-6)]), ("reference", [1.0, -1.0, -1.0])):
+    for kind, outputs in (
+        ("current", [3.0]),
+        ("current", [-3.0 * (1.0 + 0.5e-6)]),
+        ("speed", [300.0 * (1.0 + 0.5e-6)]),
+        ("speed", [-300.0]),
+        ("reference", [1.0, -1.0, -1.0]),
+    ):
         assert read_contract(vectors_of(kind, outputs)).vectors[0].outputs == tuple(outputs)
     for kind, outputs in (
         ("current", [3.0 * (1.0 + 2e-6)]),
         ("current", [-1e9]),
+        ("speed", [-300.0 * (1.0 + 2e-6)]),
+        ("speed", [500.0]),
         ("reference", [1.0 + 2e-6, 0.0, 0.5]),
         ("reference", [0.0, -1.1, 0.5]),
         ("reference", [0.0, 0.0, 1.1]),
@@ -145,7 +158,11 @@ def on(**changes: Any) -> Bench:
 
 def test_a_bench_that_goes_beyond_the_policys_limits_is_refused_by_its_key_and_a_narrower_one_is_not() -> None:
     small = PolicyLimits(3.0, (-5.0, 50.0), 300.0)
-    for data in (constant_actor(BENCH, 2.0, limits=small), reference_actor(BENCH, limits=small)):
+    for data in (
+        constant_actor(BENCH, 2.0, limits=small),
+        constant_actor(BENCH, 300.0, limits=small, kind="speed"),
+        reference_actor(BENCH, limits=small),
+    ):
         load_policy(data, on(current=3.0, angle=(-5.0, 50.0), velocity=300.0))
         load_policy(data, on(current=1.0, angle=(-1.0, 20.0), velocity=100.0))
         for key, wider in (
@@ -202,20 +219,29 @@ def test_a_sane_policy_is_loaded_and_gives_what_its_graph_gives(tmp_path: Path) 
 
 
 def test_angle_velocity_and_time_reach_the_graph_and_the_estimate_where_it_asks_for_it() -> None:
-    def summing(inputs: tuple[str, ...]) -> tuple[bytes, Any]:
+    def summing(inputs: tuple[str, ...], kind: str) -> tuple[bytes, Any]:
         width = len(inputs)
         weights = np.random.default_rng(1).uniform(0.5, 1.0, width).astype(np.float32)
         numbers = ", ".join(map(repr, weights.tolist()))
         text = f"agent (float[1,{width}] inputs) => (float[1,1] outputs) <float[{width},1] w = {{{numbers}}}>"
         vectors = tuple(Vector((n / 64,) * width, (float(n / 64 * weights.sum()),)) for n in range(MIN_VECTORS))
-        return model_of(text + " { outputs = MatMul(inputs, w) }", inputs=inputs, vectors=vectors), weights
+        return model_of(
+            text + " { outputs = MatMul(inputs, w) }", inputs=inputs, vectors=vectors, kind=kind, gain=0.01
+        ), weights
 
     estimator = Estimator(BENCH)
     estimator.take(0.1, 20.0, 0, 0.0)
-    for inputs in INPUTS["current"]:
-        data, weights = summing(inputs)
-        seen = np.array([2.0, 100.0, 0.004, *estimator.parameters])[: len(inputs)]
-        assert load_policy(data, BENCH).act(2.0, 100.0, 4, estimator) == pytest.approx(float(weights @ seen), rel=1e-6)
+    model, state = estimator.model, estimator.state
+    for inputs in INPUTS:
+        for kind in UNITS:
+            data, weights = summing(inputs, kind)
+            seen = np.array([2.0, 100.0, 0.004, *estimator.parameters])[: len(inputs)]
+            wanted = float(weights @ seen)
+            if kind == "speed":
+                wanted = current_for(model, state, believed(model, state), wanted, 0.01)
+            found = load_policy(data, BENCH).act(2.0, 100.0, 4, estimator)
+            assert abs(found) < 6.0 or kind == "current"  # the speed loop cuts off nothing
+            assert found == pytest.approx(wanted, rel=1e-5)
 
 
 def test_a_reference_is_followed_by_the_speed_loop_at_the_benchs_scale() -> None:
@@ -231,12 +257,13 @@ def test_a_reference_is_followed_by_the_speed_loop_at_the_benchs_scale() -> None
 
 
 def test_the_speed_loop_takes_an_estimate_within_its_range_only() -> None:
-    policy, estimator = load_policy(reference_actor(BENCH, gain=0.01), BENCH), Estimator(BENCH)
-    found = []
-    for k_m in (9.0, estimator.model.high[0], 1.0):
-        estimator.state = estimator.state._replace(mean=(10.0, 50.0, k_m, 1.0, 1.0, 1.0))
-        found.append(policy.act(10.0, 50.0, 0.0, estimator))
-    assert found[0] == found[1] != found[2]
+    for data in (reference_actor(BENCH, gain=0.01), constant_actor(BENCH, 250.0, kind="speed", gain=0.01)):
+        policy, estimator = load_policy(data, BENCH), Estimator(BENCH)
+        found = []
+        for k_m in (9.0, estimator.model.high[0], 1.0):
+            estimator.state = estimator.state._replace(mean=(10.0, 50.0, k_m, 1.0, 1.0, 1.0))
+            found.append(policy.act(10.0, 50.0, 0.0, estimator))
+        assert found[0] == found[1] != found[2]
 
 
 def test_a_reference_that_is_not_finite_or_beyond_its_contract_asks_for_a_current_that_is_so_too() -> None:
@@ -269,6 +296,30 @@ def test_a_reference_that_is_not_finite_or_beyond_its_contract_asks_for_a_curren
             assert stopped.value.fault is fault, (place, output)
 
 
+def test_a_speed_that_is_not_finite_or_beyond_its_contract_asks_for_a_current_that_is_so_too() -> None:
+    for output, fault in (
+        *((output, Fault.POLICY_NOT_FINITE) for output in (math.nan, math.inf, -math.inf)),
+        *((output, Fault.POLICY_BEYOND_CONTRACT) for output in (1e9, -3e38, 500.001, -500.001)),
+        *((output, None) for output in (500.0, -500.0, 0.0)),
+    ):
+        policy = load_policy(constant_actor(BENCH, 250.0, later=output, kind="speed"), BENCH)
+        assert abs(asked(policy, 0.0, 0.0, 99)) <= BENCH.limits.current
+        current = asked(policy, 0.0, 0.0, 100)
+        if fault is None:
+            assert checked(current, BENCH.limits.current) == current
+            continue
+        with pytest.raises(StopError) as stopped:
+            checked(current, BENCH.limits.current)
+        assert stopped.value.fault is fault, output
+
+
+def test_a_speed_of_an_estimate_that_is_not_finite_asks_for_a_current_that_is_not() -> None:
+    policy, estimator = load_policy(constant_actor(BENCH, 250.0, kind="speed"), BENCH), Estimator(BENCH)
+    for mean in ((math.nan, 0.0, 1.0, 1.0, 1.0, 1.0), (0.0, math.nan, 1.0, 1.0, 1.0, 1.0)):
+        estimator.state = estimator.state._replace(mean=mean)
+        assert math.isnan(policy.act(0.0, 0.0, 0.0, estimator))
+
+
 def test_what_the_graph_gives_is_passed_on_as_it_is_and_nan_measurements_raise_nothing() -> None:
     for output in (math.nan, 1e9, math.inf):
         policy = load_policy(constant_actor(BENCH, 2.0, later=output), BENCH)
@@ -279,16 +330,22 @@ def test_what_the_graph_gives_is_passed_on_as_it_is_and_nan_measurements_raise_n
 def test_a_policy_that_does_not_reproduce_its_vectors_is_refused() -> None:
     for output in (math.nan, 2.001, 1e9):
         assert "test vector 0" in refused(constant_actor(BENCH, output, vectors=GOOD.vectors))
-    for difference, taken in ((0.9e-5 * 6.0, True), (1.2e-5 * 6.0, False)):
+    for kind, difference, taken in (
+        ("current", 0.9e-5 * 6.0, True),
+        ("current", 1.2e-5 * 6.0, False),
+        ("speed", 0.9e-5 * 500.0, True),
+        ("speed", 1.2e-5 * 500.0, False),
+    ):
         vectors = tuple(Vector(v.inputs, (2.0 + difference,)) for v in GOOD.vectors)
-        data = constant_actor(BENCH, 2.0, vectors=vectors)
+        data = constant_actor(BENCH, 2.0, vectors=vectors, kind=kind)
         if taken:
             load_policy(data, BENCH)
         else:
             refused(data)
-    widest = PolicyLimits(1e9, (-10.0, 100.0), 500.0)  # a contract cannot widen what its vectors may be off by
+    widest = PolicyLimits(1e9, (-10.0, 100.0), 1e9)  # a contract cannot widen what its vectors may be off by
     other = tuple(Vector(v.inputs, (-2.0,)) for v in GOOD.vectors)
-    assert "test vector 0" in refused(constant_actor(BENCH, 2.0, limits=widest, vectors=other))
+    for kind in UNITS:
+        assert "test vector 0" in refused(constant_actor(BENCH, 2.0, limits=widest, vectors=other, kind=kind))
     off = (Vector((0.02, 23.0, 0.01, 2e-5), (0.5, -0.25, 0.40002)),) * MIN_VECTORS
     assert "output 2" in refused(reference_actor(BENCH, vectors=off))
 
