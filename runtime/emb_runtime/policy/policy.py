@@ -51,14 +51,14 @@ class Policy:
         self._sample_time = bench.timing.sample_time
         self._scale = scale_of(bench, contract.gain)
         self._levels = (len(inference.outputs) + 1) // 2
-        self._greatest = contract.greatest * (1.0 + ROUNDING)
+        self._greatest = contract.greatest
 
     def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         """Current for the period that begins at a sample [A]; finite and within limits only if the caller checks it.
 
         The speed loop cuts off every current at the limit. So a target speed or a reference that is not finite gives
-        NaN, and one beyond the contract a current beyond its limit. PolicyRefusedError if ONNX Runtime could not
-        evaluate the graph.
+        NaN, and one beyond the contract a current that is so many times beyond its limit. PolicyRefusedError if ONNX
+        Runtime could not evaluate the graph.
 
         Args:
             angle: measured [rad].
@@ -79,8 +79,9 @@ class Policy:
             return outputs[0]
         if not all(map(math.isfinite, outputs)):
             return math.nan
-        if max(map(abs, outputs)) > self._greatest:
-            return 2.0 * self.contract.limits.current
+        share = max(map(abs, outputs)) / self._greatest
+        if share > 1.0 + ROUNDING:
+            return self.contract.limits.current * (share + ROUNDING)  # beyond the limit, however it is rounded
         model, state, parameters = estimator.model, estimator.state, estimator.relative
         if self._kind == "speed":
             return current_for(model, state, parameters, outputs[0], self._scale.gain)

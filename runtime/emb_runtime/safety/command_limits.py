@@ -39,7 +39,7 @@ def checked(requested: float, contract_limit: float) -> float:
     if not math.isfinite(requested):
         raise StopError(Fault.POLICY_NOT_FINITE, f"it answered {requested}")
     if abs(requested) > contract_limit * (1.0 + ROUNDING):
-        detail = f"it asked for {requested:g} A, its contract allows {contract_limit:g} A"
+        detail = f"it asked for {abs(requested) / contract_limit:g} times what its contract allows"
         raise StopError(Fault.POLICY_BEYOND_CONTRACT, detail)
     return requested
 

@@ -210,7 +210,7 @@ FAULTS: dict[Fault, FaultInfo] = {
         "the policy answered with a number that is not finite", "the actor is broken: train or export it again"
     ),
     Fault.POLICY_BEYOND_CONTRACT: FaultInfo(
-        "the policy asked for more current than its contract allows", "the actor is broken: export it again"
+        "the policy asked for more than its contract allows", "the actor is broken: export it again"
     ),
     Fault.GUARD_REJECTED: FaultInfo(
         "the guard refused a command", "this is an error in the program: please report it with the log"

@@ -73,20 +73,20 @@ def test_a_node_that_lies_meanwhile_does_not_drive_it_out_of_its_limits(lie: str
 
 
 @pytest.mark.parametrize(
-    ("later", "fault"),
+    ("later", "fault", "words"),
     [
-        (math.nan, Fault.POLICY_NOT_FINITE),
-        (-math.inf, Fault.POLICY_NOT_FINITE),
-        (1e9, Fault.POLICY_BEYOND_CONTRACT),
-        (-501.0, Fault.POLICY_BEYOND_CONTRACT),
+        (math.nan, Fault.POLICY_NOT_FINITE, "it answered nan"),
+        (-math.inf, Fault.POLICY_NOT_FINITE, "it answered nan"),
+        (1e9, Fault.POLICY_BEYOND_CONTRACT, "it asked for 2e+06 times what its contract allows"),
+        (-900.0, Fault.POLICY_BEYOND_CONTRACT, "it asked for 1.8 times what its contract allows"),
     ],
 )
 def test_a_speed_that_no_contract_allows_ends_the_run_by_the_stop_frame(
-    later: float, fault: Fault, simulate: Simulate
+    later: float, fault: Fault, words: str, simulate: Simulate
 ) -> None:
     policy = load_policy(constant_actor(BENCH, 300.0, later, kind="speed"), BENCH)
     found = simulate(actor=policy)
-    assert found.outcome.fault is fault
+    assert (found.outcome.fault, found.outcome.detail) == (fault, words)
     assert found.outcome.counters.answered == 100
     assert found.transport.node.top_speed <= BENCH.limits.velocity
 
