@@ -41,6 +41,9 @@ def test_a_wish_may_pass_its_contract_by_a_millionth_of_rounding_and_no_more(sig
     with pytest.raises(StopError) as caught:
         checked(math.nextafter(most, sign * 4.0), 3.0)
     assert caught.value.fault is Fault.POLICY_BEYOND_CONTRACT
+    with pytest.raises(StopError) as caught:
+        checked(sign * 4.5, 3.0)
+    assert caught.value.detail == "it asked for 1.5 times what its contract allows"
 
 
 @given(angles, velocities, st.floats(-9, 9), currents, steps)
