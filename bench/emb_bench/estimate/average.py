@@ -15,7 +15,6 @@ unknowns follow the errors by regression.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -47,24 +46,30 @@ class Average(NamedTuple):
         found[np.ix_(self.errors, self.errors)] = np.linalg.inv(self.covariance) - self.full
         return found
 
-    def bias(self, effect: Effect) -> tuple[Floats, float]:
-        """Root mean squares of an effect's bias of each unknown, with the sign of a positive one's, and of its size."""
-        own = self.full @ effect.moved[self.errors]
-        seen = own @ effect.moved[self.errors] - np.einsum("i,cij,j->c", own, self.covariances, own)
-        information = effect.information + np.maximum(seen, 0.0)[:, None]
-        score = (effect.score + self.shifts @ own)[:, None]
-        moved = effect.moved - (effect.moved[self.errors] - self.covariances @ own) @ self.gain.T
-        moved = moved + np.copysign(effect.besides, moved)
-        variances = 1.0 / (effect.deviations**-2.0 + information)
-        logs = 0.5 * (variances * score**2 - np.log1p(effect.deviations**2 * information))
-        logs += self.chances[:, None] + math.log(effect.present / len(effect.deviations))
-        most = max(float(logs.max()), float(self.chances.max()))
-        weights, absent = np.exp(logs - most), (1.0 - effect.present) * float(np.exp(self.chances - most).sum())
-        squares = (weights * (variances + (variances * score) ** 2)).sum(axis=1) / (float(weights.sum()) + absent)
-        bias: Floats = np.copysign(
-            np.sqrt(np.einsum("c,ci->i", squares, moved**2)), np.einsum("c,ci->i", np.exp(self.chances), moved)
-        )
-        return bias, float(squares.sum() ** 0.5)
+    def biases(self, effects: Sequence[Effect]) -> tuple[Floats, Floats]:
+        """Root mean squares of effects' biases of the unknowns, with the signs of positive ones', and of their sizes.
+
+        Shapes (effects, p) and (effects,).
+        """
+        moved, information, score, deviations, present, besides = map(np.array, zip(*effects, strict=True))
+        there, sizes = moved[:, self.errors], deviations[:, None, :]
+        own = there @ self.full
+        spread = np.einsum("cij,ej->eci", self.covariances, own)
+        seen = np.einsum("ei,ei->e", own, there)[:, None] - np.einsum("ei,eci->ec", own, spread)
+        informations = (information[:, None] + np.maximum(seen, 0.0))[:, :, None]
+        scores = (score[:, None] + own @ self.shifts.T)[:, :, None]
+        changed = moved[:, None] - (there[:, None] - spread) @ self.gain.T
+        changed += np.copysign(besides[:, None], changed)
+        variances = 1.0 / (sizes**-2.0 + informations)
+        logs = 0.5 * (variances * scores**2 - np.log1p(sizes**2 * informations)) + self.chances[:, None]
+        logs += np.log(present / deviations.shape[1])[:, None, None]
+        most = np.maximum(logs.max(axis=(1, 2)), self.chances.max())[:, None]
+        weights, absent = np.exp(logs - most[:, :, None]), (1.0 - present) * np.exp(self.chances - most).sum(axis=1)
+        squares = (weights * (variances + (variances * scores) ** 2)).sum(axis=2)
+        squares /= (weights.sum(axis=(1, 2)) + absent)[:, None]
+        roots = np.sqrt(np.einsum("ec,eci->ei", squares, changed**2))
+        signs = np.einsum("c,eci->ei", np.exp(self.chances), changed)
+        return np.copysign(roots, signs), np.sqrt(squares.sum(axis=1))
 
 
 class Effect(NamedTuple):
@@ -73,7 +78,7 @@ class Effect(NamedTuple):
     moved: Floats  # Change of the unknowns by an effect of size 1, shape (p,)
     information: float  # On its size
     score: float  # Of the residuals
-    deviations: Floats  # Those that its prior may have
+    deviations: Floats  # Those that its prior may have, as many as of any other effect
     present: float  # Probability before the record that it is there
     besides: Floats  # Further bias of each unknown, which adds to its size
 
@@ -83,7 +88,7 @@ def average(problem: Problem, z: Floats, found: tuple[Floats, Floats]) -> Averag
     residuals, jacobian = found
     unit = np.linalg.norm(jacobian, axis=0)
     unit = np.where(unit > 0.0, unit, 1.0)
-    step = -np.linalg.lstsq(jacobian / unit, residuals, rcond=None)[0] / unit
+    step = -np.linalg.lstsq(jacobian / unit, residuals, rcond=None)[0] / unit if residuals.any() else np.zeros(len(z))
     names, priors = [unknown.name for unknown in problem.unknowns], problem.asked.systematic
     at = [i for i, name in enumerate(names) if name in priors]
     if not at:

@@ -24,7 +24,7 @@ from emb_bench.brake.motion import SENSITIVE, STATES, Floats
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
-from emb_bench.estimate.average import average, unaveraged
+from emb_bench.estimate.average import average
 from emb_bench.estimate.estimate import OF_THE_BENCH
 from emb_bench.estimate.intervals import unnoticed
 from emb_bench.estimate.prediction import Problem, make_problem
@@ -32,10 +32,9 @@ from emb_bench.estimate.records import Contribution, EstimationProblem, with_sys
 from emb_bench.estimate.suspects import (
     OF_THE_SPRING,
     Simulated,
-    beside_model,
+    budget_of,
     effect_of,
     features,
-    pseudo_inverse,
     scales,
     secants,
     turning,
@@ -50,8 +49,6 @@ from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 
 NUMBERS = ("T", "I")
-
-SMALLEST = 1e-12  # Current beside the command's that counts, of an effect's unit [A]; a sensitivity is divided by it
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,38 +163,46 @@ def of_experiment(
 
 def of_problem(problem: Problem, z: Floats) -> Interval:
     """The interval of a problem of one record, without noise, that is explained by ``z``."""
-    weights = problem.weights(z)
-    shown = Simulated(problem, z, weights)
-    errors, jacobian = problem.jacobian(z, weights)
-    errors = np.zeros(len(errors))  # of records without noise
-    averaged = average(problem, z, (errors, jacobian))
-    in_full = unaveraged(averaged.step)
-    pseudo = pseudo_inverse(jacobian)
-    basis = np.linalg.qr(jacobian)[0]
+    unknown = [one.name for one in problem.unknowns]
+    held = tuple(name for name in ("J", *PARAMETER_NAMES) if name not in unknown)
+    said = [problem.predict(z, i, held) for i in range(len(problem.records))]
+    weights = problem.weights(z, said)
+    shown = Simulated(problem, z, weights, said)
+    jacobian = problem.jacobian(z, weights, said)[1]
+    averaged = average(problem, z, (np.zeros(len(jacobian)), jacobian))  # of records without noise
+    lengths = np.linalg.norm(jacobian, axis=0)
+    lengths = np.where(lengths > 0.0, lengths, 1.0)
+    basis, triangle = np.linalg.qr(jacobian / lengths)
+    pseudo = np.linalg.pinv(triangle) @ basis.T / lengths[:, None]
     if any(record.gap_unknowns for record in problem.records):
         basis = np.concatenate([basis, problem.gap_basis(z, weights)], axis=1)
-    allowed, every = problem.asked.allowed, columns(problem, z, shown)
-    untested = scales(problem, z, jacobian, shown, every, allowed)
-    budget = []
-    for name, column in (every | untested).items():
-        if name in allowed:
-            whole, beside = beside_model(column, basis)
-            information = float(beside @ beside)
-            effect = effect_of(problem, name, allowed[name], pseudo @ whole, information, math.sqrt(information))
-            bias, size = (in_full if name in untested else averaged).bias(effect)
-            budget.append(Contribution(name, tuple(bias.tolist()), size))
+    every = columns(problem, z, shown, held)
+    untested = scales(problem, z, jacobian, shown, every, problem.asked.allowed)
+    found = {name: column for name, column in (every | untested).items() if name in problem.asked.allowed}
+    whole = np.zeros((len(found), len(jacobian)))
+    for row, column in zip(whole, found.values(), strict=True):
+        row[: len(column)] = column
+    beside, moved = whole - whole @ basis @ basis.T, whole @ pseudo.T
+    effects = {
+        name: effect_of(problem, name, problem.asked.allowed[name], moved[i], information, math.sqrt(information))
+        for i, (name, information) in enumerate(zip(found, np.sum(beside**2, axis=1).tolist(), strict=True))
+    }
+    budget = budget_of(averaged, effects, untested)
     covariance = Spectrum(jacobian.T @ jacobian + averaged.added()).inverse()
-    wanted = [i for i, unknown in enumerate(problem.unknowns) if unknown.name not in problem.asked.along]
+    wanted = [i for i, name in enumerate(unknown) if name not in problem.asked.along]
     own = tuple(replace(one, bias=tuple(one.bias[i] for i in wanted)) for one in budget)
-    names = tuple(problem.unknowns[i].name for i in wanted)
+    names = tuple(unknown[i] for i in wanted)
     return Interval(names, len(problem.asked.params), covariance[np.ix_(wanted, wanted)], own)
 
 
-def columns(problem: Problem, z: Floats, shown: Simulated) -> dict[str, Floats]:
-    """Columns of the effects that the total allows for: samples per unit, in standard deviations."""
-    own = [unknown.name for unknown in problem.unknowns]
-    names = tuple(name for name in ("J", *PARAMETER_NAMES) if name not in own)
-    found = {name: [shown.columns(0, names)[:, k]] for k, name in enumerate(names)}
+def columns(problem: Problem, z: Floats, shown: Simulated, held: Sequence[str]) -> dict[str, Floats]:
+    """Columns of the effects that the total allows for: samples per unit, in standard deviations.
+
+    The prediction has columns of parameters that are ``held``.
+    """
+    assert shown.said is not None
+    moved = shown.said[0].sensitivities[:, len(problem.unknowns) :] * shown.weights[0][:, None]
+    found = {name: [moved[:, k]] for k, name in enumerate(held)}
     if any(record.gap_unknowns for record in problem.records):
         found |= secants(problem, z, shown)
     else:
@@ -222,7 +227,6 @@ def beside_currents(problem: Problem, z: Floats, rows: Floats) -> Floats:
     acting = held(record.currents + at.errors.current_offset, problem.bench.timing.sample_time, late)
     states, s = np.empty((record.periods + 1, STATES)), np.zeros((record.periods + 1, rows.shape[1], SENSITIVE))
     states[0] = x
-    rows = np.where(np.abs(rows) < SMALLEST, 0.0, rows)
     compiled(march_beside)(problem.mechanics(z), at.brake, acting, rows, states, s)
     moved: Floats = np.concatenate([s[:1].repeat(delay, axis=0), s[1:]])[: record.periods, :, :2].copy()
     moved[:, :, 1] *= 1.0 + at.errors.velocity_gain

@@ -162,36 +162,45 @@ class Problem:
         """The unknowns that a record depends on, in the order of ``columns``."""
         return tuple(self.unknowns[i].name for i in self.columns(record))
 
-    def predict(
-        self,
-        z: Floats,
-        record: int,
-        besides: tuple[str, ...] = (),
-        *,
-        mechanics: Mechanics | None = None,
-        added: Floats | float = 0.0,
+    def predict(self, z: Floats, record: int, besides: tuple[str, ...] = ()) -> Trajectory:
+        """Predicts a record, with sensitivities to its unknowns, to those ``besides``, and to those of its gaps."""
+        return self._simulated(z, record, self.mechanics(z), 0.0, (*self.names(record), *besides))
+
+    def motion(
+        self, z: Floats, record: int, mechanics: Mechanics | None = None, added: Floats | float = 0.0
     ) -> Trajectory:
-        """Predicts a record, with sensitivities to its unknowns, to those ``besides``, and to those of its gaps.
+        """Predicts a record without sensitivities to unknowns that are not its gaps'.
 
         Another brake moves by ``mechanics``; ``added`` is a current that acts besides [A].
         """
-        plant = replace(self.plant, mechanics=self.mechanics(z) if mechanics is None else mechanics)
-        data = replace(self.records[record], currents=self.records[record].currents + added)
-        names, t_s = (*self.names(record), *besides), self.bench.timing.sample_time
-        return simulate(plant, self.at(z, record), data, t_s, names, compiled(march))
+        return self._simulated(z, record, self.mechanics(z) if mechanics is None else mechanics, added, ())
 
-    def weights(self, z: Floats) -> list[Floats]:
-        """Inverse standard deviations of each record's samples at ``z``, zero where they do not count, shape (n, 2)."""
+    def _simulated(
+        self, z: Floats, record: int, mechanics: Mechanics, added: Floats | float, names: tuple[str, ...]
+    ) -> Trajectory:
+        plant, data = replace(self.plant, mechanics=mechanics), self.records[record]
+        if np.any(added):
+            data = replace(data, currents=data.currents + added)
+        return simulate(plant, self.at(z, record), data, self.bench.timing.sample_time, names, compiled(march))
+
+    def weights(self, z: Floats, said: Sequence[Trajectory] | None = None) -> list[Floats]:
+        """Inverse standard deviations of each record's samples at ``z``, zero where they do not count, shape (n, 2).
+
+        What is predicted there may have been ``said`` before.
+        """
         result = []
         for i, record in enumerate(self.records):
             instruments = self.plant.instruments
-            along = weights_along(self.bench, "physical", instruments, self.predict(z, i).states)
+            states = (self.motion(z, i) if said is None else said[i]).states
+            along = weights_along(self.bench, "physical", instruments, states)
             root = np.sqrt(along) * record.measured[:, None]
             root[later(record.inside.astype(np.float64), instruments.measurement_delay) > 0.0] = 0.0
             result.append(root)
         return result
 
-    def jacobian(self, z: Floats, weights: Sequence[Floats]) -> tuple[Floats, Floats]:
+    def jacobian(
+        self, z: Floats, weights: Sequence[Floats], said: Sequence[Trajectory] | None = None
+    ) -> tuple[Floats, Floats]:
         """Residuals measured − shown in standard deviations and their derivatives to z, without what gaps explain.
 
         Of a single period without report the current is unknown, Gaussian around the one that is assumed and as wide as
@@ -203,7 +212,7 @@ class Problem:
             Shapes (m,) and (m, len(z)): all samples of all records, angle and velocity in turn, then each record's
             start if that is unknown, then the prior, then the unknowns of the gaps.
         """
-        residuals, rows = self.joint(z, weights)
+        residuals, rows = self.joint(z, weights, said)
         own, basis = rows[:, : len(z)], _orthonormal(rows[:, len(z) :])
         return residuals - basis @ (basis.T @ residuals), own - basis @ (basis.T @ own)
 
@@ -211,7 +220,9 @@ class Problem:
         """Orthonormal basis of the residuals that the unknowns of the gaps can explain, shape (m, gaps)."""
         return _orthonormal(self.joint(z, weights)[1][:, len(z) :])
 
-    def joint(self, z: Floats, weights: Sequence[Floats]) -> tuple[Floats, Floats]:
+    def joint(
+        self, z: Floats, weights: Sequence[Floats], said: Sequence[Trajectory] | None = None
+    ) -> tuple[Floats, Floats]:
         """Residuals as in :meth:`jacobian`, with the unknowns of the gaps where the records hold them.
 
         Returns:
@@ -219,10 +230,11 @@ class Problem:
         """
         parts, columns = [], []
         for i, (record, root) in enumerate(zip(self.records, weights, strict=True)):
-            said, asked = self.predict(z, i), len(self.columns(i))
-            rows = said.sensitivities * root[:, None]
-            parts.append((np.nan_to_num(record.samples - said.samples) * root, rows[:, :asked]))
-            columns.append(rows[:, asked:].transpose(0, 2, 1).reshape(root.size, -1))
+            at = self.predict(z, i) if said is None else said[i]
+            rows = at.sensitivities * root[:, None]
+            parts.append((np.nan_to_num(record.samples - at.samples) * root, rows[:, : len(self.columns(i))]))
+            in_gaps = rows[:, rows.shape[1] - record.gap_unknowns :]
+            columns.append(in_gaps.transpose(0, 2, 1).reshape(root.size, -1))
         residuals, rows = self.stacked(z, parts)
         count = sum(record.gap_unknowns for record in self.records)
         if not count:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from emb_bench.brake.motion import Floats, is_plain
@@ -113,7 +113,7 @@ def freed(asked: EstimationProblem, bench: Bench) -> EstimationProblem:
 
 def with_systematic(asked: EstimationProblem, bench: Bench, plant: Plant) -> EstimationProblem:
     """The problem with what the bench cannot exclude and the plant can have: estimated too, or allowed for."""
-    known: dict[str, float] = asdict(bench.systematic)
+    known: dict[str, float] = dict(vars(bench.systematic))
     if (measured := known.pop("k_m")) is not None and "k_m" in asked.names and not asked.known:
         k_m = bench.brake.k_m
         asked = freed(replace(asked, known={"k_m": (k_m, measured * k_m)}), bench)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -23,10 +24,11 @@ from scipy import special
 
 from emb_bench.brake.motion import Floats, is_plain
 from emb_bench.brake.parameters import FEATURES, PARAMETERS, SI, Parameter, Quantity, quantity
+from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import DIRECTED, EXACT, Mechanics
-from emb_bench.estimate.average import SHARES, Effect, average, unaveraged
+from emb_bench.estimate.average import SHARES, Average, Effect, average, unaveraged
 from emb_bench.estimate.derived_velocity import derived
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import (
@@ -43,6 +45,7 @@ from emb_bench.estimate.records import (
     has_time_for_a_delay,
     searched,
 )
+from emb_bench.experiment.simulate import Trajectory
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Limits
 
 SLOW = 30.0  # Stribeck velocity with which friction at rest is suspected, where the plant has none [rad/s]
@@ -90,6 +93,16 @@ class Simulated:
     problem: Problem
     z: Floats
     weights: Sequence[Floats]
+    said: Sequence[Trajectory] | None = None  # Prediction of each record, where there is one
+
+    @cached_property
+    def _mechanics(self) -> Mechanics:
+        return self.problem.mechanics(self.z)
+
+    @cached_property
+    def _motion(self) -> list[Floats]:
+        said = self.said or [self.problem.motion(self.z, i) for i in range(len(self.problem.records))]
+        return [one.samples for one in said]
 
     def columns(self, record: int, names: tuple[str, ...]) -> Floats:
         """As :class:`Shown`."""
@@ -99,7 +112,9 @@ class Simulated:
 
     def shown(self, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
         """As :class:`Shown`."""
-        return self.problem.predict(self.z, record, mechanics=mechanics, added=added).samples * self.weights[record]
+        nominal = mechanics == self._mechanics and not np.any(added)
+        samples = self._motion[record] if nominal else self.problem.motion(self.z, record, mechanics, added).samples
+        return samples * self.weights[record]
 
     def whitened(self, record: int, shift: Floats) -> Floats:
         """As :class:`Shown`."""
@@ -107,7 +122,7 @@ class Simulated:
 
     def motion(self, record: int) -> Floats:
         """As :class:`Shown`."""
-        return self.problem.predict(self.z, record).samples
+        return self._motion[record]
 
 
 _STRIBECK = PARAMETERS["break_away"].remedy
@@ -270,12 +285,18 @@ def _path(problem: Problem, z: Floats, record: int, shown: Floats) -> Path:
 
 def _clearance(at: Path, play: float) -> Floats:
     """Torque by which the clamp acts less on the motor behind a clearance: nut and force lag behind the screw [N·m]."""
-    nut, behind = float(at.angles[0]), np.empty(len(at.angles))
-    for k, angle in enumerate(at.angles.tolist()):
-        nut = min(max(nut, angle - 0.5 * play), angle + 0.5 * play)
-        behind[k] = max(angle, 0.0) - max(nut, 0.0)
+    behind = np.empty(len(at.angles))
+    compiled(_behind)(at.angles, play, behind)
     result: Floats = at.brake.gamma * at.brake.k_1 * 0.5 * (behind[1:] + behind[:-1])
     return result
+
+
+def _behind(angles: Floats, play: float, behind: Floats) -> None:
+    """Fills in by how much less the nut is in contact than the screw [rad]."""
+    nut = angles[0]
+    for k in range(len(angles)):
+        nut = min(max(nut, angles[k] - 0.5 * play), angles[k] + 0.5 * play)
+        behind[k] = max(angles[k], 0.0) - max(nut, 0.0)
 
 
 TORQUES: Mapping[str, Callable[[Path, float], Floats]] = {
@@ -338,9 +359,7 @@ def score(
         every = {name: column for name, column in every.items() if name not in OF_THE_SPRING}
     pseudo = pseudo_inverse(jacobian)
     priors = _priors(problem, DISTURBED if disturbed else 1.0)
-    averaged = average(problem, z, left)
-    in_full = unaveraged(averaged.step)
-    found, beside_all, budget = [], [], []
+    found, beside_all, effects = [], [], dict[str, Effect]()
     untested = scales(problem, z, left[1], shown, every, priors)
     for name, column in (every | untested).items():
         whole, beside = beside_model(column, model)
@@ -348,9 +367,8 @@ def score(
         if length <= DEPENDENT * float(np.linalg.norm(whole)):
             length, beside = 0.0, np.zeros(len(errors))
         if name in priors:
-            effect = effect_of(problem, name, priors[name], pseudo @ whole, length**2, float(beside @ errors))
-            bias, size = (in_full if name in untested else averaged).bias(effect)
-            budget.append(Contribution(name, tuple(bias.tolist()), size))
+            about = length**2, float(beside @ errors)
+            effects[name] = effect_of(problem, name, priors[name], pseudo @ whole, *about)
         if length == 0.0 or name in untested:
             continue
         if name not in ALONE:
@@ -360,13 +378,14 @@ def score(
         p = float(special.ndtr(-away) if EFFECTS[name].positive else 2.0 * special.ndtr(-abs(away)))
         low, high = possible(name, problem.bench)
         found.append(Suspect(name, amount, sigmas / max(ratio, 1e-300) ** 0.5, p, possible=low < amount < high))
+    budget = budget_of(average(problem, z, left), effects, untested)
     if not found:
-        return (), tuple(budget), None
+        return (), budget, None
     axes, values, _ = np.linalg.svd(np.stack(beside_all, axis=1), full_matrices=False)
     kept = axes[:, values > 1e-3]
     statistic, rank = float(np.sum((kept.T @ errors) ** 2)), kept.shape[1]
     p_value = float(special.chdtrc(rank, statistic / max(ratio, 1.0)))
-    return _with_observer(_ranked(found), problem), tuple(budget), JointScore(statistic, rank, p_value)
+    return _with_observer(_ranked(found), problem), budget, JointScore(statistic, rank, p_value)
 
 
 def scales(
@@ -404,8 +423,19 @@ def effect_of(problem: Problem, name: str, prior: float, moved: Floats, informat
     ends = np.array([0.5 if f"{u.name}_drift" == name else 0.0 for u in problem.unknowns])
     if name == "J":  # all torques scale with it, those that are held as well: no trace is left
         moved, information, score = np.array([float(u.name in PARAMETER_NAMES) for u in problem.unknowns]), 0.0, 0.0
-    sizes, present = (np.array([1.0]), 1.0) if name in NEVER_EXACT else (np.array(SHARES), PRESENT)
+    sizes, present = (np.ones(len(SHARES)), 1.0) if name in NEVER_EXACT else (np.array(SHARES), PRESENT)
     return Effect(moved, information, score, prior * sizes, present, ends)
+
+
+def budget_of(averaged: Average, effects: Mapping[str, Effect], in_full: Container[str]) -> tuple[Contribution, ...]:
+    """The budget of effects, of some of them with all priors of systematic errors in full."""
+    found = dict[str, Contribution]()
+    for way, some in ((averaged, False), (unaveraged(averaged.step), True)):
+        names = [name for name in effects if (name in in_full) is some]
+        biases, sizes = way.biases([effects[name] for name in names]) if names else ((), ())
+        for name, bias, size in zip(names, biases, sizes, strict=True):
+            found[name] = Contribution(name, tuple(bias.tolist()), float(size))
+    return tuple(found[name] for name in effects)
 
 
 def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:

@@ -107,11 +107,11 @@ def simulate_parts(
     # A command that acts early is counted to first order, for which its sensitivity is needed.
     early = ("delay",) if errors.delay < 0.0 and "delay" not in params else ()
     x, chosen, s = theta.begin(parts[0].before, (*params, *early))
-    # Rows that the next samples show: until a delay has passed, the start.
-    waiting = (
-        np.repeat(x[None], delay, axis=0),
-        np.pad(np.repeat(s[None], delay, axis=0), ((0, 0), (0, parts[0].gap_unknowns), (0, 0))),
-    )
+    if delay:  # rows that the next samples show: until it has passed, the start
+        waiting = (
+            np.repeat(x[None], delay, axis=0),
+            np.pad(np.repeat(s[None], delay, axis=0), ((0, 0), (0, parts[0].gap_unknowns), (0, 0))),
+        )
     for part in parts:
         breaks, places = gap_ends(part, plant.instruments)
         acting = Input(
@@ -122,11 +122,11 @@ def simulate_parts(
             breaks,
             places - [theta.contact, 0.0],
         )
-        rows = trajectory(loop, plant.mechanics, theta.brake, acting, chosen, x, s)
-        x, s = (row[-1] for row in rows)
-        states, moved = (np.concatenate(both) for both in zip(waiting, rows, strict=True))
-        n = part.periods
-        waiting = states[n:-1], moved[n:-1]
+        states, moved = trajectory(loop, plant.mechanics, theta.brake, acting, chosen, x, s)
+        x, s, n = states[-1], moved[-1], part.periods
+        if delay:
+            states, moved = (np.concatenate(both) for both in zip(waiting, (states, moved), strict=True))
+            waiting = states[n:-1], moved[n:-1]
         unknowns = np.append(chosen, np.full(part.gap_unknowns, COMMAND))
         shown = _shown(states[: n + 1], moved[: n + 1], unknowns, theta, theta.offset(plant), part.late, t_s)
         if early:
@@ -180,6 +180,8 @@ def gap_ends(experiment: Experiment, instruments: Instruments) -> tuple[Integers
     breaks = np.minimum(experiment.gaps[1] + int(delay == 0), last)
     if experiment.places is not None:
         return breaks, experiment.places
+    if not len(breaks):
+        return breaks, np.zeros((0, 2))
     measured = experiment.samples[np.minimum(breaks + delay, last)]
     return breaks, np.nan_to_num(measured) - [instruments.encoder_offset, 0.0]
 

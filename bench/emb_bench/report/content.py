@@ -275,7 +275,7 @@ def _run(
 
 
 def _predicted(e: Estimate, number: int) -> NDArray[np.float64]:
-    return e.problem.predict(e.z, number).samples
+    return e.problem.motion(e.z, number).samples
 
 
 @dataclass(frozen=True)

@@ -110,39 +110,45 @@ def march(mechanics: Mechanics, p: BrakeParameters, acting: Input, chosen: Integ
 def march_beside(mechanics: Mechanics, p: BrakeParameters, acting: Input, rows: Floats, x: Floats, s: Floats) -> None:
     """Fills states ``x``, and sensitivities ``s`` to currents that act beside those of an input without gaps.
 
-    Such a current is a row's number times its current in each period [A], ``rows`` of shape (n, m). A period's map of a
-    sensitivity is affine, s → A s + b with the command's b: a current w takes it to w (A s/w + b). Runs as it is or
-    compiled.
+    Such a current is a row's number times its current in each period [A], ``rows`` of shape (n, m). A period's map of
+    sensitivities is affine and the same for all of them; it is that of the states' own, and of one command. Runs as it
+    is or compiled.
     """
-    every, t_s, late, before = np.full(s.shape[1], PAST_COMMAND), acting.t_s, acting.late, float(x[0, 3])
+    remembers = mechanics.hysteresis > 0.0 or mechanics.play > 0.0 or mechanics.current_lag > 0.0
+    count = SENSITIVE if remembers else 2
+    every, unit = np.full(count + 1, PAST_COMMAND), np.empty((count + 1, SENSITIVE))
+    every[count] = COMMAND
+    t_s, late, before = acting.t_s, acting.late, float(x[0, 3])
     for k in range(acting.currents.shape[0]):
         _carry(x, s, k)
         u = float(acting.currents[k])
         if late > 0.0:
-            if k > 0:
-                _over(rows[k - 1], every, s[k + 1])
-            advance(mechanics, p, x[k + 1], before, late * t_s, every, s[k + 1])
-            if k > 0:
-                _times(rows[k - 1], s[k + 1])
-        _over(rows[k], every, s[k + 1])
-        advance(mechanics, p, x[k + 1], u, (1.0 - late) * t_s, every, s[k + 1])
-        _times(rows[k], s[k + 1])
+            _identity(unit)
+            advance(mechanics, p, x[k + 1], before, late * t_s, every, unit)
+            _map(unit, rows[max(k - 1, 0)], 1.0 if k > 0 else 0.0, s[k + 1])
+        _identity(unit)
+        advance(mechanics, p, x[k + 1], u, (1.0 - late) * t_s, every, unit)
+        _map(unit, rows[k], 1.0, s[k + 1])
         before = u
 
 
-def _over(row: Floats, every: Integers, s: Floats) -> None:
-    """Sensitivities over a period's currents; where there is none, no command acts."""
-    for j in range(s.shape[0]):
-        every[j] = PAST_COMMAND if row[j] == 0.0 else COMMAND
-        for i in range(SENSITIVE):
-            s[j, i] /= row[j] if row[j] != 0.0 else 1.0
+def _identity(unit: Floats) -> None:
+    """Sensitivities to the states at the begin of a period, and none to its command."""
+    for i in range(unit.shape[0]):
+        for j in range(SENSITIVE):
+            unit[i, j] = 1.0 if i == j and i < unit.shape[0] - 1 else 0.0
 
 
-def _times(row: Floats, s: Floats) -> None:
-    """The inverse of :func:`_over`."""
+def _map(unit: Floats, row: Floats, share: float, s: Floats) -> None:
+    """Sensitivities at the end of a period in which a share of a row's currents acts besides, in place."""
+    count, start = unit.shape[0] - 1, np.empty(SENSITIVE)
     for j in range(s.shape[0]):
         for i in range(SENSITIVE):
-            s[j, i] *= row[j] if row[j] != 0.0 else 1.0
+            start[i] = s[j, i]
+        for i in range(SENSITIVE):
+            s[j, i] = share * row[j] * unit[count, i]
+            for from_state in range(count):
+                s[j, i] += start[from_state] * unit[from_state, i]
 
 
 def _carry(x: Floats, s: Floats, k: int) -> None:

@@ -139,6 +139,6 @@ def test_a_bias_is_that_of_all_combinations_of_errors_and_effect(bench: Bench, s
         squares.append(moved**2 * sizes[-1])
     weights = np.exp(np.array(logs) - max(logs))
     expected = np.sqrt(weights @ np.array(squares) / weights.sum())
-    found, size = averaged.bias(effect)
+    (found,), (size,) = averaged.biases([effect])
     assert size == pytest.approx(float(np.sqrt(weights @ np.array(sizes) / weights.sum())), rel=0.01)
     assert np.abs(found[:4]) == pytest.approx(expected[:4], rel=0.01)
