@@ -38,7 +38,7 @@ from emb_runtime.can.transport import SocketCan, Transport
 from emb_runtime.cli import experiment, session
 from emb_runtime.cli import main as run
 from emb_runtime.config.bench import Bench
-from emb_runtime.control import core, loop
+from emb_runtime.control import core, loop, phases
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE
 from emb_runtime.estimator.estimator import Estimator
@@ -54,10 +54,10 @@ STEPS: dict[str, tuple[Any, str]] = {
     "reception": (Reception, "take"),
     "estimator": (Estimator, "take"),
     "policy": (Policy, "act"),
-    "clip, slew, shield": (core, "decide"),
-    "permission and encoding": (core.Core, "commit"),
-    "guard and bus": (Guard, "send"),
-    "  of it, the bus": (SocketCan, "send"),
+    "clip, slew, shield": (phases, "decide"),
+    "permission, encoding, guard": (core.Core, "answer"),
+    "  of it, the guard": (Guard, "check"),
+    "bus": (Guard, "send"),
     "recording": (Recorder, "push"),
 }
 

@@ -22,6 +22,7 @@ from emb_runtime.control.actor import Actor
 from emb_runtime.control.core import Core
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.result import Outcome
+from emb_runtime.control.setup import Setup
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, Record
 from emb_runtime.records import CycleRecord, Frame
@@ -155,7 +156,7 @@ def make_loop(
         "steps": steps,
         "guard": Guard(layout, bench, send, pulse, core.get("limit", CEILING_CURRENT)),
     }
-    return Loop(Core(**(given | core)), receive, now_ns, push, stop_requested, pulse, overheard)
+    return Loop(Core(Setup(**(given | core))), receive, now_ns, push, stop_requested, pulse, overheard)
 
 
 @dataclass

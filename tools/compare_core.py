@@ -319,7 +319,8 @@ def _guard(dice: random.Random) -> Iterator[Any]:
             command = CurrentCommand(counter, answers, current if enable or dice.random() < 0.1 else 0.0, enable)
             state = RunState.ACTIVE if dice.random() < 0.95 else dice.choice(tuple(RunState))
             frame, sampled_ns = layout.encode_command(*command), now_ns - dice.randrange(0, 2_100_000)
-            yield _tried(guard.send, frame, state, sampled_ns, now_ns), list(sent), guard.passed, guard.rejected
+            checked = _tried(guard.check, frame, state, sampled_ns, now_ns)
+            yield checked, _tried(guard.send, frame), list(sent), guard.passed, guard.rejected
             sent.clear()
 
 

@@ -22,9 +22,11 @@ from emb_runtime.can.e2e import COUNTER_MODULUS
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import CEILING_CURRENT
 from emb_runtime.control.actor import Actor, Still, homing_steps
-from emb_runtime.control.core import Core, Proposal
+from emb_runtime.control.core import Core
 from emb_runtime.control.loop import detail_of, fault_of
+from emb_runtime.control.memory import Proposal
 from emb_runtime.control.result import Outcome
+from emb_runtime.control.setup import Setup
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.drives.mapping import mapping_hash
 from emb_runtime.errors import BusError, FrameError, LogError, UsageError
@@ -177,11 +179,11 @@ class Playback:
             if not isinstance(item, EventRecord) or item.code not in (Fault.BUS_LOST.name, Fault.WATCHDOG_TRIPPED.name):
                 raise self._left(_words(item), f"the record of step {proposal.step}")
             self._refusal = BusError(_detail(item))
-        frame = core.commit(proposal, decide_ns)
+        frame = core.answer(proposal, decide_ns)
         if frame is None:
             return
         try:
-            core.guard.send(frame, core.state, proposal.sample.receive_time_ns, decide_ns)
+            core.guard.send(frame)
         except TransmitQueueFullError:
             core.sent(proposal, decide_ns, lost)
         except BusError:
@@ -226,7 +228,7 @@ class Playback:
     def _send_stop_frame(self, core: Core, time_ns: int) -> None:
         self._stops += 1
         with contextlib.suppress(BusError):
-            core.guard.send(core.stop_frame(), core.state, time_ns, time_ns)
+            core.guard.send(core.stop_frame(time_ns))
 
     def _recorded_stop_frames(self) -> list[int]:
         """Samples that the stop frames on the bus answer."""
@@ -241,7 +243,8 @@ class Playback:
     # --- what comes out ---------------------------------------------------------------------------------------------
 
     def _compare(self, core: Core) -> None:
-        records, core.records = core.records, []
+        records = core.records.copy()
+        core.records.clear()
         for record in records:
             if isinstance(record, EstimateRecord):
                 self._compare_estimate(record)
@@ -388,7 +391,7 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
     """Run the loop of a log again with what decided, the largest current of its contract [A] and its stop condition."""
     bench, layout, run = log.bench, log.layout, recorded_run(log)
     playback = Playback(log)
-    core = Core(
+    setup = Setup(
         bench=bench,
         layout=layout,
         law=make_law(bench)._replace(steps=run.steps),
@@ -400,6 +403,7 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
         homing=run.purpose == "homing",
         stop_condition=stop_condition,
     )
+    core = Core(setup)
     playback.play(core)
     outcome = core.outcome() if core.state is RunState.OVER and playback.at_end else None
     return Rerun(

@@ -99,7 +99,7 @@ def guard(draw: Random) -> Played:
         failing.append(fails)
         before = len(bus)
         with suppress(GuardRejectedError, BusError):
-            watched.send(frame, state, now_ns - age_ns, now_ns)
+            watched.send(watched.check(frame, state, now_ns - age_ns, now_ns))
         failing.clear()
         legal = model.judge(frame, state, now_ns - age_ns, now_ns, fails)
         demand((len(bus) > before) == (legal and not fails), frame, state.name, age_ns, "legal:", legal, model)

@@ -56,12 +56,12 @@ def an_old_sample_is_good_enough(patch: Patch) -> None:
 
 
 def the_guard_mends_what_it_should_reject(patch: Patch) -> None:
-    send = Guard.send
+    check = Guard.check
 
-    def careless(self: Guard, frame: Frame, *rest: Any) -> None:
-        send(self, frame._replace(extended=False), *rest)
+    def careless(self: Guard, frame: Frame, *rest: Any) -> Frame:
+        return check(self, frame._replace(extended=False), *rest)
 
-    patch.setattr(Guard, "send", careless)
+    patch.setattr(Guard, "check", careless)
 
 
 def a_stop_frame_carries_a_current(patch: Patch) -> None:

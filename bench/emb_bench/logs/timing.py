@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from emb_bench.config.bench import COUNTED, QUANTILE_NAMES, QUANTILES, Budgets
 from emb_bench.logs.log import RunLog, Table
 from emb_runtime.can.e2e import NO_COUNTER
-from emb_runtime.control.core import latest_answer_ns
+from emb_runtime.control.memory import latest_answer_ns
 from emb_runtime.records import Reason, RunState
 
 Floats = NDArray[np.float64]

@@ -21,6 +21,7 @@ from emb_runtime.cli.summary import RunResult, header, heard_document, listen_do
 from emb_runtime.control.actor import Actor, Still, homing_steps
 from emb_runtime.control.core import Core
 from emb_runtime.control.loop import Loop
+from emb_runtime.control.setup import Setup
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.errors import BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
@@ -103,7 +104,7 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
         try:
             push_clock(recorder, bus.clock)
             pulse = watchdog.pulse if watchdog is not None else Unwatched()
-            core = Core(
+            setup = Setup(
                 bench=plan.bench,
                 layout=plan.layout,
                 law=plan.law,
@@ -116,7 +117,7 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
                 stop_condition=None if homing else plan.stop_condition,
             )
             loop = Loop(
-                core=core,
+                core=Core(setup),
                 receive=paced_receive(bus, recorder),
                 now_ns=bus.clock.now_ns,
                 push=recorder.push,

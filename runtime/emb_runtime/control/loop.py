@@ -1,4 +1,8 @@
-"""Driver of a run: it waits for frames, reads the clock, sends, and stops; all else is :mod:`emb_runtime.control.core`.
+"""Driver of a run: it waits for frames, reads the clock and writes bytes; all else is :mod:`emb_runtime.control.core`.
+
+A cycle has three verbs: **read** the frames that have come by the core's deadline; **answer** the newest sample with
+the frame that the guard has checked; **record** what happened. One invariant: however the cycles end, from then on only
+stop frames leave, each is tried, and nothing that is called can keep them back.
 
 One driver serves a real bus and a simulated one in lock-step: clock and reception are handed in. The clock is read once
 per event: frames or a timeout are in hand, the command is decided, the command is sent.
@@ -11,7 +15,8 @@ from dataclasses import dataclass, field
 from typing import Final, cast
 
 from emb_runtime.can.transport import TransmitQueueFullError
-from emb_runtime.control.core import SILENT, Core, Proposal
+from emb_runtime.control.core import SILENT, Core
+from emb_runtime.control.memory import Proposal
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError, PolicyRefusedError
 from emb_runtime.log.ring_buffer import Record
@@ -43,7 +48,7 @@ class Loop:
     def __post_init__(self) -> None:
         """Set up what the cycles carry from one to the next."""
         self._now_ns = 0  # time of the event in hand
-        self._period_ns = self.core.bench.timing.sample_time_ns
+        self._period_ns = self.core.setup.bench.timing.sample_time_ns
         self._watched = False  # the watchdog has been armed
         self._fault = Fault.INTERNAL  # of what was raised
         self._cause: BaseException | None = None  # what was raised
@@ -51,7 +56,7 @@ class Loop:
         self._failures: list[tuple[str, BaseException]] = []  # steps of the stop that failed, not yet recorded
 
     def run(self) -> Outcome:
-        """Arm, run, stop. Whatever happens, what was armed ends with stop frames; no Exception is raised after them."""
+        """Arm, run, stop; no Exception is raised."""
         core = self.core
         try:
             core.begin(self._read_clock())
@@ -61,8 +66,7 @@ class Loop:
         except BaseException as err:
             self._latch(err)
         finally:
-            # Invariant: from here on only stop frames can leave, and nothing that is called can keep them back.
-            self._stop()
+            self._stop()  # the invariant holds from here on
         if self._leaving is not None:
             raise self._leaving
         return core.outcome()
@@ -72,7 +76,7 @@ class Loop:
         return self._now_ns
 
     def _cycle(self) -> None:
-        """Wait for frames, and answer the newest sample among them."""
+        """Read, answer, record."""
         core = self.core
         frames = self._read(core.deadline_ns)
         # Before the frames: the watchdog's stop frames come from another socket and look like a stranger's commands.
@@ -84,7 +88,7 @@ class Loop:
             self._answer(proposal)
         elif len(core.records) < HELD_RECORDS:
             return
-        self._flush()
+        self._push_records()
 
     def _read(self, deadline_ns: int) -> list[Frame]:
         """The next frame; with it all that wait if it is so old that newer ones are due. None of them at a deadline."""
@@ -112,21 +116,22 @@ class Loop:
         return None
 
     def _answer(self, proposal: Proposal) -> None:
+        """Write the frame that answers a sample, unless it is left to the node."""
         if not self._watched:
             self.pulse.arm(self._now_ns)
             self._watched = True
         core, decide_ns = self.core, self._read_clock()
-        frame = core.commit(proposal, decide_ns)
+        frame = core.answer(proposal, decide_ns)
         if frame is None:
             return
         try:
-            core.guard.send(frame, core.state, proposal.sample.receive_time_ns, decide_ns)
+            core.guard.send(frame)
         except TransmitQueueFullError as err:
             core.sent(proposal, decide_ns, lost=str(err))
         else:
             core.sent(proposal, self._read_clock())
 
-    def _flush(self) -> None:
+    def _push_records(self) -> None:
         """Record what has happened."""
         records = self.core.records
         while records:
@@ -175,28 +180,25 @@ class Loop:
         """Send a stop frame. Whatever is broken, the next one is still tried."""
         self._attempt("CLOCK_FAILED", self._read_clock)
         self._attempt("BEAT_FAILED", lambda: self.pulse.beat(self._now_ns))
-        self._attempt("STOP_FRAME_NOT_SENT", self._send_disabled)
-
-    def _send_disabled(self) -> None:
         core = self.core
-        core.guard.send(core.stop_frame(), core.state, self._now_ns, self._now_ns)
+        self._attempt("STOP_FRAME_NOT_SENT", lambda: core.guard.send(core.stop_frame(self._now_ns)))
 
     def _listen(self, deadline_ns: int, *, until_rest: bool = False) -> None:
         """Record what comes until a deadline, or until the node is at rest."""
-        self._attempt("LISTENING_FAILED", lambda: self._take_until(deadline_ns, until_rest))
+
+        def take() -> None:
+            while not (until_rest and self.core.at_rest):
+                frames = self._read(deadline_ns)
+                self.core.take(frames, self._now_ns)
+                self._push_records()
+                if not frames or frames[-1].time_ns >= deadline_ns:
+                    break  # on a babbling bus there is always one more
+
+        self._attempt("LISTENING_FAILED", take)
         self._record()
 
-    def _take_until(self, deadline_ns: int, until_rest: bool) -> None:
-        core = self.core
-        while not (until_rest and core.at_rest):
-            frames = self._read(deadline_ns)
-            core.take(frames, self._now_ns)
-            self._flush()
-            if not frames or frames[-1].time_ns >= deadline_ns:
-                break  # on a babbling bus there is always one more
-
     def _attempt(self, failure: str, call: Callable[[], object]) -> None:
-        """Do a step of the stop. Its failure keeps nothing back; :meth:`_record` records it, after the fault's."""
+        """Run a step of the stop; keep its failure for :meth:`_record`, and go on."""
         try:
             call()
         except BaseException as err:
@@ -209,7 +211,7 @@ class Loop:
         for failure, err in failures:
             self.core.note(self._now_ns, failure, _message_of(err))
         while self.core.records:
-            self._attempt("RECORD_FAILED", self._flush)
+            self._attempt("RECORD_FAILED", self._push_records)
 
     def _has_tripped(self) -> bool:
         """Returns True if the watchdog has tripped; False if it cannot be asked."""

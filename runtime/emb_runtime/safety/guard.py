@@ -63,6 +63,7 @@ class Guard:
         self._drive = DriveCheck(bench.guard.current_error, bench.limits.current)
         self._device_clock = DeviceClock(self._period_ns)
         self._last: CurrentCommand | None = None
+        self._checked: Frame | None = None  # the frame of that one, until it is sent
         self._sample_ns = 0  # that it was computed from
         self._most = math.ceil(RATE_WINDOW_PERIODS * RATE_SURPLUS)
         self._times: list[int] = []  # of the last commands, as many at most
@@ -78,8 +79,8 @@ class Guard:
         """Returns True if one more command now, monotonic [ns], would be more than the bench's rate allows."""
         return len(self._times) == self._most and now_ns - self._times[0] < RATE_WINDOW_PERIODS * self._period_ns
 
-    def send(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> None:
-        """Check a command frame and put it on the bus.
+    def check(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> Frame:
+        """Check a command frame; gives the frame that :meth:`send` may put on the bus.
 
         Args:
             frame: the frame.
@@ -88,21 +89,33 @@ class Guard:
             now_ns: now, monotonic [ns].
 
         Raises:
-            GuardRejectedError: the frame is not in the guard's contract; nothing was sent.
-            BusError: the bus did not take it.
+            GuardRejectedError: the frame is not in the guard's contract.
         """
         try:
-            command = self._checked(frame, state, sample_time_ns, now_ns)
+            command = self._command(frame, state, sample_time_ns, now_ns)
         except GuardRejectedError:
             self.rejected += 1
             raise
         # Counted before it leaves: if the bus fails, the node may have seen this counter value all the same.
-        self._last, self._sample_ns = command, sample_time_ns
+        self._last, self._sample_ns, self._checked = command, sample_time_ns, frame
         self._drive.sent(command.counter, command.current)
         if len(self._times) == self._most:
             del self._times[0]
         self._times.append(now_ns)
         self._pulse.publish(command.counter, command.answers)
+        return frame
+
+    def send(self, frame: Frame) -> None:
+        """Put the frame that was checked last on the bus, once.
+
+        Raises:
+            GuardRejectedError: it is another one, or was sent before; nothing was sent.
+            BusError: the bus did not take it.
+        """
+        checked, self._checked = self._checked, None
+        if self._last is None or frame is not checked:
+            self.rejected += 1
+            raise _rejected("it is not the one that was checked last")
         # Asked last. What slips through between this and the bus answers a sample that is not the newest any more
         # (the watchdog waits for periods), so the node does not obey it.
         if self._pulse.tripped:
@@ -110,7 +123,7 @@ class Guard:
         try:
             self._send(frame)
         except BusError:
-            self._last = command._replace(current=0.0)  # the node brakes: the next one begins at zero
+            self._last = self._last._replace(current=0.0)  # the node brakes: the next one begins at zero
             raise
         self.passed += 1
 
@@ -137,7 +150,7 @@ class Guard:
         if problem := self._device_clock.time_problem(sample.device_time_ns, sample.receive_time_ns, seen_ns):
             raise StopError(Fault.DEVICE_TIME, problem)
 
-    def _checked(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> CurrentCommand:
+    def _command(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> CurrentCommand:
         if not may_send(state):
             raise _rejected(f"nothing may leave in state {state.name}")
         try:

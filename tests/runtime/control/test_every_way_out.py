@@ -75,6 +75,7 @@ OURS: dict[str, tuple[type, str]] = {
     "monitor": (SensorMonitor, "check"),
     "estimator": (Estimator, "take"),
     "guard": (Guard, "send"),
+    "guard's check": (Guard, "check"),
     "guard's judge": (Guard, "judge"),
     "guard's clock": (Guard, "judge_time"),
 }
@@ -88,8 +89,9 @@ WHILE_STOPPING = (
     "publish",
     "disarm",
     "guard",
+    "guard's check",
 )
-SILENCING = ("send", "guard", "publish", "tripped")
+SILENCING = ("send", "guard", "guard's check", "publish", "tripped")
 """Places through which every frame leaves: where one fails for ever, no frame can."""
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from emb_bench.cli.replay import main as emb_replay
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Sensors, load_bench
-from emb_runtime.control.core import HOME_PAIRS
+from emb_runtime.control.phases import HOME_PAIRS
 from emb_runtime.control.stop_condition import REACHED, parse_stop_condition
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimate import LOST

@@ -51,10 +51,14 @@ def command(current: float = 1.0, counter: int = 0, enable: bool = True) -> Fram
     return load_layout().encode_command(counter, 0, current, enable)
 
 
+def let_out(guard: Guard, frame: Frame, state: RunState, sample_ns: int, now_ns: int) -> None:
+    guard.send(guard.check(frame, state, sample_ns, now_ns))
+
+
 def refused(guard: Guard, bus: Bus, frame: Frame, reason: str, state: RunState = ACTIVE, age_ns: int = 0) -> None:
     passed, rejected = guard.passed, guard.rejected
     with pytest.raises(GuardRejectedError, match=reason) as caught:
-        guard.send(frame, state, 100 * MS - age_ns, 100 * MS)
+        let_out(guard, frame, state, 100 * MS - age_ns, 100 * MS)
     assert caught.value.exit_code == EXIT_SAFETY_STOP
     assert (guard.passed, guard.rejected) == (passed, rejected + 1)
     assert len(bus.frames) == passed
@@ -64,8 +68,29 @@ def test_a_guard_begins_with_counter_0_and_counts_what_passed_and_what_it_refuse
     assert (guard.next_counter, guard.passed, guard.rejected) == (0, 0, 0)
     refused(guard, bus, command(6.0)._replace(extended=True), "not a classical data frame of this message")
     assert guard.next_counter == 0
-    guard.send(command(), ACTIVE, 100 * MS, 100 * MS)
+    let_out(guard, command(), ACTIVE, 100 * MS, 100 * MS)
     assert (guard.next_counter, guard.passed, guard.rejected) == (1, 1, 1)
+
+
+def test_only_the_frame_that_was_checked_last_leaves_and_only_once(guard: Guard, bus: Bus) -> None:
+    def is_refused(frame: Frame) -> None:
+        passed, rejected = guard.passed, guard.rejected
+        with pytest.raises(GuardRejectedError, match="it is not the one that was checked last"):
+            guard.send(frame)
+        assert (guard.passed, guard.rejected, len(bus.frames)) == (passed, rejected + 1, passed)
+
+    is_refused(command())
+    first = guard.check(command(), ACTIVE, 100 * MS, 100 * MS)
+    is_refused(command())  # the same bytes, and not checked
+    is_refused(first)  # another one was tried
+    second = guard.check(command(counter=1), ACTIVE, 100 * MS, 100 * MS)
+    guard.send(second)
+    is_refused(second)
+    older = guard.check(command(counter=2), ACTIVE, 100 * MS, 100 * MS)
+    newer = guard.check(command(counter=3), ACTIVE, 100 * MS, 100 * MS)
+    guard.send(newer)
+    is_refused(older)
+    assert bus.frames == [second, newer]
 
 
 @pytest.mark.parametrize("state", [RunState.INIT, RunState.SILENT, RunState.ARMED, RunState.OVER])
@@ -76,7 +101,7 @@ def test_nothing_leaves_before_the_experiment(guard: Guard, bus: Bus, state: Run
 
 def test_while_stopping_only_the_stop_frame_leaves(guard: Guard, bus: Bus) -> None:
     refused(guard, bus, command(), "enabled in state STOPPING", RunState.STOPPING)
-    guard.send(command(0.0, enable=False), RunState.STOPPING, 0, 100 * MS)
+    let_out(guard, command(0.0, enable=False), RunState.STOPPING, 0, 100 * MS)
     assert len(bus.frames) == 1
 
 
@@ -86,10 +111,10 @@ def test_a_disabled_command_with_a_current_is_refused(guard: Guard, bus: Bus) ->
 
 def test_the_counter_must_follow(guard: Guard, bus: Bus) -> None:
     for counter in [13, 14, 0, 1]:
-        guard.send(command(counter=counter), ACTIVE, 100 * MS, 100 * MS)
+        let_out(guard, command(counter=counter), ACTIVE, 100 * MS, 100 * MS)
     for counter in [1, 3, 14]:
         refused(guard, bus, command(counter=counter), "does not follow 1")
-    guard.send(command(counter=2), ACTIVE, 100 * MS, 100 * MS)
+    let_out(guard, command(counter=2), ACTIVE, 100 * MS, 100 * MS)
 
 
 def test_every_current_that_the_signal_can_hold_passes_exactly_if_it_is_within_the_limit(layout: Layout) -> None:
@@ -98,7 +123,7 @@ def test_every_current_that_the_signal_can_hold_passes_exactly_if_it_is_within_t
         bus = Bus()
         guard = Guard(layout, bench, bus.send)
         if abs(raw) <= 15_000:
-            guard.send(command(raw * 2e-4), ACTIVE, 100 * MS, 100 * MS)
+            let_out(guard, command(raw * 2e-4), ACTIVE, 100 * MS, 100 * MS)
         else:
             refused(guard, bus, command(raw * 2e-4), "beyond 3 A")
 
@@ -112,7 +137,7 @@ def test_no_bench_no_limit_and_no_dbc_reaches_beyond_the_ceiling_of_six_ampere(b
     wide = replace(load_layout(), command=command, encode_command=encode)
     guard = Guard(wide, replace(bench, limits=replace(bench.limits, current=6.5)), bus.send, limit=6.5)
     refused(guard, bus, wide.encode_command(0, 0, 6.0002, True), "beyond 6 A")
-    guard.send(wide.encode_command(0, 0, 6.0, True), ACTIVE, 100 * MS, 100 * MS)
+    let_out(guard, wide.encode_command(0, 0, 6.0, True), ACTIVE, 100 * MS, 100 * MS)
 
 
 @pytest.mark.parametrize("age_ns", [-MS - 1, 2 * MS + 1, 50 * MS])
@@ -122,12 +147,12 @@ def test_a_command_from_an_old_or_a_future_sample_is_refused(guard: Guard, bus: 
 
 @pytest.mark.parametrize("age_ns", [-MS, 0, 2 * MS])
 def test_a_sample_may_be_two_periods_old_and_its_stamp_one_period_ahead(guard: Guard, age_ns: int) -> None:
-    guard.send(command(), ACTIVE, 100 * MS - age_ns, 100 * MS)
+    let_out(guard, command(), ACTIVE, 100 * MS - age_ns, 100 * MS)
 
 
 def test_the_rate_counts_from_the_oldest_of_the_last_24_commands(guard: Guard) -> None:
     def send(time_ns: int) -> None:
-        guard.send(command(counter=guard.next_counter), ACTIVE, time_ns, time_ns)
+        let_out(guard, command(counter=guard.next_counter), ACTIVE, time_ns, time_ns)
 
     oldest, second = 100 * MS, 101 * MS
     for time_ns in [oldest, second, *[109 * MS] * 22]:
@@ -140,9 +165,9 @@ def test_the_rate_counts_from_the_oldest_of_the_last_24_commands(guard: Guard) -
 
 def test_a_stop_frame_is_never_too_fast(guard: Guard, bus: Bus) -> None:
     for n in range(24):
-        guard.send(command(counter=n % 15), ACTIVE, 100 * MS, 100 * MS)
+        let_out(guard, command(counter=n % 15), ACTIVE, 100 * MS, 100 * MS)
     for n in range(24, 27):
-        guard.send(command(0.0, counter=n % 15, enable=False), RunState.STOPPING, 100 * MS, 100 * MS)
+        let_out(guard, command(0.0, counter=n % 15, enable=False), RunState.STOPPING, 100 * MS, 100 * MS)
     assert len(bus.frames) == 27
 
 
@@ -152,10 +177,10 @@ def test_a_bus_that_fails_is_not_counted_as_passed_and_its_counter_is_spent(benc
 
     guard = Guard(layout, bench, lost)
     with pytest.raises(BusError):
-        guard.send(command(counter=4), ACTIVE, 100 * MS, 100 * MS)
+        let_out(guard, command(counter=4), ACTIVE, 100 * MS, 100 * MS)
     assert guard.passed == 0
     with pytest.raises(GuardRejectedError, match="does not follow 4"):
-        guard.send(command(counter=4), ACTIVE, 100 * MS, 100 * MS)
+        let_out(guard, command(counter=4), ACTIVE, 100 * MS, 100 * MS)
 
 
 def answer(current: float, counter: int, answers: int) -> Frame:
@@ -172,17 +197,17 @@ def test_a_change_may_be_the_slew_and_one_step_of_the_signal_and_no_more(layout:
     guard = Guard(layout, replace(bench, timing=replace(bench.timing, sample_time=2e-3)), bus.send)
     for counter, (passes, fails) in enumerate([(2.0002, 2.0004), (4.0, 4.0006), (2.0, 1.9996)]):
         refused(guard, bus, answer(sign * fails, counter, counter), "a change by -?2 A in one period is beyond 2 A")
-        guard.send(answer(sign * passes, counter, counter), ACTIVE, 100 * MS, 100 * MS)
+        let_out(guard, answer(sign * passes, counter, counter), ACTIVE, 100 * MS, 100 * MS)
 
 
 @pytest.mark.parametrize("missing", [2, 3, 14])
 def test_after_a_period_without_a_command_the_slew_counts_from_zero(layout: Layout, bus: Bus, missing: int) -> None:
     guard = Guard(layout, slow(2000.0), bus.send)
     for n, current in enumerate([2.0, 4.0, 6.0]):
-        guard.send(answer(current, n, n), ACTIVE, 100 * MS, 100 * MS)
+        let_out(guard, answer(current, n, n), ACTIVE, 100 * MS, 100 * MS)
     after = (2 + missing) % 15
     refused(guard, bus, answer(5.0, 3, after), "a change by 5 A")
-    guard.send(answer(-2.0, 3, after), ACTIVE, 100 * MS, 100 * MS)
+    let_out(guard, answer(-2.0, 3, after), ACTIVE, 100 * MS, 100 * MS)
 
 
 @pytest.mark.parametrize(
@@ -193,9 +218,9 @@ def test_a_counter_that_has_come_round_is_not_that_of_the_next_sample(
     layout: Layout, bus: Bus, elapsed_ns: int, follows: bool, current: float, from_the_last: bool
 ) -> None:
     guard, now_ns = Guard(layout, slow(2000.0), bus.send), 100 * MS + elapsed_ns
-    guard.send(answer(2.0, 0, 3), ACTIVE, 100 * MS, 100 * MS)
+    let_out(guard, answer(2.0, 0, 3), ACTIVE, 100 * MS, 100 * MS)
     with contextlib.nullcontext() if follows == from_the_last else pytest.raises(GuardRejectedError):
-        guard.send(answer(current, 1, 4), ACTIVE, now_ns, now_ns)
+        let_out(guard, answer(current, 1, 4), ACTIVE, now_ns, now_ns)
 
 
 @pytest.mark.parametrize(
@@ -211,18 +236,18 @@ def test_after_a_command_that_the_bus_did_not_take_the_slew_counts_from_zero(
             raise BusError("no room")
 
     guard = Guard(layout, slow(2000.0), send)
-    guard.send(answer(2.0, 0, 0), ACTIVE, 100 * MS, 100 * MS)
+    let_out(guard, answer(2.0, 0, 0), ACTIVE, 100 * MS, 100 * MS)
     with pytest.raises(BusError):
-        guard.send(answer(4.0, 1, 1), ACTIVE, 100 * MS, 100 * MS)
+        let_out(guard, answer(4.0, 1, 1), ACTIVE, 100 * MS, 100 * MS)
     assert guard.next_counter == 2
     with contextlib.nullcontext() if passes else pytest.raises(GuardRejectedError):
-        guard.send(answer(current, 2, 2), ACTIVE, 100 * MS, 100 * MS)
+        let_out(guard, answer(current, 2, 2), ACTIVE, 100 * MS, 100 * MS)
 
 
 def test_a_limit_asked_for_narrows_the_guard_and_never_widens_it(bench: Bench, layout: Layout, bus: Bus) -> None:
     guard = Guard(layout, bench, bus.send, limit=1.0)
     refused(guard, bus, command(1.0002), "is beyond 1 A")
-    guard.send(command(1.0), ACTIVE, 100 * MS, 100 * MS)
+    let_out(guard, command(1.0), ACTIVE, 100 * MS, 100 * MS)
     narrow = parse_bench(shipped_bench_text().replace("current  = 6.0", "current  = 2.5"), "t")
     refused(Guard(layout, narrow, bus.send, limit=100.0), Bus(), command(2.6), "is beyond 2.5 A")
 
@@ -237,7 +262,7 @@ def test_once_the_watchdog_has_spoken_not_even_a_stop_frame_leaves(bench: Bench,
     guard = Guard(layout, bench, bus.send, Tripped())
     for frame, state in [(command(), ACTIVE), (command(0.0, 1, enable=False), RunState.STOPPING)]:
         with pytest.raises(StopError) as caught:
-            guard.send(frame, state, 100 * MS, 100 * MS)
+            let_out(guard, frame, state, 100 * MS, 100 * MS)
         assert caught.value.fault is Fault.WATCHDOG_TRIPPED
     assert bus.frames == []
 
@@ -255,12 +280,12 @@ def test_the_watchdog_learns_of_a_command_before_it_is_asked(bench: Bench, layou
             return False
 
     guard = Guard(layout, bench, lambda _frame: order.append("sent"), Pulse())
-    guard.send(answer(1.0, 3, 9), ACTIVE, 100 * MS, 100 * MS)
+    let_out(guard, answer(1.0, 3, 9), ACTIVE, 100 * MS, 100 * MS)
     assert order == [(3, 9), "asked", "sent"]
 
 
 def test_a_drive_that_does_not_apply_what_left_ends_the_run(guard: Guard, bus: Bus) -> None:
-    guard.send(command(4.0), ACTIVE, 100 * MS, 100 * MS)
+    let_out(guard, command(4.0), ACTIVE, 100 * MS, 100 * MS)
     sample = SensorSample(1, 0.0, 0.0, 0, 0, 4.0, 0, NodeState.ACTIVE)
     for _ in range(20):
         guard.judge(sample)
@@ -317,7 +342,7 @@ def test_once_the_device_time_is_wrong_no_enabled_command_passes_and_stop_frames
     for n in range(10):
         assert guard.learn_time(sample_at(n * MS, (50 + n) * MS), first=n == 0)
     guard.judge_time(sample_at(10 * MS, 60 * MS), 60 * MS)
-    guard.send(command(), ACTIVE, 100 * MS, 100 * MS)
+    let_out(guard, command(), ACTIVE, 100 * MS, 100 * MS)
     with pytest.raises(StopError, match="DEVICE_TIME") as caught:
         guard.judge_time(sample_at(24 * MS, 61 * MS), 61 * MS)
     assert (caught.value.fault, caught.value.detail) == (
@@ -325,7 +350,7 @@ def test_once_the_device_time_is_wrong_no_enabled_command_passes_and_stop_frames
         "it has gained 13.000 ms on this computer's",
     )
     refused(guard, bus, command(counter=1), "the device time of what it answers is wrong: it has gained 13.000 ms")
-    guard.send(command(0.0, counter=1, enable=False), ACTIVE, 100 * MS, 100 * MS)
+    let_out(guard, command(0.0, counter=1, enable=False), ACTIVE, 100 * MS, 100 * MS)
     assert len(bus.frames) == 2
 
 
@@ -357,8 +382,8 @@ def test_the_rate_can_be_asked_for_before_a_command_is_refused(guard: Guard, bus
     surplus = 24
     for n in range(surplus):
         assert not guard.too_fast(100 * MS)
-        guard.send(command(counter=n % 15), ACTIVE, 100 * MS, 100 * MS)
+        let_out(guard, command(counter=n % 15), ACTIVE, 100 * MS, 100 * MS)
     assert guard.too_fast(100 * MS)
     assert guard.too_fast(120 * MS - 1)
     assert not guard.too_fast(120 * MS)
-    guard.send(command(counter=surplus % 15), ACTIVE, 120 * MS, 120 * MS)
+    let_out(guard, command(counter=surplus % 15), ACTIVE, 120 * MS, 120 * MS)

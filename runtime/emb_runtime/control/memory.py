@@ -1,0 +1,181 @@
+"""Memory of a run by sampling periods: what came, what was missed, what was sent, and the record of each cycle.
+
+The one place that counts periods. The node's clock sets the pace: its device time says how many periods lie between two
+samples. A sample that does not come in time is a missed period on a grid that runs on from the last arrival.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, LeakyCount, next_counter
+from emb_runtime.config.bench import Bench
+from emb_runtime.control.result import RunCounters
+from emb_runtime.log.ring_buffer import EventRecord, Record
+from emb_runtime.records import CurrentCommand, CycleRecord, Reason, RunState, SensorSample
+from emb_runtime.safety.command_limits import Decision
+from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS
+from emb_runtime.safety.shield import NO_PAST
+
+MISSED: Final = int(Reason.MISSED)  # an enumeration combines its members in Python
+NONE_SENT: Final = (math.nan, math.nan, math.nan)
+
+
+class Proposal(NamedTuple):
+    """Command computed for a sample, before its deadline is checked."""
+
+    sample: SensorSample
+    step: int
+    wanted: float  # By the policy [A]
+    decision: Decision
+
+
+class Interval(NamedTuple):
+    """Interval between a sample and the one before."""
+
+    elapsed: float  # By the device's clock [s]
+    periods: int
+    command: float  # That answered the sample before; 0 if none was sent [A]
+    obeyed: bool  # True if the node says that this command acted
+
+    @property
+    def follows(self) -> bool:
+        """Returns True if nothing is missing between the two samples, and the command acted."""
+        return self.obeyed and self.periods == 1
+
+
+class Memory:
+    """Memory of one run."""
+
+    def __init__(self, bench: Bench, *, homing: bool) -> None:
+        self.period_ns = bench.timing.sample_time_ns
+        self.records: list[Record] = []  # What happened, in its order, until the driver takes it
+        self.counters = RunCounters()
+        self.read_ns = 0  # Time of the last read, monotonic [ns]
+        self.deadline_ns = 0  # Time at which the next sample is half a period late, monotonic [ns]
+        self.start_ns = 0  # Device time of the first sample [ns]
+        self.newest: SensorSample | None = None  # Newest valid sample
+        self.interval = Interval(0.0, 0, 0.0, False)  # Between it and the sample before, in control
+        self.missed = 0  # Periods without a valid pair just before it
+        self.skipped = 0  # Samples that the node's counter has skipped, and its device time has not
+        self.lost = LeakyCount(bench.watch.stop_missed)  # Periods without a valid pair
+        self.unobeyed = LeakyCount(bench.watch.stop_missed)  # Periods in which the node obeyed no command
+        self.past = NO_PAST  # Last own commands, newest first [A]
+        self._sent: CurrentCommand | None = None  # the last command
+        self._answered = False  # it answers the newest sample
+        self._state = RunState.HOMING if homing else RunState.ACTIVE  # of the cycles
+
+    def note(self, time_ns: int, code: str, text: str) -> None:
+        """Record an event."""
+        self.records.append(EventRecord(time_ns, code, text))
+
+    # --- the grid ---------------------------------------------------------------------------------------------------
+
+    def take(self, sample: SensorSample) -> SensorSample | None:
+        """Take a sample; gives the one before."""
+        before, self.newest = self.newest, sample
+        self.deadline_ns = sample.receive_time_ns + self.period_ns * 3 // 2
+        return before
+
+    def begin(self, sample: SensorSample) -> None:
+        """Begin the experiment, or the way home, with its first sample."""
+        self.start_ns = sample.device_time_ns
+        self.counters.pairs = 1
+
+    def step_of(self, sample: SensorSample) -> int:
+        """Index of a sample on the run's grid, by the node's own clock."""
+        return round((sample.device_time_ns - self.start_ns) / self.period_ns)
+
+    def is_next(self, before: SensorSample | None, sample: SensorSample) -> bool:
+        """Returns True if no sample is missing between two."""
+        return before is None or sample.device_time_ns - before.device_time_ns < self.period_ns * 3 // 2
+
+    def miss(self) -> int:
+        """Pass over the deadline, which is given; the next one is a period later."""
+        # The deadline and not the clock: a computer that stood still has frames waiting, and they come first.
+        deadline_ns = self.deadline_ns
+        self.deadline_ns += self.period_ns
+        return deadline_ns
+
+    def follow(self, before: SensorSample, sample: SensorSample) -> None:
+        """Count the periods between two samples, and whether the node obeyed."""
+        elapsed_ns = sample.device_time_ns - before.device_time_ns
+        periods = round(elapsed_ns / self.period_ns)
+        self.missed = max(0, periods - 1)
+        # What the counter has skipped within the device time was sampled, and did not come.
+        steps = (sample.counter - before.counter) % COUNTER_MODULUS
+        skipped = max(0, steps - periods) if periods < COUNTER_MODULUS else 0
+        self.skipped += skipped
+        self.counters.count_pair(sample, self.missed + skipped)
+        self.lost.forgive()
+        self.lost.reject(self.missed + skipped)
+        command, obeyed = 0.0, False
+        if self._answered and self._sent is not None:
+            command, obeyed = self._sent.current, sample.command_counter == self._sent.counter
+            # Across a gap the node does not tell: it names the command of the last period only.
+            if periods == 1 and obeyed:
+                self.unobeyed.forgive()
+            elif periods == 1:
+                self.counters.not_obeyed += 1
+                self.unobeyed.reject()
+        self._answered = False
+        self.interval = tuple.__new__(Interval, (elapsed_ns * 1e-9, periods, command, obeyed))
+
+    # --- what was sent ----------------------------------------------------------------------------------------------
+
+    def slew_reference(self, sample: SensorSample) -> float:
+        """Command of the period before; 0 if there was none [A]."""
+        follows = self._sent is not None and sample.counter == next_counter(self._sent.answers)
+        return self.past[0] if follows else 0.0
+
+    def pass_missed(self, missed: int) -> None:
+        """Note that nothing was sent in the missed periods before a sample."""
+        for _ in range(min(missed, len(NO_PAST))):
+            self._remember(0.0)
+
+    def answered(self, proposal: Proposal, command: CurrentCommand, decide_ns: int, send_ns: int) -> None:
+        """Count and record a command that was decided and handed to the bus at these times, monotonic [ns]."""
+        sample, step, wanted, decision = proposal
+        self._remember(command.current)
+        self._sent, self._answered = command, True
+        self.counters.count_answer(decision.reasons, command.current)
+        currents = wanted, decision.clipped, command.current
+        self.record(sample, step, decision.reasons, self.missed, decide_ns, currents, command.counter, send_ns)
+
+    def unanswered(self, sample: SensorSample, missed: int, decide_ns: int = 0, reasons: int = 0) -> None:
+        """Count and record a sample for which nothing is sent: the node brakes in its period.
+
+        With ``reasons`` it does so because the core decided that.
+        """
+        self._remember(0.0)
+        self.counters.unanswered += 1
+        self.counters.left += bool(reasons)
+        if not reasons:
+            self.unobeyed.reject()
+        self.record(sample, self.step_of(sample), reasons or MISSED, missed, decide_ns)
+
+    def _remember(self, current: float) -> None:
+        self.past = (current, *self.past[:4])
+
+    def record(
+        self,
+        sample: SensorSample,
+        step: int,
+        reasons: int,
+        missed: int,
+        decide_ns: int = 0,
+        currents: tuple[float, float, float] = NONE_SENT,
+        command_counter: int = NO_COUNTER,
+        send_ns: int = 0,
+    ) -> None:
+        """Record a cycle; ``currents`` are those of the policy, clipped, and sent [A]."""
+        counter, angle, velocity, device_ns, receive_ns, applied, _, node_state = sample
+        of_cycle = step, self._state, int(reasons), counter, command_counter, missed, node_state
+        times = device_ns, receive_ns, self.read_ns, decide_ns, send_ns
+        self.records.append(tuple.__new__(CycleRecord, (*of_cycle, angle, velocity, applied, *currents, *times)))
+
+
+def latest_answer_ns(bench: Bench) -> int:
+    """Age of a sample beyond which an answer cannot act any more in the period that it is meant for [ns]."""
+    return min(1 + bench.shield.frame_age[1], OLDEST_SAMPLE_PERIODS) * bench.timing.sample_time_ns

@@ -1,0 +1,289 @@
+"""Phases of a run: each takes a sample and returns the next phase.
+
+    Silent -> Control -> Stopping
+              Control -> Coasting -> Stopping
+
+Silent listens until the node has shown itself. Control checks each sample and answers it. Coasting lets friction stop a
+brake of which motor or sensors may have the wrong sign. Stopping watches the node come to rest. A fault is a StopError,
+which leads to Stopping from anywhere; the core sees to that.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from emb_runtime.control.memory import Proposal
+from emb_runtime.control.monitors import IDLE, OBEYING
+from emb_runtime.control.setup import Setup
+from emb_runtime.control.start_conditions import READY_PAIRS
+from emb_runtime.records import Reason, RunState, SensorSample
+from emb_runtime.safety.command_limits import CommandLimits, Decision, checked, decide
+from emb_runtime.safety.motion_balance import REST_SAMPLES, unheld_motion
+from emb_runtime.safety.shield import NO_PAST
+from emb_runtime.safety.state_machine import Event, Fault, StopError, may_enable
+
+HOME_PAIRS: Final = 50  # Valid pairs in a row, at home, that end a way home
+UNSTEADY: Final = "its samples come earlier and earlier by its own clock: they had piled up, or that clock is fast"
+"""Reason why a node is not ready."""
+SILENT_WAIT: Final = 10  # Periods after which a driver that waits for the node asks again for the operator's wish
+COVERAGE: Final = 0.8
+"""Least share of an experiment's periods with a sample and a command that acted."""
+ARMED: Final = RunState.ARMED
+
+
+class Phase:
+    """A phase of a run."""
+
+    def __init__(self, setup: Setup) -> None:
+        self.setup = setup
+
+    @property
+    def deadline_ns(self) -> int:
+        """Time until which the next frames are waited for, monotonic [ns]."""
+        return self.setup.memory.deadline_ns
+
+    def take(self, sample: SensorSample) -> Phase:
+        """Take a valid sample; gives the next phase."""
+        raise NotImplementedError
+
+    def propose(self) -> Proposal | None:
+        """Decide on a command for the newest sample, when all of a read have been taken."""
+        return None
+
+    def miss(self) -> None:
+        """Count that nothing came until the deadline."""
+
+
+class Silent(Phase):
+    """Listens until enough samples in a row meet the start conditions; nothing leaves."""
+
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
+        self._control = Control(setup)
+        self._ready = 0  # samples in a row that met the conditions
+        self._not_ready = ""  # reason why the last one did not
+
+    @property
+    def deadline_ns(self) -> int:
+        """Time until which the next frames are waited for, monotonic [ns]."""
+        setup, memory = self.setup, self.setup.memory
+        give_up_ns = setup.machine.run.since_ns + round(setup.bench.watch.start_timeout * 1e9)
+        return min(give_up_ns, memory.read_ns + SILENT_WAIT * memory.period_ns)
+
+    def take(self, sample: SensorSample) -> Phase:
+        """Arm, if the node is ready."""
+        setup, memory = self.setup, self.setup.memory
+        before = memory.take(sample)
+        reason = setup.conditions.not_ready(setup.reception.status, sample, memory.read_ns)
+        in_row = self._ready > 0 and not reason and memory.is_next(before, sample)
+        steady = setup.guard.learn_time(sample, first=not in_row)
+        self._ready = 0 if reason else self._ready + 1 if in_row and steady else 1
+        self._not_ready = reason or ("" if steady else UNSTEADY)
+        self._control.warm_up(sample)
+        if self._ready < READY_PAIRS:
+            return self
+        setup.machine.handle_event(Event.NODE_READY, memory.read_ns)
+        return self._control
+
+    def propose(self) -> Proposal | None:
+        """Give up a node that has not shown itself in time."""
+        self.miss()
+        return None
+
+    def miss(self) -> None:
+        """Give up a node that has not shown itself in time."""
+        try:
+            self.setup.machine.handle_event(Event.TIME, self.setup.memory.read_ns)
+        except StopError as stop:
+            unpaired = self.setup.reception.pairing_problem
+            fault = Fault.NODE_NOT_READY if unpaired else stop.fault
+            raise StopError(fault, self._not_ready or unpaired or stop.detail) from None
+
+
+class Control(Phase):
+    """Armed: each sample is checked and answered. The first one begins the experiment, or the way home."""
+
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
+        bench, law = setup.bench, setup.law
+        limit = setup.layout.current_within(min(setup.limit, bench.limits.current))
+        self._limits = CommandLimits(limit, bench.guard.slew * bench.timing.sample_time)
+        self._late_step = law.steps - 2 - math.ceil(law.settling / law.sample_time)
+        self._at_home = 0  # samples in a row at home, once the brake is to return
+        self._open: SensorSample | None = None  # newest sample of the read, which is to be answered
+
+    def warm_up(self, sample: SensorSample) -> None:
+        """Run one cycle for nothing: Python runs code several times before it runs it fast, and first cycles count."""
+        self.setup.sensors.warm_up(sample, self._limits.current)
+        estimator = self.setup.estimate.estimator
+        estimator.begin()
+        estimator.take(sample.angle, sample.velocity, 0, sample.applied_current)
+        decide(self.setup.law, self._limits, sample.angle, sample.velocity, 0.0, NO_PAST, 0.0, 0)
+
+    def take(self, sample: SensorSample) -> Phase:
+        """Count the periods since the sample before, and check that the sensors can be right."""
+        setup, memory = self.setup, self.setup.memory
+        before, missed, phase = memory.take(sample), memory.missed, self
+        if before is not None and may_enable(setup.machine.run.state):
+            setup.sensors.update_balance()
+            memory.follow(before, sample)
+            phase = self._check_sensors(sample)
+            if self._open is not None:  # overtaken: the node obeys an answer to its newest sample only
+                memory.pass_missed(missed)
+                memory.unanswered(self._open, missed)
+        phase._open = sample
+        return phase
+
+    def propose(self) -> Proposal | None:
+        """Check the newest sample, and decide on a command for it; None at the last one, which ends the run."""
+        sample, self._open = self._open, None
+        if sample is None:
+            return None
+        setup, memory, estimate = self.setup, self.setup.memory, self.setup.estimate
+        # Before its device time says which step it is, or that it is the last one. A stamp may be just ahead of now.
+        setup.guard.judge_time(sample, max(memory.read_ns, sample.receive_time_ns))
+        if setup.machine.run.state is ARMED:
+            self._begin(sample)
+        else:
+            returns = setup.homing or estimate.reached
+            self._at_home = self._at_home + 1 if returns and setup.bounds.is_home(sample) else 0
+        step = memory.step_of(sample)
+        if self._is_last(step):
+            self._finish(sample, step)
+            return None
+        for check in setup.monitors:
+            check(sample, memory)
+        if memory.missed:
+            memory.pass_missed(memory.missed)
+        estimate.estimator.take(sample.angle, sample.velocity, step, sample.applied_current)
+        asked = setup.actor.act(sample.angle, sample.velocity, step, estimate.estimator)
+        wanted = checked(asked, setup.current_limit)
+        return tuple.__new__(Proposal, (sample, step, wanted, self._command(sample, wanted, step)))
+
+    def miss(self) -> None:
+        """Count a period without a sample; too many in a row end the run."""
+        self.setup.machine.handle_event(Event.TIME, self.setup.memory.miss())
+
+    def _begin(self, sample: SensorSample) -> None:
+        setup, memory = self.setup, self.setup.memory
+        memory.begin(sample)
+        setup.machine.handle_event(Event.BEGIN_HOMING if setup.homing else Event.BEGIN, memory.read_ns)
+        setup.sensors.begin(sample)
+        setup.estimate.estimator.begin()
+
+    def _is_last(self, step: int) -> bool:
+        return step >= self.setup.steps or self._at_home >= HOME_PAIRS
+
+    def _check_sensors(self, sample: SensorSample) -> Control:
+        """Coast if the sign is not known to be right and friction alone can stop the brake.
+
+        With a wrong sign the node's own stop would drive it on.
+        """
+        sensors = self.setup.sensors
+        try:
+            sensors.check(sample, self.setup.memory)
+        except StopError as stop:
+            time = sensors.monitor.coasting_time(sample)
+            if time == 0.0:
+                raise
+            # Now, since something else may end the run meanwhile, and would hide it.
+            self.setup.machine.note(stop.fault, stop.detail, sample.receive_time_ns)
+            return Coasting(self.setup, stop, time)
+        return self
+
+    def _command(self, sample: SensorSample, wanted: float, step: int) -> Decision:
+        """Command for a sample, in the shield's view of time: on the way home the end is always near."""
+        memory, sensors, limits = self.setup.memory, self.setup.sensors, self._limits
+        last, reached = memory.slew_reference(sample), self.setup.estimate.reached
+        if self.setup.homing:
+            step = self._late_step
+        elif reached:
+            step, wanted = max(step, self._late_step), 0.0
+        if (most := sensors.monitor.largest_current(limits.current)) < limits.current:
+            limits = limits._replace(current=max(most, abs(last) - limits.slew))  # down to it as fast as may be
+        decision = decide(sensors.law, limits, sample.angle, sample.velocity, wanted, memory.past, last, step)
+        return decision._replace(reasons=decision.reasons | Reason.RETURNING) if reached else decision
+
+    def _finish(self, sample: SensorSample, step: int) -> None:
+        """Check the whole run at its last sample."""
+        setup, memory = self.setup, self.setup.memory
+        memory.record(sample, step, 0, memory.missed)
+        if setup.homing and self._at_home < HOME_PAIRS:
+            raise StopError(Fault.NOT_HOME, f"at {sample.angle:.2f} rad after {step} periods")
+        if not setup.homing:
+            self._check_complete(sample, min(step, setup.steps))
+            setup.sensors.check_balance()
+        setup.machine.handle_event(Event.FINISHED, memory.read_ns)
+
+    def _check_complete(self, end: SensorSample, periods: int) -> None:
+        """Check that an experiment of so many periods is complete."""
+        setup, counters = self.setup, self.setup.memory.counters
+        acted = counters.answered + counters.left - counters.not_obeyed
+        if acted < COVERAGE * periods:
+            found = f"{acted} of {periods} periods had a sample and a command that acted"
+            raise StopError(Fault.INCOMPLETE, f"{found}, at least {COVERAGE:.0%} must")
+        # Below the bench's limit the shield cannot always bring the brake home in time: that is the operator's choice.
+        if not setup.bounds.is_home(end) and setup.limit >= setup.bench.limits.current:
+            found = f"at {end.angle:.2f} rad and {end.velocity:.1f} rad/s after {periods} periods"
+            raise StopError(Fault.INCOMPLETE, f"the brake is not home: {found}")
+
+
+class Coasting(Control):
+    """Motor or sensors may have the wrong sign: 0 A until friction has stopped the brake, then the fault.
+
+    Meanwhile everything but the sensors' sums and the end of the run is checked as ever.
+    """
+
+    def __init__(self, setup: Setup, stop: StopError, time: float) -> None:
+        super().__init__(setup)
+        self._stop = stop
+        self._time = time  # that is left [s]
+
+    def _check_sensors(self, sample: SensorSample) -> Control:
+        """End the run once the brake has been stopped."""
+        self.setup.sensors.response.watch(sample)
+        self._time -= self.setup.memory.interval.elapsed
+        if self._time <= 0.0:
+            raise self._stop
+        return self
+
+    def _is_last(self, step: int) -> bool:
+        return False
+
+    def _command(self, sample: SensorSample, wanted: float, step: int) -> Decision:
+        """0 A, as fast as may be."""
+        last, slew = self.setup.memory.slew_reference(sample), self._limits.slew
+        return Decision(0.0, min(max(0.0, last - slew), last + slew), int(Reason.LIMITED))
+
+
+class Stopping(Phase):
+    """After the end, or a fault: watches the node come to rest."""
+
+    def __init__(self, setup: Setup, end: SensorSample | None) -> None:
+        super().__init__(setup)
+        self.end = end  # The newest sample before; None of a run that never armed
+        self.rests = False  # The newest sample since then says idle
+        self._left = False  # the node has left ACTIVE since then
+        self._samples: list[SensorSample] = []  # the last ones since then
+
+    def take(self, sample: SensorSample) -> Phase:
+        """Keep what tells how the node stops."""
+        self.setup.memory.newest = sample
+        self.setup.sensors.response.watch(sample)
+        if sample.node_state is not OBEYING and not self._left:
+            self._left = True
+            self.setup.reception.status = None  # its reason was that of another stop
+        self.rests = sample.node_state is IDLE
+        self._samples = [*self._samples[1 - REST_SAMPLES :], sample]
+        return self
+
+    def check_rest(self) -> None:
+        """Check that the node has come to rest; raises StopError."""
+        newest = self.setup.memory.newest
+        if not self.rests:
+            found = "" if newest is None else f"the node's last state is {newest.node_state.name}"
+            raise StopError(Fault.NOT_AT_REST, found)
+        if speed := unheld_motion(self.setup.bench, self._samples):
+            moves = f"in the stop the node goes on to measure {speed:.1f} rad/s, where friction holds any brake"
+            raise StopError(Fault.MOTION_UNEXPLAINED, moves)

@@ -1,0 +1,40 @@
+"""Running estimate of an experiment, and the stop condition on its precision."""
+
+from __future__ import annotations
+
+from emb_runtime.config.bench import Bench
+from emb_runtime.control.memory import Memory
+from emb_runtime.control.stop_condition import REACHED, StopCondition
+from emb_runtime.estimator.estimate import LOST
+from emb_runtime.estimator.estimator import Estimator, estimated
+from emb_runtime.log.ring_buffer import EstimateRecord
+from emb_runtime.records import SensorSample
+
+
+class RunningEstimate:
+    """Estimate of one run."""
+
+    def __init__(self, bench: Bench, condition: StopCondition | None, *, homing: bool) -> None:
+        self.estimator = Estimator(bench)
+        self.numbers: tuple[float, ...] = ()  # The latest estimate; empty if there is none
+        self.reached = False  # The stop condition was met: all that is left is the way home
+        self.reached_ns = 0  # Device time from the first sample to that at which it was met [ns]
+        self._condition = condition
+        self._finite = not homing and bool(estimated(bench))  # there is an estimate, and it was finite so far
+
+    def record(self, sample: SensorSample, step: int, memory: Memory) -> None:
+        """Record the estimate at a sample; once it is not finite, the run has none."""
+        if not self._finite:
+            return
+        self.numbers = numbers = self.estimator.estimate
+        if not numbers:
+            self._finite = False
+            text = "not finite: the measurements do not fit the bench's noise; the run goes on without an estimate"
+            memory.note(sample.receive_time_ns, LOST, text)
+            return
+        memory.records.append(EstimateRecord(sample.receive_time_ns, step, numbers))
+        condition = self._condition
+        if condition is not None and not self.reached and condition.reached(numbers):
+            self.reached = True
+            self.reached_ns = sample.device_time_ns - memory.start_ns
+            memory.note(sample.receive_time_ns, REACHED, condition.describe(numbers))

@@ -1,0 +1,48 @@
+"""Setup of a run: what it is given, and the parts that its phases share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from emb_runtime.can.messages import Layout
+from emb_runtime.can.receiver import Reception
+from emb_runtime.config.bench import CEILING_CURRENT, Bench
+from emb_runtime.control.actor import Actor
+from emb_runtime.control.memory import Memory
+from emb_runtime.control.monitors import Sensors, monitors
+from emb_runtime.control.running_estimate import RunningEstimate
+from emb_runtime.control.start_conditions import Bounds, StartConditions
+from emb_runtime.control.stop_condition import StopCondition
+from emb_runtime.safety.guard import Guard
+from emb_runtime.safety.shield_design import ShieldLaw
+from emb_runtime.safety.state_machine import StateMachine
+
+
+@dataclass
+class Setup:
+    """Setup of one run: an experiment, or the way home."""
+
+    bench: Bench
+    layout: Layout
+    law: ShieldLaw
+    actor: Actor
+    current_limit: float  # Largest current that the policy's contract allows it to ask for [A]
+    steps: int  # Samples to answer; on the way home, at most
+    guard: Guard
+    limit: float = CEILING_CURRENT  # A current narrower than the bench's, where the operator asked for one [A]
+    homing: bool = False  # Begin anywhere, let the shield bring the brake home, and end when it rests there
+    stop_condition: StopCondition | None = None  # Precision of the estimate at which the way home begins early
+
+    def __post_init__(self) -> None:
+        """Make the parts."""
+        bench = self.bench
+        self.memory = memory = Memory(bench, homing=self.homing)
+        self.machine = StateMachine(bench, memory.note)
+        self.reception = Reception(
+            self.layout, bench, lambda frame, why: memory.note(frame.time_ns, "FRAME_REJECTED", why)
+        )
+        self.bounds = Bounds(bench)
+        self.conditions = StartConditions(bench, self.layout, self.bounds, anywhere=self.homing)
+        self.monitors = monitors(self.bounds, self.conditions, self.reception, self.guard)
+        self.sensors = Sensors(bench, self.law, homing=self.homing)
+        self.estimate = RunningEstimate(bench, self.stop_condition, homing=self.homing)
