@@ -51,6 +51,9 @@ class Core:
         self.setup = setup
         self.guard = setup.guard
         self.records = setup.memory.records
+        self._memory = setup.memory
+        self._machine = setup.machine
+        self._reception = setup.reception
         self._phase: Phase = Silent(setup)
         self._stopping: Stopping | None = None  # the last phase
         self._latest_answer_ns = latest_answer_ns(setup.bench)
@@ -65,12 +68,12 @@ class Core:
     @property
     def state(self) -> RunState:
         """State of the run."""
-        return self.setup.machine.run.state
+        return self._machine.run.state
 
     @property
     def fault(self) -> Fault | None:
         """First fault that latched."""
-        return self.setup.machine.run.fault
+        return self._machine.run.fault
 
     @property
     def running(self) -> bool:
@@ -81,7 +84,7 @@ class Core:
     def at_rest(self) -> bool:
         """Returns True if the node has come to rest after the stop frames, and its status says why it stopped."""
         rests = self._stopping is not None and self._stopping.rests
-        return rests and self.setup.reception.stop_reason is not None
+        return rests and self._reception.stop_reason is not None
 
     @property
     def deadline_ns(self) -> int:
@@ -91,19 +94,19 @@ class Core:
     @property
     def newest_counter(self) -> int:
         """Counter of the newest sample; 0 before the first."""
-        newest = self.setup.memory.newest
+        newest = self._memory.newest
         return newest.counter if newest else 0
 
     # --- the run ----------------------------------------------------------------------------------------------------
 
     def begin(self, now_ns: int) -> None:
         """Begin to listen for the node."""
-        self.setup.memory.read_ns = now_ns
-        self.setup.machine.handle_event(Event.PREPARED, now_ns)
+        self._memory.read_ns = now_ns
+        self._machine.handle_event(Event.PREPARED, now_ns)
 
     def take(self, frames: Sequence[Frame], now_ns: int) -> Proposal | None:
         """Take the frames of one read, in hand at a monotonic time [ns]; gives a command for the newest sample."""
-        self.setup.memory.read_ns = now_ns
+        self._memory.read_ns = now_ns
         for left, frame in enumerate(frames, 1 - len(frames)):
             self.records.append(tuple.__new__(FrameRecord, (frame, now_ns if left == 0 else 0)))
             try:
@@ -114,13 +117,13 @@ class Core:
         if not self.running:
             return None
         try:
-            check_bus(self.setup.layout, self.setup.reception)
-            proposal = self._phase.propose()
+            check_bus(self.setup.layout, self._reception)
+            if (proposal := self._phase.propose()) is not None:
+                return proposal
+            self._follow_state()
         except StopError as ended:
             self.fail(ended.fault, now_ns, ended.detail)
-            return None
-        self._follow_state()
-        return proposal
+        return None
 
     def answer(self, proposal: Proposal, now_ns: int) -> Frame | None:
         """Frame that answers a sample, decided at a monotonic time [ns]; None if it is left to the node.
@@ -132,7 +135,7 @@ class Core:
         in_time = now_ns - sample.receive_time_ns <= self._latest_answer_ns  # else the sample that it answers is stale
         if not in_time or not self._may_answer(now_ns) or math.isnan(decision.current):
             left = decision.reasons & Reason.LEFT if in_time else 0
-            self.setup.memory.unanswered(sample, self.setup.memory.missed, now_ns, left)
+            self._memory.unanswered(sample, self._memory.missed, now_ns, left)
             self._end_cycle(proposal)
             return None
         current = round(decision.current / self._current_step) * self._current_step  # the bus has whole steps
@@ -145,10 +148,10 @@ class Core:
 
         Where the bus had no room for it, ``lost`` says so: sent later, it would answer an old sample.
         """
-        memory = self.setup.memory
+        memory = self._memory
         if lost:
             memory.counters.not_taken += 1
-            self.setup.machine.note(Fault.SEND_QUEUE_FULL, lost, self._decide_ns)
+            self._machine.note(Fault.SEND_QUEUE_FULL, lost, self._decide_ns)
             memory.unanswered(proposal.sample, memory.missed, self._decide_ns)
         else:
             memory.answered(proposal, self._command, self._decide_ns, now_ns)
@@ -156,7 +159,7 @@ class Core:
 
     def timeout(self, now_ns: int) -> None:
         """Count that no frame came until :attr:`deadline_ns`."""
-        self.setup.memory.read_ns = now_ns
+        self._memory.read_ns = now_ns
         try:
             self._phase.miss()
         except StopError as stop:
@@ -169,13 +172,13 @@ class Core:
 
     def latch(self, fault: Fault, now_ns: int) -> None:
         """Latch a fault that was raised in the driver; :meth:`explain` records it, once a stop frame has left."""
-        self.setup.machine.latch(fault, now_ns)
+        self._machine.latch(fault, now_ns)
         self._follow_state()
 
     def explain(self, fault: Fault, detail: str) -> None:
         """Record a fault that was latched."""
         self._detail = self._detail or detail
-        self.setup.machine.explain(fault, detail)
+        self._machine.explain(fault, detail)
 
     def stop_frame(self, now_ns: int) -> Frame:
         """Next stop frame, at a monotonic time [ns]; it has passed the guard's check."""
@@ -184,8 +187,7 @@ class Core:
 
     def end(self, now_ns: int) -> None:
         """Check how the node came to rest; the run is over."""
-        setup = self.setup
-        setup.memory.read_ns = now_ns
+        setup, self._memory.read_ns = self.setup, now_ns
         if self.fault in OF_RESPONSE:
             response = setup.sensors.response
             named = cause(setup.bench, response.model, response.rows, response.stop, response.proven)
@@ -195,15 +197,15 @@ class Core:
                 self._stopping.check_rest()
             except StopError as stop:
                 self.fail(stop.fault, now_ns, stop.detail)
-        setup.machine.handle_event(Event.STOPPED, now_ns)
+        self._machine.handle_event(Event.STOPPED, now_ns)
 
     def note(self, time_ns: int, code: str, text: str) -> None:
         """Record an event."""
-        self.setup.memory.note(time_ns, code, text)
+        self._memory.note(time_ns, code, text)
 
     def outcome(self) -> Outcome:
         """Outcome of the run, when it is over."""
-        setup, memory, reception = self.setup, self.setup.memory, self.setup.reception
+        setup, memory, reception = self.setup, self._memory, self._reception
         end, last = self._stopping.end if self._stopping else None, memory.newest
         counters, estimate, response = memory.counters, setup.estimate, setup.sensors.response
         counters.rejected, counters.dropped = reception.rejected, reception.dropped
@@ -235,51 +237,51 @@ class Core:
 
     def _take(self, frame: Frame) -> None:
         """Take a frame; a sample that it completes is the phase's."""
-        setup = self.setup
-        while frame.time_ns >= setup.memory.deadline_ns and self.state in IN_CONTROL:
+        memory, reception = self._memory, self._reception
+        while frame.time_ns >= memory.deadline_ns and self.state in IN_CONTROL:
             self._phase.miss()
         if frame.own:
-            setup.memory.counters.confirmed += 1
+            memory.counters.confirmed += 1
             return
-        dropped = setup.reception.dropped
-        sample = setup.reception.take(frame)
+        dropped = reception.dropped
+        sample = reception.take(frame)
         if frame.error:
             self._count_error(frame)
             return
-        if setup.reception.dropped > dropped:
-            setup.machine.note(Fault.FRAMES_DROPPED, f"{setup.reception.dropped} so far", frame.time_ns)
+        if reception.dropped > dropped:
+            self._machine.note(Fault.FRAMES_DROPPED, f"{reception.dropped} so far", frame.time_ns)
         if sample is not None:
-            setup.machine.handle_event(PAIR, sample.receive_time_ns)
+            self._machine.handle_event(PAIR, sample.receive_time_ns)
             self._phase = self._phase.take(sample)
 
     def _count_error(self, frame: Frame) -> None:
-        counters, errors = self.setup.memory.counters, self.setup.reception.bus_errors
+        counters, errors = self._memory.counters, self._reception.bus_errors
         counters.bus_errors += 1
         if BUS_OFF in errors and self.running:
             raise StopError(Fault.BUS_LOST, "the CAN controller reports bus-off: it has stopped taking part")
         if counters.bus_errors == 1:
-            self.setup.machine.note(Fault.BUS_ERRORS, ", ".join(errors), frame.time_ns)
+            self._machine.note(Fault.BUS_ERRORS, ", ".join(errors), frame.time_ns)
 
     def _may_answer(self, now_ns: int) -> bool:
         """Returns True if one more command is not too fast, and every message of the node permits it."""
         if self.guard.too_fast(now_ns):  # samples came in a burst, and there is a newer one
             return False
-        why = self.setup.reception.inhibit_reason(now_ns)
+        why = self._reception.inhibit_reason(now_ns)
         if why and self._permitted:
-            self.setup.machine.note(Fault.PERMISSION_LOST, why, now_ns)
+            self._machine.note(Fault.PERMISSION_LOST, why, now_ns)
         self._permitted = not why
         return not why
 
     def _end_cycle(self, proposal: Proposal) -> None:
         """Record the estimate, and check the motion so far: the command has left."""
-        self.setup.estimate.record(proposal.sample, proposal.step, self.setup.memory)
+        self.setup.estimate.record(proposal.sample, proposal.step, self._memory)
         try:
             self.setup.sensors.update_balance()
         except StopError as stop:
-            self.fail(stop.fault, self.setup.memory.read_ns, stop.detail)
+            self.fail(stop.fault, self._memory.read_ns, stop.detail)
 
     def _follow_state(self) -> None:
         """Enter the last phase, where an end or a fault leads to it."""
         if self._stopping is None and not self.running:
             armed = not isinstance(self._phase, Silent)
-            self._phase = self._stopping = Stopping(self.setup, self.setup.memory.newest if armed else None)
+            self._phase = self._stopping = Stopping(self.setup, self._memory.newest if armed else None)

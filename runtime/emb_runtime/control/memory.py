@@ -35,14 +35,9 @@ class Interval(NamedTuple):
     """Interval between a sample and the one before."""
 
     elapsed: float  # By the device's clock [s]
-    periods: int
     command: float  # That answered the sample before; 0 if none was sent [A]
     obeyed: bool  # True if the node says that this command acted
-
-    @property
-    def follows(self) -> bool:
-        """Returns True if nothing is missing between the two samples, and the command acted."""
-        return self.obeyed and self.periods == 1
+    follows: bool  # True if nothing is missing between the two samples either
 
 
 class Memory:
@@ -56,7 +51,7 @@ class Memory:
         self.deadline_ns = 0  # Time at which the next sample is half a period late, monotonic [ns]
         self.start_ns = 0  # Device time of the first sample [ns]
         self.newest: SensorSample | None = None  # Newest valid sample
-        self.interval = Interval(0.0, 0, 0.0, False)  # Between it and the sample before, in control
+        self.interval = Interval(0.0, 0.0, False, False)  # Between it and the sample before, in control
         self.missed = 0  # Periods without a valid pair just before it
         self.skipped = 0  # Samples that the node's counter has skipped, and its device time has not
         self.lost = LeakyCount(bench.watch.stop_missed)  # Periods without a valid pair
@@ -120,7 +115,7 @@ class Memory:
                 self.counters.not_obeyed += 1
                 self.unobeyed.reject()
         self._answered = False
-        self.interval = tuple.__new__(Interval, (elapsed_ns * 1e-9, periods, command, obeyed))
+        self.interval = tuple.__new__(Interval, (elapsed_ns * 1e-9, command, obeyed, obeyed and periods == 1))
 
     # --- what was sent ----------------------------------------------------------------------------------------------
 

@@ -1,7 +1,8 @@
-"""Monitors of a run: each checks a sample, and ends the run by a StopError.
+"""Monitors of a run: each checks the newest sample, and ends the run by a StopError.
 
-:class:`Sensors` check every sample in control. The newest one, which is to be answered, is checked by the clock, which
-says whether its step can be told, and then by :func:`monitors`: limits, node, obeyed, lost, drive.
+Every sample in control is checked by :class:`Sensors`. One that is to be answered is checked by the guard's clock,
+before its step is told from its device time, and then by :func:`monitors`: limits, node, obeyed, lost, drive.
+:func:`check_bus` checks what no sample shows.
 """
 
 from __future__ import annotations
@@ -179,5 +180,5 @@ class Sensors:
 
     @property
     def law(self) -> ShieldLaw:
-        """Law of the shield. Before the sign is shown the current is limited to what friction can stop, for any law."""
+        """Law of the shield. Before the sign is shown the current is limited, and a way home may need all of it."""
         return self.response.law if self.monitor.obeys else self._law

@@ -37,11 +37,13 @@ class Phase:
 
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
+        self.memory = setup.memory
+        self.machine = setup.machine
 
     @property
     def deadline_ns(self) -> int:
         """Time until which the next frames are waited for, monotonic [ns]."""
-        return self.setup.memory.deadline_ns
+        return self.memory.deadline_ns
 
     def take(self, sample: SensorSample) -> Phase:
         """Take a valid sample; gives the next phase."""
@@ -67,13 +69,12 @@ class Silent(Phase):
     @property
     def deadline_ns(self) -> int:
         """Time until which the next frames are waited for, monotonic [ns]."""
-        setup, memory = self.setup, self.setup.memory
-        give_up_ns = setup.machine.run.since_ns + round(setup.bench.watch.start_timeout * 1e9)
-        return min(give_up_ns, memory.read_ns + SILENT_WAIT * memory.period_ns)
+        give_up_ns = self.machine.run.since_ns + round(self.setup.bench.watch.start_timeout * 1e9)
+        return min(give_up_ns, self.memory.read_ns + SILENT_WAIT * self.memory.period_ns)
 
     def take(self, sample: SensorSample) -> Phase:
         """Arm, if the node is ready."""
-        setup, memory = self.setup, self.setup.memory
+        setup, memory = self.setup, self.memory
         before = memory.take(sample)
         reason = setup.conditions.not_ready(setup.reception.status, sample, memory.read_ns)
         in_row = self._ready > 0 and not reason and memory.is_next(before, sample)
@@ -83,7 +84,7 @@ class Silent(Phase):
         self._control.warm_up(sample)
         if self._ready < READY_PAIRS:
             return self
-        setup.machine.handle_event(Event.NODE_READY, memory.read_ns)
+        self.machine.handle_event(Event.NODE_READY, memory.read_ns)
         return self._control
 
     def propose(self) -> Proposal | None:
@@ -94,7 +95,7 @@ class Silent(Phase):
     def miss(self) -> None:
         """Give up a node that has not shown itself in time."""
         try:
-            self.setup.machine.handle_event(Event.TIME, self.setup.memory.read_ns)
+            self.machine.handle_event(Event.TIME, self.memory.read_ns)
         except StopError as stop:
             unpaired = self.setup.reception.pairing_problem
             fault = Fault.NODE_NOT_READY if unpaired else stop.fault
@@ -123,9 +124,9 @@ class Control(Phase):
 
     def take(self, sample: SensorSample) -> Phase:
         """Count the periods since the sample before, and check that the sensors can be right."""
-        setup, memory = self.setup, self.setup.memory
+        setup, memory = self.setup, self.memory
         before, missed, phase = memory.take(sample), memory.missed, self
-        if before is not None and may_enable(setup.machine.run.state):
+        if before is not None and may_enable(self.machine.run.state):
             setup.sensors.update_balance()
             memory.follow(before, sample)
             phase = self._check_sensors(sample)
@@ -140,10 +141,10 @@ class Control(Phase):
         sample, self._open = self._open, None
         if sample is None:
             return None
-        setup, memory, estimate = self.setup, self.setup.memory, self.setup.estimate
+        setup, memory, estimate = self.setup, self.memory, self.setup.estimate
         # Before its device time says which step it is, or that it is the last one. A stamp may be just ahead of now.
         setup.guard.judge_time(sample, max(memory.read_ns, sample.receive_time_ns))
-        if setup.machine.run.state is ARMED:
+        if self.machine.run.state is ARMED:
             self._begin(sample)
         else:
             returns = setup.homing or estimate.reached
@@ -163,12 +164,12 @@ class Control(Phase):
 
     def miss(self) -> None:
         """Count a period without a sample; too many in a row end the run."""
-        self.setup.machine.handle_event(Event.TIME, self.setup.memory.miss())
+        self.machine.handle_event(Event.TIME, self.memory.miss())
 
     def _begin(self, sample: SensorSample) -> None:
-        setup, memory = self.setup, self.setup.memory
+        setup, memory = self.setup, self.memory
         memory.begin(sample)
-        setup.machine.handle_event(Event.BEGIN_HOMING if setup.homing else Event.BEGIN, memory.read_ns)
+        self.machine.handle_event(Event.BEGIN_HOMING if setup.homing else Event.BEGIN, memory.read_ns)
         setup.sensors.begin(sample)
         setup.estimate.estimator.begin()
 
@@ -182,19 +183,19 @@ class Control(Phase):
         """
         sensors = self.setup.sensors
         try:
-            sensors.check(sample, self.setup.memory)
+            sensors.check(sample, self.memory)
         except StopError as stop:
             time = sensors.monitor.coasting_time(sample)
             if time == 0.0:
                 raise
             # Now, since something else may end the run meanwhile, and would hide it.
-            self.setup.machine.note(stop.fault, stop.detail, sample.receive_time_ns)
+            self.machine.note(stop.fault, stop.detail, sample.receive_time_ns)
             return Coasting(self.setup, stop, time)
         return self
 
     def _command(self, sample: SensorSample, wanted: float, step: int) -> Decision:
         """Command for a sample, in the shield's view of time: on the way home the end is always near."""
-        memory, sensors, limits = self.setup.memory, self.setup.sensors, self._limits
+        memory, sensors, limits = self.memory, self.setup.sensors, self._limits
         last, reached = memory.slew_reference(sample), self.setup.estimate.reached
         if self.setup.homing:
             step = self._late_step
@@ -207,18 +208,18 @@ class Control(Phase):
 
     def _finish(self, sample: SensorSample, step: int) -> None:
         """Check the whole run at its last sample."""
-        setup, memory = self.setup, self.setup.memory
+        setup, memory = self.setup, self.memory
         memory.record(sample, step, 0, memory.missed)
         if setup.homing and self._at_home < HOME_PAIRS:
             raise StopError(Fault.NOT_HOME, f"at {sample.angle:.2f} rad after {step} periods")
         if not setup.homing:
             self._check_complete(sample, min(step, setup.steps))
             setup.sensors.check_balance()
-        setup.machine.handle_event(Event.FINISHED, memory.read_ns)
+        self.machine.handle_event(Event.FINISHED, memory.read_ns)
 
     def _check_complete(self, end: SensorSample, periods: int) -> None:
         """Check that an experiment of so many periods is complete."""
-        setup, counters = self.setup, self.setup.memory.counters
+        setup, counters = self.setup, self.memory.counters
         acted = counters.answered + counters.left - counters.not_obeyed
         if acted < COVERAGE * periods:
             found = f"{acted} of {periods} periods had a sample and a command that acted"
@@ -243,7 +244,7 @@ class Coasting(Control):
     def _check_sensors(self, sample: SensorSample) -> Control:
         """End the run once the brake has been stopped."""
         self.setup.sensors.response.watch(sample)
-        self._time -= self.setup.memory.interval.elapsed
+        self._time -= self.memory.interval.elapsed
         if self._time <= 0.0:
             raise self._stop
         return self
@@ -253,7 +254,7 @@ class Coasting(Control):
 
     def _command(self, sample: SensorSample, wanted: float, step: int) -> Decision:
         """0 A, as fast as may be."""
-        last, slew = self.setup.memory.slew_reference(sample), self._limits.slew
+        last, slew = self.memory.slew_reference(sample), self._limits.slew
         return Decision(0.0, min(max(0.0, last - slew), last + slew), int(Reason.LIMITED))
 
 
@@ -269,7 +270,7 @@ class Stopping(Phase):
 
     def take(self, sample: SensorSample) -> Phase:
         """Keep what tells how the node stops."""
-        self.setup.memory.newest = sample
+        self.memory.newest = sample
         self.setup.sensors.response.watch(sample)
         if sample.node_state is not OBEYING and not self._left:
             self._left = True
@@ -280,7 +281,7 @@ class Stopping(Phase):
 
     def check_rest(self) -> None:
         """Check that the node has come to rest; raises StopError."""
-        newest = self.setup.memory.newest
+        newest = self.memory.newest
         if not self.rests:
             found = "" if newest is None else f"the node's last state is {newest.node_state.name}"
             raise StopError(Fault.NOT_AT_REST, found)
