@@ -66,5 +66,5 @@ def design(
     brake = true_parameters(its, given, option="--theta: ")
     problem = make_problem(its, goal, names, model=model, kind=kind, brake=brake, returns=return_home)
     say_if_compiling()
-    with progress("design", steps_of(starts)) as advance:
+    with progress("design", steps_of(goal, starts)) as advance:
         return make_report(its, problem, kind, starts=starts, seed=seed, told=told or advance)

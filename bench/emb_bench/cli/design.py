@@ -9,7 +9,7 @@ from pathlib import Path
 from emb_bench import api
 from emb_bench.cli.options import add, add_output_options, answer, given, summary
 from emb_bench.output import require_place
-from emb_runtime.errors import EXIT_DONE, EmbError
+from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError
 from emb_runtime.system.terminal import Parser, complain, mention
 
 EPILOG = """\
@@ -28,7 +28,7 @@ exit codes:
   0    done; the design keeps the limits on the brake that it was made for
   2    usage: wrong argument, unreadable bench file, file that cannot be written, no
        design found
-  130  Ctrl-C: nothing is written
+  130  Ctrl-C: the best design so far is written, if there is one
 """
 
 
@@ -50,13 +50,12 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point of ``emb-design``."""
     args = parser().parse_args(argv)
     try:
-        _design(args)
+        return _design(args)
     except EmbError as err:
         return complain("emb-design", err)
-    return EXIT_DONE
 
 
-def _design(args: argparse.Namespace) -> None:
+def _design(args: argparse.Namespace) -> int:
     told = mention if args.verbose and sys.stderr is not None and not sys.stderr.isatty() else None
     require_place("--output", args.output, (".csv",))
     report = api.design(**given(args, api.design), told=told)
@@ -67,6 +66,10 @@ def _design(args: argparse.Namespace) -> None:
     from emb_bench.report.design import text
 
     answer(args, report.metadata, lambda verbose: text(report, str(args.output or ""), verbose=verbose))
+    if report.found.interrupted:
+        mention("emb-design: interrupted; this is the best design so far")
+        return EXIT_INTERRUPTED
+    return EXIT_DONE
 
 
 if __name__ == "__main__":

@@ -119,7 +119,7 @@ class Report:
         return dict(zip(self.problem.params, deviations.tolist(), strict=True))
 
     def metadata(self) -> dict[str, Any]:
-        """Metadata of the design for its files; equal for the same problem and seed."""
+        """Metadata of the design for its files; equal for the same problem and seed, unless Ctrl-C ended the search."""
         p, criterion = self.problem, self.criterion
         return {
             "command": "emb-design",
@@ -139,6 +139,7 @@ class Report:
             "horizon": p.horizon,
             "seed": self.seed,
             "starts": self.starts,
+            "interrupted": self.found.interrupted,
             "local_optima": [criterion.value(d.phi) for d in self.found.designs],
             "cramer_rao": self.bounds(),
             "checks": [asdict(c) for c in self.checks],

@@ -25,6 +25,7 @@ import numpy as np
 from emb_bench.design.anneal import annealed
 from emb_bench.design.polish import Settings, merit, polish
 from emb_bench.design.problem import MARGIN, Design, Problem
+from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.information.criteria import Criterion, distances
 from emb_bench.information.symmetric import Floats
 from emb_bench.parallel import Lost, shared_out
@@ -64,6 +65,7 @@ class Found:
 
     best: Design
     designs: tuple[Design, ...]  # The polished ones within the limits, best first: local optima, or near one
+    interrupted: bool = False  # By Ctrl-C: the best of what was found by then
 
 
 class Table(NamedTuple):
@@ -87,34 +89,44 @@ def search(
     """The best design of many searches; the same seed finds the same design, whatever the number of workers.
 
     ``starts`` are coarse searches, ``workers`` threads, 0 for one per processor, ``warm`` currents to begin with too.
-    ``told`` is called after each of at most ``steps_of(starts)`` steps, with what was done.
+    ``told`` is called after each of at most :func:`steps_of` steps, with what was done. Ctrl-C ends the search with the
+    best design so far, if there is one.
     """
     if not isinstance(problem.goal, Criterion):
         return _best_table(problem, starts, seed, workers, told)
     seeds = np.random.SeedSequence(seed).spawn(starts + LINES)
     draws = [np.random.default_rng(s) for s in seeds[starts:]]
     tables: list[Table] = []
+    lines: list[Design] = []
+    ended: list[Design] = []
+    history: list[float] = []
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
-        for wave in np.array_split(np.arange(starts), WAVES):
-            found = list(tables)
-            for table in pool.map(lambda i, f=found: coarse(problem, JOURNEYS[i % len(JOURNEYS)], seeds[i], f), wave):
-                tables.append(table)
-                told(f"start {len(tables)} of {starts} done")
-        begun = [problem.design(table.currents) for table in _diverse(tables, LINES)]
-        begun += [problem.design(u) for u in warm]
-        lines = sorted(pool.map(lambda d: _better(d, polish(problem, d.currents, LONG)), begun), key=_rank)[::-1]
-        told("the best starts polished")
-        ended: list[Design] = []
-        history: list[float] = []
-        while not _settled(history):
-            kept = max(1, LINES - len(history))
-            ended += lines[kept:]
-            lines = lines[:kept]
-            varied = pool.map(lambda d, rng: _varied(problem, d, rng), lines if kept > 1 else lines * LAST, draws)
-            lines = sorted(varied, key=_rank, reverse=True)[:kept]
-            history.append(_rank(lines[0]))
-            told(f"round {len(history)} of at most {ROUNDS} of improvement done")
-    ended.append(_better(lines[0], polish(problem, lines[0].currents, LONG)))
+        try:
+            for wave in np.array_split(np.arange(starts), WAVES):
+                found = list(tables)
+                for table in pool.map(
+                    lambda i, f=found: coarse(problem, JOURNEYS[i % len(JOURNEYS)], seeds[i], f), wave
+                ):
+                    tables.append(table)
+                    told(f"start {len(tables)} of {starts} done")
+            begun = [problem.design(table.currents) for table in _diverse(tables, LINES)]
+            begun += [problem.design(u) for u in warm]
+            lines = sorted(pool.map(lambda d: _better(d, polish(problem, d.currents, LONG)), begun), key=_rank)[::-1]
+            told("the best starts polished")
+            while not _settled(history):
+                kept = max(1, LINES - len(history))
+                ended += lines[kept:]
+                lines = lines[:kept]
+                varied = pool.map(lambda d, rng: _varied(problem, d, rng), lines if kept > 1 else lines * LAST, draws)
+                lines = sorted(varied, key=_rank, reverse=True)[:kept]
+                history.append(_rank(lines[0]))
+                told(f"round {len(history)} of at most {ROUNDS} of improvement done")
+            interrupted = False
+        except KeyboardInterrupt:
+            if not lines:
+                raise
+            interrupted = True
+    ended += [_better(lines[0], polish(problem, lines[0].currents, LONG)), *lines[1:]]
     polished = sorted(ended, key=_rank, reverse=True)
     best = next((d for d in (_between_samples(problem, d) for d in polished) if d is not None), None)
     if best is None:
@@ -124,24 +136,31 @@ def search(
             "try more starts, or check whether the brake can come home in time"
         )
     others = sorted((d for d in polished if d.feasible and d.phi < best.phi), key=_rank, reverse=True)
-    return Found(best, (best, *others))
+    return Found(best, (best, *others), interrupted)
 
 
 def _best_table(problem: Problem, starts: int, seed: int, workers: int, told: Callable[[str], object]) -> Found:
     """The best coarse design for a criterion without a slope to climb, within the limits between samples too."""
     pieces = list(enumerate(np.random.SeedSequence(seed).spawn(starts)))
-    designs = []
-    for number, found in shared_out(partial(_table, problem), pieces, workers or os.cpu_count() or 1, math.inf):
-        if isinstance(found, Lost):
-            raise UsageError(f"start {number + 1} of the search: {found.why}")
-        told(f"start {number + 1} of {starts} done")
-        design = problem.design(found)
-        if design.feasible and max(problem.beyond(design)) <= MARGIN:
-            designs.append(design)
+    designs: list[Design] = []
+    interrupted, done = False, 0
+    try:
+        for number, found in shared_out(partial(_table, problem), pieces, workers or os.cpu_count() or 1, math.inf):
+            if isinstance(found, Lost):
+                raise UsageError(f"start {number + 1} of the search: {found.why}")
+            design = problem.design(found)
+            if design.feasible and max(problem.beyond(design)) <= MARGIN:
+                designs.append(design)
+            done += 1
+            told(f"start {done} of {starts} done")
+    except KeyboardInterrupt:
+        if not designs:
+            raise
+        interrupted = True
     if not designs:
         raise UsageError(f"no design of {starts} starts keeps the limits: try more starts")
     designs.sort(key=_rank, reverse=True)
-    return Found(designs[0], tuple(designs))
+    return Found(designs[0], tuple(designs), interrupted)
 
 
 def _table(problem: Problem, piece: tuple[int, np.random.SeedSequence]) -> Floats:
@@ -150,9 +169,9 @@ def _table(problem: Problem, piece: tuple[int, np.random.SeedSequence]) -> Float
     return coarse(problem, JOURNEYS[number % len(JOURNEYS)], seed).currents
 
 
-def steps_of(starts: int) -> int:
-    """Most steps of a search, which take similar times: its starts, their polish, the rounds."""
-    return starts + 1 + ROUNDS
+def steps_of(goal: Criterion | IntervalCriterion, starts: int) -> int:
+    """Most steps of a search, which take similar times: its starts, and for some goals their polish and the rounds."""
+    return starts + 1 + ROUNDS if isinstance(goal, Criterion) else starts
 
 
 def _diverse(tables: Sequence[Table], count: int) -> list[Table]:

@@ -26,7 +26,7 @@ def text(report: Report, written: str = "", *, verbose: bool = False) -> str:
         ("criterion", f"{d['criterion']} of {', '.join(d['params'])}"),
         ("brake", brake),
         ("repeatability", bounds and f"smallest possible, ± 95 % (k=2): {bounds}"),
-        ("optima", f"{optima} ({d['starts']} starts, seed {d['seed']})"),
+        ("optima", f"{optima} ({d['starts']} starts, seed {d['seed']}{', interrupted' if d['interrupted'] else ''})"),
         ("currents", written or "not written: use -o design.csv"),
     )
     return "\n".join([*lines, *(["", *_checks(report).lines()] if verbose else [])])

@@ -15,7 +15,7 @@ from emb_bench.design.report import read_design
 from emb_bench.experiment.experiment import planned
 from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.information.fisher import fisher
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import EXIT_INTERRUPTED, UsageError
 from tests.benches import SENSOR_TEXT
 
 PERIODS = 50
@@ -111,6 +111,24 @@ def test_the_csv_says_the_same_as_the_json(short: Path, tmp_path: Path, capsys: 
     assert max(abs(float(row["current"])) for row in rows) <= 6.0
     assert (printed["criterion"], printed["returns"]) == ("A", False)
     assert printed["value"] == pytest.approx(sum(bound**2 for bound in printed["cramer_rao"].values()), rel=1e-6)
+
+
+def test_ctrl_c_writes_the_best_design_so_far(
+    short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def settled(history: list[float]) -> bool:
+        if history:
+            raise KeyboardInterrupt
+        return False
+
+    monkeypatch.setattr("emb_bench.design.search._settled", settled)
+    out = tmp_path / "design.csv"
+    assert main(["--bench", str(short), *QUICK, "--output", str(out)]) == EXIT_INTERRUPTED
+    printed = capsys.readouterr()
+    assert "(1 starts, seed 0, interrupted)" in printed.out
+    assert "this is the best design so far" in printed.err
+    assert json.loads(out.read_text(encoding="utf-8").splitlines()[0].removeprefix("# "))["interrupted"] is True
+    assert read_design(out, load_bench(short))[0].shape == (PERIODS,)
 
 
 def test_the_weighted_information_has_no_bound(short: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -335,6 +336,8 @@ def test_a_design_for_the_interval_is_worth_what_an_estimate_is_expected_to_tell
     told: list[str] = []
     found = search(p, starts=2, seed=1, told=told.append)
     assert told == ["start 1 of 2 done", "start 2 of 2 done"]
+    assert len(told) == search_module.steps_of(p.goal, 2)
+    assert not found.interrupted
     interval = api.interval(api.fisher_information(found.best.currents))
     deviations = interval.repeatability if name == "I" else interval.between_runs
     wanted = -2.0 * np.log(deviations[2:3] if name == "T_c" else deviations).sum()
@@ -343,6 +346,29 @@ def test_a_design_for_the_interval_is_worth_what_an_estimate_is_expected_to_tell
     assert max(p.beyond(found.best)) <= MARGIN
     assert found.best.phi == max(design.phi for design in found.designs)
     assert check(bench, p, "physical", found.best.currents, "exact").value == found.best.phi
+
+
+def test_an_interrupted_search_keeps_the_best_design_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As soon as one can keep the limits: a coarse one for T, a polished one for D."""
+    monkeypatch.setattr(search_module, "FEW", 60)
+    monkeypatch.setattr(search_module, "shared_out", lambda work, pieces, *_: enumerate(map(work, pieces)))
+    of_interval = replace(make_problem(load_bench(), IntervalCriterion("T"), PARAMETER_NAMES), horizon=120)
+
+    def told_until(last: str) -> Callable[[str], None]:
+        def told(done: str) -> None:
+            if done.startswith(last):
+                raise KeyboardInterrupt
+
+        return told
+
+    of_information = problem(horizon=40)
+    for p, last in ((of_interval, "start 1 of 2"), (of_information, "round 1")):
+        found = search(p, starts=2, seed=1, told=told_until(last))
+        assert found.interrupted
+        assert found.best.feasible
+        assert found.best.phi == max(design.phi for design in found.designs)
+    with pytest.raises(KeyboardInterrupt):
+        search(of_information, starts=2, seed=1, told=told_until("start 1"))
 
 
 def test_currents_that_say_nothing_are_the_worst_design_for_the_interval() -> None:
