@@ -63,7 +63,7 @@ class Guard:
         self._drive = DriveCheck(bench.guard.current_error, bench.limits.current)
         self._device_clock = DeviceClock(self._period_ns)
         self._last: CurrentCommand | None = None
-        self._checked: Frame | None = None  # the frame of that one, until it is sent
+        self._allowed: tuple[Frame, CurrentCommand] | None = None  # that one and its frame, until it is sent
         self._sample_ns = 0  # that it was computed from
         self._most = math.ceil(RATE_WINDOW_PERIODS * RATE_SURPLUS)
         self._times: list[int] = []  # of the last commands, as many at most
@@ -91,13 +91,14 @@ class Guard:
         Raises:
             GuardRejectedError: the frame is not in the guard's contract.
         """
+        self._allowed = None
         try:
-            command = self._command(frame, state, sample_time_ns, now_ns)
+            command = self._checked(frame, state, sample_time_ns, now_ns)
         except GuardRejectedError:
             self.rejected += 1
             raise
         # Counted before it leaves: if the bus fails, the node may have seen this counter value all the same.
-        self._last, self._sample_ns, self._checked = command, sample_time_ns, frame
+        self._last, self._sample_ns, self._allowed = command, sample_time_ns, (frame, command)
         self._drive.sent(command.counter, command.current)
         if len(self._times) == self._most:
             del self._times[0]
@@ -112,8 +113,8 @@ class Guard:
             GuardRejectedError: it is another one, or was sent before; nothing was sent.
             BusError: the bus did not take it.
         """
-        checked, self._checked = self._checked, None
-        if self._last is None or frame is not checked:
+        allowed, self._allowed = self._allowed, None
+        if allowed is None or allowed[0] is not frame:
             self.rejected += 1
             raise _rejected("it is not the one that was checked last")
         # Asked last. What slips through between this and the bus answers a sample that is not the newest any more
@@ -123,7 +124,7 @@ class Guard:
         try:
             self._send(frame)
         except BusError:
-            self._last = self._last._replace(current=0.0)  # the node brakes: the next one begins at zero
+            self._last = allowed[1]._replace(current=0.0)  # the node brakes: the next one begins at zero
             raise
         self.passed += 1
 
@@ -150,7 +151,7 @@ class Guard:
         if problem := self._device_clock.time_problem(sample.device_time_ns, sample.receive_time_ns, seen_ns):
             raise StopError(Fault.DEVICE_TIME, problem)
 
-    def _command(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> CurrentCommand:
+    def _checked(self, frame: Frame, state: RunState, sample_time_ns: int, now_ns: int) -> CurrentCommand:
         if not may_send(state):
             raise _rejected(f"nothing may leave in state {state.name}")
         try:

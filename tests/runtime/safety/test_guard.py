@@ -90,6 +90,9 @@ def test_only_the_frame_that_was_checked_last_leaves_and_only_once(guard: Guard,
     newer = guard.check(command(counter=3), ACTIVE, 100 * MS, 100 * MS)
     guard.send(newer)
     is_refused(older)
+    overtaken = guard.check(command(counter=4), ACTIVE, 100 * MS, 100 * MS)
+    refused(guard, bus, command(counter=4), "does not follow")
+    is_refused(overtaken)
     assert bus.frames == [second, newer]
 
 
