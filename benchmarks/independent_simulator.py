@@ -83,16 +83,26 @@ class Brake:
     velocity_asymmetry: float = 0.0  # Share by which the velocity is shown too large in the positive direction
     velocity_lag: float = 0.0  # Of the velocity that is shown [s]
     clock_scale: float = 0.0  # Share by which a period is longer than it is said to be
+    bent: float = 0.0  # Torque that changes with the place, the velocity, ... by a form: one of ``TORQUES``
+    along: float = 0.0  # What it changes with: one of ``ALONG``
+    form: tuple[float, ...] = (0.0, 0.0)
+    """Share by which it is larger, at even distances from -1 to 1 of what it changes with, over ``RANGES``."""
 
     def numbers(self) -> Floats:
-        """All of them in one row, as the integration takes them."""
-        return np.array(list(vars(self).values()), dtype=np.float64)
+        """All of them in one row, as the integration takes them; the form comes last."""
+        scalars = [value for name, value in vars(self).items() if name != "form"]
+        return np.array([*scalars, 0.0, *self.form], dtype=np.float64)
 
 
 # Places in ``Brake.numbers``.
 _KM, _K1, _TC, _FV, _J, _GAMMA, _, _BIAS, _, _, _QUAD, _CUBE, _PLAY, _STRIBECK, _HYST, _LAG, _ASYM = range(17)
 _VS, _FL, _TRAVEL, _KM_DRIFT, _K1_DRIFT, _TC_DRIFT, _FV_DRIFT = range(17, 24)
 _RIPPLE, _PERIOD, _K1_RIPPLE, _GAIN, _DEAD, _DRAG, _THIN, _FV_ASYM, _MU, _PLACE = range(32, 42)
+TORQUES = "none", "k_m", "k_1", "T_c", "f_v"
+ALONG = "none", "place", "speed", "velocity", "load", "current", "time"
+RANGES = 1.0, 100.0, 500.0, 500.0, 100.0, 6.0, 1.0
+"""Of them: angle and travel of the clamp [rad], velocity [rad/s], current [A], the whole record."""
+_BENT, _ALONG, _NOW, _FORM = 49, 50, 51, 52
 SETTLING = 0.1  # Time in which what settles has decayed to 1/e [s]
 
 
@@ -125,13 +135,38 @@ def brake_of(bench: Bench, plant: Plant, factors: Floats) -> Brake:
 
 
 @numba.njit(cache=False)
+def _formed(b, torque, x, v, i):  # type: ignore[no-untyped-def]
+    """Factor of a torque that changes by the form."""
+    if b[_BENT] != torque:
+        return 1.0
+    along = int(b[_ALONG])
+    if along == 1:
+        at = x
+    elif along == 2:
+        at = abs(v)
+    elif along == 3:
+        at = v
+    elif along == 4:
+        at = max(x, 0.0)
+    elif along == 5:
+        at = i
+    else:
+        at = b[_NOW]
+    last = b.shape[0] - _FORM - 1
+    place = min(max(0.5 * (at / RANGES[along] + 1.0), 0.0), 1.0) * last
+    k = min(int(place), last - 1)
+    return 1.0 + b[_FORM + k] + (place - k) * (b[_FORM + k + 1] - b[_FORM + k])
+
+
+@numba.njit(cache=False)
 def _force(b, x, z, w):  # type: ignore[no-untyped-def]
     """Clamping force: of the travel behind the clearance, with a hysteresis."""
     travel = x if b[_PLAY] == 0.0 else z
     if travel <= 0.0:
         return 0.0
     periodic = 1.0 + b[_K1_RIPPLE] * math.sin(2.0 * math.pi * travel / b[_PERIOD])
-    return b[_K1] * travel * (1.0 + b[_QUAD] * travel + b[_CUBE] * travel * travel) * (1.0 + b[_HYST] * w) * periodic
+    k_1 = b[_K1] * _formed(b, 2, travel, 0.0, 0.0)
+    return k_1 * travel * (1.0 + b[_QUAD] * travel + b[_CUBE] * travel * travel) * (1.0 + b[_HYST] * w) * periodic
 
 
 @numba.njit(cache=False)
@@ -147,32 +182,34 @@ def _follow(b, x, z, w, moved):  # type: ignore[no-untyped-def]
 def _friction(b, x, v, force, sign):  # type: ignore[no-untyped-def]
     """Friction but the viscous one: Coulomb's, and what is static beyond it as far as it is left at a speed."""
     left = math.exp(-((v / b[_VS]) ** 2))
-    coulomb = b[_TC] * (1.0 + b[_ASYM] * sign) * (1.0 + 0.01 * b[_PLACE] * x)
+    coulomb = b[_TC] * (1.0 + b[_ASYM] * sign) * (1.0 + 0.01 * b[_PLACE] * x) * _formed(b, 3, x, v, 0.0)
     return coulomb * (1.0 + b[_STRIBECK] * left) + (b[_FL] * left + b[_MU]) * force
 
 
 @numba.njit(cache=False)
-def _viscous(b, v, sign):  # type: ignore[no-untyped-def]
+def _viscous(b, x, v, sign):  # type: ignore[no-untyped-def]
     """Viscous friction [N·m]."""
     size = abs(v)
     thinned = (250.0 / size) ** b[_THIN] if b[_THIN] != 0.0 and size > 0.0 else 1.0
-    return b[_FV] * v * (1.0 + b[_DRAG] * size / 500.0) * (1.0 + b[_FV_ASYM] * sign) * thinned
+    return (
+        b[_FV] * _formed(b, 4, x, v, 0.0) * v * (1.0 + b[_DRAG] * size / 500.0) * (1.0 + b[_FV_ASYM] * sign) * thinned
+    )
 
 
 @numba.njit(cache=False)
-def _drive(b, x, i):  # type: ignore[no-untyped-def]
+def _drive(b, x, v, i):  # type: ignore[no-untyped-def]
     """Torque of the motor [N·m]."""
     if abs(i) < b[_DEAD]:
         i = 0.0
     ripple = b[_RIPPLE] * b[_TC] * math.sin(2.0 * math.pi * x / b[_PERIOD])
-    return b[_KM] * i * (1.0 + b[_GAIN] * abs(i) / 6.0) + ripple
+    return b[_KM] * _formed(b, 1, x, v, i) * i * (1.0 + b[_GAIN] * abs(i) / 6.0) + ripple
 
 
 @numba.njit(cache=False)
 def _slope(b, x, v, i, z0, w0, x0, sign):  # type: ignore[no-untyped-def]
     z, w = _follow(b, x, z0, w0, x - x0)
     force = _force(b, x, z, w)
-    torque = _drive(b, x, i) - b[_GAMMA] * force - _viscous(b, v, sign) - sign * _friction(b, x, v, force, sign)
+    torque = _drive(b, x, v, i) - b[_GAMMA] * force - _viscous(b, x, v, sign) - sign * _friction(b, x, v, force, sign)
     return torque / b[_J]
 
 
@@ -205,7 +242,7 @@ def _move(b, state, command, duration):  # type: ignore[no-untyped-def]
         h = min(STEP, left)
         if v == 0.0:
             force = _force(b, x, z, w)
-            drive = _drive(b, x, _current(b, i, u, h)) - b[_GAMMA] * force
+            drive = _drive(b, x, 0.0, _current(b, i, u, h)) - b[_GAMMA] * force
             sign = 1.0 if drive > 0.0 else -1.0
             if abs(drive) <= _friction(b, x, 0.0, force, sign):
                 i = _current(b, i, u, h)
@@ -324,6 +361,7 @@ def simulate(
         said = round(float(u), 3) if heard else braking(bench, float(velocity))
         u = said if heard and not (losses and losses.commands[k]) else braking(bench, state[1])
         b[_KM : _FV + 1] = constant * (1.0 + b[_KM_DRIFT : _FV_DRIFT + 1] * (k + 0.5) / n)
+        b[_NOW] = (k + 0.5) / n
         settling = math.exp(-k * t_s / SETTLING)
         b[_KM] *= 1.0 + brake.k_m_settling * settling
         b[_TC] *= 1.0 + brake.t_c_settling * settling

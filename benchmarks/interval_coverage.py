@@ -9,7 +9,10 @@ no code with the estimators. The cases are ``CASES``:
 - ``total``: a right model, all systematic errors drawn from their priors in the bench file;
 - ``inertia``, ``angle_scale``: only that one drawn;
 - ``unlisted``: a small error of the model of one of ``UNLISTED``;
+- ``drawn``: a small error of the model whose form is drawn: 20 kinds that nobody has chosen (:func:`kind_of`);
 - ``prior``: errors and effects drawn from all priors;
+- ``known``: a right model whose k_m was measured to 0.1 %, its inertia drawn with 5 %, the scale of the angle with its
+  prior or right and excluded;
 - ``near-misses``: a small error of the model of one of ``KINDS`` in one of three sizes, in turns with a right model;
 - ``disturbance``: the velocity or the load walks at random, and the estimator does not know;
 - ``losses``: 2, 5 and 10 % of the samples are lost, one by one or in bursts of 20 ms, and a fifth as many commands;
@@ -42,13 +45,13 @@ from scipy import stats
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the simulator is a neighbour
 
-from benchmarks.independent_simulator import Brake, Floats, Losses, brake_of, simulate
+from benchmarks.independent_simulator import ALONG, TORQUES, Brake, Floats, Losses, brake_of, simulate
 from emb_bench.analysis.conclusion import noise_deviations
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Plant
 from emb_bench.estimate.average import SHARES
 from emb_bench.estimate.methods import method_of
-from emb_bench.estimate.records import NORMAL_95, EstimationProblem, with_systematic
+from emb_bench.estimate.records import FREE, NORMAL_95, EstimationProblem, with_systematic
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.numbers import in_percent
@@ -151,6 +154,27 @@ def right(bench: Bench, draws: int, seed: int, *, errors: Collection[str] = ()) 
         yield Drawn("right", bench, plant, simulate(brake, bench, rng, f"seed {at}"), brake)
 
 
+MEASURED = 1e-3  # Relative deviation of a k_m that was measured
+
+
+def known(shipped: Bench, draws: int, seed: int) -> Iterator[Drawn]:
+    """Right models whose k_m was measured."""
+    plant = shipped.plant("exact")
+    for at, scaled in [(at, scaled) for at in range(seed, seed + draws) for scaled in (True, False)]:
+        rng = np.random.default_rng(at)
+        brake = brake_of(shipped, plant, rng.uniform(0.5, 1.5, 4))
+        inertia, k_m, scale = rng.standard_normal(3).tolist()
+        measured = shipped.brake._replace(k_m=brake.k_m * (1.0 + MEASURED * k_m))
+        systematic = replace(shipped.systematic, k_m=MEASURED)
+        systematic = systematic if scaled else replace(systematic, angle_scale=0.0)
+        brake = replace(
+            brake, inertia=brake.inertia * (1.0 + FREE * inertia), angle_scale=systematic.angle_scale * scale
+        )
+        row = "angle's scale from its prior" if scaled else "angle's scale right"
+        bench = replace(shipped, brake=measured, systematic=systematic)
+        yield Drawn(row, bench, plant, simulate(brake, bench, rng, f"seed {at}"), brake)
+
+
 def near_misses(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
     """Wrong models and right ones in turns."""
     plant = bench.plant("exact")
@@ -185,6 +209,75 @@ def unlisted(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
             record = simulate(wrong, bench, rng, f"seed {at}")
             yield Drawn(name, bench, plant, record, wrong)
         seed += draws * len(sizes)
+
+
+BENT: Mapping[str, tuple[tuple[str, ...], float]] = {
+    "k_m": (("place", "current", "time"), 0.01),
+    "k_1": (("load", "time"), 0.01),
+    "T_c": (("place", "velocity", "speed", "load", "time"), 0.1),
+    "f_v": (("place", "velocity", "speed", "load", "time"), 0.1),
+}
+"""Numbers that each torque may change with, and its largest share."""
+BEYOND = {
+    ("T_c", "velocity"),
+    ("T_c", "speed"),
+    ("f_v", "velocity"),
+    ("f_v", "speed"),
+    ("k_m", "current"),
+    ("k_1", "load"),
+}
+"""Decays of what is special at small speeds, currents or loads: the parameter is meant beyond them."""
+FORM = 401  # Points of a form, from -1 to 1
+SMALL = 3e-3  # The smallest size of an error over the largest
+
+
+def kind_of(seed: int) -> tuple[str, dict[str, float], Floats, float]:
+    """A kind of error that is drawn: its name, what is given with it, its form of size 1, its largest size.
+
+    A parameter is meant at rest, at the origin, without load or current, or in the middle of the run; but see
+    ``BEYOND``.
+    """
+    rng = np.random.default_rng([seed, 7])
+    torque = str(rng.choice(list(BENT)))
+    along = str(rng.choice(BENT[torque][0]))
+    u = np.linspace(-1.0, 1.0, FORM)
+    place, width, waves, phase = (
+        rng.uniform(0.2, 0.9),
+        rng.uniform(0.04, 0.4),
+        rng.uniform(0.3, 12.0),
+        rng.uniform(0, 6),
+    )
+    power = rng.uniform(0.5, 3.0)
+    knots = rng.standard_normal(9)
+    signed = np.sign(u) if along in {"place", "velocity", "current"} and rng.random() < 0.5 else 1.0
+    wave, soft = np.sin(math.pi * waves * u + phase), np.interp(u, np.linspace(-1.0, 1.0, 9), knots)
+    forms = {
+        "power": signed * np.abs(u) ** power,
+        "decay": signed * np.exp(-((np.abs(u) / width) ** power)),
+        "bump": signed * np.exp(-(((np.abs(u) - place) / width) ** 2)),
+        "step": signed * 0.5 * (1.0 + np.tanh((np.abs(u) - place) / width)),
+        "wave": wave,
+        "line with bends": soft,
+    }
+    name = str(rng.choice([each for each in forms if along != "time" or each != "wave"]))
+    form = forms[name]
+    if name != "decay" or (torque, along) not in BEYOND:
+        form = form - form[3 * FORM // 4 if along == "time" else FORM // 2]
+    given = {"bent": float(TORQUES.index(torque)), "along": float(ALONG.index(along))}
+    return f"{torque} by {along}, {name}", given, form / np.abs(form).max(), BENT[torque][1]
+
+
+def drawn_kinds(bench: Bench, draws: int, seed: int) -> Iterator[Drawn]:
+    """Wrong models of 20 kinds that are drawn, ``draws`` of each."""
+    plant = bench.plant("exact")
+    for kind in range(seed, seed + 20):
+        name, given, form, largest = kind_of(kind)
+        for at in range(draws):
+            rng = np.random.default_rng([kind, at])
+            size = largest * SMALL ** rng.random() * rng.choice((-1.0, 1.0))
+            right = brake_of(bench, plant, rng.uniform(0.5, 1.5, 4))
+            wrong = Brake(**(vars(right) | given | {"form": tuple(size * form)}))
+            yield Drawn(f"{kind}: {name}", bench, plant, simulate(wrong, bench, rng, f"seed {kind}, {at}"), wrong)
 
 
 EXPECTED = 1.0 / 6.0  # Share of the brakes that have a certain effect
@@ -300,8 +393,10 @@ CASES: Mapping[str, Callable[[Bench, int, int], Iterator[Drawn]]] = {
     "total": partial(right, errors=tuple(ERRORS)),
     "inertia": partial(right, errors=("inertia",)),
     "angle_scale": partial(right, errors=("angle_scale",)),
+    "known": known,
     "near-misses": near_misses,
     "unlisted": unlisted,
+    "drawn": drawn_kinds,
     "prior": prior,
     "disturbance": disturbance,
     "losses": partial(losses, charge=False),
@@ -408,7 +503,7 @@ def main() -> None:
     print(f"{args.case}: seeds from {args.seed}, method {args.method}, systematic errors {args.systematic}")
     outcomes: dict[str, list[Outcome]] = {}
     bench = load_bench()
-    if args.case not in {"total", "inertia", "angle_scale", "prior"}:
+    if args.case not in {"total", "inertia", "angle_scale", "prior", "known"}:
         bench = replace(bench, systematic=replace(bench.systematic, inertia=0.0, angle_scale=0.0))
     if args.case == "repeatability":
         bench = replace(bench, systematic=replace(bench.systematic, time_scale=0.0))

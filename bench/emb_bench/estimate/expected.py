@@ -20,8 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from emb_bench.brake.motion import SENSITIVE, STATES, Floats
-from emb_bench.compiled import compiled
+from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
 from emb_bench.estimate.average import average
@@ -34,17 +33,14 @@ from emb_bench.estimate.suspects import (
     Simulated,
     budget_of,
     effect_of,
-    features,
     scales,
     secants,
-    turning,
 )
 from emb_bench.experiment.experiment import Experiment, planned
 from emb_bench.experiment.from_log import REST_SAMPLES
 from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors
 from emb_bench.information.evaluation import Evaluation, Information, Question
 from emb_bench.information.identifiability import Spectrum
-from emb_bench.sim.open_loop import held, march_beside
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 
@@ -202,32 +198,7 @@ def columns(problem: Problem, z: Floats, shown: Simulated, held: Sequence[str]) 
     """
     assert shown.said is not None
     moved = shown.said[0].sensitivities[:, len(problem.unknowns) :] * shown.weights[0][:, None]
-    found = {name: [moved[:, k]] for k, name in enumerate(held)}
-    if any(record.gap_unknowns for record in problem.records):
-        found |= secants(problem, z, shown)
-    else:
-        found |= features(problem, z, shown)
-        turned = turning(problem, z, 0, shown.motion(0))
-        rows = np.stack([current / step for current, step in turned.values()], axis=1)
-        moved = beside_currents(problem, z, rows) * shown.weights[0][:, None]
-        found |= {name: [moved[:, j]] for j, name in enumerate(turned)}
+    found = {name: [moved[:, k]] for k, name in enumerate(held)} | secants(problem, z, shown)
     if problem.bench.brake.k_1 == 0.0:
         found = {name: parts for name, parts in found.items() if name not in OF_THE_SPRING}
     return {name: np.concatenate([part.ravel() for part in parts]) for name, parts in found.items()}
-
-
-def beside_currents(problem: Problem, z: Floats, rows: Floats) -> Floats:
-    """Changes of angle [rad] and velocity [rad/s] that are shown, per unit of currents that act besides.
-
-    Shapes (n, m), of the currents [A], to (n, m, 2). The record has no gaps.
-    """
-    at, record = problem.at(z, 0), problem.records[0]
-    x, _, _ = at.begin(record.before, ())
-    late, delay = max(at.errors.delay, 0.0), problem.plant.instruments.measurement_delay
-    acting = held(record.currents + at.errors.current_offset, problem.bench.timing.sample_time, late)
-    states, s = np.empty((record.periods + 1, STATES)), np.zeros((record.periods + 1, rows.shape[1], SENSITIVE))
-    states[0] = x
-    compiled(march_beside)(problem.mechanics(z), at.brake, acting, rows, states, s)
-    moved: Floats = np.concatenate([s[:1].repeat(delay, axis=0), s[1:]])[: record.periods, :, :2].copy()
-    moved[:, :, 1] *= 1.0 + at.errors.velocity_gain
-    return moved

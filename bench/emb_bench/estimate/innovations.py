@@ -32,7 +32,7 @@ from emb_bench.compiled import compiled
 from emb_bench.config.plants import Mechanics
 from emb_bench.estimate.prediction import Problem
 from emb_bench.sim.instruments import reading, sensor_share
-from emb_bench.sim.open_loop import advance_period, delay_share
+from emb_bench.sim.open_loop import advance_shares, delay_share
 from emb_runtime.config.bench import BrakeParameters
 
 START = ("x1_0", "x2_0", "current_offset")
@@ -87,7 +87,7 @@ class Filter:
         besides: tuple[str, ...] = (),
         *,
         mechanics: Mechanics | None = None,
-        added: Floats | float = 0.0,
+        parts: tuple[Integers, Floats] | None = None,
         shifted: Floats | float = 0.0,
     ) -> tuple[Floats, Floats]:
         """Innovations of record ``i`` over their standard deviations, and what unknowns add to what is shown.
@@ -98,9 +98,9 @@ class Filter:
             root: inverse standard deviations of its samples, shape (n, 2).
             gain: its gains, shape (n, 2, 4); become those if they are not held.
             held: True if the gains are given.
-            besides: further unknowns, which come last.
+            besides: further unknowns, which come after those of ``z``.
             mechanics: how another brake moves; without, that of ``z``.
-            added: current that acts besides [A].
+            parts: unknowns that come last, and the share by which each counts in a period, shape (n, m).
             shifted: what is added to the samples, shape (n, 2).
 
         Returns:
@@ -110,9 +110,11 @@ class Filter:
         n, names = len(record.currents), (*problem.names(i), *besides)
         at = problem.at(z, i)
         x, chosen, s = at.begin(record.before, (*START, *names))
-        innovations, shares = np.zeros((n, 2)), np.zeros((n, len(names), 2))
+        in_part, counted = (np.zeros(0, np.int64), np.zeros((n, 0))) if parts is None else parts
+        chosen, s = np.append(chosen, in_part), np.pad(s, ((0, len(in_part)), (0, 0)))
+        innovations, shares = np.zeros((n, 2)), np.zeros((n, len(names) + len(in_part), 2))
         given = FilterInput(
-            record.currents + at.errors.current_offset + added,
+            record.currents + at.errors.current_offset,
             problem.bench.timing.sample_time,
             max(at.errors.delay, 0.0),
             problem.plant.instruments.measurement_delay,
@@ -124,6 +126,7 @@ class Filter:
             1.0 + at.errors.velocity_gain,
             self.walk,
             self.load,
+            counted,
         )
         moves, results = problem.mechanics(z) if mechanics is None else mechanics, Innovations(innovations, shares)
         covariance = self._uncertainty(i)
@@ -164,12 +167,16 @@ class Followed:
         _, shares = self.filter.followed(self.z, record, self.weights[record], self.gains[record], besides=names)
         return shares[:, -len(names) :]
 
-    def shown(self, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
-        """Expected less measured samples of another brake under the same currents, and some more [A], whitened."""
-        innovations, _ = self.filter.followed(
-            self.z, record, self.weights[record], self.gains[record], mechanics=mechanics, added=added
-        )
-        return -innovations
+    def parts(self, record: int, unknowns: Integers, shares: Floats) -> Floats:
+        """Derivatives to unknowns that count by shares, in standard deviations, shape (n, m, 2)."""
+        weights, gains = self.weights[record], self.gains[record]
+        _, found = self.filter.followed(self.z, record, weights, gains, parts=(unknowns, shares))
+        return found[:, -len(unknowns) :]
+
+    def shown(self, record: int, mechanics: Mechanics) -> Floats:
+        """Expected less measured samples of another brake under the same currents, whitened."""
+        weights, gains = self.weights[record], self.gains[record]
+        return -self.filter.followed(self.z, record, weights, gains, mechanics=mechanics)[0]
 
     def whitened(self, record: int, shift: Floats) -> Floats:
         """A small change of what is shown, shape (n, 2), as the innovations have it."""
@@ -207,6 +214,7 @@ class FilterInput(NamedTuple):
     velocity_scale: float  # Reading at a velocity of 1 rad/s [rad/s]
     walk: float  # q [rad/s per √s]
     load: float  # r [A per √s]
+    parts: Floats  # Shares by which the last of the unknowns count in each period, shape (n, m)
 
 
 class Innovations(NamedTuple):
@@ -233,9 +241,9 @@ def march_filtered(
     The unknowns ``chosen`` begin with ``START``. State ``x``, its sensitivities ``s``, the ``covariance`` of angle,
     velocity and load, shape (3, 3), and ``results`` change in place; so do the ``gains``, unless they are ``held``.
     """
-    currents, t_s, late, delay, samples, stamps, unreported, root, bias, velocity_scale, walk, load = given
+    currents, t_s, late, delay, samples, stamps, unreported, root, bias, velocity_scale, walk, load, parts = given
     innovations, shares = results
-    before, acting, known = float(x[3]), 0.0, len(START)
+    before, acting, known, every = float(x[3]), 0.0, len(START), chosen.copy()
     follows = np.zeros(chosen.shape[0])  # derivatives of the load
     for i in range(currents.shape[0]):
         k, acceleration, tau = i - delay, 0.0, stamps[i]
@@ -245,7 +253,7 @@ def march_filtered(
                 for m in range(s.shape[1]):
                     s[j, m] = 0.0
             s[0, 0] = s[1, 1] = 1.0
-            advance_period(mechanics, p, x, before + acting, u + acting, t_s, late, chosen, s)
+            advance_shares(mechanics, p, x, before + acting, u + acting, t_s, late, chosen, parts, k, every, s)
             before = u
             for j in range(known, chosen.shape[0]):
                 s[j, 0] += s[2, 0] * follows[j]

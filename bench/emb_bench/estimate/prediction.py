@@ -11,16 +11,24 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from emb_bench.brake.motion import Floats
+from emb_bench.brake.motion import Floats, Integers
 from emb_bench.brake.parameters import FEATURES, PARAMETERS
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Mechanics, Plant
 from emb_bench.estimate.records import EstimationProblem, Unknown, check_model, searched
 from emb_bench.experiment.experiment import Booleans, Experiment
-from emb_bench.experiment.simulate import SystematicErrors, Theta, Trajectory, gap_ends, later, simulate
+from emb_bench.experiment.simulate import (
+    SystematicErrors,
+    Theta,
+    Trajectory,
+    gap_ends,
+    later,
+    simulate,
+    simulate_shares,
+)
 from emb_bench.information.fisher import information_of_range, weights_along
-from emb_bench.sim.open_loop import march
+from emb_bench.sim.open_loop import march, march_shares
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import LogError, UsageError
 
@@ -164,24 +172,23 @@ class Problem:
 
     def predict(self, z: Floats, record: int, besides: tuple[str, ...] = ()) -> Trajectory:
         """Predicts a record, with sensitivities to its unknowns, to those ``besides``, and to those of its gaps."""
-        return self._simulated(z, record, self.mechanics(z), 0.0, (*self.names(record), *besides))
+        return self._simulated(z, record, self.mechanics(z), (*self.names(record), *besides))
 
-    def motion(
-        self, z: Floats, record: int, mechanics: Mechanics | None = None, added: Floats | float = 0.0
-    ) -> Trajectory:
+    def motion(self, z: Floats, record: int, mechanics: Mechanics | None = None) -> Trajectory:
         """Predicts a record without sensitivities to unknowns that are not its gaps'.
 
-        Another brake moves by ``mechanics``; ``added`` is a current that acts besides [A].
+        Another brake moves by ``mechanics``.
         """
-        return self._simulated(z, record, self.mechanics(z) if mechanics is None else mechanics, added, ())
+        return self._simulated(z, record, self.mechanics(z) if mechanics is None else mechanics, ())
 
-    def _simulated(
-        self, z: Floats, record: int, mechanics: Mechanics, added: Floats | float, names: tuple[str, ...]
-    ) -> Trajectory:
-        plant, data = replace(self.plant, mechanics=mechanics), self.records[record]
-        if np.any(added):
-            data = replace(data, currents=data.currents + added)
-        return simulate(plant, self.at(z, record), data, self.bench.timing.sample_time, names, compiled(march))
+    def parts(self, z: Floats, record: int, unknowns: Integers, shares: Floats) -> Floats:
+        """Sensitivities of a record to unknowns that count in each period by a share, as :func:`simulate_shares`."""
+        plant, data, t_s = self.solved(z).plant, self.records[record], self.bench.timing.sample_time
+        return simulate_shares(plant, self.at(z, record), data, t_s, unknowns, shares, compiled(march_shares))
+
+    def _simulated(self, z: Floats, record: int, mechanics: Mechanics, names: tuple[str, ...]) -> Trajectory:
+        plant, t_s = replace(self.plant, mechanics=mechanics), self.bench.timing.sample_time
+        return simulate(plant, self.at(z, record), self.records[record], t_s, names, compiled(march))
 
     def weights(self, z: Floats, said: Sequence[Trajectory] | None = None) -> list[Floats]:
         """Inverse standard deviations of each record's samples at ``z``, zero where they do not count, shape (n, 2).

@@ -22,8 +22,20 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy import special
 
-from emb_bench.brake.motion import Floats, is_plain
-from emb_bench.brake.parameters import FEATURES, PARAMETERS, SI, Parameter, Quantity, quantity
+from emb_bench.brake.motion import Floats, Integers, is_plain
+from emb_bench.brake.parameters import (
+    COMMAND,
+    F_V,
+    FEATURES,
+    K_1,
+    K_M,
+    PARAMETERS,
+    SI,
+    T_C,
+    Parameter,
+    Quantity,
+    quantity,
+)
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.config.machine import Machine
@@ -65,7 +77,7 @@ random walk of a filter follows without an alarm."""
 
 ALIKE = 2.0  # Difference of two suspects' squared scores below which they are hardly distinguished
 
-STEP = 1e-4  # Of the secant of an effect that is proportional to its size
+SMALLEST = 1e-12  # Share of a period that counts, per unit of an effect; a sensitivity is divided by it
 
 DEPENDENT = 1e-6  # share of a regressor beside the others below which it is one of them
 
@@ -76,8 +88,11 @@ class Shown(Protocol):
     def columns(self, record: int, names: tuple[str, ...]) -> Floats:
         """Derivatives of what is shown to other unknowns, shape (n, names, 2)."""
 
-    def shown(self, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
-        """Samples of another brake under the same currents, and some more [A], shape (n, 2)."""
+    def parts(self, record: int, unknowns: Integers, shares: Floats) -> Floats:
+        """Derivatives to unknowns that count in each period by shares of the shape (n, m), shape (n, m, 2)."""
+
+    def shown(self, record: int, mechanics: Mechanics) -> Floats:
+        """Samples of another brake under the same currents, shape (n, 2)."""
 
     def whitened(self, record: int, shift: Floats) -> Floats:
         """A small change of what is shown [rad, rad/s], in the unit of the residuals, shape (n, 2)."""
@@ -110,10 +125,14 @@ class Simulated:
         columns = self.problem.predict(self.z, record, names).sensitivities[:, own : own + len(names)]
         return columns * self.weights[record][:, None]
 
-    def shown(self, record: int, mechanics: Mechanics, added: Floats | float = 0.0) -> Floats:
+    def parts(self, record: int, unknowns: Integers, shares: Floats) -> Floats:
         """As :class:`Shown`."""
-        nominal = mechanics == self._mechanics and not np.any(added)
-        samples = self._motion[record] if nominal else self.problem.motion(self.z, record, mechanics, added).samples
+        return self.problem.parts(self.z, record, unknowns, shares) * self.weights[record][:, None]
+
+    def shown(self, record: int, mechanics: Mechanics) -> Floats:
+        """As :class:`Shown`."""
+        nominal = mechanics == self._mechanics
+        samples = self._motion[record] if nominal else self.problem.motion(self.z, record, mechanics).samples
         return samples * self.weights[record]
 
     def whitened(self, record: int, shift: Floats) -> Floats:
@@ -202,12 +221,14 @@ def held(problem: Problem) -> tuple[str, ...]:
 
 def secants(problem: Problem, z: Floats, model: Shown) -> dict[str, list[Floats]]:
     """Columns of the effects without a sensitivity: samples per unit in standard deviations, by record."""
-    mechanics, found = problem.mechanics(z), features(problem, z, model)
-    observed = problem.plant.instruments.observer_bandwidth > 0.0
+    found, observed = features(problem, z, model), problem.plant.instruments.observer_bandwidth > 0.0
     for i, record in enumerate(problem.records):
-        base, motion = model.shown(i, mechanics), model.motion(i)
-        for name, (added, step) in turning(problem, z, i, motion).items():
-            found.setdefault(name, []).append((model.shown(i, mechanics, added) - base) / step)
+        motion = model.motion(i)
+        turned = turning(problem, z, i, motion)
+        unknowns, shares = (list(of) for of in zip(*turned.values(), strict=True))
+        moved = model.parts(i, np.array(unknowns), np.stack(shares, axis=1))
+        for j, name in enumerate(turned):
+            found.setdefault(name, []).append(moved[:, j])
         if not observed:
             slope = np.diff(motion[:, 1], prepend=record.velocity) / problem.bench.timing.sample_time
             lag = np.stack([np.zeros_like(slope), -slope], axis=1)
@@ -232,62 +253,54 @@ def features(problem: Problem, z: Floats, model: Shown) -> dict[str, list[Floats
     return found
 
 
-def turning(problem: Problem, z: Floats, record: int, motion: Floats) -> dict[str, tuple[Floats, float]]:
-    """Currents that turn the motor as effects of some sizes do [A], with these sizes, by name; ``motion`` is shown."""
+def turning(problem: Problem, z: Floats, record: int, motion: Floats) -> dict[str, tuple[int, Floats]]:
+    """Unknowns that turn the motor as effects do, and their shares in each period, by name; ``motion`` is shown."""
     mechanics, at = problem.mechanics(z), _path(problem, z, record, motion)
     lacking = mechanics.play == 0.0 and mechanics.solver == EXACT
-    steps = {name: EFFECTS[name].step or STEP for name in TORQUES if name != "play" or lacking}
-    return {name: (TORQUES[name](at, step) / at.brake.k_m, step) for name, step in steps.items()}
+    found = {name: (unknown, share(at)) for name, (unknown, share) in TORQUES.items() if name != "play" or lacking}
+    return {name: (unknown, np.where(np.abs(own) < SMALLEST, 0.0, own)) for name, (unknown, own) in found.items()}
 
 
 class Path(NamedTuple):
-    """Means of the periods of a record as the model moves, each shape (n,)."""
+    """A record as the model moves."""
 
     brake: BrakeParameters
     limits: Limits
-    share: Floats  # Of the record that has passed, -½ to ½
-    current: Floats  # [A]
+    passed: Floats  # Share of the record that has passed, -½ to ½, shape (n,)
+    current: Floats  # Shape (n,) [A]
     angles: Floats  # From contact, at the ends of the periods, shape (n + 1,) [rad]
-    velocity: Floats  # [rad/s]
-    direction: Floats
-    """Of the motion, -1 to 1: the friction acts one way and then the other in a period in which the brake turns."""
-
-    @property
-    def angle(self) -> Floats:
-        """Angle from contact [rad]."""
-        return 0.5 * (self.angles[1:] + self.angles[:-1])
-
-    @property
-    def clamping(self) -> Floats:
-        """Torque of the clamping force against the motor [N·m]."""
-        clamped = np.maximum(self.angles, 0.0)
-        return self.brake.gamma * self.brake.k_1 * 0.5 * (clamped[1:] + clamped[:-1])
+    velocities: Floats  # At the same, shape (n + 1,) [rad/s]
 
 
 def _path(problem: Problem, z: Floats, record: int, shown: Floats) -> Path:
-    """The motion that is shown, by periods, as if the velocity changed evenly in each."""
+    """The motion that is shown."""
     at, data = problem.at(z, record), problem.records[record]
     n, delay = len(shown), problem.plant.instruments.measurement_delay
     ends = np.concatenate([shown[delay:], np.repeat(shown[-1:], min(delay, n), axis=0)])[:n]
-    angles = np.append(at.start[0], ends[:, 0] - at.offset(problem.plant)) - at.contact
-    velocity = np.append(at.start[1], ends[:, 1])
-    speed = np.abs(velocity[1:]) + np.abs(velocity[:-1])
     return Path(
         at.brake,
         problem.bench.limits,
         (np.arange(n) + 0.5) / n - 0.5,
         data.currents + at.errors.current_offset,
-        angles,
-        0.5 * (velocity[1:] + velocity[:-1]),
-        (velocity[1:] + velocity[:-1]) / np.where(speed > 0.0, speed, 1.0),
+        np.append(at.start[0], ends[:, 0] - at.offset(problem.plant)) - at.contact,
+        np.append(at.start[1], ends[:, 1]),
     )
 
 
-def _clearance(at: Path, play: float) -> Floats:
-    """Torque by which the clamp acts less on the motor behind a clearance: nut and force lag behind the screw [N·m]."""
-    behind = np.empty(len(at.angles))
+def _mean(of: Callable[[Floats], Floats], ends: Floats) -> Floats:
+    """Means in the periods between these ends, in which a number changes evenly (Simpson)."""
+    first, last = ends[:-1], ends[1:]
+    return (of(first) + 4.0 * of(0.5 * (first + last)) + of(last)) / 6.0
+
+
+def _clearance(at: Path) -> Floats:
+    """Torque by which the clamp acts less on the motor behind a clearance, per size of it, as a current [A/rad].
+
+    Nut and force lag behind the screw.
+    """
+    play, behind = EFFECTS["play"].step, np.empty(len(at.angles))
     compiled(_behind)(at.angles, play, behind)
-    result: Floats = at.brake.gamma * at.brake.k_1 * 0.5 * (behind[1:] + behind[:-1])
+    result: Floats = at.brake.gamma * at.brake.k_1 / at.brake.k_m * 0.5 * (behind[1:] + behind[:-1]) / play
     return result
 
 
@@ -299,23 +312,32 @@ def _behind(angles: Floats, play: float, behind: Floats) -> None:
         behind[k] = max(angles[k], 0.0) - max(nut, 0.0)
 
 
-TORQUES: Mapping[str, Callable[[Path, float], Floats]] = {
-    "play": _clearance,
-    "k_m_drift": lambda at, a: a * at.share * at.brake.k_m * at.current,
-    "k_1_drift": lambda at, a: -a * at.share * at.clamping,
-    "T_c_drift": lambda at, a: -a * at.share * at.brake.T_c * at.direction,
-    "f_v_drift": lambda at, a: -a * at.share * at.brake.f_v * at.velocity,
-    "friction_100": lambda at, a: -a * at.brake.T_c * at.direction * np.exp(-((at.velocity / 100.0) ** 2)),
-    "friction_200": lambda at, a: -a * at.brake.T_c * at.direction * np.exp(-((at.velocity / 200.0) ** 2)),
-    "drag": lambda at, a: -a * at.brake.f_v * at.velocity * np.abs(at.velocity) / at.limits.velocity,
-    "ripple_sine": lambda at, a: a * at.brake.T_c * np.sin(at.angle),
-    "ripple_cosine": lambda at, a: a * at.brake.T_c * np.cos(at.angle),
-    "current_gain": lambda at, a: a * at.brake.k_m * at.current * np.abs(at.current) / at.limits.current,
-    "dead_current": lambda at, a: -a * at.brake.k_m * np.sign(at.current),
-    "stiffness_sine": lambda at, a: -a * at.clamping * np.sin(at.angle),
-    "stiffness_cosine": lambda at, a: -a * at.clamping * np.cos(at.angle),
+def _decaying(speed: float) -> Callable[[Path], Floats]:
+    return lambda at: _mean(lambda v: np.exp(-((v / speed) ** 2)), at.velocities)
+
+
+def _ripple(wave: Callable[[Floats], Floats]) -> Callable[[Path], Floats]:
+    return lambda at: at.brake.T_c / at.brake.k_m * _mean(wave, at.angles)
+
+
+TORQUES: Mapping[str, tuple[int, Callable[[Path], Floats]]] = {
+    "play": (COMMAND, _clearance),
+    "k_m_drift": (K_M, lambda at: at.passed),
+    "k_1_drift": (K_1, lambda at: at.passed),
+    "T_c_drift": (T_C, lambda at: at.passed),
+    "f_v_drift": (F_V, lambda at: at.passed),
+    "friction_100": (T_C, _decaying(100.0)),
+    "friction_200": (T_C, _decaying(200.0)),
+    "drag": (F_V, lambda at: _mean(np.abs, at.velocities) / at.limits.velocity),
+    "ripple_sine": (COMMAND, _ripple(np.sin)),
+    "ripple_cosine": (COMMAND, _ripple(np.cos)),
+    "current_gain": (K_M, lambda at: np.abs(at.current) / at.limits.current),
+    "dead_current": (COMMAND, lambda at: -np.sign(at.current)),
+    "stiffness_sine": (K_1, lambda at: _mean(np.sin, at.angles)),
+    "stiffness_cosine": (K_1, lambda at: _mean(np.cos, at.angles)),
 }
-"""Torques that turn the motor as effects of a size do that the brake has no sensitivity to, by name [N·m].
+"""Effects that turn the motor and that the brake has no sensitivity to: a share of the torque of a parameter, or a
+current [A], in each period and per unit of their size.
 
 A drift is by the whole parameter from the first period to the last, zero in the middle.
 """

@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emb_bench.brake.motion import Floats, Integers, no_sensitivity, rest
+from emb_bench.brake.motion import SENSITIVE, Floats, Integers, no_sensitivity, rest
 from emb_bench.brake.parameters import COMMAND, DELAY
 from emb_bench.config.plants import Instruments, Plant
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.sim.instruments import reading, sensor_share
-from emb_bench.sim.open_loop import Input, check_unknowns, delay_share, held, march, trajectory
+from emb_bench.sim.open_loop import Input, check_unknowns, delay_share, held, march, march_shares, trajectory
 from emb_runtime.config.bench import BrakeParameters
 
 
@@ -113,15 +113,7 @@ def simulate_parts(
             np.pad(np.repeat(s[None], delay, axis=0), ((0, 0), (0, parts[0].gap_unknowns), (0, 0))),
         )
     for part in parts:
-        breaks, places = gap_ends(part, plant.instruments)
-        acting = Input(
-            part.currents + errors.current_offset,
-            t_s,
-            max(errors.delay, 0.0),
-            part.gaps[0],
-            breaks,
-            places - [theta.contact, 0.0],
-        )
+        acting = _acting(plant, theta, part, t_s)
         states, moved = trajectory(loop, plant.mechanics, theta.brake, acting, chosen, x, s)
         x, s, n = states[-1], moved[-1], part.periods
         if delay:
@@ -132,6 +124,33 @@ def simulate_parts(
         if early:
             shown = shown._replace(sensitivities=np.delete(shown.sensitivities, len(params), axis=1))
         yield shown
+
+
+def simulate_shares(
+    plant: Plant,
+    theta: Theta,
+    experiment: Experiment,
+    t_s: float,
+    unknowns: Integers,
+    shares: Floats,
+    loop: Callable[..., None] = march_shares,
+) -> Floats:
+    """Sensitivities of the samples to unknowns that count in each period by a share, shape (n, m, 2).
+
+    The unknowns are indices in ``PARAMETERS``, or ``COMMAND``; the shares have the shape (n, m).
+    """
+    (x, _, _), delay = theta.begin(experiment.before, ()), plant.instruments.measurement_delay
+    states, s = np.tile(x, (len(shares) + 1, 1)), np.zeros((len(shares) + 1, len(unknowns), SENSITIVE))
+    loop(plant.mechanics, theta.brake, _acting(plant, theta, experiment, t_s), unknowns, shares, states, s)
+    rows = later(states, delay), later(s, delay)
+    return _shown(*rows, unknowns, theta, theta.offset(plant), experiment.late, t_s).sensitivities
+
+
+def _acting(plant: Plant, theta: Theta, experiment: Experiment, t_s: float) -> Input:
+    """Currents of an experiment, and where its gaps end."""
+    breaks, places = gap_ends(experiment, plant.instruments)
+    currents, late = experiment.currents + theta.errors.current_offset, max(theta.errors.delay, 0.0)
+    return Input(currents, t_s, late, experiment.gaps[0], breaks, places - [theta.contact, 0.0])
 
 
 def simulate_apart(

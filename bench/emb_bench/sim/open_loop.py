@@ -2,7 +2,7 @@
 
 :func:`march` is the one loop over a record, compiled or as it is; what instruments show of its motion is
 :mod:`emb_bench.experiment.simulate`. Loops that need the state between two periods, because a filter corrects it or a
-current answers it, are :mod:`emb_bench.estimate.innovations` on :func:`advance_period`, and :func:`feedback` in plain
+current answers it, are :mod:`emb_bench.estimate.innovations` on :func:`advance_shares`, and :func:`feedback` in plain
 Python.
 
 **Which samples count.** A sequence of n currents u_0..u_{n−1} moves the brake from the state x_0 to x_n, and the
@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import SENSITIVE, STATES, Floats, Integers, advance, no_sensitivity, rest
-from emb_bench.brake.parameters import COMMAND, DELAY, PARAMETERS, PAST_COMMAND
+from emb_bench.brake.parameters import COMMAND, DELAY, K_M, PARAMETERS, PAST_COMMAND
 from emb_bench.config.plants import Mechanics
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError, near
@@ -103,52 +103,87 @@ def march(mechanics: Mechanics, p: BrakeParameters, acting: Input, chosen: Integ
         advance(mechanics, p, x[k + 1], u, (1.0 - late) * t_s, every, s[k + 1])
         before = u
         if after_gap:
-            _put(x, s, k, places[broken], count + 2 * broken)
+            _put(x, s, k, places[broken])
+            for i in range(2):
+                s[k + 1, count + 2 * broken + i, i] = 1.0
             broken += 1
 
 
-def march_beside(mechanics: Mechanics, p: BrakeParameters, acting: Input, rows: Floats, x: Floats, s: Floats) -> None:
-    """Fills states ``x``, and sensitivities ``s`` to currents that act beside those of an input without gaps.
+def march_shares(
+    mechanics: Mechanics, p: BrakeParameters, acting: Input, chosen: Integers, shares: Floats, x: Floats, s: Floats
+) -> None:
+    """Fills states ``x``, and sensitivities ``s`` to unknowns ``chosen`` that count in each period by a share.
 
-    Such a current is a row's number times its current in each period [A], ``rows`` of shape (n, m). A period's map of
-    sensitivities is affine and the same for all of them; it is that of the states' own, and of one command. Runs as it
-    is or compiled.
+    The ``shares``, shape (n, m), may be any numbers. The gaps have no unknowns here. Runs as it is or compiled.
     """
-    remembers = mechanics.hysteresis > 0.0 or mechanics.play > 0.0 or mechanics.current_lag > 0.0
-    count = SENSITIVE if remembers else 2
-    every, unit = np.full(count + 1, PAST_COMMAND), np.empty((count + 1, SENSITIVE))
-    every[count] = COMMAND
-    t_s, late, before = acting.t_s, acting.late, float(x[0, 3])
+    every, before, broken = chosen.copy(), float(x[0, 3]), 0
     for k in range(acting.currents.shape[0]):
         _carry(x, s, k)
+        after_gap = broken < acting.breaks.shape[0] and acting.breaks[broken] == k
+        if after_gap:
+            x[k + 1, 0], x[k + 1, 1] = acting.places[broken, 0], acting.places[broken, 1]
         u = float(acting.currents[k])
-        if late > 0.0:
-            _identity(unit)
-            advance(mechanics, p, x[k + 1], before, late * t_s, every, unit)
-            _map(unit, rows[max(k - 1, 0)], 1.0 if k > 0 else 0.0, s[k + 1])
-        _identity(unit)
-        advance(mechanics, p, x[k + 1], u, (1.0 - late) * t_s, every, unit)
-        _map(unit, rows[k], 1.0, s[k + 1])
+        advance_shares(mechanics, p, x[k + 1], before, u, acting.t_s, acting.late, chosen, shares, k, every, s[k + 1])
         before = u
+        if after_gap:
+            _put(x, s, k, acting.places[broken])
+            broken += 1
 
 
-def _identity(unit: Floats) -> None:
-    """Sensitivities to the states at the begin of a period, and none to its command."""
-    for i in range(unit.shape[0]):
-        for j in range(SENSITIVE):
-            unit[i, j] = 1.0 if i == j and i < unit.shape[0] - 1 else 0.0
+def advance_shares(
+    mechanics: Mechanics,
+    p: BrakeParameters,
+    x: Floats,
+    before: float,
+    u: float,
+    t_s: float,
+    late: float,
+    chosen: Integers,
+    shares: Floats,
+    k: int,
+    every: Integers,
+    s: Floats,
+) -> None:
+    """Period ``k``, in which the command ``u`` [A] acts late, and the one ``before`` [A] until then; in place.
+
+    A delay's sensitivity counts a switch by the time step that it begins, here the shorter one: it has to be divided
+    by :func:`delay_share`. The last of the unknowns ``chosen`` count by their ``shares``, shape (n, m): a period's map
+    of a sensitivity is affine, s → A s + b with b of the unknown, and a share w takes s to w (A s/w + b); none is
+    the current of another period. ``every`` is a copy of ``chosen``, which changes.
+    """
+    if late > 0.0:
+        _over(chosen, shares, k, True, every, s)
+        advance(mechanics, p, x, before, late * t_s, every, s)
+        _times(chosen, shares, k, True, s)
+    _over(chosen, shares, k, False, every, s)
+    advance(mechanics, p, x, u, (1.0 - late) * t_s, every, s)
+    _times(chosen, shares, k, False, s)
 
 
-def _map(unit: Floats, row: Floats, share: float, s: Floats) -> None:
-    """Sensitivities at the end of a period in which a share of a row's currents acts besides, in place."""
-    count, start = unit.shape[0] - 1, np.empty(SENSITIVE)
-    for j in range(s.shape[0]):
+def _share(unknown: int, shares: Floats, k: int, j: int, late: bool) -> float:
+    """Share of an unknown in a period; the command before that acts late has its own."""
+    if late and unknown in (K_M, COMMAND):
+        return float(shares[k - 1, j]) if k > 0 else 0.0
+    return float(shares[k, j])
+
+
+def _over(chosen: Integers, shares: Floats, k: int, late: bool, every: Integers, s: Floats) -> None:
+    """Sensitivities over the shares of a period."""
+    first = chosen.shape[0] - shares.shape[1]
+    for j in range(shares.shape[1]):
+        share = _share(int(chosen[first + j]), shares, k, j, late)
+        every[first + j] = PAST_COMMAND if share == 0.0 else chosen[first + j]
         for i in range(SENSITIVE):
-            start[i] = s[j, i]
+            s[first + j, i] /= share if share != 0.0 else 1.0
+
+
+def _times(chosen: Integers, shares: Floats, k: int, late: bool, s: Floats) -> None:
+    """The inverse of :func:`_over`."""
+    first = chosen.shape[0] - shares.shape[1]
+    for j in range(shares.shape[1]):
+        share = _share(int(chosen[first + j]), shares, k, j, late)
         for i in range(SENSITIVE):
-            s[j, i] = share * row[j] * unit[count, i]
-            for from_state in range(count):
-                s[j, i] += start[from_state] * unit[from_state, i]
+            s[first + j, i] *= share if share != 0.0 else 1.0
 
 
 def _carry(x: Floats, s: Floats, k: int) -> None:
@@ -159,39 +194,17 @@ def _carry(x: Floats, s: Floats, k: int) -> None:
             s[k + 1, j, i] = s[k, j, i]
 
 
-def _put(x: Floats, s: Floats, k: int, place: Floats, own: int) -> None:
-    """Put the brake to an angle and a velocity at the end of period k, whose sensitivities begin at row ``own``."""
+def _put(x: Floats, s: Floats, k: int, place: Floats) -> None:
+    """Put the brake to an angle and a velocity at the end of period k, which depend on nothing before."""
     x[k, 1] = 2.0 * place[1] - x[k + 1, 1]  # keeps the acceleration near the place
     for i in range(2):
         x[k + 1, i] = place[i]
         for j in range(s.shape[1]):
             s[k + 1, j, i] = 0.0
-        s[k + 1, own + i, i] = 1.0
-
-
-def advance_period(
-    mechanics: Mechanics,
-    p: BrakeParameters,
-    x: Floats,
-    before: float,
-    u: float,
-    t_s: float,
-    late: float,
-    chosen: Integers,
-    s: Floats,
-) -> None:
-    """One period in which the command ``u`` [A] acts late, and the one ``before`` [A] until then; in place.
-
-    A delay's sensitivity counts a switch by the time step that it begins, here the shorter one: it has to be divided
-    by :func:`delay_share`.
-    """
-    if late > 0.0:
-        advance(mechanics, p, x, before, late * t_s, chosen, s)
-    advance(mechanics, p, x, u, (1.0 - late) * t_s, chosen, s)
 
 
 def delay_share(unknown: int, late: float) -> float:
-    """Divisor that makes a sensitivity from :func:`advance_period` one per sample: 1, but for the delay's own."""
+    """Divisor that makes a sensitivity from :func:`advance_shares` one per sample: 1, but for the delay's own."""
     return 1.0 - late if unknown == DELAY else 1.0
 
 

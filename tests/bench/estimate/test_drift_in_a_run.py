@@ -49,7 +49,7 @@ def test_its_column_is_the_finite_difference_of_a_brake_that_drifts(bench: Bench
     column = secants(problem, z, Simulated(problem, z, weights))[f"{name}_drift"][0]
     h = 1e-5
     expected = (motion(bench, currents, name, h) - motion(bench, currents, name, -h)) / (2.0 * h) * weights[0]
-    assert np.linalg.norm(column - expected) < 0.02 * np.linalg.norm(expected)
+    assert np.linalg.norm(column - expected) < 1e-4 * np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize(

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from emb_bench.api import fisher_information
+from emb_bench.brake.parameters import COMMAND, F_V, K_1, K_M, T_C
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.expected import Interval, beside_currents, of_experiment, of_information
-from emb_bench.estimate.prediction import make_problem
+from emb_bench.config.plants import Plant
+from emb_bench.estimate.expected import Interval, of_experiment, of_information
+from emb_bench.estimate.innovations import Filter, Followed
+from emb_bench.estimate.prediction import Problem, make_problem
 from emb_bench.estimate.records import EstimationProblem, with_systematic
-from emb_bench.estimate.suspects import TORQUES, Simulated, turning
+from emb_bench.estimate.suspects import TORQUES, Shown, Simulated, beside_model, secants, turning
 from emb_bench.experiment.simulate import SystematicErrors
 from emb_bench.information.evaluation import Question, expected
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 
-from tests.bench.measurements import Floats, fit, record  # isort: skip
+from tests.bench.measurements import Floats, currents_of, fit, problem_of, record  # isort: skip
 
 CURRENTS = np.repeat(np.random.default_rng(3).uniform(-2.5, 3.0, 25), 12)
 
@@ -39,35 +44,92 @@ def without_systematic(bench: Bench, **but: float) -> Bench:
 PLANTS = ("exact", "euler", "stribeck", "load", "hysteresis", "cubic", "play", "observer", "offset", "late")
 
 
-@pytest.mark.parametrize("late", [0.0, 0.3])
-@pytest.mark.parametrize("name", PLANTS)
-def test_a_row_beside_the_currents_sums_the_estimator_s_derivatives_to_single_currents(
-    bench: Bench, name: str, late: float
-) -> None:
-    """An estimate has these derivatives for reports that were lost; its effects are differences along such rows."""
-    plant = bench.plant(name)
+def modelled(bench: Bench, plant: Plant, late: float = 0.0) -> tuple[Problem, Floats]:
+    """A record without noise that the model explains at z."""
     shown = record(bench, plant, CURRENTS, seed=None)
     problem = make_problem(bench, plant, [shown], with_systematic(EstimationProblem(), bench, plant))
     z = problem.nominal()
     for i, unknown in enumerate(problem.unknowns):
         z[i] = late if unknown.name == "delay" else z[i]
+    return problem, z
+
+
+@pytest.mark.parametrize("late", [0.0, 0.3])
+@pytest.mark.parametrize("name", PLANTS)
+def test_an_effect_that_acts_as_a_current_sums_the_derivatives_to_single_currents(
+    bench: Bench, name: str, late: float
+) -> None:
+    """An estimate has these derivatives for reports that were lost."""
+    problem, z = modelled(bench, bench.plant(name), late)
     model = Simulated(problem, z, [np.ones((len(CURRENTS), 2))])
     turned = turning(problem, z, 0, model.motion(0))
-    rows = np.stack([current / step for current, step in turned.values()], axis=1)
-    found, wanted = beside_currents(problem, z, rows), np.zeros((len(CURRENTS), rows.shape[1], 2))
+    assert {*turned} == {*TORQUES} - ({"play"} if name in ("play", "euler") else set())
+    acting = {each: (u, s) for each, (u, s) in turned.items() if u in (COMMAND, K_M)}
+    rows = np.stack([s * (CURRENTS if u == K_M else 1.0) for u, s in acting.values()], axis=1)
+    found = model.parts(0, np.array([u for u, _ in acting.values()]), np.stack([s for _, s in acting.values()], axis=1))
+    wanted = np.zeros_like(found)
     for odd in range(2):
         lost = np.arange(len(CURRENTS)) % 2 == odd
-        gaps = replace(problem, records=(replace(shown, assumed=np.where(lost, CURRENTS, np.nan)),))
+        gaps = replace(problem, records=(replace(problem.records[0], assumed=np.where(lost, CURRENTS, np.nan)),))
         single = gaps.predict(z, 0).sensitivities[:, len(z) :]
         wanted += np.einsum("kgo,gj->kjo", single, rows[lost])
-    assert {*turned} == {*TORQUES} - ({"play"} if name in ("play", "euler") else set())
     assert (np.abs(found - wanted).max(axis=0) <= 1e-8 * np.abs(wanted).max(axis=0)).all()
-    if name == "exact":  # and differences, as the estimator takes them
-        mechanics, base = problem.mechanics(z), model.shown(0, problem.mechanics(z))
-        for j, row in enumerate(rows.T):
-            h = 1e-5 / float(np.abs(row).max())
-            secant = (model.shown(0, mechanics, h * row) - base) / h
-            assert np.abs(found[:, j] - secant).max() <= 1e-3 * np.abs(secant).max()
+
+
+@pytest.mark.parametrize("method", ["oem", "pem"])
+@pytest.mark.parametrize("late", [0.0, 0.3])
+@pytest.mark.parametrize("name", PLANTS)
+def test_the_parts_of_a_parameter_in_each_period_add_to_its_derivative(
+    bench: Bench, name: str, late: float, method: str
+) -> None:
+    problem, z = modelled(bench, bench.plant(name), late)
+    weights = problem.weights(z)
+    followed = Filter(problem, 10.0)
+    gains = followed.gains(z, weights)
+    model: Shown = Simulated(problem, z, weights)
+    jacobian = problem.jacobian(z, weights)[1]
+    if method == "pem":
+        model, jacobian = Followed(followed, z, weights, gains), followed.jacobian(z, weights, gains)[1]
+    whole = -jacobian[: 2 * len(CURRENTS), :4].reshape(-1, 2, 4).transpose(0, 2, 1)
+    shares = np.random.default_rng(5).uniform(-1.0, 2.0, (len(CURRENTS), 4))
+    shares[10:20] = 0.0
+    unknowns = np.array([K_M, K_1, T_C, F_V])
+    found = model.parts(0, unknowns, shares) + model.parts(0, unknowns, 1.0 - shares)
+    assert (np.abs(found - whole).max(axis=(0, 2)) <= 1e-8 * np.abs(whole).max(axis=(0, 2))).all()
+
+
+FRICTION: dict[str, dict[str, Any]] = {
+    "friction_100": {"break_away": 1.0 + 1e-5, "stribeck_velocity": 100.0},
+    "friction_200": {"break_away": 1.0 + 1e-5, "stribeck_velocity": 200.0},
+}
+
+
+PERIODS = np.arange(500)
+TURNING: dict[str, Callable[[Bench], Floats]] = {
+    "chirp": lambda bench: currents_of(bench, "chirp"),
+    "multisine": lambda bench: currents_of(bench, "multisine"),
+    "square, 40 ms": lambda _: 3.0 * np.sign(np.sin(2.0 * math.pi * PERIODS / 40.0 + 0.1)),
+    "square, 25 ms": lambda _: 3.0 * np.sign(np.sin(2.0 * math.pi * PERIODS / 25.0 + 0.1)),
+    "sine, 30 ms": lambda _: 3.0 * np.sin(2.0 * math.pi * PERIODS / 30.0),
+}
+
+
+@pytest.mark.parametrize("currents", TURNING)
+@pytest.mark.parametrize("name", FRICTION)
+def test_what_a_friction_leaves_beside_the_model_is_that_of_a_brake_that_has_it(
+    bench: Bench, name: str, currents: str
+) -> None:
+    """A current in place of it leaves up to ten times as much where the brake turns back often."""
+    plant = bench.plant("exact")
+    problem = problem_of(bench, PARAMETER_NAMES, record(bench, plant, TURNING[currents](bench), seed=None))
+    z = problem.nominal()
+    weights = problem.weights(z)
+    model, basis = Simulated(problem, z, weights), np.linalg.qr(problem.jacobian(z, weights)[1])[0]
+    changed = plant.mechanics._replace(tolerance=1e-12, **FRICTION[name])
+    (more, less) = (model.shown(0, m) for m in (changed, changed._replace(break_away=1.0)))
+    wanted = beside_model(((more - less) / 1e-5).ravel(), basis)[1]
+    found = beside_model(secants(problem, z, model)[name][0].ravel(), basis)[1]
+    assert np.linalg.norm(found - wanted) < 0.05 * np.linalg.norm(wanted)
 
 
 @pytest.mark.parametrize("name", ["exact", "stribeck"])
@@ -113,8 +175,7 @@ def test_one_effect_moves_the_parameters_by_regression(bench: Bench) -> None:
     weights = problem.weights(z)
     jacobian = problem.jacobian(z, weights)[1]
     ones = Simulated(problem, z, weights)
-    current, step = turning(problem, z, 0, ones.motion(0))["k_m_drift"]
-    column = (beside_currents(problem, z, (current / step)[:, None])[:, 0] * weights[0]).ravel()
+    column = secants(problem, z, ones)["k_m_drift"][0].ravel()
     moved, square, *_ = np.linalg.lstsq(jacobian, column, rcond=None)
     information, squares, weights_of = float(square[0]), 0.0, 0.5  # half the brakes have none
     for share in (1e-3, 1e-2, 0.1, 1.0):
