@@ -290,7 +290,8 @@ def _path(problem: Problem, z: Floats, record: int, shown: Floats) -> Path:
 def _mean(of: Callable[[Floats], Floats], ends: Floats) -> Floats:
     """Means in the periods between these ends, in which a number changes evenly (Simpson)."""
     first, last = ends[:-1], ends[1:]
-    return (of(first) + 4.0 * of(0.5 * (first + last)) + of(last)) / 6.0
+    mean: Floats = (of(first) + 4.0 * of(0.5 * (first + last)) + of(last)) / 6.0
+    return mean
 
 
 def _clearance(at: Path) -> Floats:
