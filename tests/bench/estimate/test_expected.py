@@ -98,12 +98,7 @@ def test_the_parts_of_a_parameter_in_each_period_add_to_its_derivative(
     assert (np.abs(found - whole).max(axis=(0, 2)) <= 1e-8 * np.abs(whole).max(axis=(0, 2))).all()
 
 
-FRICTION: dict[str, dict[str, Any]] = {
-    "friction_100": {"break_away": 1.0 + 1e-5, "stribeck_velocity": 100.0},
-    "friction_200": {"break_away": 1.0 + 1e-5, "stribeck_velocity": 200.0},
-}
-
-
+FRICTION = {"friction_100": 100.0, "friction_200": 200.0}  # Stribeck velocities [rad/s]
 PERIODS = np.arange(500)
 TURNING: dict[str, Callable[[Bench], Floats]] = {
     "chirp": lambda bench: currents_of(bench, "chirp"),
@@ -125,7 +120,7 @@ def test_what_a_friction_leaves_beside_the_model_is_that_of_a_brake_that_has_it(
     z = problem.nominal()
     weights = problem.weights(z)
     model, basis = Simulated(problem, z, weights), np.linalg.qr(problem.jacobian(z, weights)[1])[0]
-    changed = plant.mechanics._replace(tolerance=1e-12, **FRICTION[name])
+    changed = plant.mechanics._replace(tolerance=1e-12, break_away=1.0 + 1e-5, stribeck_velocity=FRICTION[name])
     (more, less) = (model.shown(0, m) for m in (changed, changed._replace(break_away=1.0)))
     wanted = beside_model(((more - less) / 1e-5).ravel(), basis)[1]
     found = beside_model(secants(problem, z, model)[name][0].ravel(), basis)[1]
