@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Final
+from typing import Final, cast
 
 from emb_runtime.can.e2e import COUNTER_MODULUS, next_counter
 from emb_runtime.can.messages import Layout
@@ -63,7 +63,7 @@ class Guard:
         self._drive = DriveCheck(bench.guard.current_error, bench.limits.current)
         self._device_clock = DeviceClock(self._period_ns)
         self._last: CurrentCommand | None = None
-        self._allowed: tuple[Frame, CurrentCommand] | None = None  # that one and its frame, until it is sent
+        self._allowed: Frame | None = None  # that one's frame, until it is sent
         self._sample_ns = 0  # that it was computed from
         self._most = math.ceil(RATE_WINDOW_PERIODS * RATE_SURPLUS)
         self._times: list[int] = []  # of the last commands, as many at most
@@ -98,12 +98,13 @@ class Guard:
             self.rejected += 1
             raise
         # Counted before it leaves: if the bus fails, the node may have seen this counter value all the same.
-        self._last, self._sample_ns, self._allowed = command, sample_time_ns, (frame, command)
+        self._last, self._sample_ns = command, sample_time_ns
         self._drive.sent(command.counter, command.current)
         if len(self._times) == self._most:
             del self._times[0]
         self._times.append(now_ns)
         self._pulse.publish(command.counter, command.answers)
+        self._allowed = frame  # last: a check that fails on its way allows nothing
         return frame
 
     def send(self, frame: Frame) -> None:
@@ -114,7 +115,7 @@ class Guard:
             BusError: the bus did not take it.
         """
         allowed, self._allowed = self._allowed, None
-        if allowed is None or allowed[0] is not frame:
+        if allowed is not frame:
             self.rejected += 1
             raise _rejected("it is not the one that was checked last")
         # Asked last. What slips through between this and the bus answers a sample that is not the newest any more
@@ -124,7 +125,8 @@ class Guard:
         try:
             self._send(frame)
         except BusError:
-            self._last = allowed[1]._replace(current=0.0)  # the node brakes: the next one begins at zero
+            # The node brakes: the next one begins at zero.
+            self._last = cast("CurrentCommand", self._last)._replace(current=0.0)
             raise
         self.passed += 1
 

@@ -287,6 +287,19 @@ def test_the_watchdog_learns_of_a_command_before_it_is_asked(bench: Bench, layou
     assert order == [(3, 9), "asked", "sent"]
 
 
+def test_a_frame_of_which_the_watchdog_does_not_learn_is_refused(bench: Bench, layout: Layout, bus: Bus) -> None:
+    class Broken(Unwatched):
+        def publish(self, counter: int, answers: int) -> None:
+            raise OSError("no memory")
+
+    guard, frame = Guard(layout, bench, bus.send, Broken()), command()
+    with pytest.raises(OSError, match="no memory"):
+        guard.check(frame, ACTIVE, 100 * MS, 100 * MS)
+    with pytest.raises(GuardRejectedError, match="it is not the one that was checked last"):
+        guard.send(frame)
+    assert bus.frames == []
+
+
 def test_a_drive_that_does_not_apply_what_left_ends_the_run(guard: Guard, bus: Bus) -> None:
     let_out(guard, command(4.0), ACTIVE, 100 * MS, 100 * MS)
     sample = SensorSample(1, 0.0, 0.0, 0, 0, 4.0, 0, NodeState.ACTIVE)

@@ -26,7 +26,7 @@ from emb_runtime.system import compiled_core
 compiled_core.choose()
 core = compiled_core.running()
 from {NAME} import __file__ as file
-from emb_runtime.control.core import decide
+from emb_runtime.control.phases import decide
 print(json.dumps([core.compiled, core.text, core.warning, file, decide.__code__.co_filename]))
 """
 
