@@ -95,7 +95,7 @@ class CycleRecord(NamedTuple):
 
     Times are monotonic nanoseconds. A value that does not exist in a cycle (a policy output in a missed one) is NaN.
 
-    The log's topic ``/cycle`` has these fields, see ``emb.proto``; ``Memory.record`` of the loop fills them.
+    The log's topic ``/cycle`` has these fields, see ``emb.proto``; ``control.memory.Memory.record`` fills them.
     """
 
     step: int  # Sample index since the experiment began; −1 before

@@ -11,15 +11,15 @@ LONGEST_WAY = 3.0  # Time for a way home; from anywhere inside the limits it tak
 
 
 class Actor(Protocol):
-    """Source of the wanted currents: a policy, or the way home."""
+    """Source of the requested currents: a policy, or the way home."""
 
     def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
-        """Current wanted for the period that begins at this sample, which the estimator has taken in [A]."""
+        """Current requested for the period that begins at this sample, which the estimator has taken in [A]."""
         ...
 
 
 class Still:
-    """Actor of the way home: it wants 0 A, so that the shield alone moves the brake."""
+    """Actor of the way home: it requests 0 A, so that the shield alone moves the brake."""
 
     def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         """Return 0 A."""

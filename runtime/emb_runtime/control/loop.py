@@ -2,7 +2,8 @@
 
 A cycle has three verbs: **read** the frames that have come by the core's deadline; **answer** the newest sample with
 the frame that the guard has checked; **record** what happened. One invariant: however the cycles end, from then on only
-stop frames leave, each is tried, and nothing that is called can keep them back.
+stop frames leave, each is tried, and nothing that is called can keep them back. None leaves where nothing was armed, or
+where the watchdog sends them. Any other BaseException than an Exception or SystemExit is raised after the stop.
 
 One driver serves a real bus and a simulated one in lock-step: clock and reception are handed in. The clock is read once
 per event: frames or a timeout are in hand, the command is decided, the command is sent.

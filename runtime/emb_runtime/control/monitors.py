@@ -1,8 +1,9 @@
 """Monitors of a run: each checks the newest sample, and ends the run by a StopError.
 
-Every sample in control is checked by :class:`Sensors`. One that is to be answered is checked by the guard's clock,
-before its step is told from its device time, and then by :func:`monitors`: limits, node, obeyed, lost, drive.
-:func:`check_bus` checks what no sample shows.
+Every sample in control is checked by :class:`Sensors`, but for the first one and those while the brake coasts; a fault
+that they find may begin the coasting. One that is to be answered is checked by the guard's clock, before its step is
+told from its device time, and then by :func:`monitors`: limits, node, obeyed, lost, drive. :func:`check_bus` checks
+what no sample shows.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_runtime.safety.state_machine import Fault, StopError
 
-# What each cycle asks for, by a name of its own: in Python 3.11 a member of an enumeration takes as long as a call.
+# Names of their own, as in :mod:`emb_runtime.safety.state_machine`.
 IDLE: Final = NodeState.IDLE
 OBEYING: Final = NodeState.ACTIVE
 UNFIT: Final = (NodeState.STOPPING, NodeState.FAULT)
@@ -78,7 +79,7 @@ def check_lost(sample: SensorSample, memory: Memory) -> None:
 
 
 class Node:
-    """The node obeys, and is the one that it was."""
+    """Monitor of the node: it obeys, and is the one that it was."""
 
     def __init__(self, conditions: StartConditions, reception: Reception) -> None:
         self._conditions = conditions
@@ -123,7 +124,7 @@ class Node:
 
 
 class Sensors:
-    """The sensors agree with each other and with the currents; one brake explains the motion."""
+    """Monitor of the sensors: they agree with each other and with the currents; one brake explains the motion."""
 
     def __init__(self, bench: Bench, law: ShieldLaw, *, homing: bool) -> None:
         self._law = law
@@ -141,7 +142,7 @@ class Sensors:
         self._balance.begin(sample)
 
     def check(self, sample: SensorSample, memory: Memory) -> None:
-        """Check the newest sample against the one before."""
+        """Check the newest sample against the one before; raises StopError. Queues it for the motion balance."""
         interval = memory.interval
         try:
             self.monitor.check(interval.elapsed, sample, interval.obeyed, interval.command)
@@ -166,7 +167,7 @@ class Sensors:
         self._balance.judge_zero()
 
     def warm_up(self, sample: SensorSample, limit: float) -> None:
-        """Run one cycle for nothing; :meth:`begin` forgets it."""
+        """Warm-up: run one dummy cycle, which :meth:`begin` forgets."""
         self.monitor.begin(sample)
         with contextlib.suppress(StopError):
             self.monitor.check(self._law.sample_time, sample, True, 0.0)
