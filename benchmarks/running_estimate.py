@@ -2,7 +2,8 @@
 
     python benchmarks/running_estimate.py [--brakes 5000] [--seed 1]
 
-Plays the shipped actor and that of ``--quick`` on random brakes within ±50 %, in whole experiments behind the shield.
+Plays the speeds that the shipped actor and that of ``--quick`` ask for with the nominal estimate, on random brakes
+within ±50 %, in whole experiments behind the shield.
 The first row has a sensor of the velocity, the second the same sensor where an observer is declared: what declaring it
 costs. The others have declared observers of their least bandwidth and of twice it. A row has the experiments whose
 model is said to fit, the parameters inside their 95 % intervals, the level that the running mean of the innovations
@@ -14,24 +15,19 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES, Sensors
 from emb_runtime.estimator.estimate import NORMAL_95
-from emb_runtime.estimator.kalman import Model, believed, deviations, fits, follow, start
-from emb_runtime.estimator.speed_loop import Scale
-from emb_train.closed_loop import Experiments, Setup, advance_one
-from emb_train.play import fresh_draws
-from emb_train.reference import Box, stored, wanted_current
-from emb_train.trial import Trials
+from emb_runtime.estimator.kalman import believed, deviations, fits
+from emb_runtime.policy.policy import load_policy, shipped_actor_path
+from emb_train.closed_loop import Batch, Conditions, state_of
+from emb_train.play import begin_all, fresh_draws, target_speeds
 
-ACTORS = ("four-d-exact-quadratic", "four-time-exact-quadratic")
 COUNT = len(PARAMETER_NAMES)
 FITS, WORST, LEFT, WIDTH = 2 * COUNT, 2 * COUNT + 1, 2 * COUNT + 2, 2 * COUNT + 3  # After values and deviations
 CASES = (
@@ -45,50 +41,29 @@ CASES = (
 """Name, declared and true bandwidth [rad/s]; 0 for a sensor."""
 
 
-def fly(
-    setup: Setup, model: Model, scale: Scale, box: Box, experiments: Experiments, table: Floats, out: Floats
-) -> None:
-    """N experiments with an estimator each; a row of results of each goes to ``out``, relative to the nominal brake."""
-    reference = np.zeros(table.shape[0])
-    for i in range(out.shape[0]):
-        state = start(model)
-        for _ in range(setup.rules.horizon):
-            y, u = experiments.y, experiments.applied[i]
-            state = follow(model, state, y[i, 0], y[i, 1], float(experiments.k[i]), u)
-            advance_one(setup, experiments, i, wanted_current(model, state, scale, box, table, reference))
-            if experiments.violated[i]:
-                out[i, LEFT] = 1.0
-                break
-        values, known = believed(model, state), deviations(model, state)
-        for j in range(COUNT):
-            out[i, j], out[i, COUNT + j] = values[j], known[j]
-        out[i, FITS], out[i, WORST] = fits(state), state.worst
-
-
 def share(part: int, of: int) -> str:
     """A share with its 95 % interval."""
     low, high = stats.binomtest(part, of).proportion_ci(method="exact")
     return f"{part} of {of}, {100 * low:.2f} to {100 * high:.2f} %"
 
 
-def results(bench: Bench, actor: str, declared: float, true: float, count: int, seed: int) -> tuple[Floats, Floats]:
+def results(bench: Bench, quick: bool, declared: float, true: float, count: int, seed: int) -> tuple[Floats, Floats]:
     """True relative parameters, and rows of results."""
+    exact, ranges = bench.plant("exact"), bench.range_set("pm50")
+    plant = replace(exact, name="observed", instruments=exact.instruments._replace(observer_bandwidth=true))
     sensors = Sensors("observer", declared) if declared else Sensors()
-    bench, kept = replace(bench, sensors=sensors), stored(actor)
-    draws = fresh_draws(bench.range_set("pm50"), seed, count)
-    trials = Trials(bench, bench.range_set("pm50"), PARAMETER_NAMES, draws)
-    instruments = trials.setup.instruments._replace(observer_bandwidth=true)
+    bench = replace(bench, sensors=sensors, plants={**bench.plants, plant.name: plant})
+    draws = fresh_draws(ranges, seed, count)
+    batch = Batch(bench, ranges, PARAMETER_NAMES, count, plant.name, Conditions(acts="speed", observes="estimate"))
+    begin_all(batch, draws)
     out = np.zeros((count, WIDTH))
-    arguments: tuple[Any, ...] = (
-        trials.setup._replace(instruments=instruments),
-        trials.model,
-        kept.scale(bench),
-        trials.box,
-        trials.experiments,
-        kept.array(),
-        out,
-    )
-    compiled(fly)(*arguments)
+    for speed in target_speeds(load_policy(shipped_actor_path(quick), bench), bench):
+        batch.advance(np.full(count, speed))
+        out[batch.violated, LEFT] = 1.0
+    for row, kept in zip(out, batch.experiments.estimate, strict=True):
+        state = state_of(kept)
+        row[:FITS] = *believed(batch.model, state), *deviations(batch.model, state)
+        row[FITS], row[WORST] = fits(state), state.worst
     truths = [[getattr(d.brake, name) / getattr(bench.brake, name) for name in PARAMETER_NAMES] for d in draws]
     return np.array(truths), out
 
@@ -100,12 +75,12 @@ def main() -> None:
     p.add_argument("--seed", type=int, default=1)
     arguments = p.parse_args()
     bench = load_bench()
-    for actor in ACTORS:
-        print(f"\n{actor}, {arguments.brakes} brakes each")
+    for quick in (False, True):
+        print(f"\n{shipped_actor_path(quick).name}, {arguments.brakes} brakes each")
         print("| velocity | left limits | fits | covered | of each | level of 1e-4 | largest | median deviations |")
         print("|---" * 8 + "|", flush=True)
         for name, declared, true in CASES:
-            truths, r = results(bench, actor, declared, true, arguments.brakes, arguments.seed)
+            truths, r = results(bench, quick, declared, true, arguments.brakes, arguments.seed)
             errors, known = np.abs(r[:, :COUNT] - truths), r[:, COUNT : 2 * COUNT]
             inside, worst = errors <= NORMAL_95 * known, r[:, WORST]
             told = ", ".join(f"{100 * one:.1f}" for one in inside.mean(axis=0))

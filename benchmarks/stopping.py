@@ -25,11 +25,9 @@ import numpy as np
 from emb_bench.config.bench import load_bench
 from emb_bench.logs.estimates import by_step
 from emb_bench.logs.log import read_log
-from emb_export.file import reference_file
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES
 
-ACTORS = ("four-d-exact-quadratic",)
 PLANTS = ("exact", "euler")
 GOAL = {"k_1": 0.02, "f_v": 0.1}
 SEED = 11
@@ -39,7 +37,7 @@ def main() -> None:
     """Run the benchmark."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--brakes", type=int, default=30, help="of each kind (default: %(default)s)")
-    p.add_argument("--quick", action="store_true", help="emb-run --quick in place of the two actors")
+    p.add_argument("--quick", action="store_true", help="emb-run --quick in place of the whole experiment")
     arguments = p.parse_args()
     bench = load_bench()
     ranges = bench.range_set("pm50")
@@ -65,35 +63,30 @@ def played(brake: np.ndarray, seed: int, plant: str, folder: Path, *arguments: s
 
 
 def goals(brakes: np.ndarray, folder: Path) -> None:
-    """Two actors on brakes of two kinds, until the parameters of GOAL are known."""
-    bench, count, rows = load_bench(), len(brakes), []
+    """The shipped actor on brakes of two kinds, until the parameters of GOAL are known."""
+    count, rows = len(brakes), []
     goal = ",".join(f"{name}={share:.0%}" for name, share in GOAL.items())
     asked = [PARAMETER_NAMES.index(name) for name in GOAL]
     print(f"--stop-when {goal}, {count} brakes each")
-    print(
-        f"{'actor':22}{'brake':8}{'early':>8}{'mean s':>8}{'rms z':>8}{'beyond 2':>10}{'worst k_1, f_v if early':>26}"
-    )
-    for name in ACTORS:
-        path = folder / f"{name}.onnx"
-        path.write_bytes(reference_file(name, bench))
-        for plant in PLANTS:
-            early, seconds, z, worst = 0, [], [], np.zeros(len(GOAL))
-            for i, brake in enumerate(brakes):
-                run = played(brake, i, plant, folder, "--policy", str(path), "--stop-when", goal)
-                stated = [run["estimate"][n]["deviation"] for n in PARAMETER_NAMES]
-                z += (run["errors"] * brake / stated).tolist()
-                seconds.append(run["duration_s"])
-                if run["goal_reached"]:
-                    early += 1
-                    worst = np.maximum(worst, np.abs(run["errors"])[asked])
-            beyond = float((np.abs(z) > 2.0).mean())
-            told = ", ".join(f"{share:.2%}" for share in worst) if early else "-"
-            rows.append(f"{plant}: {early}, {told}")
-            rms = float(np.sqrt(np.mean(np.square(z))))
-            print(
-                f"{name:22}{plant:8}{f'{early}/{count}':>8}{np.mean(seconds):8.3f}{rms:8.2f}{beyond:10.1%}{told:>26}",
-                flush=True,
-            )
+    print(f"{'brake':8}{'early':>8}{'mean s':>8}{'rms z':>8}{'beyond 2':>10}{'worst k_1, f_v if early':>26}")
+    for plant in PLANTS:
+        early, seconds, z, worst = 0, [], [], np.zeros(len(GOAL))
+        for i, brake in enumerate(brakes):
+            run = played(brake, i, plant, folder, "--stop-when", goal)
+            stated = [run["estimate"][n]["deviation"] for n in PARAMETER_NAMES]
+            z += (run["errors"] * brake / stated).tolist()
+            seconds.append(run["duration_s"])
+            if run["goal_reached"]:
+                early += 1
+                worst = np.maximum(worst, np.abs(run["errors"])[asked])
+        beyond = float((np.abs(z) > 2.0).mean())
+        told = ", ".join(f"{share:.2%}" for share in worst) if early else "-"
+        rows.append(f"{plant}: {early}, {told}")
+        rms = float(np.sqrt(np.mean(np.square(z))))
+        print(
+            f"{plant:8}{f'{early}/{count}':>8}{np.mean(seconds):8.3f}{rms:8.2f}{beyond:10.1%}{told:>26}",
+            flush=True,
+        )
     print(f"| `--stop-when {goal}`: early of {count} brakes, largest errors | –; euler: 0 | {'; '.join(rows)} |")
 
 

@@ -79,8 +79,8 @@ class Batched(VecEnv):
 def stable_baselines(training: Training, bench: Bench, seconds: float) -> float:
     """Steps per second of processor time of Stable-Baselines3's PPO."""
     ppo, actor = training.ppo, training.untrained_actor(bench)
-    centre, span = actor.centre.numpy(), actor.span.numpy()
-    env = Batched(training.environment(bench, ppo.envs), lambda seen: (seen - centre) / span)
+    (own,) = training.environments(bench, ppo.envs)
+    env = Batched(own, lambda seen: actor.features(torch.from_numpy(seen)).numpy())
     model = PPO(
         "MlpPolicy",
         env,
@@ -107,9 +107,9 @@ def stable_baselines(training: Training, bench: Bench, seconds: float) -> float:
 
 def ours(training: Training, bench: Bench, seconds: float) -> float:
     """Steps per second of processor time of our PPO."""
-    env, actor = training.environment(bench, training.ppo.envs), training.untrained_actor(bench)
+    envs, actor = training.environments(bench, training.ppo.envs), training.untrained_actor(bench)
     start = time.process_time()
-    iterations = train(env, actor, training.ppo, training.seed)
+    iterations = train(envs, actor, training.ppo, training.seed)
     steps = next(iterations).steps
     while time.process_time() - start < seconds:
         steps = next(iterations).steps
@@ -123,7 +123,7 @@ def on_grid(trained: Trained) -> dict[str, Outcome]:
     draws = grid_draws(ranges, training.parameters[0], training.seed)
 
     def played(excitation: Excitation) -> Outcome:
-        return play(bench, ranges, training.parameters, excitation, draws, training.plant, training.conditions)
+        return play(bench, ranges, training.parameters, excitation, draws, training.plants[0], training.conditions)
 
     blind = {}
     for u in (limit, -limit):

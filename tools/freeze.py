@@ -288,8 +288,6 @@ ALL = (
     "aborted",
 )
 SEVERAL = ("clean", "second", "third")
-REFERENCE = "four-d-exact-delay-quadratic"
-"""Exported for the bench with late frames."""
 MODEL = {"misfit": "exact", "disturbed": "exact", "delay": "late"}
 METHODS = {"oem": [], "pem": ["--starts", "2"], "rls": [], "windows": ["--window", "0.04"]}
 EMPS_MAP = """\
@@ -337,7 +335,7 @@ def files(checkout: Checkout, policies: bool = True) -> None:
     (checkout.folder / "emps_held.toml").write_text(EMPS_MAP.replace('"linear"', '"held"'), encoding="utf-8")
     if not policies:
         return
-    require(checkout.type("export", REFERENCE, "--bench", "late.toml", "--output", "late.onnx"))
+    require(checkout.type("export", "chirp:f1=20", "--bench", "late.toml", "--output", "late.onnx"))
     for name, later in (("nan", "nan"), ("beyond", "1e9")):
         program = (
             "import sys, pathlib, json; from tests.actors import constant_actor; "
@@ -607,9 +605,7 @@ from emb_bench.config.bench import load_bench
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train.closed_loop import Conditions
-from emb_train.reference import PolicyFile
-from emb_train.play import MEASURES
-from emb_train.play import fresh_draws, play
+from emb_train.play import MEASURES, PolicyFile, fresh_draws, play
 bench = load_bench(sys.argv[2])
 ranges, out = bench.range_set("pm50"), {}
 draws = fresh_draws(ranges, 0, int(sys.argv[1]))

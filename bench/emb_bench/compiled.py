@@ -15,6 +15,7 @@ import enum
 import hashlib
 import os
 import shutil
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -185,8 +186,14 @@ def _names(code: CodeType) -> Iterator[str]:
 def _is_ours(value: object, caller: FunctionType) -> bool:
     if not isinstance(value, FunctionType):
         return False
-    package = value.__module__.partition(".")[0]
-    return package in PACKAGES or package == caller.__module__.partition(".")[0]
+    package = _package(value)
+    return package in PACKAGES or package == _package(caller)
+
+
+def _package(fn: FunctionType) -> str:
+    """The package of a function; of one in ``__main__``, that of the module that was started."""
+    spec = sys.modules["__main__"].__spec__ if fn.__module__ == "__main__" else None
+    return (spec.name if spec is not None else fn.__module__).partition(".")[0]
 
 
 class _UnknownValueError(Exception):

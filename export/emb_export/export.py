@@ -1,4 +1,4 @@
-"""``emb-export``: a reference, currents, a training's actor, or a network of others, as one ONNX file with a contract.
+"""``emb-export``: currents, a training's actor, or a network of others, as one ONNX file with a contract.
 
 What needs torch is imported inside functions, so that ``--help`` is quick and a missing extra is one line.
 """
@@ -17,14 +17,11 @@ from emb_runtime.policy.contract import UNITS
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.input_file import near_file
 from emb_runtime.system.terminal import Parser, complain, show
-from emb_train.presets import reference_names, wrapped
+from emb_train.presets import wrapped
 
 EPILOG = """\
 sequences:
 {sequences}
-
-tuned references:
-{references}
 
 example:
   emb-export chirp:f1=20,amplitude=0.5 -o chirp.onnx
@@ -40,17 +37,16 @@ def parser() -> argparse.ArgumentParser:
     p = Parser(
         prog="emb-export",
         description="Write a policy for emb-run as one ONNX file with its contract, and check that the file computes\n"
-        "the same as its source: a reference, currents, a design, the actor of a training, or a network of your own.",
-        epilog=EPILOG.format(sequences=wrapped(list(EXCITATIONS)), references=wrapped(reference_names())),
+        "the same as its source: currents, a design, the actor of a training, or a network of your own.",
+        epilog=EPILOG.format(sequences=wrapped(list(EXCITATIONS))),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     p.add_argument(
         "source",
-        metavar="REFERENCE|EXCITATION|CSV|ONNX|DIR",
-        help="a tuned reference, one of those below or the reference.json of emb-train reference; a sequence: "
-        "step:amplitude=1.5, chirp:f1=20, ..., the .csv file of emb-design, or your own with the columns current, or "
-        "time,current; your network as .onnx: one number for angle, velocity and time, or for these and the running "
-        "estimate; or a directory that emb-train wrote",
+        metavar="EXCITATION|CSV|ONNX|DIR",
+        help="a sequence: step:amplitude=1.5, chirp:f1=20, ..., the .csv file of emb-design, or your own with the "
+        "columns current, or time,current; your network as .onnx: one number for angle, velocity and time, or for "
+        "these and the running estimate; or a directory that emb-train wrote",
     )
     p.add_argument("-o", "--output", type=Path, metavar="FILE", help="the ONNX file (default: DIR/actor.onnx)")
     p.add_argument(
@@ -86,14 +82,14 @@ def _export(arguments: argparse.Namespace) -> str:
         raise UsageError("--bench: a training's actor is for the bench that it was trained on; leave it out")
     is_graph = not is_training and source.suffix.lower() == ".onnx"
     if arguments.kind and not is_graph:
-        what = "a training knows its own" if is_training else "a sequence or a reference has its own"
+        what = "a training knows its own" if is_training else "a sequence has its own"
         raise UsageError(f"--kind {arguments.kind}: is for a network as .onnx; {what}: leave it out")
     if path is None and not is_training:
         raise UsageError(f"{source} is no folder of a training: name the file to write, as in --output actor.onnx")
     path = path or source / "actor.onnx"
     require_place("--output", path, (".onnx",))
     if is_training:
-        from emb_export.network import network_file
+        from emb_train.network import network_file
 
         data, what = network_file(source)
     else:
@@ -101,18 +97,15 @@ def _export(arguments: argparse.Namespace) -> str:
             from emb_bench.export.own_policy import onnx_policy
             from emb_bench.export.policy_file import sequence_file
             from emb_bench.export.sequence import read_sequence
-            from emb_export.file import reference_file
 
         bench = load_bench(arguments.bench)
         make_law(bench)  # where no shield can be made, emb-run would refuse the bench
-        if source.suffix == ".json" or arguments.source in reference_names():
-            data, what = reference_file(arguments.source, bench), "the reference"
-        elif is_graph:
+        if is_graph:
             data, what = onnx_policy(source, bench, arguments.kind or "current")
         elif (name := arguments.source.partition(":")[0]) not in EXCITATIONS and source.suffix.lower() != ".csv":
-            hint = near(name, (*EXCITATIONS, *reference_names())) or near_file(source)
-            named = "a reference or a sequence (emb-export --help lists them)"
-            raise UsageError(f"{source}: expected {named}, a .csv, an .onnx or a .json of emb-train{hint}")
+            hint = near(name, EXCITATIONS) or near_file(source)
+            named = "a sequence (emb-export --help lists them)"
+            raise UsageError(f"{source}: expected {named}, a .csv, an .onnx or a folder of emb-train{hint}")
         else:
             currents, what = read_sequence(arguments.source, bench)
             data = sequence_file(currents, what, bench)

@@ -79,8 +79,8 @@ class Training:
             reward: of a step, unscaled; the training's without.
         """
         config, ranges = self.config, self.bench.range_set(self.config.ranges)
-        batch = Batch(self.bench, ranges, config.parameters, len(draws), config.plant, config.conditions)
-        scoring = Scoring(batch, reward or REWARDS[config.reward])
+        batch = Batch(self.bench, ranges, config.parameters, len(draws), config.plants[0], config.conditions)
+        scoring = Scoring(batch, config.plants[0], reward or REWARDS[config.reward])
         begin_all(batch, draws)
         over = np.zeros(len(draws), np.bool_)
         series: tuple[list[Floats], ...] = ([batch.x[:, :2].copy()], [], [], [])

@@ -22,19 +22,19 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_bench.excitation import excitation
 from emb_bench.export.own_policy import observations
 from emb_bench.export.policy_file import sequence_file
+from emb_bench.export.torch_policy import torch_graph
 from emb_export import emb_export
 from emb_export.export import main
-from emb_export.file import reference_file
-from emb_export.network import network_file
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.policy.contract import CONTRACT_KEY, MAX_VECTORS, MIN_VECTORS, Contract, read_contract
+from emb_runtime.estimator.speed_loop import current_for
+from emb_runtime.policy.contract import CONTRACT_KEY, INPUTS, MAX_VECTORS, MIN_VECTORS, Contract, read_contract
 from emb_runtime.policy.policy import load_policy
 from emb_train.cli import main as train_main
+from emb_train.network import network_file
+from emb_train.play import target_speeds
 from emb_train.ppo import DeployedActor
-from emb_train.presets import reference_names
-from emb_train.reference import box_of, features, of_features, set_reference, stored
 from emb_train.training import BENCH as BENCH_FILE
 from emb_train.training import CONFIGURATION, load_training, save_actor
 from tests.actors import parsed
@@ -121,7 +121,7 @@ def test_the_contract_has_what_the_actor_was_trained_for(run: Path, exported: by
     assert ranges["f_v"] == (1e-5, 5e-5)
     assert ranges["k_m"] == (bench.brake.k_m, bench.brake.k_m)
     for name, value in json.loads((run / CONFIGURATION).read_text()).items():
-        found = contract.provenance[name]
+        found = contract.provenance.get(name)
         assert (json.loads(str(found)) if isinstance(value, dict | list) else found) == value
     best = load_training(run)
     assert contract.provenance["steps"] == best.iteration * ITERATION
@@ -137,7 +137,8 @@ def test_the_clip_is_in_the_graph_and_a_network_that_is_not_finite_is_not_export
         actor.actor.layers[-1].bias.fill_(50.0)  # type: ignore[operator]  # the last layer is Linear
     data, *_ = network_file(saved_beside(run, actor, "clip"))
     assert load_policy(data, bench).act(0.0, 0.0, 0, Estimator(bench)) == bench.limits.current
-    actor.actor.span.zero_()  # every weight is finite, and no answer is
+    for constant in actor.actor.features.buffers():
+        constant.zero_()  # every weight is finite, and no answer is
     other = saved_beside(run, actor, "infinite")
     assert "not finite" in refused(lambda: main([str(other)]), capsys, code=5)
     assert not (other / "actor.onnx").exists()
@@ -149,44 +150,51 @@ def test_nothing_of_this_machine_is_in_the_file_and_it_is_the_same_each_time(run
         assert trace.encode() not in exported
 
 
-# A reference ----------------------------------------------------------------------------------------------------------
+# A training for speeds ------------------------------------------------------------------------------------------------
 
 
-def test_a_reference_file_gives_its_levels_and_switches_for_every_estimate() -> None:
-    low, high = BENCH.range_set("pm50").low, BENCH.range_set("pm50").high
-    nominal = np.array([getattr(BENCH.brake, name) for name in PARAMETER_NAMES])
-    for name in reference_names():
-        kept = stored(name)
-        if kept.task.startswith("viscous"):
-            continue
-        data = reference_file(name, BENCH)
-        contract = contract_of(data)
-        assert (contract.kind, contract.gain, len(data) < 40_000) == ("reference", kept.gain, True)
-        assert contract.ranges == {n: (getattr(low, n), getattr(high, n)) for n in PARAMETER_NAMES}
-        relative = np.random.default_rng(1).uniform(0.3, 1.7, (50, 4))
-        found = answers(data, relative * nominal)
-        box = box_of(BENCH, BENCH.range_set("pm50"))
-        for row, numbers in zip(relative.tolist(), found, strict=True):
-            values = [of_features(terms, features(box, tuple(row))) for terms in kept.array()]
-            assert numbers == pytest.approx(np.clip(values, -1.0, 1.0), abs=1e-12)
+@pytest.fixture(scope="module")
+def speeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("speeds")
+    assert train_main(["ppo", "--output", str(folder / "run"), "--bench", str(short_bench(folder))]) == 0
+    return folder / "run"
 
 
-def test_a_parameter_that_is_known_has_no_part_in_a_reference() -> None:
-    data = reference_file("viscous-exact-quadratic", BENCH)
-    nominal = [getattr(BENCH.brake, name) for name in PARAMETER_NAMES]
-    several = np.array([nominal, [2.0 * nominal[0], *nominal[1:]], [*nominal[:3], 1.5 * nominal[3]]])
-    first, other_k_m, other_f_v = answers(data, several)
-    assert first.tolist() == other_k_m.tolist() != other_f_v.tolist()
+def test_a_training_for_speeds_gives_target_speeds_of_the_estimate_which_the_runtime_follows(speeds: Path) -> None:
+    data, said = network_file(speeds)
+    assert data == (speeds / "actor.onnx").read_bytes()
+    assert "the trained network" in said
+    trained = load_training(speeds)
+    bench, policy = trained.bench, load_policy(data, trained.bench)
+    contract = policy.contract
+    assert (contract.kind, contract.inputs) == ("speed", INPUTS[1])
+    low, high = bench.range_set("pm50").low, bench.range_set("pm50").high
+    assert contract.ranges == {n: (getattr(low, n), getattr(high, n)) for n in PARAMETER_NAMES}
+    estimator, rng = Estimator(bench), np.random.default_rng(1)
+    for step in range(HORIZON):
+        angle, velocity = float(rng.normal(0.0, 1e-3)), float(rng.normal(0.0, 1.0))
+        estimator.take(angle, velocity, float(step), 0.0)
+        with torch.no_grad():
+            action = trained.actor(torch.tensor([[angle, velocity, float(step), *estimator.parameters]]))
+            speed = bench.limits.velocity * trained.actor.part(action).item()
+        wanted = current_for(estimator.model, estimator.state, estimator.relative, speed, contract.gain)
+        assert policy.act(angle, velocity, float(step), estimator) == pytest.approx(wanted, abs=1e-2)
+    seen = np.zeros((HORIZON, 11), np.float32)
+    seen[:, 2], seen[:, 3:7] = 1e-3 * np.arange(HORIZON), [getattr(bench.brake, name) for name in PARAMETER_NAMES]
+    np.testing.assert_allclose(answers(data, seen)[:, 0], target_speeds(policy, bench), atol=1e-2)
 
 
-def test_a_file_that_computes_something_else_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    def wrong(table: Any, f: Any, reference: Any) -> None:
-        set_reference(table, f, reference)
-        reference *= 1.0 - 1e-4  # a switch of 0.3 differs by 3e-5
+def test_a_file_that_computes_something_else_is_not_written(
+    speeds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def wrong(actor: Any, width: int) -> Any:
+        with torch.no_grad():
+            actor.actor.layers[-1].bias.add_(0.1)
+        return torch_graph(actor, width)
 
-    monkeypatch.setattr("emb_export.file.set_reference", wrong)
-    with pytest.raises(PolicyRefusedError):
-        reference_file("four-d-exact-blind", BENCH)
+    monkeypatch.setattr("emb_train.network.torch_graph", wrong)
+    assert refused(lambda: main([str(speeds), "--output", str(tmp_path / "x.onnx")]), capsys, code=5)
+    assert not (tmp_path / "x.onnx").exists()
 
 
 # A sequence -----------------------------------------------------------------------------------------------------------
@@ -229,10 +237,10 @@ def test_a_design_is_exported_as_a_policy(tmp_path: Path) -> None:
 
 
 def test_each_graph_stands_alone_in_a_version_that_the_runtimes_oldest_library_reads(
-    exported: bytes, tmp_path: Path
+    exported: bytes, speeds: Path, tmp_path: Path
 ) -> None:
     assert main(["step", "--output", str(tmp_path / "step.onnx")]) == 0
-    for data in (exported, reference_file("four-d-exact-quadratic", BENCH), (tmp_path / "step.onnx").read_bytes()):
+    for data in (exported, (speeds / "actor.onnx").read_bytes(), (tmp_path / "step.onnx").read_bytes()):
         model = onnx.load_from_string(data)
         onnx.checker.check_model(model, full_check=True)
         assert [(o.domain, o.version) for o in model.opset_import] == [("", 20)]
@@ -267,12 +275,11 @@ def test_ctrl_c_is_no_traceback_and_leaves_nothing(tmp_path: Path, monkeypatch: 
 def test_a_file_is_for_the_limits_and_the_sample_time_of_the_bench_that_is_named(tmp_path: Path) -> None:
     bench, path = tmp_path / "my.toml", tmp_path / "x.onnx"
     bench.write_text(shipped_bench_text().replace("velocity = 500.0", "velocity = 400.0"))
-    for source in ("ramp:amplitude=-3", "four-d-exact-quadratic"):
-        assert main([source, "--bench", str(bench), "--output", str(path)]) == 0
-        load_policy(path, load_bench(bench))
-        for other in (BENCH, dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, sample_time=2e-3))):
-            with pytest.raises(PolicyRefusedError):
-                load_policy(path, other)
+    assert main(["ramp:amplitude=-3", "--bench", str(bench), "--output", str(path)]) == 0
+    load_policy(path, load_bench(bench))
+    for other in (BENCH, dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, sample_time=2e-3))):
+        with pytest.raises(PolicyRefusedError):
+            load_policy(path, other)
     bench.write_text(shipped_bench_text().replace('envelope      = "braking"', 'envelope      = "coasting"'))
     path.unlink()
     assert (
@@ -283,19 +290,17 @@ def test_a_file_is_for_the_limits_and_the_sample_time_of_the_bench_that_is_named
 
 def test_a_bench_is_not_named_for_a_network_which_has_its_own(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert refused(lambda: main([str(run), "--bench", str(run / BENCH_FILE)]), capsys)
-    assert not (run / "actor.onnx").exists()
 
 
-def test_a_reference_and_a_sequence_are_exported_without_torch(tmp_path: Path) -> None:
-    for source in ("step", "four-d-exact-quadratic"):
-        code = (
-            "import sys\n"
-            "class NoTorch:\n"
-            "    def find_spec(self, name, *_):\n"
-            "        if name.partition('.')[0] == 'torch':\n"
-            "            raise ModuleNotFoundError(name=name)\n"
-            "sys.meta_path.insert(0, NoTorch())\n"
-            "from emb_export.export import main\n"
-            f"sys.exit(main([{source!r}, '--output', {str(tmp_path / 'x.onnx')!r}]))"
-        )
-        assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0
+def test_a_sequence_is_exported_without_torch(tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        "class NoTorch:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name.partition('.')[0] == 'torch':\n"
+        "            raise ModuleNotFoundError(name=name)\n"
+        "sys.meta_path.insert(0, NoTorch())\n"
+        "from emb_export.export import main\n"
+        f"sys.exit(main(['step', '--output', {str(tmp_path / 'x.onnx')!r}]))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0

@@ -18,9 +18,7 @@ from emb_bench.sim.simulated_brake import read_brake
 from emb_bench.sim.transport import open_sim
 from emb_runtime.cli import options
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
-from emb_train import cli as train
 from emb_train.closed_loop import Batch
-from emb_train.trial import TASKS
 
 from tests.bench.simulated_logs import write_log  # isort: skip
 from tests.conftest import Simulate  # isort: skip
@@ -30,10 +28,8 @@ def test_whatever_is_told_no_plant_takes_the_same(bench: Bench) -> None:
     defaults = [
         open_sim("", bench)[0].truth["plant"],
         read_brake(node.parser().parse_args(["--iface", "vcan0"]).brake, bench, "").plant.name,
-        train.parser().parse_args(["reference", "four-d", "--output", "a"]).plant,
         *(inspect.signature(call).parameters["plant"].default for call in (api.simulate, Batch)),
         *(inspect.signature(call).parameters["model"].default for call in (api.design, make_problem)),
-        *(task.plant for task in TASKS.values()),
     ]
     assert set(defaults) == {DEFAULT_PLANT}
     assert bench.plant(DEFAULT_PLANT).mechanics.solver == EXACT

@@ -27,9 +27,8 @@ ROOMS = {
     "runtime/emb_runtime": "errors records numbers system config can estimator policy log safety drives control cli",
     "bench/emb_bench": "config documents numbers compiled output figures parallel brake sim logs experiment "
     "information excitation recordings hil rerun estimate design export analysis report commission live batch api cli",
-    "train/emb_train": "presets rewards closed_loop env intervals play reference trial evolve plan ppo training "
-    "optimum evaluate cli",
-    "export/emb_export": "file network export",
+    "train/emb_train": "presets rewards closed_loop intervals env play ppo plan training network optimum evaluate cli",
+    "export/emb_export": "export",
 }
 """Sub-packages and single modules of each package, lowest first: each imports from those before it only."""
 

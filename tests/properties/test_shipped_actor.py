@@ -1,4 +1,4 @@
-"""The shipped policies: each is its reference, runs on benches of one's own, and what is said of it holds."""
+"""The shipped policies: they run on benches of one's own, and what is said of them holds."""
 
 from __future__ import annotations
 
@@ -9,15 +9,11 @@ import pytest
 
 from emb_bench.commission.bench_file import MEASURED, found_text
 from emb_bench.config.bench import Bench, parse_bench
-from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.logs.log import read_log
-from emb_export.file import reference_file
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train.closed_loop import Conditions
-from emb_train.play import MEASURES, Played, fresh_draws, play
-from emb_train.reference import Following, PolicyFile, stored
-from tools.shipped_actors import REFERENCES
+from emb_train.play import MEASURES, Played, PolicyFile, fresh_draws, play
 
 from tests.bench.commission.test_steps import LOGS, found, sheet_text  # isort: skip
 from tests.runtime.operating import EmbRun  # isort: skip
@@ -26,18 +22,9 @@ PHYSICAL = Conditions(information="physical")
 
 
 @pytest.mark.parametrize("quick", [False, True])
-def test_a_shipped_file_is_its_reference(bench: Bench, quick: bool) -> None:
-    kept, policy = stored(REFERENCES[quick]), load_policy(shipped_actor_path(quick), bench)
-    assert policy.data == reference_file(REFERENCES[quick], bench)
-    assert (policy.warnings, policy.contract.provenance["plant"]) == ([], DEFAULT_PLANT)
-    assert len(policy.data) < 10_000
-    ranges = bench.range_set("pm50")
-    draws = fresh_draws(ranges, 4, 3)
-    followed, file = (
-        play(bench, ranges, PARAMETER_NAMES, e, draws, kept.plant, PHYSICAL)
-        for e in (Following(kept, bench, ranges), PolicyFile(policy, bench))
-    )
-    np.testing.assert_allclose(file.matrices, followed.matrices, rtol=1e-6)
+def test_a_shipped_file_fits_the_shipped_bench(bench: Bench, quick: bool) -> None:
+    policy = load_policy(shipped_actor_path(quick), bench)
+    assert (policy.warnings, len(policy.data) < 200_000) == ([], True)
 
 
 def test_on_brakes_that_it_never_saw_it_returns_within_limits_and_tells_more_than_constant_current(
@@ -66,28 +53,22 @@ OTHER_BENCHES = {
 }
 
 
-def test_it_runs_on_a_bench_of_ones_own_as_one_made_for_that_bench_does() -> None:
+def test_it_runs_on_a_bench_of_ones_own_and_tells_as_much(bench: Bench) -> None:
+    ranges, draws = bench.range_set("pm50"), fresh_draws(bench.range_set("pm50"), 5, 4)
+    shipped = PolicyFile(load_policy(shipped_actor_path(), bench), bench)
+    own = MEASURES["D"].values(play(bench, ranges, PARAMETER_NAMES, shipped, draws, conditions=PHYSICAL).matrices)
     for what, changes in OTHER_BENCHES.items():
         text = shipped_bench_text()
         for old, new in changes.items():
             assert old in text, what
             text = text.replace(old, new)
-        bench = parse_bench(text, what)
-        ranges = bench.range_set("pm50")
-        made = load_policy(reference_file(REFERENCES[False], bench), bench)
-        values = []
-        for policy in (load_policy(shipped_actor_path(), bench), made):
-            played = play(
-                bench,
-                ranges,
-                PARAMETER_NAMES,
-                PolicyFile(policy, bench),
-                fresh_draws(ranges, 5, 4),
-                conditions=PHYSICAL,
-            )
-            assert (int(played.left.sum()), int(played.home.sum())) == (0, 4), what
-            values.append(MEASURES["D"].values(played.matrices))
-        assert np.abs(values[0] - values[1]).max() < 0.005, what
+        mine = parse_bench(text, what)
+        ranges = mine.range_set("pm50")
+        policy = PolicyFile(load_policy(shipped_actor_path(), mine), mine)
+        played = play(mine, ranges, PARAMETER_NAMES, policy, fresh_draws(ranges, 5, 4), conditions=PHYSICAL)
+        assert (int(played.left.sum()), int(played.home.sum())) == (0, 4), what
+        lost = own - MEASURES["D"].values(played.matrices)
+        assert lost.max() < 3.0, what  # of four parameters 8 ln 1.3 = 2.1 are the noise's
 
 
 def test_it_runs_with_the_bench_file_that_a_commissioning_writes(tmp_path: Path) -> None:

@@ -50,9 +50,8 @@ COMMANDS = {
     "emb-replay live": "runs --port 0",
     "emb-design": "--starts 1",
     "emb-commission": "new",
-    "emb-train evaluate": "four-d-exact-blind --draws 4",
+    "emb-train evaluate": "actor --draws 4",
     "emb-train ppo": "single-viscous --output new",
-    "emb-train reference": "four-d --output new",
     "emb-export": "step --output new.onnx",
     "emb-hil": "--uml -- sleep 2",
 }

@@ -24,20 +24,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from emb_bench.brake.motion import SENSITIVE, STATES
+from emb_bench.brake.motion import STATES
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Instruments, Mechanics
 from emb_bench.sim.instruments import MEMORY as INSTRUMENTS_MEMORY
-from emb_bench.sim.instruments import command, settle
+from emb_bench.sim.instruments import settle
 from emb_bench.sim.node import REST_TIME, REST_TRAVEL
-from emb_bench.sim.simulated_brake import pass_period, sent_current
+from emb_bench.sim.simulated_brake import sent_current
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import BrakeParameters, Sensors
 from emb_runtime.control.loop import STOP_LISTEN_NS
 from emb_runtime.control.start_conditions import Bounds
-from emb_runtime.estimator.kalman import Model, fits, follow, make_model, start
-from emb_runtime.estimator.speed_loop import Scale
+from emb_runtime.estimator.kalman import Model, believed, fits, follow, make_model, start
+from emb_runtime.estimator.speed_loop import current_for
+from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.motion_balance import MEMORY as BALANCE_MEMORY
 from emb_runtime.safety.motion_balance import (
@@ -56,14 +57,14 @@ from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
-from emb_train.reference import Box, box_of, stored, wanted_current
+from emb_train.closed_loop import BENCH_CONDITIONS
+from emb_train.play import target_speeds
 from tests.benches import SENSOR_BENCH
-from tests.searches.sensor_monitor import COMMAND_LOST, COVERED, SAMPLE_LOST, Script, covered, draw, tail
+from tests.searches.sensor_monitor import COMMAND_LOST, COVERED, SAMPLE_LOST, Script, covered, draw, moved, passed, tail
 
 Floats = NDArray[np.float64]
 
 CHUNK = 1000
-ACTORS = ("four-d-exact-quadratic", "four-time-exact-quadratic")
 LENGTHS = (500, 500, 250, 100)
 PLANTS = (*(name for name in COVERED if name != "observer"), "play")
 DECLARED = {
@@ -96,9 +97,7 @@ def fly(
     mechanics: Mechanics,
     instruments: Instruments,
     model: Model,
-    scale: Scale,
-    box: Box,
-    table: Floats,
+    speeds: Floats,
     scripted: bool,
     script: Script,
     stop: Stop,
@@ -107,8 +106,7 @@ def fly(
     """Play each experiment of a script to its end, whatever the monitor or the balance says, and to its rest."""
     ts = law.sample_time
     memory, sums, instrument = np.zeros(MEMORY), np.zeros(BALANCE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
-    x, reference = np.zeros(STATES), np.zeros(table.shape[0])
-    no_unknowns, no_sensitivity = np.zeros(0, np.int64), np.zeros((0, SENSITIVE))
+    x = np.zeros(STATES)
     for m in range(out.shape[0]):
         b = script.brakes[m]
         p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
@@ -124,7 +122,7 @@ def fly(
             if scripted:
                 wanted = script.wanted[m, k]
             elif periods == 0:
-                wanted = wanted_current(model, state, scale, box, table, reference)
+                wanted = current_for(model, state, believed(model, state), speeds[k], BENCH_CONDITIONS.gain)
             limit = largest_current(law, limits, memory, law.current)
             u, _ = sent_current(law, True, angle, velocity, wanted, past, k, limit)
             if periods > 0 or script.losses[m, k] == COMMAND_LOST:
@@ -132,22 +130,8 @@ def fly(
             if periods == 0:
                 obeyed, sent = not math.isnan(u), 0.0 if math.isnan(u) else u
             periods += 1
-            asked = command(instruments, instrument, u)
-            felt = damped_current(x[1], law.current, law.damping_velocity) if math.isnan(asked) else asked
-            past = (0.0 if math.isnan(u) else u, past[0], past[1], past[2], past[3])
             e = script.errors[m, k + 1]
-            angle, velocity = pass_period(
-                mechanics,
-                instruments,
-                p,
-                ts,
-                felt,
-                (e[0], e[1], e[2]),
-                x,
-                no_unknowns,
-                no_sensitivity,
-                instrument,
-            )
+            angle, velocity, felt, past = passed(law, mechanics, instruments, p, u, past, e, x, instrument)
             if script.losses[m, k] == SAMPLE_LOST and k < law.steps - 1:
                 continue
             out[m, SPEED] = max(out[m, SPEED], abs(velocity))
@@ -183,18 +167,7 @@ def halt(
         u = damped_current(x[1], law.current, law.damping_velocity)
         u = round(u / stop.current_step) * stop.current_step if idle < 0 else 0.0
         e = script.errors[m, n - k % n]
-        _, velocity = pass_period(
-            mechanics,
-            instruments,
-            p,
-            law.sample_time,
-            u,
-            (e[0], e[1], e[2]),
-            x,
-            np.zeros(0, np.int64),
-            np.zeros((0, SENSITIVE)),
-            instrument,
-        )
+        _, velocity = moved(mechanics, instruments, p, law.sample_time, u, e, x, instrument)
         if script.losses[m, n - 1 - k % n] != SAMPLE_LOST:
             row[FIRST_VELOCITY + newest % REST_SAMPLES] = velocity
             newest += 1
@@ -223,7 +196,8 @@ def results(bench: Bench, name: str, count: int, rng: np.random.Generator) -> Fl
         case = replace(bench, sensors=Sensors("observer", least))
         chosen = replace(chosen, instruments=chosen.instruments._replace(observer_bandwidth=true))
     law, prior = make_law(case), bench.range_set(bench.prior)
-    model, box = make_model(case, prior, sticks=True), box_of(bench, prior)
+    model = make_model(case, prior, sticks=True)
+    actors = [target_speeds(load_policy(shipped_actor_path(quick), bench), bench) for quick in (False, True)]
     stop = Stop(
         late=math.ceil(case.node.watchdog / law.sample_time - 1e-9),
         current_step=load_layout().command.signal("Current").factor,
@@ -235,7 +209,7 @@ def results(bench: Bench, name: str, count: int, rng: np.random.Generator) -> Fl
     for turn in range(0, count, CHUNK):
         script = draw(rng, case, min(CHUNK, count - turn), plant)
         script.errors[:, :, 2] = chosen.instruments.clock_jitter * rng.standard_normal(script.errors.shape[:2])
-        actor = stored(ACTORS[int(rng.integers(len(ACTORS)))])
+        speeds = actors[int(rng.integers(len(actors)))]
         out = np.zeros((len(script.brakes), COLUMNS))
         arguments: tuple[Any, ...] = (
             law._replace(steps=int(rng.choice(LENGTHS))),
@@ -244,9 +218,7 @@ def results(bench: Bench, name: str, count: int, rng: np.random.Generator) -> Fl
             chosen.mechanics,
             chosen.instruments,
             model,
-            actor.scale(bench),
-            box,
-            actor.array(),
+            speeds,
             bool(rng.integers(2)),
             script,
             stop,

@@ -32,17 +32,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from emb_bench.brake.motion import SENSITIVE, STATES
+from emb_bench.brake.motion import STATES
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Instruments, Mechanics
 from emb_bench.sim.instruments import MEMORY as INSTRUMENTS_MEMORY
-from emb_bench.sim.instruments import command, settle
-from emb_bench.sim.simulated_brake import pass_period, sent_current
+from emb_bench.sim.instruments import settle
+from emb_bench.sim.simulated_brake import sent_current
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Sensors
-from emb_runtime.estimator.kalman import Model, follow, make_model, start
-from emb_runtime.estimator.speed_loop import Scale
+from emb_runtime.estimator.kalman import Model, believed, follow, make_model, start
+from emb_runtime.estimator.speed_loop import current_for
+from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.safety.response import (
     CONTRADICTED,
     OPEN,
@@ -57,16 +58,16 @@ from emb_runtime.safety.response import MEMORY as RESPONSE_MEMORY
 from emb_runtime.safety.sensor_monitor import HONEST, MEMORY, OBEYS, judge, largest_current
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
-from emb_runtime.safety.shield import NO_PAST, Past, damped_current
+from emb_runtime.safety.shield import NO_PAST, Past
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
-from emb_train.reference import Box, box_of, stored, wanted_current
+from emb_train.closed_loop import BENCH_CONDITIONS
+from emb_train.play import target_speeds
 from tests.benches import SENSOR_BENCH
-from tests.searches.sensor_monitor import COMMAND_LOST, COVERED, MOVING, SAMPLE_LOST, Script, covered, draw
+from tests.searches.sensor_monitor import COMMAND_LOST, COVERED, MOVING, SAMPLE_LOST, Script, covered, draw, passed
 
 Floats = NDArray[np.float64]
 
 CHUNK: Final = 1000
-ACTOR: Final = "four-d-exact-quadratic"  # The shipped one
 STOP: Final = 100  # Periods that are followed after a run has ended
 LOWEST, HIGHEST, FASTEST, VERDICT, DISHONEST, PROVEN_AT, CHANGED = range(7)
 COLUMNS: Final = CHANGED + 1
@@ -100,9 +101,7 @@ def fly(
     mechanics: Mechanics,
     instruments: Instruments,
     model: Model,
-    scale: Scale,
-    box: Box,
-    table: Floats,
+    speeds: Floats,
     scripted: bool,
     script: Script,
     out: Floats,
@@ -110,8 +109,7 @@ def fly(
     """Play each experiment of a script to its end, or to the first verdict against it and then to rest."""
     ts = law.sample_time
     memory, proof, instrument = np.zeros(MEMORY), np.zeros(RESPONSE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
-    x, reference = np.zeros(STATES), np.zeros(table.shape[0])
-    no_unknowns, no_sensitivity = np.zeros(0, np.int64), np.zeros((0, SENSITIVE))
+    x = np.zeros(STATES)
     for m in range(out.shape[0]):
         b, row = script.brakes[m], out[m]
         p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
@@ -127,7 +125,7 @@ def fly(
             if scripted:
                 wanted = script.wanted[m, k]
             elif periods == 0 and rest < 0:
-                wanted = wanted_current(model, state, scale, box, table, reference)
+                wanted = current_for(model, state, believed(model, state), speeds[k], BENCH_CONDITIONS.gain)
             limit = largest_current(law, limits, memory, law.current)
             u, full = sent(
                 law, slow, verdict != PROVEN and memory[OBEYS] != 0.0, angle, velocity, wanted, past, k, limit
@@ -138,15 +136,8 @@ def fly(
             if periods == 0:
                 obeyed, given = not math.isnan(u), 0.0 if math.isnan(u) else u
             periods += 1
-            own = damped_current(x[1], law.current, law.damping_velocity)
-            asked = command(instruments, instrument, u)
-            felt = own if math.isnan(asked) else asked
-            past = (0.0 if math.isnan(u) else u, past[0], past[1], past[2], past[3])
             e = script.errors[m, k + 1]
-            errors = (e[0], e[1], e[2])
-            angle, velocity = pass_period(
-                mechanics, instruments, p, ts, felt, errors, x, no_unknowns, no_sensitivity, instrument
-            )
+            angle, velocity, felt, past = passed(law, mechanics, instruments, p, u, past, e, x, instrument)
             row[LOWEST], row[HIGHEST] = min(row[LOWEST], x[0]), max(row[HIGHEST], x[0])
             row[FASTEST] = max(row[FASTEST], abs(x[1]))
             if rest >= 0:
@@ -202,11 +193,9 @@ def sent(
     return sent_current(slow, True, angle, velocity, wanted, past, k, limit)[0], full
 
 
-def results(
-    bench: Bench, mechanics: Mechanics, instruments: Instruments, scripted: bool, script: Script, actor: str = ACTOR
-) -> Floats:
+def results(bench: Bench, mechanics: Mechanics, instruments: Instruments, scripted: bool, script: Script) -> Floats:
     """Play a script; a row of results per experiment."""
-    law, prior, of_actor = make_law(bench), bench.range_set(bench.prior), stored(actor)
+    law, prior = make_law(bench), bench.range_set(bench.prior)
     out = np.zeros((len(script.brakes), COLUMNS))
     arguments: tuple[Any, ...] = (
         law,
@@ -216,9 +205,7 @@ def results(
         mechanics,
         instruments,
         make_model(bench, prior, sticks=True),
-        of_actor.scale(bench),
-        box_of(bench, prior),
-        of_actor.array(),
+        target_speeds(load_policy(shipped_actor_path(), bench), bench),
         scripted,
         script,
         out,

@@ -46,7 +46,7 @@ from emb_runtime.safety.sensor_monitor import (
     unseen_speed,
 )
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
-from emb_runtime.safety.shield import NO_PAST, damped_current
+from emb_runtime.safety.shield import NO_PAST, Past, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from tests.properties.shield_search import (
     bang_bang,
@@ -149,6 +149,28 @@ def moved(
     """Measured angle [rad] and velocity [rad/s] at the end of a sample period, see :func:`pass_period`."""
     none, e = np.zeros(0, np.int64), (errors[0], errors[1], errors[2])
     return pass_period(mechanics, instruments, p, ts, current, e, x, none, np.zeros((0, SENSITIVE)), instrument)
+
+
+def passed(
+    law: ShieldLaw,
+    mechanics: Mechanics,
+    instruments: Instruments,
+    p: BrakeParameters,
+    u: float,
+    past: Past,
+    errors: Floats,
+    x: Floats,
+    instrument: Floats,
+) -> tuple[float, float, float, Past]:
+    """A period in which the node is sent ``u`` [A], NaN for nothing.
+
+    Returns:
+        Measured angle [rad] and velocity [rad/s] at its end, the current that acted [A], and the commands sent so far.
+    """
+    asked = command(instruments, instrument, u)
+    felt = damped_current(x[1], law.current, law.damping_velocity) if math.isnan(asked) else asked
+    angle, velocity = moved(mechanics, instruments, p, law.sample_time, felt, errors, x, instrument)
+    return angle, velocity, felt, (0.0 if math.isnan(u) else u, past[0], past[1], past[2], past[3])
 
 
 def fly(

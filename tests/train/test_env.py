@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,13 +16,18 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import Instruments, Plant
+from emb_bench.estimate.expected import IntervalCriterion, of_experiment, sampled
+from emb_bench.information.evaluation import Question
 from emb_bench.information.fisher import fisher
 from emb_bench.information.symmetric import unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
+from emb_runtime.estimator.estimator import Estimator
+from emb_runtime.estimator.speed_loop import current_for
 from emb_train.closed_loop import Batch, Conditions, Experiments, advance
-from emb_train.env import ENV_ID, EmbExcitationEnv, EmbExcitationVectorEnv
+from emb_train.env import ENV_ID, EmbExcitationEnv, EmbExcitationVectorEnv, ExpectedInterval, TimeToPrecision
 from emb_train.presets import preset_summaries
 from emb_train.rewards import Transition, penalised_increment
 from emb_train.training import load_preset
@@ -55,10 +61,11 @@ MANY = dataclasses.replace(SHORT, plants={**SHORT.plants, **PLANTS})
 
 OPEN = Conditions(shielded=False, horizon=30, observes="everything", information="physical")
 VARYING = Conditions(command_delay=(0, 2))
+FOLLOWED = Conditions(acts="speed", observes="estimate", information="physical")
 
 
 def test_gymnasium_finds_nothing_wrong_with_the_registered_environment() -> None:
-    for conditions in (Conditions(), OPEN, Conditions(shielded=False)):
+    for conditions in (Conditions(), OPEN, Conditions(shielded=False), FOLLOWED):
         check_env(gymnasium.make(ENV_ID, conditions=conditions).unwrapped, skip_render_check=True)
     env = gymnasium.make_vec(ENV_ID, num_envs=3)
     assert isinstance(env.unwrapped, EmbExcitationVectorEnv)
@@ -85,7 +92,7 @@ def compare_infos(vector: dict[str, Any], row: int, scalar: dict[str, Any]) -> N
         np.testing.assert_array_equal(vector[name][row], value, err_msg=name)
 
 
-@given(seed=st.integers(0, 2**40), conditions=st.sampled_from([Conditions(), OPEN, VARYING]))
+@given(seed=st.integers(0, 2**40), conditions=st.sampled_from([Conditions(), OPEN, VARYING, FOLLOWED]))
 @settings(max_examples=5, deadline=None)
 def test_the_vector_environment_is_the_scalar_one_step_for_step_and_reset_for_reset(
     seed: int, conditions: Conditions
@@ -271,7 +278,120 @@ def test_an_actor_that_is_told_everything_sees_what_the_critic_sees_without_the_
 
 def test_the_environment_of_every_preset_can_be_made() -> None:
     for preset in map(load_preset, preset_summaries()):
-        env = preset.environment(BENCH, 2)
+        (env, *_) = preset.environments(BENCH, 2)
         seen, _ = env.reset(seed=0)
         assert seen.shape == (2, preset.conditions.observation_size(len(preset.parameters)))
         assert np.isfinite(env.step(np.ones((2, 1), np.float32))[1]).all()
+
+
+# Speeds and estimates
+
+
+def held(seed: int, steps: int, rows: int) -> Any:
+    """Random speeds that hold for a while, as parts of the limit, shape [steps, rows, 1]."""
+    levels = np.random.default_rng(seed).uniform(-0.1, 0.4, (steps // 15 + 1, rows, 1))
+    return np.repeat(levels, 15, axis=0)[:steps].astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "bench", [SHORT, dataclasses.replace(load_bench(), timing=SHORT.timing)], ids=["sensor", "observer"]
+)
+def test_a_speed_becomes_the_current_of_the_runtimes_loop_and_the_estimate_is_that_of_the_runtime(bench: Bench) -> None:
+    env = EmbExcitationVectorEnv(3, bench, "pm50", PARAMETER_NAMES, trace_increment, conditions=FOLLOWED)
+    seen, _ = env.reset(seed=4)
+    batch, estimators, asked = env.batch, [Estimator(bench) for _ in range(3)], 0
+    for action in held(1, 60, 3):
+        before = batch.k.copy()
+        for i, estimator in enumerate(estimators):
+            angle, velocity = batch.y[i].tolist()
+            estimator.take(angle, velocity, float(before[i]), float(batch.experiments.applied[i]))
+            np.testing.assert_array_equal(
+                seen[i], np.array([*batch.y[i], before[i], *estimator.parameters], np.float32)
+            )
+        assert env.observation_space.contains(seen)
+        seen, _, _, _, info = env.advance(action)
+        for i, estimator in enumerate(estimators):
+            speed = bench.limits.velocity * float(action[i, 0])
+            wanted = current_for(estimator.model, estimator.state, estimator.relative, speed, 1.0)
+            if info["reasons"][i] == 0:
+                assert info["current"][i] == wanted
+                asked += 1
+    assert asked > 20
+
+
+@pytest.mark.parametrize("plant", ["exact", "stribeck"])
+def test_the_reward_of_a_whole_experiment_is_the_criterion_of_the_interval_that_its_currents_lead_to(
+    plant: str,
+) -> None:
+    reward = ExpectedInterval(IntervalCriterion("T"))
+    env = EmbExcitationVectorEnv(2, SHORT, "pm50", PARAMETER_NAMES, reward, 0.5, plant, FOLLOWED)
+    for _ in range(2):  # the second time from arrays that are not new
+        env.reset(seed=4)
+        acted, paid = [], []
+        for action in held(2, 60, 2):
+            _, rewards, _, _, _ = env.advance(action)
+            acted.append(env.batch.experiments.applied.copy())
+            paid.append(rewards)
+        assert not np.any(paid[:-1])
+        assert env.batch.home.all()
+        for currents, brake, found in zip(np.transpose(acted), env.batch.brakes.tolist(), paid[-1], strict=True):
+            known = BrakeParameters(*brake)
+            information = of_experiment(
+                SHORT,
+                SHORT.model(plant),
+                known,
+                sampled(SHORT, SHORT.model(plant), currents),
+                Question(PARAMETER_NAMES),
+            )
+            assert found == pytest.approx(0.5 * information.of_comparison, rel=1e-9)
+    batch, rows, lowest = env.batch, np.array([True, True]), np.array([-2.0, -5.5])
+    arguments = (batch, plant, rows, np.transpose(acted))
+    free, far = reward(*arguments, np.zeros(2)), reward(*arguments, lowest)
+    np.testing.assert_allclose(free - far, [0.0, 2.5], atol=1e-12)
+    batch.x[1, 0] = 20.0  # not at home
+    np.testing.assert_allclose(free - reward(*arguments, np.zeros(2)), [0.0, 20.0], atol=1e-12)
+    assert reward(batch, plant, np.array([False, True]), np.transpose(acted), lowest).shape == (1,)
+
+
+def test_the_reward_of_a_time_counts_periods_until_every_estimate_is_precise() -> None:
+    reward = TimeToPrecision(0.25)
+    env = EmbExcitationVectorEnv(3, SHORT, "pm50", PARAMETER_NAMES, reward, 1.0, conditions=FOLLOWED)
+    env.reset(seed=4)
+    total, missing = np.zeros(3), []
+    for action in held(3, 60, 3):
+        _, rewards, _, _, _ = env.advance(action)
+        told = env.batch.estimate()
+        missing.append((told[:, 4:] / told[:, :4]).max(axis=1) / 0.25)
+        total -= rewards
+    assert (np.min(missing, axis=0) < 1.0).any()
+    for periods, ratios in zip(total, np.transpose(missing), strict=True):
+        known = int(np.argmax(ratios <= 1.0)) if (ratios <= 1.0).any() else 60
+        assert known <= periods + 1e-9 <= known + 1.0 + 1e-9
+        if 0 < known < 60:
+            before, after = math.log(np.min(ratios[:known])), math.log(ratios[known])
+            assert periods == pytest.approx(known + before / (before - after))
+
+
+def test_systematic_errors_are_drawn_from_the_benchs_priors_and_show_where_they_belong() -> None:
+    wrong = Conditions(shielded=False, systematic=True)
+    many = Batch(SHORT, SHORT.range_set("pm50"), PARAMETER_NAMES, 600, conditions=wrong)
+    for i in range(600):
+        many.begin(i, np.random.default_rng(i))
+    priors = SHORT.systematic
+    expected = [priors.offset, priors.current_offset]
+    np.testing.assert_allclose(many.experiments.errors.std(axis=0), expected, rtol=0.1)
+    assert many.y[:, 0].std() == pytest.approx(math.hypot(priors.offset, SHORT.noise.angle), rel=0.1)
+    offset, current = 0.3, 0.5
+    clean, marred = (
+        Batch(SHORT, SHORT.range_set("pm50"), PARAMETER_NAMES, 1, conditions=Conditions(shielded=False))
+        for _ in range(2)
+    )
+    for batch in (clean, marred):
+        batch.begin(0, np.random.default_rng(7))
+    marred.experiments.errors[0] = offset, current
+    for wanted in (3.0, 3.0, -1.0, 2.0):
+        clean.advance(np.array([wanted + current]))
+        marred.advance(np.array([wanted]))
+        np.testing.assert_allclose(marred.x, clean.x, rtol=1e-12)
+        np.testing.assert_allclose(marred.y, clean.y + np.array([offset, 0.0]), rtol=1e-9)
+        assert marred.experiments.applied[0] == wanted

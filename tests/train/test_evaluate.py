@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +21,18 @@ from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import fisher
 from emb_bench.parallel import processes
 from emb_runtime.config.bench import PARAMETER_NAMES, shipped_bench_text
-from emb_runtime.errors import PolicyRefusedError
+from emb_runtime.errors import PolicyRefusedError, UsageError
+from emb_runtime.policy.policy import load_policy
 from emb_train import optimum
 from emb_train.cli import main
 from emb_train.closed_loop import Batch, Conditions
 from emb_train.evaluate import Settings, Subject, document, evaluate, open_subject, references, text
 from emb_train.optimum import followed, optima, searchable
-from emb_train.play import MEASURES, Draw, Law, Played, fresh_draws, mean_score, play
+from emb_train.play import MEASURES, Draw, Law, Played, PolicyFile, fresh_draws, mean_score, play
+from emb_train.training import ONNX, PLAN, begin_training, save_actor
 from tests.benches import SENSOR_BENCH
 from tests.commands import refused
-from tests.train.trainings import HORIZON
+from tests.train.trainings import HORIZON, tiny
 
 BENCH = load_bench()
 SHORT = parse_bench(shipped_bench_text().replace("horizon     = 500", f"horizon     = {HORIZON}"), "short")
@@ -94,6 +97,26 @@ def test_policies_that_cannot_be_played_are_refused(tmp_path: Path) -> None:
     path.touch()
     with pytest.raises(PolicyRefusedError, match=str(path)):
         open_subject(str(path), None)
+
+
+def test_a_plan_beside_its_training_has_the_bench_the_ranges_and_the_shield_of_that(
+    finished_speeds: Path, tmp_path: Path
+) -> None:
+    trained, own = open_subject(str(finished_speeds), None), open_subject(str(finished_speeds / PLAN), None)
+    assert (own.bench, own.ranges, own.shield) == (trained.bench, trained.ranges, trained.shield)
+    with pytest.raises(UsageError, match="--bench"):
+        open_subject(str(finished_speeds / PLAN), finished_speeds / "bench.toml")
+    alone = shutil.copy(finished_speeds / PLAN, tmp_path)
+    assert open_subject(str(alone), finished_speeds / "bench.toml").ranges == ""
+
+
+def test_a_training_for_speeds_without_its_policy_file_is_refused_with_the_command_that_makes_it(
+    finished_speeds: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(finished_speeds, tmp_path / "run")
+    (folder / ONNX).unlink()
+    with pytest.raises(UsageError, match=f"emb-export {folder} -o {folder / ONNX}"):
+        open_subject(str(folder), None)
 
 
 def test_the_measures_are_those_of_a_matrix_worked_out_by_hand_and_their_shares_nats_or_ratios() -> None:
@@ -252,15 +275,32 @@ def test_the_share_of_the_optimum_is_over_the_draws_that_have_one(searched: list
 
 
 def test_a_policy_is_evaluated_behind_the_shield_that_it_was_made_behind(
-    capsys: pytest.CaptureFixture[str],
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ("viscous-exact-quadratic", "--criterion", "weighted", "--json")
-    assert run(*arguments) == 0
+    bench, folder = load_bench(finished / "bench.toml"), tmp_path / "narrow"
+    training = tiny(conditions={"shield_ranges": "viscous"})
+    begin_training(folder, training, bench)
+    save_actor(folder, training.untrained_actor(bench), 1, 0.0)
+    assert run(folder, "--criterion", "weighted", "--json") == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["ranges"], said["conditions"]["shield_ranges"]) == ("viscous", "viscous")
     assert {row["left"] for row in said["plants"]["euler"]["rows"]} == {0}
-    assert run("actor", "four-d-exact-blind") == 0  # both behind the bench's own
-    assert run("actor", "viscous-exact-quadratic", "--ranges", "viscous") == 2
+    assert "different shields" in refused(lambda: run(finished, folder), capsys)
+
+
+def test_a_training_for_speeds_is_evaluated_as_the_runtime_plays_its_policy(
+    finished_speeds: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(finished_speeds, "--criterion", "D", "--json") == 0
+    said = json.loads(capsys.readouterr().out)
+    row = said["plants"]["euler"]["rows"][0]
+    bench = load_bench(finished_speeds / "bench.toml")
+    policy = PolicyFile(load_policy(finished_speeds / "actor.onnx", bench), bench)
+    draws = fresh_draws(bench.range_set("pm50"), 0, 4)
+    conditions = Conditions(information="physical", shield_ranges=said["conditions"]["shield_ranges"])
+    outcome = play(bench, bench.range_set("pm50"), PARAMETER_NAMES, policy, draws, "euler", conditions)
+    assert row["values"] == MEASURES["D"].values(outcome.matrices).tolist()
+    assert said["ranges"] == "pm50"
 
 
 def test_delays_change_each_experiment_and_are_told(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from contextlib import nullcontext
-from pathlib import Path
+import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -12,91 +11,134 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from emb_bench.config.bench import load_bench
+from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.estimator.speed_loop import scale_of
-from emb_train import plan
-from emb_train.cli import main
-from emb_train.evolve import Progress
-from emb_train.plan import PRICE, Compared, numbers_of, search, table_of
-from emb_train.play import MEASURES
-from emb_train.reference import TERMS, stored
-from emb_train.trial import TASKS, Task
+from emb_train.closed_loop import Conditions
+from emb_train.env import EmbExcitationEnv, EmbExcitationVectorEnv, ExpectedInterval
+from emb_train.plan import LEVELS, SPREAD, Compared, Found, play, search, speeds_of
+from tests.benches import SENSOR_BENCH
 
-BENCH = load_bench()
-FOUR, SCALE = TASKS["four-t"], scale_of(BENCH)
-
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few plans on few brakes, in this process."""
-    sizes = {"DRAWN": 6, "SCREENINGS": 2, "SCREENED": 1, "KEPT": 3, "BRAKES": 2, "JUDGED": 2, "POPULATION": 4}
-    for name, value in sizes.items():
-        monkeypatch.setattr(plan, name, value)
-    monkeypatch.setattr(plan, "processes", lambda jobs: nullcontext())
+BENCH = SENSOR_BENCH
+SHORT = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=60))
+FOLLOWED = Conditions(acts="speed", observes="estimate", information="physical")
+FINE = 2000  # Parts of a period
+NUMBERS = arrays(np.float64, 2 * LEVELS, elements=st.floats(-1.05, 1.05))
 
 
-@given(arrays(np.float64, 10, elements=st.floats(-1.05, 1.05)))
-def test_a_plan_has_levels_up_to_full_speed_and_switches_in_order(numbers: Floats) -> None:
-    table = table_of(numbers)
-    assert table.shape == (9, TERMS)
-    assert not table[:, 1:].any()
-    assert (np.abs(table[:5, 0]) <= 1.0).all()
-    assert (table[:5, 0] * numbers[:5] >= 0.0).all()
-    assert (np.diff(table[5:, 0], prepend=0.0, append=1.0) > 0.0).all()
+@given(NUMBERS)
+def test_a_plan_has_its_levels_in_their_order_each_for_its_time(numbers: Floats) -> None:
+    levels, times = np.split(np.clip(numbers, -1.0, 1.0), 2)
+    levels, ends = np.copysign(levels * levels, levels), np.cumsum(np.exp(3.0 * times))
+    at = ends[-1] * (np.arange(40 * FINE) + 0.5) / (40 * FINE)
+    means = levels[np.searchsorted(ends, at)].reshape(40, FINE).mean(axis=1)
+    np.testing.assert_allclose(speeds_of(numbers, 40), means, atol=2.0 * LEVELS / FINE)
 
 
-@given(arrays(np.float64, 10, elements=st.floats(-0.3, 0.3)))
-def test_a_search_that_goes_on_begins_with_the_plan_that_it_was_given(numbers: Floats) -> None:
-    np.testing.assert_allclose(table_of(numbers_of(table_of(numbers))), table_of(numbers), atol=1e-9)
+@given(NUMBERS, st.integers(1, 300))
+def test_a_plan_stays_within_the_limit_and_goes_as_far_as_its_levels_do(numbers: Floats, horizon: int) -> None:
+    speeds = speeds_of(np.stack([numbers, -numbers]), horizon)
+    assert speeds.shape == (2, horizon)
+    assert (np.abs(speeds) <= 1.0 + 1e-12).all()
+    levels, times = np.split(np.clip(numbers, -1.0, 1.0), 2)
+    weights = np.exp(3.0 * times)
+    assert speeds[0].mean() == pytest.approx(np.sign(levels) * levels**2 @ weights / weights.sum(), abs=1e-9)
 
 
-def test_a_plan_is_judged_by_the_interval_and_pays_for_each_brake_that_does_not_come_home() -> None:
-    compared = Compared(FOUR, BENCH, SCALE, None, 5, 3)
-    (score,), (outcome,) = compared.scores(np.array([[0.9, -0.9, -0.1, 0.2, 0.2, 0.1]]))
-    brakes = [draw.brake for draw in FOUR.draws(BENCH, 5, 3)]
-    (values,) = MEASURES["T"].of_outcomes(BENCH, "exact", PARAMETER_NAMES, brakes, [outcome])
-    assert outcome.home.all()
-    assert score == pytest.approx(values.mean())
-    outcome.home[1] = False
-    assert np.mean(values - PRICE * ~outcome.home) == pytest.approx(score - PRICE / 3.0)
+class Landscape(Compared):
+    """Plans that are worth what a function says, with what was asked; one brake says nearly the same."""
+
+    def __init__(self, worth: Callable[[Floats], Floats]) -> None:
+        self.plans, self.screened, self.asked, self._worth = 16, list[Floats](), list[Floats](), worth
+
+    def screening(self) -> Compared:
+        one = Landscape(self._worth)
+        one.plans, one.asked = 40, self.screened
+        return one
+
+    def returns(self, plans: Floats) -> Floats:
+        assert len(plans) == self.plans
+        self.asked.append(plans.copy())
+        return self._worth(plans)
 
 
-def test_a_search_returns_a_plan_that_is_worth_more_than_it_began_with() -> None:
-    seen: list[Progress] = []
-    begin = table_of(np.array([0.5, -0.5, 0.1, 0.0, 0.0, 0.0]))
-    found = search(FOUR, BENCH, SCALE, begin, steps=4, seed=3, show=seen.append)
-    assert [step.steps for step in seen] == [1, 2, 3, 4]
-    assert {step.played for step in seen} == {8}
-    fresh = Compared(FOUR, BENCH, SCALE, None, 77, 4)
-    scores, _ = fresh.scores(np.stack([numbers_of(found.table), numbers_of(begin)]))
-    assert scores[0] > scores[1]
-    again = search(FOUR, BENCH, SCALE, begin, steps=4, seed=3)
-    assert again.table.tolist() == found.table.tolist()
+def distance(plans: Floats) -> Floats:
+    """A landscape with one top."""
+    worth: Floats = -np.square(plans - 0.4).sum(axis=1)
+    return worth
 
 
-def test_a_search_that_is_interrupted_keeps_the_best_plan_so_far() -> None:
-    def press(step: Progress) -> None:
-        if step.steps == 2:
-            raise KeyboardInterrupt
-
-    found = search(FOUR, BENCH, SCALE, table_of(np.zeros(6)), steps=9, seed=3, show=press)
-    assert found.steps == 2
-    assert found.table.shape == (5, TERMS)
-
-
-def test_the_command_finds_a_plan_by_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "mine"
-    assert main(["reference", "four-t", "--steps", "1", "--output", str(folder)]) == 0
-    kept = stored(str(folder / "reference.json"))
-    assert (kept.task, kept.form, kept.plant, len(kept.table)) == ("four-t", "blind", "exact", 2 * plan.LEVELS - 1)
-    assert Task.of(kept).measure is MEASURES["T"]
-    assert f"{kept.score:.6g}" in capsys.readouterr().out
-    metrics = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    assert [(line["steps"], line["played"]) for line in metrics] == [(0, 3), (0, 3), (1, 8)]
+def test_a_search_begins_with_the_best_plans_at_random_and_returns_the_best_of_all() -> None:
+    landscape, shown = Landscape(distance), list[Found]()
+    found = search(landscape, drawn=90, starts=2, steps=30, rng=np.random.default_rng(3), show=shown.append)
+    assert [one.plans for one in shown] == [40, 80, 120, *(120 + 16 * (i + 1) for i in range(1 + 2 * 30))]
+    assert (np.diff([one.best for one in shown[3:]]) >= 0.0).all()
+    drawn = np.concatenate(landscape.screened)
+    assert (np.abs(drawn) <= 1.0).all()
+    best = drawn[np.argsort(-distance(drawn))[:16]]
+    assert sorted(landscape.asked[0].tolist()) == sorted(best.tolist())
+    for begin, first in zip(best, landscape.asked[1::30], strict=False):
+        assert np.abs(first.mean(axis=0) - begin).max() < 5.0 * SPREAD / np.sqrt(16)
+    everything = np.concatenate(landscape.asked)
+    assert found.tolist() == np.clip(everything[np.argmax(distance(everything))], -1.0, 1.0).tolist()
+    assert distance(found[None])[0] > 0.2 * distance(drawn).max()
+    again = search(Landscape(distance), drawn=90, starts=2, steps=30, rng=np.random.default_rng(3))
+    assert again.tolist() == found.tolist()
 
 
-def test_a_plan_that_depends_on_the_estimate_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["reference", "four-t", "--form", "quadratic", "--output", str(tmp_path / "x")]) == 2
-    assert "--form: expected blind" in capsys.readouterr().err
+def test_a_plan_that_no_step_improves_is_kept() -> None:
+    calls = 0
+
+    def falling(plans: Floats) -> Floats:
+        nonlocal calls
+        calls += 1
+        returns: Floats = np.arange(len(plans), dtype=np.float64) - 100.0 * calls
+        return returns
+
+    landscape = Landscape(falling)
+    found = search(landscape, drawn=32, starts=1, steps=5, rng=np.random.default_rng(3))
+    assert found.tolist() == landscape.asked[0][-1].tolist()
+
+
+def environments(count: int) -> list[EmbExcitationVectorEnv]:
+    reward = ExpectedInterval(IntervalCriterion("T"))
+    where = (count, SHORT, "pm50", PARAMETER_NAMES, reward, 1.0)
+    return [EmbExcitationVectorEnv(*where, plant, FOLLOWED) for plant in ("exact", "stribeck")]
+
+
+def test_plans_are_compared_on_the_same_brakes_of_each_plant_and_worth_the_mean() -> None:
+    rng = np.random.default_rng(1)
+    plans = rng.uniform(-1.0, 1.0, (3, 2 * LEVELS))
+    plans[2] = plans[0]
+    both = environments(6)
+    found = Compared(both, 3, 60, 5).returns(plans)
+    assert found[0] == found[2] != found[1]
+    for env in both:
+        brakes = env.batch.brakes.reshape(3, 2, -1)
+        assert (brakes[0] == brakes[1]).all()
+        assert (brakes[0, 0] != brakes[0, 1]).any()
+    assert (both[0].batch.brakes != both[1].batch.brakes).any()
+    screening = Compared(environments(6), 3, 60, 5).screening()
+    many = screening.returns(np.repeat(plans[:1], screening.plans, axis=0))
+    assert (screening.plans, len({*many.tolist()})) == (6, 1)
+    apart = [Compared([env], 3, 60, 5).returns(plans) for env in environments(6)[:1]]
+    assert found[0] != apart[0][0]
+    assert Compared(environments(6), 3, 60, 6).returns(plans)[0] != found[0]
+
+
+def test_an_experiment_counts_until_it_is_over() -> None:
+    settings = {"bench": BENCH, "ranges": "pm50", "scale": 1e-6}
+    conditions = Conditions(acts="speed", observes="estimate", shielded=False)
+    actions, seeds = np.full((2, 500), 1.0), [1, 2]
+    actions[1] = 0.01
+    env = EmbExcitationVectorEnv(2, conditions=conditions, **settings)  # type: ignore[arg-type]  # of several types
+    found = play(env, seeds, actions)
+    for seed, row, value in zip(seeds, actions, found, strict=True):
+        one = EmbExcitationEnv(conditions=conditions, **settings)
+        one.reset(seed=seed)
+        total, steps, over = 0.0, 0, False
+        while not over:
+            _, reward, over, _, _ = one.step(row[steps : steps + 1].astype(np.float32))
+            total, steps = total + reward, steps + 1
+        assert value == pytest.approx(total)
+        assert (steps < 500) == (seed == 1)

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_bench.config.bench import load_bench
+from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.information.symmetric import pack, unpack
 from emb_runtime.errors import UsageError
 from emb_train.closed_loop import Batch
@@ -202,7 +203,7 @@ def test_a_reward_gets_the_state_in_which_the_way_home_began(monkeypatch: pytest
 
     bench = load_bench()
     batch = Batch(bench, bench.range_set("viscous"), ("f_v",), 1)
-    scoring = Scoring(batch, noted)
+    scoring = Scoring(batch, DEFAULT_PLANT, noted)
     batch.begin(0, np.random.default_rng(0))
     states, informations = [batch.x[0, :2].copy()], [batch.m[0].copy()]
     for _ in range(30):
@@ -219,7 +220,7 @@ def test_a_reward_gets_the_state_in_which_the_way_home_began(monkeypatch: pytest
 def test_the_packed_matrix_of_the_environment_is_the_one_that_the_rewards_unpack() -> None:
     bench = load_bench()
     batch = Batch(bench, bench.range_set("pm50"), ("k_1", "f_v"), 1)
-    scoring = Scoring(batch, trajectory_return)
+    scoring = Scoring(batch, DEFAULT_PLANT, trajectory_return)
     batch.begin(0, np.random.default_rng(0))
     total = sum(float(scoring.advance(np.full(1, 2.0))[0]) for _ in range(100))
     assert total == pytest.approx(np.linalg.eigvalsh(unpack(batch.m[0], 2))[0], rel=1e-9)

@@ -21,29 +21,29 @@ from safetensors.torch import load_file, save_file
 from emb_bench.config.bench import load_bench
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_USAGE, UsageError
-from emb_train import presets as names
+from emb_runtime.policy.policy import load_policy
 from emb_train.cli import main
-from emb_train.closed_loop import Conditions
-from emb_train.evolve import Progress
+from emb_train.plan import LEVELS, Found
 from emb_train.play import fresh_draws
-from emb_train.presets import preset_summaries
-from emb_train.reference import stored
+from emb_train.presets import preset_record, preset_summaries
 from emb_train.rewards import Transition, information_increment
 from emb_train.training import (
     ACTOR,
     BENCH,
     CONFIGURATION,
+    CURVE,
     METRICS,
+    ONNX,
+    PLAN,
     Validation,
     load_preset,
     load_training,
     training_from,
 )
-from emb_train.trial import TASKS, Task
 from tests.commands import refused
 from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench, tiny
 
-FILES = [ACTOR, BENCH, METRICS, CONFIGURATION]
+FILES = [ACTOR, ONNX, BENCH, CURVE, METRICS, CONFIGURATION]
 
 
 def metrics_of(folder: Path) -> list[dict[str, Any]]:
@@ -63,12 +63,102 @@ def test_a_training_writes_all_that_its_result_depends_on_and_keeps_the_best_act
     assert len({(finished / name).stat().st_mode for name in (CONFIGURATION, ACTOR)}) == 1
 
 
-def test_the_same_seed_gives_the_same_files(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_for_speeds_begins_with_a_plan_and_is_never_worse(finished_speeds: Path) -> None:
+    assert sorted(p.name for p in finished_speeds.iterdir()) == sorted([*FILES, PLAN])
+    plan = json.loads((finished_speeds / PLAN).read_text())["speeds"]
+    assert len(plan) == HORIZON
+    assert max(map(abs, plan)) <= 1.0
+    trained, metrics = load_training(finished_speeds), metrics_of(finished_speeds)
+    assert [m["steps"] for m in metrics] == [0, ITERATION, 2 * ITERATION]
+    assert trained.score >= max(m["score"] for m in metrics)
+    assert Validation(trained.training, trained.bench).score(trained.actor) == trained.score
+    policy = load_policy(finished_speeds / ONNX, trained.bench)
+    assert (policy.contract.kind, len(policy.contract.inputs)) == ("speed", 11)
+
+
+@pytest.mark.parametrize(("preset", "of"), [("single-viscous", "finished"), ("interval", "finished_speeds")])
+def test_the_same_seed_gives_the_same_files(
+    preset: str, of: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     make_tiny(monkeypatch)
-    bench, other = finished.parent / "short.toml", tmp_path / "run"
-    assert main(["ppo", "single-viscous", "--bench", str(bench), "--output", str(other)]) == 0
-    for name in FILES:
-        assert (other / name).read_bytes() == (finished / name).read_bytes(), name
+    done: Path = request.getfixturevalue(of)
+    bench, other = done.parent / "short.toml", tmp_path / "run"
+    assert main(["ppo", preset, "--bench", str(bench), "--output", str(other)]) == 0
+    for path in done.iterdir():
+        assert (other / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_hyper_parameters_are_set_by_their_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_tiny(monkeypatch)
+    given = ("hidden=[4, 4]", "clip=0.1", "plan.drawn=3", "clone_steps=2", "scale=0.5", "total_steps=1", "gain=0.2")
+    options = [word for text in given for word in ("--set", text)]
+    options += ["--command-delay", "0", "2", "--plant", "exact,observer,stribeck"]
+    folder, bench = tmp_path / "run", short_bench(tmp_path)
+    assert main(["ppo", "--bench", str(bench), "--output", str(folder), *options]) == 0
+    training = load_training(folder).training
+    assert load_policy(folder / ONNX, load_bench(bench)).contract.gain == training.conditions.gain == 0.2
+    assert (training.conditions.command_delay, training.ppo.envs) == ((0, 2), 12)  # pairs of each of three plants
+    assert (training.ppo.hidden, training.ppo.clip, training.ppo.clone_steps) == ((4, 4), 0.1, 2)
+    assert training.plan is not None
+    assert (training.plan.drawn, training.scale, len(metrics_of(folder))) == (3, 0.5, 2)
+    said = capsys.readouterr().out
+    assert all(str(folder / name) in said for name in (ONNX, CURVE))
+
+
+def test_ctrl_c_before_there_is_an_actor_leaves_none_and_after_that_the_best_one_as_a_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_tiny(monkeypatch)
+    bench = short_bench(tmp_path)
+
+    def pressed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    def pressed_once(what: str) -> Callable[..., object]:
+        real, times = getattr(sys.modules["emb_train.training"], what), 0
+
+        def once(*given: Any, **named: Any) -> object:
+            nonlocal times
+            times += 1
+            if what == "clone" and times > 1:
+                return real(*given, **named)
+            if what == "search":
+                named["show"](Found(4, 1.0, np.linspace(-1.0, 1.0, 2 * LEVELS)))
+            raise KeyboardInterrupt
+
+        return once
+
+    for what, name, left in (
+        ("search", "plan", False),
+        ("clone", "cloning, twice", False),
+        ("search", "a plan", True),
+        ("clone", "cloning", True),
+        ("train", "PPO", True),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"emb_train.training.{what}", pressed_once(what) if left else pressed)
+            folder = tmp_path / name
+            assert main(["ppo", "--bench", str(bench), "--output", str(folder)]) == EXIT_INTERRUPTED
+        said = capsys.readouterr()
+        assert (folder / ONNX).exists() == left, name
+        assert ("nothing was trained" in said.err) != left, name
+        assert (str(folder / ONNX) in said.out) == left, name
+        if not left:
+            assert list(folder.iterdir()) == [], name
+            continue
+        assert (load_training(folder).iteration, len(metrics_of(folder))) == (0, 1)
+        assert (folder / CURVE).exists()
+        assert metrics_of(folder)[0]["score"] == load_training(folder).score
+        load_policy(folder / ONNX, load_bench(bench))
+
+
+def test_the_table_of_a_preset_is_its_callers_own() -> None:
+    before = load_preset("interval")
+    load_preset("interval", **{"plan.population": 5, "epochs": 1, "gain": 0.5})
+    preset_record("interval")["ppo"]["hidden"] = []
+    assert load_preset("interval") == before
 
 
 def test_ctrl_c_and_divergence_leave_the_best_actor_so_far(
@@ -103,7 +193,7 @@ def test_training_validation_and_evaluation_draw_other_brakes(finished: Path) ->
     for seed in range(20):
         validation = Validation(msgspec.structs.replace(trained.training, seed=seed), trained.bench)
         validation.score(trained.actor)
-        drawn += validation._env.batch.brakes[:, f_v].tolist()
+        drawn += validation._envs[0].batch.brakes[:, f_v].tolist()
         drawn += [draw.brake.f_v for draw in fresh_draws(ranges, seed, 50)]
         for iteration in range(5):  # as emb_train.ppo draws its seeds
             seeds = np.random.SeedSequence([seed, iteration]).generate_state(10, np.uint64).tolist()
@@ -111,46 +201,11 @@ def test_training_validation_and_evaluation_draw_other_brakes(finished: Path) ->
     assert len(set(drawn)) == len(drawn) == 20 * (64 + 50 + 50)
 
 
-def test_a_reference_is_searched_for_and_a_ctrl_c_keeps_what_was_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for module, value in (("BATCH", 4), ("JUDGED", 4)):
-        monkeypatch.setattr(f"emb_train.evolve.{module}", value)
-    command = ["reference", "viscous", "--bench", str(short_bench(tmp_path)), "--steps", "3", "--seed", "7"]
-    assert main([*command, "--output", str(tmp_path / "whole")]) == 0
-    assert sorted(p.name for p in (tmp_path / "whole").iterdir()) == ["bench.toml", "metrics.jsonl", "reference.json"]
-    kept = stored(str(tmp_path / "whole" / "reference.json"))
-    assert (kept.task, kept.form, kept.seed, kept.command.split()[:3]) == (
-        *("viscous", "quadratic", 7),
-        ["emb-train", "reference", "viscous"],
-    )
-    assert f"{kept.score:.6g}" in capsys.readouterr().out
-    blind, found = tmp_path / "blind", tmp_path / "found"
-    command[1], options = "four-d", ["--command-delay", "1", "2", "--gain", "0.3"]
-    assert main([*command, "--form", "blind", "--begin=1,-1,0,0.3,0.6", *options, "--output", str(blind)]) == 0
-    assert main([*command, "--start", str(blind / "reference.json"), *options, "--output", str(found)]) == 0
-    assert not stored(str(blind / "reference.json")).array()[:, 1:].any()
-    assert Task.of(stored(str(found / "reference.json"))).conditions.command_delay == (1, 2)
-    done = Progress._asdict
-
-    def pressed(step: Progress) -> dict[str, Any]:
-        if step.steps == 2:
-            raise KeyboardInterrupt
-        return done(step)
-
-    monkeypatch.setattr(Progress, "_asdict", pressed)
-    assert main([*command, "--output", str(tmp_path / "part")]) == EXIT_INTERRUPTED
-    begun = stored(str(tmp_path / "part" / "reference.json"))
-    assert np.isfinite(begun.array()).all()
-
-
 def test_the_help_takes_no_torch_and_says_the_summaries_of_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
-    assert set(names.TASKS) == set(TASKS)
-    for command, listed in (("ppo", preset_summaries()), ("reference", names.TASKS)):
-        with pytest.raises(SystemExit):
-            main([command, "--help"])
-        said = " ".join(capsys.readouterr().out.split())
-        assert all(f" {name} {summary} " in said for name, summary in listed.items())
+    with pytest.raises(SystemExit):
+        main(["ppo", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert all(f" {name} {summary} " in said for name, summary in preset_summaries().items())
     code = (
         "import contextlib, sys\n"
         "from emb_train.cli import main\n"
@@ -232,11 +287,13 @@ def test_a_damaged_folder_is_refused(finished: Path, tmp_path: Path) -> None:
 
 
 def test_every_configuration_survives_json_and_impossible_values_are_refused_by_their_key() -> None:
-    varied = Conditions(command_delay=(0, 2))
-    for name in preset_summaries():
-        for training in (load_preset(name), load_preset(name, plant="exact", seed=3, conditions=varied)):
-            record = msgspec.json.decode(msgspec.json.encode(training))
-            assert training_from(record, "it") == training
+    trainings = [load_preset(name, **changes) for name in preset_summaries() for changes in ({}, {"seed": 3})]
+    trainings += [
+        load_preset("interval", plants=["exact"], **{"plan.drawn": 3}),
+        tiny(conditions={"command_delay": [0, 2]}),
+    ]
+    for training in trainings:
+        assert training_from(msgspec.json.decode(msgspec.json.encode(training)), "it") == training
     record = msgspec.json.decode(msgspec.json.encode(tiny()))
     cases: list[tuple[str, Any]] = [
         ("reward", "none"),
@@ -251,6 +308,7 @@ def test_every_configuration_survives_json_and_impossible_values_are_refused_by_
         ("ppo.gamma", 1.1),
         ("ppo.clip", math.nan),
         ("ppo.noise_memory", 1.0),
+        ("ppo.noise_hold", HORIZON + 1),
         ("ppo.hidden", [8, 0]),
         ("ppo.initial_mean", math.nan),
         ("ppo.memory", 0),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,17 @@ ITERATION = HORIZON * ENVS  # Environment steps in an iteration
 PPO = {"envs": ENVS, "rollout": HORIZON, "minibatch": 160, "epochs": 2, "hidden": [8, 8], "initial_mean": 0.5}
 
 
+SPEEDS = {"minibatch": 96, "clone_steps": 30}
+PLAN = {"drawn": 8, "starts": 1, "steps": 2, "population": 4, "brakes": 1}
+
+
 def tiny_record(name: str) -> dict[str, Any]:
-    """The table of a preset with little to do: three iterations of eight experiments."""
-    return {**preset_record(name), "ppo": {**PPO, "total_steps": 3 * ITERATION}}
+    """The table of a preset with little to do: three iterations of eight experiments; of a training for speeds two."""
+    record = preset_record(name)
+    if "plan" not in record:
+        return {**record, "ppo": {**PPO, "total_steps": 3 * ITERATION}}
+    ppo = {**record["ppo"], **PPO, **SPEEDS, "initial_mean": 0.0, "total_steps": 2 * ITERATION}
+    return {**record, "plants": ["exact", "stribeck"], "ppo": ppo, "plan": dict(PLAN)}
 
 
 def tiny(**changes: Any) -> Training:
@@ -28,8 +37,9 @@ def tiny(**changes: Any) -> Training:
 
 
 def make_tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every preset have little to do."""
+    """Let every preset have little to do, in this process."""
     monkeypatch.setattr("emb_train.training.preset_record", tiny_record)
+    monkeypatch.setattr("emb_train.training.processes", lambda jobs: nullcontext())
 
 
 def short_bench(directory: Path, old: str = "", new: str = "") -> Path:

@@ -1,4 +1,4 @@
-"""Learning an excitation: environments, rewards, asymmetric PPO, contextual evolution of references, evaluation."""
+"""Learning an excitation: environments, rewards, search for a plan, asymmetric PPO, evaluation."""
 
 from __future__ import annotations
 

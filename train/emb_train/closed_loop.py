@@ -1,6 +1,6 @@
 """N experiments side by side, one sample period after the other: shield, instruments, brake and Fisher information.
 
-:func:`advance` is the one definition of a step; a :class:`Batch` and the trials of a reference run it compiled.
+:func:`advance` is the one definition of a step; a :class:`Batch` runs it compiled.
 
 Time: an experiment begins with the measurement y_0. The current that answers y_k is shielded with y_k and acts during
 [k, k + 1], or later by the plant's command delay. The Fisher information is that of angle and velocity with the bench's
@@ -28,6 +28,9 @@ from emb_bench.sim.instruments import MEMORY, command, measure, settle
 from emb_bench.sim.simulated_brake import pass_period, sent_current
 from emb_runtime.config.bench import OLDEST_FRAME, PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import UsageError
+from emb_runtime.estimator.kalman import Model, State, believed, deviations, follow, make_model, start
+from emb_runtime.estimator.speed_loop import current_for
+from emb_runtime.policy.contract import SAMPLE
 from emb_runtime.safety.response import MEMORY as RESPONSE
 from emb_runtime.safety.response import OPEN, PROVEN, VERDICT, ResponseModel, response_model, take, unproven_law
 from emb_runtime.safety.response import begin as begin_response
@@ -39,9 +42,14 @@ from emb_runtime.safety.shield import PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 
 MEASURED: Literal["measured"] = "measured"
+ESTIMATE: Literal["estimate"] = "estimate"
 EVERYTHING: Literal["everything"] = "everything"
+CURRENT: Literal["current"] = "current"
+SPEED: Literal["speed"] = "speed"
 
 Bools = NDArray[np.bool_]
+MOST = 100.0  # Greatest estimate or deviation that is observed, of the nominal value
+ESTIMATES = 30  # Numbers of an estimator's state
 
 
 class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -50,8 +58,13 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shielded: bool = True  # True if the shield is between actor and brake; without it an action is clipped, no more
     shield_ranges: str | None = None  # Set of the bench that the shield covers; None for the one that the bench names
     horizon: int = 0  # Steps in one experiment; 0 for the bench's
-    observes: Literal["measured", "everything"] = MEASURED
-    """Observation of the actor: ``measured`` angle, velocity and step, or ``everything`` (x₁, x₂, k, θ, the FIM)."""
+    acts: Literal["current", "speed"] = CURRENT
+    """Action of the actor: a current, or a target speed that the runtime's speed loop follows by the estimate."""
+    observes: Literal["measured", "estimate", "everything"] = MEASURED
+    """Observation of the actor: ``measured`` angle, velocity and step; these and the running ``estimate`` of the four
+    parameters with its deviations; or ``everything`` (x₁, x₂, k, θ, the FIM)."""
+    systematic: bool = False
+    """Draw the offsets of encoder and current from the bench's priors; a wrong scale is what no shield can know."""
     information: Kind = "weighted"  # Fisher information that is collected: the thesis's, or the physical one
     draws: Literal["uniform", "normal"] = "uniform"
     """Distribution of the brakes in their ranges: normal is cut off at both ends, two standard deviations away."""
@@ -60,6 +73,7 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tracking: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0  # Factor of the weights of the deviation from the quintic
     command_delay: tuple[int, int] = (0, 0)
     """Least and most samples that a command waits beside the plant's own delay, drawn for each experiment."""
+    gain: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 1.0  # Of the speed loop; less where commands act late
 
     def __post_init__(self) -> None:
         """Refuse what does not exist.
@@ -82,7 +96,13 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def observation_size(self, count: int) -> int:
         """Length of the actor's observation if the information of this many parameters is collected."""
-        return 3 if self.observes == MEASURED else 3 + count + packed_size(count)
+        sizes = {MEASURED: len(SAMPLE), ESTIMATE: len(SAMPLE) + 2 * len(PARAMETER_NAMES)}
+        return sizes.get(self.observes, 3 + count + packed_size(count))
+
+    @property
+    def estimates(self) -> bool:
+        """True if the estimator is in the loop."""
+        return self.acts == SPEED or self.observes == ESTIMATE
 
     def applied(self, bench: Bench) -> Bench:
         """The bench with this horizon, and a shield for this set of brakes that covers the drawn delays as well.
@@ -162,6 +182,8 @@ class Experiments(NamedTuple):
 
     brakes: Floats  # Rows of :class:`BrakeParameters`, shape [N, 6]
     delay: Integers  # Samples that each experiment's commands wait beside its plant's delay, shape [N]
+    errors: Floats
+    """Systematic errors: of the angle [rad] and of the current [A], shape [N, 2]."""
     x: Floats
     """True states, see :mod:`emb_bench.brake.motion`: angle [rad], velocity [rad/s] and two more, shape [N, 4]."""
     s: Floats  # Sensitivities of all four to the relative parameters, shape [N, n, 4]
@@ -179,6 +201,7 @@ class Experiments(NamedTuple):
     monitor: Floats
     """Memory of the sensor monitor, which is asked only until it confirms the polarity, shape [N, MONITOR]."""
     response: Floats  # Memory of the proof of the response, until it is proven, shape [N, RESPONSE]
+    estimate: Floats  # State of the estimator, see :func:`state_of`; shape [N, ESTIMATES]
 
 
 def no_experiments(count: int, n: int, steps: int) -> Experiments:
@@ -186,6 +209,7 @@ def no_experiments(count: int, n: int, steps: int) -> Experiments:
     return Experiments(
         brakes=np.zeros((count, len(BrakeParameters._fields))),
         delay=np.zeros(count, np.int64),
+        errors=np.zeros((count, 2)),
         x=np.zeros((count, STATES)),
         s=np.zeros((count, n, SENSITIVE)),
         m=np.zeros((count, packed_size(n))),
@@ -200,15 +224,39 @@ def no_experiments(count: int, n: int, steps: int) -> Experiments:
         violated=np.zeros(count, np.bool_),
         monitor=np.zeros((count, MONITOR)),
         response=np.zeros((count, RESPONSE)),
+        estimate=np.zeros((count, ESTIMATES)),
     )
 
 
-def delayed(instruments: Instruments, delay: int) -> Instruments:
-    """The plant's instruments with the commands later by some samples; compiled code has no ``_replace``."""
+def state_of(row: Any) -> State:
+    """The state of an estimator as it is stored, shape [ESTIMATES]."""
+    mean = (float(row[1]), float(row[2]), float(row[3]), float(row[4]), float(row[5]), float(row[6]))
+    covariance = (
+        float(row[7]), float(row[8]), float(row[9]), float(row[10]), float(row[11]), float(row[12]),
+        float(row[13]), float(row[14]), float(row[15]), float(row[16]), float(row[17]),
+        float(row[18]), float(row[19]), float(row[20]), float(row[21]),
+        float(row[22]), float(row[23]), float(row[24]),
+        float(row[25]), float(row[26]),
+        float(row[27]),
+    )  # fmt: skip
+    return State(float(row[0]), mean, covariance, float(row[28]), float(row[29]))
+
+
+def store(state: State, row: Any) -> None:
+    """Store the state of an estimator, shape [ESTIMATES]."""
+    row[0], row[28], row[29] = state.step, state.innovation, state.worst
+    for j in range(6):
+        row[1 + j] = state.mean[j]
+    for j in range(21):
+        row[7 + j] = state.covariance[j]
+
+
+def delayed(instruments: Instruments, delay: int, offset: float = 0.0) -> Instruments:
+    """The plant's instruments with later commands [samples] and an offset [rad]; compiled code has no ``_replace``."""
     return Instruments(
         instruments.command_delay + delay,
         instruments.measurement_delay,
-        instruments.encoder_offset,
+        instruments.encoder_offset + offset,
         instruments.clock_jitter,
         instruments.observer_bandwidth,
     )
@@ -222,7 +270,10 @@ def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
 
 def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -> None:
     """One sample period of experiment ``i``, in place; arguments as for :func:`advance`."""
-    brakes, delay, x, s, m, memory, y, applied, past, k, noise, late, reasons, violated, monitor, response = experiments
+    (
+        brakes, delay, beside, x, s, m, memory, y, applied,
+        past, k, noise, late, reasons, violated, monitor, response, _,
+    ) = experiments  # fmt: skip
     rules = setup.rules
     p = BrakeParameters(
         float(brakes[i, 0]),
@@ -232,7 +283,7 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
         float(brakes[i, 4]),
         float(brakes[i, 5]),
     )
-    instruments = delayed(setup.instruments, int(delay[i]))
+    instruments = delayed(setup.instruments, int(delay[i]), float(beside[i, 0]))
     y1, y2 = float(y[i, 0]), float(y[i, 1])
     u1, u2, u3, u4, u5 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2]), float(past[i, 3]), float(past[i, 4])
     most = largest_current(setup.law, setup.thresholds, monitor[i], setup.law.current)
@@ -246,7 +297,16 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     k[i] += 1
     errors = (float(noise[i, k[i], 0]), float(noise[i, k[i], 1]), float(late[i, k[i]]))
     y1, y2 = pass_period(
-        setup.mechanics, instruments, p, rules.sample_time, current, errors, x[i], setup.chosen, s[i], memory[i]
+        setup.mechanics,
+        instruments,
+        p,
+        rules.sample_time,
+        current + beside[i, 1],
+        errors,
+        x[i],
+        setup.chosen,
+        s[i],
+        memory[i],
     )
     add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
     past[i, 0], past[i, 1], past[i, 2], past[i, 3], past[i, 4] = sent, u1, u2, u3, u4
@@ -258,6 +318,30 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
         judge(setup.law, setup.thresholds, monitor[i], rules.sample_time, y1, y2, obeyed, sent, current)
     inside = rules.angle_low <= x[i, 0] <= rules.angle_high and abs(x[i, 1]) <= rules.velocity
     violated[i] = not inside
+
+
+def advance_speeds(setup: Setup, model: Model, gain: float, experiments: Experiments, speeds: Floats) -> None:
+    """As :func:`advance`, with currents by which the speed loop follows target speeds [rad/s]."""
+    for i in range(experiments.k.shape[0]):
+        state = state_of(experiments.estimate[i])
+        wanted = current_for(model, state, believed(model, state), float(speeds[i]), gain)
+        advance_one(setup, experiments, i, wanted)
+
+
+def estimate_all(model: Model, experiments: Experiments, rows: Integers) -> None:
+    """Take the newest sample into the estimators of these rows, in place."""
+    y, k, applied, estimate = experiments.y, experiments.k, experiments.applied, experiments.estimate
+    for i in rows:
+        store(follow(model, state_of(estimate[i]), y[i, 0], y[i, 1], float(k[i]), applied[i]), estimate[i])
+
+
+def tell_estimates(model: Model, experiments: Experiments, told: Floats) -> None:
+    """Values, then deviations, of k_m, k_1, T_c and f_v in SI units, as the estimators have them, shape [N, 8]."""
+    for i in range(told.shape[0]):
+        state = state_of(experiments.estimate[i])
+        values, widths = believed(model, state), deviations(model, state)
+        for j in range(4):
+            told[i, j], told[i, 4 + j] = values[j] * model.nominal[j], widths[j] * model.nominal[j]
 
 
 class Batch:
@@ -316,7 +400,9 @@ class Batch:
         )
         require_possible(self._plant, conditions)
         self._deviations = np.array([bench.noise.angle, bench.noise.velocity])
-        self._advance = compiled(advance)
+        self._advance, self._advance_speeds = compiled(advance), compiled(advance_speeds)
+        self.model = make_model(bench, bench.range_set(bench.prior), sticks=True)  # as the runtime's
+        self._every, self._nominal = np.arange(count), np.abs(np.array(self.model.nominal * 2))
         e = self.experiments = no_experiments(count, len(parameters), self.setup.rules.horizon)
         self.brakes, self.x, self.y, self.m, self.k = e.brakes, e.x, e.y, e.m, e.k
         self.past, self.reasons, self.violated = e.past, e.reasons, e.violated
@@ -327,12 +413,13 @@ class Batch:
         self.observation_size = conditions.observation_size(len(parameters))
 
     def begin(self, i: int, rng: np.random.Generator, brake: BrakeParameters | None = None) -> None:
-        """Begin a new experiment in row ``i``: at rest at the origin.
+        """Begin a new experiment in row ``i``: at rest at the origin, with an estimator at its prior.
 
         Args:
             i: row.
             rng: draws the uncertain parameters first (also if ``brake`` is given), then the noise of all samples, then
-                the jitter of their instants if there is any, then the delay if it varies.
+                the jitter of their instants if there is any, then the delay if it varies, then the systematic errors
+                if the conditions have them.
             brake: the brake to use instead of a drawn one.
         """
         e = self.experiments
@@ -345,8 +432,11 @@ class Batch:
         if self.conditions.varies:
             low, high = self.conditions.command_delay
             e.delay[i] = rng.integers(low, high + 1)
+        if self.conditions.systematic:
+            priors = self.bench.systematic
+            e.errors[i] = rng.standard_normal(2) * (priors.offset, priors.current_offset)
         e.x[i] = 0.0
-        instruments = delayed(self._plant.instruments, int(e.delay[i]))
+        instruments = delayed(self._plant.instruments, int(e.delay[i]), float(e.errors[i, 0]))
         settle(instruments, e.memory[i], 0.0)
         errors = (float(error) for error in (e.late[i, 0], *e.noise[i, 0]))
         e.y[i] = measure(instruments, e.memory[i], self.setup.rules.sample_time, 0.0, 0.0, 0.0, *errors)
@@ -354,9 +444,14 @@ class Batch:
             of_the_past[i] = 0
         begin_monitor(e.monitor[i], *e.y[i].tolist())
         begin_response(self.setup.response, e.response[i], *e.y[i].tolist())
+        if self.conditions.estimates:
+            store(start(self.model), e.estimate[i])
+            compiled(estimate_all)(self.model, e, self._every[i : i + 1])
 
     def advance(self, wanted: Floats) -> None:
-        """One sample period with the requested currents [A], shape [N]; one that is not finite counts as 0 A.
+        """One sample period with the requested currents [A], or target speeds [rad/s], by the conditions; shape [N].
+
+        A current that is not finite counts as 0 A, and so does a speed that is no number.
 
         Raises:
             UsageError: the shape is another, or a row was not begun or has reached the horizon. The compiled step would
@@ -364,11 +459,17 @@ class Batch:
         """
         if wanted.shape != self.k.shape:
             raise UsageError(
-                f"expected one current for each of the {len(self.k)} experiments, got shape {wanted.shape}"
+                f"expected one {self.conditions.acts} for each of the {len(self.k)} experiments, got shape "
+                f"{wanted.shape}"
             )
         if (self.k >= self.setup.rules.horizon).any():
             raise UsageError("expected experiments that go on, got one that is over or was not begun: call reset first")
-        self._advance(self.setup, self.experiments, wanted)
+        if self.conditions.acts == SPEED:
+            self._advance_speeds(self.setup, self.model, self.conditions.gain, self.experiments, wanted)
+        else:
+            self._advance(self.setup, self.experiments, wanted)
+        if self.conditions.estimates:
+            compiled(estimate_all)(self.model, self.experiments, self._every)
 
     @property
     def terminated(self) -> Bools:
@@ -383,14 +484,23 @@ class Batch:
         return at_home & ~self.violated
 
     def observation(self) -> NDArray[np.float32]:
-        """Observation of the actor, by the conditions: :meth:`actor_observation`, or Table 4.2 without measurements.
+        """Observation of the actor, by the conditions: measured, with the estimate, or Table 4.2 without measurements.
 
         Returns:
             Shape [N, observation_size].
         """
-        if self.conditions.observes != EVERYTHING:
+        if self.conditions.observes == MEASURED:
             return self.actor_observation()
+        if self.conditions.observes == ESTIMATE:
+            return np.hstack([self.actor_observation(), self.estimate()], dtype=np.float32)
         return self.critic_observation()[:, : self.observation_size].copy()
+
+    def estimate(self) -> Floats:
+        """Estimates of k_m, k_1, T_c and f_v in SI units, then their deviations, bounded; shape [N, 8]."""
+        told = np.empty((len(self.k), 2 * len(PARAMETER_NAMES)))
+        compiled(tell_estimates)(self.model, self.experiments, told)
+        bounded: Floats = np.minimum(told, MOST * self._nominal)
+        return bounded
 
     def actor_observation(self) -> NDArray[np.float32]:
         """Measured angle [rad], measured velocity [rad/s], step; raw, shape [N, 3]."""

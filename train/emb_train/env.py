@@ -1,8 +1,11 @@
 """The Gymnasium environment ``EmbExcitation-v0``: experiments on brakes whose parameters the actor does not know.
 
-* **Action**, shape [1]: the requested current as a part of the bench's limit, −1..1. The shield has the last word.
+* **Action**, shape [1]: the requested current as a part of the bench's limit, −1..1; under conditions in which it acts
+  by ``speed``, the target speed as a part of that limit, which the runtime's speed loop follows by the running
+  estimate. The shield has the last word.
 * **Observation**, shape [3]: measured angle [rad], measured velocity [rad/s], step (thesis Table 4.2, actor), raw;
-  under conditions in which the actor sees everything (5.2), the critic's observation without the sensitivities.
+  where it observes the ``estimate``, shape [11], k_m, k_1, T_c and f_v in SI units and their deviations follow; where
+  it sees everything (5.2), it is the critic's observation without the sensitivities.
 * ``info["critic"]``: the critic's observation, see :meth:`emb_train.closed_loop.Batch.critic_observation`.
 * **Reward**: see :mod:`emb_train.rewards`.
 * **End**: leaving the limits and reaching the horizon are both terminal. The experiment is the horizon long by design
@@ -18,6 +21,8 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -28,35 +33,102 @@ from numpy.typing import NDArray
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
+from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import BrakeParameters
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_train import register_environments
-from emb_train.closed_loop import BENCH_CONDITIONS, MEASURED, Batch, Conditions
+from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, MEASURED, MOST, SPEED, Batch, Conditions
+from emb_train.intervals import finite, intervals
 from emb_train.rewards import OUTWARD, Reward, Transition, Turn, information_increment, require_defined
 
 ENV_ID = "EmbExcitation-v0"
 SCALED = 100.0  # Bound of an observation in scales of order one
+UNKNOWN = 1e9  # Times a deviation is too large before the first sample
+ASTRAY = 20.0  # Price of an experiment that leaves the limits or does not end at home [nat]
+DEPTH, PRICE = -3.0, 1.0  # Lowest angle that costs nothing [rad], and price of each one below [nat/rad]
 
 Observations = NDArray[np.float32]
 Steps = tuple[Observations, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
 
 
+@dataclass(frozen=True)
+class ExpectedInterval:
+    """Reward of a whole experiment, in its last step [nat]: the criterion of the interval that an estimate will have.
+
+    Without a discount it is the sum of the criterion's increments. An experiment that leaves the limits or does not end
+    at home pays ``ASTRAY``; one that goes far to the side of the release pays for what it goes beyond ``DEPTH``, for a
+    sensor that lies moves a brake by some radians before it is found out.
+    """
+
+    criterion: IntervalCriterion
+    pool: Executor | None = None  # Of processes that share the work
+
+    def __call__(self, batch: Batch, plant: str, rows: NDArray[np.bool_], acted: Floats, lowest: Floats) -> Floats:
+        """The reward of the experiments of some rows.
+
+        Args:
+            batch: of N experiments.
+            plant: of the bench, that its brakes are.
+            rows: mask of the R experiments that have ended, shape [N].
+            acted: currents that acted [A], 0 after the end, shape [N, horizon].
+            lowest: true angles [rad], shape [N].
+
+        Returns:
+            Shape [R].
+        """
+        brakes = [BrakeParameters(*brake) for brake in batch.brakes[rows].tolist()]
+        found = intervals(batch.bench, plant, batch.parameters, brakes, acted[rows], self.pool)
+        values = finite([self.criterion.of(one) for one in found])
+        priced: Floats = values - ASTRAY * ~batch.home[rows] - PRICE * np.maximum(DEPTH - lowest[rows], 0.0)
+        return priced
+
+
+@dataclass(frozen=True)
+class TimeToPrecision:
+    """Reward of a step: minus the share of the period in which an estimate was less precise than asked for.
+
+    So the return is minus the number of periods until all four are known; what the actor does from then on counts for
+    nothing.
+    """
+
+    precision: float = 0.0065  # Relative standard deviation; 95 % of the estimates are then within twice that
+
+    def missing(self, batch: Batch) -> Floats:
+        """Greatest ratio of a relative deviation to the one asked for, shape [N]."""
+        told = batch.estimate()
+        missing: Floats = np.minimum((told[:, 4:] / (self.precision * told[:, :4])).max(axis=1), UNKNOWN)
+        return missing
+
+    def __call__(self, before: Floats, after: Floats) -> Floats:
+        """The reward of a step, from what was missing before and is after it; continuous in the time. Shape [N]."""
+        first, second = np.log(np.maximum(before, 1e-9)), np.log(np.maximum(after, 1e-9))
+        share = np.where(second <= 0.0, first / np.maximum(first - second, 1e-9), 1.0)
+        rewards: Floats = np.where(first <= 0.0, 0.0, -np.clip(share, 0.0, 1.0))
+        return rewards
+
+
 class Scoring:
     """Rewards of the steps of a batch, with the state from before a step that a reward needs."""
 
-    def __init__(self, batch: Batch, reward: Reward) -> None:
-        """Score the steps that :meth:`advance` makes, and no others."""
-        self._batch = batch
+    def __init__(self, batch: Batch, plant: str, reward: AnyReward) -> None:
+        """Score the steps that :meth:`advance` makes, and no others; ``plant`` is the batch's."""
+        self._batch, self._plant = batch, plant
         self._reward = reward
+        self._missing = np.full(len(batch.k), UNKNOWN)
+        self._acted, self._lowest = np.zeros_like(batch.experiments.late[:, 1:]), np.zeros(len(batch.k))
         self._turn = Turn(np.zeros_like(batch.x[:, :2]), np.zeros(len(batch.k)), np.zeros_like(batch.m))
 
     def advance(self, wanted: Floats) -> Floats:
-        """One sample period with the requested currents [A], shape [N]; its rewards, shape [N].
+        """One sample period with requested currents [A] or target speeds [rad/s], shape [N]; its rewards, shape [N].
 
         Raises:
             UsageError: see :meth:`emb_train.closed_loop.Batch.advance`.
         """
+        if isinstance(self._reward, ExpectedInterval):
+            return self._at_the_end(wanted, self._reward)
+        if isinstance(self._reward, TimeToPrecision):
+            return self._until_known(wanted, self._reward)
         batch, turn, rules = self._batch, self._turn, self._batch.setup.rules
         before, velocity = batch.information(), batch.x[:, 1].copy()
         batch.advance(wanted)
@@ -68,6 +140,27 @@ class Scoring:
         return self._reward(
             Transition(before, after, x, batch.k, batch.violated, turn, rules.horizon, rules.sample_time, tracking)
         )
+
+    def _at_the_end(self, wanted: Floats, reward: ExpectedInterval) -> Floats:
+        batch = self._batch
+        begun = batch.k == 0
+        self._acted[begun], self._lowest[begun] = 0.0, 0.0
+        batch.advance(wanted)
+        self._acted[np.arange(len(batch.k)), batch.k - 1] = batch.experiments.applied
+        np.minimum(self._lowest, batch.x[:, 0], out=self._lowest)
+        rewards, over = np.zeros(len(batch.k)), batch.terminated
+        if over.any():
+            rewards[over] = reward(batch, self._plant, over, self._acted, self._lowest)
+        return rewards
+
+    def _until_known(self, wanted: Floats, reward: TimeToPrecision) -> Floats:
+        self._missing[self._batch.k == 0] = UNKNOWN
+        self._batch.advance(wanted)
+        before, self._missing = self._missing, np.minimum(self._missing, reward.missing(self._batch))
+        return reward(before, self._missing)
+
+
+AnyReward = Reward | ExpectedInterval | TimeToPrecision
 
 
 class EmbExcitationVectorEnv(gymnasium.vector.VectorEnv[Observations, Observations, NDArray[Any]]):
@@ -85,7 +178,7 @@ class EmbExcitationVectorEnv(gymnasium.vector.VectorEnv[Observations, Observatio
         bench: Bench | None = None,
         ranges: str = "viscous",
         parameters: Sequence[str] = ("f_v",),
-        reward: Reward = information_increment,
+        reward: AnyReward = information_increment,
         scale: float = 1e-6,
         plant: str = DEFAULT_PLANT,
         conditions: Conditions = BENCH_CONDITIONS,
@@ -97,7 +190,7 @@ class EmbExcitationVectorEnv(gymnasium.vector.VectorEnv[Observations, Observatio
             bench: the bench; without one, the shipped one.
             ranges: name of the set of the bench that brakes are drawn from.
             parameters: whose Fisher information is collected.
-            reward: reward of a step.
+            reward: reward of a step, or of a whole experiment; a time needs conditions with the estimate.
             scale: its factor, which brings a return to a number that a network fits.
             plant: which of the bench's plants the brakes are.
             conditions: shield or none, number of steps, observation, kind of information.
@@ -107,10 +200,11 @@ class EmbExcitationVectorEnv(gymnasium.vector.VectorEnv[Observations, Observatio
             BenchFileError: the bench has no such set, or no such plant.
         """
         bench = bench or load_bench()
-        require_defined(reward, tuple(parameters))
+        if not isinstance(reward, ExpectedInterval | TimeToPrecision):
+            require_defined(reward, tuple(parameters))
         self.num_envs = num_envs
         self.batch = Batch(bench, bench.range_set(ranges), parameters, num_envs, plant, conditions)
-        self._scoring, self._scale = Scoring(self.batch, reward), scale
+        self._scoring, self._scale = Scoring(self.batch, plant, reward), scale
         self._generators: list[np.random.Generator] = []
         self.single_observation_space = _observation_space(self.batch)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -146,7 +240,7 @@ class EmbExcitationVectorEnv(gymnasium.vector.VectorEnv[Observations, Observatio
         """Apply the shielded currents for one sample period; an experiment that ends begins again.
 
         Args:
-            actions: parts of the limit, shape [N, 1].
+            actions: parts of the limit of the current, or of the speed, shape [N, 1].
         """
         observation, rewards, terminated, truncated, info = self.advance(actions)
         if terminated.any():
@@ -158,7 +252,8 @@ class EmbExcitationVectorEnv(gymnasium.vector.VectorEnv[Observations, Observatio
 
     def advance(self, actions: Observations) -> Steps:
         """:meth:`step` without a new beginning: an experiment that is over has to begin before the next step."""
-        limit = self.batch.bench.limits.current
+        limits = self.batch.bench.limits
+        limit = limits.velocity if self.batch.conditions.acts == SPEED else limits.current
         wanted: Floats = limit * np.clip(np.asarray(actions, np.float64).reshape(-1), -1.0, 1.0)  # NaN stays NaN
         rewards = self._scale * self._scoring.advance(wanted)
         terminated = self.batch.terminated
@@ -223,6 +318,10 @@ def _observation_space(batch: Batch) -> gymnasium.spaces.Box[Any]:
     least, greatest = [-SCALED] * size, [SCALED] * size
     if batch.conditions.observes == MEASURED:
         least, greatest = [low - room, -2.0 * room, 0.0], [high + room, 2.0 * room, batch.setup.rules.horizon]
+    elif batch.conditions.observes == ESTIMATE:
+        nominal = np.abs([getattr(batch.bench.brake, name) for name in PARAMETER_NAMES]) * MOST
+        least = [low - room, -2.0 * room, 0.0, *[0.0] * (2 * len(nominal))]
+        greatest = [high + room, 2.0 * room, batch.setup.rules.horizon, *nominal, *nominal]
     return gymnasium.spaces.Box(np.array(least, np.float32), np.array(greatest, np.float32), dtype=np.float32)
 
 

@@ -17,7 +17,6 @@ import torch
 from torch import nn
 
 from emb_bench.config.bench import Bench, load_bench
-from emb_bench.config.plants import EULER
 from emb_bench.documents import to_json
 from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.excitation import ACTOR, COMPARED, parse_excitation
@@ -30,7 +29,7 @@ from emb_runtime.errors import PolicyRefusedError, UsageError, near
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
 from emb_runtime.system.input_file import near_file
-from emb_train.closed_loop import EVERYTHING, Conditions
+from emb_train.closed_loop import EVERYTHING, SPEED, Conditions
 from emb_train.optimum import optima, searchable
 from emb_train.play import (
     APPLIED,
@@ -39,6 +38,8 @@ from emb_train.play import (
     Law,
     Measure,
     Outcome,
+    Planned,
+    PolicyFile,
     Seen,
     fresh_draws,
     mean_score,
@@ -46,10 +47,7 @@ from emb_train.play import (
     play,
 )
 from emb_train.ppo import DeployedActor
-from emb_train.presets import reference_names
-from emb_train.reference import Following, PolicyFile, stored
-from emb_train.training import load_training
-from emb_train.trial import Task
+from emb_train.training import CONFIGURATION, ONNX, PLAN, load_configuration, load_plan, load_training
 
 
 class Network(Excitation):
@@ -83,9 +81,8 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
     """Opens a policy.
 
     Args:
-        given: folder of a training, an ONNX file, ``actor`` for the shipped one, or a reference: its name,
-            or a ``.json`` file.
-        bench_file: bench of what has none of its own; the shipped one without.
+        given: folder of a training, its plan, an ONNX file, or ``actor`` for the shipped one.
+        bench_file: bench of what has none of its own, as a plan outside such a folder; the shipped one without.
 
     Raises:
         UsageError: there is nothing of that kind, or it sees what no bench measures, or is damaged.
@@ -96,25 +93,36 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
     torch.set_num_threads(1)  # more would get into each other's way at this size, and change the last digits
     if given == ACTOR or path.suffix == ".onnx":
         return _file(given, shipped_actor_path() if given == ACTOR else path, load_bench(bench_file))
-    if path.suffix == ".json" or given in reference_names():
-        bench, kept = load_bench(bench_file), stored(given)
-        task = Task.of(kept)
-        sticks = bench.plant(kept.plant).mechanics.solver != EULER
-        following = Following(kept, bench, bench.range_set(task.ranges), sticks=sticks)
-        return Subject(given, bench, following, task.ranges, _other_shield(task.shield_ranges, bench))
+    if path.suffix == ".json":
+        speeds = load_plan(path)
+        if not (path.parent / CONFIGURATION).exists():
+            bench = load_bench(bench_file)
+            return Subject(given, bench, Planned(speeds, bench))
+        _require_own(given, bench_file)
+        training, bench = load_configuration(path.parent)
+        shield = _other_shield(training.conditions.shield_ranges, bench)
+        return Subject(given, bench, Planned(speeds, bench, training.conditions.gain), training.ranges, shield)
     if not path.is_dir():
-        names = (ACTOR, *reference_names())
-        there = f"there are: {', '.join(names)}{near(given, names) or near_file(path)}"
-        raise UsageError(f"{given}: no such folder, and no reference of that name; {there}")
-    if bench_file is not None:
-        raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
+        hint = near(given, [ACTOR]) or near_file(path)
+        raise UsageError(f"{given}: expected '{ACTOR}', an .onnx file, the folder of a training or its {PLAN}{hint}")
+    _require_own(given, bench_file)
     trained = load_training(path)
     training, conditions = trained.training, trained.training.conditions
     if conditions.observes == EVERYTHING:
         raise UsageError(f"{given}: sees the parameters and the information, which no bench measures: it cannot be run")
-    excitation = Network(DeployedActor(trained.actor, trained.bench.limits.current))
     shield = _other_shield(conditions.shield_ranges, trained.bench)
+    excitation: Excitation = Network(DeployedActor(trained.actor, trained.bench.limits.current))
+    if conditions.acts == SPEED:  # which the runtime's speed loop follows
+        if not (path / ONNX).exists():
+            raise UsageError(f"{path / ONNX}: expected the actor's policy file: emb-export {path} -o {path / ONNX}")
+        excitation = _file(given, path / ONNX, trained.bench).excitation
     return Subject(given, trained.bench, excitation, training.ranges, shield)
+
+
+def _require_own(given: str, bench_file: Path | None) -> None:
+    """Refuse a bench beside that of a training."""
+    if bench_file is not None:
+        raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
 
 
 def _other_shield(name: str | None, bench: Bench) -> str | None:

@@ -1,153 +1,154 @@
-"""Search for a plan: levels of speed and switches between them that are best for the interval of an estimate.
+"""Search for a plan of speeds for brakes that nobody knows: a few levels and their times, by CMA-ES.
 
-A plan is a blind reference (:mod:`emb_train.reference`). The interval has no slope that one experiment would tell, and
-many local optima: plans are drawn at random and screened on a few brakes, the best of them are compared on more, and
-CMA-ES (Hansen, arXiv:1604.00772) goes on from there. Levels are squares of its numbers with their signs, so that it
-finds a creep, and times are shares by their logarithms. All plans meet the same brakes with the same noise.
+A plan holds n levels of speed, for a time each, and then the shield brings the brake home; it depends on no
+measurement. Its 2 n numbers lie within ±1: the signed root of each level, so that a creep of some rad/s is as wide as
+a full stroke, and the logarithm of each time, so that the levels keep their order. The landscape has many tops, and
+most plans say nothing at all: the best of some hundred at random begins, and CMA-ES (Hansen and Ostermeier, Completely
+derandomized self-adaptation in evolution strategies, Evolutionary Computation 9, 2001) improves it with the same brakes
+in each step, one set for each environment.
 """
 
 from __future__ import annotations
 
-import contextlib
-import os
-import warnings
-from collections.abc import Callable
-from concurrent.futures import Executor
-from typing import Any
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
+import cma
 import numpy as np
 
-from emb_bench.config.bench import Bench
 from emb_bench.information.symmetric import Floats
-from emb_bench.parallel import processes
-from emb_runtime.estimator.speed_loop import Scale
-from emb_train.evolve import TUNING_SEED, Progress, Tuned
-from emb_train.reference import TERMS
-from emb_train.trial import ReportedOutcome, Task, Trials
+from emb_train.env import EmbExcitationVectorEnv
+from emb_train.ppo import at_once
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # of what it would like to have for plots
-    import cma
-
-LEVELS = 9  # Levels of a plan that begins at random
-DRAWN = 800  # Plans drawn at random
-SCREENED = 4  # Brakes on which they are compared
-SCREENINGS = 40  # Parts in which this is done
-KEPT = 20  # Plans that are compared on all brakes
-BRAKES = 16  # Brakes of the search
-JUDGED = 64  # Brakes on which its results are compared, and which it did not have
-POPULATION = 16  # Plans of one step of CMA-ES
+LEVELS = 9  # Of a plan; seven nearly suffice
 SPREAD = 0.15  # First standard deviation of its numbers, -1 to 1
 BOUND = 1.05  # Beyond the ends of the numbers, so that full speed is inside
 NEAR = 0.3  # Half the levels drawn are this much smaller, for a creep
 WIDTHS = 3.0  # Logarithm of the longest time over the mean
-PRICE = 20.0  # Of an experiment that leaves the limits or does not end at home [nat]
+STREAM = 0x706C616E  # Spawn key of the brakes on which plans are compared
 
 
-def table_of(numbers: Floats) -> Floats:
-    """The table of a plan's 2 n numbers: of its levels, then of its times."""
-    of_levels, of_times = np.split(np.clip(numbers, -1.0, 1.0), 2)
-    times = np.cumsum(np.exp(WIDTHS * of_times))
-    table = np.zeros((2 * len(of_levels) - 1, TERMS))
-    table[:, 0] = np.concatenate([np.sign(of_levels) * of_levels**2, times[:-1] / times[-1]])
-    return table
+class Found(NamedTuple):
+    """State of a search."""
+
+    plans: int  # Played so far
+    best: float  # Greatest mean return of a plan
+    numbers: Floats  # Of that plan, shape [2 n]
 
 
-def numbers_of(table: Floats) -> Floats:
-    """The numbers of a table, as near as their ends allow."""
-    levels, switches = np.split(table[:, 0], [(len(table) + 1) // 2])
-    times = np.log(np.maximum(np.diff(switches, prepend=0.0, append=1.0), 1e-6))
-    numbers = np.concatenate([np.sign(levels) * np.sqrt(np.abs(levels)), (times - times.mean()) / WIDTHS])
-    result: Floats = np.clip(numbers, -1.0, 1.0)
-    return result
+def speeds_of(numbers: Floats, horizon: int) -> Floats:
+    """Speeds of plans at each step as parts of the limit; shape [..., 2 n] to [..., horizon].
+
+    In the period in which a level begins, the speed is the mean of both, by their shares of the period.
+    """
+    of_levels, of_times = np.split(np.clip(numbers, -1.0, 1.0), 2, axis=-1)
+    times = np.cumsum(np.exp(WIDTHS * of_times), axis=-1)
+    ends = np.concatenate([np.zeros_like(times[..., :1]), times / times[..., -1:]], axis=-1)
+    passed = np.clip(np.arange(horizon + 1.0) - horizon * ends[..., None], 0.0, None)
+    shares = np.diff(passed, axis=-1)
+    within = shares[..., :-1, :] - shares[..., 1:, :]  # of each period in each level
+    speeds: Floats = np.einsum("...i,...ik->...k", np.sign(of_levels) * of_levels**2, within)
+    return speeds
 
 
 class Compared:
-    """Brakes on which plans are compared."""
+    """Brakes of several environments on which plans are compared, some plans at a time."""
 
-    def __init__(self, task: Task, bench: Bench, scale: Scale, pool: Executor | None, seed: int, count: int) -> None:
-        self._task, self._bench, self._scale, self._pool = task, bench, scale, pool
-        draws = task.draws(bench, seed, count)
-        self._brakes = [draw.brake for draw in draws]
-        self._trials: Trials = task.trials(bench, draws)
+    def __init__(self, environments: Sequence[EmbExcitationVectorEnv], plans: int, steps: int, seed: int) -> None:
+        """Draw the brakes: as many in each environment as leave room for ``plans`` of these steps at a time."""
+        self._environments, self.plans, self._steps = environments, plans, steps
+        streams = np.random.SeedSequence(seed, spawn_key=(STREAM,)).spawn(len(environments))
+        self._seeds = [
+            stream.generate_state(env.num_envs // plans, np.uint64).tolist()
+            for stream, env in zip(streams, environments, strict=True)
+        ]
 
-    def scores(self, plans: Floats) -> tuple[Floats, list[ReportedOutcome]]:
-        """Mean score of each of some plans, shape (plans, numbers), and their experiments."""
-        outcomes = self._trials.play(self._scale, [table_of(plan) for plan in plans])
-        task = self._task
-        values = task.measure.of_outcomes(self._bench, task.plant, task.parameters, self._brakes, outcomes, self._pool)
-        scored = [float(np.mean(v - PRICE * ~o.home)) for v, o in zip(values, outcomes, strict=True)]
-        return np.array(scored), outcomes
+    def screening(self) -> Compared:
+        """Gives the same with the first brake of each environment alone, for as many more plans at a time."""
+        screening = copy.copy(self)
+        screening.plans = self._environments[0].num_envs
+        screening._seeds = [seeds[:1] for seeds in self._seeds]
+        return screening
+
+    def returns(self, plans: Floats) -> Floats:
+        """Mean return of each plan, shape [plans, 2 n] to [plans]."""
+        speeds = speeds_of(plans, self._steps)
+
+        def of_env(env: EmbExcitationVectorEnv, seeds: list[int]) -> Floats:
+            returns = play(env, seeds * len(plans), np.repeat(speeds, len(seeds), axis=0))
+            of_plans: Floats = returns.reshape(len(plans), -1).mean(axis=1)
+            return of_plans
+
+        means: Floats = np.mean(at_once(of_env, self._environments, self._seeds), axis=0)
+        return means
+
+
+def play(env: EmbExcitationVectorEnv, seeds: Sequence[int], actions: Floats) -> Floats:
+    """Returns of experiments with these seeds and actions, shape [N, steps] to [N], each until it is over."""
+    env.reset(seed=seeds)
+    returns, over = np.zeros(env.num_envs), np.zeros(env.num_envs, np.bool_)
+    for k in range(actions.shape[1]):
+        step = env.step if k + 1 < actions.shape[1] else env.advance
+        _, rewards, ended, _, _ = step(actions[:, k : k + 1].astype(np.float32))
+        returns += np.where(over, 0.0, rewards)
+        over |= ended
+    return returns
 
 
 def search(
-    task: Task,
-    bench: Bench,
-    scale: Scale,
-    begin: Floats | None,
+    compared: Compared,
     *,
+    drawn: int,
+    starts: int,
     steps: int,
-    seed: int,
-    show: Callable[[Progress], object] = lambda progress: None,
-) -> Tuned:
+    rng: np.random.Generator,
+    show: Callable[[Found], object] = lambda found: None,
+) -> Floats:
     """Finds a plan.
 
     Args:
-        task: what counts, on which brakes, behind which shield.
-        bench: limits, noise, timing, and what an estimate does not know.
-        scale: of the plan.
-        begin: table to begin with; None for plans at random.
-        steps: of CMA-ES.
-        seed: of the plans and of the brakes.
-        show: called after each part of the plans at random, with 0 steps, and after each step.
+        compared: brakes, as many plans at a time as a step of CMA-ES has.
+        drawn: plans at random, rounded up; the best are compared on all brakes.
+        starts: of these, from which CMA-ES begins.
+        steps: of CMA-ES from each.
+        rng: of the plans.
+        show: called after each comparison.
 
     Returns:
-        The better one of the best plan and the mean of the last step, on brakes that no step had; after a Ctrl-C, of
-        those so far.
+        The best of all plans on these brakes; shape [2 n].
     """
-    rng, first, made = np.random.default_rng(seed), TUNING_SEED + 4 * seed, 0
-    with processes(os.cpu_count() or 1) as pool:
-        few, many, fresh = (
-            Compared(task, bench, scale, pool, first + i, count) for i, count in enumerate((SCREENED, BRAKES, JUDGED))
-        )
-        best = drawn(rng, few, many, show) if begin is None else numbers_of(begin)
-        (least,), _ = many.scores(best[None])
-        mean = best
+    found = Found(0, -np.inf, np.zeros(2 * LEVELS))
+
+    def note(plans: Floats, by: Compared, counts: bool = True) -> Floats:
+        nonlocal found
+        returns = by.returns(plans)
+        at = int(np.argmax(returns))
+        better = counts and returns[at] > found.best
+        best = (float(returns[at]), plans[at].copy()) if better else (found.best, found.numbers)
+        found = Found(found.plans + len(plans), *best)
+        show(found)
+        return returns
+
+    screening, plans, returns = compared.screening(), [], []
+    for _ in range(-(-drawn // screening.plans)):
+        some = rng.uniform(-1.0, 1.0, (screening.plans, 2 * LEVELS))
+        some[:, :LEVELS] *= np.where(rng.random((len(some), LEVELS)) < 0.5, NEAR, 1.0)
+        plans.append(some)
+        returns.append(note(some, screening, counts=False))
+    best = _best(np.concatenate(plans), np.concatenate(returns), compared.plans)
+    for begin in _best(best, note(best, compared), starts):
         options: dict[str, Any] = {
-            "popsize": POPULATION, "bounds": [-BOUND, BOUND], "verbose": -9, "seed": np.nan,
+            "popsize": compared.plans, "bounds": [-BOUND, BOUND], "verbose": -9, "seed": np.nan,
             "randn": lambda *shape: rng.standard_normal(shape),
         }  # fmt: skip
-        strategy = cma.CMAEvolutionStrategy(best, SPREAD, options)
-        with contextlib.suppress(KeyboardInterrupt):  # what was found by then is judged and kept
-            while made < steps and not strategy.stop():
-                asked = strategy.ask()
-                scores, outcomes = many.scores(np.array(asked))
-                strategy.tell(asked, (-scores).tolist())
-                made, mean = made + 1, np.array(strategy.mean)
-                if scores.max() > least:
-                    best, least = np.array(asked[int(np.argmax(scores))]), float(scores.max())
-                show(progress(made, scores, outcomes))
-            made = steps  # or it converged
-        judged, _ = fresh.scores(np.array([best, mean]))
-    chosen = int(np.argmax(judged))
-    return Tuned(table_of((best, mean)[chosen]), float(judged[chosen]), made)
+        strategy = cma.CMAEvolutionStrategy(begin, SPREAD, options)
+        for _ in range(steps):
+            asked = np.array(strategy.ask())
+            strategy.tell(list(asked), (-note(asked, compared)).tolist())
+    return np.clip(found.numbers, -1.0, 1.0)
 
 
-def progress(steps: int, scores: Floats, outcomes: list[ReportedOutcome]) -> Progress:
-    """Progress of plans that were played after some steps."""
-    home, left = (sum(int(getattr(o, name).sum()) for o in outcomes) for name in ("home", "left"))
-    return Progress(steps, float(scores.mean()), home, left, sum(len(o.home) for o in outcomes))
-
-
-def drawn(rng: np.random.Generator, few: Compared, many: Compared, show: Callable[[Progress], object]) -> Floats:
-    """The best of plans at random; ``show`` is called ``SCREENINGS`` times."""
-    plans = rng.uniform(-1.0, 1.0, (DRAWN, 2 * LEVELS))
-    plans[:, :LEVELS] *= np.where(rng.random((DRAWN, LEVELS)) < 0.5, NEAR, 1.0)
-    found = []
-    for part in np.array_split(plans, SCREENINGS):
-        scores, outcomes = few.scores(part)
-        found.append(scores)
-        show(progress(0, scores, outcomes))
-    kept = plans[np.argsort(-np.concatenate(found))[:KEPT]]
-    best: Floats = kept[int(np.argmax(many.scores(kept)[0]))]
-    return best
+def _best(plans: Floats, returns: Floats, count: int) -> Floats:
+    chosen: Floats = plans[np.argsort(-returns)[:count]]
+    return chosen

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields
@@ -24,8 +25,12 @@ from emb_bench.information.criteria import Criterion
 from emb_bench.information.fisher import Kind
 from emb_bench.information.symmetric import Floats, unpack
 from emb_bench.numbers import LEVEL, Score
-from emb_runtime.config.bench import BrakeParameters, Ranges
+from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import PolicyRefusedError
+from emb_runtime.estimator.estimator import Estimator
+from emb_runtime.estimator.speed_loop import current_for, share_after
+from emb_runtime.policy.inference import Inference
+from emb_runtime.policy.policy import Policy
 from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Bools, Conditions
 from emb_train.intervals import finite, intervals
 from emb_train.rewards import PRIOR
@@ -71,6 +76,66 @@ class Law(Excitation):
     def __call__(self, seen: Seen) -> Currents:
         """See :class:`Excitation`."""
         return np.array([self._law(angle, velocity, int(step)) for angle, velocity, step, _ in seen.tolist()])
+
+
+class PolicyFile(Excitation):
+    """A policy file, one experiment after the other as the runtime calls it, each with an estimator of its own."""
+
+    def __init__(self, policy: Policy, bench: Bench) -> None:
+        """Use this policy, with estimators as the bench has them."""
+        self._policy, self._bench = policy, bench
+        self._estimators: list[Estimator] = []
+
+    def begin(self, count: int) -> None:
+        """Begin N experiments anew."""
+        self._estimators = [Estimator(self._bench) for _ in range(count)]
+
+    def __call__(self, seen: Seen) -> Currents:
+        """See :class:`emb_train.play.Excitation`."""
+        wanted: Currents = np.zeros(len(seen))
+        for i, (angle, velocity, step, applied) in enumerate(seen.tolist()):
+            self._estimators[i].take(angle, velocity, step, applied)
+            wanted[i] = self._policy.act(angle, velocity, step, self._estimators[i])
+        return wanted
+
+
+class Planned(Excitation):
+    """A plan of speeds, followed as the runtime follows those of a policy: with an estimator for each experiment."""
+
+    def __init__(self, speeds: Sequence[float], bench: Bench, gain: float = BENCH_CONDITIONS.gain) -> None:
+        """Follow a plan, parts of the limit of the speed, one for each step, with this gain of the speed loop."""
+        self._speeds, self._bench, self._gain = [bench.limits.velocity * part for part in speeds], bench, gain
+        self._estimators: list[Estimator] = []
+
+    def begin(self, count: int) -> None:
+        """Begin N experiments anew."""
+        self._estimators = [Estimator(self._bench) for _ in range(count)]
+
+    def __call__(self, seen: Seen) -> Currents:
+        """See :class:`Excitation`."""
+        wanted: Currents = np.zeros(len(seen))
+        for i, (angle, velocity, step, applied) in enumerate(seen.tolist()):
+            estimator = self._estimators[i]
+            estimator.take(angle, velocity, step, applied)
+            speed = self._speeds[min(int(step), len(self._speeds) - 1)]
+            wanted[i] = current_for(estimator.model, estimator.state, estimator.relative, speed, self._gain)
+        return wanted
+
+
+def target_speeds(policy: Policy, bench: Bench) -> Floats:
+    """Speeds that a policy asks for at each step [rad/s], at rest with the nominal estimate, shape [horizon]."""
+    inference, timing = Inference(policy.data, policy.contract), bench.timing
+    nominal, speeds = [getattr(bench.brake, name) for name in PARAMETER_NAMES], np.zeros(timing.horizon)
+    followed = policy.contract.kind == "reference"
+    for k in range(timing.horizon):
+        seen = nominal if followed else [0.0, 0.0, k * timing.sample_time, *nominal, *[0.0] * len(nominal)]
+        inference.inputs[:] = array(inference.inputs.typecode, seen[: len(inference.inputs)])
+        inference.run()
+        levels = inference.outputs[: (len(inference.outputs) + 1) // 2]
+        after = [share_after(switch, float(k), float(timing.horizon)) for switch in inference.outputs[len(levels) :]]
+        within = -np.diff(np.minimum.accumulate([1.0, *after, 0.0]))  # share of the period in each level
+        speeds[k] = within @ np.array(levels) * (bench.limits.velocity if followed else 1.0)
+    return speeds
 
 
 Results = TypeVar("Results", bound="Outcome")
@@ -159,9 +224,7 @@ def followed(batch: Batch, excitation: Excitation) -> Iterator[Seen]:
         seen = batch.seen()
         wanted = excitation(seen)
         if not np.isfinite(wanted[~left]).all():
-            raise PolicyRefusedError(
-                f"expected finite currents, got another at step {k}, not finite: this actor cannot be played"
-            )
+            raise PolicyRefusedError(f"its current is not finite at step {k}: it cannot be played")
         batch.advance(wanted)
         left |= batch.violated
         yield seen

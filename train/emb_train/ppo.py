@@ -7,10 +7,13 @@ iteration i comes from (seed, i); the networks begin with torch's global random 
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -18,12 +21,21 @@ import torch
 from torch import Tensor, nn
 
 from emb_bench.config.bench import Bench
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EmbError
+from emb_runtime.policy.contract import SAMPLE
 from emb_train.env import EmbExcitationVectorEnv
 
+Result = TypeVar("Result")
 Count = Annotated[int, msgspec.Meta(ge=1, le=2**31)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+
+
+STEPS = 128  # Soft steps in time that a network of time and estimate has
+SLOPE = 2.0  # Of the soft step in an estimate, at the nominal value and relative to it
+FARTHEST = 1.0  # Most that a reward may be from its pair's mean
+FINENESS = 9.0  # A speed is sinh(9 a)/sinh 9 of the limit for the action a
 
 
 class TrainingDivergedError(EmbError):
@@ -47,10 +59,18 @@ class Ppo(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     entropy: float = 0.0  # Weight of the entropy bonus
     max_gradient: Positive = 0.5  # Largest norm of the gradient, for each network separately
     hidden: tuple[Count, ...] = (64, 64)  # Widths of the hidden layers of both networks
-    initial_mean: float = 0.0  # Mean action of the untrained actor, part of the current limit
-    initial_deviation: Positive = 0.5  # The untrained action's standard deviation, part of the current limit
+    initial_mean: float = 0.0  # Mean action of the untrained actor, part of the limit
+    initial_deviation: Positive = 0.5  # The untrained action's standard deviation, part of the limit
     noise_memory: Annotated[float, msgspec.Meta(ge=0.0, lt=1.0)] = 0.0
     """Correlation of the exploration noise from one step to the next, see :func:`exploration_noise`."""
+    noise_hold: Count = 1  # Steps for which a value of the exploration noise is held; one step of these is learned from
+    final_deviation: Positive | None = None
+    """The action's standard deviation falls linearly to this one over the training; None learns it."""
+    clone_steps: Count = 6000  # Gradient steps of the cloning of a plan
+    clone_rate: Positive = 3e-3  # Learning rate of the cloning at the start
+    pairs: bool = False
+    """Experiments come in pairs with the same brake and the opposite exploration, and a return counts by its difference
+    from the pair's mean (antithetic variates): the luck of the brake drops out."""
 
     @property
     def batch(self) -> int:
@@ -63,44 +83,98 @@ class Ppo(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         return -(-self.total_steps // self.batch)
 
 
-class Actor(nn.Module):
-    """Network from raw actor observations to the mean of the action, a part of the current limit.
-
-    The normaliser has fixed constants from the bench (middle and half of each signal's range), is part of the network,
-    and therefore of every file and of the exported graph. An action is Gaussian around the mean; the environment clips
-    it to the limit.
-    """
+class Scaled(nn.Module):
+    """Raw observations in scales of order one, with fixed constants from the bench."""
 
     centre: Tensor
     span: Tensor
 
-    def __init__(
-        self, bench: Bench, hidden: Sequence[int], initial_mean: float, initial_deviation: float, inputs: int = 3
-    ) -> None:
-        """Build the network.
-
-        Args:
-            bench: gives the ranges of the signals.
-            hidden: widths of the hidden layers.
-            initial_mean: mean of the untrained action, everywhere, as a part of the limit.
-            initial_deviation: standard deviation of the untrained action.
-            inputs: length of an observation; one of another length than the measured three has scales of order one.
-        """
+    def __init__(self, bench: Bench, size: int) -> None:
+        """Middle and half of each measured signal's range; an observation of another length has such scales already."""
         super().__init__()
         (low, high), half = bench.limits.angle, 0.5 * bench.timing.horizon
-        centre, span = torch.zeros(inputs), torch.ones(inputs)
-        if inputs == 3:
+        centre, span = torch.zeros(size), torch.ones(size)
+        if size == len(SAMPLE):
             centre = torch.tensor([0.5 * (low + high), 0.0, half])
             span = torch.tensor([0.5 * (high - low), bench.limits.velocity, half])
         self.register_buffer("centre", centre)
         self.register_buffer("span", span)
-        self.log_deviation = nn.Parameter(torch.full((1,), math.log(initial_deviation)))
-        self.layers = perceptron(inputs, hidden, gain=0.01, bias=initial_mean)
+
+    def in_seconds(self, sample_time: float) -> None:
+        """Take the time in seconds in place of the step."""
+        self.centre[len(SAMPLE) - 1] *= sample_time
+        self.span[len(SAMPLE) - 1] *= sample_time
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Shape [N, size] to the same."""
+        return (observation - self.centre) / self.span
+
+
+class TimeAndEstimate(nn.Module):
+    """Features of an observation with the estimate: soft steps in time, and in each of the four estimates.
+
+    A plan changes its speed from one sample to the next. Steps spread over the experiment let a network do so from the
+    start. The measured sample and the estimate's deviations are left out: under clock jitter the deviations jump.
+    """
+
+    scale: Tensor
+    shift: Tensor
+
+    def __init__(self, bench: Bench) -> None:
+        super().__init__()
+        width, nominal = bench.timing.horizon / STEPS, torch.tensor(nominal_of(bench))
+        scale, shift = torch.zeros(STEPS + len(nominal), 1 + len(nominal)), torch.zeros(STEPS + len(nominal))
+        scale[:STEPS, 0], shift[:STEPS] = 1.0 / width, -torch.arange(STEPS)
+        scale[STEPS:, 1:], shift[STEPS:] = torch.diag(SLOPE / nominal), -SLOPE
+        self.register_buffer("scale", scale)
+        self.register_buffer("shift", shift)
+
+    def in_seconds(self, sample_time: float) -> None:
+        """Take the time in seconds in place of the step."""
+        self.scale[:, 0] /= sample_time
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Shape [N, 11] to [N, features]."""
+        time_and_estimate = observation[:, len(SAMPLE) - 1 : len(SAMPLE) + len(PARAMETER_NAMES)]
+        return torch.tanh(nn.functional.linear(time_and_estimate, self.scale, self.shift))
+
+
+class Actor(nn.Module):
+    """Network from raw actor observations to the mean of the action.
+
+    The features have fixed constants from the bench, are part of the network, and therefore of every file and of the
+    exported graph. An action is Gaussian around the mean; :meth:`part` makes it a part of the limit.
+    """
+
+    def __init__(self, bench: Bench, ppo: Ppo, inputs: int = len(SAMPLE), speed: bool = False) -> None:
+        """Build the network.
+
+        Args:
+            bench: gives the ranges of the signals.
+            ppo: widths of the layers, mean and standard deviation of the untrained action.
+            inputs: length of an observation; one of another length than the measured three has scales of order one.
+            speed: the action is a target speed, of time and estimate.
+        """
+        super().__init__()
+        self._speed = speed
+        features = TimeAndEstimate(bench) if speed else Scaled(bench, inputs)
+        self.features: TimeAndEstimate | Scaled = features
+        self.log_deviation = nn.Parameter(torch.full((1,), math.log(ppo.initial_deviation)))
+        self.log_deviation.requires_grad_(ppo.final_deviation is None)
+        size = len(features.shift) if isinstance(features, TimeAndEstimate) else inputs
+        self.layers = perceptron(size, ppo.hidden, gain=0.01, bias=ppo.initial_mean)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Means of the actions, shape [N, 1], for observations of shape [N, I]."""
-        mean: Tensor = self.layers((observation - self.centre) / self.span)
+        mean: Tensor = self.layers(self.features(observation))
         return mean
+
+    def part(self, action: Tensor) -> Tensor:
+        """The part of the limit that an action is; one beyond ±1 is clipped behind it.
+
+        Near zero a speed is exponentially finer, so that noise lets neither a creep nor a standstill stick.
+        """
+        return torch.sinh(FINENESS * action.clamp(-1.0, 1.0)) / math.sinh(FINENESS) if self._speed else action
 
     def log_density(self, observation: Tensor, action: Tensor) -> Tensor:
         """Log π(a | o) of actions, shape [N, 1], around their means: shape [N]."""
@@ -119,10 +193,10 @@ class Actor(nn.Module):
 class Critic(nn.Module):
     """Network from the critic's observations, already of order one, to the value of the state."""
 
-    def __init__(self, size: int, hidden: Sequence[int]) -> None:
-        """Build the network for observations of length ``size``."""
+    def __init__(self, size: int, hidden: Sequence[int], gain: float = 1.0) -> None:
+        """Build the network for observations of length ``size``; ``gain`` is of the untrained values."""
         super().__init__()
-        self.layers = perceptron(size, hidden, gain=1.0, bias=0.0)
+        self.layers = perceptron(size, hidden, gain=gain, bias=0.0)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Values, shape [N], for observations of shape [N, size]."""
@@ -131,18 +205,53 @@ class Critic(nn.Module):
 
 
 class DeployedActor(nn.Module):
-    """The network that is exported: raw observation in, current [A] out; normaliser, scaling and clip inside."""
+    """The network that is exported: raw observation in, current [A] or speed [rad/s] out; scaling and clip inside."""
 
     def __init__(self, actor: Actor, limit: float, sample_time: float = 1.0) -> None:
-        """Wrap a trained actor for a bench with this current limit [A]; with a sample time [s] it is given the time."""
+        """Wrap a trained actor for a bench with this limit, [A] or [rad/s]; with a sample time [s] it gets the time."""
         super().__init__()
-        self.actor, self.limit, self.sample_time = actor, limit, sample_time
+        self.actor, self.limit = copy.deepcopy(actor), limit
+        if sample_time != 1.0:
+            self.actor.features.in_seconds(sample_time)
+        alike = [nn.Tanh() if isinstance(layer, Tanh) else layer for layer in self.actor.layers]  # one operator
+        self.actor.layers = nn.Sequential(*alike)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Currents [A] within ±limit, shape [N, 1], for raw observations, shape [N, I]."""
-        if self.sample_time != 1.0:
-            observation = torch.cat([observation[:, :2], observation[:, 2:] / self.sample_time], 1)
-        return self.limit * torch.clamp(self.actor(observation), -1.0, 1.0)
+        """Currents [A] or speeds [rad/s] within ±limit, shape [N, 1], for raw observations, shape [N, I]."""
+        return torch.clamp(self.limit * self.actor.part(self.actor(observation)), -self.limit, self.limit)
+
+
+def clone(actor: Actor, speeds: Sequence[float], bench: Bench, ppo: Ppo, generator: torch.Generator) -> float:
+    """Let an untrained actor of speeds follow a plan, whatever the estimate is: supervised learning, in place.
+
+    Args:
+        actor: becomes the plan.
+        speeds: parts of the limit, one for each step.
+        bench: of the actor; gives the estimates that are drawn around the nominal ones.
+        ppo: number of steps, and learning rate, of the cloning.
+        generator: of the estimates.
+
+    Returns:
+        Root mean square of what is left, of the action.
+    """
+    wanted = torch.asinh(torch.tensor(speeds, dtype=torch.float32) * math.sinh(FINENESS)) / FINENESS
+    time, nominal = torch.arange(len(wanted), dtype=torch.float32)[:, None], torch.tensor(nominal_of(bench))
+    optimiser = torch.optim.Adam(actor.layers.parameters(), ppo.clone_rate, fused=True)
+    loss = torch.zeros(())
+    for step in range(ppo.clone_steps):
+        optimiser.param_groups[0]["lr"] = ppo.clone_rate * (1.0 - step / ppo.clone_steps)
+        estimate = nominal * (0.5 + torch.rand(len(wanted), len(nominal), generator=generator))
+        seen = torch.cat([torch.zeros(len(wanted), 2), time, estimate, torch.zeros_like(estimate)], 1)
+        loss = (actor(seen)[:, 0] - wanted).square().mean()
+        optimiser.zero_grad()
+        torch.autograd.backward(loss)
+        optimiser.step()
+    return math.sqrt(float(loss.detach()))
+
+
+def nominal_of(bench: Bench) -> list[float]:
+    """Nominal values of the four parameters, SI units."""
+    return [getattr(bench.brake, name) for name in PARAMETER_NAMES]
 
 
 class _Tanh(torch.autograd.Function):
@@ -197,10 +306,17 @@ class Rollout:
     log_densities: Tensor  # Log π(a | o) of these actions, shape [T, N]
     rewards: Tensor  # Shape [T, N]
     terminals: Tensor  # 1 where the step ended its experiment, shape [T, N]
+    strayed: Tensor  # 1 where the step left the limits, shape [T, N]
     ended: int  # Experiments that ended
-    violations: int  # Experiments among these that left the limits
     home: int  # Experiments among these that ended at home
     information: float  # Mean of the first diagonal element of the FIM over the experiments that ended; NaN if none did
+    mean_return: float
+    """Sum of the rewards per experiment that ended; that began, where the rollout is shorter than an experiment."""
+
+    @property
+    def violations(self) -> int:
+        """Experiments among these that left the limits."""
+        return int(self.strayed.sum())
 
 
 @dataclass(frozen=True)
@@ -220,8 +336,8 @@ class Metrics:
     deviation: float  # Standard deviation of the action, part of the limit
 
 
-def train(env: EmbExcitationVectorEnv, actor: Actor, ppo: Ppo, seed: int) -> Iterator[Metrics]:
-    """Train an actor, in place (Algorithm 1).
+def train(envs: Sequence[EmbExcitationVectorEnv], actor: Actor, ppo: Ppo, seed: int) -> Iterator[Metrics]:
+    """Train an actor, in place (Algorithm 1), on the experiments of several environments alike.
 
     Yields:
         After each iteration, its results.
@@ -230,30 +346,35 @@ def train(env: EmbExcitationVectorEnv, actor: Actor, ppo: Ppo, seed: int) -> Ite
         TrainingDivergedError: something is not finite any more, or for long every experiment has left the limits.
     """
     torch.set_num_threads(1)  # networks this small lose more by sharing out a product than they win
-    critic = Critic(env.batch.critic_size, ppo.hidden)
-    optimiser = torch.optim.Adam([*actor.parameters(), *critic.parameters()], eps=1e-5, fused=True)
+    critic = Critic(envs[0].batch.critic_size, ppo.hidden, 0.01 if ppo.pairs else 1.0)
+    learned = [weight for weight in (*actor.parameters(), *critic.parameters()) if weight.requires_grad]
+    optimiser = torch.optim.Adam(learned, eps=1e-5, fused=True)
     early = 0
     for iteration in range(ppo.iterations):
         draws = np.random.SeedSequence([seed, iteration]).generate_state(ppo.envs + 1, np.uint64).tolist()
         generator = torch.Generator().manual_seed(draws.pop() >> 1)
-        optimiser.param_groups[0]["lr"] = ppo.learning_rate * (1.0 - iteration / ppo.iterations)
-        rollout = collect(env, actor, ppo.rollout, ppo.noise_memory, draws, generator)
+        left = 1.0 - iteration / ppo.iterations
+        optimiser.param_groups[0]["lr"] = ppo.learning_rate * left
+        if ppo.final_deviation is not None:
+            deviation = ppo.final_deviation + left * (ppo.initial_deviation - ppo.final_deviation)
+            actor.log_deviation.fill_(math.log(deviation))
+        rollout = collect_all(envs, actor, ppo, draws, generator)
         losses = improve(actor, critic, optimiser, rollout, ppo, generator)
         if not all(torch.isfinite(w).all() for network in (actor, critic) for w in network.parameters()):
             raise TrainingDivergedError(
-                f"training diverged in iteration {iteration + 1}: a weight is not finite: lower the learning rate or "
-                "the reward's scale"
+                f"training diverged in iteration {iteration + 1}: a weight is not finite: lower learning_rate or "
+                "scale with --set"
             )
         early = early + 1 if rollout.ended == rollout.violations > 0 else 0
         if early > max(10, ppo.iterations // 4):
             raise TrainingDivergedError(
                 f"training diverged in iteration {iteration + 1}: for {early} iterations every experiment has left "
-                "the limits: lower the learning rate, raise the penalty, or train with the shield"
+                "the limits: lower learning_rate with --set, or take a preset with the shield"
             )
         yield Metrics(
             iteration=iteration + 1,
             steps=(iteration + 1) * ppo.batch,
-            mean_return=float(rollout.rewards.sum()) / max(rollout.ended, 1),
+            mean_return=rollout.mean_return,
             information=rollout.information,
             violations=rollout.violations,
             home=rollout.home,
@@ -263,67 +384,129 @@ def train(env: EmbExcitationVectorEnv, actor: Actor, ppo: Ppo, seed: int) -> Ite
         )
 
 
-@torch.no_grad()
-def collect(
-    env: EmbExcitationVectorEnv,
-    actor: Actor,
-    steps: int,
-    noise_memory: float,
-    seeds: Sequence[int],
-    generator: torch.Generator,
-    exploration: float = 1.0,
+def collect_all(
+    envs: Sequence[EmbExcitationVectorEnv], actor: Actor, ppo: Ppo, seeds: Sequence[int], generator: torch.Generator
 ) -> Rollout:
-    """Begin new experiments with these seeds and follow the actor for ``steps`` steps.
+    """The rollouts of all environments side by side, each with its share of the seeds; see :func:`collect`."""
+    noise = [exploration_noise(ppo.rollout, e.num_envs, ppo.noise_memory, generator, ppo.noise_hold) for e in envs]
+    own, left = [], list(seeds)
+    for env in envs:
+        own.append(left[: env.num_envs])
+        del left[: env.num_envs]
+    if not ppo.pairs:
+        return joined(at_once(collect, envs, [actor] * len(envs), noise, own))
+    for of_env, values in zip(own, noise, strict=True):
+        half = len(of_env) // 2
+        of_env[half:], values[:, half:] = of_env[:half], -values[:, :half]
+    return joined([against_mean(found) for found in at_once(collect, envs, [actor] * len(envs), noise, own)])
+
+
+def at_once(work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
+    """The results of work with several environments: while one steps, another may wait for what processes do."""
+    with ThreadPoolExecutor(os.cpu_count() or 1) as threads:
+        return list(threads.map(work, *arguments))
+
+
+def against_mean(rollout: Rollout) -> Rollout:
+    """A rollout of pairs, experiment i and i + N/2, with rewards less their pair's mean.
+
+    A pair of which one leaves the limits does not end together. There, the first experiments are compared by their
+    returns, each in its last step. One that left the limits gets the least, and what follows counts for nothing.
+    """
+    apart = _less_mean(rollout.rewards)
+    first = rollout.terminals.cumsum(0) - rollout.terminals == 0.0
+    left = (rollout.strayed.bool() & first).any(0)
+    returns = torch.where(first, rollout.rewards, 0.0).sum(0).masked_fill(left, -math.inf)
+    paid = torch.where(left, -FARTHEST, _less_mean(returns[None])[0])
+    ends = torch.zeros_like(apart)
+    ends[first.sum(0) - 1, torch.arange(len(left))] = paid
+    one, other = rollout.strayed.any(0).chunk(2)
+    return replace(rollout, rewards=torch.where(torch.cat(2 * [one | other]), ends, apart))
+
+
+def _less_mean(values: Tensor) -> Tensor:
+    """Values of pairs less their pair's mean, bounded: one that goes astray would drown all others. Shape [.., N]."""
+    first, second = torch.chunk(values, 2, 1)
+    apart = (0.5 * (first - second)).clamp(-FARTHEST, FARTHEST)
+    return torch.cat([apart, -apart], 1)
+
+
+def joined(rollouts: Sequence[Rollout]) -> Rollout:
+    """Several rollouts of the same steps as one, side by side."""
+
+    def beside(name: str) -> Tensor:
+        return torch.cat([getattr(one, name) for one in rollouts], 1)
+
+    return Rollout(
+        seen=beside("seen"),
+        states=beside("states"),
+        actions=beside("actions"),
+        log_densities=beside("log_densities"),
+        rewards=beside("rewards"),
+        terminals=beside("terminals"),
+        ended=sum(one.ended for one in rollouts),
+        strayed=beside("strayed"),
+        home=sum(one.home for one in rollouts),
+        information=float(np.mean([one.information for one in rollouts])),
+        mean_return=float(np.mean([one.mean_return for one in rollouts])),
+    )
+
+
+@torch.no_grad()
+def collect(env: EmbExcitationVectorEnv, actor: Actor, noise: Tensor, seeds: Sequence[int]) -> Rollout:
+    """Begin new experiments with these seeds and follow the actor for T steps.
 
     An experiment that ends begins again with another brake.
 
     Args:
         env: with N experiments.
         actor: on the CPU.
-        steps: T.
-        noise_memory: see :func:`exploration_noise`.
+        noise: in standard deviations of the policy, shape [T, N, 1]; zeros follow the mean action.
         seeds: of the N experiments.
-        generator: of the exploration.
-        exploration: times the policy's own standard deviation; 0 for the mean action.
     """
+    steps = len(noise)
     observation, info = env.reset(seed=seeds)
     seen = torch.empty(steps, *observation.shape)
     states = torch.empty(steps + 1, *info["critic"].shape)
-    rewards, terminals = torch.empty(steps, env.num_envs), torch.empty(steps, env.num_envs)
-    actions = exploration_noise(steps, env.num_envs, noise_memory, generator)
-    log_densities = actor.log_density_of(actions)
-    actions *= exploration * actor.log_deviation.exp()
-    ended, violations, home, gathered = 0, 0, 0, 0.0
+    rewards, terminals, strayed = (torch.zeros(steps, env.num_envs) for _ in range(3))
+    log_densities = actor.log_density_of(noise)
+    actions = noise * actor.log_deviation.exp()
+    ended, home, gathered = 0, 0, 0.0
     for t in range(steps):
         seen[t], states[t] = torch.from_numpy(observation), torch.from_numpy(info["critic"])
         actions[t] += actor(seen[t])
         step = env.step if t + 1 < steps else env.advance  # nobody would play what begins after the last one
-        observation, reward, over, _, info = step(actions[t].numpy())
+        observation, reward, over, _, info = step(actor.part(actions[t]).numpy())
         rewards[t], terminals[t] = torch.from_numpy(reward), torch.from_numpy(over)
         if over.any():
             final = info.get("final_info", info)
             ended, gathered = ended + int(over.sum()), gathered + float(final["fim"][over, 0].sum())
-            violations, home = violations + int(final["violated"][over].sum()), home + int(final["home"][over].sum())
+            home += int(final["home"][over].sum())
+            strayed[t] = torch.from_numpy(over & final["violated"])
     states[steps] = torch.from_numpy(info["critic"])
     information = gathered / ended if ended else math.nan
-    return Rollout(seen, states, actions, log_densities, rewards, terminals, ended, violations, home, information)
+    whole = ended and steps >= env.batch.setup.rules.horizon
+    mean_return = float(rewards.sum()) / (ended if whole else env.num_envs + int(terminals[:-1].sum()))
+    return Rollout(
+        seen, states, actions, log_densities, rewards, terminals, strayed, ended, home, information, mean_return
+    )
 
 
-def exploration_noise(steps: int, envs: int, noise_memory: float, generator: torch.Generator) -> Tensor:
+def exploration_noise(steps: int, envs: int, noise_memory: float, generator: torch.Generator, hold: int = 1) -> Tensor:
     """Gaussian noise with standard deviation 1 at every step and correlation ``noise_memory`` from step to step.
 
     White noise at 1 kHz averages out before the brake notices. Each step's own density is unchanged, and the policy's
     gradient estimated with it is the true one of the smoothed objective times the noise's covariance over time: an
-    ascent direction that moves neighbouring steps together.
+    ascent direction that moves neighbouring steps together. Each value is held for ``hold`` steps.
 
     Returns:
         Shape [steps, envs, 1].
     """
-    noise = torch.randn(steps, envs, 1, generator=generator)
+    noise = torch.randn(-(-steps // hold), envs, 1, generator=generator)
     noise[1:] *= math.sqrt(1.0 - noise_memory * noise_memory)
-    for t in range(1, steps):
+    for t in range(1, len(noise)):
         noise[t] += noise_memory * noise[t - 1]
-    return noise
+    return noise.repeat_interleave(hold, 0)[:steps]
 
 
 def improve(
@@ -335,15 +518,20 @@ def improve(
     generator: torch.Generator,
 ) -> dict[str, float]:
     """Improve both networks on a rollout, K epochs of minibatches; returns the losses of :class:`Metrics`."""
-    seen, actions = rollout.seen.flatten(0, 1), rollout.actions.flatten(0, 1)
-    states = rollout.states[:-1].flatten(0, 1)
+    phase = int(torch.randint(ppo.noise_hold, (), generator=generator)) if ppo.noise_hold > 1 else 0
+
+    def thinned(of_steps: Tensor) -> Tensor:
+        """One step of each that the noise was held for, those of all experiments one after the other."""
+        return of_steps[phase :: ppo.noise_hold].flatten(0, 1)
+
+    seen, actions, states = thinned(rollout.seen), thinned(rollout.actions), thinned(rollout.states[:-1])
     with torch.no_grad():
         values = critic(rollout.states)
     advantages = generalised_advantages(rollout.rewards, values, rollout.terminals, ppo.gamma, ppo.gae_lambda)
-    returns = (advantages + values[:-1]).flatten()
-    advantages = advantages.flatten()
+    returns = thinned(advantages + values[:-1])
+    advantages = thinned(advantages)
     advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-    columns = (seen, actions, states, torch.stack((rollout.log_densities.flatten(), advantages, returns), 1))
+    columns = (seen, actions, states, torch.stack((thinned(rollout.log_densities), advantages, returns), 1))
     samples, widths = torch.cat(columns, 1), [column.shape[1] for column in columns]  # one gather, not six
     records: list[list[float]] = []
     for epoch in range(ppo.epochs):

@@ -1,11 +1,12 @@
-"""Presets, tasks and packaged references by name, with a line on each for ``--help``: read without torch.
+"""Presets by name, with a line on each for ``--help``: read without torch.
 
-Presets are the trainings of ``emb-train ppo``, in ``presets.toml``: ``thesis-…`` under the thesis's conditions and with
+They are the trainings of ``emb-train ppo``, in ``presets.toml``: ``thesis-…`` under the thesis's conditions and with
 its hyper-parameters, the others the project's own.
 """
 
 from __future__ import annotations
 
+import copy
 import textwrap
 import tomllib
 from collections.abc import Mapping
@@ -16,17 +17,8 @@ from typing import Any
 from emb_runtime.errors import UsageError, near
 
 FILES = resources.files("emb_train")
+DEFAULT_PRESET = "interval"
 WIDTH = 118  # Of a help text's lines
-TASKS: Mapping[str, str] = {
-    "viscous": "f_v in 1e-5..5e-5, the others known, weighted",
-    "viscous-stiffness": "k_1 and f_v of Table 6.1, the others known, weighted E",
-    "four-d": "k_m, k_1, T_c, f_v within 50 %, D",
-    "four-e": "k_m, k_1, T_c, f_v within 50 %, E",
-    "four-a": "k_m, k_1, T_c, f_v within 50 %, A",
-    "four-t": "k_m, k_1, T_c, f_v within 50 %, T: the interval between runs that an estimate will have",
-    "four-time": "k_m, k_1, T_c, f_v within 50 %, until 95 % of each are within 1.2 %",
-}
-"""Tasks that a reference is learned for."""
 
 
 @cache
@@ -40,7 +32,7 @@ def preset_summaries() -> dict[str, str]:
 
 
 def preset_record(name: str) -> dict[str, Any]:
-    """The table of a preset, with its hyper-parameters.
+    """The table of a preset, with its hyper-parameters; the caller's own.
 
     Raises:
         UsageError: there is no such preset.
@@ -49,13 +41,9 @@ def preset_record(name: str) -> dict[str, Any]:
     if name not in presets:
         there = f"there are: {', '.join(sorted(presets))}{near(name, presets)}"
         raise UsageError(f"no preset is called '{name}'; {there}")
-    own = dict(presets[name]["ppo"])
-    return {**presets[name], "preset": name, "ppo": _file()["hyper_parameters"][own.pop("base")] | own}
-
-
-def reference_names() -> list[str]:
-    """Names of the references that are part of the package."""
-    return sorted(file.name.removesuffix(".json") for file in FILES.joinpath("references").iterdir())
+    record = copy.deepcopy(presets[name])
+    base = copy.deepcopy(_file()["hyper_parameters"][record["ppo"].pop("base")])
+    return {**record, "preset": name, "ppo": base | record["ppo"]}
 
 
 def listed(entries: Mapping[str, str]) -> str:

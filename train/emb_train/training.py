@@ -4,6 +4,10 @@
 * ``bench.toml``: the bench as it was read.
 * ``actor.safetensors``: the actor of the iteration that did best on brakes that no training draws.
 * ``metrics.jsonl``: a line for each iteration.
+* ``plan.json``: the plan that an actor of speeds began with.
+
+A training for speeds has a plan before: it searches a coarse one (:mod:`emb_train.plan`), lets the actor follow it
+(:func:`emb_train.ppo.clone`), and improves that.
 """
 
 from __future__ import annotations
@@ -11,7 +15,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections.abc import Callable
+from concurrent.futures import Executor
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -24,22 +31,50 @@ from safetensors.torch import load, save
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
+from emb_bench.estimate.expected import NUMBERS, IntervalCriterion
+from emb_bench.figures import COLOURS, GREY, drawn
 from emb_bench.output import make_empty_folder, replacing
+from emb_bench.parallel import processes
 from emb_runtime.config.typed import read
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
 from emb_runtime.system.terminal import as_json
-from emb_train.closed_loop import BENCH_CONDITIONS, Conditions, require_covered, require_possible
-from emb_train.env import EmbExcitationVectorEnv
-from emb_train.ppo import Actor, Metrics, Ppo, collect, train
+from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, SPEED, Conditions, require_covered, require_possible
+from emb_train.env import AnyReward, EmbExcitationVectorEnv, ExpectedInterval, TimeToPrecision
+from emb_train.plan import Compared, Found, search, speeds_of
+from emb_train.ppo import Actor, Count, Metrics, Ppo, at_once, clone, collect, joined, train
 from emb_train.presets import preset_record
 from emb_train.rewards import REWARDS
 
 ACTOR, CONFIGURATION, BENCH, METRICS = "actor.safetensors", "training.json", "bench.toml", "metrics.jsonl"
+TIME = "time"  # Reward: until the estimates are precise
+PLAN, CURVE, ONNX = "plan.json", "curve.png", "actor.onnx"
 LARGEST_FILE = 1 << 26  # [bytes]
 VALIDATION_BRAKES = 64  # In a validation
 VALIDATIONS = 10  # Validations in a training, evenly spread
+PLAN_STREAM = 0x6E756D73  # Spawn key of the plans
 VALIDATION_STREAM = 0x6578616D  # Spawn key of the seeds of the validation; those of a training's iterations have none
+
+
+class PlanSearch(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The search for the plan that an actor begins with."""
+
+    drawn: Count = 1600  # Plans at random
+    starts: Count = 2  # Of these, from which CMA-ES begins
+    steps: Count = 60  # Of CMA-ES from each
+    population: Annotated[int, msgspec.Meta(ge=4, le=1000)] = 16  # Plans of a step
+    brakes: Count = 3  # Of each plant, on which they are compared
+
+    @property
+    def rounds(self) -> int:
+        """Times that plans are compared."""
+        return -(-self.drawn // (self.population * self.brakes)) + 1 + self.starts * self.steps
+
+
+class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A plan as it is kept: parts of the limit of the speed, one for each step."""
+
+    speeds: Annotated[tuple[Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)], ...], msgspec.Meta(min_length=1)]
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -49,28 +84,44 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     summary: str  # One line on what is learned
     ranges: str  # Set of the bench that brakes are drawn from, uniformly (thesis 4.7.2)
     parameters: tuple[str, ...]  # Parameters whose Fisher information is collected, in the order of ``PARAMETER_NAMES``
-    reward: str  # Name of a reward of :data:`emb_train.rewards.REWARDS`
+    reward: str  # One of :data:`emb_train.rewards.REWARDS`, a criterion of the expected interval, or ``time``
     scale: Annotated[float, msgspec.Meta(gt=0.0)]  # Its factor: the thesis normalises, a fixed one needs no state
     ppo: Ppo  # The hyper-parameters
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] = 0  # Seed of everything random
-    plant: str = DEFAULT_PLANT  # Name of the bench's plant that the brakes are
+    plants: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)] = (DEFAULT_PLANT,)  # Of the bench, each alike
     conditions: Conditions = BENCH_CONDITIONS
+    plan: PlanSearch | None = None  # What the actor begins with; None for a network that knows nothing
 
-    def environment(self, bench: Bench, count: int) -> EmbExcitationVectorEnv:
-        """N experiments under this training's conditions.
+    @property
+    def share(self) -> int:
+        """Experiments side by side are a multiple of this: as many of each plant, in pairs if they come so."""
+        return len(self.plants) * (2 if self.ppo.pairs else 1)
+
+    def environments(self, bench: Bench, count: int, pool: Executor | None = None) -> list[EmbExcitationVectorEnv]:
+        """Experiments under this training's conditions, as many with each plant; the ``pool`` has processes.
 
         Raises:
             UsageError: the reward is not defined for the parameters, or the bench is none for this training.
-            BenchFileError: the bench lacks the ranges or the plant.
+            BenchFileError: the bench lacks the ranges or a plant.
         """
-        reward = REWARDS[self.reward]
-        where = (bench, self.ranges, self.parameters)
-        return EmbExcitationVectorEnv(count, *where, reward, self.scale, self.plant, self.conditions)
+        reward: AnyReward
+        if self.reward == TIME:
+            reward = TimeToPrecision()
+        elif self.reward in NUMBERS:
+            reward = ExpectedInterval(IntervalCriterion(self.reward), pool)
+        else:
+            reward = REWARDS[self.reward]
+        where = (count, bench, self.ranges, self.parameters, reward, self.scale)
+        return [EmbExcitationVectorEnv(*where, plant, self.conditions) for plant in self.plants]
 
     def untrained_actor(self, bench: Bench) -> Actor:
         """The actor that the training begins with."""
-        ppo, inputs = self.ppo, self.conditions.observation_size(len(self.parameters))
-        return Actor(bench, ppo.hidden, ppo.initial_mean, ppo.initial_deviation, inputs)
+        conditions = self.conditions
+        inputs = conditions.observation_size(len(self.parameters))
+        return Actor(bench, self.ppo, inputs, speed=conditions.acts == SPEED)
+
+
+Show = Callable[[Metrics | Found | None], object]
 
 
 class Trained(NamedTuple):
@@ -90,21 +141,56 @@ def training_from(record: object, source: str) -> Training:
         UsageError: a key is unknown or missing, or a value is of another type or impossible.
     """
     training = read(Training, record, source, UsageError)
-    if training.reward not in REWARDS:
-        raise UsageError(f"{source}: reward: expected one of {', '.join(REWARDS)}, got '{training.reward}'")
+    if training.reward not in (*REWARDS, *NUMBERS, TIME):
+        known = ", ".join((*REWARDS, *NUMBERS, TIME))
+        raise UsageError(f"{source}: reward: expected one of {known}, got '{training.reward}'")
+    if training.reward == TIME and not training.conditions.estimates:
+        raise UsageError(f'{source}: reward: a time needs the conditions acts = "speed", observes = "estimate"')
+    if (training.conditions.acts == SPEED) != (training.conditions.observes == ESTIMATE):
+        raise UsageError(f'{source}: conditions: expected acts = "speed" together with observes = "estimate"')
+    if training.plan is not None and training.conditions.acts != SPEED:
+        raise UsageError(f"{source}: plan: expected none, for the actor's action is no speed")
+    if training.ppo.noise_hold > training.ppo.rollout:
+        raise UsageError(f"{source}: noise_hold: expected at most the rollout of {training.ppo.rollout} steps")
+    if training.plan is not None and training.plan.starts > training.plan.population:
+        raise UsageError(f"{source}: plan.starts: expected at most the plan.population of {training.plan.population}")
+    if training.ppo.envs % training.share:
+        raise UsageError(
+            f"{source}: envs: expected a multiple of {training.share}, for as many of each plant, got "
+            f"{training.ppo.envs}"
+        )
     return training
 
 
 def load_preset(name: str, **changes: Any) -> Training:
-    """The configuration of a preset, with some values changed; ``total_steps`` is one of them.
+    """The configuration of a preset with some values changed.
+
+    Those of ``ppo`` and ``conditions`` have their own names, those of the plan's search ``plan.`` before it. Unless it
+    is changed, the number of experiments is rounded up to as many for each plant.
 
     Raises:
         UsageError: there is no such preset, or a value is not possible.
     """
     record = preset_record(name)
-    if "total_steps" in changes:
-        record["ppo"]["total_steps"] = changes.pop("total_steps")
-    return training_from({**record, **changes}, name)
+    for key, value in changes.items():
+        table, _, own = key.rpartition(".")
+        table = table or next((of for of, kind in TABLES.items() if key in kind.__struct_fields__), "")
+        (record.setdefault(table, {}) if table else record)[own] = value
+    if "envs" not in changes:
+        share = max(len(record["plants"]), 1) * (2 if record["ppo"].get("pairs") else 1)
+        record["ppo"]["envs"] = -(-record["ppo"].get("envs", Ppo(total_steps=1).envs) // share) * share
+    return training_from(record, name)
+
+
+TABLES = {"ppo": Ppo, "conditions": Conditions}  # Their values have names of their own
+
+
+def hyper_parameters(training: Training) -> dict[str, Any]:
+    """The values of a training that have names of their own, by name."""
+    plan = msgspec.structs.asdict(training.plan) if training.plan else {}
+    gain = {"gain": training.conditions.gain} if training.conditions.acts == SPEED else {}
+    of_plan = {f"plan.{name}": value for name, value in plan.items()}
+    return {"scale": training.scale} | msgspec.structs.asdict(training.ppo) | gain | of_plan
 
 
 def require_trainable(training: Training, bench: Bench) -> None:
@@ -115,9 +201,14 @@ def require_trainable(training: Training, bench: Bench) -> None:
             would not see the end of its experiments.
         BenchFileError: the bench lacks the ranges or the plant.
     """
-    require_possible(bench.plant(training.plant), training.conditions)
+    for plant in training.plants:
+        require_possible(bench.plant(plant), training.conditions)
     require_covered(bench, bench.range_set(training.ranges), training.conditions)
     rollout, horizon = training.ppo.rollout, training.conditions.applied(bench).timing.horizon
+    if rollout > horizon and (training.plan is not None or training.reward == TIME):
+        raise UsageError(f"rollout: expected at most the bench's horizon of {horizon} steps, got {rollout}")
+    if training.reward == TIME:  # what comes after the estimates are known does not count
+        return
     if rollout < horizon or (training.conditions.shielded and rollout % horizon):  # else experiments end at any step
         raise UsageError(
             f"expected a rollout of whole experiments, got {rollout} steps for the bench's horizon of {horizon}: "
@@ -125,51 +216,144 @@ def require_trainable(training: Training, bench: Bench) -> None:
         )
 
 
-def run_training(
-    folder: Path, training: Training, bench: Bench, show: Callable[[Metrics], object] = lambda metrics: None
-) -> None:
+def run_training(folder: Path, training: Training, bench: Bench, show: Show = lambda progress: None) -> None:
     """Train in a folder that has begun. It has the best actor so far at any time: a training can be interrupted.
+
+    One that is interrupted while it searches or clones a plan first lets the actor follow the best plan so far.
 
     Args:
         folder: of the results.
         training: what is trained.
         bench: limits, noise, timing, shield.
-        show: called after each iteration.
+        show: called after each step of the search for a plan, without one where the actor begins to follow it, and
+            after each iteration.
 
     Raises:
         EmbError: see :func:`emb_train.ppo.train`; or the folder is not writable.
     """
     torch.manual_seed(training.seed)
-    env, actor = training.environment(bench, training.ppo.envs), training.untrained_actor(bench)
-    validation, best = Validation(training, bench), -math.inf
-    every, last = max(1, training.ppo.iterations // VALIDATIONS), training.ppo.iterations
-    for metrics in train(env, actor, training.ppo, training.seed):
-        score = None
-        if metrics.iteration in (1, last) or metrics.iteration % every == 0:
-            score = validation.score(actor)
-            if score > best:
+    torch.set_num_threads(1)  # networks this small lose more by sharing out a product than they win
+    shared = training.reward in NUMBERS
+    with processes(os.cpu_count() or 1) if shared else nullcontext() as pool:
+        each = training.ppo.envs // len(training.plants)
+        envs, actor = training.environments(bench, each, pool), training.untrained_actor(bench)
+        stopped = False
+        if training.plan is not None:
+            stopped = follow_plan(folder, actor, training, training.plan, bench, pool, show)
+        validation, best = Validation(training, bench, pool), -math.inf
+        every, last = max(1, training.ppo.iterations // VALIDATIONS), training.ppo.iterations
+        if training.plan is not None:
+            best = validation.score(actor)
+            _note(folder, {"iteration": 0, "steps": 0, "score": best})
+            save_actor(folder, actor, 0, best)
+            if stopped:
+                raise KeyboardInterrupt
+        for metrics in train(envs, actor, training.ppo, training.seed):
+            validated = metrics.iteration in (1, last) or metrics.iteration % every == 0
+            score = validation.score(actor) if validated else None
+            _note(folder, asdict(metrics) | {"score": score})
+            if score is not None and score > best:
                 save_actor(folder, actor, metrics.iteration, score)
                 best = score
-        with (folder / METRICS).open("a", encoding="utf-8") as file:
-            file.write(as_json(asdict(metrics) | {"score": score}) + "\n")
-        show(metrics)
+            show(metrics)
+
+
+def _note(folder: Path, record: dict[str, Any]) -> None:
+    with (folder / METRICS).open("a", encoding="utf-8") as file:
+        file.write(as_json(record) + "\n")
+
+
+def follow_plan(
+    folder: Path,
+    actor: Actor,
+    training: Training,
+    asked: PlanSearch,
+    bench: Bench,
+    pool: Executor | None,
+    show: Show,
+) -> bool:
+    """Search a plan and let the actor follow it, in place; True if a Ctrl-C ended that, with the best plan so far.
+
+    Raises:
+        KeyboardInterrupt: there was no plan yet, or a second one came.
+    """
+    found: list[Found] = []
+
+    def searched(one: Found) -> None:
+        found[:] = [one]
+        show(one)
+
+    def follow() -> None:
+        numbers = np.clip(found[0].numbers, -1.0, 1.0)
+        speeds = speeds_of(numbers, training.ppo.rollout)
+        plan = np.pad(speeds, (0, max(bench.timing.horizon - len(speeds), 0)), "edge").tolist()
+        (folder / PLAN).write_bytes(msgspec.json.encode(Plan(tuple(plan))) + b"\n")
+        show(None)
+        clone(actor, plan, bench, training.ppo, torch.Generator().manual_seed(training.seed))
+
+    try:
+        search_plan(training, asked, bench, pool, searched)
+        follow()
+    except KeyboardInterrupt:
+        if not found or not math.isfinite(found[0].best):
+            raise
+        follow()
+        return True
+    return False
+
+
+def search_plan(
+    training: Training, asked: PlanSearch, bench: Bench, pool: Executor | None, show: Callable[[Found], object]
+) -> None:
+    """Search the plan that a training begins with; the last that is shown is the best."""
+    compared = Compared(
+        training.environments(bench, asked.population * asked.brakes, pool),
+        asked.population,
+        training.ppo.rollout,
+        training.seed,
+    )
+    rng = np.random.default_rng(np.random.SeedSequence(training.seed, spawn_key=(PLAN_STREAM,)))
+    search(compared, drawn=asked.drawn, starts=asked.starts, steps=asked.steps, rng=rng, show=show)
 
 
 class Validation:
     """Scores an actor on brakes that no training draws; they and their noise are drawn once."""
 
-    def __init__(self, training: Training, bench: Bench) -> None:
+    def __init__(self, training: Training, bench: Bench, pool: Executor | None = None) -> None:
         """Prepare for actors of this training."""
-        self._env = training.environment(bench, VALIDATION_BRAKES)
+        each = -(-VALIDATION_BRAKES // len(training.plants))
+        self._envs = training.environments(bench, each, pool)
         stream = np.random.SeedSequence(training.seed, spawn_key=(VALIDATION_STREAM,))
-        self._seeds = stream.generate_state(VALIDATION_BRAKES, np.uint64).tolist()
+        self._seeds = stream.generate_state(each, np.uint64).tolist()
 
     def score(self, actor: Actor) -> float:
         """Mean return of an experiment without exploration, in the training's own reward."""
-        steps = self._env.batch.setup.rules.horizon
-        seen = collect(self._env, actor, steps, 0.0, self._seeds, torch.Generator(), exploration=0.0)
+        steps, count = self._envs[0].batch.setup.rules.horizon, len(self._seeds)
+        each = len(self._envs)
+        noise = [torch.zeros(steps, count, 1)] * each
+        seen = joined(at_once(collect, self._envs, [actor] * each, noise, [self._seeds] * each))
         over = seen.terminals.cumsum(0) - seen.terminals
-        return float(torch.where(over > 0.0, 0.0, seen.rewards).sum()) / VALIDATION_BRAKES
+        return float(torch.where(over > 0.0, 0.0, seen.rewards).sum()) / seen.rewards.shape[1]
+
+
+def clear(folder: Path) -> None:
+    """Remove what a training wrote that has no actor yet."""
+    for name in (BENCH, CONFIGURATION, METRICS, PLAN):
+        (folder / name).unlink(missing_ok=True)
+
+
+def load_plan(path: Path) -> tuple[float, ...]:
+    """The plan that an actor began with: parts of the limit of the speed, one for each step.
+
+    Raises:
+        UsageError: the file cannot be read, or is something else.
+    """
+    try:
+        return msgspec.json.decode(read_bytes(path, LARGEST_FILE), type=Plan).speeds
+    except OSError as err:
+        raise UsageError(f"{path}: {err.strerror}") from err
+    except msgspec.DecodeError as err:
+        raise UsageError(f"{path}: expected the {PLAN} of emb-train ppo: {err}") from err
 
 
 def begin_training(folder: Path, training: Training, bench: Bench) -> None:
@@ -199,11 +383,11 @@ def save_actor(folder: Path, actor: Actor, iteration: int, score: float) -> None
         beside.write_bytes(save(tensors, {"training": record}))
 
 
-def load_training(folder: Path) -> Trained:
-    """Configuration, bench and actor of a training.
+def load_configuration(folder: Path) -> tuple[Training, Bench]:
+    """Configuration and bench of a training.
 
     Raises:
-        UsageError: it is not a training's folder, or a file in it is damaged or of another training.
+        UsageError: it is not a training's folder, or a file of these is damaged.
     """
     try:
         training = training_from(
@@ -212,7 +396,16 @@ def load_training(folder: Path) -> Trained:
     except (OSError, msgspec.DecodeError) as err:
         why = err.strerror if isinstance(err, OSError) else err
         raise UsageError(f"{folder}: not the folder of a training: cannot read {CONFIGURATION}: {why}") from err
-    bench = load_bench(folder / BENCH)
+    return training, load_bench(folder / BENCH)
+
+
+def load_training(folder: Path) -> Trained:
+    """Configuration, bench and actor of a training.
+
+    Raises:
+        UsageError: it is not a training's folder, or a file in it is damaged or of another training.
+    """
+    training, bench = load_configuration(folder)
     actor = training.untrained_actor(bench)
     try:
         data = read_bytes(folder / ACTOR, LARGEST_FILE)
@@ -233,3 +426,26 @@ def load_training(folder: Path) -> Trained:
 def _origin(folder: Path) -> str:
     """Digest that ties an actor to the two files beside it."""
     return hashlib.sha256((folder / CONFIGURATION).read_bytes() + (folder / BENCH).read_bytes()).hexdigest()
+
+
+def draw_curve(folder: Path, path: Path) -> None:
+    """Draw the learning curve of a training: mean return of an iteration, and the validations.
+
+    Raises:
+        UsageError: the results cannot be read, or the picture cannot be written.
+    """
+    try:
+        records = [msgspec.json.decode(line) for line in (folder / METRICS).read_bytes().splitlines()]
+    except (OSError, msgspec.DecodeError) as err:
+        raise UsageError(f"{folder / METRICS}: cannot be read: {err}") from err
+    steps = [1e-6 * record["steps"] for record in records]
+    validated = [
+        (at, record["score"]) for at, record in zip(steps, records, strict=True) if record["score"] is not None
+    ]
+    with drawn(path, 1, 1, "learning curve", (7.0, 4.0)) as axes:
+        (plot,) = axes.flat
+        returns = [record.get("mean_return", math.nan) for record in records]  # the plan's actor did not explore
+        plot.plot(steps, returns, color=GREY, label="with exploration")
+        plot.plot(*zip(*validated, strict=True), "o-", color=COLOURS[0], label="on brakes that no training draws")
+        plot.set(xlabel="steps of the environment, million", ylabel="mean return of an experiment")
+        plot.legend()

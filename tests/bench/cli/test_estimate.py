@@ -35,7 +35,7 @@ def test_a_run_on_the_simulated_bus_gives_back_the_brake_that_was_simulated(path
     assert list(got["parameters"]) == list(PARAMETER_NAMES)
     assert got["parameters"]["f_v"]["true"] == 3e-5
     for found in got["parameters"].values():
-        assert abs(found["value"] / found["true"] - 1.0) < 4.0 * found["deviation_between_runs"] < 0.04
+        assert abs(found["value"] / found["true"] - 1.0) < 4.0 * found["deviation_between_runs"] < 0.05
         low, high = found["interval_95"]
         assert high - low == pytest.approx(2.0 * 1.959964 * found["deviation"] * found["value"])
         assert 0.5 < found["sandwich"] / found["cramer_rao"] < 2.0

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 import torch
 
-from emb_bench.export.own_policy import observations
+from emb_bench.export.own_policy import WIDTHS, observations
 from emb_bench.export.policy_file import policy_file, versions
 from emb_bench.export.torch_policy import torch_graph
-from emb_export.file import bounds
+from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import PolicyRefusedError, UsageError
-from emb_runtime.policy.contract import SAMPLE, greatest_output
+from emb_runtime.policy.contract import MIN_VECTORS, VECTOR_TOLERANCE, greatest_output
 from emb_train.closed_loop import EVERYTHING
 from emb_train.ppo import DeployedActor
 from emb_train.training import load_training
@@ -32,22 +34,35 @@ def network_file(directory: Path) -> tuple[bytes, str]:
     if training.conditions.observes == EVERYTHING:
         raise UsageError(f"{directory}: observes the parameters and the information, which no bench measures")
     torch.set_num_threads(1)
-    kind = "current"  # of the environment's action
+    kind, width = training.conditions.acts, training.conditions.observation_size(len(training.parameters))
     actor = DeployedActor(trained.actor, greatest_output(kind, bench.limits), bench.timing.sample_time).eval()
-    seen = observations(bench)
+    seen = observations(bench, width)
     with torch.no_grad():
         wanted = actor(torch.from_numpy(seen)).numpy().astype(np.float64)
+        finer = copy.deepcopy(actor).double()(torch.from_numpy(seen.astype(np.float64))).numpy()
     if not np.isfinite(wanted).all():
         raise PolicyRefusedError("the trained network's answers are not finite: there is nothing to export")
-    parts = json.loads(msgspec.json.encode(training))
+    rounded = np.abs(finer - wanted)[:, 0] / actor.limit
+    alike = rounded <= 0.25 * VECTOR_TOLERANCE  # a test vector has to be met on other computers, too
+    if alike.sum() < MIN_VECTORS:
+        raise PolicyRefusedError(
+            f"the trained network's answers round by {rounded.max():.1g} of the limit: it would differ elsewhere"
+        )
+    parts = {k: v for k, v in json.loads(msgspec.json.encode(training)).items() if v is not None}
     provenance = {
-        **{k: json.dumps(v, separators=(",", ":")) if isinstance(v, dict | list) else v for k, v in parts.items()},
+        **{name: text_of(value) for name, value in parts.items() if value is not None},
         "steps": trained.iteration * training.ppo.batch,
         "score": trained.score,
         **versions("torch", "onnxscript"),
     }
     ranges = bench.range_set(training.ranges)
-    fields = {"kind": kind, "inputs": SAMPLE, "ranges": bounds(ranges)}
-    data = policy_file(torch_graph(actor, len(SAMPLE)), bench, seen, wanted, provenance, **fields)
+    made_for = {name: (getattr(ranges.low, name), getattr(ranges.high, name)) for name in PARAMETER_NAMES}
+    fields = {"kind": kind, "inputs": WIDTHS[width], "ranges": made_for, "gain": training.conditions.gain}
+    data = policy_file(torch_graph(actor, width), bench, seen[alike], wanted[alike], provenance, **fields)
     score = f"iteration {trained.iteration} of {training.ppo.iterations}, which returned {trained.score:.6g}"
     return data, f"the trained network, of {score} on brakes that no training draws"
+
+
+def text_of(value: Any) -> Any:
+    """A value as a provenance has it: a table or a list as JSON."""
+    return json.dumps(value, separators=(",", ":")) if isinstance(value, dict | list) else value
