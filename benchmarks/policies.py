@@ -6,7 +6,7 @@ A POLICY is ``actor`` for the shipped one, an ONNX file, or the ``plan.json`` of
 that need no estimate, and random currents, each held for 10 samples. All are behind the shield; the offsets of encoder
 and current are drawn from the bench's priors, brakes within ±50 %.
 
-A row has T and I [nat], the medians of the interval between runs of each parameter [%], and how many times the first
+A row has the medians of T and I [nat], and of the interval between runs of each parameter [%], and how many times the first
 policy's is narrower, with its 95 % interval over the brakes (bootstrap); then how many left the limits, or were not
 home. docs/explanation/two-informations.md says what T and I are.
 """
@@ -72,7 +72,7 @@ def main() -> None:
                 found = intervals(bench, plant, PARAMETER_NAMES, brakes, outcome.currents, pool)
                 between = np.array([one.between_runs[: len(PARAMETER_NAMES)] for one in found])
                 first = between if first is None else first
-                t, i = (np.mean([getattr(one, n) for one in found]) for n in ("of_comparison", "of_repeatability"))
+                t, i = (np.median([getattr(one, n) for one in found]) for n in ("of_comparison", "of_repeatability"))
                 print(f"  {name}: T {t:.2f}, I {i:.2f}; left {outcome.left.sum()}, not home {(~outcome.home).sum()}")
                 for at, parameter in enumerate(PARAMETER_NAMES):
                     ratio = between[:, at] / first[:, at]
