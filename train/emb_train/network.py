@@ -48,7 +48,7 @@ def network_file(directory: Path) -> tuple[bytes, str]:
         raise PolicyRefusedError(
             f"the trained network's answers round by {rounded.max():.1g} of the limit: it would differ elsewhere"
         )
-    parts = {k: v for k, v in json.loads(msgspec.json.encode(training)).items() if v is not None}
+    parts = json.loads(msgspec.json.encode(training))
     provenance = {
         **{name: text_of(value) for name, value in parts.items() if value is not None},
         "steps": trained.iteration * training.ppo.batch,
