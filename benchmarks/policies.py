@@ -6,9 +6,9 @@ A POLICY is ``actor`` for the shipped one, an ONNX file, or the ``plan.json`` of
 that need no estimate, and random currents, each held for 10 samples. All are behind the shield; the offsets of encoder
 and current are drawn from the bench's priors, brakes within ±50 %.
 
-A row has the medians of T and I [nat], and of the interval between runs of each parameter [%], and how many times the first
-policy's is narrower, with its 95 % interval over the brakes (bootstrap); then how many left the limits, or were not
-home. docs/explanation/two-informations.md says what T and I are.
+A row has the medians of T and I [nat], and of the interval between runs of each parameter [%], and how many times the
+first policy's is narrower, with its 95 % interval over the brakes (bootstrap); then how many left the limits, or were
+not home. docs/explanation/two-informations.md says what T and I are.
 """
 
 from __future__ import annotations
