@@ -356,6 +356,7 @@ class Batch:
         m: packed FIMs, of the conditions' kind, shape [N, n (n + 1) / 2].
         k: steps, shape [N].
         past: last sent currents, newest first, shape [N, PAST].
+        most: greatest estimates and deviations that are observed, shape [8].
         reasons: why the last sent current is not the requested one, shape [N].
         violated: True where the brake is outside its limits after the last step, shape [N].
     """
@@ -402,7 +403,7 @@ class Batch:
         self._deviations = np.array([bench.noise.angle, bench.noise.velocity])
         self._advance, self._advance_speeds = compiled(advance), compiled(advance_speeds)
         self.model = make_model(bench, bench.range_set(bench.prior), sticks=True)  # as the runtime's
-        self._every, self._nominal = np.arange(count), np.abs(np.array(self.model.nominal * 2))
+        self._every, self.most = np.arange(count), MOST * np.abs(np.array(self.model.nominal * 2))
         e = self.experiments = no_experiments(count, len(parameters), self.setup.rules.horizon)
         self.brakes, self.x, self.y, self.m, self.k = e.brakes, e.x, e.y, e.m, e.k
         self.past, self.reasons, self.violated = e.past, e.reasons, e.violated
@@ -499,7 +500,7 @@ class Batch:
         """Estimates of k_m, k_1, T_c and f_v in SI units, then their deviations, bounded; shape [N, 8]."""
         told = np.empty((len(self.k), 2 * len(PARAMETER_NAMES)))
         compiled(tell_estimates)(self.model, self.experiments, told)
-        bounded: Floats = np.minimum(told, MOST * self._nominal)
+        bounded: Floats = np.minimum(told, self.most)
         return bounded
 
     def actor_observation(self) -> NDArray[np.float32]:

@@ -35,10 +35,10 @@ from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.information.symmetric import Floats
-from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_train import register_environments
-from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, MEASURED, MOST, SPEED, Batch, Conditions
+from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, MEASURED, SPEED, Batch, Conditions
 from emb_train.intervals import finite, intervals
 from emb_train.rewards import OUTWARD, Reward, Transition, Turn, information_increment, require_defined
 
@@ -319,9 +319,8 @@ def _observation_space(batch: Batch) -> gymnasium.spaces.Box[Any]:
     if batch.conditions.observes == MEASURED:
         least, greatest = [low - room, -2.0 * room, 0.0], [high + room, 2.0 * room, batch.setup.rules.horizon]
     elif batch.conditions.observes == ESTIMATE:
-        nominal = np.abs([getattr(batch.bench.brake, name) for name in PARAMETER_NAMES]) * MOST
-        least = [low - room, -2.0 * room, 0.0, *[0.0] * (2 * len(nominal))]
-        greatest = [high + room, 2.0 * room, batch.setup.rules.horizon, *nominal, *nominal]
+        least = [low - room, -2.0 * room, 0.0, *[0.0] * len(batch.most)]
+        greatest = [high + room, 2.0 * room, batch.setup.rules.horizon, *batch.most]
     return gymnasium.spaces.Box(np.array(least, np.float32), np.array(greatest, np.float32), dtype=np.float32)
 
 

@@ -24,7 +24,6 @@ from emb_bench.information.symmetric import Floats
 from emb_bench.numbers import Score
 from emb_bench.parallel import processes
 from emb_bench.report.text import WIDTH, Table
-from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import PolicyRefusedError, UsageError, near
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
@@ -41,6 +40,7 @@ from emb_train.play import (
     Planned,
     PolicyFile,
     Seen,
+    bounds,
     fresh_draws,
     mean_score,
     middle_of,
@@ -136,11 +136,7 @@ def _file(name: str, path: Path, bench: Bench) -> Subject:
     except PolicyRefusedError as err:
         raise PolicyRefusedError(f"{path}: {err}") from err
     made_for = {str(name): pair for name, pair in policy.contract.ranges.items()}
-    sets = [
-        s.name
-        for s in bench.ranges.values()
-        if made_for == {n: (getattr(s.low, n), getattr(s.high, n)) for n in PARAMETER_NAMES}
-    ]
+    sets = [ranges.name for ranges in bench.ranges.values() if made_for == bounds(ranges)]
     return Subject(name, bench, PolicyFile(policy, bench), sets[0] if sets else "")
 
 

@@ -14,10 +14,10 @@ import torch
 from emb_bench.export.own_policy import WIDTHS, observations
 from emb_bench.export.policy_file import policy_file, versions
 from emb_bench.export.torch_policy import torch_graph
-from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.policy.contract import MIN_VECTORS, VECTOR_TOLERANCE, greatest_output
 from emb_train.closed_loop import EVERYTHING
+from emb_train.play import bounds
 from emb_train.ppo import DeployedActor
 from emb_train.training import load_training
 
@@ -56,8 +56,7 @@ def network_file(directory: Path) -> tuple[bytes, str]:
         **versions("torch", "onnxscript"),
     }
     ranges = bench.range_set(training.ranges)
-    made_for = {name: (getattr(ranges.low, name), getattr(ranges.high, name)) for name in PARAMETER_NAMES}
-    fields = {"kind": kind, "inputs": WIDTHS[width], "ranges": made_for, "gain": training.conditions.gain}
+    fields = {"kind": kind, "inputs": WIDTHS[width], "ranges": bounds(ranges), "gain": training.conditions.gain}
     data = policy_file(torch_graph(actor, width), bench, seen[alike], wanted[alike], provenance, **fields)
     score = f"iteration {trained.iteration} of {training.ppo.iterations}, which returned {trained.score:.6g}"
     return data, f"the trained network, of {score} on brakes that no training draws"

@@ -78,33 +78,12 @@ class Law(Excitation):
         return np.array([self._law(angle, velocity, int(step)) for angle, velocity, step, _ in seen.tolist()])
 
 
-class PolicyFile(Excitation):
-    """A policy file, one experiment after the other as the runtime calls it, each with an estimator of its own."""
+class Estimating(Excitation):
+    """An excitation as the runtime calls a policy: one sample of one experiment at a time, with its own estimator."""
 
-    def __init__(self, policy: Policy, bench: Bench) -> None:
-        """Use this policy, with estimators as the bench has them."""
-        self._policy, self._bench = policy, bench
-        self._estimators: list[Estimator] = []
-
-    def begin(self, count: int) -> None:
-        """Begin N experiments anew."""
-        self._estimators = [Estimator(self._bench) for _ in range(count)]
-
-    def __call__(self, seen: Seen) -> Currents:
-        """See :class:`emb_train.play.Excitation`."""
-        wanted: Currents = np.zeros(len(seen))
-        for i, (angle, velocity, step, applied) in enumerate(seen.tolist()):
-            self._estimators[i].take(angle, velocity, step, applied)
-            wanted[i] = self._policy.act(angle, velocity, step, self._estimators[i])
-        return wanted
-
-
-class Planned(Excitation):
-    """A plan of speeds, followed as the runtime follows those of a policy: with an estimator for each experiment."""
-
-    def __init__(self, speeds: Sequence[float], bench: Bench, gain: float = BENCH_CONDITIONS.gain) -> None:
-        """Follow a plan, parts of the limit of the speed, one for each step, with this gain of the speed loop."""
-        self._speeds, self._bench, self._gain = [bench.limits.velocity * part for part in speeds], bench, gain
+    def __init__(self, bench: Bench) -> None:
+        """Estimate as the bench says."""
+        self._bench = bench
         self._estimators: list[Estimator] = []
 
     def begin(self, count: int) -> None:
@@ -115,11 +94,39 @@ class Planned(Excitation):
         """See :class:`Excitation`."""
         wanted: Currents = np.zeros(len(seen))
         for i, (angle, velocity, step, applied) in enumerate(seen.tolist()):
-            estimator = self._estimators[i]
-            estimator.take(angle, velocity, step, applied)
-            speed = self._speeds[min(int(step), len(self._speeds) - 1)]
-            wanted[i] = current_for(estimator.model, estimator.state, estimator.relative, speed, self._gain)
+            self._estimators[i].take(angle, velocity, step, applied)
+            wanted[i] = self.act(angle, velocity, step, self._estimators[i])
         return wanted
+
+    @abstractmethod
+    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
+        """Requested current [A], as :meth:`emb_runtime.policy.policy.Policy.act`."""
+
+
+class PolicyFile(Estimating):
+    """A policy file."""
+
+    def __init__(self, policy: Policy, bench: Bench) -> None:
+        super().__init__(bench)
+        self._policy = policy
+
+    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
+        """See :class:`Estimating`."""
+        return self._policy.act(angle, velocity, step, estimator)
+
+
+class Planned(Estimating):
+    """A plan of speeds, followed as the runtime follows those of a policy."""
+
+    def __init__(self, speeds: Sequence[float], bench: Bench, gain: float = BENCH_CONDITIONS.gain) -> None:
+        """Follow a plan, parts of the limit of the speed, one for each step, with this gain of the speed loop."""
+        super().__init__(bench)
+        self._speeds, self._gain = [bench.limits.velocity * part for part in speeds], gain
+
+    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
+        """See :class:`Estimating`."""
+        speed = self._speeds[min(int(step), len(self._speeds) - 1)]
+        return current_for(estimator.model, estimator.state, estimator.relative, speed, self._gain)
 
 
 def target_speeds(policy: Policy, bench: Bench) -> Floats:
@@ -240,6 +247,11 @@ def grid_draws(ranges: Ranges, parameter: str, seed: int) -> list[Draw]:
     """
     values = np.linspace(getattr(ranges.low, parameter), getattr(ranges.high, parameter), GRID)
     return [Draw(seed + i, middle_of(ranges)._replace(**{parameter: float(v)})) for i, v in enumerate(values)]
+
+
+def bounds(ranges: Ranges) -> dict[str, tuple[float, float]]:
+    """Lowest and highest value of each parameter."""
+    return {name: (getattr(ranges.low, name), getattr(ranges.high, name)) for name in PARAMETER_NAMES}
 
 
 def middle_of(ranges: Ranges) -> BrakeParameters:

@@ -176,6 +176,10 @@ class Actor(nn.Module):
         """
         return torch.sinh(FINENESS * action.clamp(-1.0, 1.0)) / math.sinh(FINENESS) if self._speed else action
 
+    def action(self, part: Tensor) -> Tensor:
+        """The action whose :meth:`part` this is, of a speed."""
+        return torch.asinh(part * math.sinh(FINENESS)) / FINENESS
+
     def log_density(self, observation: Tensor, action: Tensor) -> Tensor:
         """Log π(a | o) of actions, shape [N, 1], around their means: shape [N]."""
         return self.log_density_of((action - self(observation)) / self.log_deviation.exp())
@@ -234,7 +238,7 @@ def clone(actor: Actor, speeds: Sequence[float], bench: Bench, ppo: Ppo, generat
     Returns:
         Root mean square of what is left, of the action.
     """
-    wanted = torch.asinh(torch.tensor(speeds, dtype=torch.float32) * math.sinh(FINENESS)) / FINENESS
+    wanted = actor.action(torch.tensor(speeds, dtype=torch.float32))
     time, nominal = torch.arange(len(wanted), dtype=torch.float32)[:, None], torch.tensor(nominal_of(bench))
     optimiser = torch.optim.Adam(actor.layers.parameters(), ppo.clone_rate, fused=True)
     loss = torch.zeros(())

@@ -141,9 +141,9 @@ def training_from(record: object, source: str) -> Training:
         UsageError: a key is unknown or missing, or a value is of another type or impossible.
     """
     training = read(Training, record, source, UsageError)
-    if training.reward not in (*REWARDS, *NUMBERS, TIME):
-        known = ", ".join((*REWARDS, *NUMBERS, TIME))
-        raise UsageError(f"{source}: reward: expected one of {known}, got '{training.reward}'")
+    known = (*REWARDS, *NUMBERS, TIME)
+    if training.reward not in known:
+        raise UsageError(f"{source}: reward: expected one of {', '.join(known)}, got '{training.reward}'")
     if training.reward == TIME and not training.conditions.estimates:
         raise UsageError(f'{source}: reward: a time needs the conditions acts = "speed", observes = "estimate"')
     if (training.conditions.acts == SPEED) != (training.conditions.observes == ESTIMATE):
