@@ -23,12 +23,12 @@ from emb_runtime.control.monitors import check_bus
 from emb_runtime.control.phases import Phase, Silent, Stopping
 from emb_runtime.control.result import Outcome
 from emb_runtime.control.setup import Setup
-from emb_runtime.log.ring_buffer import FrameRecord
+from emb_runtime.log.ring_buffer import FrameRecord, Record
 from emb_runtime.records import CurrentCommand, Frame, Reason, RunState
 from emb_runtime.safety.response_cause import cause
 from emb_runtime.safety.state_machine import Event, Fault, StopError
 
-# What each cycle asks for, by a name of its own: in Python 3.11 a member of an enumeration takes as long as a call.
+# Names of their own, as in :mod:`emb_runtime.safety.state_machine`.
 SILENT: Final = RunState.SILENT
 OVER: Final = RunState.OVER
 IN_CONTROL: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
@@ -50,7 +50,6 @@ class Core:
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
         self.guard = setup.guard
-        self.records = setup.memory.records
         self._memory = setup.memory
         self._machine = setup.machine
         self._reception = setup.reception
@@ -58,12 +57,15 @@ class Core:
         self._stopping: Stopping | None = None  # the last phase
         self._latest_answer_ns = latest_answer_ns(setup.bench)
         self._current_step = setup.layout.command.signal("Current").factor
-        self._command = CurrentCommand(0, 0, 0.0, False)  # the last one that was answered with
-        self._decide_ns = 0  # and when
         self._permitted = True
         self._detail = ""  # of the fault
 
     # --- what the driver asks ---------------------------------------------------------------------------------------
+
+    @property
+    def records(self) -> list[Record]:
+        """Records of what happened, in its order, until the driver takes them."""
+        return self._memory.records
 
     @property
     def state(self) -> RunState:
@@ -106,9 +108,10 @@ class Core:
 
     def take(self, frames: Sequence[Frame], now_ns: int) -> Proposal | None:
         """Take the frames of one read, in hand at a monotonic time [ns]; gives a command for the newest sample."""
-        self._memory.read_ns = now_ns
+        memory = self._memory
+        memory.read_ns = now_ns
         for left, frame in enumerate(frames, 1 - len(frames)):
-            self.records.append(tuple.__new__(FrameRecord, (frame, now_ns if left == 0 else 0)))
+            memory.records.append(tuple.__new__(FrameRecord, (frame, now_ns if left == 0 else 0)))
             try:
                 if self.state is not OVER:
                     self._take(frame)
@@ -128,10 +131,10 @@ class Core:
     def answer(self, proposal: Proposal, now_ns: int) -> Frame | None:
         """Frame that answers a sample, decided at a monotonic time [ns]; None if it is left to the node.
 
-        The frame has passed the guard's check.
+        Raises:
+            GuardRejectedError: the frame is not in the guard's contract.
         """
         sample, _, _, decision = proposal
-        self._decide_ns = now_ns
         in_time = now_ns - sample.receive_time_ns <= self._latest_answer_ns  # else the sample that it answers is stale
         if not in_time or not self._may_answer(now_ns) or math.isnan(decision.current):
             left = decision.reasons & Reason.LEFT if in_time else 0
@@ -139,22 +142,24 @@ class Core:
             self._end_cycle(proposal)
             return None
         current = round(decision.current / self._current_step) * self._current_step  # the bus has whole steps
-        self._command = tuple.__new__(CurrentCommand, (self.guard.next_counter, sample.counter, current, True))
-        frame = self.setup.layout.encode_command(*self._command)
+        command = tuple.__new__(CurrentCommand, (self.guard.next_counter, sample.counter, current, True))
+        self._memory.decided(command, now_ns)
+        frame = self.setup.layout.encode_command(*command)
         return self.guard.check(frame, self.state, sample.receive_time_ns, now_ns)
 
     def sent(self, proposal: Proposal, now_ns: int, lost: str = "") -> None:
         """Record the cycle of a command that was handed to the bus at a monotonic time [ns].
 
-        Where the bus had no room for it, ``lost`` says so: sent later, it would answer an old sample.
+        Where the bus had no room for it, ``lost`` says so, and the time is that of the decision: sent later, it would
+        answer an old sample.
         """
         memory = self._memory
         if lost:
             memory.counters.not_taken += 1
-            self._machine.note(Fault.SEND_QUEUE_FULL, lost, self._decide_ns)
-            memory.unanswered(proposal.sample, memory.missed, self._decide_ns)
+            self._machine.note(Fault.SEND_QUEUE_FULL, lost, now_ns)
+            memory.unanswered(proposal.sample, memory.missed, now_ns)
         else:
-            memory.answered(proposal, self._command, self._decide_ns, now_ns)
+            memory.answered(proposal, now_ns)
         self._end_cycle(proposal)
 
     def timeout(self, now_ns: int) -> None:
@@ -181,7 +186,11 @@ class Core:
         self._machine.explain(fault, detail)
 
     def stop_frame(self, now_ns: int) -> Frame:
-        """Next stop frame, at a monotonic time [ns]; it has passed the guard's check."""
+        """Next stop frame, checked by the guard at a monotonic time [ns].
+
+        Raises:
+            GuardRejectedError: the frame is not in the guard's contract.
+        """
         frame = self.setup.layout.encode_command(self.guard.next_counter, self.newest_counter, 0.0, False)
         return self.guard.check(frame, self.state, now_ns, now_ns)
 

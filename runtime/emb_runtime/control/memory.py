@@ -1,7 +1,7 @@
 """Memory of a run by sampling periods: what came, what was missed, what was sent, and the record of each cycle.
 
-The one place that counts periods. The node's clock sets the pace: its device time says how many periods lie between two
-samples. A sample that does not come in time is a missed period on a grid that runs on from the last arrival.
+The one place that counts periods by device time: it says how many lie between two samples. By arrival
+:func:`emb_runtime.safety.state_machine.missed` counts them, at the deadlines of a grid that runs on from the last one.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from emb_runtime.safety.shield import NO_PAST
 
 MISSED: Final = int(Reason.MISSED)  # an enumeration combines its members in Python
 NONE_SENT: Final = (math.nan, math.nan, math.nan)
+NO_COMMAND: Final = CurrentCommand(NO_COUNTER, NO_COUNTER, 0.0, False)
 
 
 class Proposal(NamedTuple):
@@ -27,7 +28,7 @@ class Proposal(NamedTuple):
 
     sample: SensorSample
     step: int
-    wanted: float  # By the policy [A]
+    requested: float  # By the policy [A]
     decision: Decision
 
 
@@ -57,8 +58,9 @@ class Memory:
         self.lost = LeakyCount(bench.watch.stop_missed)  # Periods without a valid pair
         self.unobeyed = LeakyCount(bench.watch.stop_missed)  # Periods in which the node obeyed no command
         self.past = NO_PAST  # Last own commands, newest first [A]
-        self._sent: CurrentCommand | None = None  # the last command
-        self._answered = False  # it answers the newest sample
+        self._command = NO_COMMAND  # the last one that was decided
+        self._decide_ns = 0  # and when
+        self._answered = False  # it was sent, and answers the newest sample
         self._state = RunState.HOMING if homing else RunState.ACTIVE  # of the cycles
 
     def note(self, time_ns: int, code: str, text: str) -> None:
@@ -67,14 +69,14 @@ class Memory:
 
     # --- the grid ---------------------------------------------------------------------------------------------------
 
-    def take(self, sample: SensorSample) -> SensorSample | None:
-        """Take a sample; gives the one before."""
+    def add_sample(self, sample: SensorSample) -> SensorSample | None:
+        """Add a sample; returns the one before."""
         before, self.newest = self.newest, sample
         self.deadline_ns = sample.receive_time_ns + self.period_ns * 3 // 2
         return before
 
-    def begin(self, sample: SensorSample) -> None:
-        """Begin the experiment, or the way home, with its first sample."""
+    def start(self, sample: SensorSample) -> None:
+        """Start the experiment, or the way home, with its first sample."""
         self.start_ns = sample.device_time_ns
         self.counters.pairs = 1
 
@@ -87,7 +89,7 @@ class Memory:
         return before is None or sample.device_time_ns - before.device_time_ns < self.period_ns * 3 // 2
 
     def miss(self) -> int:
-        """Pass over the deadline, which is given; the next one is a period later."""
+        """Move the deadline on by a period; returns the old one."""
         # The deadline and not the clock: a computer that stood still has frames waiting, and they come first.
         deadline_ns = self.deadline_ns
         self.deadline_ns += self.period_ns
@@ -106,8 +108,8 @@ class Memory:
         self.lost.forgive()
         self.lost.reject(self.missed + skipped)
         command, obeyed = 0.0, False
-        if self._answered and self._sent is not None:
-            command, obeyed = self._sent.current, sample.command_counter == self._sent.counter
+        if self._answered:
+            command, obeyed = self._command.current, sample.command_counter == self._command.counter
             # Across a gap the node does not tell: it names the command of the last period only.
             if periods == 1 and obeyed:
                 self.unobeyed.forgive()
@@ -121,27 +123,31 @@ class Memory:
 
     def slew_reference(self, sample: SensorSample) -> float:
         """Command of the period before; 0 if there was none [A]."""
-        follows = self._sent is not None and sample.counter == next_counter(self._sent.answers)
-        return self.past[0] if follows else 0.0
+        return self.past[0] if sample.counter == next_counter(self._command.answers) else 0.0
 
     def pass_missed(self, missed: int) -> None:
         """Note that nothing was sent in the missed periods before a sample."""
         for _ in range(min(missed, len(NO_PAST))):
             self._remember(0.0)
 
-    def answered(self, proposal: Proposal, command: CurrentCommand, decide_ns: int, send_ns: int) -> None:
-        """Count and record a command that was decided and handed to the bus at these times, monotonic [ns]."""
-        sample, step, wanted, decision = proposal
+    def decided(self, command: CurrentCommand, decide_ns: int) -> None:
+        """Keep a command that was decided at a monotonic time [ns]."""
+        self._command, self._decide_ns = command, decide_ns
+
+    def answered(self, proposal: Proposal, send_ns: int) -> None:
+        """Count and record the command that was decided last, handed to the bus at a monotonic time [ns]."""
+        sample, step, requested, decision = proposal
+        command, self._answered = self._command, True
         self._remember(command.current)
-        self._sent, self._answered = command, True
         self.counters.count_answer(decision.reasons, command.current)
-        currents = wanted, decision.clipped, command.current
-        self.record(sample, step, decision.reasons, self.missed, decide_ns, currents, command.counter, send_ns)
+        currents = requested, decision.clipped, command.current
+        self.record(sample, step, decision.reasons, self.missed, self._decide_ns, currents, command.counter, send_ns)
 
     def unanswered(self, sample: SensorSample, missed: int, decide_ns: int = 0, reasons: int = 0) -> None:
         """Count and record a sample for which nothing is sent: the node brakes in its period.
 
-        With ``reasons`` it does so because the core decided that.
+        With ``reasons`` it does so because the core decided that. The caller gives the periods missed before it: the
+        memory's own are those before the newest sample, which may have overtaken this one.
         """
         self._remember(0.0)
         self.counters.unanswered += 1

@@ -1,16 +1,15 @@
-"""Phases of a run: each takes a sample and returns the next phase.
+"""Phases of a run: each takes a sample and returns the next phase, or itself.
 
     Silent -> Control -> Stopping
               Control -> Coasting -> Stopping
 
 Silent listens until the node has shown itself. Control checks each sample and answers it. Coasting lets friction stop a
-brake of which motor or sensors may have the wrong sign. Stopping watches the node come to rest. A fault is a StopError,
-which leads to Stopping from anywhere; the core sees to that.
+brake of which motor or sensors may have the wrong sign. Stopping watches the node come to rest. No phase returns it:
+the core enters it when the state machine says that the run has ended, or has failed by a StopError.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 from emb_runtime.control.memory import Proposal
@@ -18,7 +17,7 @@ from emb_runtime.control.monitors import IDLE, OBEYING
 from emb_runtime.control.setup import Setup
 from emb_runtime.control.start_conditions import READY_PAIRS
 from emb_runtime.records import Reason, RunState, SensorSample
-from emb_runtime.safety.command_limits import CommandLimits, Decision, checked, decide
+from emb_runtime.safety.command_limits import Decision, checked, decide
 from emb_runtime.safety.motion_balance import REST_SAMPLES, unheld_motion
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.state_machine import Event, Fault, StopError, may_enable
@@ -58,7 +57,7 @@ class Phase:
 
 
 class Silent(Phase):
-    """Listens until enough samples in a row meet the start conditions; nothing leaves."""
+    """Phase before arming: listens until enough samples in a row meet the start conditions; nothing leaves."""
 
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
@@ -75,7 +74,7 @@ class Silent(Phase):
     def take(self, sample: SensorSample) -> Phase:
         """Arm, if the node is ready."""
         setup, memory = self.setup, self.memory
-        before = memory.take(sample)
+        before = memory.add_sample(sample)
         reason = setup.conditions.not_ready(setup.reception.status, sample, memory.read_ns)
         in_row = self._ready > 0 and not reason and memory.is_next(before, sample)
         steady = setup.guard.learn_time(sample, first=not in_row)
@@ -103,42 +102,38 @@ class Silent(Phase):
 
 
 class Control(Phase):
-    """Armed: each sample is checked and answered. The first one begins the experiment, or the way home."""
+    """Phase from arming to the end: checks and answers each sample. The first begins the experiment or the way home."""
 
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
-        bench, law = setup.bench, setup.law
-        limit = setup.layout.current_within(min(setup.limit, bench.limits.current))
-        self._limits = CommandLimits(limit, bench.guard.slew * bench.timing.sample_time)
-        self._late_step = law.steps - 2 - math.ceil(law.settling / law.sample_time)
         self._at_home = 0  # samples in a row at home, once the brake is to return
-        self._open: SensorSample | None = None  # newest sample of the read, which is to be answered
+        self._unanswered: SensorSample | None = None  # newest sample of the read, which is to be answered
 
     def warm_up(self, sample: SensorSample) -> None:
-        """Run one cycle for nothing: Python runs code several times before it runs it fast, and first cycles count."""
-        self.setup.sensors.warm_up(sample, self._limits.current)
-        estimator = self.setup.estimate.estimator
+        """Warm-up: run one dummy cycle so that the interpreter specialises the code."""
+        setup, estimator = self.setup, self.setup.estimate.estimator
+        setup.sensors.warm_up(sample, setup.command_limits.current)
         estimator.begin()
         estimator.take(sample.angle, sample.velocity, 0, sample.applied_current)
-        decide(self.setup.law, self._limits, sample.angle, sample.velocity, 0.0, NO_PAST, 0.0, 0)
+        decide(setup.law, setup.command_limits, sample.angle, sample.velocity, 0.0, NO_PAST, 0.0, 0)
 
     def take(self, sample: SensorSample) -> Phase:
         """Count the periods since the sample before, and check that the sensors can be right."""
         setup, memory = self.setup, self.memory
-        before, missed, phase = memory.take(sample), memory.missed, self
+        before, missed, phase = memory.add_sample(sample), memory.missed, self
         if before is not None and may_enable(self.machine.run.state):
             setup.sensors.update_balance()
             memory.follow(before, sample)
             phase = self._check_sensors(sample)
-            if self._open is not None:  # overtaken: the node obeys an answer to its newest sample only
+            if self._unanswered is not None:  # overtaken: the node obeys an answer to its newest sample only
                 memory.pass_missed(missed)
-                memory.unanswered(self._open, missed)
-        phase._open = sample
+                memory.unanswered(self._unanswered, missed)
+        phase._unanswered = sample
         return phase
 
     def propose(self) -> Proposal | None:
         """Check the newest sample, and decide on a command for it; None at the last one, which ends the run."""
-        sample, self._open = self._open, None
+        sample, self._unanswered = self._unanswered, None
         if sample is None:
             return None
         setup, memory, estimate = self.setup, self.memory, self.setup.estimate
@@ -158,9 +153,9 @@ class Control(Phase):
         if memory.missed:
             memory.pass_missed(memory.missed)
         estimate.estimator.take(sample.angle, sample.velocity, step, sample.applied_current)
-        asked = setup.actor.act(sample.angle, sample.velocity, step, estimate.estimator)
-        wanted = checked(asked, setup.current_limit)
-        return tuple.__new__(Proposal, (sample, step, wanted, self._command(sample, wanted, step)))
+        request = setup.actor.act(sample.angle, sample.velocity, step, estimate.estimator)
+        requested = checked(request, setup.current_limit)
+        return tuple.__new__(Proposal, (sample, step, requested, self._command(sample, requested, step)))
 
     def miss(self) -> None:
         """Count a period without a sample; too many in a row end the run."""
@@ -168,7 +163,7 @@ class Control(Phase):
 
     def _begin(self, sample: SensorSample) -> None:
         setup, memory = self.setup, self.memory
-        memory.begin(sample)
+        memory.start(sample)
         self.machine.handle_event(Event.BEGIN_HOMING if setup.homing else Event.BEGIN, memory.read_ns)
         setup.sensors.begin(sample)
         setup.estimate.estimator.begin()
@@ -193,17 +188,17 @@ class Control(Phase):
             return Coasting(self.setup, stop, time)
         return self
 
-    def _command(self, sample: SensorSample, wanted: float, step: int) -> Decision:
+    def _command(self, sample: SensorSample, requested: float, step: int) -> Decision:
         """Command for a sample, in the shield's view of time: on the way home the end is always near."""
-        memory, sensors, limits = self.memory, self.setup.sensors, self._limits
-        last, reached = memory.slew_reference(sample), self.setup.estimate.reached
-        if self.setup.homing:
-            step = self._late_step
+        setup, memory, sensors, limits = self.setup, self.memory, self.setup.sensors, self.setup.command_limits
+        last, reached = memory.slew_reference(sample), setup.estimate.reached
+        if setup.homing:
+            step = setup.late_step
         elif reached:
-            step, wanted = max(step, self._late_step), 0.0
+            step, requested = max(step, setup.late_step), 0.0
         if (most := sensors.monitor.largest_current(limits.current)) < limits.current:
             limits = limits._replace(current=max(most, abs(last) - limits.slew))  # down to it as fast as may be
-        decision = decide(sensors.law, limits, sample.angle, sample.velocity, wanted, memory.past, last, step)
+        decision = decide(sensors.law, limits, sample.angle, sample.velocity, requested, memory.past, last, step)
         return decision._replace(reasons=decision.reasons | Reason.RETURNING) if reached else decision
 
     def _finish(self, sample: SensorSample, step: int) -> None:
@@ -231,9 +226,9 @@ class Control(Phase):
 
 
 class Coasting(Control):
-    """Motor or sensors may have the wrong sign: 0 A until friction has stopped the brake, then the fault.
+    """Phase of a brake of which motor or sensors may have the wrong sign: 0 A until friction has stopped it.
 
-    Meanwhile everything but the sensors' sums and the end of the run is checked as ever.
+    Then the fault ends the run. Meanwhile everything but the sensors' sums and the end of the run is checked as ever.
     """
 
     def __init__(self, setup: Setup, stop: StopError, time: float) -> None:
@@ -252,14 +247,14 @@ class Coasting(Control):
     def _is_last(self, step: int) -> bool:
         return False
 
-    def _command(self, sample: SensorSample, wanted: float, step: int) -> Decision:
+    def _command(self, sample: SensorSample, requested: float, step: int) -> Decision:
         """0 A, as fast as may be."""
-        last, slew = self.memory.slew_reference(sample), self._limits.slew
+        last, slew = self.memory.slew_reference(sample), self.setup.command_limits.slew
         return Decision(0.0, min(max(0.0, last - slew), last + slew), int(Reason.LIMITED))
 
 
 class Stopping(Phase):
-    """After the end, or a fault: watches the node come to rest."""
+    """Phase after the end, or a fault: watches the node come to rest."""
 
     def __init__(self, setup: Setup, end: SensorSample | None) -> None:
         super().__init__(setup)
@@ -270,7 +265,7 @@ class Stopping(Phase):
 
     def take(self, sample: SensorSample) -> Phase:
         """Keep what tells how the node stops."""
-        self.memory.newest = sample
+        self.memory.newest = sample  # not added: from the end on no deadline runs
         self.setup.sensors.response.watch(sample)
         if sample.node_state is not OBEYING and not self._left:
             self._left = True

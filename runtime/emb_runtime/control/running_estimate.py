@@ -20,15 +20,15 @@ class RunningEstimate:
         self.reached = False  # The stop condition was met: all that is left is the way home
         self.reached_ns = 0  # Device time from the first sample to that at which it was met [ns]
         self._condition = condition
-        self._finite = not homing and bool(estimated(bench))  # there is an estimate, and it was finite so far
+        self._available = not homing and bool(estimated(bench))  # there is an estimate, and it was finite so far
 
     def record(self, sample: SensorSample, step: int, memory: Memory) -> None:
         """Record the estimate at a sample; once it is not finite, the run has none."""
-        if not self._finite:
+        if not self._available:
             return
         self.numbers = numbers = self.estimator.estimate
         if not numbers:
-            self._finite = False
+            self._available = False
             text = "not finite: the measurements do not fit the bench's noise; the run goes on without an estimate"
             memory.note(sample.receive_time_ns, LOST, text)
             return

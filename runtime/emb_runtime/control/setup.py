@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from emb_runtime.can.messages import Layout
@@ -13,6 +14,7 @@ from emb_runtime.control.monitors import Sensors, monitors
 from emb_runtime.control.running_estimate import RunningEstimate
 from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.control.stop_condition import StopCondition
+from emb_runtime.safety.command_limits import CommandLimits
 from emb_runtime.safety.guard import Guard
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_runtime.safety.state_machine import StateMachine
@@ -35,7 +37,7 @@ class Setup:
 
     def __post_init__(self) -> None:
         """Make the parts."""
-        bench = self.bench
+        bench, law = self.bench, self.law
         self.memory = memory = Memory(bench, homing=self.homing)
         self.machine = StateMachine(bench, memory.note)
         self.reception = Reception(
@@ -44,5 +46,9 @@ class Setup:
         self.bounds = Bounds(bench)
         self.conditions = StartConditions(bench, self.layout, self.bounds, anywhere=self.homing)
         self.monitors = monitors(self.bounds, self.conditions, self.reception, self.guard)
-        self.sensors = Sensors(bench, self.law, homing=self.homing)
+        self.sensors = Sensors(bench, law, homing=self.homing)
+        limit = self.layout.current_within(min(self.limit, bench.limits.current))
+        self.command_limits = CommandLimits(limit, bench.guard.slew * bench.timing.sample_time)
+        # On the way home the end is always as near as at this step.
+        self.late_step = law.steps - 2 - math.ceil(law.settling / law.sample_time)
         self.estimate = RunningEstimate(bench, self.stop_condition, homing=self.homing)
