@@ -18,7 +18,7 @@ import argparse
 import math
 import sys
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,7 @@ from tests.searches.sensor_monitor import COMMAND_LOST, COVERED, SAMPLE_LOST, Sc
 Floats = NDArray[np.float64]
 
 CHUNK = 1000
+GAIN: Final = BENCH_CONDITIONS.gain  # Of the speed loop
 LENGTHS = (500, 500, 250, 100)
 PLANTS = (*(name for name in COVERED if name != "observer"), "play")
 DECLARED = {
@@ -122,7 +123,7 @@ def fly(
             if scripted:
                 wanted = script.wanted[m, k]
             elif periods == 0:
-                wanted = current_for(model, state, believed(model, state), speeds[k], BENCH_CONDITIONS.gain)
+                wanted = current_for(model, state, believed(model, state), speeds[k], GAIN)
             limit = largest_current(law, limits, memory, law.current)
             u, _ = sent_current(law, True, angle, velocity, wanted, past, k, limit)
             if periods > 0 or script.losses[m, k] == COMMAND_LOST:

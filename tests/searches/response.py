@@ -68,6 +68,7 @@ from tests.searches.sensor_monitor import COMMAND_LOST, COVERED, MOVING, SAMPLE_
 Floats = NDArray[np.float64]
 
 CHUNK: Final = 1000
+GAIN: Final = BENCH_CONDITIONS.gain  # Of the speed loop
 STOP: Final = 100  # Periods that are followed after a run has ended
 LOWEST, HIGHEST, FASTEST, VERDICT, DISHONEST, PROVEN_AT, CHANGED = range(7)
 COLUMNS: Final = CHANGED + 1
@@ -125,7 +126,7 @@ def fly(
             if scripted:
                 wanted = script.wanted[m, k]
             elif periods == 0 and rest < 0:
-                wanted = current_for(model, state, believed(model, state), speeds[k], BENCH_CONDITIONS.gain)
+                wanted = current_for(model, state, believed(model, state), speeds[k], GAIN)
             limit = largest_current(law, limits, memory, law.current)
             u, full = sent(
                 law, slow, verdict != PROVEN and memory[OBEYS] != 0.0, angle, velocity, wanted, past, k, limit
