@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -27,7 +28,16 @@ from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.speed_loop import current_for
 from emb_train.closed_loop import Batch, Conditions, Experiments, advance
-from emb_train.env import ENV_ID, EmbExcitationEnv, EmbExcitationVectorEnv, ExpectedInterval, TimeToPrecision
+from emb_train.env import (
+    ENV_ID,
+    Demands,
+    EmbExcitationEnv,
+    EmbExcitationVectorEnv,
+    ExpectedInterval,
+    Precision,
+    TimeToPrecision,
+)
+from emb_train.lies import LIES
 from emb_train.presets import preset_summaries
 from emb_train.rewards import Transition, penalised_increment
 from emb_train.training import load_preset
@@ -323,8 +333,8 @@ def test_a_speed_becomes_the_current_of_the_runtimes_loop_and_the_estimate_is_th
 def test_the_reward_of_a_whole_experiment_is_the_criterion_of_the_interval_that_its_currents_lead_to(
     plant: str,
 ) -> None:
-    reward = ExpectedInterval(IntervalCriterion("T"))
-    env = EmbExcitationVectorEnv(2, SHORT, "pm50", PARAMETER_NAMES, reward, 0.5, plant, FOLLOWED)
+    free = ExpectedInterval(IntervalCriterion("T"), Demands(hidden=0.0))
+    env = EmbExcitationVectorEnv(2, SHORT, "pm50", PARAMETER_NAMES, free, 0.5, plant, FOLLOWED)
     for _ in range(2):  # the second time from arrays that are not new
         env.reset(seed=4)
         acted, paid = [], []
@@ -344,17 +354,32 @@ def test_the_reward_of_a_whole_experiment_is_the_criterion_of_the_interval_that_
                 Question(PARAMETER_NAMES),
             )
             assert found == pytest.approx(0.5 * information.of_comparison, rel=1e-9)
-    batch, rows, lowest = env.batch, np.array([True, True]), np.array([-2.0, -5.5])
-    arguments = (batch, plant, rows, np.transpose(acted))
-    free, far = reward(*arguments, np.zeros(2)), reward(*arguments, lowest)
-    np.testing.assert_allclose(free - far, [0.0, 2.5], atol=1e-12)
+
+
+def test_an_experiment_pays_for_the_release_side_for_what_lies_it_hides_and_for_not_coming_home() -> None:
+    criterion = IntervalCriterion("T")
+    env = EmbExcitationVectorEnv(2, SHORT, "pm50", PARAMETER_NAMES, ExpectedInterval(criterion), 1.0, "exact", FOLLOWED)
+    env.reset(seed=4)
+    acted = []
+    for action in held(2, 60, 2):
+        env.advance(action)
+        acted.append(env.batch.experiments.applied.copy())
+    batch, rows, motion = env.batch, np.array([True, True]), np.zeros((2, 61, 2))
+
+    def reward(**demands: float) -> np.ndarray:
+        of = ExpectedInterval(criterion, Demands(**demands))
+        return of(batch, "exact", rows, np.transpose(acted), motion)
+
+    assert (reward(hidden=0.0) - reward()).tolist() == pytest.approx([len(LIES) * 1.4 * 5.0] * 2)  # nothing moved
+    motion[1, 30, 0] = 0.3 * SHORT.limits.angle[0] - 2.5
+    np.testing.assert_allclose(reward(hidden=0.0, beyond=0.0) - reward(hidden=0.0), [0.0, 2.5], atol=1e-12)
     batch.x[1, 0] = 20.0  # not at home
-    np.testing.assert_allclose(free - reward(*arguments, np.zeros(2)), [0.0, 20.0], atol=1e-12)
-    assert reward(batch, plant, np.array([False, True]), np.transpose(acted), lowest).shape == (1,)
+    np.testing.assert_allclose(reward(hidden=0.0, astray=0.0) - reward(hidden=0.0), [0.0, 20.0], atol=1e-12)
+    assert ExpectedInterval(criterion)(batch, "exact", ~rows | [False, True], np.transpose(acted), motion).shape == (1,)
 
 
 def test_the_reward_of_a_time_counts_periods_until_every_estimate_is_precise() -> None:
-    reward = TimeToPrecision(0.25)
+    reward = TimeToPrecision(Precision(repeatability=0.25, price=0.0))
     env = EmbExcitationVectorEnv(3, SHORT, "pm50", PARAMETER_NAMES, reward, 1.0, conditions=FOLLOWED)
     env.reset(seed=4)
     total, missing = np.zeros(3), []
@@ -370,6 +395,35 @@ def test_the_reward_of_a_time_counts_periods_until_every_estimate_is_precise() -
         if 0 < known < 60:
             before, after = math.log(np.min(ratios[:known])), math.log(ratios[known])
             assert periods == pytest.approx(known + before / (before - after))
+
+
+def test_an_experiment_whose_estimates_are_known_returns_and_pays_for_the_interval_of_its_record() -> None:
+    asked = Precision(repeatability=0.25, interval=0.001, price=3.0)
+    where = (3, BENCH, "pm50", PARAMETER_NAMES)
+    env = EmbExcitationVectorEnv(*where, TimeToPrecision(asked), 1.0, conditions=FOLLOWED)
+    free = EmbExcitationVectorEnv(
+        *where, TimeToPrecision(msgspec.structs.replace(asked, price=0.0)), 1.0, conditions=FOLLOWED
+    )
+    env.reset(seed=4)
+    free.reset(seed=4)
+    acted, paid, home = [], np.zeros(3), np.full(3, 500)
+    for action in held(3, 300, 3):
+        _, rewards, _, _, _ = env.advance(action)
+        _, periods, _, _, _ = free.advance(action)
+        paid += periods - rewards
+        acted.append(env.batch.experiments.applied.copy())
+        arrived = env.batch.experiments.returning & env.batch.home
+        home = np.where(arrived, np.minimum(home, len(acted)), home)
+    assert (home < 300).all()  # the shield alone would bring it home at the horizon of 500
+    for i, brake in enumerate(env.batch.brakes.tolist()):
+        currents = np.array(acted)[: home[i], i]
+        model = BENCH.model("exact")
+        found = of_experiment(
+            BENCH, model, BrakeParameters(*brake), sampled(BENCH, model, currents), Question(PARAMETER_NAMES)
+        )
+        wide = np.maximum(found.between_runs[:4] / 0.001, 1.0)
+        assert paid[i] == pytest.approx(3.0 * np.log(wide).sum(), rel=1e-9)
+        assert paid[i] > 0.0
 
 
 def test_systematic_errors_are_drawn_from_the_benchs_priors_and_show_where_they_belong() -> None:

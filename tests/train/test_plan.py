@@ -71,14 +71,18 @@ def distance(plans: Floats) -> Floats:
 def test_a_search_begins_with_the_best_plans_at_random_and_returns_the_best_of_all() -> None:
     landscape, shown = Landscape(distance), list[Found]()
     found = search(landscape, drawn=90, starts=2, steps=30, rng=np.random.default_rng(3), show=shown.append)
-    assert [one.plans for one in shown] == [40, 80, 120, *(120 + 16 * (i + 1) for i in range(1 + 2 * 30))]
+    assert [one.plans for one in shown] == [40, 80, 120, *(120 + 16 * (i + 1) for i in range(1 + 3 * 30))]
     assert (np.diff([one.best for one in shown[3:]]) >= 0.0).all()
     drawn = np.concatenate(landscape.screened)
     assert (np.abs(drawn) <= 1.0).all()
     best = drawn[np.argsort(-distance(drawn))[:16]]
     assert sorted(landscape.asked[0].tolist()) == sorted(best.tolist())
-    for begin, first in zip(best, landscape.asked[1::30], strict=False):
+    first_steps = landscape.asked[1::30]
+    for begin, first in zip(best, first_steps[:2], strict=False):
         assert np.abs(first.mean(axis=0) - begin).max() < 5.0 * SPREAD / np.sqrt(16)
+    last = [landscape.asked[30], landscape.asked[60]]
+    better = max(last, key=lambda plans: float(distance(plans).max()))
+    assert np.abs(first_steps[2] - better.mean(axis=0)).max() < 5.0 * np.std(better)  # where it ended, it goes on
     everything = np.concatenate(landscape.asked)
     assert found.tolist() == np.clip(everything[np.argmax(distance(everything))], -1.0, 1.0).tolist()
     assert distance(found[None])[0] > 0.2 * distance(drawn).max()

@@ -39,7 +39,7 @@ from emb_runtime.safety.sensor_monitor import MEMORY as MONITOR
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import PAST, damped_current
-from emb_runtime.safety.shield_design import ShieldLaw, make_law
+from emb_runtime.safety.shield_design import ShieldLaw, late_step, make_law
 
 MEASURED: Literal["measured"] = "measured"
 ESTIMATE: Literal["estimate"] = "estimate"
@@ -130,6 +130,7 @@ class Rules(NamedTuple):
     shielded: bool  # True if the shield has the last word; else the requested current is clipped to the limit
     sample_time: float  # [s]
     horizon: int  # Steps in one experiment
+    late_step: int  # Step in which the shield has an experiment that has ended, for it is to go home
     angle_low: float  # [rad]
     angle_high: float  # [rad]
     velocity: float  # Largest speed [rad/s]
@@ -162,6 +163,7 @@ def make_setup(
         shielded,
         timing.sample_time,
         timing.horizon,
+        late_step(law),
         *limits.angle,
         limits.velocity,
         *weights_of(bench, kind),
@@ -198,6 +200,7 @@ class Experiments(NamedTuple):
     reasons: Integers
     """Reasons why the last current is not the requested one: :class:`emb_runtime.records.Reason` bits, shape [N]."""
     violated: Bools  # Mask of the brakes outside their limits, shape [N]
+    returning: Bools  # Mask of the experiments that have ended before their horizon and are on the way home, shape [N]
     monitor: Floats
     """Memory of the sensor monitor, which is asked only until it confirms the polarity, shape [N, MONITOR]."""
     response: Floats  # Memory of the proof of the response, until it is proven, shape [N, RESPONSE]
@@ -222,6 +225,7 @@ def no_experiments(count: int, n: int, steps: int) -> Experiments:
         late=np.zeros((count, steps + 1)),
         reasons=np.zeros(count, np.int64),
         violated=np.zeros(count, np.bool_),
+        returning=np.zeros(count, np.bool_),
         monitor=np.zeros((count, MONITOR)),
         response=np.zeros((count, RESPONSE)),
         estimate=np.zeros((count, ESTIMATES)),
@@ -272,7 +276,7 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     """One sample period of experiment ``i``, in place; arguments as for :func:`advance`."""
     (
         brakes, delay, beside, x, s, m, memory, y, applied,
-        past, k, noise, late, reasons, violated, monitor, response, _,
+        past, k, noise, late, reasons, violated, returning, monitor, response, _,
     ) = experiments  # fmt: skip
     rules = setup.rules
     p = BrakeParameters(
@@ -289,7 +293,10 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     most = largest_current(setup.law, setup.thresholds, monitor[i], setup.law.current)
     unproven = monitor[i, OBEYS] != 0.0 and response[i, VERDICT] != PROVEN
     law = setup.unproven if unproven else setup.law
-    asked, reasons[i] = sent_current(law, rules.shielded, y1, y2, wanted, (u1, u2, u3, u4, u5), int(k[i]), most)
+    step = int(k[i])
+    if returning[i]:
+        wanted, step = 0.0, max(step, rules.late_step)
+    asked, reasons[i] = sent_current(law, rules.shielded, y1, y2, wanted, (u1, u2, u3, u4, u5), step, most)
     sent = 0.0 if math.isnan(asked) else asked
     current = command(instruments, memory[i], asked)
     if math.isnan(current):
@@ -441,7 +448,7 @@ class Batch:
         settle(instruments, e.memory[i], 0.0)
         errors = (float(error) for error in (e.late[i, 0], *e.noise[i, 0]))
         e.y[i] = measure(instruments, e.memory[i], self.setup.rules.sample_time, 0.0, 0.0, 0.0, *errors)
-        for of_the_past in (e.applied, e.s, e.m, e.past, e.k, e.reasons, e.violated):
+        for of_the_past in (e.applied, e.s, e.m, e.past, e.k, e.reasons, e.violated, e.returning):
             of_the_past[i] = 0
         begin_monitor(e.monitor[i], *e.y[i].tolist())
         begin_response(self.setup.response, e.response[i], *e.y[i].tolist())

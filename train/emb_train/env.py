@@ -23,9 +23,10 @@ import operator
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium
+import msgspec
 import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
@@ -40,31 +41,50 @@ from emb_runtime.errors import UsageError
 from emb_train import register_environments
 from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, MEASURED, SPEED, Batch, Conditions
 from emb_train.intervals import finite, intervals
+from emb_train.lies import shown
 from emb_train.rewards import OUTWARD, Reward, Transition, Turn, information_increment, require_defined
 
 ENV_ID = "EmbExcitation-v0"
 SCALED = 100.0  # Bound of an observation in scales of order one
 UNKNOWN = 1e9  # Times a deviation is too large before the first sample
-ASTRAY = 20.0  # Price of an experiment that leaves the limits or does not end at home [nat]
-DEPTH, PRICE = -3.0, 1.0  # Lowest angle that costs nothing [rad], and price of each one below [nat/rad]
 
 Observations = NDArray[np.float32]
 Steps = tuple[Observations, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+
+
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+Price = Annotated[float, msgspec.Meta(ge=0.0)]
+
+
+class Demands(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What an experiment has to do besides telling much, and what it pays where it does not.
+
+    A sensor that lies moves a brake by some radians before it is found out: there is to be room on the side of the
+    release. And the motion is to show that a node lies (:mod:`emb_train.lies`).
+    """
+
+    astray: Price = 20.0  # Price of limits left, or of an end away from home [nat]
+    release: Share = 0.3  # Part of the way to the lowest angle that is free
+    beyond: Price = 1.0  # Price of each radian beyond it [nat]
+    shown: Price = 1.4  # How clearly the motion shows each lie; above 1 a run is ended
+    hidden: Price = 5.0  # Price of what a lie is short of that [nat]
+
+
+DEMANDS = Demands()
 
 
 @dataclass(frozen=True)
 class ExpectedInterval:
     """Reward of a whole experiment, in its last step [nat]: the criterion of the interval that an estimate will have.
 
-    Without a discount it is the sum of the criterion's increments. An experiment that leaves the limits or does not end
-    at home pays ``ASTRAY``; one that goes far to the side of the release pays for what it goes beyond ``DEPTH``, for a
-    sensor that lies moves a brake by some radians before it is found out.
+    Without a discount it is the sum of the criterion's increments. What the experiment pays is taken off.
     """
 
     criterion: IntervalCriterion
+    demands: Demands = DEMANDS
     pool: Executor | None = None  # Of processes that share the work
 
-    def __call__(self, batch: Batch, plant: str, rows: NDArray[np.bool_], acted: Floats, lowest: Floats) -> Floats:
+    def __call__(self, batch: Batch, plant: str, rows: NDArray[np.bool_], acted: Floats, motion: Floats) -> Floats:
         """The reward of the experiments of some rows.
 
         Args:
@@ -72,7 +92,7 @@ class ExpectedInterval:
             plant: of the bench, that its brakes are.
             rows: mask of the R experiments that have ended, shape [N].
             acted: currents that acted [A], 0 after the end, shape [N, horizon].
-            lowest: true angles [rad], shape [N].
+            motion: true angles and velocities at each sample [rad, rad/s], 0 after the end, shape [N, horizon + 1, 2].
 
         Returns:
             Shape [R].
@@ -80,24 +100,41 @@ class ExpectedInterval:
         brakes = [BrakeParameters(*brake) for brake in batch.brakes[rows].tolist()]
         found = intervals(batch.bench, plant, batch.parameters, brakes, acted[rows], self.pool)
         values = finite([self.criterion.of(one) for one in found])
-        priced: Floats = values - ASTRAY * ~batch.home[rows] - PRICE * np.maximum(DEPTH - lowest[rows], 0.0)
-        return priced
+        demands, free = self.demands, self.demands.release * batch.bench.limits.angle[0]
+        hidden = np.maximum(demands.shown - shown(batch.bench, brakes, motion[rows], acted[rows]), 0.0)
+        beyond = np.maximum(free - motion[rows, :, 0].min(axis=1), 0.0)
+        prices = demands.astray * ~batch.home[rows] + demands.beyond * beyond + demands.hidden * hidden.sum(axis=1)
+        left: Floats = values - prices
+        return left
+
+
+class Precision(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What is to be known, as relative standard deviations; 95 % of the estimates are within twice that."""
+
+    repeatability: Annotated[float, msgspec.Meta(gt=0.0)] = 0.0065  # Of the running estimates, which ends an experiment
+    interval: Annotated[float, msgspec.Meta(gt=0.0)] = 0.0025  # Between runs, of the whole record
+    price: Price = 10.0  # Of an interval that is e times as wide [periods]
+
+
+PRECISION = Precision()
 
 
 @dataclass(frozen=True)
 class TimeToPrecision:
-    """Reward of a step: minus the share of the period in which an estimate was less precise than asked for.
+    """Reward of a step: minus the share of the period in which a running estimate was less precise than asked for.
 
-    So the return is minus the number of periods until all four are known; what the actor does from then on counts for
-    nothing.
+    So the return is minus the number of periods until all four are known. The experiment has ended then, and its way
+    home begins, as in the runtime. What the interval of the whole record is wider than asked for is taken off: when it
+    has ended for the record so far, and what is won on the way is given back at home.
     """
 
-    precision: float = 0.0065  # Relative standard deviation; 95 % of the estimates are then within twice that
+    precision: Precision = PRECISION
+    pool: Executor | None = None  # Of processes that share the work
 
     def missing(self, batch: Batch) -> Floats:
         """Greatest ratio of a relative deviation to the one asked for, shape [N]."""
-        told = batch.estimate()
-        missing: Floats = np.minimum((told[:, 4:] / (self.precision * told[:, :4])).max(axis=1), UNKNOWN)
+        told, asked = batch.estimate(), self.precision.repeatability
+        missing: Floats = np.minimum((told[:, 4:] / (asked * told[:, :4])).max(axis=1), UNKNOWN)
         return missing
 
     def __call__(self, before: Floats, after: Floats) -> Floats:
@@ -106,6 +143,15 @@ class TimeToPrecision:
         share = np.where(second <= 0.0, first / np.maximum(first - second, 1e-9), 1.0)
         rewards: Floats = np.where(first <= 0.0, 0.0, -np.clip(share, 0.0, 1.0))
         return rewards
+
+    def price(self, batch: Batch, plant: str, rows: NDArray[np.bool_], acted: Floats) -> Floats:
+        """Price of the interval of the records so far of some rows; arguments as for the expected interval, [R]."""
+        brakes = [BrakeParameters(*brake) for brake in batch.brakes[rows].tolist()]
+        records = [row[:k] for row, k in zip(acted[rows], batch.k[rows].tolist(), strict=True)]
+        found = intervals(batch.bench, plant, batch.parameters, brakes, records, self.pool)
+        wide = np.array([one.between_runs[: one.count] for one in found]) / self.precision.interval
+        prices: Floats = self.precision.price * np.log(np.clip(wide, 1.0, UNKNOWN)).sum(axis=1)
+        return prices
 
 
 class Scoring:
@@ -116,7 +162,9 @@ class Scoring:
         self._batch, self._plant = batch, plant
         self._reward = reward
         self._missing = np.full(len(batch.k), UNKNOWN)
-        self._acted, self._lowest = np.zeros_like(batch.experiments.late[:, 1:]), np.zeros(len(batch.k))
+        self._acted = np.zeros_like(batch.experiments.late[:, 1:])
+        self._price = np.zeros(len(batch.k))
+        self._motion = np.zeros((*batch.experiments.late.shape, 2))
         self._turn = Turn(np.zeros_like(batch.x[:, :2]), np.zeros(len(batch.k)), np.zeros_like(batch.m))
 
     def advance(self, wanted: Floats) -> Floats:
@@ -144,20 +192,33 @@ class Scoring:
     def _at_the_end(self, wanted: Floats, reward: ExpectedInterval) -> Floats:
         batch = self._batch
         begun = batch.k == 0
-        self._acted[begun], self._lowest[begun] = 0.0, 0.0
+        self._acted[begun], self._motion[begun] = 0.0, 0.0
+        self._motion[begun, 0] = batch.x[begun, :2]
         batch.advance(wanted)
-        self._acted[np.arange(len(batch.k)), batch.k - 1] = batch.experiments.applied
-        np.minimum(self._lowest, batch.x[:, 0], out=self._lowest)
+        each = np.arange(len(batch.k))
+        self._acted[each, batch.k - 1] = batch.experiments.applied
+        self._motion[each, batch.k] = batch.x[:, :2]
         rewards, over = np.zeros(len(batch.k)), batch.terminated
         if over.any():
-            rewards[over] = reward(batch, self._plant, over, self._acted, self._lowest)
+            rewards[over] = reward(batch, self._plant, over, self._acted, self._motion)
         return rewards
 
     def _until_known(self, wanted: Floats, reward: TimeToPrecision) -> Floats:
-        self._missing[self._batch.k == 0] = UNKNOWN
-        self._batch.advance(wanted)
-        before, self._missing = self._missing, np.minimum(self._missing, reward.missing(self._batch))
-        return reward(before, self._missing)
+        batch, returning = self._batch, self._batch.experiments.returning
+        begun = batch.k == 0
+        self._missing[begun], self._acted[begun], self._price[begun] = UNKNOWN, 0.0, 0.0
+        batch.advance(wanted)
+        self._acted[np.arange(len(batch.k)), batch.k - 1] = batch.experiments.applied
+        before, self._missing = self._missing, np.minimum(self._missing, reward.missing(batch))
+        rewards = reward(before, self._missing)
+        ended, arrived = ~returning & (self._missing <= 1.0), (self._price > 0.0) & returning & batch.home
+        returning |= ended
+        for rows, more in ((ended, 1.0), (arrived, 0.0)):
+            if rows.any():
+                price = reward.price(batch, self._plant, rows, self._acted)
+                rewards[rows] += self._price[rows] - price
+                self._price[rows] = more * price
+        return rewards
 
 
 AnyReward = Reward | ExpectedInterval | TimeToPrecision

@@ -32,12 +32,12 @@ def intervals(
     plant: str,
     parameters: Sequence[str],
     brakes: Sequence[BrakeParameters],
-    currents: Floats,
+    currents: Sequence[Floats] | Floats,
     pool: Executor | None = None,
 ) -> list[Interval]:
     """The interval that each of N experiments will lead to, from its brake and the currents that acted [A].
 
-    Shape (N, horizon). The ``pool`` has processes that share the work.
+    Shape (N, horizon), or N rows of their own lengths. The ``pool`` has processes that share the work.
     """
     alike = Conditions(bench, bench.model(plant), tuple(parameters))
     pieces = [slice(i, i + PIECE) for i in range(0, len(brakes), PIECE)]
@@ -47,7 +47,7 @@ def intervals(
     return [one for those in done for one in those]
 
 
-def _intervals(alike: Conditions, brakes: Sequence[BrakeParameters], currents: Floats) -> list[Interval]:
+def _intervals(alike: Conditions, brakes: Sequence[BrakeParameters], currents: Sequence[Floats]) -> list[Interval]:
     bench, plant, asked = alike.bench, alike.plant, Question(alike.parameters)
     return [
         of_experiment(bench, plant, brake, sampled(bench, plant, row), asked)

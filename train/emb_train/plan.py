@@ -11,6 +11,7 @@ in each step, one set for each environment.
 from __future__ import annotations
 
 import copy
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -111,7 +112,7 @@ def search(
         compared: brakes, as many plans at a time as a step of CMA-ES has.
         drawn: plans at random, rounded up; the best are compared on all brakes.
         starts: of these, from which CMA-ES begins.
-        steps: of CMA-ES from each.
+        steps: of CMA-ES from each; the one that is best then goes on for as many.
         rng: of the plans.
         show: called after each comparison.
 
@@ -130,22 +131,31 @@ def search(
         show(found)
         return returns
 
+    def improve(strategy: Any) -> float:
+        """A step of CMA-ES after the other; gives the best return of the last."""
+        last = -np.inf
+        for _ in range(steps):
+            asked = np.array(strategy.ask())
+            returns = note(asked, compared)
+            strategy.tell(list(asked), (-returns).tolist())
+            last = float(returns.max())
+        return last
+
     screening, plans, returns = compared.screening(), [], []
     for _ in range(-(-drawn // screening.plans)):
         some = rng.uniform(-1.0, 1.0, (screening.plans, 2 * LEVELS))
         some[:, :LEVELS] *= np.where(rng.random((len(some), LEVELS)) < 0.5, NEAR, 1.0)
         plans.append(some)
         returns.append(note(some, screening, counts=False))
-    best = _best(np.concatenate(plans), np.concatenate(returns), compared.plans)
+    best, searches = _best(np.concatenate(plans), np.concatenate(returns), compared.plans), []
     for begin in _best(best, note(best, compared), starts):
         options: dict[str, Any] = {
             "popsize": compared.plans, "bounds": [-BOUND, BOUND], "verbose": -9, "seed": np.nan,
             "randn": lambda *shape: rng.standard_normal(shape),
         }  # fmt: skip
         strategy = cma.CMAEvolutionStrategy(begin, SPREAD, options)
-        for _ in range(steps):
-            asked = np.array(strategy.ask())
-            strategy.tell(list(asked), (-note(asked, compared)).tolist())
+        searches.append((improve(strategy), strategy))
+    improve(max(searches, key=operator.itemgetter(0))[1])
     return np.clip(found.numbers, -1.0, 1.0)
 
 

@@ -40,7 +40,16 @@ from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
 from emb_runtime.system.terminal import as_json
 from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, SPEED, Conditions, require_covered, require_possible
-from emb_train.env import AnyReward, EmbExcitationVectorEnv, ExpectedInterval, TimeToPrecision
+from emb_train.env import (
+    DEMANDS,
+    PRECISION,
+    AnyReward,
+    Demands,
+    EmbExcitationVectorEnv,
+    ExpectedInterval,
+    Precision,
+    TimeToPrecision,
+)
 from emb_train.plan import Compared, Found, search, speeds_of
 from emb_train.ppo import Actor, Count, Metrics, Ppo, at_once, clone, collect, joined, train
 from emb_train.presets import preset_record
@@ -61,14 +70,14 @@ class PlanSearch(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     drawn: Count = 1600  # Plans at random
     starts: Count = 2  # Of these, from which CMA-ES begins
-    steps: Count = 60  # Of CMA-ES from each
+    steps: Count = 60  # Of CMA-ES from each, and from the best of them on
     population: Annotated[int, msgspec.Meta(ge=4, le=1000)] = 16  # Plans of a step
     brakes: Count = 3  # Of each plant, on which they are compared
 
     @property
     def rounds(self) -> int:
         """Times that plans are compared."""
-        return -(-self.drawn // (self.population * self.brakes)) + 1 + self.starts * self.steps
+        return -(-self.drawn // (self.population * self.brakes)) + 1 + (self.starts + 1) * self.steps
 
 
 class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -91,6 +100,8 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     plants: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)] = (DEFAULT_PLANT,)  # Of the bench, each alike
     conditions: Conditions = BENCH_CONDITIONS
     plan: PlanSearch | None = None  # What the actor begins with; None for a network that knows nothing
+    demands: Demands = DEMANDS  # Of an experiment whose reward is a criterion of the expected interval
+    precision: Precision = PRECISION  # At which a time ends
 
     @property
     def share(self) -> int:
@@ -106,9 +117,9 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """
         reward: AnyReward
         if self.reward == TIME:
-            reward = TimeToPrecision()
+            reward = TimeToPrecision(self.precision, pool)
         elif self.reward in NUMBERS:
-            reward = ExpectedInterval(IntervalCriterion(self.reward), pool)
+            reward = ExpectedInterval(IntervalCriterion(self.reward), self.demands, pool)
         else:
             reward = REWARDS[self.reward]
         where = (count, bench, self.ranges, self.parameters, reward, self.scale)
@@ -165,8 +176,8 @@ def training_from(record: object, source: str) -> Training:
 def load_preset(name: str, **changes: Any) -> Training:
     """The configuration of a preset with some values changed.
 
-    Those of ``ppo`` and ``conditions`` have their own names, those of the plan's search ``plan.`` before it. Unless it
-    is changed, the number of experiments is rounded up to as many for each plant.
+    Those of ``ppo`` and ``conditions`` have their own names, those of the plan's search ``plan.`` before it, those of
+    other tables likewise. Unless it is changed, the number of experiments is rounded up to as many for each plant.
 
     Raises:
         UsageError: there is no such preset, or a value is not possible.
@@ -187,10 +198,19 @@ TABLES = {"ppo": Ppo, "conditions": Conditions}  # Their values have names of th
 
 def hyper_parameters(training: Training) -> dict[str, Any]:
     """The values of a training that have names of their own, by name."""
-    plan = msgspec.structs.asdict(training.plan) if training.plan else {}
+    tables = {
+        "plan": training.plan,
+        "demands": training.demands if training.reward in NUMBERS else None,
+        "precision": training.precision if training.reward == TIME else None,
+    }
     gain = {"gain": training.conditions.gain} if training.conditions.acts == SPEED else {}
-    of_plan = {f"plan.{name}": value for name, value in plan.items()}
-    return {"scale": training.scale} | msgspec.structs.asdict(training.ppo) | gain | of_plan
+    in_tables = {
+        f"{table}.{name}": value
+        for table, record in tables.items()
+        if record is not None
+        for name, value in msgspec.structs.asdict(record).items()
+    }
+    return {"scale": training.scale} | msgspec.structs.asdict(training.ppo) | gain | in_tables
 
 
 def require_trainable(training: Training, bench: Bench) -> None:
@@ -233,7 +253,7 @@ def run_training(folder: Path, training: Training, bench: Bench, show: Show = la
     """
     torch.manual_seed(training.seed)
     torch.set_num_threads(1)  # networks this small lose more by sharing out a product than they win
-    shared = training.reward in NUMBERS
+    shared = training.reward in (*NUMBERS, TIME)
     with processes(os.cpu_count() or 1) if shared else nullcontext() as pool:
         each = training.ppo.envs // len(training.plants)
         envs, actor = training.environments(bench, each, pool), training.untrained_actor(bench)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from emb_runtime.can.messages import Layout
@@ -16,7 +15,7 @@ from emb_runtime.control.start_conditions import Bounds, StartConditions
 from emb_runtime.control.stop_condition import StopCondition
 from emb_runtime.safety.command_limits import CommandLimits
 from emb_runtime.safety.guard import Guard
-from emb_runtime.safety.shield_design import ShieldLaw
+from emb_runtime.safety.shield_design import ShieldLaw, late_step
 from emb_runtime.safety.state_machine import StateMachine
 
 
@@ -49,6 +48,5 @@ class Setup:
         self.sensors = Sensors(bench, law, homing=self.homing)
         limit = self.layout.current_within(min(self.limit, bench.limits.current))
         self.command_limits = CommandLimits(limit, bench.guard.slew * bench.timing.sample_time)
-        # On the way home the end is always as near as at this step.
-        self.late_step = law.steps - 2 - math.ceil(law.settling / law.sample_time)
+        self.late_step = late_step(law)
         self.estimate = RunningEstimate(bench, self.stop_condition, homing=self.homing)

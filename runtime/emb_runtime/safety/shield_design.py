@@ -179,6 +179,11 @@ def make_law(bench: Bench) -> ShieldLaw:
     return law
 
 
+def late_step(law: ShieldLaw) -> int:
+    """Step that a way home is always at for the shield: the end is as near as it may be while the brake still moves."""
+    return law.steps - 2 - math.ceil(law.settling / law.sample_time)
+
+
 def _or_lower(bench: Bench) -> str:
     """Another remedy: the largest whole upper angle with which every condition holds, if there is one."""
     bottom, top = bench.limits.angle

@@ -1,0 +1,118 @@
+"""How clearly the motion of an experiment shows that a node lies.
+
+The runtime ends a run whose motion is that of no one brake (:mod:`emb_runtime.safety.motion_balance`). Whether it can
+tell depends on the excitation: a scale that slides is seen in long strokes, not in a creep. Here the record of an
+honest experiment is changed as a lie changes it, and the balance judges it. What a lie changes in the loop itself is
+left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from emb_bench.compiled import compiled
+from emb_bench.information.symmetric import Floats
+from emb_runtime.config.bench import Bench, BrakeParameters
+from emb_runtime.safety.motion_balance import (
+    MEMORY,
+    BalanceModel,
+    allowance,
+    balance_model,
+    begin,
+    origin,
+    take,
+    unexplained,
+)
+
+SWING = 10.0 * np.pi  # Angular frequency of what swings [rad/s]
+
+
+class Record(NamedTuple):
+    """What an experiment of n periods of the length ``ts`` [s] showed, or would show if its node lied."""
+
+    ts: float
+    brake: BrakeParameters  # The true one
+    x: Floats  # Angles [rad], shape [n + 1]
+    v: Floats  # Velocities [rad/s], shape [n + 1]
+    u: Floats  # Currents of the periods [A], shape [n]
+
+    @property
+    def at(self) -> Floats:
+        """Times of the samples [s], shape [n + 1]."""
+        times: Floats = self.ts * np.arange(len(self.x), dtype=np.float64)
+        return times
+
+    @property
+    def within(self) -> Floats:
+        """Times of the middle of each period [s], shape [n]."""
+        return self.at[:-1] + 0.5 * self.ts
+
+    def scaled(self, scale: Floats) -> Record:
+        """The velocities by a scale, shape [n + 1], and the angles as their integral."""
+        v = scale * self.v
+        moves = 0.5 * self.ts * (v[1:] + v[:-1])
+        return self._replace(v=v, x=self.x[0] + np.concatenate([[0.0], np.cumsum(moves)]))
+
+    def pulled(self, torque: Floats) -> Record:
+        """The currents that are missing where a torque acts that is not known [N·m], shape [n]."""
+        return self._replace(u=self.u + torque / self.brake.k_m)
+
+
+LIES: Mapping[str, Callable[[Record], Record]] = {
+    "scale falls by 0.5/s": lambda r: r.scaled(1.0 - 0.5 * r.at),
+    "scale grows by 0.5/s": lambda r: r.scaled(1.0 + 0.5 * r.at),
+    "scale swings by a tenth": lambda r: r.scaled(1.0 + 0.1 * np.sin(SWING * r.at)),
+    "angle curved by 0.001/rad": lambda r: r._replace(x=r.x - 0.001 * r.x**2, v=r.v * (1.0 - 0.002 * r.x)),
+    "zero at 5 rad": lambda r: r._replace(x=r.x - 5.0),
+    "zero at -5 rad": lambda r: r._replace(x=r.x + 5.0),
+    "current falls by 0.5/s": lambda r: r._replace(u=r.u / (1.0 - 0.5 * r.within)),
+    "current swings by a tenth": lambda r: r._replace(u=r.u / (1.0 + 0.1 * np.sin(SWING * r.within))),
+    "reported current 0.1 A off": lambda r: r._replace(u=r.u + 0.1),
+    "friction doubles in 1 s": lambda r: r.pulled(-r.brake.T_c * np.sign(r.v[1:]) * r.within),
+    "stiffness halves at 0.25 s": lambda r: r.pulled(
+        0.5 * r.brake.gamma * r.brake.k_1 * np.maximum(r.x[1:], 0.0) * (r.within > 0.25)
+    ),
+}
+"""Records as lies of a node would leave them, by what the lie is."""
+
+
+def shown(bench: Bench, brakes: list[BrakeParameters], motion: Floats, currents: Floats) -> Floats:
+    """How clearly each of N experiments shows each lie: what is found over what an honest run may show.
+
+    Args:
+        bench: of the experiments.
+        brakes: their brakes, N.
+        motion: true angles and velocities at the samples [rad, rad/s], shape [N, n + 1, 2].
+        currents: those that acted [A], shape [N, n].
+
+    Returns:
+        Shape [N, lies]: a run with this lie is ended where it is above 1; 0 where nothing is judged.
+    """
+    ts, found = bench.timing.sample_time, np.zeros((len(brakes), len(LIES)))
+    for row, brake, states, acted in zip(found, brakes, motion, currents, strict=True):
+        honest = Record(ts, brake, states[:, 0], states[:, 1], acted)
+        records = [lie(honest) for lie in LIES.values()]
+        arguments: tuple[Any, ...] = (
+            balance_model(bench),
+            np.stack([record.x for record in records]),
+            np.stack([record.v for record in records]),
+            np.stack([record.u for record in records]),
+            np.zeros(MEMORY),
+            row,
+        )
+        compiled(judge)(*arguments)
+    return found
+
+
+def judge(model: BalanceModel, x: Floats, v: Floats, u: Floats, memory: Floats, found: Floats) -> None:
+    """Let the balance judge some records, at their ends; shapes as in :class:`Record` with one axis before."""
+    for i in range(len(found)):
+        begin(memory, x[i, 0], v[i, 0])
+        for k in range(u.shape[1]):
+            take(model, memory, True, x[i, k + 1], v[i, k + 1], u[i, k])
+        share = unexplained(model, memory) / allowance(model, memory)
+        place, most = origin(model, memory)
+        found[i] = max(share, abs(place) / most) if share > 0.0 else 0.0
