@@ -85,18 +85,3 @@ def speed_network(bench: Bench, weights: tuple[float, float, float], phase: floa
             tensor.CopyFrom(onnx.numpy_helper.from_array(np.array(numbers[tensor.name], np.float32), tensor.name))
     vectors = (Vector((0.0, 0.0, 0.0), (float(np.sign(phase)) * limit,)),) * MIN_VECTORS
     return with_contract(model, contract_for(bench, limit, kind="speed", vectors=vectors))
-
-
-REFERENCE = """agent (double[1,4] inputs) => (double[1,3] outputs)
-<double[4,3] slopes = {0., 0., 0., 0., 0., 0., 0., 0., 0., 0., 0., 0.}, double[1,3] constants = {0.5, -0.25, 0.4}> {
-    product = MatMul(inputs, slopes)
-    outputs = Add(product, constants) }"""
-"""Levels 0.5 and −0.25 with a switch at 0.4, whatever is estimated."""
-
-
-def reference_actor(bench: Bench, **changes: Any) -> bytes:
-    """A policy of the kind ``reference``, see :data:`REFERENCE`."""
-    nominal = tuple(getattr(bench.brake, name) for name in PARAMETER_NAMES)
-    vectors = (Vector(nominal, (0.5, -0.25, 0.4)),) * MIN_VECTORS
-    right = {"kind": "reference", "inputs": PARAMETER_NAMES, "vectors": vectors}
-    return with_contract(parsed(REFERENCE), contract_for(bench, 1.0, **(right | changes)))

@@ -352,19 +352,17 @@ def _bounds(dice: random.Random) -> Iterator[Any]:
 
 
 def _estimator(dice: random.Random) -> Iterator[Any]:
-    """Estimates of a brake that moves about as it should, and the currents that follow a reference."""
+    """Estimates of a brake that moves about as it should, and the currents that follow a target speed."""
     while True:
         model = Estimator(_bench()).model._replace(sticks=dice.random() < 0.7, derived=dice.random() < 0.3)
-        state, scale = kalman.start(model), speed_loop.scale_of(_bench(), dice.choice((1.0, 0.4)))
+        state, gain = kalman.start(model), dice.choice((1.0, 0.4))
         angle, velocity, current, step = dice.uniform(-1.0, 40.0), dice.uniform(-200.0, 200.0), 0.0, 0
         for _ in range(30):
             step += dice.choice((1, 1, 1, 1, 2, 4))
             seen = angle + dice.gauss(0.0, 1e-3), velocity + dice.gauss(0.0, 1.0)
             state = kalman.follow(model, state, *seen, float(step), current)
-            levels = [dice.uniform(-1.0, 1.0) for _ in range(3)]
-            switches = [dice.uniform(0.0, 0.1) for _ in range(2)]
             believed = kalman.believed(model, state)
-            wanted = speed_loop.follow_reference(model, state, believed, scale, levels, switches, float(step))
+            wanted = speed_loop.current_for(model, state, believed, dice.uniform(-500.0, 500.0), gain)
             yield state, believed, kalman.deviations(model, state), wanted
             current = dice.uniform(-6.0, 6.0)
             push = model.motor * current - model.spring * max(angle, 0.0) - model.viscous * velocity

@@ -33,14 +33,14 @@ from emb_bench.logs.mcap_file import MAGIC
 from emb_runtime.config.bench import load_bench, shipped_bench_text
 from emb_runtime.policy.contract import CONTRACT_KEY
 from emb_runtime.policy.onnx_file import FIXED
-from tests.actors import constant_actor, reference_actor
+from tests.actors import constant_actor
 from tests.bench.damaged import chunk, record, records
 
 LONGEST = 5.0  # Time that a command may take with a file that it refuses, or that has little in it [s]
 MOST_MEMORY = 512 << 20  # Memory of its largest process [bytes]
 TRACEBACK = re.compile(r"Traceback|Error\(|error in the program|\x1b")
 BENCH = load_bench()
-ACTORS = constant_actor, partial(constant_actor, current=300.0, kind="speed"), reference_actor  # One of each kind
+ACTORS = constant_actor, partial(constant_actor, current=300.0, kind="speed")  # One of each kind
 
 JUNK: tuple[Any, ...] = (
     *(

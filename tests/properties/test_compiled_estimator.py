@@ -8,7 +8,7 @@ from emb_bench.compiled import compiled
 from emb_runtime.config.bench import load_bench
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.kalman import believed, follow, start
-from emb_runtime.estimator.speed_loop import follow_reference, scale_of
+from emb_runtime.estimator.speed_loop import current_for
 
 BENCH = load_bench()
 SAMPLES = [(0.0, 0.3, 0.0, 0.0), (0.02, 15.0, 1.0, 6.0), (0.4, 80.0, 6.0, 6.0), (0.45, 60.0, 7.0, -6.0)]
@@ -21,5 +21,6 @@ def test_compiled_for_the_batch_it_has_the_same_bits() -> None:
         for sample in SAMPLES:
             plain, fast = follow(model, plain, *sample), compiled(follow)(model, fast, *sample)
             assert plain == fast
-            asked = model, plain, believed(model, plain), scale_of(BENCH), (1.0, -1.0), (0.0131,), 6.0
-            assert follow_reference(*asked) == compiled(follow_reference)(*asked)
+            for speed in (120.0, -3.0):
+                asked = model, plain, believed(model, plain), speed, 0.4
+                assert current_for(*asked) == compiled(current_for)(*asked)

@@ -57,7 +57,7 @@ Price = Annotated[float, msgspec.Meta(ge=0.0)]
 
 
 class Demands(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What an experiment has to do besides telling much, and what it pays where it does not.
+    """Demands on an experiment besides telling much, and what it pays where it does not meet them.
 
     A sensor that lies moves a brake by some radians before it is found out: there is to be room on the side of the
     release. And the motion is to show that a node lies (:mod:`emb_train.lies`).
@@ -109,7 +109,7 @@ class ExpectedInterval:
 
 
 class Precision(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is to be known, as relative standard deviations; 95 % of the estimates are within twice that."""
+    """Precision to be reached, as relative standard deviations; 95 % of the estimates are within twice that."""
 
     repeatability: Annotated[float, msgspec.Meta(gt=0.0)] = 0.0065  # Of the running estimates, which ends an experiment
     interval: Annotated[float, msgspec.Meta(gt=0.0)] = 0.0025  # Between runs, of the whole record

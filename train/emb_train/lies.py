@@ -1,4 +1,4 @@
-"""How clearly the motion of an experiment shows that a node lies.
+"""Clearness with which the motion of an experiment shows that a node lies.
 
 The runtime ends a run whose motion is that of no one brake (:mod:`emb_runtime.safety.motion_balance`). Whether it can
 tell depends on the excitation: a scale that slides is seen in long strokes, not in a creep. Here the record of an
@@ -31,7 +31,7 @@ SWING = 10.0 * np.pi  # Angular frequency of what swings [rad/s]
 
 
 class Record(NamedTuple):
-    """What an experiment of n periods of the length ``ts`` [s] showed, or would show if its node lied."""
+    """Record of n periods of the length ``ts`` [s], as it is or as a node that lies would leave it."""
 
     ts: float
     brake: BrakeParameters  # The true one
@@ -80,7 +80,7 @@ LIES: Mapping[str, Callable[[Record], Record]] = {
 
 
 def shown(bench: Bench, brakes: list[BrakeParameters], motion: Floats, currents: Floats) -> Floats:
-    """How clearly each of N experiments shows each lie: what is found over what an honest run may show.
+    """Motion that each lie leaves unexplained in each of N experiments, as a share of what an honest run may leave.
 
     Args:
         bench: of the experiments.

@@ -28,7 +28,7 @@ from emb_bench.numbers import LEVEL, Score
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.estimator.speed_loop import current_for, share_after
+from emb_runtime.estimator.speed_loop import current_for
 from emb_runtime.policy.inference import Inference
 from emb_runtime.policy.policy import Policy
 from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Bools, Conditions
@@ -133,15 +133,11 @@ def target_speeds(policy: Policy, bench: Bench) -> Floats:
     """Speeds that a policy asks for at each step [rad/s], at rest with the nominal estimate, shape [horizon]."""
     inference, timing = Inference(policy.data, policy.contract), bench.timing
     nominal, speeds = [getattr(bench.brake, name) for name in PARAMETER_NAMES], np.zeros(timing.horizon)
-    followed = policy.contract.kind == "reference"
     for k in range(timing.horizon):
-        seen = nominal if followed else [0.0, 0.0, k * timing.sample_time, *nominal, *[0.0] * len(nominal)]
+        seen = [0.0, 0.0, k * timing.sample_time, *nominal, *[0.0] * len(nominal)]
         inference.inputs[:] = array(inference.inputs.typecode, seen[: len(inference.inputs)])
         inference.run()
-        levels = inference.outputs[: (len(inference.outputs) + 1) // 2]
-        after = [share_after(switch, float(k), float(timing.horizon)) for switch in inference.outputs[len(levels) :]]
-        within = -np.diff(np.minimum.accumulate([1.0, *after, 0.0]))  # share of the period in each level
-        speeds[k] = within @ np.array(levels) * (bench.limits.velocity if followed else 1.0)
+        speeds[k] = inference.outputs[0]
     return speeds
 
 

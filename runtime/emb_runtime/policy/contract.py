@@ -56,13 +56,11 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Everything that must fit before a policy may drive a bench.
 
     A graph of the kind ``current`` gives a current [A], one of the kind ``speed`` a target speed [rad/s], which the
-    runtime's speed loop follows. One of the kind ``reference`` sees the parameters only; it gives n levels of speed, as
-    parts of the limit, then n − 1 switches between them, as parts of the horizon. All are within ±1; a level whose
-    switch is not above 0 is left out.
+    runtime's speed loop follows.
     """
 
     schema: Literal[4] = SCHEMA
-    kind: Literal["current", "speed", "reference"]
+    kind: Literal["current", "speed"]
     inputs: Annotated[tuple[str, ...], Meta(max_length=MAX_WIDTH)]
     limits: PolicyLimits
     sample_time: Positive  # [s]
@@ -75,28 +73,24 @@ class Contract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     provenance: dict[Name, Text | int | float] = {}
 
     def __post_init__(self) -> None:
-        allowed = (PARAMETER_NAMES,) if self.kind == "reference" else INPUTS
-        if self.inputs not in allowed:
-            wanted = " or ".join(f"[{', '.join(names)}]" for names in allowed)
+        if self.inputs not in INPUTS:
+            wanted = " or ".join(f"[{', '.join(names)}]" for names in INPUTS)
             raise ValueError(f"inputs: expected {wanted}, got {shown(self.inputs)}")
         for name, (low, high) in (("limits.angle", self.limits.angle), *self.ranges.items()):
             if not low <= high:
                 raise ValueError(f"{name}: expected a lower bound first")
-        width = len(self.vectors[0].outputs)
         for i, vector in enumerate(self.vectors):
-            if (len(vector.inputs), len(vector.outputs)) != (len(self.inputs), width):
-                raise ValueError(f"vectors[{i}]: expected {len(self.inputs)} inputs and {width} outputs")
+            if (len(vector.inputs), len(vector.outputs)) != (len(self.inputs), 1):
+                given = f"{len(vector.inputs)} and {len(vector.outputs)}"
+                raise ValueError(f"vectors[{i}]: expected {len(self.inputs)} inputs and one {self.kind}, got {given}")
             # This way round, NaN is refused.
             if not all(abs(output) <= self.greatest * (1.0 + ROUNDING) for output in vector.outputs):
                 raise ValueError(f"vectors[{i}]: expected outputs within ±{self.greatest:g}")
-        if width % 2 == 0 or (self.kind != "reference" and width > 1):
-            wanted = "an odd number of levels and switches" if self.kind == "reference" else f"one {self.kind}"
-            raise ValueError(f"vectors: expected {wanted}, got {width}")
 
     @property
     def greatest(self) -> float:
-        """Greatest output of the graph, both signs, but for its rounding; of levels and switches 1."""
-        return 1.0 if self.kind == "reference" else greatest_output(self.kind, self.limits)
+        """Greatest output of the graph, both signs, but for its rounding."""
+        return greatest_output(self.kind, self.limits)
 
     def to_json(self) -> str:
         """The contract as JSON; floats keep their full precision."""

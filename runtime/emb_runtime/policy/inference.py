@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 INPUT_NAME = "inputs"
 OUTPUT_NAME = "outputs"
+CODE = "f"  # Of single precision
 
 
 class Inference:
@@ -27,11 +28,10 @@ class Inference:
 
     def __init__(self, data: bytes, contract: Contract) -> None:
         self._session = open_session(data)
-        code, kind = ("d", "tensor(double)") if contract.kind == "reference" else ("f", "tensor(float)")
-        self.inputs = array(code, contract.vectors[0].inputs)
-        self.outputs = array(code, contract.vectors[0].outputs)
+        self.inputs = array(CODE, contract.vectors[0].inputs)
+        self.outputs = array(CODE, contract.vectors[0].outputs)
         ports = {INPUT_NAME: self.inputs, OUTPUT_NAME: self.outputs}
-        wanted = [(name, kind, [1, len(numbers)]) for name, numbers in ports.items()]
+        wanted = [(name, "tensor(float)", [1, len(numbers)]) for name, numbers in ports.items()]
         found = [(port.name, port.type, port.shape) for port in self._session.get_inputs()]
         found += [(port.name, port.type, port.shape) for port in self._session.get_outputs()]
         if found != wanted:
@@ -42,7 +42,7 @@ class Inference:
         self._binding = self._session.io_binding()
         # ONNX Runtime gets their addresses only: neither changes its size, and both live as long as this.
         for bind, name in ((self._binding.bind_input, INPUT_NAME), (self._binding.bind_output, OUTPUT_NAME)):
-            bind(name, "cpu", 0, np.dtype(code), [1, len(ports[name])], ports[name].buffer_info()[0])
+            bind(name, "cpu", 0, np.dtype(CODE), [1, len(ports[name])], ports[name].buffer_info()[0])
 
     def run(self) -> None:
         """Compute the outputs of the inputs; PolicyRefusedError if ONNX Runtime could not."""

@@ -1,4 +1,4 @@
-"""A policy: one ONNX file that gives a current from a sample, or a reference from the estimate.
+"""A policy: one ONNX file that gives a current or a target speed, from a sample and the estimate.
 
 A file is of unknown origin: it is bounded in size, must stand alone (no other file, no control flow), must be made of
 operators whose work is the same for every sample (:mod:`emb_runtime.policy.onnx_file`), must have exactly the input and
@@ -16,7 +16,7 @@ from pathlib import Path
 from emb_runtime.config.bench import CEILING_CURRENT, CEILING_VELOCITY, Bench
 from emb_runtime.errors import PolicyRefusedError, UsageError
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.estimator.speed_loop import current_for, follow_reference, scale_of
+from emb_runtime.estimator.speed_loop import current_for
 from emb_runtime.policy.contract import CONTRACT_KEY, ROUNDING, SAMPLE, VECTOR_TOLERANCE, Contract, read_contract
 from emb_runtime.policy.inference import Inference
 from emb_runtime.policy.onnx_file import Graph, read_graph, require_bounded
@@ -49,16 +49,14 @@ class Policy:
         self._kind = contract.kind
         self._estimates = len(contract.inputs) > len(SAMPLE)
         self._sample_time = bench.timing.sample_time
-        self._scale = scale_of(bench, contract.gain)
-        self._levels = (len(inference.outputs) + 1) // 2
         self._greatest = contract.greatest
 
     def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         """Current for the period that begins at a sample [A]; finite and within limits only if the caller checks it.
 
-        The speed loop cuts off every current at the limit. So a target speed or a reference that is not finite gives
-        NaN, and one beyond the contract a current that is so many times beyond its limit. PolicyRefusedError if ONNX
-        Runtime could not evaluate the graph.
+        The speed loop cuts off every current at the limit. So a target speed that is not finite gives NaN, and one
+        beyond the contract a current that is so many times beyond its limit. PolicyRefusedError if ONNX Runtime could
+        not evaluate the graph.
 
         Args:
             angle: measured [rad].
@@ -66,27 +64,21 @@ class Policy:
             step: samples since the experiment began.
             estimator: with the sample taken in.
         """
-        inputs, outputs = self._inference.inputs, self._inference.outputs
-        if self._kind == "reference":
-            inputs[0], inputs[1], inputs[2], inputs[3] = estimator.in_si(estimator.relative)
-        else:
-            inputs[0], inputs[1], inputs[2] = angle, velocity, step * self._sample_time
-            if self._estimates:
-                for i, number in enumerate(estimator.parameters):
-                    inputs[len(SAMPLE) + i] = number
+        inputs = self._inference.inputs
+        inputs[0], inputs[1], inputs[2] = angle, velocity, step * self._sample_time
+        if self._estimates:
+            for i, number in enumerate(estimator.parameters):
+                inputs[len(SAMPLE) + i] = number
         self._inference.run()
+        output = self._inference.outputs[0]
         if self._kind == "current":
-            return outputs[0]
-        if not all(map(math.isfinite, outputs)):
+            return output
+        if not math.isfinite(output):
             return math.nan
-        share = max(map(abs, outputs)) / self._greatest
+        share = abs(output) / self._greatest
         if share > 1.0 + ROUNDING:
             return self.contract.limits.current * (share + ROUNDING)  # beyond the limit, however it is rounded
-        model, state, parameters = estimator.model, estimator.state, estimator.relative
-        if self._kind == "speed":
-            return current_for(model, state, parameters, outputs[0], self._scale.gain)
-        levels, switches = outputs[: self._levels], outputs[self._levels :]
-        return follow_reference(model, state, parameters, self._scale, levels, switches, step)
+        return current_for(estimator.model, estimator.state, estimator.relative, output, self.contract.gain)
 
 
 def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
@@ -117,7 +109,7 @@ def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
 
 
 def _difference(inference: Inference, contract: Contract) -> str:
-    """First output of a test vector that is not reproduced; "" if all are.
+    """First test vector that is not reproduced; "" if all are.
 
     The tolerance is a part of the output's limit, which a contract cannot widen beyond all currents or speeds.
     """
@@ -125,9 +117,9 @@ def _difference(inference: Inference, contract: Contract) -> str:
     for index, vector in enumerate(contract.vectors):
         inference.inputs[:] = type(inference.inputs)(inference.inputs.typecode, vector.inputs)
         inference.run()
-        for number, (wanted, got) in enumerate(zip(vector.outputs, inference.outputs, strict=True)):
-            if not abs(wanted - got) <= VECTOR_TOLERANCE * largest:  # this way round, NaN differs
-                return f"{index}: output {number} should be {wanted:.7g} and is {got:.7g}"
+        wanted, got = vector.outputs[0], inference.outputs[0]
+        if not abs(wanted - got) <= VECTOR_TOLERANCE * largest:  # this way round, NaN differs
+            return f"{index}: the output should be {wanted:.7g} and is {got:.7g}"
     return ""
 
 

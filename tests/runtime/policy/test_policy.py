@@ -25,7 +25,7 @@ from emb_runtime.config.bench import PARAMETER_NAMES, Bench, Sensors, load_bench
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.kalman import believed
-from emb_runtime.estimator.speed_loop import current_for, follow_reference, scale_of
+from emb_runtime.estimator.speed_loop import current_for
 from emb_runtime.policy.contract import (
     CONTRACT_KEY,
     INPUTS,
@@ -41,7 +41,7 @@ from emb_runtime.policy.onnx_file import FIXED, MAX_PARTS, read_graph
 from emb_runtime.policy.policy import MAX_FILE_BYTES, load_policy, shipped_actor_path
 from emb_runtime.safety.command_limits import checked
 from emb_runtime.safety.state_machine import Fault, StopError
-from tests.actors import constant_actor, contract_for, parsed, reference_actor, with_contract
+from tests.actors import constant_actor, contract_for, parsed, with_contract
 from tests.runtime.operating import refusal
 
 BENCH = load_bench()
@@ -106,16 +106,15 @@ def test_what_is_no_contract_is_refused() -> None:
     ):
         refusal(partial(read_contract, text))
     for kind, outputs, expected in (
-        ("current", [0.0] * 3, "one current"),
-        ("speed", [0.0] * 3, "one speed"),
-        ("reference", [0.0] * 2, "an odd number of levels and switches"),
+        ("current", [0.0] * 3, "one current, got 3 and 3"),
+        ("speed", [0.0] * 2, "one speed, got 3 and 2"),
     ):
-        assert f"expected {expected}, got" in refusal(partial(read_contract, vectors_of(kind, outputs)))
+        assert f"expected 3 inputs and {expected}" in refusal(partial(read_contract, vectors_of(kind, outputs)))
 
 
 def vectors_of(kind: str, outputs: list[float]) -> str:
     """A contract for 3 A and 300 rad/s, all of whose test vectors have these outputs."""
-    inputs = list(PARAMETER_NAMES if kind == "reference" else INPUTS[0])
+    inputs = list(INPUTS[0])
     vectors = [{"inputs": [1.0] * len(inputs), "outputs": outputs}] * MIN_VECTORS
     record = json.loads(GOOD.to_json()) | {"kind": kind, "inputs": inputs, "vectors": vectors}
     record["limits"] |= {"current": 3.0, "velocity": 300.0}
@@ -128,7 +127,6 @@ def test_the_outputs_of_test_vectors_are_within_what_a_policy_may_ask_for() -> N
         ("current", [-3.0 * (1.0 + 0.5e-6)]),
         ("speed", [300.0 * (1.0 + 0.5e-6)]),
         ("speed", [-300.0]),
-        ("reference", [1.0, -1.0, -1.0]),
     ):
         assert read_contract(vectors_of(kind, outputs)).vectors[0].outputs == tuple(outputs)
     for kind, outputs in (
@@ -136,9 +134,6 @@ def test_the_outputs_of_test_vectors_are_within_what_a_policy_may_ask_for() -> N
         ("current", [-1e9]),
         ("speed", [-300.0 * (1.0 + 2e-6)]),
         ("speed", [500.0]),
-        ("reference", [1.0 + 2e-6, 0.0, 0.5]),
-        ("reference", [0.0, -1.1, 0.5]),
-        ("reference", [0.0, 0.0, 1.1]),
     ):
         assert "vectors[0]" in refusal(partial(read_contract, vectors_of(kind, outputs)))
 
@@ -161,7 +156,6 @@ def test_a_bench_that_goes_beyond_the_policys_limits_is_refused_by_its_key_and_a
     for data in (
         constant_actor(BENCH, 2.0, limits=small),
         constant_actor(BENCH, 300.0, limits=small, kind="speed"),
-        reference_actor(BENCH, limits=small),
     ):
         load_policy(data, on(current=3.0, angle=(-5.0, 50.0), velocity=300.0))
         load_policy(data, on(current=1.0, angle=(-1.0, 20.0), velocity=100.0))
@@ -244,56 +238,13 @@ def test_angle_velocity_and_time_reach_the_graph_and_the_estimate_where_it_asks_
             assert found == pytest.approx(wanted, rel=1e-5)
 
 
-def test_a_reference_is_followed_by_the_speed_loop_at_the_benchs_scale() -> None:
-    estimator = Estimator(BENCH)
-    estimator.take(0.0, 0.0, 0, 0.0)
-    for bench in (BENCH, on(velocity=250.0)):
-        policy = load_policy(reference_actor(BENCH, gain=0.5), bench)
-        for step in (0.0, 150.0, 199.0, 200.0, 400.0):
-            scale = scale_of(bench, 0.5)
-            model, state = estimator.model, estimator.state
-            wanted = follow_reference(model, state, believed(model, state), scale, (0.5, -0.25), (0.4,), step)
-            assert policy.act(0.0, 0.0, step, estimator) == wanted
-
-
 def test_the_speed_loop_takes_an_estimate_within_its_range_only() -> None:
-    for data in (reference_actor(BENCH, gain=0.01), constant_actor(BENCH, 250.0, kind="speed", gain=0.01)):
-        policy, estimator = load_policy(data, BENCH), Estimator(BENCH)
-        found = []
-        for k_m in (9.0, estimator.model.high[0], 1.0):
-            estimator.state = estimator.state._replace(mean=(10.0, 50.0, k_m, 1.0, 1.0, 1.0))
-            found.append(policy.act(10.0, 50.0, 0.0, estimator))
-        assert found[0] == found[1] != found[2]
-
-
-def test_a_reference_that_is_not_finite_or_beyond_its_contract_asks_for_a_current_that_is_so_too() -> None:
-    model = parsed(
-        """agent (double[1,4] inputs) => (double[1,3] outputs)
-        <int64[1] zero = {0}, int64[1] one = {1}, double[1,1] half = {0.5},
-         double[1,3] now = {0.5, -0.25, 0.4}, double[1,3] later = {0., 0., 0.}> {
-            k_m = Slice(inputs, zero, one, one)
-            estimated = Less(k_m, half)
-            outputs = Where(estimated, later, now) }"""
-    )
-    vectors = (Vector((1.0,) * 4, (0.5, -0.25, 0.4)),) * MIN_VECTORS  # k_m of 1 N·m/A, which no estimate is
-    contract = contract_for(BENCH, 1.0, kind="reference", inputs=PARAMETER_NAMES, vectors=vectors)
-    (later,) = (tensor for tensor in model.graph.initializer if tensor.name == "later")
-    for output, fault in (
-        *((output, Fault.POLICY_NOT_FINITE) for output in (math.nan, math.inf, -math.inf)),
-        *((output, Fault.POLICY_BEYOND_CONTRACT) for output in (1e9, -1e9, 1.0 + 2e-6, -1.0 - 2e-6)),
-        *((output, None) for output in (1.0, -1.0, 1.0 + 0.5e-6)),
-    ):
-        for place in range(3):
-            numbers = np.array([[0.5, -0.25, 0.4]])
-            numbers[0, place] = output
-            later.CopyFrom(onnx.numpy_helper.from_array(numbers, "later"))
-            current = asked(load_policy(with_contract(model, contract), BENCH), 0.0, 0.0, 0)
-            if fault is None:
-                assert checked(current, BENCH.limits.current) == current
-                continue
-            with pytest.raises(StopError) as stopped:
-                checked(current, BENCH.limits.current)
-            assert stopped.value.fault is fault, (place, output)
+    policy, estimator = load_policy(constant_actor(BENCH, 250.0, kind="speed", gain=0.01), BENCH), Estimator(BENCH)
+    found = []
+    for k_m in (9.0, estimator.model.high[0], 1.0):
+        estimator.state = estimator.state._replace(mean=(10.0, 50.0, k_m, 1.0, 1.0, 1.0))
+        found.append(policy.act(10.0, 50.0, 0.0, estimator))
+    assert found[0] == found[1] != found[2]
 
 
 def test_a_speed_that_is_not_finite_or_beyond_its_contract_asks_for_a_current_that_is_so_too() -> None:
@@ -346,8 +297,6 @@ def test_a_policy_that_does_not_reproduce_its_vectors_is_refused() -> None:
     other = tuple(Vector(v.inputs, (-2.0,)) for v in GOOD.vectors)
     for kind in UNITS:
         assert "test vector 0" in refused(constant_actor(BENCH, 2.0, limits=widest, vectors=other, kind=kind))
-    off = (Vector((0.02, 23.0, 0.01, 2e-5), (0.5, -0.25, 0.40002)),) * MIN_VECTORS
-    assert "output 2" in refused(reference_actor(BENCH, vectors=off))
 
 
 # The file -------------------------------------------------------------------------------------------------------------
