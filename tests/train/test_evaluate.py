@@ -155,7 +155,7 @@ def test_the_interval_is_that_of_the_currents_that_acted_on_each_brake() -> None
             assert found == pytest.approx(api.interval(known).of_comparison, rel=1e-12)
         (own,) = MEASURES["I"].of_outcomes(BENCH, plant, PARAMETER_NAMES, brakes, [outcome])
         assert (own > alone).all()
-    with processes(2) as pool:
+    with processes() as pool:
         both = MEASURES["T"].of_outcomes(BENCH, "stribeck", PARAMETER_NAMES, brakes, [outcome, outcome], pool)
     assert [values.tolist() for values in both] == 2 * [alone.tolist()]
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import nullcontext
@@ -234,7 +233,7 @@ def run_training(folder: Path, training: Training, bench: Bench, show: Show = la
     torch.manual_seed(training.seed)
     torch.set_num_threads(1)  # networks this small lose more by sharing out a product than they win
     shared = training.reward in NUMBERS
-    with processes(os.cpu_count() or 1) if shared else nullcontext() as pool:
+    with processes() if shared else nullcontext() as pool:
         each = training.ppo.envs // len(training.plants)
         envs, actor = training.environments(bench, each, pool), training.untrained_actor(bench)
         stopped = False

@@ -12,7 +12,6 @@ end.
 from __future__ import annotations
 
 import math
-import os
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +27,7 @@ from emb_bench.design.problem import MARGIN, Design, Problem
 from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.information.criteria import Criterion, distances
 from emb_bench.information.symmetric import Floats
-from emb_bench.parallel import Lost, shared_out
+from emb_bench.parallel import Lost, processors, shared_out
 from emb_runtime.errors import UsageError
 
 with warnings.catch_warnings():
@@ -100,7 +99,7 @@ def search(
     lines: list[Design] = []
     ended: list[Design] = []
     history: list[float] = []
-    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(workers or processors()) as pool:
         try:
             for wave in np.array_split(np.arange(starts), WAVES):
                 found = list(tables)
@@ -145,7 +144,7 @@ def _best_table(problem: Problem, starts: int, seed: int, workers: int, told: Ca
     designs: list[Design] = []
     interrupted, done = False, 0
     try:
-        for number, found in shared_out(partial(_table, problem), pieces, workers or os.cpu_count() or 1, math.inf):
+        for number, found in shared_out(partial(_table, problem), pieces, workers or processors(), math.inf):
             if isinstance(found, Lost):
                 raise UsageError(f"start {number + 1} of the search: {found.why}")
             design = problem.design(found)
