@@ -217,7 +217,7 @@ def test_speeds_that_are_followed_are_reached_on_another_brake() -> None:
     speeds = np.concatenate([np.linspace(0.0, 60.0, 100), np.linspace(60.0, -60.0, 200), np.linspace(-60.0, -5.0, 200)])
     for plant in ("euler", "exact"):
         asked = problem(plant, k_m=0.015, T_c=0.012)
-        design = asked.design(followed(asked, speeds.tolist()))
+        design = asked.design(followed(asked, speeds))
         assert np.abs(design.states[21:, 1] - speeds[20:]).max() < 2.5  # T_c changes within a sample
 
 
