@@ -41,7 +41,7 @@ from emb_runtime.system.terminal import as_json
 from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, SPEED, Conditions, require_covered, require_possible
 from emb_train.env import AnyReward, EmbExcitationVectorEnv, ExpectedInterval, TimeToPrecision
 from emb_train.plan import Compared, Found, search, speeds_of
-from emb_train.ppo import Actor, Count, Metrics, Ppo, at_once, clone, collect, joined, train
+from emb_train.ppo import Actor, Count, Metrics, Positive, Ppo, at_once, clone, collect, joined, train
 from emb_train.presets import preset_record
 from emb_train.rewards import REWARDS
 
@@ -63,6 +63,8 @@ class PlanSearch(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     steps: Count = 60  # Of CMA-ES from each
     population: Annotated[int, msgspec.Meta(ge=4, le=1000)] = 16  # Plans of a step
     brakes: Count = 3  # Of each plant, on which they are compared
+    levels: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 9  # Of a plan; seven nearly suffice
+    spread: Positive = 0.15  # First standard deviation of its numbers, -1 to 1, in CMA-ES
 
     @property
     def rounds(self) -> int:
@@ -85,6 +87,7 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     parameters: tuple[str, ...]  # Parameters whose Fisher information is collected, in the order of ``PARAMETER_NAMES``
     reward: str  # One of :data:`emb_train.rewards.REWARDS`, a criterion of the expected interval, or ``time``
     scale: Annotated[float, msgspec.Meta(gt=0.0)]  # Its factor: the thesis normalises, a fixed one needs no state
+    precision: Positive = TimeToPrecision.precision  # Relative standard deviation that the time is counted until
     ppo: Ppo  # The hyper-parameters
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] = 0  # Seed of everything random
     plants: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)] = (DEFAULT_PLANT,)  # Of the bench, each alike
@@ -105,7 +108,7 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """
         reward: AnyReward
         if self.reward == TIME:
-            reward = TimeToPrecision()
+            reward = TimeToPrecision(self.precision)
         elif self.reward in NUMBERS:
             reward = ExpectedInterval(IntervalCriterion(self.reward), pool)
         else:
@@ -188,8 +191,9 @@ def hyper_parameters(training: Training) -> dict[str, Any]:
     """The values of a training that have names of their own, by name."""
     plan = msgspec.structs.asdict(training.plan) if training.plan else {}
     gain = {"gain": training.conditions.gain} if training.conditions.acts == SPEED else {}
+    precision = {"precision": training.precision} if training.reward == TIME else {}
     of_plan = {f"plan.{name}": value for name, value in plan.items()}
-    return {"scale": training.scale} | msgspec.structs.asdict(training.ppo) | gain | of_plan
+    return {"scale": training.scale} | precision | msgspec.structs.asdict(training.ppo) | gain | of_plan
 
 
 def require_trainable(training: Training, bench: Bench) -> None:
@@ -312,7 +316,8 @@ def search_plan(
         training.seed,
     )
     rng = np.random.default_rng(np.random.SeedSequence(training.seed, spawn_key=(PLAN_STREAM,)))
-    search(compared, drawn=asked.drawn, starts=asked.starts, steps=asked.steps, rng=rng, show=show)
+    own = {name: getattr(asked, name) for name in ("drawn", "starts", "steps", "levels", "spread")}
+    search(compared, **own, rng=rng, show=show)
 
 
 class Validation:
