@@ -14,7 +14,6 @@ not home. docs/explanation/two-informations.md says what T and I are.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 
@@ -61,7 +60,7 @@ def main() -> None:
     bench, rng = load_bench(), np.random.default_rng(arguments.seed)
     ranges, conditions = bench.range_set("pm50"), Conditions(information="physical", systematic=True)
     draws = fresh_draws(ranges, arguments.seed, arguments.draws)
-    with processes(os.cpu_count() or 1) as pool:
+    with processes() as pool:
         for plant in arguments.plant.split(","):
             print(f"plant {plant}, {len(draws)} brakes")
             first = None

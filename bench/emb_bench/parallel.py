@@ -66,10 +66,18 @@ def shared_out(
         pool.join()
 
 
+def processors() -> int:
+    """Number of processors that this process may use, which taskset, a batch system or a container limit."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @contextmanager
-def processes(jobs: int) -> Iterator[Executor]:
-    """Processes for many small pieces of work: one thread for each library, deaf to Ctrl-C, ended with the context."""
-    pool = ProcessPoolExecutor(jobs, mp_context=_SPAWN)
+def processes() -> Iterator[Executor]:
+    """Processes for many small pieces of work, as many as processors: deaf to Ctrl-C, ended with the context.
+
+    Each of them has one thread for each library.
+    """
+    pool = ProcessPoolExecutor(processors(), mp_context=_SPAWN)
     try:
         with _environment(), _deaf():
             pool.submit(os.getpid).result()  # which begins all of them

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import shutil
@@ -188,6 +189,7 @@ def test_a_file_that_computes_something_else_is_not_written(
     speeds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def wrong(actor: Any, width: int) -> Any:
+        actor = copy.deepcopy(actor)
         with torch.no_grad():
             actor.actor.layers[-1].bias.add_(0.1)
         return torch_graph(actor, width)

@@ -155,7 +155,7 @@ def test_the_interval_is_that_of_the_currents_that_acted_on_each_brake() -> None
             assert found == pytest.approx(api.interval(known).of_comparison, rel=1e-12)
         (own,) = MEASURES["I"].of_outcomes(BENCH, plant, PARAMETER_NAMES, brakes, [outcome])
         assert (own > alone).all()
-    with processes(2) as pool:
+    with processes() as pool:
         both = MEASURES["T"].of_outcomes(BENCH, "stribeck", PARAMETER_NAMES, brakes, [outcome, outcome], pool)
     assert [values.tolist() for values in both] == 2 * [alone.tolist()]
 
@@ -217,7 +217,7 @@ def test_speeds_that_are_followed_are_reached_on_another_brake() -> None:
     speeds = np.concatenate([np.linspace(0.0, 60.0, 100), np.linspace(60.0, -60.0, 200), np.linspace(-60.0, -5.0, 200)])
     for plant in ("euler", "exact"):
         asked = problem(plant, k_m=0.015, T_c=0.012)
-        design = asked.design(followed(asked, speeds.tolist()))
+        design = asked.design(followed(asked, speeds))
         assert np.abs(design.states[21:, 1] - speeds[20:]).max() < 2.5  # T_c changes within a sample
 
 

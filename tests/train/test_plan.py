@@ -16,13 +16,14 @@ from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_train.closed_loop import Conditions
 from emb_train.env import EmbExcitationEnv, EmbExcitationVectorEnv, ExpectedInterval
-from emb_train.plan import LEVELS, SPREAD, Compared, Found, play, search, speeds_of
+from emb_train.plan import Compared, Found, play, search, speeds_of
 from tests.benches import SENSOR_BENCH
 
 BENCH = SENSOR_BENCH
 SHORT = dataclasses.replace(BENCH, timing=dataclasses.replace(BENCH.timing, horizon=60))
 FOLLOWED = Conditions(acts="speed", observes="estimate", information="physical")
 FINE = 2000  # Parts of a period
+LEVELS, SPREAD = 9, 0.15
 NUMBERS = arrays(np.float64, 2 * LEVELS, elements=st.floats(-1.05, 1.05))
 
 
@@ -70,7 +71,8 @@ def distance(plans: Floats) -> Floats:
 
 def test_a_search_begins_with_the_best_plans_at_random_and_returns_the_best_of_all() -> None:
     landscape, shown = Landscape(distance), list[Found]()
-    found = search(landscape, drawn=90, starts=2, steps=30, rng=np.random.default_rng(3), show=shown.append)
+    asked = {"drawn": 90, "starts": 2, "steps": 30, "levels": LEVELS, "spread": SPREAD}
+    found = search(landscape, **asked, rng=np.random.default_rng(3), show=shown.append)  # type: ignore[arg-type]
     assert [one.plans for one in shown] == [40, 80, 120, *(120 + 16 * (i + 1) for i in range(1 + 3 * 30))]
     assert (np.diff([one.best for one in shown[3:]]) >= 0.0).all()
     drawn = np.concatenate(landscape.screened)
@@ -86,7 +88,7 @@ def test_a_search_begins_with_the_best_plans_at_random_and_returns_the_best_of_a
     everything = np.concatenate(landscape.asked)
     assert found.tolist() == np.clip(everything[np.argmax(distance(everything))], -1.0, 1.0).tolist()
     assert distance(found[None])[0] > 0.2 * distance(drawn).max()
-    again = search(Landscape(distance), drawn=90, starts=2, steps=30, rng=np.random.default_rng(3))
+    again = search(Landscape(distance), **asked, rng=np.random.default_rng(3))  # type: ignore[arg-type]
     assert again.tolist() == found.tolist()
 
 
@@ -100,7 +102,8 @@ def test_a_plan_that_no_step_improves_is_kept() -> None:
         return returns
 
     landscape = Landscape(falling)
-    found = search(landscape, drawn=32, starts=1, steps=5, rng=np.random.default_rng(3))
+    found = search(landscape, drawn=32, starts=1, steps=5, levels=4, spread=0.15, rng=np.random.default_rng(3))
+    assert len(found) == 2 * 4
     assert found.tolist() == landscape.asked[0][-1].tolist()
 
 

@@ -23,7 +23,7 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_USAGE, UsageError
 from emb_runtime.policy.policy import load_policy
 from emb_train.cli import main
-from emb_train.plan import LEVELS, Found
+from emb_train.plan import Found
 from emb_train.play import fresh_draws
 from emb_train.presets import preset_record, preset_summaries
 from emb_train.rewards import Transition, information_increment
@@ -36,6 +36,7 @@ from emb_train.training import (
     ONNX,
     PLAN,
     Validation,
+    hyper_parameters,
     load_preset,
     load_training,
     training_from,
@@ -92,8 +93,9 @@ def test_hyper_parameters_are_set_by_their_names(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     make_tiny(monkeypatch)
-    given = ("hidden=[4, 4]", "clip=0.1", "plan.drawn=3", "clone_steps=2", "scale=0.5", "total_steps=1", "gain=0.2")
-    options = [word for text in given for word in ("--set", text)]
+    given = "hidden=[4,4] clip=0.1 clone_steps=2 scale=0.5 total_steps=1 gain=0.2"
+    given += " plan.drawn=3 plan.levels=4 plan.spread=0.3"
+    options = [word for text in given.split() for word in ("--set", text)]
     options += ["--command-delay", "0", "2", "--plant", "exact,observer,stribeck"]
     folder, bench = tmp_path / "run", short_bench(tmp_path)
     assert main(["ppo", "--bench", str(bench), "--output", str(folder), *options]) == 0
@@ -102,9 +104,27 @@ def test_hyper_parameters_are_set_by_their_names(
     assert (training.conditions.command_delay, training.ppo.envs) == ((0, 2), 12)  # pairs of each of three plants
     assert (training.ppo.hidden, training.ppo.clip, training.ppo.clone_steps) == ((4, 4), 0.1, 2)
     assert training.plan is not None
-    assert (training.plan.drawn, training.scale, len(metrics_of(folder))) == (3, 0.5, 2)
+    assert (training.plan.drawn, training.plan.levels, training.plan.spread) == (3, 4, 0.3)
+    assert (training.scale, len(metrics_of(folder))) == (0.5, 2)
     said = capsys.readouterr().out
     assert all(str(folder / name) in said for name in (ONNX, CURVE))
+
+
+def test_the_time_counts_until_the_precision_that_is_set(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_tiny(monkeypatch)
+    bench, waited = load_bench(short_bench(tmp_path)), {}
+    for precision in (0.0065, 0.5):  # a brake within 50 % is known to 0.29 before it moves
+        training = load_preset("quick", **{"precision.repeatability": precision, "precision.price": 0.0})
+        assert hyper_parameters(training)["precision.repeatability"] == precision
+        (env, _) = training.environments(bench, 2)
+        env.reset(seed=1)
+        waited[precision] = sum(env.step(np.full((2, 1), 0.1, np.float32))[1].sum() for _ in range(HORIZON))
+    assert waited[0.0065] == pytest.approx(-2 * HORIZON * training.scale)
+    assert waited[0.5] > -2 * training.scale
+    command = ["ppo", "interval", "--output", str(tmp_path / "x"), "--set", "precision.price=0.1"]
+    assert "no hyper-parameter" in refused(lambda: main(command), capsys)
 
 
 def test_ctrl_c_before_there_is_an_actor_leaves_none_and_after_that_the_best_one_as_a_policy(
@@ -125,7 +145,7 @@ def test_ctrl_c_before_there_is_an_actor_leaves_none_and_after_that_the_best_one
             if what == "clone" and times > 1:
                 return real(*given, **named)
             if what == "search":
-                named["show"](Found(4, 1.0, np.linspace(-1.0, 1.0, 2 * LEVELS)))
+                named["show"](Found(4, 1.0, np.linspace(-1.0, 1.0, 18)))
             raise KeyboardInterrupt
 
         return once

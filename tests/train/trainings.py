@@ -39,7 +39,7 @@ def tiny(**changes: Any) -> Training:
 def make_tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let every preset have little to do, in this process."""
     monkeypatch.setattr("emb_train.training.preset_record", tiny_record)
-    monkeypatch.setattr("emb_train.training.processes", lambda jobs: nullcontext())
+    monkeypatch.setattr("emb_train.training.processes", nullcontext)
 
 
 def short_bench(directory: Path, old: str = "", new: str = "") -> Path:

@@ -205,6 +205,8 @@ class Experiments(NamedTuple):
     """Memory of the sensor monitor, which is asked only until it confirms the polarity, shape [N, MONITOR]."""
     response: Floats  # Memory of the proof of the response, until it is proven, shape [N, RESPONSE]
     estimate: Floats  # State of the estimator, see :func:`state_of`; shape [N, ESTIMATES]
+    told: Floats
+    """Its values, then their deviations, of k_m, k_1, T_c and f_v in SI units, shape [N, 8]."""
 
 
 def no_experiments(count: int, n: int, steps: int) -> Experiments:
@@ -229,6 +231,7 @@ def no_experiments(count: int, n: int, steps: int) -> Experiments:
         monitor=np.zeros((count, MONITOR)),
         response=np.zeros((count, RESPONSE)),
         estimate=np.zeros((count, ESTIMATES)),
+        told=np.zeros((count, 2 * len(PARAMETER_NAMES))),
     )
 
 
@@ -276,7 +279,7 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     """One sample period of experiment ``i``, in place; arguments as for :func:`advance`."""
     (
         brakes, delay, beside, x, s, m, memory, y, applied,
-        past, k, noise, late, reasons, violated, returning, monitor, response, _,
+        past, k, noise, late, reasons, violated, returning, monitor, response, _, _,
     ) = experiments  # fmt: skip
     rules = setup.rules
     p = BrakeParameters(
@@ -337,15 +340,11 @@ def advance_speeds(setup: Setup, model: Model, gain: float, experiments: Experim
 
 def estimate_all(model: Model, experiments: Experiments, rows: Integers) -> None:
     """Take the newest sample into the estimators of these rows, in place."""
-    y, k, applied, estimate = experiments.y, experiments.k, experiments.applied, experiments.estimate
+    y, k, applied = experiments.y, experiments.k, experiments.applied
+    estimate, told = experiments.estimate, experiments.told
     for i in rows:
-        store(follow(model, state_of(estimate[i]), y[i, 0], y[i, 1], float(k[i]), applied[i]), estimate[i])
-
-
-def tell_estimates(model: Model, experiments: Experiments, told: Floats) -> None:
-    """Values, then deviations, of k_m, k_1, T_c and f_v in SI units, as the estimators have them, shape [N, 8]."""
-    for i in range(told.shape[0]):
-        state = state_of(experiments.estimate[i])
+        state = follow(model, state_of(estimate[i]), y[i, 0], y[i, 1], float(k[i]), applied[i])
+        store(state, estimate[i])
         values, widths = believed(model, state), deviations(model, state)
         for j in range(4):
             told[i, j], told[i, 4 + j] = values[j] * model.nominal[j], widths[j] * model.nominal[j]
@@ -505,9 +504,7 @@ class Batch:
 
     def estimate(self) -> Floats:
         """Estimates of k_m, k_1, T_c and f_v in SI units, then their deviations, bounded; shape [N, 8]."""
-        told = np.empty((len(self.k), 2 * len(PARAMETER_NAMES)))
-        compiled(tell_estimates)(self.model, self.experiments, told)
-        bounded: Floats = np.minimum(told, self.most)
+        bounded: Floats = np.minimum(self.experiments.told, self.most)
         return bounded
 
     def actor_observation(self) -> NDArray[np.float32]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
@@ -215,9 +214,7 @@ def evaluate(bench: Bench, settings: Settings, subjects: Sequence[Subject], tell
             if model not in known:
                 known[model] = optima(bench, measure, names, model, brakes, tell)[1:]
             drawn = [draw.brake for draw in draws]
-            with (
-                processes(os.cpu_count() or 1) if isinstance(measure.goal, IntervalCriterion) else nullcontext() as pool
-            ):
+            with processes() if isinstance(measure.goal, IntervalCriterion) else nullcontext() as pool:
                 values = measure.of_outcomes(bench, plant, names, drawn, list(outcomes.values()), pool)
             found[plant] = result(measure, outcomes, values, len(subjects), known[model])
     except KeyboardInterrupt:

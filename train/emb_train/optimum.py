@@ -1,8 +1,9 @@
 """Known-parameter optimum: the best currents for each brake if its parameters were known.
 
 A search takes a quarter of a minute for a brake, and minutes for the first one, in the middle of the ranges. The others
-start from the optimum of that one: its speeds are followed on the other brake, and the search goes on from there. The
-result is the best that was found, not proved to be the best there is.
+start from the optimum of that one: its speeds, or its table of journeys where the search polishes none, are followed on
+the other brake, and the search goes on from there. The result is the best that was found, not proved to be the best
+there is.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def optima(
         measure: what is optimised.
         parameters: whose information counts.
         plant: ``euler`` or ``exact``.
-        brakes: the first is searched for from many starts, and the others from its speeds.
+        brakes: the first is searched for from many starts, and the others from its optimum too.
         tell: called with a line on the progress.
 
     Returns:
@@ -65,7 +66,7 @@ def optima(
     Raises:
         UsageError: nothing that was found for a brake keeps the limits.
     """
-    speeds: Sequence[float] = ()
+    begun: Floats | None = None  # What the search for the first brake found
     values: list[float] = []
     of_interval = isinstance(measure.goal, IntervalCriterion)  # which an estimate has with the bench's instruments
     ideal = bench if of_interval else replace(bench, sensors=Sensors())
@@ -73,15 +74,16 @@ def optima(
         tell(f"optimum on {plant}, brake {number} of {len(brakes)}")
         goal = measure.goal
         problem = make_problem(ideal, goal, parameters, model=plant, kind=measure.kind, brake=brake, returns=True)
-        warm = [followed(problem, speeds)] if speeds else []
-        found = search(problem, starts=STARTS if speeds else FIRST_STARTS, seed=SEED, warm=warm)
+        warm = [] if begun is None else [begun if of_interval else followed(problem, begun)]
+        found = search(problem, starts=FIRST_STARTS if begun is None else STARTS, seed=SEED, warm=warm)
         design = problem.design(found.best.currents)
-        speeds = speeds or design.states[1:, 1].tolist()
+        if begun is None:
+            begun = found.genes if of_interval else design.states[1:, 1]
         values.append(design.phi if of_interval else float(measure.values(design.matrix[None])[0]))
     return np.array(values)
 
 
-def followed(problem: Problem, speeds: Sequence[float]) -> Floats:
+def followed(problem: Problem, speeds: Floats) -> Floats:
     """Currents [A] that give a known brake these speeds [rad/s] at the samples' ends, within the current limit."""
     p, t_s, limit = problem.brake, problem.sample_time, problem.box.current
 

@@ -22,8 +22,6 @@ from emb_bench.information.symmetric import Floats
 from emb_train.env import EmbExcitationVectorEnv
 from emb_train.ppo import at_once
 
-LEVELS = 9  # Of a plan; seven nearly suffice
-SPREAD = 0.15  # First standard deviation of its numbers, -1 to 1
 BOUND = 1.05  # Beyond the ends of the numbers, so that full speed is inside
 NEAR = 0.3  # Half the levels drawn are this much smaller, for a creep
 WIDTHS = 3.0  # Logarithm of the longest time over the mean
@@ -103,6 +101,8 @@ def search(
     drawn: int,
     starts: int,
     steps: int,
+    levels: int,
+    spread: float,
     rng: np.random.Generator,
     show: Callable[[Found], object] = lambda found: None,
 ) -> Floats:
@@ -113,13 +113,15 @@ def search(
         drawn: plans at random, rounded up; the best are compared on all brakes.
         starts: of these, from which CMA-ES begins.
         steps: of CMA-ES from each; the one that is best then goes on for as many.
+        levels: of a plan.
+        spread: first standard deviation of its numbers, -1 to 1, in CMA-ES.
         rng: of the plans.
         show: called after each comparison.
 
     Returns:
         The best of all plans on these brakes; shape [2 n].
     """
-    found = Found(0, -np.inf, np.zeros(2 * LEVELS))
+    found = Found(0, -np.inf, np.zeros(2 * levels))
 
     def note(plans: Floats, by: Compared, counts: bool = True) -> Floats:
         nonlocal found
@@ -143,8 +145,8 @@ def search(
 
     screening, plans, returns = compared.screening(), [], []
     for _ in range(-(-drawn // screening.plans)):
-        some = rng.uniform(-1.0, 1.0, (screening.plans, 2 * LEVELS))
-        some[:, :LEVELS] *= np.where(rng.random((len(some), LEVELS)) < 0.5, NEAR, 1.0)
+        some = rng.uniform(-1.0, 1.0, (screening.plans, 2 * levels))
+        some[:, :levels] *= np.where(rng.random((len(some), levels)) < 0.5, NEAR, 1.0)
         plans.append(some)
         returns.append(note(some, screening, counts=False))
     best, searches = _best(np.concatenate(plans), np.concatenate(returns), compared.plans), []
@@ -153,7 +155,7 @@ def search(
             "popsize": compared.plans, "bounds": [-BOUND, BOUND], "verbose": -9, "seed": np.nan,
             "randn": lambda *shape: rng.standard_normal(shape),
         }  # fmt: skip
-        strategy = cma.CMAEvolutionStrategy(begin, SPREAD, options)
+        strategy = cma.CMAEvolutionStrategy(begin, spread, options)
         searches.append((improve(strategy), strategy))
     improve(max(searches, key=operator.itemgetter(0))[1])
     return np.clip(found.numbers, -1.0, 1.0)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -21,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from emb_bench.config.bench import Bench
+from emb_bench.parallel import processors
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EmbError
 from emb_runtime.policy.contract import SAMPLE
@@ -407,7 +407,7 @@ def collect_all(
 
 def at_once(work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
     """The results of work with several environments: while one steps, another may wait for what processes do."""
-    with ThreadPoolExecutor(os.cpu_count() or 1) as threads:
+    with ThreadPoolExecutor(processors()) as threads:
         return list(threads.map(work, *arguments))
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import nullcontext
@@ -51,7 +50,7 @@ from emb_train.env import (
     TimeToPrecision,
 )
 from emb_train.plan import Compared, Found, search, speeds_of
-from emb_train.ppo import Actor, Count, Metrics, Ppo, at_once, clone, collect, joined, train
+from emb_train.ppo import Actor, Count, Metrics, Positive, Ppo, at_once, clone, collect, joined, train
 from emb_train.presets import preset_record
 from emb_train.rewards import REWARDS
 
@@ -73,6 +72,8 @@ class PlanSearch(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     steps: Count = 60  # Of CMA-ES from each, and from the best of them on
     population: Annotated[int, msgspec.Meta(ge=4, le=1000)] = 16  # Plans of a step
     brakes: Count = 3  # Of each plant, on which they are compared
+    levels: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 9  # Of a plan; seven nearly suffice
+    spread: Positive = 0.15  # First standard deviation of its numbers, -1 to 1, in CMA-ES
 
     @property
     def rounds(self) -> int:
@@ -254,7 +255,7 @@ def run_training(folder: Path, training: Training, bench: Bench, show: Show = la
     torch.manual_seed(training.seed)
     torch.set_num_threads(1)  # networks this small lose more by sharing out a product than they win
     shared = training.reward in (*NUMBERS, TIME)
-    with processes(os.cpu_count() or 1) if shared else nullcontext() as pool:
+    with processes() if shared else nullcontext() as pool:
         each = training.ppo.envs // len(training.plants)
         envs, actor = training.environments(bench, each, pool), training.untrained_actor(bench)
         stopped = False
@@ -333,7 +334,8 @@ def search_plan(
         training.seed,
     )
     rng = np.random.default_rng(np.random.SeedSequence(training.seed, spawn_key=(PLAN_STREAM,)))
-    search(compared, drawn=asked.drawn, starts=asked.starts, steps=asked.steps, rng=rng, show=show)
+    own = {name: getattr(asked, name) for name in ("drawn", "starts", "steps", "levels", "spread")}
+    search(compared, **own, rng=rng, show=show)
 
 
 class Validation:

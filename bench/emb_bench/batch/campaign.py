@@ -16,7 +16,7 @@ from emb_bench.batch.row import ENDINGS as ROWS
 from emb_bench.batch.row import Options, Row, Source, failed, write_rows
 from emb_bench.batch.summary import Campaign, mark_copies, summarise
 from emb_bench.output import progress, replacing, require_place
-from emb_bench.parallel import Lost, shared_out, shared_out_on_ray
+from emb_bench.parallel import Lost, processors, shared_out, shared_out_on_ray
 from emb_runtime.errors import UsageError, needs
 from emb_runtime.records import HOMING_LOG, LISTEN_ONLY_LOG
 from emb_runtime.system.input_file import near_file
@@ -44,7 +44,7 @@ def run_campaign(
     sources, evaluate = find(paths), partial(evaluate_one, options=options)
     with replacing(output) as beside:
         if ray is None:
-            numbered = shared_out(evaluate, sources, jobs or os.cpu_count() or 1, time_limit)
+            numbered = shared_out(evaluate, sources, jobs or processors(), time_limit)
         else:
             numbered = shared_out_on_ray(evaluate, sources, jobs, time_limit, ray)
         rows = mark_copies(in_order(sources, numbered))

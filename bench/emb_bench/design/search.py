@@ -12,7 +12,6 @@ end.
 from __future__ import annotations
 
 import math
-import os
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +27,7 @@ from emb_bench.design.problem import MARGIN, Design, Problem
 from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.information.criteria import Criterion, distances
 from emb_bench.information.symmetric import Floats
-from emb_bench.parallel import Lost, shared_out
+from emb_bench.parallel import Lost, processors, shared_out
 from emb_runtime.errors import UsageError
 
 with warnings.catch_warnings():
@@ -41,6 +40,7 @@ DRAWN = 400  # Tables drawn at random, of which the best one starts a search
 FIRST = 4000  # Coarse designs that one search simulates
 FEW = 600  # The same for a criterion of the interval, which takes a hundred times as long; a fifth is drawn besides
 WIDE = 0.2  # Initial standard deviation of the genes, −1..1
+CLOSE = 0.05  # The same of a search that begins with the table of another brake
 POPULATION = 24  # Population of CMA-ES
 WAVES = 3  # Batches of coarse searches, each of which keeps away from what the earlier ones found
 NEAR = 0.3  # Distance (:func:`distances`) below which two tables count as near; those that go on are half of it apart
@@ -66,6 +66,7 @@ class Found:
     best: Design
     designs: tuple[Design, ...]  # The polished ones within the limits, best first: local optima, or near one
     interrupted: bool = False  # By Ctrl-C: the best of what was found by then
+    genes: Floats | None = None  # Of the best one, if no polish followed, for the search on another brake
 
 
 class Table(NamedTuple):
@@ -88,19 +89,20 @@ def search(
 ) -> Found:
     """The best design of many searches; the same seed finds the same design, whatever the number of workers.
 
-    ``starts`` are coarse searches, ``workers`` threads, 0 for one per processor, ``warm`` currents to begin with too.
+    ``starts`` are coarse searches, ``workers`` threads, 0 for one per processor. ``warm`` are currents to begin with
+    too, of a criterion of the interval the genes of tables.
     ``told`` is called after each of at most :func:`steps_of` steps, with what was done. Ctrl-C ends the search with the
     best design so far, if there is one.
     """
     if not isinstance(problem.goal, Criterion):
-        return _best_table(problem, starts, seed, workers, told)
+        return _best_table(problem, starts, seed, workers, warm, told)
     seeds = np.random.SeedSequence(seed).spawn(starts + LINES)
     draws = [np.random.default_rng(s) for s in seeds[starts:]]
     tables: list[Table] = []
     lines: list[Design] = []
     ended: list[Design] = []
     history: list[float] = []
-    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(workers or processors()) as pool:
         try:
             for wave in np.array_split(np.arange(starts), WAVES):
                 found = list(tables)
@@ -139,34 +141,39 @@ def search(
     return Found(best, (best, *others), interrupted)
 
 
-def _best_table(problem: Problem, starts: int, seed: int, workers: int, told: Callable[[str], object]) -> Found:
+def _best_table(
+    problem: Problem, starts: int, seed: int, workers: int, warm: Sequence[Floats], told: Callable[[str], object]
+) -> Found:
     """The best coarse design for a criterion without a slope to climb, within the limits between samples too."""
-    pieces = list(enumerate(np.random.SeedSequence(seed).spawn(starts)))
-    designs: list[Design] = []
+    seeds = np.random.SeedSequence(seed).spawn(starts + len(warm))
+    pieces = list(zip(range(len(seeds)), seeds, [None] * starts + list(warm), strict=True))
+    designs: list[tuple[Design, Floats]] = []
     interrupted, done = False, 0
     try:
-        for number, found in shared_out(partial(_table, problem), pieces, workers or os.cpu_count() or 1, math.inf):
+        for number, found in shared_out(partial(_table, problem), pieces, workers or processors(), math.inf):
             if isinstance(found, Lost):
                 raise UsageError(f"start {number + 1} of the search: {found.why}")
-            design = problem.design(found)
+            design = problem.design(found.currents)
             if design.feasible and max(problem.beyond(design)) <= MARGIN:
-                designs.append(design)
+                designs.append((design, found.genes))
             done += 1
-            told(f"start {done} of {starts} done")
+            told(f"start {done} of {len(pieces)} done")
     except KeyboardInterrupt:
         if not designs:
             raise
         interrupted = True
     if not designs:
         raise UsageError(f"no design of {starts} starts keeps the limits: try more starts")
-    designs.sort(key=_rank, reverse=True)
-    return Found(designs[0], tuple(designs), interrupted)
+    designs.sort(key=lambda found: _rank(found[0]), reverse=True)
+    return Found(designs[0][0], tuple(design for design, _ in designs), interrupted, designs[0][1])
 
 
-def _table(problem: Problem, piece: tuple[int, np.random.SeedSequence]) -> Floats:
-    """Currents of one coarse search."""
-    number, seed = piece
-    return coarse(problem, JOURNEYS[number % len(JOURNEYS)], seed).currents
+def _table(problem: Problem, piece: tuple[int, np.random.SeedSequence, Floats | None]) -> Table:
+    """The table of one coarse search, from ``warm`` genes if there are some."""
+    number, seed, warm = piece
+    if warm is None:
+        return coarse(problem, JOURNEYS[number % len(JOURNEYS)], seed)
+    return evolved(problem, warm, CLOSE, FEW, np.random.default_rng(seed))
 
 
 def steps_of(goal: Criterion | IntervalCriterion, starts: int) -> int:

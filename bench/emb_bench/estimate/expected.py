@@ -31,6 +31,7 @@ from emb_bench.estimate.records import Contribution, EstimationProblem, with_sys
 from emb_bench.estimate.suspects import (
     OF_THE_SPRING,
     Simulated,
+    basis_and_inverse,
     budget_of,
     effect_of,
     scales,
@@ -166,10 +167,7 @@ def of_problem(problem: Problem, z: Floats) -> Interval:
     shown = Simulated(problem, z, weights, said)
     jacobian = problem.jacobian(z, weights, said)[1]
     averaged = average(problem, z, (np.zeros(len(jacobian)), jacobian))  # of records without noise
-    lengths = np.linalg.norm(jacobian, axis=0)
-    lengths = np.where(lengths > 0.0, lengths, 1.0)
-    basis, triangle = np.linalg.qr(jacobian / lengths)
-    pseudo = np.linalg.pinv(triangle) @ basis.T / lengths[:, None]
+    basis, pseudo = basis_and_inverse(jacobian)
     if any(record.gap_unknowns for record in problem.records):
         basis = np.concatenate([basis, problem.gap_basis(z, weights)], axis=1)
     every = columns(problem, z, shown, held)

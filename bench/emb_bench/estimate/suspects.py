@@ -380,7 +380,7 @@ def score(
     } | {name: np.concatenate([column.ravel() for column in parts]) for name, parts in added.items()}
     if problem.bench.brake.k_1 == 0.0:
         every = {name: column for name, column in every.items() if name not in OF_THE_SPRING}
-    pseudo = pseudo_inverse(jacobian)
+    _, pseudo = basis_and_inverse(jacobian)
     priors = _priors(problem, DISTURBED if disturbed else 1.0)
     found, beside_all, effects = [], [], dict[str, Effect]()
     untested = scales(problem, z, left[1], shown, every, priors)
@@ -432,12 +432,12 @@ def beside_model(column: Floats, model: Floats) -> tuple[Floats, Floats]:
     return whole, whole - model @ (model.T @ whole)
 
 
-def pseudo_inverse(jacobian: Floats) -> Floats:
-    """Pseudo-inverse of a matrix whose columns differ in scale."""
+def basis_and_inverse(jacobian: Floats) -> tuple[Floats, Floats]:
+    """An orthonormal basis and the pseudo-inverse of a tall matrix whose columns differ in scale."""
     lengths = np.linalg.norm(jacobian, axis=0)
     lengths = np.where(lengths > 0.0, lengths, 1.0)
-    result: Floats = np.linalg.pinv(jacobian / lengths) / lengths[:, None]
-    return result
+    basis, triangle = np.linalg.qr(jacobian / lengths)
+    return basis, np.linalg.pinv(triangle) @ basis.T / lengths[:, None]
 
 
 def effect_of(problem: Problem, name: str, prior: float, moved: Floats, information: float, score: float) -> Effect:

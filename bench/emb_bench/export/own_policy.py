@@ -115,37 +115,56 @@ def own_policy(
         model = bare(onnx.inliner.inline_local_functions(model))
         require_bounded(read_graph(model.SerializeToString()))
         port, width, answer = _ports(model)
-        seen, limit = observations(bench, width), greatest_output(kind, bench.limits)
-        wrapped = _wrapped(model, port, width, answer, limit)
+        wrapped = _wrapped(model, port, width, answer, greatest_output(kind, bench.limits))
         _require_small(wrapped)
-        asked = (source or _evaluated(model, port))(seen)
-        if asked.size != len(seen):
-            shape = list(asked.shape[1:])
-            raise PolicyRefusedError(
-                f"its output has the shape {shape}: expected one {kind} [{UNITS[kind]}], shape [1, 1]"
-            )
-        asked = asked.reshape(len(seen), 1)
-        for row in seen[~np.isfinite(asked[:, 0])]:
-            named = ", ".join(f"{name} {value:.4g}" for name, value in zip(WIDTHS[width], row.tolist(), strict=True))
-            raise PolicyRefusedError(f"its {kind} is not finite for {named}")
-        wanted = np.clip(asked, -limit, limit)
-        found = _evaluated(wrapped, wrapped.graph.input[0])(seen).reshape(wanted.shape)
-        apart = np.abs(found - wanted)[:, 0] / limit
-        if not apart.max() <= APART:
-            raise PolicyRefusedError(
-                f"its graph differs from it by {apart.max() * limit:.3g} {UNITS[kind]}, expected rounding alone"
-            )
-        alike = apart <= 0.25 * VECTOR_TOLERANCE  # a test vector has to be met on other computers, too
-        if alike.sum() < MIN_VECTORS:
-            raise PolicyRefusedError(
-                f"its {kind}s round by more than {VECTOR_TOLERANCE * limit:g} {UNITS[kind]}: scale its inputs"
-            )
-        fields = {"kind": kind, "inputs": WIDTHS[width]}
-        data = policy_file(wrapped, bench, seen[alike], wanted[alike], provenance, **fields)
+        return finished(wrapped, bench, provenance, what, source or _evaluated(model, port), kind)
     except PolicyRefusedError:
         raise
     except Exception as err:  # the errors of the onnx package share no base class
         raise PolicyRefusedError(f"the onnx package refuses it: {first_line(err)}") from err
+
+
+def finished(
+    graph: onnx.ModelProto,
+    bench: Bench,
+    provenance: Provenance,
+    what: str,
+    source: Callable[[NDArray[np.float32]], Floats],
+    kind: str,
+    **contract: Any,
+) -> tuple[bytes, str]:
+    """The policy file of a graph with input and output of the contract, compared with its source; and its origin.
+
+    Arguments as of :func:`own_policy`, and other fields of the contract.
+
+    Raises:
+        PolicyRefusedError: an output is not finite, or differs by more than rounding.
+    """
+    (port,) = graph.graph.input
+    width, limit = port.type.tensor_type.shape.dim[-1].dim_value, greatest_output(kind, bench.limits)
+    seen = observations(bench, width)
+    asked = source(seen)
+    if asked.size != len(seen):
+        shape = list(asked.shape[1:])
+        raise PolicyRefusedError(f"its output has the shape {shape}: expected one {kind} [{UNITS[kind]}], shape [1, 1]")
+    asked = asked.reshape(len(seen), 1)
+    for row in seen[~np.isfinite(asked[:, 0])]:
+        named = ", ".join(f"{name} {value:.4g}" for name, value in zip(WIDTHS[width], row.tolist(), strict=True))
+        raise PolicyRefusedError(f"its {kind} is not finite for {named}")
+    wanted = np.clip(asked, -limit, limit)
+    found = _evaluated(graph, port)(seen).reshape(wanted.shape)
+    apart = np.abs(found - wanted)[:, 0] / limit
+    if not apart.max() <= APART:
+        raise PolicyRefusedError(
+            f"its graph differs from it by {apart.max() * limit:.3g} {UNITS[kind]}, expected rounding alone"
+        )
+    alike = apart <= 0.25 * VECTOR_TOLERANCE  # a test vector has to be met on other computers, too
+    if alike.sum() < MIN_VECTORS:
+        raise PolicyRefusedError(
+            f"its {kind}s round by more than {VECTOR_TOLERANCE * limit:g} {UNITS[kind]}: scale its inputs"
+        )
+    fields = {"kind": kind, "inputs": WIDTHS[width], **contract}
+    data = policy_file(graph, bench, seen[alike], wanted[alike], provenance, **fields)
     beyond = int((np.abs(asked) > limit * (1.0 + ROUNDING)).sum())
     clipped = f"; {beyond} of {len(seen)} {kind}s are beyond {limit:g} {UNITS[kind]}: clipped" if beyond else ""
     return data, f"{what} ({kind} of {', '.join(WIDTHS[width])}) at {len(seen)} inputs{clipped}"

@@ -348,6 +348,23 @@ def test_a_design_for_the_interval_is_worth_what_an_estimate_is_expected_to_tell
     assert check(bench, p, "physical", found.best.currents, "exact").value == found.best.phi
 
 
+def test_a_search_for_the_interval_goes_on_from_the_table_of_another_brake(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search_module, "FEW", 60)
+    monkeypatch.setattr(search_module, "shared_out", lambda work, pieces, *_: enumerate(map(work, pieces)))
+    bench = load_bench()
+    first = replace(make_problem(bench, IntervalCriterion("T"), PARAMETER_NAMES), horizon=120)
+    other = replace(first, brake=bench.brake._replace(T_c=0.7 * bench.brake.T_c))
+    begun = search(first, starts=3, seed=1)
+    assert begun.genes is not None
+    _, _, (as_it_is,), (price,) = other.explore(begun.genes[None])
+    assert price == 0.0
+    told: list[str] = []
+    found = search(other, starts=1, seed=1, warm=[begun.genes], told=told.append)
+    assert told == ["start 1 of 2 done", "start 2 of 2 done"]
+    assert found.best.phi > as_it_is
+    assert found.best.phi > search(other, starts=1, seed=1).best.phi
+
+
 def test_an_interrupted_search_keeps_the_best_design_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
     """As soon as one can keep the limits: a coarse one for T, a polished one for D."""
     monkeypatch.setattr(search_module, "FEW", 60)
