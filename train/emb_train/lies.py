@@ -2,8 +2,8 @@
 
 The runtime ends a run whose motion is that of no one brake (:mod:`emb_runtime.safety.motion_balance`). Whether it can
 tell depends on the excitation: a scale that slides is seen in long strokes, not in a creep. Here the record of an
-honest experiment is changed as a lie changes it, and the balance judges it. What a lie changes in the loop itself is
-left out.
+honest experiment is changed as a lie changes it, and the balance judges it. The loop follows what the node tells: with
+a wrong sensor the motion that is told stays, and the true one changes with its currents.
 """
 
 from __future__ import annotations
@@ -50,14 +50,20 @@ class Record(NamedTuple):
         """Times of the middle of each period [s], shape [n]."""
         return self.at[:-1] + 0.5 * self.ts
 
+    def moved(self, x: Floats, v: Floats) -> Record:
+        """The record where the true motion is another one, shape [n + 1] each: the loop follows what it is told."""
+        brake, more = self.brake, v - self.v
+        spring = brake.gamma * brake.k_1 * (np.maximum(x, 0.0) - np.maximum(self.x, 0.0))[1:]
+        return self.pulled(brake.J * np.diff(more) / self.ts + spring + brake.f_v * more[1:])
+
     def scaled(self, scale: Floats) -> Record:
-        """The velocities by a scale, shape [n + 1], and the angles as their integral."""
-        v = scale * self.v
+        """The record where angle and velocity are told by a scale, shape [n + 1]; the angle stays an integral."""
+        v = self.v / scale
         moves = 0.5 * self.ts * (v[1:] + v[:-1])
-        return self._replace(v=v, x=self.x[0] + np.concatenate([[0.0], np.cumsum(moves)]))
+        return self.moved(self.x[0] + np.concatenate([[0.0], np.cumsum(moves)]), v)
 
     def pulled(self, torque: Floats) -> Record:
-        """The currents that are missing where a torque acts that is not known [N·m], shape [n]."""
+        """The record where a torque acts that nobody knows of, which the current overcomes [N·m], shape [n]."""
         return self._replace(u=self.u + torque / self.brake.k_m)
 
 
@@ -65,15 +71,15 @@ LIES: Mapping[str, Callable[[Record], Record]] = {
     "scale falls by 0.5/s": lambda r: r.scaled(1.0 - 0.5 * r.at),
     "scale grows by 0.5/s": lambda r: r.scaled(1.0 + 0.5 * r.at),
     "scale swings by a tenth": lambda r: r.scaled(1.0 + 0.1 * np.sin(SWING * r.at)),
-    "angle curved by 0.001/rad": lambda r: r._replace(x=r.x - 0.001 * r.x**2, v=r.v * (1.0 - 0.002 * r.x)),
-    "zero at 5 rad": lambda r: r._replace(x=r.x - 5.0),
-    "zero at -5 rad": lambda r: r._replace(x=r.x + 5.0),
+    "angle curved by 0.001/rad": lambda r: r.moved(r.x + 0.001 * r.x**2, r.v * (1.0 + 0.002 * r.x)),
+    "zero at 5 rad": lambda r: r.moved(r.x + 5.0, r.v),
+    "zero at -5 rad": lambda r: r.moved(r.x - 5.0, r.v),
     "current falls by 0.5/s": lambda r: r._replace(u=r.u / (1.0 - 0.5 * r.within)),
     "current swings by a tenth": lambda r: r._replace(u=r.u / (1.0 + 0.1 * np.sin(SWING * r.within))),
     "reported current 0.1 A off": lambda r: r._replace(u=r.u + 0.1),
-    "friction doubles in 1 s": lambda r: r.pulled(-r.brake.T_c * np.sign(r.v[1:]) * r.within),
+    "friction doubles in 1 s": lambda r: r.pulled(r.brake.T_c * np.sign(r.v[1:]) * r.within),
     "stiffness halves at 0.25 s": lambda r: r.pulled(
-        0.5 * r.brake.gamma * r.brake.k_1 * np.maximum(r.x[1:], 0.0) * (r.within > 0.25)
+        -0.5 * r.brake.gamma * r.brake.k_1 * np.maximum(r.x[1:], 0.0) * (r.within > 0.25)
     ),
 }
 """Records as lies of a node would leave them, by what the lie is."""
