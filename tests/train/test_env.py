@@ -370,7 +370,7 @@ def test_an_experiment_pays_for_the_release_side_for_what_lies_it_hides_and_for_
         of = ExpectedInterval(criterion, Demands(**demands))
         return of(batch, "exact", rows, np.transpose(acted), motion)
 
-    assert (reward(hidden=0.0) - reward()).tolist() == pytest.approx([len(LIES) * 1.25 * 10.0] * 2)  # nothing moved
+    assert (reward(hidden=0.0) - reward()).tolist() == pytest.approx([len(LIES) * 1.15 * 10.0] * 2)  # nothing moved
     motion[1, 30, 0] = 0.3 * SHORT.limits.angle[0] - 2.5
     np.testing.assert_allclose(reward(hidden=0.0, beyond=0.0) - reward(hidden=0.0), [0.0, 2.5], atol=1e-12)
     batch.x[1, 0] = 20.0  # not at home

@@ -66,7 +66,7 @@ class Demands(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     astray: Price = 20.0  # Price of limits left, or of an end away from home [nat]
     release: Share = 0.3  # Part of the way to the lowest angle that is free
     beyond: Price = 1.0  # Price of each radian beyond it [nat]
-    shown: Price = 1.25  # How clearly the motion shows each lie; above 1 a run is ended
+    shown: Price = 1.15  # How clearly the motion shows each lie; above 1 a run is ended
     hidden: Price = 10.0  # Price of what a lie is short of that [nat]
 
 
