@@ -52,8 +52,8 @@ from emb_runtime.safety.motion_balance import (
     take,
     unexplained,
 )
-from emb_runtime.safety.sensor_monitor import MEMORY, judge, largest_current
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
+from emb_runtime.safety.sensor_monitor import judge, largest_current
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
@@ -106,7 +106,7 @@ def fly(
 ) -> None:
     """Play each experiment of a script to its end, whatever the monitor or the balance says, and to its rest."""
     ts = law.sample_time
-    memory, sums, instrument = np.zeros(MEMORY), np.zeros(BALANCE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
+    sums, instrument = np.zeros(BALANCE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
     x = np.zeros(STATES)
     for m in range(out.shape[0]):
         b = script.brakes[m]
@@ -114,7 +114,7 @@ def fly(
         x[:], state = 0.0, start(model)
         settle(instruments, instrument, 0.0)
         angle, velocity = script.errors[m, 0, 0] + instruments.encoder_offset, script.errors[m, 0, 1]
-        begin_monitor(memory, angle, velocity)
+        monitor = begin_monitor(angle, velocity)
         begin(sums, angle, velocity)
         past, periods, obeyed, sent, felt, wanted = NO_PAST, 0, False, 0.0, 0.0, 0.0
         for k in range(law.steps):
@@ -124,7 +124,7 @@ def fly(
                 wanted = script.wanted[m, k]
             elif periods == 0:
                 wanted = current_for(model, state, believed(model, state), speeds[k], GAIN)
-            limit = largest_current(law, limits, memory, law.current)
+            limit = largest_current(law, limits, monitor, law.current)
             u, _ = sent_current(law, True, angle, velocity, wanted, past, k, limit)
             if periods > 0 or script.losses[m, k] == COMMAND_LOST:
                 u = math.nan
@@ -136,8 +136,9 @@ def fly(
             if script.losses[m, k] == SAMPLE_LOST and k < law.steps - 1:
                 continue
             out[m, SPEED] = max(out[m, SPEED], abs(velocity))
-            judge(law, limits, memory, periods * ts, angle, velocity, obeyed and periods == 1, sent, felt)
-            if take(balance, sums, obeyed and periods == 1, angle, velocity, felt):
+            follows = obeyed and periods == 1
+            monitor, _ = judge(law, limits, monitor, periods * ts, angle, velocity, follows, sent, felt)
+            if take(balance, sums, follows, angle, velocity, felt):
                 out[m, LARGEST] = max(out[m, LARGEST], unexplained(balance, sums) / allowance(balance, sums))
             periods = 0
         out[m, SHOWN], out[m, SHOWN + 1], out[m, TRUE], out[m, TRUE + 1] = angle, velocity, x[0], x[1]
