@@ -271,17 +271,17 @@ def _sensors(dice: random.Random) -> Iterator[Any]:
     monitor, laws = sensor_monitor, _laws()[:2]
     limits = sensor_thresholds.sensor_thresholds(_bench(), laws[0])
     while True:
-        law, memory = dice.choice(laws), [0.0] * monitor.MEMORY
+        law = dice.choice(laws)
         angle, velocity = dice.uniform(-5.0, 80.0), dice.uniform(-300.0, 300.0)
-        monitor.begin(memory, angle, velocity)
+        state = monitor.begin(angle, velocity)
         for _ in range(40):
             elapsed, current = dice.choice((1e-3, 1e-3, 1e-3, 2e-3)), _number(dice, 6.0)
             velocity += dice.uniform(-6.0, 6.0)
             angle += elapsed * velocity
             measured = (_number(dice, 100.0), velocity) if dice.random() < 0.02 else (angle, velocity)
             obeyed, reported = dice.random() < 0.9, current + dice.uniform(-0.5, 0.5)
-            verdict = _tried(monitor.judge, law, limits, memory, elapsed, *measured, obeyed, current, reported)
-            yield verdict, list(memory), monitor.largest_current(law, limits, memory, 6.0)
+            state, verdict = monitor.judge(law, limits, state, elapsed, *measured, obeyed, current, reported)
+            yield verdict, state, monitor.largest_current(law, limits, state, 6.0)
 
 
 def _response(dice: random.Random) -> Iterator[Any]:

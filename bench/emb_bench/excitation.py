@@ -43,7 +43,7 @@ from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.safety.response import MEMORY as RESPONSE
 from emb_runtime.safety.response import OPEN, PROVEN, VERDICT, response_model, take, unproven_law
 from emb_runtime.safety.response import begin as begin_response
-from emb_runtime.safety.sensor_monitor import CONFIRMED, MEMORY, OBEYS, begin, judge, largest_current
+from emb_runtime.safety.sensor_monitor import begin, judge, largest_current
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current
 from emb_runtime.safety.shield_design import make_law
@@ -190,7 +190,7 @@ def run_excitation(
         raise UsageError(f"expected noise of shape ({count + 1}, 2), got {errors.shape}")
     limit, t_s = bench.limits.current, bench.timing.sample_time
     law = make_law(bench) if shielded else None
-    thresholds, monitor = None if law is None else sensor_thresholds(bench, law), [0.0] * MEMORY
+    thresholds, monitor = None if law is None else sensor_thresholds(bench, law), begin(0.0, 0.0)
     proof = None if law is None else (response_model(bench, law), unproven_law(bench, law), [0.0] * RESPONSE)
     states = np.zeros((count + 1, 2))
     wanted, currents = np.empty(count), np.empty(count)
@@ -198,7 +198,7 @@ def run_excitation(
     past, estimator = NO_PAST, Estimator(bench)
 
     def answer(x1: float, x2: float, k: int) -> float:
-        nonlocal past
+        nonlocal past, monitor
         y1, y2 = x1 + float(errors[k, 0]), x2 + float(errors[k, 1])
         estimator.take(y1, y2, k, float(currents[k - 1]) if k else 0.0)
         wanted[k] = excited.act(y1, y2, k, estimator)
@@ -207,14 +207,15 @@ def run_excitation(
         else:
             model, slow, response = proof
             if k == 0:
-                begin(monitor, y1, y2)
+                monitor = begin(y1, y2)
                 begin_response(model, response, y1, y2)
             elif response[VERDICT] == OPEN:
                 take(model, response, bool(obeyed[k - 1]), y1, y2, past[0])
-            if k > 0 and monitor[CONFIRMED] == 0.0:
-                judge(law, thresholds, monitor, t_s, y1, y2, bool(obeyed[k - 1]), past[0], float(currents[k - 1]))
+            if k > 0 and not monitor.confirmed:
+                told = bool(obeyed[k - 1]), past[0], float(currents[k - 1])
+                monitor, _ = judge(law, thresholds, monitor, t_s, y1, y2, *told)
             most = largest_current(law, thresholds, monitor, limit)
-            allowed = slow if monitor[OBEYS] != 0.0 and response[VERDICT] != PROVEN else law
+            allowed = slow if monitor.obeys and response[VERDICT] != PROVEN else law
             u, reasons[k] = sent_current(allowed, True, y1, y2, float(wanted[k]), past, k, most)
         obeyed[k] = not math.isnan(u)
         past = (u if obeyed[k] else 0.0, *past[:4])

@@ -40,11 +40,9 @@ from emb_runtime.estimator.kalman import Model, believed, fits, follow, make_mod
 from emb_runtime.estimator.speed_loop import current_for
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import NodeState, SensorSample
-from emb_runtime.safety.motion_balance import MEMORY as BALANCE_MEMORY
 from emb_runtime.safety.motion_balance import (
     REST_SAMPLES,
     BalanceModel,
-    allowance,
     balance_model,
     begin,
     origin,
@@ -52,8 +50,8 @@ from emb_runtime.safety.motion_balance import (
     take,
     unexplained,
 )
-from emb_runtime.safety.sensor_monitor import MEMORY, judge, largest_current
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
+from emb_runtime.safety.sensor_monitor import judge, largest_current
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, damped_current
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
@@ -106,16 +104,15 @@ def fly(
 ) -> None:
     """Play each experiment of a script to its end, whatever the monitor or the balance says, and to its rest."""
     ts = law.sample_time
-    memory, sums, instrument = np.zeros(MEMORY), np.zeros(BALANCE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
-    x = np.zeros(STATES)
+    x, instrument = np.zeros(STATES), np.zeros(INSTRUMENTS_MEMORY)
     for m in range(out.shape[0]):
         b = script.brakes[m]
         p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
         x[:], state = 0.0, start(model)
         settle(instruments, instrument, 0.0)
         angle, velocity = script.errors[m, 0, 0] + instruments.encoder_offset, script.errors[m, 0, 1]
-        begin_monitor(memory, angle, velocity)
-        begin(sums, angle, velocity)
+        monitor = begin_monitor(angle, velocity)
+        sums = begin(angle, velocity)
         past, periods, obeyed, sent, felt, wanted = NO_PAST, 0, False, 0.0, 0.0, 0.0
         for k in range(law.steps):
             if periods == 0:
@@ -124,7 +121,7 @@ def fly(
                 wanted = script.wanted[m, k]
             elif periods == 0:
                 wanted = current_for(model, state, believed(model, state), speeds[k], GAIN)
-            limit = largest_current(law, limits, memory, law.current)
+            limit = largest_current(law, limits, monitor, law.current)
             u, _ = sent_current(law, True, angle, velocity, wanted, past, k, limit)
             if periods > 0 or script.losses[m, k] == COMMAND_LOST:
                 u = math.nan
@@ -136,16 +133,18 @@ def fly(
             if script.losses[m, k] == SAMPLE_LOST and k < law.steps - 1:
                 continue
             out[m, SPEED] = max(out[m, SPEED], abs(velocity))
-            judge(law, limits, memory, periods * ts, angle, velocity, obeyed and periods == 1, sent, felt)
-            if take(balance, sums, obeyed and periods == 1, angle, velocity, felt):
-                out[m, LARGEST] = max(out[m, LARGEST], unexplained(balance, sums) / allowance(balance, sums))
+            follows = obeyed and periods == 1
+            monitor, _ = judge(law, limits, monitor, periods * ts, angle, velocity, follows, sent, felt)
+            sums = take(balance, sums, follows, angle, velocity, felt)
+            if sums.samples == 0:
+                found, most = unexplained(balance, sums)
+                out[m, LARGEST] = max(out[m, LARGEST], found / most)
             periods = 0
         out[m, SHOWN], out[m, SHOWN + 1], out[m, TRUE], out[m, TRUE + 1] = angle, velocity, x[0], x[1]
-        last = unexplained(balance, sums) / allowance(balance, sums)
-        out[m, LARGEST] = max(out[m, LARGEST], last)
-        out[m, JUDGED] = last > 0.0
+        found, most = unexplained(balance, sums)
+        out[m, LARGEST], out[m, JUDGED] = max(out[m, LARGEST], found / most), found / most > 0.0
         place, most = origin(balance, sums)
-        out[m, ORIGIN] = abs(place) / most if last > 0.0 else 0.0
+        out[m, ORIGIN] = abs(place) / most if out[m, JUDGED] else 0.0
         out[m, DOUBTED] = not fits(state)
         halt(law, mechanics, instruments, p, stop, m, script, x, instrument, out[m])
 

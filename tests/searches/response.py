@@ -55,7 +55,7 @@ from emb_runtime.safety.response import (
     unproven_law,
 )
 from emb_runtime.safety.response import MEMORY as RESPONSE_MEMORY
-from emb_runtime.safety.sensor_monitor import HONEST, MEMORY, OBEYS, judge, largest_current
+from emb_runtime.safety.sensor_monitor import HONEST, judge, largest_current
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST, Past
@@ -109,7 +109,7 @@ def fly(
 ) -> None:
     """Play each experiment of a script to its end, or to the first verdict against it and then to rest."""
     ts = law.sample_time
-    memory, proof, instrument = np.zeros(MEMORY), np.zeros(RESPONSE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
+    proof, instrument = np.zeros(RESPONSE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
     x = np.zeros(STATES)
     for m in range(out.shape[0]):
         b, row = script.brakes[m], out[m]
@@ -117,7 +117,7 @@ def fly(
         x[:], state = 0.0, start(model)
         settle(instruments, instrument, 0.0)
         angle, velocity = script.errors[m, 0, 0] + instruments.encoder_offset, script.errors[m, 0, 1]
-        begin_monitor(memory, angle, velocity)
+        monitor = begin_monitor(angle, velocity)
         begin(response, proof, angle, velocity)
         verdict, past, periods, obeyed, given, felt, wanted, rest = OPEN, NO_PAST, 0, False, 0.0, 0.0, 0.0, -1
         for k in range(law.steps):
@@ -127,10 +127,8 @@ def fly(
                 wanted = script.wanted[m, k]
             elif periods == 0 and rest < 0:
                 wanted = current_for(model, state, believed(model, state), speeds[k], GAIN)
-            limit = largest_current(law, limits, memory, law.current)
-            u, full = sent(
-                law, slow, verdict != PROVEN and memory[OBEYS] != 0.0, angle, velocity, wanted, past, k, limit
-            )
+            limit = largest_current(law, limits, monitor, law.current)
+            u, full = sent(law, slow, verdict != PROVEN and monitor.obeys, angle, velocity, wanted, past, k, limit)
             row[CHANGED] += 1.0 if u != full and not math.isnan(full) else 0.0
             if periods > 0 or script.losses[m, k] == COMMAND_LOST or rest >= 0:
                 u = math.nan
@@ -149,7 +147,8 @@ def fly(
             if script.losses[m, k] == SAMPLE_LOST and k < law.steps - 1:
                 continue
             follows = obeyed and periods == 1
-            row[DISHONEST] = judge(law, limits, memory, periods * ts, angle, velocity, follows, given, felt) != HONEST
+            monitor, found = judge(law, limits, monitor, periods * ts, angle, velocity, follows, given, felt)
+            row[DISHONEST] = found != HONEST
             verdict = judged(response, proof, verdict, follows, angle, velocity, given, k + 1, row)
             periods = 0
             if verdict == CONTRADICTED or row[DISHONEST] != 0.0:

@@ -28,16 +28,7 @@ from emb_bench.sim.instruments import command, settle
 from emb_bench.sim.simulated_brake import pass_period, sent_current
 from emb_runtime.config.bench import BrakeParameters, Sensors
 from emb_runtime.safety.sensor_monitor import (
-    DOWN_FROM,
     HONEST,
-    MEMORY,
-    MOTION_DOWN,
-    MOTION_UP,
-    OBEYS,
-    TRAVEL_DOWN,
-    TRAVEL_UP,
-    UP_FROM,
-    VELOCITY,
     begin,
     coasting_time,
     judge,
@@ -184,7 +175,7 @@ def fly(
 ) -> None:
     """Fly each experiment, until its end or the monitor's verdict, and to rest; ``first`` limits the first move."""
     ts = law.sample_time
-    memory, instrument = np.zeros(MEMORY), np.zeros(INSTRUMENTS_MEMORY)
+    instrument = np.zeros(INSTRUMENTS_MEMORY)
     x, halted, told = np.zeros(STATES), np.zeros(STATES), np.zeros(3)
     for m in range(out.shape[0]):
         b = script.brakes[m]
@@ -198,12 +189,12 @@ def fly(
         angle = script.errors[m, 0, 0] + instruments.encoder_offset
         velocity = script.errors[m, 0, 1]
         lie(kind if script.onsets[m] == 0 else NOTHING, script.sizes[m], ts, told, angle, velocity, angle)
-        begin(memory, told[0], told[1])
+        state = begin(told[0], told[1])
         past = NO_PAST
         periods, obeyed, sent, felt = 0, False, 0.0, 0.0
         verdict = HONEST
         for k in range(law.steps):
-            limit = largest_current(law, limits, memory, law.current) if first else law.current
+            limit = largest_current(law, limits, state, law.current) if first else law.current
             u, _ = sent_current(law, True, told[0], told[1], script.wanted[m, k], past, k, limit)
             if periods > 0 or script.losses[m, k] == COMMAND_LOST:
                 u = math.nan
@@ -226,15 +217,16 @@ def fly(
             lie(kind if on else NOTHING, script.sizes[m], ts, told, angle, velocity, before)
             if script.losses[m, k] == SAMPLE_LOST and k < law.steps - 1:
                 continue
-            verdict = judge(law, limits, memory, periods * ts, told[0], told[1], obeyed and periods == 1, sent, felt)
+            follows = obeyed and periods == 1
+            state, verdict = judge(law, limits, state, periods * ts, told[0], told[1], follows, sent, felt)
             periods = 0
             travel = max(
-                memory[TRAVEL_UP] - lag_angle(limits, memory[VELOCITY] - memory[UP_FROM]),
-                memory[TRAVEL_DOWN] - lag_angle(limits, memory[DOWN_FROM] - memory[VELOCITY]),
+                state.travel.up - lag_angle(limits, state.velocity - state.up_from),
+                state.travel.down - lag_angle(limits, state.down_from - state.velocity),
             )
             row[TRAVEL] = max(row[TRAVEL], travel / limits.travel)
-            row[MOTION] = max(row[MOTION], max(memory[MOTION_UP], memory[MOTION_DOWN]) / limits.motion)
-            if row[SHOWN_AT] < 0.0 and memory[OBEYS] != 0.0:
+            row[MOTION] = max(row[MOTION], max(state.motion.up, state.motion.down) / limits.motion)
+            if row[SHOWN_AT] < 0.0 and state.obeys:
                 row[SHOWN_AT] = k + 1
             if verdict != HONEST:
                 row[VERDICT], row[STEP] = verdict, k + 1
@@ -242,8 +234,8 @@ def fly(
         if verdict != HONEST:
             halted[:] = x
             halt(law, mechanics, instruments, p, kind, 0.0, halted, instrument, row, HALTED)
-            unseen = unseen_speed(law, limits, memory)
-            waits = coasting_time(law, told[0], told[1], unseen) if memory[OBEYS] == 0.0 else 0.0
+            unseen = unseen_speed(law, limits, state)
+            waits = coasting_time(law, told[0], told[1], unseen) if not state.obeys else 0.0
             halt(law, mechanics, instruments, p, kind, waits, x, instrument, row, COASTED)
 
 

@@ -22,12 +22,12 @@ from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_runtime.safety.command_limits import LEFT
 from emb_runtime.safety.response import begin as begin_response
-from emb_runtime.safety.sensor_monitor import OBEYS, largest_current
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
+from emb_runtime.safety.sensor_monitor import largest_current
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import make_law
-from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Conditions, delayed
+from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Conditions, delayed, monitor_of, store_monitor
 from emb_train.play import Played, fresh_draws, play
 from tests.benches import SENSOR_BENCH, SENSOR_TEXT
 
@@ -174,7 +174,7 @@ def test_a_batch_that_hears_what_a_run_heard_sends_what_that_sent(plant: str, tm
     batch = begun(plant, 0)
     batch.experiments.noise[:] = 0.0
     batch.y[0] = heard[0]
-    begin_monitor(batch.experiments.monitor[0], *heard[0].tolist())
+    store_monitor(begin_monitor(*heard[0].tolist()), batch.experiments.monitor[0])
     begin_response(batch.setup.response, batch.experiments.response[0], *heard[0].tolist())
     for k in range(HORIZON - 1):
         # The noise that makes the batch's next measurement the run's.
@@ -193,8 +193,8 @@ def test_until_the_motion_has_shown_its_sign_a_batch_sends_no_more_than_friction
     weak = np.array([1.5, 1.0, 0.5, 1.0, 1.5, 1.0])
     batch.experiments.brakes[0] *= weak
     for _ in range(15):
-        monitor = batch.experiments.monitor[0]
-        shown.append(bool(monitor[OBEYS]))
+        monitor = monitor_of(batch.experiments.monitor[0])
+        shown.append(monitor.obeys)
         most = largest_current(LAW, batch.setup.thresholds, monitor, 6.0)
         batch.advance(np.array([6.0]))
         assert batch.past[0, 0] == most

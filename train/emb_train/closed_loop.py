@@ -34,8 +34,8 @@ from emb_runtime.policy.contract import SAMPLE
 from emb_runtime.safety.response import MEMORY as RESPONSE
 from emb_runtime.safety.response import OPEN, PROVEN, VERDICT, ResponseModel, response_model, take, unproven_law
 from emb_runtime.safety.response import begin as begin_response
-from emb_runtime.safety.sensor_monitor import CONFIRMED, OBEYS, judge, largest_current
-from emb_runtime.safety.sensor_monitor import MEMORY as MONITOR
+from emb_runtime.safety.sensor_monitor import Cusum, Opposed, judge, largest_current
+from emb_runtime.safety.sensor_monitor import State as MonitorState
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
 from emb_runtime.safety.shield import PAST, damped_current
@@ -50,6 +50,7 @@ SPEED: Literal["speed"] = "speed"
 Bools = NDArray[np.bool_]
 MOST = 100.0  # Greatest estimate or deviation that is observed, of the nominal value
 ESTIMATES = 30  # Numbers of an estimator's state
+MONITOR = 29  # Numbers of a sensor monitor's state
 
 
 class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -202,7 +203,7 @@ class Experiments(NamedTuple):
     violated: Bools  # Mask of the brakes outside their limits, shape [N]
     returning: Bools  # Mask of the experiments that have ended before their horizon and are on the way home, shape [N]
     monitor: Floats
-    """Memory of the sensor monitor, which is asked only until it confirms the polarity, shape [N, MONITOR]."""
+    """State of the sensor monitor until it confirms the polarity, see :func:`monitor_of`; shape [N, MONITOR]."""
     response: Floats  # Memory of the proof of the response, until it is proven, shape [N, RESPONSE]
     estimate: Floats  # State of the estimator, see :func:`state_of`; shape [N, ESTIMATES]
     told: Floats
@@ -258,6 +259,30 @@ def store(state: State, row: Any) -> None:
         row[7 + j] = state.covariance[j]
 
 
+def monitor_of(row: Any) -> MonitorState:
+    """The state of a sensor monitor as it is stored, shape [MONITOR]."""
+    travel, motion = Cusum(float(row[2]), float(row[3])), Cusum(float(row[6]), float(row[7]))
+    against = Cusum(float(row[11]), float(row[12]))
+    opposed = Opposed(float(row[8]), float(row[9]), float(row[10]), against)
+    lows = float(row[13]), float(row[14]), float(row[15]), float(row[16]), float(row[17]), float(row[18])
+    highs = float(row[19]), float(row[20]), float(row[21]), float(row[22]), float(row[23]), float(row[24])
+    flowing, obeys, confirmed = (float(row[25]), float(row[26])), bool(row[27]), bool(row[28])
+    start, rise, fall = (float(row[0]), float(row[1])), float(row[4]), float(row[5])
+    return MonitorState(*start, travel, rise, fall, motion, opposed, lows, highs, flowing, obeys, confirmed)
+
+
+def store_monitor(state: MonitorState, row: Any) -> None:
+    """Store the state of a sensor monitor, shape [MONITOR]."""
+    opposed = state.opposed
+    row[0], row[1], row[2], row[3] = state.angle, state.velocity, state.travel.up, state.travel.down
+    row[4], row[5], row[6], row[7] = state.up_from, state.down_from, state.motion.up, state.motion.down
+    row[8], row[9], row[10] = opposed.travel, opposed.integral, opposed.begin
+    row[11], row[12] = opposed.motion.up, opposed.motion.down
+    for j in range(OLDEST_FRAME + 1):
+        row[13 + j], row[19 + j] = state.lows[j], state.highs[j]
+    row[25], row[26], row[27], row[28] = state.flowing[0], state.flowing[1], float(state.obeys), float(state.confirmed)
+
+
 def delayed(instruments: Instruments, delay: int, offset: float = 0.0) -> Instruments:
     """The plant's instruments with later commands [samples] and an offset [rad]; compiled code has no ``_replace``."""
     return Instruments(
@@ -293,8 +318,9 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     instruments = delayed(setup.instruments, int(delay[i]), float(beside[i, 0]))
     y1, y2 = float(y[i, 0]), float(y[i, 1])
     u1, u2, u3, u4, u5 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2]), float(past[i, 3]), float(past[i, 4])
-    most = largest_current(setup.law, setup.thresholds, monitor[i], setup.law.current)
-    unproven = monitor[i, OBEYS] != 0.0 and response[i, VERDICT] != PROVEN
+    seen = monitor_of(monitor[i])
+    most = largest_current(setup.law, setup.thresholds, seen, setup.law.current)
+    unproven = seen.obeys and response[i, VERDICT] != PROVEN
     law = setup.unproven if unproven else setup.law
     step = int(k[i])
     if returning[i]:
@@ -324,8 +350,9 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     obeyed = not math.isnan(asked)
     if response[i, VERDICT] == OPEN:
         take(setup.response, response[i], obeyed, y1, y2, sent)
-    if monitor[i, CONFIRMED] == 0.0:
-        judge(setup.law, setup.thresholds, monitor[i], rules.sample_time, y1, y2, obeyed, sent, current)
+    if not seen.confirmed:
+        seen, _ = judge(setup.law, setup.thresholds, seen, rules.sample_time, y1, y2, obeyed, sent, current)
+        store_monitor(seen, monitor[i])
     inside = rules.angle_low <= x[i, 0] <= rules.angle_high and abs(x[i, 1]) <= rules.velocity
     violated[i] = not inside
 
@@ -449,7 +476,7 @@ class Batch:
         e.y[i] = measure(instruments, e.memory[i], self.setup.rules.sample_time, 0.0, 0.0, 0.0, *errors)
         for of_the_past in (e.applied, e.s, e.m, e.past, e.k, e.reasons, e.violated, e.returning):
             of_the_past[i] = 0
-        begin_monitor(e.monitor[i], *e.y[i].tolist())
+        store_monitor(begin_monitor(*e.y[i].tolist()), e.monitor[i])
         begin_response(self.setup.response, e.response[i], *e.y[i].tolist())
         if self.conditions.estimates:
             store(start(self.model), e.estimate[i])

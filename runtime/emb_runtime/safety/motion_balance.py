@@ -16,7 +16,7 @@ An observer shows the velocity late, and how late is known from above only. Ther
 angle in a period: the mean of that period, which lags for no brake. From one mean to the next acts the mean torque of
 both periods.
 
-Plain scalar functions on one row of numbers, so that the runtime and a compiled batch run the same code. What it sees
+Plain functions of numbers and lists of them, so that the runtime and a compiled batch run the same code. What it sees
 and what it cannot: ``docs/explanation/sensor-monitor.md``.
 """
 
@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import SensorSample
@@ -45,38 +45,11 @@ BREAK: Final = 0.6  # Allowed beside that for each stretch, whose ends noise dec
 REST_SAMPLES: Final = 20  # Last samples of a node at rest that are looked at; even
 MOVING: Final = 2.0  # Mean velocity that no brake at rest has, in standard deviations of a measurement
 TERMS: Final = COEFFICIENTS + 1  # And the spring's origin, as a share of the travel
+WIDTH: Final = TERMS + 1  # And the change of the velocity
 ORIGIN_ALLOWED: Final = 2.2  # Distance of the origin from 0 that an honest run may show, beside what follows [rad]
 ORIGIN_ERRORS: Final = 6.0  # Errors of the origin that are allowed, in standard deviations
 ORIGIN_LATE: Final = 20.0  # Allowed where all of the current acts late, or the velocity lags [rad]
-PRODUCTS: Final = TERMS * (TERMS + 3) // 2
-EQUATIONS: Final = COEFFICIENTS * (COEFFICIENTS + 1) // 2
-WIDTH: Final = COEFFICIENTS + 1
-
-# Places in the row.
-ANGLE: Final = 0  # Last measurement [rad]
-VELOCITY: Final = 1  # Last measurement [rad/s]
-CURRENT: Final = 2  # Current of the last period, then of the one before [A]
-FOLLOWED: Final = 4  # Samples without a gap before the last one
-PERIODS: Final = 5  # Periods that were taken in
-STRETCHES: Final = 6  # Stretches of such periods without a break
-SLID: Final = 7  # 1.0 if the last period was taken in
-SAMPLES: Final = 8  # Samples since the last entry
-SPACING: Final = 9  # Samples from one entry to the next
-STORED: Final = 10  # Entries
-NORMAL: Final = 11  # Normal equations: upper triangle by rows
-RIGHT: Final = NORMAL + EQUATIONS  # Their right side
-SUMS: Final = RIGHT + COEFFICIENTS  # Sums of each regressor so far, and of the change of the velocity
-TABLE: Final = SUMS + WIDTH  # Entries: these sums, as they were
-WORK: Final = TABLE + ENTRIES * WIDTH  # Equations during elimination
-SOLUTION: Final = WORK + COEFFICIENTS * WIDTH  # Coefficients, as :func:`solve` left them
-COUNT: Final = SOLUTION + COEFFICIENTS  # Velocities in the present stretch
-SUM: Final = COUNT + 1  # Sums of the regressors since its begin, and the change of the velocity
-FIRST: Final = SUM + TERMS + 1  # Sums of these over its velocities
-SECOND: Final = FIRST + TERMS + 1  # Sums of their products: upper triangle by rows
-CENTRED: Final = SECOND + PRODUCTS  # The same of earlier stretches, less the means
-ORIGIN_WORK: Final = CENTRED + PRODUCTS  # Equations during elimination
-ORIGIN: Final = ORIGIN_WORK + TERMS * (TERMS + 1)  # Coefficients, as :func:`origin` left them
-MEMORY: Final = ORIGIN + TERMS  # Length of the row
+Rows = list[list[float]]
 
 
 class BalanceModel(NamedTuple):
@@ -124,38 +97,76 @@ def balance_model(bench: Bench) -> BalanceModel:
     )
 
 
-def begin(memory: Any, angle: float, velocity: float) -> None:
-    """Begin a run with its first measurement, in a row of length MEMORY that is overwritten [rad, rad/s]."""
-    for i in range(MEMORY):
-        memory[i] = 0.0
-    memory[ANGLE], memory[VELOCITY], memory[SPACING] = angle, velocity, STRIDE
+class Stretch(NamedTuple):
+    """Sums over the velocities of a stretch of sliding, the one at its begin included; lists are changed in place."""
+
+    total: list[float]  # Sum of the rows since its begin, shape [WIDTH]: the velocity gained, and what it consists of
+    first: list[float]  # Sum of ``total`` over the velocities, shape [WIDTH]
+    second: Rows  # Sum of its products: upper triangle of shape [TERMS, WIDTH]
 
 
-def take(model: BalanceModel, memory: Any, follows: bool, angle: float, velocity: float, current: float) -> bool:
+class State(NamedTuple):
+    """State of the balance after a sample; lists are changed in place.
+
+    The row of a period is the change of the velocity by each coefficient, by the origin, and as measured [rad/s].
+    """
+
+    angle: float  # Last measurement [rad]
+    velocity: float  # Last measurement [rad/s]
+    current: float  # Of the last period [A]
+    earlier: float  # Of the one before [A]
+    followed: int  # Samples without a gap before the last one
+    periods: int  # Periods that were taken in
+    stretches: int  # Stretches of such periods without a break
+    length: int  # Velocities in the present stretch; 0 if the last period was not taken in
+    samples: int  # Samples since the last entry; 0 if the last one made an entry
+    spacing: int  # Samples from one entry to the next
+    total: list[float]  # Sum of all rows so far, shape [WIDTH]
+    entries: Rows  # These sums as they were at first, where they are zero, and with some samples
+    equations: Rows  # Sum of the products of all rows: upper triangle of shape [COEFFICIENTS, WIDTH]
+    stretch: Stretch  # The present one
+    centred: Rows  # Products of earlier stretches, less the means: upper triangle of shape [TERMS, WIDTH]
+
+
+def begin(angle: float, velocity: float) -> State:
+    """State at the first measurement of a run [rad, rad/s]."""
+    total, equations, centred = [0.0] * WIDTH, _zeros(COEFFICIENTS), _zeros(TERMS)
+    return State(angle, velocity, 0.0, 0.0, 0, 0, 0, 0, 0, STRIDE, total, _zeros(1), equations, _new_stretch(), centred)
+
+
+def _zeros(count: int) -> Rows:
+    return [[0.0] * WIDTH for _ in range(count)]
+
+
+def _new_stretch() -> Stretch:
+    return Stretch([0.0] * WIDTH, [0.0] * WIDTH, _zeros(TERMS))
+
+
+def take(model: BalanceModel, state: State, follows: bool, angle: float, velocity: float, current: float) -> State:
     """Take in one more sample.
 
     Args:
         model: of the bench.
-        memory: row of the run, changed.
+        state: after the sample before.
         follows: it is the next sample, and the command acted between the two; else nothing is summed up.
         angle: measured [rad].
         velocity: measured [rad/s].
         current: that the node reports of the period [A].
 
     Returns:
-        True if an entry was stored: now :func:`unexplained` may have grown.
+        The next state. If an entry was made, :func:`unexplained` may have grown.
     """
-    x, v, u1, u2 = memory[ANGLE], memory[VELOCITY], memory[CURRENT], memory[CURRENT + 1]
-    followed = memory[FOLLOWED] + 1.0 if follows else 0.0
+    x, v, u1, u2 = state.angle, state.velocity, state.current, state.earlier
+    followed = state.followed + 1 if follows else 0
     acted, pressed = current, 0.5 * (x + angle)
     if model.derived:
         velocity, acted, pressed = (angle - x) / model.sample_time, 0.5 * (current + u1), x
-    memory[ANGLE], memory[VELOCITY], memory[CURRENT], memory[CURRENT + 1] = angle, velocity, current, u1
-    memory[FOLLOWED] = followed
     sign = 1.0 if min(v, velocity) > model.slides else -1.0 if max(v, velocity) < -model.slides else 0.0
+    periods, stretches, length = state.periods, state.stretches, state.length
+    total, stretch, centred = state.total, state.stretch, state.centred
     if followed > PAST and sign != 0.0:
         pressed = max(pressed, 0.0)
-        row = (
+        row = [
             model.motor * acted,
             -model.spring * pressed,
             -model.coulomb * sign,
@@ -164,160 +175,120 @@ def take(model: BalanceModel, memory: Any, follows: bool, angle: float, velocity
             model.motor * (u2 - u1),
             -model.curved * pressed * pressed,
             -model.spring * pressed * sign,
-        )
-        _add(memory, row, velocity - v)
-        _add_to_stretch(memory, row, -model.spring * model.travel if pressed > 0.0 else 0.0, velocity - v)
-        memory[STRETCHES] += 1.0 - memory[SLID]
-        memory[SLID] = 1.0
-    else:
-        memory[SLID] = 0.0
-        _end_stretch(memory)
-    memory[SAMPLES] += 1.0
-    if memory[SAMPLES] < memory[SPACING]:
-        return False
-    memory[SAMPLES] = 0.0
-    _store(memory)
-    return True
+            -model.spring * model.travel if pressed > 0.0 else 0.0,
+            velocity - v,
+        ]
+        _add(total, row)
+        _add_products(state.equations, row)
+        _add(stretch.total, row)
+        _add(stretch.first, stretch.total)
+        _add_products(stretch.second, stretch.total)
+        periods += 1
+        stretches += 0 if length else 1
+        length = max(length, 1) + 1  # with the velocity at its begin, where all sums are 0
+    elif length:
+        centred = _centred(state)
+        stretch, length = _new_stretch(), 0
+    samples, spacing, entries = state.samples + 1, state.spacing, state.entries
+    if samples == spacing:
+        samples = 0
+        if len(entries) > ENTRIES:
+            entries, spacing = entries[::2], 2 * spacing
+        entries.append(total.copy())
+    return State(
+        angle, velocity, current, u1, followed, periods, stretches, length, samples, spacing, total, entries,
+        state.equations, stretch, centred,
+    )  # fmt: skip
 
 
-def _add(memory: Any, row: tuple[float, ...], change: float) -> None:
-    place = NORMAL
-    for i in range(COEFFICIENTS):
-        for j in range(i, COEFFICIENTS):
-            memory[place] += row[i] * row[j]
-            place += 1
-        memory[RIGHT + i] += row[i] * change
-        memory[SUMS + i] += row[i]
-    memory[SUMS + COEFFICIENTS] += change
-    memory[PERIODS] += 1.0
-
-
-def _store(memory: Any) -> None:
-    stored = int(memory[STORED])
-    if stored == ENTRIES:
-        stored //= 2
-        for i in range(stored):
-            for j in range(WIDTH):
-                memory[TABLE + i * WIDTH + j] = memory[TABLE + (2 * i + 1) * WIDTH + j]
-        memory[SPACING] *= 2.0
+def _add(sums: list[float], row: list[float]) -> None:
     for j in range(WIDTH):
-        memory[TABLE + stored * WIDTH + j] = memory[SUMS + j]
-    memory[STORED] = stored + 1.0
+        sums[j] += row[j]
 
 
-def unexplained(model: BalanceModel, memory: Any) -> float:
-    """Velocity that the best brake leaves unexplained: the range of the sum of its residuals [rad/s].
+def _add_products(sums: Rows, row: list[float]) -> None:
+    for i in range(len(sums)):
+        line, factor = sums[i], row[i]
+        for j in range(i, WIDTH):
+            line[j] += factor * row[j]
 
-    Friction that grows with the load can look like much that is none: it may explain ``model.load`` and no more.
+
+def _centred(state: State) -> Rows:
+    """Products of all stretches, the present one included, less the means."""
+    first, out = state.stretch.first, _zeros(TERMS)
+    for i in range(TERMS):
+        for j in range(i, WIDTH):
+            here = state.stretch.second[i][j] - first[i] * first[j] / state.length
+            out[i][j] = state.centred[i][j] + here
+    return out
+
+
+def unexplained(model: BalanceModel, state: State) -> tuple[float, float]:
+    """Velocity that the best brake leaves unexplained, and what an honest run may leave [rad/s].
+
+    The first is the range of the sum of its residuals. Friction that grows with the load can look like much that is
+    none: it may explain ``model.load`` and no more. The second is infinite where too little slid.
     """
-    without = _range(model, memory, COEFFICIENTS - 1) - model.load
-    return max(_range(model, memory, COEFFICIENTS), without)
+    best, _ = solve(state.equations, COEFFICIENTS, model.prior)
+    without, _ = solve(state.equations, COEFFICIENTS - 1, model.prior)
+    found = max(_range(state, best), _range(state, without) - model.load)
+    if state.periods < LEAST_PERIODS:
+        return found, math.inf
+    acting_late = abs(best[PHYSICAL]) + abs(best[PHYSICAL + 1])
+    return found, model.allowed + model.stretch * state.stretches + model.late * acting_late
 
 
-def _range(model: BalanceModel, memory: Any, count: int) -> float:
-    """Range of the sum of the residuals, with the first coefficients only."""
-    solve(model, memory, count)
-    low, high = 0.0, 0.0
-    for at in range(SUMS, TABLE + int(memory[STORED]) * WIDTH, WIDTH):
-        left = memory[at + COEFFICIENTS]
-        for j in range(count):
-            left -= memory[SOLUTION + j] * memory[at + j]
+def _range(state: State, coefficients: list[float]) -> float:
+    """Range of the sum of the residuals."""
+    low = high = _left(state.total, coefficients)
+    for sums in state.entries:
+        left = _left(sums, coefficients)
         low, high = min(left, low), max(left, high)
-    return float(high - low)
+    return high - low
 
 
-def allowance(model: BalanceModel, memory: Any) -> float:
-    """Unexplained velocity of an honest run, after :func:`unexplained` [rad/s]; infinite where too little slid."""
-    if memory[PERIODS] < LEAST_PERIODS:
-        return math.inf
-    late = SOLUTION + PHYSICAL
-    acting_late = abs(memory[late]) + abs(memory[late + 1])
-    return float(model.allowed + model.stretch * memory[STRETCHES] + model.late * acting_late)
+def _left(sums: list[float], coefficients: list[float]) -> float:
+    left = sums[TERMS]
+    for j in range(len(coefficients)):
+        left -= coefficients[j] * sums[j]
+    return left
 
 
-def solve(model: BalanceModel, memory: Any, count: int) -> None:
-    """Solve the normal equations for the first coefficients, by Gauss's elimination, in the row.
+def solve(equations: Rows, count: int, prior: float) -> tuple[list[float], float]:
+    """Solve normal equations for the first coefficients, by Gauss's elimination; the ``prior`` is the nominal brake's.
 
     They are factors of the nominal k_m, k_1, T_c and f_v, shares of the two currents before that still act, the
-    curvature, and the share of the load in friction. Where the run says nothing of one, it is nominal.
+    curvature, the share of the load in friction, and the origin. Where the run says nothing of one, it is nominal.
+
+    Returns:
+        The coefficients, and the weight of the last one: the inverse of its variance for errors of variance 1.
     """
-    place = NORMAL
+    rows = [equations[i].copy() for i in range(count)]
     for i in range(count):
-        for j in range(i, COEFFICIENTS):
-            memory[WORK + i * WIDTH + j] = memory[place]
-            place += 1
-        nominal = 1.0 if i < PHYSICAL else 0.0
-        memory[WORK + i * WIDTH + i] += model.prior
-        memory[WORK + i * WIDTH + COEFFICIENTS] = memory[RIGHT + i] + model.prior * nominal
-    _eliminate(memory, WORK, SOLUTION, count, WIDTH)
-
-
-def origin(model: BalanceModel, memory: Any) -> tuple[float, float]:
-    """Angle at which the spring of the nominal brake begins, and how far from 0 that may be [rad]."""
-    _end_stretch(memory)
-    prior, width = model.deviation * model.deviation, TERMS + 1
-    place = CENTRED
-    for i in range(TERMS):
-        for j in range(i, width):
-            memory[ORIGIN_WORK + i * width + j] = memory[place]
-            place += 1
-        memory[ORIGIN_WORK + i * width + i] += prior
-        memory[ORIGIN_WORK + i * width + TERMS] += prior if i < PHYSICAL else 0.0
-    _eliminate(memory, ORIGIN_WORK, ORIGIN, TERMS, width)
-    pivot = memory[ORIGIN_WORK + (TERMS - 1) * width + TERMS - 1]  # the last is the inverse of a variance
-    error = model.travel * model.deviation / math.sqrt(pivot)
-    late = abs(memory[ORIGIN + PHYSICAL]) + abs(memory[ORIGIN + PHYSICAL + 1])
-    allowed = ORIGIN_ALLOWED + ORIGIN_ERRORS * error + ORIGIN_LATE * late
-    return -model.travel * float(memory[ORIGIN + TERMS - 1]), float(allowed)
-
-
-def _add_to_stretch(memory: Any, row: tuple[float, ...], torque: float, change: float) -> None:
-    memory[COUNT] = max(memory[COUNT], 1.0) + 1.0  # with the velocity at its begin, where all sums are 0
-    for i in range(COEFFICIENTS):
-        memory[SUM + i] += row[i]
-    memory[SUM + COEFFICIENTS] += torque
-    memory[SUM + TERMS] += change
-    place = SECOND
-    for i in range(TERMS):
-        left = memory[SUM + i]
-        memory[FIRST + i] += left
-        for j in range(i, TERMS + 1):
-            memory[place] += left * memory[SUM + j]
-            place += 1
-    memory[FIRST + TERMS] += memory[SUM + TERMS]
-
-
-def _end_stretch(memory: Any) -> None:
-    count = memory[COUNT]
-    if count == 0.0:
-        return
-    place = 0
-    for i in range(TERMS):
-        for j in range(i, TERMS + 1):
-            memory[CENTRED + place] += memory[SECOND + place] - memory[FIRST + i] * memory[FIRST + j] / count
-            place += 1
-    for at in range(COUNT, CENTRED):
-        memory[at] = 0.0
-
-
-def _eliminate(memory: Any, work: int, solution: int, count: int, width: int) -> None:
-    """Solve ``count`` symmetric equations by Gauss's elimination, in the row.
-
-    At the place ``work`` lies their upper triangle, in rows of ``width`` with the right side at the end; what solves
-    them comes to the place ``solution``.
-    """
+        rows[i][i] += prior
+        rows[i][TERMS] += prior if i < PHYSICAL else 0.0
     for i in range(count):
-        top = work + i * width
+        top = rows[i]
         for j in range(i + 1, count):
-            factor = memory[top + j] / memory[top + i]
-            for k in range(j, width):
-                memory[work + j * width + k] -= factor * memory[top + k]
+            factor, row = top[j] / top[i], rows[j]
+            for k in range(j, WIDTH):
+                row[k] -= factor * top[k]
+    coefficients = [0.0] * count
     for i in range(count - 1, -1, -1):
-        top = work + i * width
-        value = memory[top + width - 1]
+        value = rows[i][TERMS]
         for j in range(i + 1, count):
-            value -= memory[top + j] * memory[solution + j]
-        memory[solution + i] = value / memory[top + i]
+            value -= rows[i][j] * coefficients[j]
+        coefficients[i] = value / rows[i][i]
+    return coefficients, rows[count - 1][count - 1]
+
+
+def origin(model: BalanceModel, state: State) -> tuple[float, float]:
+    """Angle at which the spring of the nominal brake begins, and how far from 0 that may be [rad]."""
+    centred = _centred(state) if state.length else state.centred
+    found, weight = solve(centred, TERMS, model.deviation * model.deviation)
+    error = model.travel * model.deviation / math.sqrt(weight)
+    late = abs(found[PHYSICAL]) + abs(found[PHYSICAL + 1])
+    return -model.travel * found[COEFFICIENTS], ORIGIN_ALLOWED + ORIGIN_ERRORS * error + ORIGIN_LATE * late
 
 
 def steady_motion(velocities: Sequence[float], deviation: float) -> float:
@@ -353,19 +324,20 @@ def unheld_motion(bench: Bench, stopping: Sequence[SensorSample]) -> float:
 class MotionBalance:
     """The balance of one run on a bench."""
 
-    __slots__ = ("_memory", "_model")
+    __slots__ = ("_model", "_state")
 
     def __init__(self, bench: Bench) -> None:
         self._model = balance_model(bench)
-        self._memory = [0.0] * MEMORY
+        self._state = begin(0.0, 0.0)
 
     def begin(self, sample: SensorSample) -> None:
         """Begin a run with its first sample."""
-        begin(self._memory, sample.angle, sample.velocity)
+        self._state = begin(sample.angle, sample.velocity)
 
     def take(self, sample: SensorSample, follows: bool) -> None:
         """Take in one more sample, as :func:`take`; raises StopError if the motion so far has no explanation."""
-        if take(self._model, self._memory, follows, sample.angle, sample.velocity, sample.applied_current):
+        self._state = take(self._model, self._state, follows, sample.angle, sample.velocity, sample.applied_current)
+        if self._state.samples == 0:
             self.judge()
 
     def judge(self) -> tuple[float, float]:
@@ -373,8 +345,7 @@ class MotionBalance:
 
         Raises StopError if it is more than that.
         """
-        found = unexplained(self._model, self._memory)
-        most = allowance(self._model, self._memory)
+        found, most = unexplained(self._model, self._state)
         if found > most:
             raise StopError(
                 Fault.MOTION_UNEXPLAINED,
@@ -384,8 +355,9 @@ class MotionBalance:
 
     def judge_zero(self) -> None:
         """Raise StopError if the spring, at the end of a run, does not begin at the zero of the angle."""
-        place, most = origin(self._model, self._memory)
-        if abs(place) > most and allowance(self._model, self._memory) < math.inf:
+        place, most = origin(self._model, self._state)
+        _, allowed = unexplained(self._model, self._state)
+        if abs(place) > most and allowed < math.inf:
             raise StopError(
                 Fault.MOTION_UNEXPLAINED,
                 f"the spring begins at {place:.1f} rad, at most {most:.1f} rad from 0 is expected: the angle's zero is "

@@ -17,14 +17,10 @@ from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety import motion_balance
 from emb_runtime.safety.motion_balance import (
     COEFFICIENTS,
-    MEMORY,
-    PERIODS,
     REST_SAMPLES,
-    SOLUTION,
-    STORED,
-    STRETCHES,
+    BalanceModel,
     MotionBalance,
-    allowance,
+    State,
     balance_model,
     begin,
     origin,
@@ -145,13 +141,18 @@ class Reference:
         return float(max(25.0 * sigma, 0.05 * fastest) + 0.6 * sigma * self.stretches + 0.16 * fastest * late)
 
 
-def taken(bench: Bench, rows: list[Row]) -> tuple[list[float], list[int]]:
-    """The memory after all rows, and the samples with which an entry was stored."""
-    model, memory = balance_model(bench), [7.0] * MEMORY
-    begin(memory, rows[0].angle, rows[0].velocity)
-    stored = [take(model, memory, *row) for row in rows[1:]]
-    assert set(stored) <= {False, True}
-    return memory, [k for k, new in enumerate(stored, 1) if new]
+def taken(bench: Bench, rows: list[Row]) -> tuple[State, list[int]]:
+    """The state after all rows, and the samples with which an entry was made."""
+    model, state = balance_model(bench), begin(rows[0].angle, rows[0].velocity)
+    entries = []
+    for k, row in enumerate(rows[1:], 1):
+        state = take(model, state, *row)
+        entries += [k] if state.samples == 0 else []
+    return state, entries
+
+
+def coefficients(model: BalanceModel, state: State, count: int) -> list[float]:
+    return solve(state.equations, count, model.prior)[0]
 
 
 @of_each_bench
@@ -160,17 +161,16 @@ def test_coefficients_range_and_allowance_are_those_of_the_page(
     bench: Bench, seed: int, samples: int, gain: float
 ) -> None:
     rows = played(bench, seed, samples, gain=gain)
-    model, (memory, entries) = balance_model(bench), taken(bench, rows)
+    model, (state, entries) = balance_model(bench), taken(bench, rows)
     assert entries == list(range(20, samples + 1, 20))
     reference = Reference(bench, rows)
-    assert (memory[PERIODS], memory[STRETCHES]) == (len(reference.y), reference.stretches)
-    found = unexplained(model, memory)
+    assert (state.periods, state.stretches) == (len(reference.y), reference.stretches)
+    found, allowed = unexplained(model, state)
     assert found == pytest.approx(reference.unexplained([*entries, samples]), rel=1e-7, abs=1e-7)
-    assert memory[SOLUTION : SOLUTION + COEFFICIENTS] == pytest.approx(reference.coefficients(8), rel=1e-6, abs=1e-6)
-    expected = reference.allowed() if len(reference.y) >= 40 else math.inf
-    assert allowance(model, memory) == pytest.approx(expected, rel=1e-7)
-    solve(model, memory, 7)
-    assert memory[SOLUTION : SOLUTION + 7] == pytest.approx(reference.coefficients(7), rel=1e-6, abs=1e-6)
+    assert allowed == pytest.approx(reference.allowed() if len(reference.y) >= 40 else math.inf, rel=1e-7)
+    for count in (COEFFICIENTS, 7):
+        expected = pytest.approx(reference.coefficients(count), rel=1e-6, abs=1e-6)
+        assert coefficients(model, state, count) == expected
 
 
 def test_both_ways_to_explain_decide_in_the_rows_above() -> None:
@@ -185,10 +185,10 @@ def test_before_the_first_entry_it_is_what_is_left_now() -> None:
         rows = played(BENCH, seed, 19, lost=0.0)
         if seed % 2:
             rows = [Row(row.follows, -row.angle, -row.velocity, -row.current) for row in rows]
-        memory, entries = taken(BENCH, rows)
+        state, entries = taken(BENCH, rows)
         assert entries == []
         expected = Reference(BENCH, rows).unexplained([19])
-        assert unexplained(balance_model(BENCH), memory) == pytest.approx(expected, abs=1e-9)
+        assert unexplained(balance_model(BENCH), state)[0] == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -197,18 +197,17 @@ def test_before_the_first_entry_it_is_what_is_left_now() -> None:
 def test_a_long_run_keeps_a_coarser_table(samples: int, since: int) -> None:
     """Also where what was dropped is the extreme."""
     rows = played(BENCH, 5, samples, gain=1.2, since=since)
-    memory, entries = taken(BENCH, rows)
+    state, entries = taken(BENCH, rows)
     spacing, at = 20, 0
     kept: list[int] = []
     while (at := at + spacing) <= samples:
         if len(kept) == 32:
             kept, spacing = kept[1::2], 2 * spacing
         kept.append(at)
-    assert memory[STORED] == len(kept)
+    assert len(state.entries) == len(kept) + 1  # and the one at the begin
     assert set(kept) <= set(entries)
-    assert unexplained(balance_model(BENCH), memory) == pytest.approx(
-        Reference(BENCH, rows).unexplained([*kept, samples]), rel=1e-7
-    )
+    expected = Reference(BENCH, rows).unexplained([*kept, samples])
+    assert unexplained(balance_model(BENCH), state)[0] == pytest.approx(expected, rel=1e-7)
 
 
 EDGES = {
@@ -220,13 +219,10 @@ EDGES = {
 def test_the_edges_of_a_period_that_counts() -> None:
     model = balance_model(BENCH)
     for velocities, counts in EDGES.items():
-        memory = [0.0] * MEMORY
-        begin(memory, 0.0, velocities[0])
+        state = begin(0.0, velocities[0])
         for _ in range(2):
-            take(model, memory, True, 0.0, velocities[0], 1.0)
-        memory[PERIODS] = 0.0
-        take(model, memory, True, 0.0, velocities[1], 1.0)
-        assert memory[PERIODS] == counts, velocities
+            state = take(model, state, True, 0.0, velocities[0], 1.0)
+        assert take(model, state, True, 0.0, velocities[1], 1.0).periods - state.periods == counts, velocities
 
 
 @pytest.mark.parametrize(
@@ -250,18 +246,16 @@ def test_a_declared_observer_is_not_blamed_for_its_lag_of_three_samples_and_an_u
         late.append(row._replace(velocity=shown))
     shares = []
     for bench in (BENCH, replace(BENCH, sensors=Sensors("observer", 800.0))):
-        model, (memory, _) = balance_model(bench), taken(bench, late)
-        shares.append(unexplained(model, memory) / allowance(model, memory))
+        found, allowed = unexplained(balance_model(bench), taken(bench, late)[0])
+        shares.append(found / allowed)
     assert shares[0] > 1.0
     assert shares[1] < 0.3
 
 
 def test_too_little_motion_is_not_judged() -> None:
-    model, memory = balance_model(BENCH), taken(BENCH, played(BENCH, 2, 230))[0]
-    memory[PERIODS] = 40.0
-    assert math.isfinite(allowance(model, memory))
-    memory[PERIODS] = 39.0
-    assert allowance(model, memory) == math.inf
+    model, state = balance_model(BENCH), taken(BENCH, played(BENCH, 2, 230))[0]
+    assert math.isfinite(unexplained(model, state._replace(periods=40))[1])
+    assert unexplained(model, state._replace(periods=39))[1] == math.inf
 
 
 def sample(row: Row) -> SensorSample:
@@ -377,11 +371,9 @@ def test_origin_and_what_is_allowed_are_those_of_least_squares(
     rows = played(bench, seed, samples, gain=0.8, lost=lost)
     released = [row._replace(angle=row.angle - rows[samples // 2].angle) for row in rows]
     for case in (rows, released):
-        memory, _ = taken(bench, case)
-        for _ in range(2):
-            assert origin(balance_model(bench), memory) == pytest.approx(
-                origin_reference(bench, case), rel=1e-6, abs=1e-6
-            )
+        state, _ = taken(bench, case)
+        expected = pytest.approx(origin_reference(bench, case), rel=1e-6, abs=1e-6)
+        assert origin(balance_model(bench), state) == expected
 
 
 def run(bench: Bench, zero: float, seed: int = 1, samples: int = 500) -> MotionBalance:

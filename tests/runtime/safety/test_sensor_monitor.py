@@ -7,6 +7,7 @@ sensors are played by the loop (test_lies.py, test_homing.py) and by the search 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -16,8 +17,6 @@ from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.sensor_monitor import (
     CONTRADICTING,
     HONEST,
-    MEMORY,
-    OBEYS,
     OUTSIDE_SET,
     REVERSED,
     SensorMonitor,
@@ -40,24 +39,26 @@ TS = 1e-3
 
 @pytest.mark.parametrize("elapsed", [math.nan, math.inf, -math.inf, 0.0, -TS, 1e9])
 def test_a_time_that_is_none_contradicts(elapsed: float) -> None:
-    memory = [0.0] * MEMORY
-    begin(memory, 0.0, 0.0)
-    assert judge(LAW, LIMITS, memory, elapsed, 0.0, 0.0, True, 0.0, 0.0) == CONTRADICTING
+    assert judge(LAW, LIMITS, begin(0.0, 0.0), elapsed, 0.0, 0.0, True, 0.0, 0.0)[1] == CONTRADICTING
+
+
+def numbers(state: Any) -> list[float]:
+    """All numbers of a state."""
+    return [number for part in state for number in numbers(part)] if isinstance(state, tuple) else [state]
 
 
 wild = st.floats(-1e6, 1e6) | st.floats(-10.0, 10.0)
 
 
 @given(st.lists(st.tuples(st.floats(1e-9, 1e6), wild, wild, st.booleans(), wild, wild), max_size=8))
-def test_whatever_comes_the_memory_stays_finite(
+def test_whatever_comes_the_state_stays_finite(
     samples: list[tuple[float, float, float, bool, float, float]],
 ) -> None:
-    memory = [0.0] * MEMORY
-    begin(memory, 0.0, 0.0)
+    state = begin(0.0, 0.0)
     for elapsed, angle, velocity, obeyed, command, reported in samples:
-        verdict = judge(LAW, LIMITS, memory, elapsed, angle, velocity, obeyed, command, reported)
+        state, verdict = judge(LAW, LIMITS, state, elapsed, angle, velocity, obeyed, command, reported)
         assert verdict in (HONEST, CONTRADICTING, OUTSIDE_SET, REVERSED)
-        assert all(map(math.isfinite, memory))
+        assert all(map(math.isfinite, numbers(state)))
 
 
 # --- the monitor of a run ---------------------------------------------------------------------------------------------
@@ -85,12 +86,11 @@ def test_at_rest_at_the_origin_the_first_move_is_the_full_current_and_far_from_i
 
 
 def test_once_the_motion_has_shown_its_sign_nothing_is_limited() -> None:
-    memory = [0.0] * MEMORY
-    begin(memory, 50.0, 300.0)
-    assert largest_current(LAW, LIMITS, memory, 6.0) == LIMITS.first_current
-    memory[OBEYS] = 1.0
-    assert largest_current(LAW, LIMITS, memory, 6.0) == 6.0
-    assert largest_current(LAW, LIMITS, memory, 1.0) == 1.0
+    state = begin(50.0, 300.0)
+    assert largest_current(LAW, LIMITS, state, 6.0) == LIMITS.first_current
+    state = state._replace(obeys=True)
+    assert largest_current(LAW, LIMITS, state, 6.0) == 6.0
+    assert largest_current(LAW, LIMITS, state, 1.0) == 1.0
 
 
 def test_friction_is_waited_for_where_the_motion_has_not_shown_its_sign() -> None:

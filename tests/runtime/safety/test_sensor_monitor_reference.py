@@ -11,35 +11,21 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from random import Random
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import pytest
 
 from emb_runtime.config.bench import OLDEST_FRAME
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.sensor_monitor import (
-    ANGLE,
-    CONFIRMED,
     CONTRADICTING,
-    FLOWING_HIGH,
-    FLOWING_LOW,
-    HIGHS,
     HONEST,
-    INTEGRAL,
-    LOWS,
-    MEMORY,
-    MOTION_DOWN,
-    MOTION_UP,
-    OBEYS,
-    OPPOSED_DOWN,
-    OPPOSED_TRAVEL,
-    OPPOSED_UP,
+    NO_CURRENTS,
     OUTSIDE_SET,
     REVERSED,
-    TRAVEL_DOWN,
-    TRAVEL_UP,
-    VELOCITY,
+    Currents,
     SensorMonitor,
+    State,
     begin,
     coasting_time,
     judge,
@@ -53,13 +39,9 @@ from tests.benches import SENSOR_BENCH
 
 BENCH = SENSOR_BENCH
 SHIPPED = make_law(BENCH)
-SUMS = (
-    TRAVEL_UP, TRAVEL_DOWN, MOTION_UP, MOTION_DOWN, OPPOSED_UP, OPPOSED_DOWN, OPPOSED_TRAVEL, INTEGRAL, CONFIRMED,
-    OBEYS,
-)  # fmt: skip
 NEVER = 1e9
 Range = tuple[float, float]
-Memory = tuple[list[float], "Sample"]  # The row before a sample, and that sample
+Run = tuple[State, "Sample"]  # The state before a sample, and that sample
 
 
 class Sample(NamedTuple):
@@ -71,6 +53,13 @@ class Sample(NamedTuple):
     obeyed: bool
     command: float
     reported: float
+
+
+def sums_of(state: State) -> list[float]:
+    """All that a state sums up, and what it has found out."""
+    opposed = state.opposed
+    sums = [*state.travel, *state.motion, *opposed.motion, opposed.travel, opposed.integral]
+    return [*sums, float(state.confirmed), float(state.obeys)]
 
 
 class Reference:
@@ -88,7 +77,7 @@ class Reference:
 
     @property
     def sums(self) -> list[float]:
-        """As SUMS."""
+        """As :func:`sums_of`."""
         sums = [*self.travel, *self.motion, *self.opposed_motion, self.opposed_travel, self.integral]
         return [*sums, float(self.confirmed), float(self.obeys)]
 
@@ -291,13 +280,13 @@ def test_verdicts_and_sums_are_those_of_the_page() -> None:
         for _ in range(6):
             law, limits = drawn_law(rng), drawn_limits(rng)
             start = rng.uniform(-1.0, 1.0), rng.uniform(-3.0, 3.0)
-            reference, memory = Reference(law, limits, *start), [rng.random() for _ in range(MEMORY)]
-            begin(memory, *start)
+            reference, state = Reference(law, limits, *start), begin(*start)
             for s in drawn_samples(rng, law, 60):
                 expected = reference.judge(s)
                 seen[expected] += 1
-                assert judge(law, limits, memory, *s) == expected
-                assert [memory[i] for i in SUMS] == pytest.approx(reference.sums, rel=1e-9, abs=1e-9)
+                state, found = judge(law, limits, state, *s)
+                assert found == expected
+                assert sums_of(state) == pytest.approx(reference.sums, rel=1e-9, abs=1e-9)
             confirmed += reference.confirmed
     assert min(confirmed, *seen.values()) >= 10
 
@@ -305,15 +294,13 @@ def test_verdicts_and_sums_are_those_of_the_page() -> None:
 # --- exactly at a threshold -------------------------------------------------------------------------------------------
 
 
-def memory_after(law: ShieldLaw, samples: Iterable[Sample], limits: SensorThresholds, confirmed: float = 0.0) -> Memory:
-    """The row before the last sample, and that sample."""
+def state_after(law: ShieldLaw, samples: Iterable[Sample], limits: SensorThresholds, confirmed: bool = False) -> Run:
+    """The state before the last sample, and that sample."""
     *before, last = samples
-    memory = [0.0] * MEMORY
-    begin(memory, 0.0, 0.0)
-    memory[CONFIRMED] = confirmed
+    state = begin(0.0, 0.0)._replace(confirmed=confirmed)
     for s in before:
-        judge(law, limits, memory, *s)
-    return memory, last
+        state, _ = judge(law, limits, state, *s)
+    return state, last
 
 
 SILENT = SensorThresholds(
@@ -321,47 +308,48 @@ SILENT = SensorThresholds(
 )
 
 
-def found(fits: Callable[[list[float]], bool], confirmed: float = 0.0) -> tuple[ShieldLaw, Memory, list[float]]:
-    """A law, the row before a sample, and the sums after it, such that the sums fit."""
+def found(fits: Callable[[State], bool], confirmed: bool = False) -> tuple[ShieldLaw, Run, State]:
+    """A law, the state before a sample, and that after it, such that it fits."""
     for seed in range(2000):
         rng = Random(seed)
         law = drawn_law(rng)
         samples = [s for s in drawn_samples(rng, law, 30) if abs(s.angle) < 1e6]
-        memory, last = memory_after(law, samples, SILENT, confirmed)
-        after = memory.copy()
-        judge(law, SILENT, after, *last)
+        state, last = state_after(law, samples, SILENT, confirmed)
+        after, _ = judge(law, SILENT, state, *last)
         if fits(after):
-            return law, (memory, last), after
+            return law, (state, last), after
     raise AssertionError("expected a run whose sums fit, found none")
 
 
-def verdict(law: ShieldLaw, run: Memory, limits: SensorThresholds) -> tuple[int, float]:
+def verdict(law: ShieldLaw, run: Run, limits: SensorThresholds) -> tuple[int, bool]:
     """Of the last sample, and whether it has confirmed the polarity."""
-    memory = run[0].copy()
-    return judge(law, limits, memory, *run[1]), memory[CONFIRMED]
+    state, found = judge(law, limits, run[0], *run[1])
+    return found, state.confirmed
 
 
 def just_below(x: float) -> float:
     return math.nextafter(x, -math.inf)
 
 
-@pytest.mark.parametrize("place", [TRAVEL_UP, TRAVEL_DOWN])
-def test_a_travel_at_its_threshold_is_honest_and_beyond_it_not(place: int) -> None:
-    law, run, sums = found(lambda m: m[place] > 0.0, confirmed=1.0)
-    assert verdict(law, run, SILENT._replace(travel=sums[place]))[0] == HONEST
-    assert verdict(law, run, SILENT._replace(travel=just_below(sums[place])))[0] == CONTRADICTING
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_a_travel_at_its_threshold_is_honest_and_beyond_it_not(direction: str) -> None:
+    law, run, after = found(lambda state: getattr(state.travel, direction) > 0.0, confirmed=True)
+    travel = getattr(after.travel, direction)
+    assert verdict(law, run, SILENT._replace(travel=travel))[0] == HONEST
+    assert verdict(law, run, SILENT._replace(travel=just_below(travel)))[0] == CONTRADICTING
 
 
-@pytest.mark.parametrize("place", [MOTION_UP, MOTION_DOWN])
-def test_a_motion_at_its_threshold_is_honest_and_beyond_it_not(place: int) -> None:
-    law, run, sums = found(lambda m: m[place] == max(m[MOTION_UP], m[MOTION_DOWN]) > 0.0, confirmed=1.0)
-    assert verdict(law, run, SILENT._replace(motion=sums[place]))[0] == HONEST
-    assert verdict(law, run, SILENT._replace(motion=just_below(sums[place])))[0] == OUTSIDE_SET
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_a_motion_at_its_threshold_is_honest_and_beyond_it_not(direction: str) -> None:
+    law, run, after = found(lambda s: getattr(s.motion, direction) == max(s.motion) > 0.0, confirmed=True)
+    motion = max(after.motion)
+    assert verdict(law, run, SILENT._replace(motion=motion))[0] == HONEST
+    assert verdict(law, run, SILENT._replace(motion=just_below(motion)))[0] == OUTSIDE_SET
 
 
-def sizes(memory: list[float]) -> tuple[float, float]:
+def sizes(state: State) -> tuple[float, float]:
     """Motion, and motion of the opposite polarity."""
-    return max(memory[MOTION_UP], memory[MOTION_DOWN]), max(memory[OPPOSED_UP], memory[OPPOSED_DOWN])
+    return max(state.motion), max(state.opposed.motion)
 
 
 def test_until_the_polarity_is_confirmed_the_threshold_of_the_motion_is_the_same() -> None:
@@ -378,12 +366,12 @@ def test_the_opposite_polarity_fits_up_to_half_the_threshold_of_the_motion() -> 
 
 
 def test_the_polarity_is_confirmed_beyond_both_thresholds() -> None:
-    law, run, sums = found(lambda m: sizes(m)[1] > sizes(m)[0] and abs(m[OPPOSED_TRAVEL]) > 2.0 * max(m[2], m[3]) > 0.0)
-    motion, travel = sizes(sums)[1], abs(sums[OPPOSED_TRAVEL])
+    law, run, sums = found(lambda s: sizes(s)[1] > sizes(s)[0] and abs(s.opposed.travel) > 2.0 * max(s.travel) > 0.0)
+    motion, travel = sizes(sums)[1], abs(sums.opposed.travel)
     for limits, confirmed in (
-        ((just_below(motion), just_below(travel)), 1.0),
-        ((motion, just_below(travel)), 0.0),
-        ((just_below(motion), travel), 0.0),
+        ((just_below(motion), just_below(travel)), True),
+        ((motion, just_below(travel)), False),
+        ((just_below(motion), travel), False),
     ):
         assert verdict(law, run, SILENT._replace(motion=limits[0], travel=limits[1])) == (HONEST, confirmed)
 
@@ -397,9 +385,8 @@ def test_the_opposite_sign_of_the_angle_fits_if_the_velocity_says_half_the_thres
     law = SHIPPED._replace(sample_time=2.0**-10)
     integral = 2.0**-10
     sample = Sample(2.0**-10, -1.5 * integral, 2.0, True, 0.0, 0.0)
-    memory = [0.0] * MEMORY
-    begin(memory, 0.0, 0.0)
-    assert judge(law, SILENT._replace(offset=0.0, travel=travel * integral), memory, *sample) == expected
+    limits = SILENT._replace(offset=0.0, travel=travel * integral)
+    assert judge(law, limits, begin(0.0, 0.0), *sample)[1] == expected
 
 
 def test_a_travel_of_exactly_zero_begins_anew() -> None:
@@ -407,12 +394,11 @@ def test_a_travel_of_exactly_zero_begins_anew() -> None:
     law = SHIPPED._replace(sample_time=ts)
     limits = SILENT._replace(offset=0.0, lag=0.5, lead=0.5)
     for sign in (-1.0, 1.0):
-        memory = [0.0] * MEMORY
-        begin(memory, 0.0, 0.0)
-        memory[CONFIRMED] = 1.0
-        assert judge(law, limits, memory, *Sample(ts, 4.0 * ts, 8.0, True, 0.0, 0.0)) == HONEST  # excess 0 at 8 rad/s
+        state = begin(0.0, 0.0)._replace(confirmed=True)
+        state, first = judge(law, limits, state, *Sample(ts, 4.0 * ts, 8.0, True, 0.0, 0.0))  # excess 0 at 8 rad/s
+        assert first == HONEST
         thrown = Sample(ts, 12.0 * ts + sign, 8.0, True, 0.0, 0.0)  # 1 rad off, with no velocity gained since
-        assert judge(law, limits._replace(travel=0.75), memory, *thrown) == CONTRADICTING
+        assert judge(law, limits._replace(travel=0.75), state, *thrown)[1] == CONTRADICTING
 
 
 # --- what counts as a measurement -------------------------------------------------------------------------------------
@@ -421,28 +407,22 @@ def test_a_travel_of_exactly_zero_begins_anew() -> None:
 @pytest.mark.parametrize("place", range(4))
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_numbers_count_up_to_a_million(place: int, sign: float) -> None:
-    def memory_of(size: float) -> list[float]:
+    def state_of(size: float) -> State:
         numbers = [0.0, 0.0, 0.0, 0.0]
         numbers[place] = sign * size
-        memory = [0.0] * MEMORY
-        begin(memory, 0.0, 0.0)
         angle, velocity, command, reported = numbers
-        verdict = judge(SHIPPED, SILENT, memory, 1e-3, angle, velocity, True, command, reported)
+        state, verdict = judge(SHIPPED, SILENT, begin(0.0, 0.0), 1e-3, angle, velocity, True, command, reported)
         assert (verdict == CONTRADICTING) == (not size <= 1e6)
-        return memory
+        return state
 
-    begun = [0.0] * MEMORY
-    begin(begun, 0.0, 0.0)
     for none in (math.nextafter(1e6, math.inf), math.inf, math.nan):
-        assert memory_of(none) == begun
-    assert memory_of(1e6) != begun
+        assert state_of(none) == begin(0.0, 0.0)
+    assert state_of(1e6) != begin(0.0, 0.0)
 
 
 def test_a_sample_time_counts_up_to_a_million_seconds() -> None:
     for elapsed, expected in ((1e6, HONEST), (math.nextafter(1e6, math.inf), CONTRADICTING)):
-        memory = [0.0] * MEMORY
-        begin(memory, 0.0, 0.0)
-        assert judge(SHIPPED, SILENT, memory, elapsed, 0.0, 0.0, True, 0.0, 0.0) == expected
+        assert judge(SHIPPED, SILENT, begin(0.0, 0.0), elapsed, 0.0, 0.0, True, 0.0, 0.0)[1] == expected
 
 
 # --- thresholds, coasting, faults -------------------------------------------------------------------------------------
@@ -537,10 +517,8 @@ def test_each_fault_tells_the_sum_and_the_threshold_that_it_passed(sign: float) 
     assert caught.detail == told
 
     at_it = [Sample(1e-3, sign * 0.525, sign * 50.0, True, 0.0, 0.0)]
-    memory = [0.0] * MEMORY
-    begin(memory, 0.0, 0.0)
-    judge(SHIPPED, SILENT, memory, *at_it[0])
-    exactly = limits._replace(motion=max(memory[MOTION_UP], memory[MOTION_DOWN]))
+    state, _ = judge(SHIPPED, SILENT, begin(0.0, 0.0), *at_it[0])
+    exactly = limits._replace(motion=max(state.motion))
     assert stopped(exactly, at_it).detail.startswith("the angle is 0.50 rad beyond")
 
 
@@ -562,19 +540,19 @@ def test_the_reported_current_of_the_sample_is_the_one_that_counts(reported: flo
 # --- the first move ---------------------------------------------------------------------------------------------------
 
 
-def unseen_of_the_page(law: ShieldLaw, limits: SensorThresholds, memory: list[float]) -> float:
+def unseen_of_the_page(law: ShieldLaw, limits: SensorThresholds, state: State) -> float:
     """Speed that currents add which have acted and are not in the sample yet."""
-    acted = [max(abs(memory[LOWS + i]), abs(memory[HIGHS + i])) for i in range(shown_late(law) + 1)]
+    acted = [max(map(abs, both)) for both in zip(state.lows, state.highs, strict=True)][: shown_late(law) + 1]
     unseen = law.sample_time * sum(acted[: law.age_high]) + limits.lag * max(acted[law.age_high :])
-    return law.motor_high * (unseen + law.lag * max(abs(memory[FLOWING_LOW]), abs(memory[FLOWING_HIGH])))
+    return law.motor_high * (unseen + law.lag * max(map(abs, state.flowing)))
 
 
-def most_of_the_page(law: ShieldLaw, limits: SensorThresholds, memory: list[float]) -> float:
+def most_of_the_page(law: ShieldLaw, limits: SensorThresholds, state: State) -> float:
     """Largest current of the first move, by bisection over what the worst brake does in two periods."""
     t, d = law.sample_time, law.friction_low
-    now = abs(memory[VELOCITY]) + law.velocity_noise + unseen_of_the_page(law, limits, memory)
+    now = abs(state.velocity) + law.velocity_noise + unseen_of_the_page(law, limits, state)
     stroke = min(-law.bottom, d / law.spring_high)
-    angle = abs(memory[ANGLE]) + 2.0 * law.angle_noise
+    angle = abs(state.angle) + 2.0 * law.angle_noise
     if angle < stroke:  # within this and the next period, and the frames' age, by the greatest speed that ends there
         angle += (2 + law.age_high) * t * math.sqrt(2.0 * d * (stroke - angle))
 
@@ -591,33 +569,28 @@ def most_of_the_page(law: ShieldLaw, limits: SensorThresholds, memory: list[floa
         middle = 0.5 * (low + high)
         low, high = (middle, high) if is_stopped(middle) else (low, middle)
     low = low if low > 1e-9 else 0.0
-    rests = abs(memory[VELOCITY]) <= law.velocity_noise
+    rests = abs(state.velocity) <= law.velocity_noise
     return max(low, limits.first_current) if rests else low
 
 
 def test_the_first_move_is_what_friction_stops_by_the_page() -> None:
     rng, beyond, below = Random(0), 0, 0
     for _ in range(4000):
-        law, limits, memory = drawn_law(rng), drawn_limits(rng), [0.0] * MEMORY
-        begin(memory, rng.uniform(-1.0, 1.0) * rng.choice([0.5, 6.0]), rng.gauss(0.0, 10.0))
-        for i in range(shown_late(law) + 1):
-            memory[LOWS + i], memory[HIGHS + i] = sorted(rng.choice([0.0, 1.0]) * rng.gauss(0.0, 1.0) for _ in "ab")
+        law, limits = drawn_law(rng), drawn_limits(rng)
+        state = begin(rng.uniform(-1.0, 1.0) * rng.choice([0.5, 6.0]), rng.gauss(0.0, 10.0))
+        pairs = [sorted(rng.choice([0.0, 1.0]) * rng.gauss(0.0, 1.0) for _ in "ab") for _ in NO_CURRENTS]
+        lows, highs = zip(*pairs, strict=True)
+        state = state._replace(lows=cast(Currents, lows), highs=cast(Currents, highs))
         if law.lag:
-            memory[FLOWING_LOW], memory[FLOWING_HIGH] = -rng.random(), rng.random()
-        assert unseen_speed(law, limits, memory) == pytest.approx(unseen_of_the_page(law, limits, memory))
-        most = most_of_the_page(law, limits, memory)
-        assert largest_current(law, limits, memory, 1e3) == pytest.approx(most, rel=1e-6)
-        assert largest_current(law, limits, memory, 0.5 * most) == 0.5 * most
+            state = state._replace(flowing=(-rng.random(), rng.random()))
+        assert unseen_speed(law, limits, state) == pytest.approx(unseen_of_the_page(law, limits, state))
+        most = most_of_the_page(law, limits, state)
+        assert largest_current(law, limits, state, 1e3) == pytest.approx(most, rel=1e-6)
+        assert largest_current(law, limits, state, 0.5 * most) == 0.5 * most
         beyond += most > limits.first_current
         below += most < limits.first_current
     assert 1000 < beyond < 3500
     assert below > 100
-
-
-def memory_at(angle: float, velocity: float = 0.0) -> list[float]:
-    memory = [0.0] * MEMORY
-    begin(memory, angle, velocity)
-    return memory
 
 
 def test_the_first_move_is_more_than_gentle_up_to_where_half_of_the_friction_holds_the_spring() -> None:
@@ -625,17 +598,17 @@ def test_the_first_move_is_more_than_gentle_up_to_where_half_of_the_friction_hol
         friction_low=1024.0, spring_high=128.0, angle_noise=0.0, sample_time=2.0**-10, bottom=-5.875
     )  # half of the friction holds 4 rad, and friction stops 64 rad/s within the 2 rad from 3.875 to 5.875
     limits = sensor_thresholds(BENCH, law)._replace(first_current=0.25)
-    assert largest_current(law, limits, memory_at(3.875), 100.0) > 0.25  # and 64 rad/s for two periods are 0.125 rad
+    assert largest_current(law, limits, begin(3.875, 0.0), 100.0) > 0.25  # and 64 rad/s for two periods are 0.125 rad
     for angle in (3.876, -3.876, 5.875, 50.0):
-        assert largest_current(law, limits, memory_at(angle), 100.0) == 0.25
+        assert largest_current(law, limits, begin(angle, 0.0), 100.0) == 0.25
     short = law._replace(bottom=-1.0)
     for angle in (1.0, 1.5, 50.0):
-        assert largest_current(short, limits, memory_at(angle), 100.0) == 0.25
+        assert largest_current(short, limits, begin(angle, 0.0), 100.0) == 0.25
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_what_may_be_at_rest_by_the_noise_may_be_moved_and_what_is_faster_is_left_to_friction(sign: float) -> None:
     limits = sensor_thresholds(BENCH, SHIPPED)._replace(first_current=1e3)
     fastest = SHIPPED.velocity_noise
-    assert largest_current(SHIPPED, limits, memory_at(0.0, sign * fastest), 1e6) == 1e3
-    assert largest_current(SHIPPED, limits, memory_at(0.0, sign * math.nextafter(fastest, math.inf)), 1e6) < 1e3
+    assert largest_current(SHIPPED, limits, begin(0.0, sign * fastest), 1e6) == 1e3
+    assert largest_current(SHIPPED, limits, begin(0.0, sign * math.nextafter(fastest, math.inf)), 1e6) < 1e3
