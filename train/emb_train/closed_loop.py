@@ -280,7 +280,8 @@ def store_monitor(state: MonitorState, row: Any) -> None:
     row[11], row[12] = opposed.motion.up, opposed.motion.down
     for j in range(OLDEST_FRAME + 1):
         row[13 + j], row[19 + j] = state.lows[j], state.highs[j]
-    row[25], row[26], row[27], row[28] = state.flowing[0], state.flowing[1], float(state.obeys), float(state.confirmed)
+    row[25], row[26] = state.flowing
+    row[27], row[28] = 1.0 if state.obeys else 0.0, 1.0 if state.confirmed else 0.0
 
 
 def delayed(instruments: Instruments, delay: int, offset: float = 0.0) -> Instruments:

@@ -8,6 +8,7 @@ a wrong sensor the motion that is told stays, and the true one changes with its 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -16,16 +17,7 @@ import numpy as np
 from emb_bench.compiled import compiled
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import Bench, BrakeParameters
-from emb_runtime.safety.motion_balance import (
-    MEMORY,
-    BalanceModel,
-    allowance,
-    balance_model,
-    begin,
-    origin,
-    take,
-    unexplained,
-)
+from emb_runtime.safety.motion_balance import BalanceModel, balance_model, begin, origin, take, unexplained
 
 SWING = 10.0 * np.pi  # Angular frequency of what swings [rad/s]
 
@@ -106,19 +98,18 @@ def shown(bench: Bench, brakes: list[BrakeParameters], motion: Floats, currents:
             np.stack([record.x for record in records]),
             np.stack([record.v for record in records]),
             np.stack([record.u for record in records]),
-            np.zeros(MEMORY),
             row,
         )
         compiled(judge)(*arguments)
     return found
 
 
-def judge(model: BalanceModel, x: Floats, v: Floats, u: Floats, memory: Floats, found: Floats) -> None:
+def judge(model: BalanceModel, x: Floats, v: Floats, u: Floats, found: Floats) -> None:
     """Let the balance judge some records, at their ends; shapes as in :class:`Record` with one axis before."""
     for i in range(len(found)):
-        begin(memory, x[i, 0], v[i, 0])
+        state = begin(x[i, 0], v[i, 0])
         for k in range(u.shape[1]):
-            take(model, memory, True, x[i, k + 1], v[i, k + 1], u[i, k])
-        share = unexplained(model, memory) / allowance(model, memory)
-        place, most = origin(model, memory)
-        found[i] = max(share, abs(place) / most) if share > 0.0 else 0.0
+            state = take(model, state, True, x[i, k + 1], v[i, k + 1], u[i, k])
+        left, allowed = unexplained(model, state)
+        place, most = origin(model, state)
+        found[i] = max(left / allowed, abs(place) / most) if allowed < math.inf else 0.0
