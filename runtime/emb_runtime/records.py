@@ -67,6 +67,19 @@ class RunState(IntEnum):
     HOMING = 6  # Stands in place of ACTIVE where the brake is brought back to the origin
 
 
+class Call(IntEnum):
+    """Calls of a run's core by its driver, but those that take frames; the numbers are those of the logs."""
+
+    BEGIN = 0  # Listen for the node
+    TIMEOUT = 1  # No frame came until the deadline
+    ANSWER = 2  # Decide on the frame that answers a sample; then it is sent, or lost
+    LATCH = 3  # Latch a fault of the driver
+    EXPLAIN = 4  # Record this fault
+    STOP_FRAME = 5  # Make a stop frame
+    NOTE = 6  # Record an event of the driver
+    END = 7  # Check how the node came to rest
+
+
 class RunType(StrEnum):
     """Type of a run, as in the log's metadata under ``purpose``."""
 

@@ -17,12 +17,13 @@ from emb_bench.rerun import Rerun, carried_policy, rerun
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import Bench, parse_bench
-from emb_runtime.log.ring_buffer import EventRecord, FrameRecord, Record
+from emb_runtime.log.ring_buffer import EventRecord, FrameRecord, InputRecord, Record
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.records import CycleRecord, Reason, RunState
 from emb_runtime.safety.state_machine import Fault
 from tests.actors import constant_actor
 from tests.bench.conftest import Replay
+from tests.bench.damaged import rewritten
 from tests.bench.hostile import Driven, HostileBus, Thoughtful, drive, write_trace
 from tests.bench.simulated_logs import square
 from tests.benches import SENSOR_BENCH
@@ -299,8 +300,8 @@ def test_a_missing_event_or_another_one_is_reported(recorded: Callable[..., Driv
 
 def test_a_sensor_frame_that_is_missing_or_other_is_reported(recorded: Callable[..., Driven], again: Again) -> None:
     run = recorded()
-    at = next(n for n, r in enumerate(run.journal.records) if isinstance(r, CycleRecord) and r.step == 60) - 1
-    assert isinstance(run.journal.records[at], FrameRecord)
+    cycle = next(n for n, r in enumerate(run.journal.records) if isinstance(r, CycleRecord) and r.step == 60)
+    at = max(n for n, r in enumerate(run.journal.records[:cycle]) if isinstance(r, FrameRecord))
     result = again(run, alter=lambda records: records.pop(at))
     assert not result.reproduced
 
@@ -379,6 +380,38 @@ def test_a_log_without_the_beginning_of_its_run_is_one_line(
     with_policy: Callable[..., list[str]], replay: Replay
 ) -> None:
     assert "beginning of the run" in replay.refused(*with_policy(lambda records: records.pop(0)), code=6)
+
+
+def test_a_log_without_the_inputs_of_its_run_is_one_line(with_policy: Callable[..., list[str]], replay: Replay) -> None:
+    def strip(records: list[Record]) -> None:
+        records[:] = [record for record in records if not isinstance(record, InputRecord)]
+
+    arguments = with_policy(strip)
+    assert "beginning of the run" in replay.refused(*arguments, code=6)
+    rewritten(Path(arguments[1]))  # a topic without messages is not written
+    assert "/input" not in read_log(arguments[1]).topics
+    assert "expected the topic /input" in replay.refused(*arguments, code=6)
+
+
+def test_inputs_in_any_disorder_are_compared_or_left_and_break_nothing(
+    hostile: Callable[..., Driven], again: Again
+) -> None:
+    run, dice = hostile(1, slow=0.05, refusing=0.1), random.Random(41)
+    for _ in range(30):
+
+        def disturb(records: list[Record]) -> None:
+            for _ in range(dice.choice((1, 1, 3, 30))):
+                at, other = dice.randrange(1, len(records)), dice.randrange(1, len(records))
+                record = records[at]
+                if dice.random() < 0.5 and isinstance(record, InputRecord):
+                    records[at] = record._replace(call=dice.randrange(10), code=dice.choice(("", "BUS_LOST", "X")))
+                elif dice.random() < 0.5:
+                    records[at], records[other] = records[other], records[at]
+                else:
+                    records.insert(at, records.pop(other))
+
+        result = again(run, alter=disturb)
+        assert result.followed or result.differences[-1].what == "what came next"
 
 
 def test_a_log_that_says_nonsense_of_its_run_is_refused(with_policy: Callable[..., list[str]], replay: Replay) -> None:

@@ -1,8 +1,10 @@
 """Every later version decides the same again, bit for bit, on what these logs hold: bench, DBC, policy and frames.
 
-``golden/done.mcap`` is ``emb-run --iface sim:plant=exact,seed=3 --duration 0.25`` with the shipped actor;
+``golden/done.mcap`` is ``emb-run --iface sim:plant=exact,seed=3 --duration 0.25`` with the actor of version 0.2;
 ``golden/rejected.mcap`` the same with every other angle 5 rad off from the 420th on, until there were too many. A
-change that decides otherwise on purpose says so in CHANGELOG.md and records them anew.
+change that decides otherwise on purpose says so in CHANGELOG.md and records them anew. Their ``/input``
+was added later: their own frames and times went through the core, which records its inputs since. Every other message
+is as it was.
 """
 
 from __future__ import annotations

@@ -174,11 +174,11 @@ def export(
 def rerun(run: Source) -> Rerun:
     """Run the loop again from the log of a run, and compare what it decides.
 
-    The control loop runs again with the policy, bench file and DBC of the log. Bus and clock give the frames and times
-    that the log recorded. Each decision (policy, clip, shield, sent current, its reason), each estimate, each sent
-    frame, each safety event and the outcome must be the same, numbers to the last bit. A cut log is compared up to its
-    end. Rounding may differ with another ONNX Runtime, numpy, Python or processor. If a decision differs, the versions
-    of the log are printed too.
+    The core of the control loop runs again with the policy, bench file and DBC of the log. What went into it goes in
+    again: the frames of each read, and the calls in ``/input``. Each decision (policy, clip, shield, sent current, its
+    reason), each estimate, each sent frame, each safety event and the outcome must be the same, numbers to the last
+    bit. A cut log is compared up to its end. Rounding may differ with another ONNX Runtime, numpy, Python or processor.
+    If a decision differs, the versions of the log are printed too.
 
     Args:
         run: MCAP file of emb-run.
@@ -188,7 +188,7 @@ def rerun(run: Source) -> Rerun:
 
     Raises:
         UsageError: the run only listened.
-        LogError: the log does not begin with its run, or carries no policy.
+        LogError: the log has no ``/input``, does not begin with its run, or carries no policy.
         PolicyError: the policy in the log is refused.
     """
     from emb_bench.rerun import rerun_as_recorded

@@ -118,9 +118,7 @@ def _campaign(args: argparse.Namespace) -> int:
 
 def _rerun(args: argparse.Namespace) -> int:
     again = api.rerun(args.run)
-    from emb_bench.rerun import document, text
-
-    answer(args, lambda: document(again), lambda verbose: text(again, verbose=verbose))
+    answer(args, lambda: runs.rerun_document(again), lambda verbose: runs.rerun_text(again, verbose=verbose))
     return EXIT_DONE if again.reproduced else EXIT_CHECK_FAILED
 
 

@@ -1,9 +1,9 @@
-"""Summary of a run, and its timing beside the budgets of its bench, as text; base install only."""
+"""Summary of a run, its timing beside the budgets of its bench, and its rerun, as text; base install only."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from emb_bench.config.bench import COUNTED, QUANTILE_NAMES
 from emb_bench.logs.log import RunLog, end_detail
@@ -15,7 +15,11 @@ from emb_runtime.estimator.estimate import words
 from emb_runtime.numbers import NOTHING, plain
 from emb_runtime.system.terminal import one_line
 
+if TYPE_CHECKING:
+    from emb_bench.rerun import Rerun
+
 UNITS = ((1.0, "s"), (1e3, "ms"), (1e6, "µs"))  # Of times, with their factors
+SHOWN_DIFFERENCES = 10  # Unless all are asked for
 
 
 def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
@@ -179,3 +183,50 @@ def _row(said: str, values: list[float]) -> list[str]:
         return [said, *[NOTHING] * len(QUANTILE_NAMES), ""]
     factor, unit = next(((f, u) for f, u in UNITS if max(map(abs, values)) * f >= 1.0), UNITS[-1])
     return [said, *(f"{factor * value:.4g}" for value in values), unit]
+
+
+def rerun_document(again: Rerun) -> dict[str, Any]:
+    """A rerun as plain data."""
+    log = again.log
+    return {
+        "log": str(log.path),
+        "complete": log.complete,
+        "missing": log.missing,
+        "reproduced": again.reproduced,
+        "decisions": again.decisions,
+        "frames": again.frames,
+        "events": again.events,
+        "ended": again.outcome is not None,
+        "home": None if again.outcome is None else again.outcome.home,
+        "followed": again.followed,
+        "differences": [difference._asdict() for difference in again.differences],
+    }
+
+
+def rerun_text(again: Rerun, *, verbose: bool = False) -> str:
+    """A rerun as text; with ``verbose`` every difference."""
+    log, shown = again.log, len(again.differences) if verbose else SHOWN_DIFFERENCES
+    lines = [f"WARNING: {log.missing}"] if log.missing else []
+    counts = f"{again.decisions} decisions, {again.frames} sent frames, {again.events} events"
+    if again.reproduced:
+        lines.append(f"reproduced   each of {counts}")
+    else:
+        found = len(again.differences)
+        lines.append(f"NOT reproduced: {found} difference{'s' * (found != 1)} in {counts}")
+    if again.outcome is not None:
+        home = "home" if again.outcome.home else "not home"
+        lines.append(f"outcome      {again.outcome.fault.name if again.outcome.fault else 'DONE'}, {home}")
+    elif again.followed:
+        lines.append("outcome      none: the log ends before the run does, and was followed up to there")
+    else:
+        lines.append("outcome      none: the loop went another way than the log, the last difference says where")
+    for difference in again.differences[:shown]:
+        where = "" if difference.step is None else f"step {difference.step}, "
+        lines.append(f"  {where}{difference.what}: recorded {difference.recorded}, came {difference.came}")
+    if len(again.differences) > shown:
+        lines.append(f"  and {len(again.differences) - shown} more (-v shows all)")
+    if not again.reproduced:
+        names = ("tool", "python", "numpy", "onnxruntime")
+        made = ", ".join(f"{name} {log.run[name]}" for name in names if name in log.run)
+        lines.append(f"  the log was made with {made}: rounding may differ with others")
+    return "\n".join(lines)

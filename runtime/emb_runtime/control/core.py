@@ -7,6 +7,7 @@ A driver does all that blocks (:mod:`emb_runtime.control.loop`; a rerun plays a 
 * :meth:`Core.sent` records the cycle;
 * :meth:`Core.timeout` counts a period without a sample.
 
+What goes in is recorded before what comes of it: each frame with the time of its read, each other call as an input.
 What happened lies in :attr:`Core.records`, in its order, until the driver takes it. A fault is a value of the state,
 not an error. A command answers the newest sample, or none is sent: nothing repeats a command.
 """
@@ -23,8 +24,8 @@ from emb_runtime.control.monitors import check_bus
 from emb_runtime.control.phases import Phase, Silent, Stopping
 from emb_runtime.control.result import Outcome
 from emb_runtime.control.setup import Setup
-from emb_runtime.log.ring_buffer import FrameRecord, Record
-from emb_runtime.records import CurrentCommand, Frame, Reason, RunState
+from emb_runtime.log.ring_buffer import FrameRecord, InputRecord, Record
+from emb_runtime.records import Call, CurrentCommand, Frame, Reason, RunState
 from emb_runtime.safety.response_cause import cause
 from emb_runtime.safety.state_machine import Event, Fault, StopError
 
@@ -34,6 +35,7 @@ OVER: Final = RunState.OVER
 IN_CONTROL: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
 ENDING: Final = (RunState.STOPPING, OVER)
 PAIR: Final = Event.PAIR
+ANSWER: Final = int(Call.ANSWER)
 OF_RESPONSE: Final = (
     Fault.RESPONSE_LATE,
     Fault.SENSORS_CONTRADICT,
@@ -59,6 +61,7 @@ class Core:
         self._current_step = setup.layout.command.signal("Current").factor
         self._permitted = True
         self._detail = ""  # of the fault
+        self._answer_at = 0  # place of the newest answer in the records
 
     # --- what the driver asks ---------------------------------------------------------------------------------------
 
@@ -103,6 +106,7 @@ class Core:
 
     def begin(self, now_ns: int) -> None:
         """Begin to listen for the node."""
+        self._take_in(Call.BEGIN, now_ns)
         self._memory.read_ns = now_ns
         self._machine.handle_event(Event.PREPARED, now_ns)
 
@@ -116,7 +120,7 @@ class Core:
                 if self.state is not OVER:
                     self._take(frame)
             except StopError as stop:
-                self.fail(stop.fault, now_ns, stop.detail)
+                self._fail(stop, now_ns)
         if not self.running:
             return None
         try:
@@ -125,15 +129,20 @@ class Core:
                 return proposal
             self._follow_state()
         except StopError as ended:
-            self.fail(ended.fault, now_ns, ended.detail)
+            self._fail(ended, now_ns)
         return None
 
     def answer(self, proposal: Proposal, now_ns: int) -> Frame | None:
         """Frame that answers a sample, decided at a monotonic time [ns]; None if it is left to the node.
 
+        If there is one, :meth:`sent` comes next, before the driver takes the records.
+
         Raises:
             GuardRejectedError: the frame is not in the guard's contract.
         """
+        records = self._memory.records
+        self._answer_at = len(records)
+        records.append(tuple.__new__(InputRecord, (now_ns, ANSWER, 0, "", "")))
         sample, _, _, decision = proposal
         in_time = now_ns - sample.receive_time_ns <= self._latest_answer_ns  # else the sample that it answers is stale
         if not in_time or not self._may_answer(now_ns) or math.isnan(decision.current):
@@ -153,7 +162,9 @@ class Core:
         Where the bus had no room for it, ``lost`` says so, and the time is that of the decision: sent later, it would
         answer an old sample.
         """
-        memory = self._memory
+        memory, at = self._memory, self._answer_at
+        decide_ns = memory.records[at].time_ns
+        memory.records[at] = tuple.__new__(InputRecord, (decide_ns, ANSWER, 0 if lost else now_ns, "", lost))
         if lost:
             memory.counters.not_taken += 1
             self._machine.note(Fault.SEND_QUEUE_FULL, lost, now_ns)
@@ -164,26 +175,23 @@ class Core:
 
     def timeout(self, now_ns: int) -> None:
         """Count that no frame came until :attr:`deadline_ns`."""
+        self._take_in(Call.TIMEOUT, now_ns)
         self._memory.read_ns = now_ns
         try:
             self._phase.miss()
         except StopError as stop:
-            self.fail(stop.fault, now_ns, stop.detail)
-
-    def fail(self, fault: Fault, now_ns: int, detail: str = "") -> None:
-        """Latch a fault, and record it."""
-        self.latch(fault, now_ns)
-        self.explain(fault, detail)
+            self._fail(stop, now_ns)
 
     def latch(self, fault: Fault, now_ns: int) -> None:
-        """Latch a fault that was raised in the driver; :meth:`explain` records it, once a stop frame has left."""
+        """Latch a fault of the driver; :meth:`explain` records it, where it was raised once a stop frame has left."""
+        self._take_in(Call.LATCH, now_ns, fault.name)
         self._machine.latch(fault, now_ns)
         self._follow_state()
 
-    def explain(self, fault: Fault, detail: str) -> None:
+    def explain(self, fault: Fault, now_ns: int, detail: str = "") -> None:
         """Record a fault that was latched."""
-        self._detail = self._detail or detail
-        self._machine.explain(fault, detail)
+        self._take_in(Call.EXPLAIN, now_ns, fault.name, detail)
+        self._explain(fault, detail)
 
     def stop_frame(self, now_ns: int) -> Frame:
         """Next stop frame, checked by the guard at a monotonic time [ns].
@@ -191,11 +199,13 @@ class Core:
         Raises:
             GuardRejectedError: the frame is not in the guard's contract.
         """
+        self._take_in(Call.STOP_FRAME, now_ns)
         frame = self.setup.layout.encode_command(self.guard.next_counter, self.newest_counter, 0.0, False)
         return self.guard.check(frame, self.state, now_ns, now_ns)
 
     def end(self, now_ns: int) -> None:
         """Check how the node came to rest; the run is over."""
+        self._take_in(Call.END, now_ns)
         setup, self._memory.read_ns = self.setup, now_ns
         if self.fault in OF_RESPONSE:
             response = setup.sensors.response
@@ -205,11 +215,12 @@ class Core:
             try:
                 self._stopping.check_rest()
             except StopError as stop:
-                self.fail(stop.fault, now_ns, stop.detail)
+                self._fail(stop, now_ns)
         self._machine.handle_event(Event.STOPPED, now_ns)
 
     def note(self, time_ns: int, code: str, text: str) -> None:
-        """Record an event."""
+        """Record an event of the driver."""
+        self._take_in(Call.NOTE, time_ns, code, text)
         self._memory.note(time_ns, code, text)
 
     def outcome(self) -> Outcome:
@@ -287,7 +298,21 @@ class Core:
         try:
             self.setup.sensors.update_balance()
         except StopError as stop:
-            self.fail(stop.fault, self._memory.read_ns, stop.detail)
+            self._fail(stop, self._memory.read_ns)
+
+    def _take_in(self, call: Call, now_ns: int, code: str = "", text: str = "") -> None:
+        """Record a call of the driver."""
+        self._memory.records.append(InputRecord(now_ns, call, 0, code, text))
+
+    def _fail(self, stop: StopError, now_ns: int) -> None:
+        """Latch a fault that the core has found, and record it."""
+        self._machine.latch(stop.fault, now_ns)
+        self._follow_state()
+        self._explain(stop.fault, stop.detail)
+
+    def _explain(self, fault: Fault, detail: str) -> None:
+        self._detail = self._detail or detail
+        self._machine.explain(fault, detail)
 
     def _follow_state(self) -> None:
         """Enter the last phase, where an end or a fault leads to it."""

@@ -31,6 +31,7 @@ STOP_LISTEN_NS: Final = 1_500_000_000
 """Longest time that the node may take to come to rest after the stop frames [ns]: a mapped one has a second, and then
 lets its drive go."""
 MOST_FRAMES: Final = 64  # Of one read: a babbling node must not hold the loop
+STOP_FRAME_NOT_SENT: Final = "STOP_FRAME_NOT_SENT"  # Code of the event that says so
 HELD_RECORDS: Final = 4  # Without a command they wait for more, so that nothing is packed between a pair's two frames
 
 
@@ -82,7 +83,8 @@ class Loop:
         frames = self._read(core.deadline_ns)
         # Before the frames: the watchdog's stop frames come from another socket and look like a stranger's commands.
         if (fault := self._fault_from_outside(self._now_ns)) is not None:
-            core.fail(fault, self._now_ns)
+            core.latch(fault, self._now_ns)
+            core.explain(fault, self._now_ns)
         if not frames:
             core.timeout(self._now_ns)
         elif (proposal := core.take(frames, self._now_ns)) is not None:
@@ -156,7 +158,7 @@ class Loop:
         if frames:  # else there is nothing to stop, or the watchdog does
             self._send_stop_frame()
         if self._cause is not None:
-            core.explain(self._fault, detail_of(self._cause))
+            core.explain(self._fault, self._now_ns, detail_of(self._cause))
         self._record()
         for sent in range(1, frames + 1):
             # Each in a period of its own: what stood in the way of one may be gone for the next.
@@ -169,20 +171,22 @@ class Loop:
 
     def _end_stop(self) -> None:
         """Let the watchdog go, and watch the node come to rest."""
+        core = self.core
         self._attempt("DISARM_FAILED", self.pulse.disarm)
         self._attempt("CLOCK_FAILED", self._read_clock)
-        if self.core.fault is None and self._has_tripped():  # while the stop frames went out
-            self.core.fail(Fault.WATCHDOG_TRIPPED, self._now_ns)
+        if core.fault is None and self._has_tripped():  # while the stop frames went out
+            core.latch(Fault.WATCHDOG_TRIPPED, self._now_ns)
+            core.explain(Fault.WATCHDOG_TRIPPED, self._now_ns)
         self._listen(self._now_ns + STOP_LISTEN_NS, until_rest=True)
         self._attempt("CLOCK_FAILED", self._read_clock)
-        self.core.end(self._now_ns)
+        core.end(self._now_ns)
 
     def _send_stop_frame(self) -> None:
         """Send a stop frame. Whatever is broken, the next one is still tried."""
         self._attempt("CLOCK_FAILED", self._read_clock)
         self._attempt("BEAT_FAILED", lambda: self.pulse.beat(self._now_ns))
         core = self.core
-        self._attempt("STOP_FRAME_NOT_SENT", lambda: core.guard.send(core.stop_frame(self._now_ns)))
+        self._attempt(STOP_FRAME_NOT_SENT, lambda: core.guard.send(core.stop_frame(self._now_ns)))
 
     def _listen(self, deadline_ns: int, *, until_rest: bool = False) -> None:
         """Record what comes until a deadline, or until the node is at rest."""

@@ -37,6 +37,7 @@ from emb_runtime.log.ring_buffer import (
     EstimateRecord,
     EventRecord,
     FrameRecord,
+    InputRecord,
     LogHeader,
     Record,
     Ring,
@@ -95,8 +96,8 @@ class LogWriter:
             self._write_frame(record, log_time)
             return
         values: tuple[Any, ...] = record
-        if isinstance(record, EventRecord):
-            values = record.code, record.text
+        if isinstance(record, EventRecord | InputRecord):
+            values = record[1:]
         elif isinstance(record, EstimateRecord):
             values = record.step, *record.numbers
         topic, message = TOPICS[type(record)]

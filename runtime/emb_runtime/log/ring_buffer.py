@@ -168,6 +168,16 @@ class FrameRecord(NamedTuple):
         return self.frame.time_ns
 
 
+class InputRecord(NamedTuple):
+    """Input of the core beside frames: a call of its driver. It stands before the records of what came of it."""
+
+    time_ns: int  # That the driver gave; of an answer, when it was decided, monotonic [ns]
+    call: int  # :class:`emb_runtime.records.Call`
+    send_time_ns: int = 0  # Of an answer: when it had been handed to the bus, monotonic [ns]; 0 if it was not
+    code: str = ""  # Of a fault, or of an event
+    text: str = ""  # Description of it; of an answer, why the bus had no room
+
+
 class EventRecord(NamedTuple):
     """Something that the safety chain did."""
 
@@ -196,7 +206,7 @@ class EstimateRecord(NamedTuple):
     numbers: tuple[float, ...]  # See :attr:`emb_runtime.estimator.estimator.Estimator.estimate`
 
 
-Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | EstimateRecord
+Record = FrameRecord | CycleRecord | EventRecord | ClockRecord | EstimateRecord | InputRecord
 
 
 TOPICS: Final[dict[type[Any], tuple[str, str]]] = {
@@ -205,12 +215,13 @@ TOPICS: Final[dict[type[Any], tuple[str, str]]] = {
     EventRecord: ("/safety", "SafetyEvent"),
     ClockRecord: ("/clock", "ClockSample"),
     EstimateRecord: ("/estimate", "Estimate"),
+    InputRecord: ("/input", "Input"),
 }
 """Topic of each record, and its message in ``emb.proto``, whose fields are those of the record but its ``time_ns``. A
 record's place here is its type byte in the ring."""
 
 _MAX_CODE: Final = 40  # Bytes of an event's code
-_MAX_EVENT_TEXT: Final = MAX_PAYLOAD - _MAX_CODE - 16
+_MAX_TEXT: Final = MAX_PAYLOAD - _MAX_CODE - 16
 
 _ENCODER: Final = msgpack.Encoder(enc_hook=lambda number: number.item())  # of numpy
 _TYPE_BYTES: Final = {record: place for place, record in enumerate(TOPICS)}
@@ -219,9 +230,8 @@ _DECODERS: Final = tuple(map(msgpack.Decoder, TOPICS))
 
 def pack(record: Record) -> tuple[int, bytes]:
     """Type byte and payload of a record: MessagePack of its fields. Texts beyond the slot are cut."""
-    if isinstance(record, EventRecord):
-        time_ns, code, text = record
-        record = EventRecord(time_ns, _clipped(code, _MAX_CODE), _clipped(text, _MAX_EVENT_TEXT))
+    if isinstance(record, (EventRecord, InputRecord)) and (record.code or record.text):
+        record = record._replace(code=_clipped(record.code, _MAX_CODE), text=_clipped(record.text, _MAX_TEXT))
     return _TYPE_BYTES[type(record)], _ENCODER.encode(record)
 
 

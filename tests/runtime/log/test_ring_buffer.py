@@ -20,12 +20,13 @@ from emb_runtime.log.ring_buffer import (
     EstimateRecord,
     EventRecord,
     FrameRecord,
+    InputRecord,
     Record,
     Ring,
     pack,
     unpack,
 )
-from emb_runtime.records import CycleRecord, Frame
+from emb_runtime.records import Call, CycleRecord, Frame
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 
@@ -154,6 +155,7 @@ FLOATS = st.floats(allow_nan=False)
         st.tuples(*[INT64] * 7, *[FLOATS] * 6, *[INT64] * 5).map(CycleRecord._make),
         st.builds(EventRecord, INT64, st.text(max_size=10), st.text(max_size=40)),
         st.builds(ClockRecord, INT64, INT64),
+        st.builds(InputRecord, INT64, st.sampled_from(Call), INT64, st.text(max_size=10), st.text(max_size=40)),
         st.builds(EstimateRecord, INT64, INT64, st.tuples(*[FLOATS] * 24)),
     )
 )
@@ -178,6 +180,7 @@ def test_a_value_that_a_cycle_does_not_have_stays_nan_and_numbers_of_numpy_trave
 def test_texts_travel_or_are_cut_between_characters(when: int, code: str, text: str) -> None:
     packed = pack(EventRecord(when, code, text))
     assert len(packed[1]) <= MAX_PAYLOAD
+    assert len(pack(InputRecord(when, Call.EXPLAIN, 0, code, text))[1]) <= MAX_PAYLOAD
     event = unpack(*packed)
     assert isinstance(event, EventRecord)
     assert event.time_ns == when

@@ -10,7 +10,7 @@ from google.protobuf.descriptor import FieldDescriptor
 
 from emb_runtime.estimator.estimate import UNITS
 from emb_runtime.log import ring_buffer, topics
-from emb_runtime.records import CycleRecord, NodeState, Reason, RunState
+from emb_runtime.records import Call, CycleRecord, NodeState, Reason, RunState
 from tests.independent import DATABASE
 from tools.compile_proto import FOLDER, compile_proto
 
@@ -46,6 +46,9 @@ def test_a_cycle_has_the_fields_of_its_record() -> None:
 def test_the_other_records_have_as_many_values_as_their_messages_have_fields() -> None:
     assert tuple(fields("ClockSample")) == ring_buffer.ClockRecord._fields
     assert tuple(fields("SafetyEvent")) == ring_buffer.EventRecord._fields[1:]
+    assert tuple(fields("Input")) == ring_buffer.InputRecord._fields[1:]
+    calls = fields("Input")["call"].enum_type.values
+    assert {value.name: value.number for value in calls} == {call.name: call.value for call in Call}
     assert tuple(fields("Estimate")) == ("step", *UNITS, *(f"{name}_deviation" for name in UNITS))
     assert units("Estimate") == {**UNITS, **{f"{name}_deviation": unit for name, unit in UNITS.items()}}
 

@@ -1,0 +1,144 @@
+"""Inputs in the journal of a run: fed to a core of the same setup, they make every record of the run again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+
+from emb_runtime.can.transport import TransmitQueueFullError
+from emb_runtime.control.core import Core
+from emb_runtime.control.memory import Proposal
+from emb_runtime.log.ring_buffer import FrameRecord, InputRecord, Record
+from emb_runtime.records import Call, Frame
+from emb_runtime.safety.state_machine import Fault
+
+from tests.conftest import FunctionActor, Journal, Simulate, make_loop  # isort: skip
+from tests.benches import SENSOR_BENCH
+from tests.runtime.control.test_faults import INJECTIONS, Pulse
+
+STEPS = 200
+
+
+def records_of(core: Core, inputs: Iterable[Record], lost: list[str]) -> list[Record]:
+    """Records of a core that gets these inputs; ``lost`` holds why the bus has no room for the next frame."""
+    frames, found = list[Frame](), list[Record]()
+    proposal: Proposal | None = None
+    for record in inputs:
+        if isinstance(record, FrameRecord):
+            frames.append(record.frame)
+            if record.read_ns:
+                proposal = taken(core, frames, record.read_ns)
+                frames = []
+        elif isinstance(record, InputRecord):
+            call(core, record, proposal, lost)
+        found += core.records
+        core.records.clear()
+    return found
+
+
+def taken(core: Core, frames: list[Frame], read_ns: int) -> Proposal | None:
+    try:
+        return core.take(frames, read_ns)
+    except ZeroDivisionError:  # of the actor
+        return None
+
+
+def call(core: Core, record: InputRecord, proposal: Proposal | None, lost: list[str]) -> None:
+    """Make a call of the driver again."""
+    time_ns, number, send_ns, code, text = record
+    match number:
+        case Call.BEGIN:
+            core.begin(time_ns)
+        case Call.TIMEOUT:
+            core.timeout(time_ns)
+        case Call.ANSWER:
+            assert proposal is not None
+            frame = core.answer(proposal, time_ns)
+            if frame is not None and (send_ns or text):
+                lost[:] = [text] if text else []
+                try:
+                    core.guard.send(frame)
+                except TransmitQueueFullError:
+                    core.sent(proposal, time_ns, text)
+                else:
+                    core.sent(proposal, send_ns)
+        case Call.LATCH:
+            core.latch(Fault[code], time_ns)
+        case Call.EXPLAIN:
+            core.explain(Fault[code], time_ns, text)
+        case Call.STOP_FRAME:
+            core.stop_frame(time_ns)
+        case Call.NOTE:
+            core.note(time_ns, code, text)
+        case Call.END:
+            core.end(time_ns)
+        case _:
+            raise AssertionError(record)
+
+
+def assert_inputs_suffice(journal: Journal, law: Any, steps: int, on_bench: Any = SENSOR_BENCH, **core: Any) -> None:
+    lost: list[str] = []
+
+    def send(_frame: Frame) -> None:
+        if lost:
+            raise TransmitQueueFullError(lost.pop())
+
+    driven: dict[str, Any] = {"send": send, "receive": None, "now_ns": None, "push": None}
+    loop = make_loop(on_bench, FunctionActor(law), steps, **driven, **core)
+    inputs = [record for record in journal.records if isinstance(record, FrameRecord | InputRecord)]
+    again = records_of(loop.core, inputs, lost)
+    assert list(map(repr, again)) == list(map(repr, journal.records))  # repr, because NaN is not equal to NaN
+
+
+@pytest.mark.parametrize("fault", sorted(INJECTIONS.keys() - {Fault.GUARD_REJECTED}), ids=lambda fault: fault.name)
+def test_the_inputs_of_a_run_make_each_of_its_records_again(fault: Fault, simulate: Simulate) -> None:
+    given: dict[str, Any] = {}
+    journal = Journal()
+
+    def record(law: Any = lambda *_: 6.0, **arguments: Any) -> Any:
+        given.update(law=law, **arguments)
+        return simulate(law, journal=journal, **arguments)
+
+    run = INJECTIONS[fault](record)
+    core = {"homing": True} if given.get("homing") else {}
+    assert_inputs_suffice(journal, given["law"], given.get("steps", run.bench.timing.horizon), run.bench, **core)
+
+
+def test_what_the_driver_did_is_in_the_journal_call_by_call(simulate: Simulate) -> None:
+    class Broken(Pulse):
+        """A watchdog that cannot be let go."""
+
+        def disarm(self) -> None:
+            raise OSError("broken pipe")
+
+    journal = Journal()
+    run = simulate(lambda *_: 3.0, steps=STEPS, journal=journal, pulse=Broken())
+    inputs = [record for record in journal.records if isinstance(record, InputRecord)]
+    assert [Call(record.call) for record in inputs] == [
+        *(Call.BEGIN, *[Call.ANSWER] * STEPS),
+        *(Call.STOP_FRAME, Call.STOP_FRAME, Call.STOP_FRAME, Call.NOTE, Call.END),
+    ]
+    answers = [(record.time_ns, record.send_time_ns) for record in inputs if record.call == Call.ANSWER]
+    assert answers == [(cycle.decide_time_ns, cycle.send_time_ns) for cycle in journal.cycles[:STEPS]]
+    assert (inputs[-2].code, inputs[-2].text) == ("DISARM_FAILED", "OSError: broken pipe")
+    assert run.outcome.fault is None
+
+
+def test_an_answer_that_was_lost_says_why_and_one_that_was_left_was_not_sent(simulate: Simulate) -> None:
+    for fault, texts in ((Fault.SEND_QUEUE_FULL, 3), (Fault.PERMISSION_LOST, 0)):
+        run = INJECTIONS[fault](simulate)
+        inputs = [record for record in run.journal.records if isinstance(record, InputRecord)]
+        unsent = [record for record in inputs if record.call == Call.ANSWER and not record.send_time_ns]
+        assert len(unsent) == run.outcome.counters.unanswered > 0
+        assert sum(bool(record.text) for record in unsent) == texts
+
+
+def test_a_fault_is_latched_before_the_first_stop_frame_and_explained_after_it(simulate: Simulate) -> None:
+    journal = INJECTIONS[Fault.INTERNAL](simulate).journal
+    inputs = [record for record in journal.records if isinstance(record, InputRecord)]
+    at = next(n for n, record in enumerate(inputs) if record.call == Call.LATCH)
+    assert [Call(record.call).name for record in inputs[at : at + 3]] == ["LATCH", "STOP_FRAME", "EXPLAIN"]
+    assert inputs[at].code == inputs[at + 2].code == "INTERNAL"
+    assert inputs[at + 2].text.startswith("ZeroDivisionError: ")
