@@ -146,7 +146,8 @@ def _best_table(
 ) -> Found:
     """The best coarse design for a criterion without a slope to climb, within the limits between samples too."""
     seeds = np.random.SeedSequence(seed).spawn(starts + len(warm))
-    pieces = list(zip(range(len(seeds)), seeds, [None] * starts + list(warm), strict=True))
+    begins: list[Floats | None] = [*[None] * starts, *warm]
+    pieces = list(zip(range(len(seeds)), seeds, begins, strict=True))
     designs: list[tuple[Design, Floats]] = []
     interrupted, done = False, 0
     try:
