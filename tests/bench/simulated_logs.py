@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from emb_runtime.can.messages import load_layout
-from emb_runtime.cli.summary import trailer
+from emb_runtime.cli.documents import trailer
 from emb_runtime.log.recorder_process import LogWriter
 from emb_runtime.log.ring_buffer import (
     Attachment,

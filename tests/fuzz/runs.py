@@ -229,7 +229,7 @@ def judge_end(outcome: Outcome, bus: HostileBus, guard: Guard) -> None:
     demand(guard.rejected == 0 and outcome.fault is not Fault.GUARD_REJECTED, "refused:", outcome.detail)
     judge = bus.judge
     demand(judge.enabled == 0 or judge.stops > 0 or bus.broken, "no stop frame:", outcome)
-    demand(outcome.armed or judge.enabled + judge.stops == 0, "sent before it was armed:", outcome)
+    demand(outcome.end is not None or judge.enabled + judge.stops == 0, "sent before it was armed:", outcome)
     node = bus.node
     inside = node.angle_range[0] >= -10.0 and node.angle_range[1] <= 100.0 and node.top_speed <= 500.0
     demand(inside or bus.forged, "limits passed:", node.angle_range, node.top_speed)

@@ -89,7 +89,7 @@ def main() -> int:
             result, code = ("done", 0) if fault is None else (fault.name, FAULTS[fault].exit_code)
             print(
                 f"| {kind} | {size_of(lie)} | {result} | {code} | {'-' if seen.detected is None else seen.detected} | "
-                f"{seen.outcome.unexplained:.1f} | {node.lowest:.1f} .. {node.highest:.1f} | {node.fastest:.0f} |",
+                f"{seen.outcome.unexplained[0]:.1f} | {node.lowest:.1f} .. {node.highest:.1f} | {node.fastest:.0f} |",
                 flush=True,
             )
             if kind == "honest":

@@ -10,7 +10,7 @@ from emb_bench.config.bench import load_bench
 from emb_bench.documents import to_json
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError, needs
-from emb_runtime.system.terminal import Parser, as_json, complain, mention, show
+from emb_runtime.system.terminal import Parser, as_json, complain, is_interactive, mention, show
 
 EPILOG = """\
 Each step is a run of emb-run behind shield, guard and watchdog, and uses the results of the steps before. Its policy
@@ -83,7 +83,7 @@ def main(argv: list[str] | None = None) -> int:
             from emb_bench.commission.commissioning import Commissioning, emb_run
         each = options(args)
         open_transport(args.iface, sheet, ())[0].close()  # what is wrong with it is said first, and before any step
-        if "--confirm" in each and (sys.stdin is None or not sys.stdin.isatty()):
+        if "--confirm" in each and not is_interactive():
             raise UsageError("--confirm: expected a terminal on standard input; --yes runs without asking")
         try:
             args.folder.mkdir(parents=True, exist_ok=True)

@@ -6,8 +6,8 @@ import math
 import statistics
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from emb_runtime.can.codec import worst_bits
 from emb_runtime.can.messages import Layout, StatusFrame
@@ -31,45 +31,81 @@ def planned_load(bench: Bench, layout: Layout, drive: DriveMapping | None) -> fl
 
 
 @dataclass(frozen=True)
-class BusStatistics:
-    """Statistics of what was on the bus."""
+class Traffic:
+    """Frames that were on the bus."""
 
     duration: float  # Time from the first frame to the last [s]
     frames: Mapping[str, int]  # Frames by message name
     rates: Mapping[str, float]  # Mean rate by message name, of those seen at least twice [1/s]
     others: int  # Data and remote frames that are none of the DBC's
+    load: float
+    """Share of the bus that all frames took, with every stuff bit that there can be; of a mapped drive's its own."""
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """Frames that no undisturbed bus has."""
+
     rejections: Mapping[str, Mapping[str, int]]  # Rejections as in :class:`~emb_runtime.control.result.Outcome`
     distrusted: bool  # True after so many of them that a run would have been stopped
     bus_errors: Mapping[str, int]  # Bus errors as in :class:`~emb_runtime.control.result.Outcome`
     dropped: int  # Frames that the kernel dropped
     commanded: bool  # Somebody sends commands to the node
-    status: StatusFrame | None  # The node's latest
-    sample: SensorSample | None  # The newest valid one
+    pairing_problem: str  # :attr:`~emb_runtime.can.receiver.Reception.pairing_problem`
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Times and scatter of the sensor pairs."""
+
     pairs: int  # Valid pairs
     missing: int  # Pairs that did not come, by the node's own clock
     period: float  # Median time between samples by the node's own clock [s]; NaN with fewer than two
     resting: int  # Number of the newest pairs, all of an idle node, that the next two are of
     angle_scatter: float  # Standard deviation of the angles; NaN for fewer than two [rad]
     velocity_scatter: float  # The same of the velocities [rad/s]
-    load: float
-    """Share of the bus that all frames took, with every stuff bit that there can be; of a mapped drive's its own."""
-    pairing_problem: str = ""  # :attr:`~emb_runtime.can.receiver.Reception.pairing_problem`
+
+
+@dataclass(frozen=True)
+class BusStatistics:
+    """Statistics of what was on the bus."""
+
+    traffic: Traffic
+    disturbances: Disturbances
+    sampling: Sampling
+    status: StatusFrame | None  # The node's latest
+    sample: SensorSample | None  # The newest valid one
+
+    def document(self) -> dict[str, Any]:
+        """The statistics as plain data."""
+        node = {
+            name: record and {key: getattr(value, "name", value) for key, value in record._asdict().items()}
+            for name, record in (("status", self.status), ("sample", self.sample))
+        }
+        return asdict(self.traffic) | asdict(self.disturbances) | asdict(self.sampling) | node
+
+
+class Seen(NamedTuple):
+    """Frames of one message that were seen."""
+
+    frames: int
+    first_ns: int  # Monotonic [ns]
+    last_ns: int
+
+    def rate(self) -> float:
+        """Mean rate of two frames or more [1/s]."""
+        return (self.frames - 1) / (self.last_ns - self.first_ns) * 1e9
 
 
 class BusMonitor:
     """Monitor of a bus: takes its frames, and counts. Each rejected frame is told with the reason."""
 
     def __init__(self, layout: Layout, bench: Bench, on_rejected: Callable[[Frame, str], None]) -> None:
+        self._bench = bench
         self._layout = layout
         self._names = {message.identifier: message.name for message in layout.known}
-        self._bits = {message.name: message.worst_bits for message in layout.known}
-        self._bitrate = bench.can.bitrate
-        self._period_ns = bench.timing.sample_time_ns
         self._reception = Reception(layout, bench, on_rejected)
-        self._frames: dict[str, int] = {}
-        self._spans_ns: dict[str, tuple[int, int]] = {}
-        self._others = 0
-        self._first_ns = self._last_ns = 0
+        self._seen: dict[str | None, Seen] = {}  # By message name; None for those that are none of the DBC's
         self._periods_ns: deque[int] = deque(maxlen=RECENT_PAIRS)
         self._at_rest: deque[tuple[float, float]] = deque(maxlen=RECENT_PAIRS)
         self._missing = 0
@@ -84,13 +120,9 @@ class BusMonitor:
     def take(self, frame: Frame) -> SensorSample | None:
         """Take one frame; gives a sample when it completes a valid pair."""
         if not frame.error:
-            self._first_ns, self._last_ns = self._first_ns or frame.time_ns, max(self._last_ns, frame.time_ns)
             name = None if frame.extended else self._names.get(frame.identifier)
-            if name is None:
-                self._others += 1
-            else:
-                self._frames[name] = self._frames.get(name, 0) + 1
-                self._spans_ns[name] = self._spans_ns.get(name, (frame.time_ns,))[0], frame.time_ns
+            frames, first_ns, last_ns = self._seen.get(name, (0, frame.time_ns, frame.time_ns))
+            self._seen[name] = Seen(frames + 1, first_ns, max(last_ns, frame.time_ns))
         sample = self._reception.take(frame)
         if sample is not None:
             self._follow(sample)
@@ -103,33 +135,39 @@ class BusMonitor:
 
     def statistics(self) -> BusStatistics:
         """Statistics so far."""
-        reception, duration = self._reception, (self._last_ns - self._first_ns) * 1e-9
-        bits = sum(self._bits[name] * count for name, count in self._frames.items()) + OTHERS_BITS * self._others
-        angles, velocities = zip(*self._at_rest, strict=True) if self._at_rest else ((), ())
+        reception, seen = self._reception, self._seen
+        spans = seen.values()
+        duration = (max(s.last_ns for s in spans) - min(s.first_ns for s in spans)) * 1e-9 if seen else 0.0
+        known = {name: s for name, s in seen.items() if name is not None}
+        frames, others = {name: s.frames for name, s in known.items()}, seen[None].frames if None in seen else 0
+        bits = OTHERS_BITS * others + sum(m.worst_bits * frames.get(m.name, 0) for m in self._layout.known)
+        resting = len(self._at_rest)
+        scatter = map(statistics.stdev, zip(*self._at_rest, strict=True)) if resting > 1 else (math.nan, math.nan)
         return BusStatistics(
-            duration=duration,
-            frames=dict(self._frames),
-            rates={
-                name: (self._frames[name] - 1) / (last - first) * 1e9
-                for name, (first, last) in self._spans_ns.items()
-                if last > first
-            },
-            others=self._others,
-            rejections=reception.rejections(),
-            distrusted=reception.too_many_rejected,
-            bus_errors=dict(reception.bus_errors),
-            dropped=reception.dropped,
-            commanded=reception.foreign_command,
+            traffic=Traffic(
+                duration=duration,
+                frames=frames,
+                rates={name: s.rate() for name, s in known.items() if s.last_ns > s.first_ns},
+                others=others,
+                load=bits / duration / self._bench.can.bitrate if duration > 0.0 else 0.0,
+            ),
+            disturbances=Disturbances(
+                rejections=reception.rejections(),
+                distrusted=reception.too_many_rejected,
+                bus_errors=dict(reception.bus_errors),
+                dropped=reception.dropped,
+                commanded=reception.foreign_command,
+                pairing_problem=reception.pairing_problem,
+            ),
+            sampling=Sampling(
+                self.pairs,
+                self._missing,
+                statistics.median(self._periods_ns) * 1e-9 if self._periods_ns else math.nan,
+                resting,
+                *scatter,
+            ),
             status=reception.status,
             sample=self.sample,
-            pairs=self.pairs,
-            missing=self._missing,
-            period=statistics.median(self._periods_ns) * 1e-9 if self._periods_ns else float("nan"),
-            resting=len(self._at_rest),
-            angle_scatter=statistics.stdev(angles) if len(angles) > 1 else math.nan,
-            velocity_scatter=statistics.stdev(velocities) if len(velocities) > 1 else math.nan,
-            pairing_problem=reception.pairing_problem,
-            load=bits / duration / self._bitrate if duration > 0.0 else 0.0,
         )
 
     def _follow(self, sample: SensorSample) -> None:
@@ -142,7 +180,7 @@ class BusMonitor:
         if before is not None:
             elapsed_ns = sample.device_time_ns - before.device_time_ns
             self._periods_ns.append(elapsed_ns)
-            self._missing += max(0, round(elapsed_ns / self._period_ns) - 1)
+            self._missing += max(0, round(elapsed_ns / self._bench.timing.sample_time_ns) - 1)
 
 
 def is_alarming(frame: Frame, layout: Layout) -> bool:

@@ -7,12 +7,12 @@ from typing import Any
 
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import StopReason
-from emb_runtime.cli import summary
 from emb_runtime.cli.bus_monitor import BusStatistics
-from emb_runtime.cli.options import Plan
+from emb_runtime.cli.documents import refusal
+from emb_runtime.cli.plan import Plan
 from emb_runtime.cli.session import Bus, Console, conduct, observe
 from emb_runtime.control.result import may_go_home
-from emb_runtime.control.start_conditions import Bounds, StartConditions
+from emb_runtime.control.start_conditions import Bounds
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError
 from emb_runtime.records import HOMING_LOG, RunType
 
@@ -23,8 +23,8 @@ def experiment(plan: Plan, path: Path, console: Console) -> tuple[dict[str, Any]
     The log must not exist; those of the ways home are called alike.
 
     Returns:
-        The document, see :func:`emb_runtime.cli.summary.document`; of the way home, where that failed before the
-        experiment. And the exit code.
+        The document, see :meth:`emb_runtime.cli.documents.RunResult.document`; of the way home, where that failed
+        before the experiment. And the exit code.
 
     Raises:
         RefusedError: the pre-flight or the operator refused; nothing was sent.
@@ -36,28 +36,28 @@ def experiment(plan: Plan, path: Path, console: Console) -> tuple[dict[str, Any]
     identifiers = tuple(message.identifier for message in plan.layout.known)
     transport, clock = open_transport(plan.iface, plan.bench, identifiers)
     bus = Bus(plan.iface, transport, clock)
+    assert plan.experiment is not None
+    home = plan.experiment.home
     try:
         homing: dict[str, Any] = {}
-        if plan.home and _is_away(plan, _observe(plan, bus, console)):
+        if home and _is_away(plan, _observe(plan, bus, console)):
             way = conduct(plan, bus, RunType.HOMING, _beside(path, "before"), console)
-            homing["before"] = summary.document(plan, plan.iface, way)
+            homing["before"] = way.document()
             if way.exit_code != EXIT_DONE:
                 return homing["before"], way.exit_code
         ran = conduct(plan, bus, RunType.EXPERIMENT, path, console)
-        document = summary.document(plan, plan.iface, ran) | {"homing": homing}
-        exit_code: int = document["exit_code"]
-        if plan.home and may_go_home(ran.outcome) and not console.stop_requested():
+        exit_code = ran.exit_code
+        if home and may_go_home(ran.outcome) and not console.stop_requested():
             way_code = _go_home(plan, bus, path, console, homing)
             exit_code = exit_code or way_code
     finally:
         transport.close()
-    return document, exit_code
+    return ran.document() | {"homing": homing}, exit_code
 
 
 def _observe(plan: Plan, bus: Bus, console: Console) -> BusStatistics:
     """Bus statistics now, wherever the brake is."""
-    start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=True)
-    return observe(plan, bus, start_conditions, console.stop_requested)
+    return observe(plan, bus, plan.start_conditions(anywhere=True), console.stop_requested)
 
 
 def _is_away(plan: Plan, heard: BusStatistics) -> bool:
@@ -76,9 +76,9 @@ def _go_home(plan: Plan, bus: Bus, path: Path, console: Console, homing: dict[st
             return EXIT_DONE
         way = conduct(plan, bus, RunType.HOMING, _beside(path, "after"), console)
     except EmbError as err:
-        homing["after"] = summary.refusal(err, bus.iface)
+        homing["after"] = refusal(err, bus.iface)
         return err.exit_code
-    homing["after"] = summary.document(plan, bus.iface, way)
+    homing["after"] = way.document()
     return way.exit_code
 
 

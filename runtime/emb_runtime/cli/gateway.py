@@ -22,7 +22,16 @@ from emb_runtime.drives.node import report
 from emb_runtime.errors import EXIT_CHECK_FAILED, EXIT_DONE, EmbError, SafetyStopError, UsageError
 from emb_runtime.safety.end_stop import released_speed
 from emb_runtime.system import realtime
-from emb_runtime.system.terminal import ARM_QUESTION, Parser, StopRequest, as_json, complain, confirmed, mention, show
+from emb_runtime.system.terminal import (
+    Parser,
+    StopRequest,
+    agreed_to_arm,
+    as_json,
+    complain,
+    is_interactive,
+    mention,
+    show,
+)
 
 PRIORITY = realtime.PRIORITY + 5  # Above the loop's, below its watchdog's
 LOOK = 0.05  # Time between two looks at the keyboard [s]
@@ -150,9 +159,9 @@ def _description(mapping: Mapping, bench: str, identity: int, speed: float, seri
 
 
 def _may_arm(agreed: bool, stop_requested: Callable[[], bool]) -> bool:
-    if agreed or sys.stdin is None or not sys.stdin.isatty():
+    if agreed or not is_interactive():
         return True
-    return confirmed(ARM_QUESTION, stop_requested, lambda: time.sleep(LOOK))
+    return agreed_to_arm(stop_requested, lambda: time.sleep(LOOK))
 
 
 if __name__ == "__main__":

@@ -14,15 +14,17 @@ from pathlib import Path
 
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.cli import summary
+from emb_runtime.cli.documents import refusal
 from emb_runtime.cli.experiment import experiment
-from emb_runtime.cli.options import Plan, Stage, log_folder, log_path, names_a_file, parser, prepare
-from emb_runtime.cli.preflight import CheckResult, RefusedError, Verdict, table
+from emb_runtime.cli.options import log_folder, log_path, names_a_file, parser, prepare
+from emb_runtime.cli.plan import Output, Plan, Stage
+from emb_runtime.cli.preflight import Check, RefusedError, table
 from emb_runtime.cli.session import Bus, Console, listen_only
 from emb_runtime.config.bench import shipped_bench_text
 from emb_runtime.errors import EXIT_DONE, BenchFileError, EmbError, UsageError
 from emb_runtime.records import LISTEN_ONLY_LOG
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
-from emb_runtime.system.terminal import ARM_QUESTION, StopRequest, as_json, complain, confirmed, mention, show
+from emb_runtime.system.terminal import StopRequest, agreed_to_arm, as_json, complain, is_interactive, mention, show
 
 LISTEN_NS = 50_000_000  # Time between two looks at the keyboard [ns]
 VIEWERS = "emb_runtime.viewers"  # Entry-point group of the modules that show a run: ``live``, and its ``report``
@@ -37,17 +39,15 @@ class Operator(Console):
         self.stop_requested = stop_requested
         self._seen = self._agreed = False
 
-    def show(self, lines: tuple[CheckResult, ...], bus: Bus) -> None:
+    def show(self, checks: tuple[Check, ...], bus: Bus) -> None:
         """Show the checks that are not ok, below the stage: it says what they are of. All where they are agreed to."""
-        whole = not self._seen and (self._plan.verbose or self._asks(bus))
-        shown = [line for line in lines if whole or line.verdict is not Verdict.OK]
-        if shown and not whole:
-            shown = [lines[0], *(line for line in shown if line is not lines[0])]
-        quiet = self._plan.json and not self._asks(bus)
-        if shown and not quiet:
-            mention(table(shown))
-        elif not self._seen and not quiet and not self._plan.quiet:
-            mention(f"pre-flight: {len(lines)} checks, all ok (-v shows them)")
+        output, asks = self._plan.output, self._asks(bus)
+        full = not self._seen and (output.verbose or asks)
+        silent = output.json and not asks
+        if not silent and (full or not all(check.ok for check in checks)):
+            mention(table([checks[0], *(check for check in checks[1:] if full or not check.ok)]))
+        elif not self._seen and not silent and not output.quiet:
+            mention(f"pre-flight: {len(checks)} checks, all ok (-v shows them)")
         self._seen = True
 
     def may_arm(self, bus: Bus) -> bool:
@@ -57,9 +57,8 @@ class Operator(Console):
         return self._agreed
 
     def _asks(self, bus: Bus) -> bool:
-        if self._plan.confirm is None:
-            return not bus.in_process and sys.stdin is not None and sys.stdin.isatty()
-        return self._plan.confirm
+        confirm = self._plan.precautions.confirm
+        return not bus.in_process and is_interactive() if confirm is None else confirm
 
     def _ask(self, bus: Bus) -> bool:
         def wait() -> None:
@@ -70,7 +69,7 @@ class Operator(Console):
                 if frame is not None:
                     bus.pass_over(frame, self._plan.layout)
 
-        return confirmed(ARM_QUESTION, self.stop_requested, wait)
+        return agreed_to_arm(self.stop_requested, wait)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -82,46 +81,45 @@ def main(argv: list[str] | None = None) -> int:
         plan = prepare(args)
         console = Operator(plan, StopRequest())
         try:
-            with log_folder(plan.log), shown(plan, console.stop_requested):
+            with log_folder(plan.output.log), live_view(plan, console.stop_requested):
                 if plan.stage is Stage.READ_ONLY:
                     return _read(plan, console)
                 return _experiment(plan, console)
         except RefusedError as err:
-            if plan.json:
-                show(as_json(summary.refusal(err, plan.iface)))
+            if plan.output.json:
+                show(as_json(refusal(err, plan.iface)))
             raise
     except EmbError as err:
         return complain("emb-run", err)
 
 
 @contextmanager
-def shown(plan: Plan, stop_requested: Callable[[], bool]) -> Iterator[None]:
+def live_view(plan: Plan, stop_requested: Callable[[], bool]) -> Iterator[None]:
     """While this lasts, another process shows the growing logs of a plan, where ``--live`` asks for that.
 
     On a terminal the page stays afterwards, until Ctrl-C: a run is over before a browser has been opened.
     """
-    if plan.live is None:
+    output, log = plan.output, plan.output.log
+    if output.live is None:
         yield
         return
     if not HAS_CHILD_PROCESSES:
         raise UsageError("--live: needs Linux; emb-replay live shows a run from another terminal")
-    entries = list(metadata.entry_points(group=VIEWERS, name="live"))
-    if not entries:
-        raise UsageError("--live: no module is installed that shows a run; emb_bench has one")
-    one = names_a_file(plan.log)
+    module = _viewer("live", "shows a run")
+    one = names_a_file(log)
     document = {
-        "folder": str(plan.log.parent if one else plan.log),
-        "pattern": f"{glob.escape(plan.log.stem)}*{glob.escape(plan.log.suffix)}" if one else "*.mcap",
-        "port": plan.live,
+        "folder": str(log.parent if one else log),
+        "pattern": f"{glob.escape(log.stem)}*{glob.escape(log.suffix)}" if one else "*.mcap",
+        "port": output.live,
     }
     try:
-        child = Child("live", entries[0].value, document, VIEWER_TIMEOUT)
+        child = Child("live", module, document, VIEWER_TIMEOUT)
     except OSError as err:
         raise UsageError(f"--live: {err}") from err
     try:
         page, addresses = child.ready
         mention(f"live at {addresses}")
-        if plan.open:
+        if output.open:
             _open(page)
         yield
         if sys.stdout is not None and sys.stdout.isatty() and not stop_requested():
@@ -140,44 +138,51 @@ def _open(page: str) -> None:
 
 
 def _experiment(plan: Plan, console: Console) -> int:
-    reporter = None if plan.report is None else _reporter(plan.report)
-    document, exit_code = experiment(plan, log_path(plan.log), console)
-    text = as_json(document) if plan.json else summary.text(document, plan.verbose)
-    show(text.partition("\n")[0] if plan.quiet else text)
-    if reporter is not None and document["log"] is not None:
-        reported = _report(reporter, document["log"], plan)
+    output = plan.output
+    reporter = None if output.report is None else _reporter(output.report)
+    document, exit_code = experiment(plan, log_path(output.log), console)
+    text = as_json(document) if output.json else summary.text(document, output.verbose)
+    show(text.partition("\n")[0] if output.quiet else text)
+    if reporter is not None:
+        reported = _report(reporter, document["log"], output)
         return exit_code or reported
     return exit_code
 
 
 def _reporter(page: Path) -> str:
     """Module whose command ``report`` writes a page; asked for before the run."""
-    entries = list(metadata.entry_points(group=VIEWERS, name="report"))
-    if not entries:
-        raise UsageError("--report: no module is installed that writes a page; emb_bench has one")
+    module = _viewer("report", "writes a page")
     if page.suffix not in (".html", ".htm"):
         raise UsageError(f"--report {page}: expected a name that ends in .html or .htm")
     if not page.absolute().parent.is_dir():
         raise UsageError(f"--report: {page.absolute().parent} is no folder")
     if page.is_dir() or not os.access(page.absolute().parent, os.W_OK):
         raise UsageError(f"--report {page}: expected a file that can be written")
+    return module
+
+
+def _viewer(name: str, does: str) -> str:
+    """Module behind an entry point of :data:`VIEWERS`."""
+    entries = list(metadata.entry_points(group=VIEWERS, name=name))
+    if not entries:
+        raise UsageError(f"--{name}: no module is installed that {does}; emb_bench has one")
     return entries[0].value
 
 
-def _report(module: str, log: str, plan: Plan) -> int:
+def _report(module: str, log: str, output: Output) -> int:
     """Have a process without the real-time settings of this one estimate, and write the page; its exit code."""
-    command = [sys.executable, "-P", "-m", module, "report", log, "--output", str(plan.report)]
-    return subprocess.run(command, stdout=sys.stderr if plan.json else None, check=False).returncode
+    command = [sys.executable, "-P", "-m", module, "report", log, "--output", str(output.report)]
+    return subprocess.run(command, stdout=sys.stderr if output.json else None, check=False).returncode
 
 
 def _read(plan: Plan, console: Console) -> int:
-    path = log_path(plan.log, LISTEN_ONLY_LOG)
+    path = log_path(plan.output.log, LISTEN_ONLY_LOG)
     transport, clock = open_transport(plan.iface, plan.bench)
     try:
-        document, lines = listen_only(plan, Bus(plan.iface, transport, clock), path, console)
+        document, checks = listen_only(plan, Bus(plan.iface, transport, clock), path, console)
     finally:
         transport.close()
-    show(as_json(document) if plan.json else summary.listen_text(document, lines))
+    show(as_json(document) if plan.output.json else summary.listen_text(document, checks))
     exit_code: int = document["exit_code"]
     return exit_code
 

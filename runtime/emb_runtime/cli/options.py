@@ -4,30 +4,25 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from emb_runtime.can.messages import Layout, load_layout
+from emb_runtime.can.messages import load_layout
+from emb_runtime.cli.plan import Experiment, Label, MappedDrive, Output, Plan, Precautions, Stage
 from emb_runtime.config.bench import CEILING_CURRENT, Bench, load_bench
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
 from emb_runtime.errors import BenchFileError, PolicyRefusedError, UsageError
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
-from emb_runtime.safety.shield_design import ShieldLaw, make_law
-from emb_runtime.system.terminal import Parser, one_line
-
-if TYPE_CHECKING:
-    from emb_runtime.drives.mapping import Mapping
+from emb_runtime.safety.shield_design import make_law
+from emb_runtime.system.terminal import Parser, is_interactive, one_line
 
 LONGEST_READING = 86_400.0  # Longest ``--read-only`` [s]
 LIVE_PORT = 8765  # Port that viewers propose
+LONGEST_LABEL = 200  # Characters of an operator's name or a serial number
 QUICK_GOAL = "1.2%"  # Repeatability of each parameter at which an experiment with ``--quick`` ends
 
 DESCRIPTION = """\
@@ -82,58 +77,6 @@ def _place(text: str) -> Path:
     return Path(text)
 
 
-LONGEST_LABEL = 200  # Characters of an operator's name or a serial number
-
-
-class Stage(StrEnum):
-    """Stages in which a bench is taken into service: how much of the chain may act."""
-
-    READ_ONLY = "read-only"
-    ZERO = "zero"
-    LIMITED = "limited"
-    FULL = "full"
-
-
-@dataclass(frozen=True)
-class MappedDrive:
-    """A drive with a DBC of its own, behind the node."""
-
-    mapping: Mapping
-    bus: str  # Its own bus, whose frames are recorded; "" in lock-step
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Plan of a run, checked as far as that is possible without a bus."""
-
-    iface: str
-    bench: Bench
-    layout: Layout
-    law: ShieldLaw
-    policy: Policy | None  # None where nothing is sent and none was named
-    steps: int  # Samples of one experiment
-    listen: float  # Time to listen with ``--read-only`` [s]
-    stage: Stage
-    limit: float  # Largest current that may leave [A]
-    stop_condition: StopCondition | None  # Precision of the estimate at which an experiment ends early
-    home: bool
-    log: Path  # Log path as given by the user: a file, or a folder
-    real_time: bool
-    watchdog: bool
-    confirm: bool | None  # Ask before anything is armed; None where the bus is real and there is somebody to ask
-    live: int | None  # Port at which the run is shown
-    open: bool  # A browser is started that shows it
-    json: bool
-    verbose: bool
-    quiet: bool  # The verdict only
-    strict: bool = False  # An estimate outside the ranges is no success
-    report: Path | None = None  # Page to write after the run
-    drive: MappedDrive | None = None  # The node is its gateway
-    operator: str = ""  # Name of who makes the run; empty if that was not said
-    serial: str = ""  # Serial number of the device; empty if that was not said
-    typed: Sequence[str] = ()  # Arguments as they were typed
-
-
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = Parser(
@@ -143,100 +86,70 @@ def parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    # fmt: off
     what = p.add_argument_group("what is run")
-    what.add_argument(
-        "--iface", default="sim", metavar="NAME",
-        help="SocketCAN interface (can0, vcan0), or 'sim' (lock-step, no CAN needed; the default)",
-    )  # fmt: skip
-    what.add_argument(
-        "--drive", metavar="FILE@BUS",
+    what.add_argument("--iface", default="sim", metavar="NAME",
+        help="SocketCAN interface (can0, vcan0), or 'sim' (lock-step, no CAN needed; the default)")
+    what.add_argument("--drive", metavar="FILE@BUS",
         help="the node is an emb-gateway with this mapping file; the pre-flight lists missing properties of the drive, "
-        "and the log also records the drive's bus, to which emb-run sends nothing",
-    )  # fmt: skip
+        "and the log also records the drive's bus, to which emb-run sends nothing")
     actor = what.add_mutually_exclusive_group()
-    actor.add_argument(
-        "--policy", type=Path, metavar="FILE", help="policy as ONNX file with its contract (default: the shipped one)"
-    )
-    actor.add_argument(
-        "--quick", action="store_true",
+    actor.add_argument("--policy", type=Path, metavar="FILE",
+        help="policy as ONNX file with its contract (default: the shipped one)")
+    actor.add_argument("--quick", action="store_true",
         help="use the shipped policy for a short experiment: it returns home and ends when all four parameters are "
-        f"known to a repeatability of {QUICK_GOAL}% (the total also has the error of J), or to that of --stop-when",
-    )  # fmt: skip
+        f"known to a repeatability of {QUICK_GOAL}% (the total also has the error of J), or to that of --stop-when")
     what.add_argument("--bench", type=Path, metavar="FILE", help="bench file (default: the shipped drum brake)")
-    what.add_argument(
-        "--log", type=_place, default=Path("runs"), metavar="FILE|DIR",
-        help="MCAP file to write (a name with a suffix), or a folder for a file named after the time (default: runs/)",
-    )  # fmt: skip
-    what.add_argument(
-        "--duration", type=float, metavar="S",
-        help="shorter experiment [s] (default: the policy's horizon); with --read-only, how long to listen",
-    )  # fmt: skip
-    what.add_argument(
-        "--stop-when", metavar="NAME=P%[,...]",
+    what.add_argument("--log", type=_place, default=Path("runs"), metavar="FILE|DIR",
+        help="MCAP file to write (a name with a suffix), or a folder for a file named after the time (default: runs/)")
+    what.add_argument("--duration", type=float, metavar="S",
+        help="shorter experiment [s] (default: the policy's horizon); with --read-only, how long to listen")
+    what.add_argument("--stop-when", metavar="NAME=P%[,...]",
         help="return home and end early when the repeatability of the running estimate is below these "
-        "shares of its values: k_1=1%%,f_v=5%%",
-    )  # fmt: skip
-    what.add_argument(
-        "--live", nargs="?", type=int, const=LIVE_PORT, metavar="PORT",
+        "shares of its values: k_1=1%%,f_v=5%%")
+    what.add_argument("--live", nargs="?", type=int, const=LIVE_PORT, metavar="PORT",
         help="show the run while it goes on, from a process of its own: to browsers, Foxglove and Lichtblick at "
         f"this port (default: {LIVE_PORT}; needs the extra [live]). On a terminal the page stays after the run, until "
-        "Ctrl-C",
-    )  # fmt: skip
+        "Ctrl-C")
     what.add_argument("--open", action="store_true", help="open the page of --live in the browser")
-    what.add_argument(
-        "--report", type=Path, metavar="FILE.html",
+    what.add_argument("--report", type=Path, metavar="FILE.html",
         help="after the run, estimate the parameters and write the page, as emb-replay report does (needs the "
-        "extra [bench])",
-    )  # fmt: skip
-    what.add_argument(
-        "--strict", action="store_true",
-        help="exit code 9 if the estimate lies outside the ranges of the bench file, for which the limits hold",
-    )  # fmt: skip
+        "extra [bench])")
+    what.add_argument("--strict", action="store_true",
+        help="exit code 9 if the estimate lies outside the ranges of the bench file, for which the limits hold")
     what.add_argument("--operator", default="", metavar="NAME", help="name of the operator, for the log and its report")
     what.add_argument("--serial", default="", metavar="TEXT", help="serial number of the device, for the log")
     output = what.add_mutually_exclusive_group()
     output.add_argument("--json", action="store_true", help="print the summary as JSON")
-    output.add_argument(
-        "-v", "--verbose", action="store_true", help="print every check of the pre-flight and every count"
-    )
+    output.add_argument("-v", "--verbose", action="store_true",
+        help="print every check of the pre-flight and every count")
     output.add_argument("-q", "--quiet", action="store_true", help="print the verdict only")
-
-    what.add_argument(
-        "--home", action="store_true",
+    what.add_argument("--home", action="store_true",
         help="bring the brake to the origin before and after the experiment; each way home is guarded like a run and "
-        "has its own log, ...-home.mcap",
-    )  # fmt: skip
+        "has its own log, ...-home.mcap")
 
     stage = p.add_argument_group("stage: how much of the chain may act (default: all of it)")
     one = stage.add_mutually_exclusive_group()
     one.add_argument("--read-only", action="store_true", help="only listen, log, and list the traffic on the bus")
     one.add_argument("--zero", action="store_true", help="the whole chain, but only 0 A is sent")
-    one.add_argument(
-        "--limit", type=float, metavar="A",
-        help="send at most this current [A]; if the shield needs more, the node brakes by itself",
-    )  # fmt: skip
+    one.add_argument("--limit", type=float, metavar="A",
+        help="send at most this current [A]; if the shield needs more, the node brakes by itself")
     asking = stage.add_mutually_exclusive_group()
-    asking.add_argument(
-        "--confirm", action="store_true",
+    asking.add_argument("--confirm", action="store_true",
         help="show the pre-flight and ask before anything is armed (default where the bus is real and standard input "
-        "is a terminal)",
-    )  # fmt: skip
+        "is a terminal)")
     asking.add_argument("--yes", action="store_true", help="do not ask")
 
     machine = p.add_argument_group("real time")
     machine.add_argument("--no-rt", action="store_true", help="do not change scheduling and memory locking")
-    machine.add_argument(
-        "--no-watchdog", action="store_true",
-        help="no watchdog process: for a bus without a brake",
-    )  # fmt: skip
-
-    machine.add_argument(
-        "--long-timeouts", action="store_true",
+    machine.add_argument("--no-watchdog", action="store_true",
+        help="no watchdog process: for a bus without a brake")
+    machine.add_argument("--long-timeouts", action="store_true",
         help="accept longer time-outs of the bench file than the shipped ones: for a bus without a brake on a computer "
-        "that has other work",
-    )  # fmt: skip
+        "that has other work")
 
     p.add_argument("--write-bench", type=Path, metavar="FILE", help="write the shipped bench file and exit")
+    # fmt: on
     return p
 
 
@@ -244,57 +157,56 @@ def prepare(args: argparse.Namespace) -> Plan:
     """Check the options, and read bench and policy."""
     bench, layout = load_bench(args.bench), load_layout()
     stage, limit = _stage(args, bench)
-    steps, listen = _duration(args, bench)
+    duration = _duration(args, bench)
     if stage is not Stage.READ_ONLY and not args.long_timeouts:
         bench.refuse_long_timeouts()
-    if args.open and args.live is None:
-        raise UsageError("--open: expected it with --live, whose page it opens")
-    of_an_experiment = {
-        "--home": args.home, "--quick": args.quick, "--stop-when": args.stop_when, "--report": args.report
-    }  # fmt: skip
-    for option, value in of_an_experiment.items():
-        if stage is Stage.READ_ONLY and value:
-            raise UsageError(f"--read-only: sends nothing, so {option} has nothing to do")
-    if stage is Stage.ZERO and args.home:
-        raise UsageError("--zero: no brake comes home with 0 A; turn it by hand, or use --limit")
-    if args.confirm and (sys.stdin is None or not sys.stdin.isatty()):
-        raise UsageError("--confirm: expected a terminal on standard input; --yes runs without asking")
+    _refuse_contradictions(args, stage)
     period = layout.command.cycle_time
     if abs(bench.timing.sample_time - period) > 1e-9:
         raise BenchFileError(
             f"timing.sample_time: the DBC's command comes every {period:g} s, got {bench.timing.sample_time:g} s"
         )
-    law = make_law(bench)._replace(steps=steps)  # before the policy: where no shield can be made, no policy helps
-    listens = stage is Stage.READ_ONLY and args.policy is None
-    policy = None if listens else _policy(args.policy, args.quick, bench)
+    experiment = _experiment(args, bench, duration)
     return Plan(
         iface=args.iface,
         bench=bench,
         layout=layout,
-        law=law,
-        policy=policy,
-        steps=steps,
-        stop_condition=_stop_condition(args, bench),
-        listen=listen,
+        drive=_drive(args.iface, args.drive, bench),
         stage=stage,
         limit=limit,
-        home=args.home,
-        log=args.log,
-        real_time=not args.no_rt,
-        watchdog=not args.no_watchdog,
-        confirm=True if args.confirm else False if args.yes else None,
-        live=_live(args.live),
-        open=args.open,
-        json=args.json,
-        verbose=args.verbose,
-        quiet=args.quiet,
+        duration=duration,
+        experiment=experiment,
         strict=args.strict,
-        report=args.report,
-        drive=_drive(args.iface, args.drive, bench),
-        operator=one_line(args.operator, LONGEST_LABEL),
-        serial=one_line(args.serial, LONGEST_LABEL),
-        typed=args.typed,
+        precautions=Precautions(not args.no_rt, not args.no_watchdog, args.confirm or (False if args.yes else None)),
+        output=Output(args.log, args.json, args.verbose, args.quiet, args.live, args.open, args.report),
+        label=Label(args.typed, one_line(args.operator, LONGEST_LABEL), one_line(args.serial, LONGEST_LABEL)),
     )
+
+
+def _refuse_contradictions(args: argparse.Namespace, stage: Stage) -> None:
+    """Refuse options that have nothing to do beside others, and a port that is none."""
+    if args.live is not None and not 0 <= args.live <= 65535:
+        raise UsageError(f"--live: expected a port, 0 to 65535, got {args.live}")
+    if args.open and args.live is None:
+        raise UsageError("--open: expected it with --live, whose page it opens")
+    for option in ("home", "quick", "stop_when", "report"):
+        if stage is Stage.READ_ONLY and getattr(args, option):
+            raise UsageError(f"--read-only: sends nothing, so --{option.replace('_', '-')} has nothing to do")
+    if stage is Stage.ZERO and args.home:
+        raise UsageError("--zero: no brake comes home with 0 A; turn it by hand, or use --limit")
+    if args.confirm and not is_interactive():
+        raise UsageError("--confirm: expected a terminal on standard input; --yes runs without asking")
+
+
+def _experiment(args: argparse.Namespace, bench: Bench, duration: float) -> Experiment | None:
+    """The experiment; None where nothing is sent: then a policy that was named is checked all the same."""
+    law = make_law(bench)  # before the policy: where no shield can be made, no policy helps
+    if args.read_only:
+        if args.policy is not None:
+            _policy(args, bench)
+        return None
+    law = law._replace(steps=round(duration / bench.timing.sample_time))
+    return Experiment(_policy(args, bench), law, _stop_condition(args, bench), args.home)
 
 
 def _drive(iface: str, given: str | None, bench: Bench) -> MappedDrive | None:
@@ -363,25 +275,20 @@ def log_path(wanted: Path, ending: str = "") -> Path:
     return path
 
 
-def _live(port: int | None) -> int | None:
-    if port is None or 0 <= port <= 65535:
-        return port
-    raise UsageError(f"--live: expected a port, 0 to 65535, got {port}")
-
-
 def _stop_condition(args: argparse.Namespace, bench: Bench) -> StopCondition | None:
-    estimates = estimated(bench)
-    if args.stop_when is not None:
-        return parse_stop_condition(args.stop_when, estimates)
-    goal = ",".join(f"{name}={QUICK_GOAL}" for name in estimates)
-    return parse_stop_condition(goal, estimates) if args.quick else None
+    estimates, goal = estimated(bench), args.stop_when
+    if goal is None and args.quick:
+        goal = ",".join(f"{name}={QUICK_GOAL}" for name in estimates)
+    return None if goal is None else parse_stop_condition(goal, estimates)
 
 
-def _policy(path: Path | None, quick: bool, bench: Bench) -> Policy:
+def _policy(args: argparse.Namespace, bench: Bench) -> Policy:
+    if args.policy is None:
+        return load_policy(shipped_actor_path(args.quick), bench)
     try:
-        return load_policy(shipped_actor_path(quick), bench) if path is None else admit_policy(path, bench)
+        return admit_policy(args.policy, bench)
     except PolicyRefusedError as err:
-        raise err if path is None else PolicyRefusedError(f"--policy {path}: {err}") from err
+        raise PolicyRefusedError(f"--policy {args.policy}: {err}") from err
 
 
 def _stage(args: argparse.Namespace, bench: Bench) -> tuple[Stage, float]:
@@ -398,12 +305,12 @@ def _stage(args: argparse.Namespace, bench: Bench) -> tuple[Stage, float]:
     return Stage.LIMITED, args.limit
 
 
-def _duration(args: argparse.Namespace, bench: Bench) -> tuple[int, float]:
-    """Samples of an experiment, and how long to listen [s]."""
-    shortest, horizon = bench.timing.sample_time, bench.timing.horizon
-    longest = LONGEST_READING if args.read_only else horizon * shortest
-    wanted = horizon * shortest if args.duration is None else args.duration
+def _duration(args: argparse.Namespace, bench: Bench) -> float:
+    """Duration of the experiment, or how long to listen [s]."""
+    shortest, horizon = bench.timing.sample_time, bench.timing.horizon * bench.timing.sample_time
+    longest = LONGEST_READING if args.read_only else horizon
+    wanted: float = horizon if args.duration is None else args.duration
     if not shortest <= wanted <= longest:
         what = "a day" if args.read_only else "the horizon of the bench"
         raise UsageError(f"--duration: expected {shortest:g} to {longest:g} s, {what}, got {wanted:g}")
-    return min(round(wanted / shortest), horizon), wanted
+    return wanted

@@ -15,14 +15,14 @@ from typing import Any
 from emb_runtime.can.messages import Layout
 from emb_runtime.can.transport import Transport
 from emb_runtime.cli.bus_monitor import BusMonitor, BusStatistics, is_alarming, listen
-from emb_runtime.cli.options import Plan
-from emb_runtime.cli.preflight import CheckResult, Findings, RefusedError, check, interrupted, refuse
-from emb_runtime.cli.summary import RunResult, header, heard_document, listen_document, log_bytes, trailer
+from emb_runtime.cli.documents import Reading, RunResult, header, log_bytes, trailer
+from emb_runtime.cli.plan import Plan
+from emb_runtime.cli.preflight import Check, Findings, RefusedError, first_refusal, interrupted, run_checks
 from emb_runtime.control.actor import Actor, Still, homing_steps
 from emb_runtime.control.core import Core
 from emb_runtime.control.loop import Loop
 from emb_runtime.control.setup import Setup
-from emb_runtime.control.start_conditions import Bounds, StartConditions
+from emb_runtime.control.start_conditions import StartConditions
 from emb_runtime.errors import BusError, LogError, UsageError
 from emb_runtime.log.recorder import Recorder
 from emb_runtime.log.ring_buffer import ClockRecord, EventRecord, FrameRecord
@@ -34,7 +34,6 @@ from emb_runtime.safety.state_machine import Fault
 from emb_runtime.safety.watchdog import WatchdogHandle
 from emb_runtime.system import compiled_core, realtime
 from emb_runtime.system.clock import Clock
-from emb_runtime.system.terminal import as_json
 
 
 @dataclass(frozen=True)
@@ -64,11 +63,11 @@ class Bus:
 
 
 class Console:
-    """The operator's end; of itself nobody's, who sees nothing, agrees, and wants no end."""
+    """User interface; this one shows nothing, agrees, and wants no end."""
 
     stop_requested: Callable[[], bool] = staticmethod(lambda: False)  # Returns True if an end is wanted
 
-    def show(self, lines: tuple[CheckResult, ...], bus: Bus) -> None:
+    def show(self, checks: tuple[Check, ...], bus: Bus) -> None:
         """Show the pre-flight."""
 
     def may_arm(self, bus: Bus) -> bool:
@@ -84,22 +83,23 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
         UsageError: the log cannot be written; nothing was sent.
         BusError: the bus was lost before anything was sent, or cannot be watched.
     """
-    homing = run_type is RunType.HOMING
-    steps = homing_steps(plan.bench) if homing else plan.steps
-    assert plan.policy is not None
-    actor: Actor = Still() if homing else plan.policy
+    experiment, homing = plan.experiment, run_type is RunType.HOMING
+    assert experiment is not None
+    steps = homing_steps(plan.bench) if homing else experiment.law.steps
+    actor: Actor = Still() if homing else experiment.policy
     with ExitStack() as stack:
         watchdog = _watch(plan, bus, stack)
-        obtained = realtime.obtain() if plan.real_time and not bus.simulated else None
-        start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=homing)
+        obtained = realtime.obtain() if plan.precautions.real_time and not bus.simulated else None
+        start_conditions = plan.start_conditions(anywhere=homing)
         heard = observe(plan, bus, start_conditions, console.stop_requested)
         duration = steps * plan.bench.timing.sample_time
-        lines = check(findings(plan, bus, start_conditions, heard, duration, path, watchdog, obtained))
-        console.show(lines, bus)
-        refuse(lines)
+        checks = run_checks(findings(plan, bus, start_conditions, heard, duration, path, watchdog, obtained))
+        console.show(checks, bus)
+        if (refused := first_refusal(checks)) is not None:
+            raise refused
         if not console.may_arm(bus):
-            raise interrupted("before anything was sent", lines)
-        recorder = start_recorder(plan, bus, run_type, path, lines, steps)
+            raise interrupted("before anything was sent", checks)
+        recorder = start_recorder(plan, bus, run_type, path, checks, steps)
         outcome = result = None
         try:
             push_clock(recorder, bus.clock)
@@ -107,14 +107,14 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
             setup = Setup(
                 bench=plan.bench,
                 layout=plan.layout,
-                law=plan.law,
+                law=experiment.law,
                 actor=actor,
-                current_limit=plan.policy.contract.limits.current,
+                current_limit=experiment.policy.contract.limits.current,
                 steps=steps,
                 guard=Guard(plan.layout, plan.bench, bus.transport.send, pulse, plan.limit),
                 limit=plan.limit,
                 homing=homing,
-                stop_condition=None if homing else plan.stop_condition,
+                stop_condition=None if homing else experiment.stop_condition,
             )
             loop = Loop(
                 core=Core(setup),
@@ -131,7 +131,7 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
             stack.pop_all()
             watched = watchdog.finish() if watchdog is not None else None
             result = recorder.finish(trailer(outcome, obtained or {}, watched))
-    return RunResult(run_type, steps, lines, outcome, result, watched, obtained or {})
+    return RunResult(plan, run_type, steps, checks, outcome, result, watched, obtained or {})
 
 
 def drop_backlog(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
@@ -199,11 +199,11 @@ def findings(
 
 
 def start_recorder(
-    plan: Plan, bus: Bus, run_type: RunType, path: Path, lines: tuple[CheckResult, ...], steps: int
+    plan: Plan, bus: Bus, run_type: RunType, path: Path, checks: tuple[Check, ...], steps: int
 ) -> Recorder:
     """Start the recorder; raises UsageError where the log cannot be written."""
     try:
-        return Recorder.start(path, header(plan, bus.iface, bus.transport, bus.clock, run_type, lines, steps))
+        return Recorder.start(path, header(plan, bus.transport, bus.clock, run_type, checks, steps))
     except LogError as err:
         raise UsageError(f"--log: {err}") from err
 
@@ -216,10 +216,11 @@ def push_clock(recorder: Recorder, clock: Clock) -> None:
 
 def _watch(plan: Plan, bus: Bus, stack: ExitStack) -> WatchdogHandle | None:
     """Start the watchdog, where another process can be on the bus; it ends with the stack."""
-    if bus.in_process or not plan.watchdog:
+    if bus.in_process or not plan.precautions.watchdog:
         return None
+    heartbeat, real_time = plan.bench.watch.heartbeat, plan.precautions.real_time
     try:
-        watchdog = WatchdogHandle.start(bus.transport, plan.bench, plan.bench.watch.heartbeat, real_time=plan.real_time)
+        watchdog = WatchdogHandle.start(bus.transport, plan.bench, heartbeat, real_time=real_time)
     except BusError as err:
         raise BusError(f"{err}; --no-watchdog runs without one") from err
     stack.callback(watchdog.finish)
@@ -239,7 +240,7 @@ def paced_receive(bus: Bus, recorder: Recorder) -> Callable[[int], Frame | None]
     return wait_and_receive
 
 
-def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dict[str, Any], tuple[CheckResult, ...]]:
+def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dict[str, Any], tuple[Check, ...]]:
     """Listen for as long as was asked for, and log all that comes; nothing is ever sent.
 
     Returns:
@@ -249,6 +250,9 @@ def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dic
     clock, receive = bus.clock, paced_receive(bus, recorder)
     end = {"exit_reason": Fault.INTERNAL.name, "detail": "the listening ended before its time"}
 
+    def note(code: str, detail: str) -> None:
+        recorder.push(EventRecord(clock.now_ns(), code, detail))
+
     def receive_and_record(deadline_ns: int) -> Frame | None:
         frame = receive(deadline_ns)
         if frame is not None:
@@ -257,31 +261,22 @@ def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dic
 
     try:
         push_clock(recorder, clock)
-        recorder.push(EventRecord(clock.now_ns(), RunState.SILENT.name, "listening"))
-        monitor = BusMonitor(
-            plan.layout,
-            plan.bench,
-            lambda _, why: recorder.push(EventRecord(clock.now_ns(), "FRAME_REJECTED", why)),
-        )
-        period_ns, deadline_ns = plan.bench.timing.sample_time_ns, clock.now_ns() + round(plan.listen * 1e9)
+        note(RunState.SILENT.name, "listening")
+        monitor = BusMonitor(plan.layout, plan.bench, lambda _, why: note("FRAME_REJECTED", why))
+        period_ns, deadline_ns = plan.bench.timing.sample_time_ns, clock.now_ns() + round(plan.duration * 1e9)
         refused: RefusedError | None = None
         try:
             listen(monitor, receive_and_record, clock, period_ns, deadline_ns, lambda *_: False, console.stop_requested)
         except BusError as err:
             refused = RefusedError(str(err), err.exit_code, fault=Fault.BUS_LOST)
-        heard = monitor.statistics()
-        start_conditions = StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=False)
-        lines = check(findings(plan, bus, start_conditions, heard, plan.listen, path))
-        try:
-            refuse(lines if refused is None else ())
-        except RefusedError as err:
-            refused = err
+        heard, start_conditions = monitor.statistics(), plan.start_conditions(anywhere=False)
+        checks = run_checks(findings(plan, bus, start_conditions, heard, plan.duration, path))
+        refused = refused or first_refusal(checks)
         if refused is not None and refused.fault is not None:
-            recorder.push(EventRecord(clock.now_ns(), refused.fault.name, str(refused)))
+            note(refused.fault.name, str(refused))
         push_clock(recorder, clock)
-        reason = "DONE" if refused is None else "REFUSED" if refused.fault is None else refused.fault.name
-        end = {"exit_reason": reason, "detail": str(refused or ""), "heard": as_json(heard_document(heard))}
-        end["preflight"] = as_json([line.document() for line in lines])
+        reading = Reading(plan, heard, checks, refused)
+        end = reading.trailer()
     finally:
         log = recorder.finish(end)
-    return listen_document(plan, bus.iface, heard, lines, refused, log), lines
+    return reading.document(log), checks

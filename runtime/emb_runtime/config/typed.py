@@ -41,9 +41,18 @@ class FieldError(ValueError):
 
 
 class _RefusedError(Exception):
-    def __init__(self, keys: Keys, reason: str) -> None:
-        super().__init__(reason)
+    """A value that is refused: its keys, what was expected there, what came, and another problem before these."""
+
+    def __init__(self, keys: Keys, expected: str, got: str = "", problem: str = "") -> None:
         self.keys = keys
+        self.expected = expected
+        self.got = got
+        self.problem = problem
+
+    def __str__(self) -> str:
+        expected = f"expected {self.expected}" if self.expected else ""
+        came = f", got {self.got}" if self.got else ""
+        return "; ".join(filter(None, (self.problem, expected + came)))
 
 
 def read(
@@ -70,17 +79,15 @@ def read(
     Raises:
         EmbError: of the given kind: a key is missing or unknown, or a value has another type or is out of bounds.
     """
-    keys: Keys = ()
     reader = _Reader(longest_text)
     try:
         record = reader.convert(document, kind, ())
-        if not reader.missing:
-            return cast("Record", record)
-        reason = _missing(reader.missing, remedy)
+        if reader.missing:
+            raise _RefusedError((), "", problem=_missing(reader.missing, remedy))
+        return cast("Record", record)
     except _RefusedError as err:
-        keys, reason = err.keys, str(err)
-    place = key_text((*at, *keys))
-    raise error(f"{source}: {place}: {reason}" if place else f"{source}: {reason}")
+        reason = ": ".join(filter(None, (source, key_text((*at, *err.keys)), str(err))))
+    raise error(reason)
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -153,7 +160,7 @@ class _Reader:
         for key in value:
             if key not in fields:
                 known = f"{', '.join(sorted(fields))}{near(key, fields)}"
-                raise _RefusedError((*keys, key), f"unknown key; expected some of {known}")
+                raise _RefusedError((*keys, key), f"some of {known}", problem="unknown key")
         self.missing += [((*keys, n), hint) for n, (hint, required) in fields.items() if required and n not in value]
         converted = {key: self.convert(inner, fields[key][0], (*keys, key)) for key, inner in value.items()}
         if self.missing:
@@ -161,14 +168,13 @@ class _Reader:
         try:
             return kind(**converted)
         except FieldError as err:
-            raise _RefusedError((*keys, err.key), str(err)) from err
+            raise _RefusedError((*keys, err.key), "", problem=str(err)) from err
 
     def _key(self, key: str, kind: Any, keys: Keys) -> str:
         try:
             return cast("str", msgspec.convert(key, kind))
         except msgspec.ValidationError:
-            wanted = _wanted(inspect.type_info(kind))
-            raise _RefusedError((*keys, key), f"unknown key; expected {wanted}") from None
+            raise _RefusedError((*keys, key), _wanted(inspect.type_info(kind)), problem="unknown key") from None
 
     def _list(self, value: list[Any], kind: Any, kinds: tuple[Any, ...], keys: Keys) -> Any:
         if kinds[-1] is ... or len(kinds) == 1:
@@ -181,8 +187,7 @@ class _Reader:
         """Refuse texts that are not printable and numbers that are not finite, which msgspec takes."""
         if isinstance(value, str):
             if not value or not value.isprintable() or len(value) > self._longest_text:
-                wanted = f"expected a printable text of 1 to {self._longest_text} characters"
-                raise _RefusedError(keys, f"{wanted}, got {shown(value)}")
+                raise _RefusedError(keys, f"a printable text of 1 to {self._longest_text} characters", shown(value))
         elif isinstance(value, int | float) and not isinstance(value, bool) and _is_number(inspect.type_info(kind)):
             _refuse_size(value, keys)
 
@@ -200,9 +205,8 @@ def _by_msgspec(value: object, kind: Any, keys: Keys) -> Any:
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError:
-        raise _RefusedError(
-            keys, f"expected {_wanted(info := inspect.type_info(kind))}, got {_got(value, info)}"
-        ) from None
+        info = inspect.type_info(kind)
+        raise _RefusedError(keys, _wanted(info), _got(value, info)) from None
 
 
 _KINDS: Mapping[type, tuple[str, tuple[str, ...]]] = {
@@ -243,10 +247,9 @@ def _refuse_size(value: float, keys: Keys) -> None:
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise _RefusedError(keys, "expected a finite number")
+        raise _RefusedError(keys, "a finite number")
     if number and not SMALLEST <= abs(number) <= 1.0 / SMALLEST:
-        wanted = f"expected 0 or a size from {SMALLEST:g} to {1.0 / SMALLEST:g}"
-        raise _RefusedError(keys, f"{wanted}, got {number:g}")
+        raise _RefusedError(keys, f"0 or a size from {SMALLEST:g} to {1.0 / SMALLEST:g}", f"{number:g}")
 
 
 _NOUNS: Mapping[type, str] = {

@@ -226,31 +226,26 @@ class Core:
     def outcome(self) -> Outcome:
         """Outcome of the run, when it is over."""
         setup, memory, reception = self.setup, self._memory, self._reception
-        end, last = self._stopping.end if self._stopping else None, memory.newest
+        end = self._stopping.end if self._stopping else None
         counters, estimate, response = memory.counters, setup.estimate, setup.sensors.response
         counters.rejected, counters.dropped = reception.rejected, reception.dropped
         return Outcome(
             fault=self.fault,
             detail=self._detail,
             counters=counters,
-            armed=end is not None,
-            end_angle=end.angle if end else math.nan,
-            end_velocity=end.velocity if end else math.nan,
+            end=end,
+            last=memory.newest,
             home=self.fault is None and end is not None and setup.bounds.is_home(end),
-            node_state=last.node_state if last else None,
             node_at_rest=self._stopping is not None and self._stopping.rests,
             node_stop_reason=reception.stop_reason,
-            last_angle=last.angle if last else math.nan,
             duration_ns=end.device_time_ns - memory.start_ns if end and memory.start_ns else 0,
             rejections=reception.rejections(),
             bus_errors=dict(reception.bus_errors),
             estimate=estimate.numbers,
             model_fits=estimate.estimator.fits,
-            goal_reached=estimate.reached,
-            goal_ns=estimate.reached_ns,
-            unexplained=setup.sensors.unexplained[0],
-            allowed=setup.sensors.unexplained[1],
+            unexplained=setup.sensors.unexplained,
             response=response.text if response.proven else "",
+            goal_ns=estimate.reached_ns if estimate.reached else None,
         )
 
     # --- what the bus says ------------------------------------------------------------------------------------------

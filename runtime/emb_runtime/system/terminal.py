@@ -27,7 +27,6 @@ LONGEST_MESSAGE = 1000  # Characters of an error's message
 LONGEST_STRING = 2000  # Characters of a string from outside
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 """Signals with which an operator ends a command, those of them that this operating system has."""
-ARM_QUESTION = "Arm now? y and Enter does, anything else ends here."
 
 _NOT_ASCII = re.compile("[^ -~]")
 
@@ -105,9 +104,14 @@ class StopRequest:
         self._requested = True
 
 
+def is_interactive() -> bool:
+    """Returns True if standard input is a terminal, so that somebody can be asked."""
+    return sys.stdin is not None and sys.stdin.isatty()
+
+
 def forget_typed() -> None:
     """Drop what was typed and nobody has read yet, where standard input is a terminal."""
-    if sys.platform != "win32" and sys.stdin is not None and sys.stdin.isatty():
+    if sys.platform != "win32" and is_interactive():
         import termios  # not on Windows
 
         termios.tcflush(sys.stdin, termios.TCIFLUSH)
@@ -120,13 +124,13 @@ def typed_line() -> str | None:
     return sys.stdin.readline()
 
 
-def confirmed(question: str, stop_requested: Callable[[], bool], wait: Callable[[], object]) -> bool:
-    """Ask a question on the terminal; True if the operator answers y, False for any other answer or an end.
+def agreed_to_arm(stop_requested: Callable[[], bool], wait: Callable[[], object]) -> bool:
+    """Ask on the terminal whether to arm; True if the operator answers y, False for any other answer or an end.
 
     An answer to an earlier question, or to none, does not count. As long as there is no answer, ``wait`` is called.
     """
     forget_typed()
-    mention(question)
+    mention("Arm now? y and Enter does, anything else ends here.")
     while not stop_requested():
         if (line := typed_line()) is not None:
             return line.strip().lower() in ("y", "yes")

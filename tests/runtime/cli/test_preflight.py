@@ -12,18 +12,26 @@ import pytest
 
 from emb_bench.sim.transport import open_sim
 from emb_runtime.can.messages import Layout, StatusFrame, StopReason, load_layout
-from emb_runtime.cli.bus_monitor import ENOUGH_PAIRS, BusMonitor, BusStatistics, listen
-from emb_runtime.cli.options import MappedDrive, Stage, parser, prepare
+from emb_runtime.cli.bus_monitor import (
+    ENOUGH_PAIRS,
+    BusMonitor,
+    BusStatistics,
+    Disturbances,
+    Sampling,
+    Traffic,
+    listen,
+)
+from emb_runtime.cli.options import parser, prepare
+from emb_runtime.cli.plan import MappedDrive, Stage
 from emb_runtime.cli.preflight import (
     CHECKS,
     SLOW_MARK,
-    CheckResult,
+    Check,
     Findings,
     RefusedError,
-    Verdict,
     advice_on,
-    check,
-    refuse,
+    first_refusal,
+    run_checks,
 )
 from emb_runtime.config.bench import Bench, Sensors, parse_bench
 from emb_runtime.control.start_conditions import Bounds, StartConditions
@@ -45,26 +53,23 @@ SAMPLE = SensorSample(3, 0.001, 0.5, 0, 0, 0.0, 15, NodeState.IDLE)
 def heard(bench: Bench, layout: Layout) -> BusStatistics:
     """A healthy node."""
     status = STATUS._replace(protocol_version=layout.protocol_version, bench_identity=int(bench.identity_hash[:4], 16))
-    return BusStatistics(
+    traffic = Traffic(
         duration=0.2,
         frames={"EMB_Angle": 200, "EMB_Velocity": 200, "EMB_Status": 2},
         rates={"EMB_Angle": 1000.0, "EMB_Velocity": 1000.0, "EMB_Status": 10.0},
         others=0,
-        rejections={},
-        distrusted=False,
-        bus_errors={},
-        dropped=0,
-        commanded=False,
-        status=status,
-        sample=SAMPLE,
+        load=0.27,
+    )
+    none = Disturbances(rejections={}, distrusted=False, bus_errors={}, dropped=0, commanded=False, pairing_problem="")
+    sampling = Sampling(
         pairs=200,
         missing=0,
         period=1e-3,
         resting=ENOUGH_PAIRS,
         angle_scatter=bench.noise.angle,
         velocity_scatter=bench.noise.velocity,
-        load=0.27,
     )
+    return BusStatistics(traffic, none, sampling, status, SAMPLE)
 
 
 @pytest.fixture(scope="module")
@@ -102,29 +107,37 @@ def edited(findings: Findings, old: str, new: str) -> Bench:
 
 
 def hears(findings: Findings, **changes: Any) -> Findings:
-    return replace(findings, heard=replace(findings.heard, **changes))
+    heard = findings.heard
+    for part in ("traffic", "disturbances", "sampling"):
+        record = getattr(heard, part)
+        of_part = {name: changes.pop(name) for name in list(changes) if hasattr(record, name)}
+        heard = replace(heard, **{part: replace(record, **of_part)})
+    return replace(findings, heard=replace(heard, **changes))
 
 
-def lines_of(findings: Findings) -> dict[str, CheckResult]:
-    return {line.what: line for line in check(findings)}
+def reads_only(findings: Findings) -> Findings:
+    return planned(replace(findings, watchdog="", realtime=None), stage=Stage.READ_ONLY, experiment=None)
+
+
+def checks_of(findings: Findings) -> dict[str, Check]:
+    return {check.name: check for check in run_checks(findings)}
 
 
 def refused_by(findings: Findings) -> RefusedError:
-    with pytest.raises(RefusedError) as refused:
-        refuse(check(findings))
-    return refused.value
+    refused = first_refusal(run_checks(findings))
+    assert refused is not None
+    return refused
 
 
 SLOW_BUS = "bitrate = 1000000", "bitrate = 250000"
 NOTHING: dict[str, Any] = {"frames": {}, "status": None, "sample": None}
-READING: dict[str, Any] = {"watchdog": "", "realtime": None}
 
 
-def test_a_bench_that_is_as_it_should_be_is_ok_in_every_line(findings: Findings) -> None:
-    lines = check(findings)
-    assert [line.verdict for line in lines] == [Verdict.OK] * len(CHECKS)
-    assert len({line.what for line in lines}) == len(CHECKS)
-    refuse(lines)
+def test_a_bench_that_is_as_it_should_be_is_ok_in_every_check(findings: Findings) -> None:
+    checks = run_checks(findings)
+    assert [check.ok for check in checks] == [True] * len(CHECKS)
+    assert len({check.name for check in checks}) == len(CHECKS)
+    assert first_refusal(checks) is None
 
 
 def test_what_was_heard_that_refuses_does_so_with_its_error_and_the_first_line_counts(findings: Findings) -> None:
@@ -148,7 +161,7 @@ def test_what_was_heard_that_refuses_does_so_with_its_error_and_the_first_line_c
         exit_code = EXIT_BUS if fault is Fault.NO_NODE else EXIT_SAFETY_STOP
         assert (refused.fault, refused.exit_code) == (fault, exit_code), changes
         assert str(refused).startswith(f"pre-flight, {what}: ")
-        assert refused.lines == check(replace(hears(findings, **changes), free=0))
+        assert refused.checks == run_checks(replace(hears(findings, **changes), free=0))
 
 
 def test_in_a_kernel_of_emb_hil_that_runs_in_real_time_no_node_may_be_a_busy_computer(
@@ -191,27 +204,27 @@ def test_what_only_warns_stands_in_its_line_alone(findings: Findings) -> None:
         (replace(findings, core=core), "core", f"Python; {core.warning}"),
     ]
     for found, what, said in rows:
-        lines = check(found)
-        assert [line.what for line in lines if line.verdict is not Verdict.OK] == [what]
-        assert said in lines_of(found)[what].found
-        refuse(lines)
+        checks = run_checks(found)
+        assert [check.name for check in checks if not check.ok] == [what]
+        assert said in checks_of(found)[what].found
+        assert first_refusal(checks) is None
 
 
 def test_a_declared_observer_of_the_velocity_is_named(findings: Findings) -> None:
-    assert "observer" not in lines_of(planned(findings, bench=SENSOR_BENCH))["shield"].found
+    assert "observer" not in checks_of(planned(findings, bench=SENSOR_BENCH))["shield"].found
     for sensors, said in (
         (Sensors("observer", 1520.0), "of at least 1520 rad/s"),
         (Sensors("observer", velocity_lag=1e-3), "1 ms late at most"),
     ):
-        line = lines_of(planned(findings, bench=replace(findings.plan.bench, sensors=sensors)))["shield"]
+        line = checks_of(planned(findings, bench=replace(findings.plan.bench, sensors=sensors)))["shield"]
         assert line.found.endswith(f"; the velocity is an observer's, {said}")
-        assert line.verdict is Verdict.OK
+        assert line.verdict == "ok"
 
 
 def test_with_read_only_a_tenth_of_the_samples_missing_is_a_failed_check(findings: Findings) -> None:
-    reading = planned(replace(findings, **READING), stage=Stage.READ_ONLY, policy=None)
-    for missing, verdict in ((20, Verdict.WARNING), (25, Verdict.REFUSED), (170, Verdict.REFUSED)):
-        assert lines_of(hears(reading, missing=missing))["samples"].verdict is verdict
+    reading = reads_only(findings)
+    for missing, verdict in ((20, "warning"), (25, "refused"), (170, "refused")):
+        assert checks_of(hears(reading, missing=missing))["samples"].verdict == verdict
     refused = refused_by(hears(reading, missing=170))
     assert "170 missing (46 %)" in str(refused)
     assert (refused.exit_code, refused.fault) == (EXIT_CHECK_FAILED, None)
@@ -219,51 +232,50 @@ def test_with_read_only_a_tenth_of_the_samples_missing_is_a_failed_check(finding
 
 def test_a_slew_that_cannot_turn_the_current_round_in_a_period_is_told(findings: Findings) -> None:
     for slew, limit, verdict, found in (
-        (12000.0, 6.0, Verdict.OK, "6 A to -6 A in 1 ms"),
-        (11999.0, 6.0, Verdict.WARNING, "6 A to -6 A in 1 ms"),
-        (1500.0, 6.0, Verdict.WARNING, "in 8 ms (guard.slew); the way home may be 7 ms late"),
-        (1500.0, 0.75, Verdict.OK, "0.75 A to -0.75 A in 1 ms"),
-        (1500.0, 0.0, Verdict.OK, "no current is sent"),
+        (12000.0, 6.0, "ok", "6 A to -6 A in 1 ms"),
+        (11999.0, 6.0, "warning", "6 A to -6 A in 1 ms"),
+        (1500.0, 6.0, "warning", "in 8 ms (guard.slew); the way home may be 7 ms late"),
+        (1500.0, 0.75, "ok", "0.75 A to -0.75 A in 1 ms"),
+        (1500.0, 0.0, "ok", "no current is sent"),
     ):
         bench = edited(findings, "slew          = 12000.0", f"slew = {slew}")
-        line = lines_of(planned(findings, bench=bench, limit=limit))["slew"]
-        assert line.verdict is verdict
+        line = checks_of(planned(findings, bench=bench, limit=limit))["slew"]
+        assert line.verdict == verdict
         assert found in line.found
 
 
 def test_a_mapped_drive_is_named_with_its_serial_number_and_has_the_load_of_its_bus_judged(findings: Findings) -> None:
     drive = MappedDrive(load_mapping(EXAMPLES / "odrive.toml"), "")
-    mapped = planned(findings, drive=drive, serial="SN 12")
-    line = lines_of(mapped)["drive"]
-    assert line.verdict is Verdict.WARNING
+    mapped = planned(findings, drive=drive, label=replace(findings.plan.label, serial="SN 12"))
+    line = checks_of(mapped)["drive"]
+    assert line.verdict == "warning"
     assert line.found.startswith("ODrive CANSimple, axis 0, serial number SN 12 by the operator, mapping ")
     # 5 bytes: 34 + 40 stuffable bits, 18 stuff bits, 13 more: 105. 8 bytes: 98 + 24 + 13 = 135 (Davis and others).
     percent = 100.0 * (1000 * 105 + 2000 * 135 + 10 * 135) / 1e6
     for found in (findings, mapped):
-        assert f"{percent:.0f}% at worst" in lines_of(found)["bus load"].found
-    busy = lines_of(hears(mapped, load=0.72, others=500))["bus load"]
-    assert busy.verdict is Verdict.WARNING
+        assert f"{percent:.0f}% at worst" in checks_of(found)["bus load"].found
+    busy = checks_of(hears(mapped, load=0.72, others=500))["bus load"]
+    assert busy.verdict == "warning"
     for part in ("72% measured, 500 frames of others", "% of the drive's bus at worst"):
         assert part in busy.found
     slow = planned(mapped, bench=edited(findings, *SLOW_BUS))
-    assert lines_of(slow)["bus load"].verdict is Verdict.REFUSED
-    alone = lines_of(replace(slow, in_process=True))["bus load"]
-    assert (alone.verdict, "measured" in alone.found) == (Verdict.OK, False)
+    assert checks_of(slow)["bus load"].verdict == "refused"
+    alone = checks_of(replace(slow, in_process=True))["bus load"]
+    assert (alone.verdict, "measured" in alone.found) == ("ok", False)
 
 
 def test_nothing_is_missed_where_nobody_else_is_on_the_bus_or_nothing_leaves(findings: Findings) -> None:
-    alone = replace(findings, in_process=True, **READING)
-    reading = planned(replace(findings, **READING), stage=Stage.READ_ONLY, policy=None)
-    for these in (alone, reading):
-        assert {line.verdict for line in check(these)} == {Verdict.OK}
+    alone = replace(findings, in_process=True, watchdog="", realtime=None)
+    for these in (alone, reads_only(findings)):
+        assert {check.verdict for check in run_checks(these)} == {"ok"}
 
 
 def test_on_the_way_home_the_brake_may_be_anywhere_inside_its_limits(findings: Findings) -> None:
     bench, layout = findings.plan.bench, findings.plan.layout
     homing = replace(findings, start_conditions=StartConditions(bench, layout, Bounds(bench), anywhere=True))
-    for angle, verdict in ((-10.0, Verdict.OK), (60.0, Verdict.OK), (101.0, Verdict.REFUSED)):
+    for angle, verdict in ((-10.0, "ok"), (60.0, "ok"), (101.0, "refused")):
         turned = hears(homing, sample=SAMPLE._replace(angle=angle))
-        assert lines_of(turned)["node state"].verdict is verdict
+        assert checks_of(turned)["node state"].verdict == verdict
 
 
 # --- listening ------------------------------------------------------------------------------------------------------
@@ -299,24 +311,29 @@ def listened(bench: Bench, layout: Layout) -> Callable[..., BusMonitor]:
 
 def test_a_node_that_is_ready_is_heard_just_long_enough(listened: Callable[..., BusMonitor], bench: Bench) -> None:
     heard = listened().statistics()
-    assert heard.pairs == ENOUGH_PAIRS
-    assert heard.period == pytest.approx(1e-3, abs=1e-12)
-    assert heard.rates["EMB_Angle"] == pytest.approx(1000.0)
-    assert heard.rates["EMB_Status"] == pytest.approx(10.0)
-    assert heard.angle_scatter == pytest.approx(bench.noise.angle, rel=0.2)
-    assert heard.velocity_scatter == pytest.approx(bench.noise.velocity, rel=0.2)
-    assert (heard.missing, heard.others, heard.commanded, heard.distrusted) == (0, 0, False, False)
-    assert heard.rejections == {}
+    assert heard.sampling.pairs == ENOUGH_PAIRS
+    assert heard.sampling.period == pytest.approx(1e-3, abs=1e-12)
+    assert heard.traffic.rates["EMB_Angle"] == pytest.approx(1000.0)
+    assert heard.traffic.rates["EMB_Status"] == pytest.approx(10.0)
+    assert heard.sampling.angle_scatter == pytest.approx(bench.noise.angle, rel=0.2)
+    assert heard.sampling.velocity_scatter == pytest.approx(bench.noise.velocity, rel=0.2)
+    assert (
+        heard.sampling.missing,
+        heard.traffic.others,
+        heard.disturbances.commanded,
+        heard.disturbances.distrusted,
+    ) == (0, 0, False, False)
+    assert heard.disturbances.rejections == {}
 
 
 def test_the_load_that_is_heard_is_that_of_the_frames(listened: Callable[..., BusMonitor]) -> None:
     heard = listened().statistics()
-    assert heard.load == pytest.approx(135 * sum(heard.frames.values()) / heard.duration / 1e6)
+    assert heard.traffic.load == pytest.approx(135 * sum(heard.traffic.frames.values()) / heard.traffic.duration / 1e6)
 
 
 def test_a_node_that_is_not_ready_is_waited_for_until_the_deadline(listened: Callable[..., BusMonitor]) -> None:
     heard = listened(angle=3.0).statistics()
-    assert heard.duration == pytest.approx(0.999, abs=0.002)
+    assert heard.traffic.duration == pytest.approx(0.999, abs=0.002)
     assert heard.sample is not None
     assert heard.sample.angle == pytest.approx(3.0, abs=0.5)  # the clamped spring creeps
 
@@ -334,8 +351,8 @@ def test_the_scatter_is_that_of_the_samples_since_the_node_is_idle(listened: Cal
         return active._replace(time_ns=frame.time_ns)
 
     heard = listened(change=active_at_first).statistics()
-    assert (heard.pairs, heard.resting) == (ENOUGH_PAIRS, ENOUGH_PAIRS - 120)
-    assert heard.angle_scatter == pytest.approx(statistics.stdev(angles[120:ENOUGH_PAIRS]))
+    assert (heard.sampling.pairs, heard.sampling.resting) == (ENOUGH_PAIRS, ENOUGH_PAIRS - 120)
+    assert heard.sampling.angle_scatter == pytest.approx(statistics.stdev(angles[120:ENOUGH_PAIRS]))
 
 
 def test_lost_frames_are_missing_pairs_and_damaged_ones_are_rejections(listened: Callable[..., BusMonitor]) -> None:
@@ -349,8 +366,8 @@ def test_lost_frames_are_missing_pairs_and_damaged_ones_are_rejections(listened:
         return frame._replace(data=b"\x00" + frame.data[1:]) if count == 150 else frame
 
     heard = listened(change=disturb).statistics()
-    assert heard.missing == 2
-    assert sum(sum(reasons.values()) for reasons in heard.rejections.values()) == 1
+    assert heard.sampling.missing == 2
+    assert sum(sum(reasons.values()) for reasons in heard.disturbances.rejections.values()) == 1
 
 
 def test_frames_from_before_the_listening_and_error_frames_are_no_traffic(bench: Bench, monitor: BusMonitor) -> None:
@@ -364,8 +381,8 @@ def test_frames_from_before_the_listening_and_error_frames_are_no_traffic(bench:
 
     listen(monitor, receive, clock, MS, clock.now_ns() + 20 * MS, lambda *_: False, lambda: False)
     heard = monitor.statistics()
-    assert heard.others == 1
-    assert heard.bus_errors == {"no acknowledgement": 1}
+    assert heard.traffic.others == 1
+    assert heard.disturbances.bus_errors == {"no acknowledgement": 1}
 
 
 def test_the_listening_ends_when_the_operator_says_so(bench: Bench, monitor: BusMonitor) -> None:

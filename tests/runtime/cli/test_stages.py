@@ -34,7 +34,7 @@ def test_read_only_logs_all_sends_nothing_and_says_what_is_on_the_bus(
     emb_run: EmbRun, tmp_path: Path, sim: Sim
 ) -> None:
     summary = emb_run.document("--log", str(tmp_path), "--read-only", "--duration", "0.7")
-    assert (summary["result"], summary["stage"]) == ("done", "read-only")
+    assert (summary["result"], summary["stage"], summary["limit"], summary["steps"]) == ("done", "read-only", 0.0, 0)
     frames = summary["heard"]["frames"]
     assert frames["EMB_Status"] == 7
     assert frames["EMB_Angle"] == pytest.approx(700, abs=1)

@@ -12,24 +12,27 @@ from typing import Any
 import pytest
 
 from emb_runtime.can.messages import StopReason
-from emb_runtime.cli.preflight import CheckResult, RefusedError
-from emb_runtime.cli.summary import RunResult, brief, document, refusal, text, trailer
+from emb_runtime.cli.documents import RunResult, refusal, trailer
+from emb_runtime.cli.options import parser, prepare
+from emb_runtime.cli.plan import Plan
+from emb_runtime.cli.preflight import Check, RefusedError
+from emb_runtime.cli.summary import brief, text
 from emb_runtime.config.bench import Bench
 from emb_runtime.control.result import Outcome, RunCounters
 from emb_runtime.errors import EXIT_OUTSIDE, BusError, UsageError
 from emb_runtime.log.recorder import RecorderResult
-from emb_runtime.records import NodeState, RunType
+from emb_runtime.records import NodeState, RunType, SensorSample
 from emb_runtime.safety.state_machine import FAULTS, Fault
 from emb_runtime.safety.watchdog import WatchdogResult
 from tests.actors import contract_for
 
 
-class Plan:
-    """As much of a plan as is told of."""
-
-    def __init__(self, bench: Bench) -> None:
-        self.bench, self.stage, self.limit, self.strict = bench, "full", 6.0, False
-        self.policy = SimpleNamespace(contract=contract_for(bench, 300.0, kind="speed"), sha256="0123456789abcdef")
+@pytest.fixture
+def plan(bench: Bench) -> Plan:
+    plan = prepare(parser().parse_args(["--iface", "can0"]))
+    assert plan.experiment is not None
+    policy: Any = SimpleNamespace(contract=contract_for(bench, 300.0, kind="speed"), sha256="0123456789abcdef")
+    return replace(plan, bench=bench, experiment=replace(plan.experiment, policy=policy))
 
 
 @pytest.fixture
@@ -40,14 +43,11 @@ def outcome() -> Outcome:
         counters=RunCounters(
             pairs=501, answered=490, unanswered=10, not_taken=2, left=3, confirmed=493, top_current=5.5
         ),
-        armed=True,
-        end_angle=0.01,
-        end_velocity=0.5,
+        end=SensorSample(0, 0.01, 0.5, 0, 0, 0.0, 15, NodeState.ACTIVE),
+        last=SensorSample(1, 0.02, 0.5, 0, 0, 0.0, 15, NodeState.IDLE),
         home=True,
-        node_state=NodeState.IDLE,
         node_at_rest=True,
         node_stop_reason=StopReason.DISABLED,
-        last_angle=0.02,
         duration_ns=500_000_000,
         rejections={},
         bus_errors={},
@@ -55,19 +55,18 @@ def outcome() -> Outcome:
 
 
 @pytest.fixture
-def ran(outcome: Outcome) -> RunResult:
+def ran(plan: Plan, outcome: Outcome) -> RunResult:
     log = RecorderResult(Path("run.mcap"), 3787, 150_000, 0, True, "")
-    return RunResult(RunType.EXPERIMENT, 500, (), outcome, log, None, {})
+    return RunResult(plan, RunType.EXPERIMENT, 500, (), outcome, log, None, {})
 
 
 @pytest.fixture
-def told(bench: Bench, ran: RunResult) -> Any:
+def told(ran: RunResult) -> Any:
     """The document of a run that was a little other."""
 
     def make(run_type: RunType = RunType.EXPERIMENT, **changes: Any) -> dict[str, Any]:
         of_run = {name: changes.pop(name) for name in ("watchdog", "realtime", "log") if name in changes}
-        changed = replace(ran, run_type=run_type, outcome=replace(ran.outcome, **changes), **of_run)
-        return document(Plan(bench), "can0", changed)  # type: ignore[arg-type]
+        return replace(ran, run_type=run_type, outcome=replace(ran.outcome, **changes), **of_run).document()
 
     return make
 
@@ -87,12 +86,12 @@ def test_every_count_and_every_trouble_has_its_words_and_an_undisturbed_run_few(
         ({"log": lost}, "INCOMPLETE: disk full"),
         ({"node_stop_reason": StopReason.LIMIT}, "LIMIT"),
         ({"node_stop_reason": None}, "stop reason not reported"),
-        ({"unexplained": 3.6, "allowed": math.inf}, "not judged"),
+        ({"unexplained": (3.6, math.inf)}, "not judged"),
         (
             {"estimate": (0.02, 23.0, 0.01, 2e-5, 0.006, 6.6, 0.003, 6e-6), "model_fits": False},
             "THE MODEL DOES NOT FIT",
         ),
-        ({"unexplained": 3.6, "allowed": 28.4}, "unexplained velocity 4 rad/s, limit 28 rad/s"),
+        ({"unexplained": (3.6, 28.4)}, "unexplained velocity 4 rad/s, limit 28 rad/s"),
         ({"response": "0.1 samples late"}, "  response   0.1 samples late\n"),
         ({"response": ""}, "  response   NOT PROVEN: too little motion, so the speed stayed low\n"),
     )
@@ -105,20 +104,19 @@ def test_every_count_and_every_trouble_has_its_words_and_an_undisturbed_run_few(
 
 
 def test_an_estimate_at_the_border_of_the_ranges_or_beyond_is_said_first_and_with_strict_no_success(
-    bench: Bench, ran: RunResult
+    ran: RunResult,
 ) -> None:
     for k_1, outside in ((23.0, False), (11.0, True), (34.56, True), (34.5, False)):
         estimate = (0.02, k_1, 0.01, 2e-5, 1e-5, 0.0004, 1e-5, 1e-7)
         for strict in (False, True):
-            plan, known = Plan(bench), replace(ran.outcome, estimate=estimate)
-            plan.strict = strict
-            said: Any = document(plan, "can0", replace(ran, outcome=known))  # type: ignore[arg-type]
+            known = replace(ran, plan=replace(ran.plan, strict=strict), outcome=replace(ran.outcome, estimate=estimate))
+            said = known.document()
             assert list(said["outside"]) == (["k_1"] if outside else [])
             assert said["exit_code"] == (EXIT_OUTSIDE if outside and strict else 0)
             first, second, *_ = text(said).splitlines()
             assert ("OUTSIDE" in first, "the limits were not guaranteed" in second) == (outside, outside)
-            stopped = replace(known, fault=Fault.INTERRUPTED)
-            assert document(plan, "can0", replace(ran, outcome=stopped))["exit_code"] == 3  # type: ignore[arg-type]
+            stopped = replace(known, outcome=replace(known.outcome, fault=Fault.INTERRUPTED))
+            assert stopped.document()["exit_code"] == 3
 
 
 def test_an_estimate_of_a_run_that_ended_before_its_response_was_proven_says_nothing_of_the_ranges(told: Any) -> None:
@@ -148,7 +146,7 @@ def test_the_ways_home_are_told_with_the_experiment(told: Any) -> None:
 @pytest.mark.parametrize(
     ("err", "result", "exit_code"),
     [
-        (RefusedError("x", 3, (CheckResult("node", "a", "b"),), Fault.NODE_NOT_READY), "NODE_NOT_READY", 3),
+        (RefusedError("x", 3, (Check("node", "a", "b"),), Fault.NODE_NOT_READY), "NODE_NOT_READY", 3),
         (RefusedError("x", 2), "REFUSED", 2),
         (BusError("x"), "BUS_LOST", 4),
         (UsageError("x"), "REFUSED", 2),
@@ -168,6 +166,14 @@ def test_the_log_s_last_record_has_all_of_it_as_text(outcome: Outcome) -> None:
     end = trailer(changed, {"scheduler": "FIFO 80"}, WatchdogResult(realtime={"scheduler": "FIFO 90"}))
     assert all(isinstance(value, str) for value in end.values())
     assert (end["exit_reason"], end["answered"], end["home"], end["left"]) == ("DONE", "490", "True", "3")
+    assert (end["duration_s"], end["end_angle"], end["last_angle"], end["node_state"]) == (
+        "0.5",
+        "0.01",
+        "0.02",
+        "IDLE",
+    )
+    assert {name for name, value in changed.document().items() if value is not None} <= set(end)
+    assert "goal_s" not in end
     assert json.loads(end["rejections"]) == {"pair": {"why": 1}}
     assert json.loads(end["bus_error_classes"]) == {"bus error": 2}
     assert (end["rt_scheduler"], end["watchdog_rt_scheduler"], end["watchdog_tripped"]) == ("FIFO 80", "FIFO 90", "")
@@ -178,11 +184,9 @@ def test_a_loop_that_gave_no_outcome_is_an_internal_error_in_the_log() -> None:
     assert (end["exit_reason"], end["watchdog_tripped"]) == ("INTERNAL", "gone")
 
 
-def test_the_last_estimate_is_told_with_its_interval_and_unit(bench: Bench, ran: RunResult) -> None:
-    known = replace(
-        ran.outcome, estimate=(0.02, 0.05, 0.01, 2e-5, 1e-5, 0.0004, 1e-5, 1e-7), goal_reached=True, goal_ns=94_000_000
-    )
-    said: Any = document(Plan(bench), "sim", replace(ran, outcome=known))  # type: ignore[arg-type]  # it is enough of one
+def test_the_last_estimate_is_told_with_its_interval_and_unit(ran: RunResult) -> None:
+    known = replace(ran.outcome, estimate=(0.02, 0.05, 0.01, 2e-5, 1e-5, 0.0004, 1e-5, 1e-7), goal_ns=94_000_000)
+    said = replace(ran, outcome=known).document()
     halves = {"repeatability": pytest.approx(1.96e-7, rel=1e-4), "total": pytest.approx(4.38e-7, rel=1e-2)}
     assert said["estimate"]["f_v"] == {"value": 2e-5, "deviation": 1e-7, **halves, "unit": "N·m·s/rad"}
     lines = text(said).splitlines()
@@ -202,11 +206,10 @@ def test_a_motion_that_was_judged_is_in_document_and_log_and_one_that_was_not_is
 ) -> None:
     rows: tuple[tuple[dict[str, Any], bool], ...] = (
         ({}, False),
-        ({"allowed": math.inf}, False),
-        ({"allowed": 28.4}, True),
+        ({"unexplained": (3.6, math.inf)}, False),
+        ({"unexplained": (3.6, 28.4)}, True),
     )
     for changes, judged in rows:
-        changes |= {"unexplained": 3.6} if changes else {}
         found, end = told(**changes), trailer(replace(outcome, **changes), {})
         numbers = (3.6, 28.4) if judged else (None, None)
         assert (found["unexplained"], found["unexplained_allowed"]) == numbers

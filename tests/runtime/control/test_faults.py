@@ -283,7 +283,7 @@ def test_every_fault_that_latches_ends_the_run_with_stop_frames_and_within_limit
     sent = commands(run, layout)
     assert all(abs(c.current) <= 6.0 for c in sent)
     armed = fault not in (Fault.NO_NODE, Fault.NODE_NOT_READY)
-    assert run.outcome.armed == armed
+    assert (run.outcome.end is not None) == armed
     if not armed:
         assert sent == []
         return
@@ -388,7 +388,7 @@ def test_a_status_from_before_the_first_command_ends_no_run(simulate: Simulate, 
 
 def test_a_node_whose_status_says_fault_is_not_armed(simulate: Simulate) -> None:
     outcome = simulate(on_receive=changing(saying(NodeState=int(NodeState.FAULT)), STATUS)).outcome
-    assert (outcome.fault, outcome.armed) == (Fault.NODE_NOT_READY, False)
+    assert (outcome.fault, outcome.end) == (Fault.NODE_NOT_READY, None)
     assert outcome.detail == "its status says FAULT"
 
 

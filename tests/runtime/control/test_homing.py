@@ -137,9 +137,8 @@ def ended() -> Outcome:
 
 
 def _anything() -> dict[str, Any]:
-    numbers = dict.fromkeys(("end_angle", "end_velocity", "last_angle"), 0.0)
-    texts = {"detail": "", "counters": RunCounters(), "armed": True, "home": False, "node_state": None}
-    return {**numbers, **texts, "duration_ns": 0, "rejections": {}, "bus_errors": {}}
+    none: dict[str, Any] = {"end": None, "last": None, "duration_ns": 0, "rejections": {}, "bus_errors": {}}
+    return {**none, "detail": "", "counters": RunCounters(), "home": False}
 
 
 def test_nothing_moves_by_itself_after_a_fault_that_casts_doubt_on_brake_drive_or_bus(ended: Outcome) -> None:

@@ -372,7 +372,8 @@ def test_an_honest_node_under_the_shipped_actor_is_explained_with_and_without_lo
     for seed, lie in enumerate((HONEST, Lie(lost=0.02), Lie(lost=0.05), HONEST)):
         outcome = run(lie, seed, actor=policy).outcome
         assert outcome.fault is None, outcome.detail
-        assert 0.0 < outcome.unexplained < 0.5 * outcome.allowed < 30.0
+        unexplained, allowed = outcome.unexplained
+        assert 0.0 < unexplained < 0.5 * allowed < 30.0
         assert outcome.model_fits
         for value, deviation in zip(outcome.estimate[:4], outcome.estimate[4:], strict=True):
             assert deviation < 0.002 * value

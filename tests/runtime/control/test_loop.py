@@ -29,7 +29,7 @@ def assert_ended_safely(run: SimRun, layout: Layout) -> None:
     sent = commands(run, layout)
     assert all(abs(c.current) <= 6.0 for c in sent)
     assert [c.counter for c in sent] == [n % 15 for n in range(len(sent))]
-    if run.outcome.armed:
+    if run.outcome.end is not None:
         assert [(c.enable, c.current) for c in sent[-STOP_FRAMES:]] == [(False, 0.0)] * STOP_FRAMES
         assert all(c.enable for c in sent[:-STOP_FRAMES])
     else:
