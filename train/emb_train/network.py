@@ -40,7 +40,8 @@ def network_file(directory: Path) -> tuple[bytes, str]:
 
     def answers(seen: NDArray[np.float32]) -> Floats:
         with torch.no_grad():
-            return actor(torch.from_numpy(seen)).numpy().astype(np.float64)
+            found: Floats = actor(torch.from_numpy(seen)).numpy().astype(np.float64)
+        return found
 
     parts = json.loads(msgspec.json.encode(training))
     provenance = {

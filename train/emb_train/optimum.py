@@ -89,7 +89,8 @@ def followed(problem: Problem, speeds: Floats) -> Floats:
 
     def law(x1: float, x2: float, k: int) -> float:
         torque = p.T_c * sign(x2 or speeds[k]) + p.f_v * x2 + stiffness(p, x1) * x1 + p.J * (speeds[k] - x2) / t_s
-        return min(max(torque / p.k_m, -limit), limit)
+        current: float = min(max(torque / p.k_m, -limit), limit)
+        return current
 
     motion = feedback(problem.plant.mechanics, p, law, t_s)
     return np.array([current for current, _, _ in islice(motion, len(speeds))])
