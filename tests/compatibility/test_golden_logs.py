@@ -1,10 +1,8 @@
 """Every later version decides the same again, bit for bit, on what these logs hold: bench, DBC, policy and frames.
 
-``golden/done.mcap`` is ``emb-run --iface sim:plant=exact,seed=3 --duration 0.25`` with the actor of version 0.2;
+``golden/done.mcap`` is ``emb-run --iface sim:plant=exact,seed=3 --duration 0.25`` with the shipped actor;
 ``golden/rejected.mcap`` the same with every other angle 5 rad off from the 420th on, until there were too many. A
-change that decides otherwise on purpose says so in CHANGELOG.md and records them anew. Their ``/input``
-was added later: their own frames and times went through the core, which records its inputs since. Every other message
-is as it was.
+change that decides otherwise on purpose says so in CHANGELOG.md and records them anew.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from emb_bench.cli.replay import main
 from emb_bench.logs.log import read_log
 
 FOLDER = Path(__file__).parent / "golden"
-LOGS = {"done": ("DONE", 251, 253, 5), "rejected": ("FRAMES_REJECTED", 215, 218, 47)}
+LOGS = {"done": ("DONE", 251, 253, 5), "rejected": ("FRAMES_REJECTED", 214, 217, 47)}
 """Exit reason, and how many decisions, sent frames and safety events each holds."""
 
 
