@@ -47,6 +47,7 @@ from emb_train.rewards import OUTWARD, Reward, Transition, Turn, information_inc
 ENV_ID = "EmbExcitation-v0"
 SCALED = 100.0  # Bound of an observation in scales of order one
 UNKNOWN = 1e9  # Times a deviation is too large before the first sample
+SHORTEST = 20  # Samples of a record below which nothing counts as known
 
 Observations = NDArray[np.float32]
 Steps = tuple[Observations, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
@@ -146,10 +147,14 @@ class TimeToPrecision:
 
     def price(self, batch: Batch, plant: str, rows: NDArray[np.bool_], acted: Floats) -> Floats:
         """Price of the interval of the records so far of some rows; arguments as for the expected interval, [R]."""
-        brakes = [BrakeParameters(*brake) for brake in batch.brakes[rows].tolist()]
-        records = [row[:k] for row, k in zip(acted[rows], batch.k[rows].tolist(), strict=True)]
-        found = intervals(batch.bench, plant, batch.parameters, brakes, records, self.pool)
-        wide = np.array([one.between_runs[: one.count] for one in found]) / self.precision.interval
+        brakes, steps = batch.brakes[rows].tolist(), batch.k[rows]
+        wide = np.full((len(brakes), len(batch.parameters)), UNKNOWN)
+        long = np.flatnonzero(steps >= SHORTEST)
+        known, records = [BrakeParameters(*brakes[i]) for i in long], [acted[rows][i, : steps[i]] for i in long]
+        for i, found in zip(
+            long, intervals(batch.bench, plant, batch.parameters, known, records, self.pool), strict=True
+        ):
+            wide[i] = found.between_runs[: found.count] / self.precision.interval
         prices: Floats = self.precision.price * np.log(np.clip(wide, 1.0, UNKNOWN)).sum(axis=1)
         return prices
 
