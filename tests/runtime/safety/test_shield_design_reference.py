@@ -23,6 +23,7 @@ from emb_runtime.safety.shield_design import (
     chatter_excess,
     coasting_excess,
     damped_excess,
+    late_step,
     law_of,
     make_law,
     stoppable,
@@ -562,3 +563,14 @@ def test_a_refusal_names_the_largest_whole_angle_that_the_shield_could_hold_if_t
             assert refusal(current, top).endswith(f"; narrow k_m or k_1, or lower limits.angle to {angle} rad")
         assert refusal(current, angle) == ""
     assert refusal(1.0, 100.0).endswith("; narrow k_m or k_1")
+
+
+@pytest.mark.parametrize(
+    ("steps", "settling", "sample_time", "late"),
+    [(500, 0.015, 1e-3, 483), (500, 0.0152, 1e-3, 482), (100, 0.0, 1e-3, 98), (500, 0.016, 4e-3, 494)],
+)
+def test_a_way_home_is_always_two_samples_and_the_settling_time_before_its_end(
+    steps: int, settling: float, sample_time: float, late: int
+) -> None:
+    law = make_law(SENSOR_BENCH)._replace(steps=steps, settling=settling, sample_time=sample_time)
+    assert late_step(law) == late
