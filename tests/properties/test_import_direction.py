@@ -28,7 +28,8 @@ ROOMS = {
     "bench/emb_bench": "config documents numbers compiled output figures parallel brake sim logs experiment "
     "information excitation recordings hil playback rerun estimate design export analysis report commission live batch "
     "api cli",
-    "train/emb_train": "presets rewards closed_loop intervals lies env play ppo plan training network optimum evaluate cli",
+    "train/emb_train": "presets rewards closed_loop intervals lies env play ppo plan training network optimum evaluate "
+    "cli",
     "export/emb_export": "export",
 }
 """Sub-packages and single modules of each package, lowest first: each imports from those before it only."""
