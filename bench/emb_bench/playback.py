@@ -115,6 +115,8 @@ class Playback:
                 self._give_call(core, item)
             else:
                 self._give_read(core)
+        except LeftError:
+            raise
         except Exception as err:  # of the actor; of the core, in a log of nonsense
             fault = fault_of(err).name
             self._due, self._came = (fault, Fault.WATCHDOG_TRIPPED.name), f"{fault} ({detail_of(err)})"
@@ -128,6 +130,8 @@ class Playback:
                 if item.read_ns:
                     break
         else:
+            if other := next((item for item in self._items if isinstance(item, CycleRecord | InputRecord)), None):
+                raise self._left(other, "frames without the time of their read")
             self._items.clear()  # the log was cut within it
             return
         self._proposal = core.take(frames, item.read_ns)

@@ -245,6 +245,20 @@ def test_a_number_that_differs_in_its_last_bit_a_state_a_reason_or_a_counter_tha
         assert (result.differences[0].what, result.decisions) == (name, 151)
 
 
+@pytest.mark.parametrize("begin", [0, 400])
+def test_frames_without_the_time_of_their_read_are_not_passed_over(
+    recorded: Callable[..., Driven], again: Again, begin: int
+) -> None:
+    def alter(records: list[Record]) -> None:
+        for n, record in enumerate(records):
+            if n >= begin and isinstance(record, FrameRecord):
+                records[n] = record._replace(read_ns=0)
+
+    result = again(recorded(), alter=alter, outcome=None)
+    assert [difference.what for difference in result.differences] == ["what came next"]
+    assert not result.reproduced
+
+
 def test_a_minus_before_a_zero_is_a_difference(recorded: Callable[..., Driven], again: Again) -> None:
     run = recorded(lambda *_: 0.0)
     assert again(run, lambda *_: 0.0).reproduced

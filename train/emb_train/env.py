@@ -102,7 +102,9 @@ class ExpectedInterval:
         found = intervals(batch.bench, plant, batch.parameters, brakes, acted[rows], self.pool)
         values = finite([self.criterion.of(one) for one in found])
         demands, free = self.demands, self.demands.release * batch.bench.limits.angle[0]
-        hidden = np.maximum(demands.shown - shown(batch.bench, brakes, motion[rows], acted[rows]), 0.0)
+        told = shown(batch.bench, brakes, motion[rows], acted[rows])
+        told[batch.violated[rows]] = 0.0  # it was stopped in the middle
+        hidden = np.maximum(demands.shown - told, 0.0)
         beyond = np.maximum(free - motion[rows, :, 0].min(axis=1), 0.0)
         prices = demands.astray * ~batch.home[rows] + demands.beyond * beyond + demands.hidden * hidden.sum(axis=1)
         left: Floats = values - prices
@@ -126,7 +128,7 @@ class TimeToPrecision:
 
     So the return is minus the number of periods until all four are known. The experiment has ended then, and its way
     home begins, as in the runtime. What the interval of the whole record is wider than asked for is taken off: when it
-    has ended for the record so far, and what is won on the way is given back at home.
+    has ended for the record so far, and what is won on the way is given back at the first sample at home.
     """
 
     precision: Precision = PRECISION
@@ -154,7 +156,7 @@ class TimeToPrecision:
         for i, found in zip(
             long, intervals(batch.bench, plant, batch.parameters, known, records, self.pool), strict=True
         ):
-            wide[i] = found.between_runs[: found.count] / self.precision.interval
+            wide[i] = np.nan_to_num(found.between_runs[: found.count], nan=UNKNOWN) / self.precision.interval
         prices: Floats = self.precision.price * np.log(np.clip(wide, 1.0, UNKNOWN)).sum(axis=1)
         return prices
 

@@ -87,8 +87,11 @@ def shown(bench: Bench, brakes: list[BrakeParameters], motion: Floats, currents:
         currents: those that acted [A], shape [N, n].
 
     Returns:
-        Shape [N, lies]: a run with this lie is ended where it is above 1; 0 where nothing is judged.
+        Shape [N, lies]: a run with this lie is ended where it is above 1; 0 where too little moves to be judged, and
+        infinite on a bench whose runs are never judged.
     """
+    if balance_model(bench).allowed == math.inf:
+        return np.full((len(brakes), len(LIES)), np.inf)
     ts, found = bench.timing.sample_time, np.zeros((len(brakes), len(LIES)))
     for row, brake, states, acted in zip(found, brakes, motion, currents, strict=True):
         honest = Record(ts, brake, states[:, 0], states[:, 1], acted)
