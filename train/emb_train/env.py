@@ -149,14 +149,14 @@ class TimeToPrecision:
 
     def price(self, batch: Batch, plant: str, rows: NDArray[np.bool_], acted: Floats) -> Floats:
         """Price of the interval of the records so far of some rows; arguments as for the expected interval, [R]."""
-        brakes, steps = batch.brakes[rows].tolist(), batch.k[rows]
-        wide = np.full((len(brakes), len(batch.parameters)), UNKNOWN)
-        long = np.flatnonzero(steps >= SHORTEST)
-        known, records = [BrakeParameters(*brakes[i]) for i in long], [acted[rows][i, : steps[i]] for i in long]
-        for i, found in zip(
-            long, intervals(batch.bench, plant, batch.parameters, known, records, self.pool), strict=True
-        ):
-            wide[i] = np.nan_to_num(found.between_runs[: found.count], nan=UNKNOWN) / self.precision.interval
+        at = np.flatnonzero(rows)
+        long = np.flatnonzero(batch.k[at] >= SHORTEST)
+        brakes = [BrakeParameters(*brake) for brake in batch.brakes[at[long]].tolist()]
+        records = [acted[row, : batch.k[row]] for row in at[long]]
+        found = intervals(batch.bench, plant, batch.parameters, brakes, records, self.pool)
+        wide = np.full((len(at), len(batch.parameters)), UNKNOWN)
+        for i, one in zip(long, found, strict=True):
+            wide[i] = np.nan_to_num(one.between_runs[: one.count], nan=UNKNOWN) / self.precision.interval
         prices: Floats = self.precision.price * np.log(np.clip(wide, 1.0, UNKNOWN)).sum(axis=1)
         return prices
 
@@ -196,15 +196,20 @@ class Scoring:
             Transition(before, after, x, batch.k, batch.violated, turn, rules.horizon, rules.sample_time, tracking)
         )
 
+    def _advance_noted(self, wanted: Floats) -> None:
+        """One sample period whose currents are noted."""
+        batch = self._batch
+        self._acted[batch.k == 0] = 0.0
+        batch.advance(wanted)
+        self._acted[np.arange(len(batch.k)), batch.k - 1] = batch.experiments.applied
+
     def _at_the_end(self, wanted: Floats, reward: ExpectedInterval) -> Floats:
         batch = self._batch
         begun = batch.k == 0
-        self._acted[begun], self._motion[begun] = 0.0, 0.0
+        self._motion[begun] = 0.0
         self._motion[begun, 0] = batch.x[begun, :2]
-        batch.advance(wanted)
-        each = np.arange(len(batch.k))
-        self._acted[each, batch.k - 1] = batch.experiments.applied
-        self._motion[each, batch.k] = batch.x[:, :2]
+        self._advance_noted(wanted)
+        self._motion[np.arange(len(batch.k)), batch.k] = batch.x[:, :2]
         rewards, over = np.zeros(len(batch.k)), batch.terminated
         if over.any():
             rewards[over] = reward(batch, self._plant, over, self._acted, self._motion)
@@ -213,9 +218,8 @@ class Scoring:
     def _until_known(self, wanted: Floats, reward: TimeToPrecision) -> Floats:
         batch, returning = self._batch, self._batch.experiments.returning
         begun = batch.k == 0
-        self._missing[begun], self._acted[begun], self._price[begun] = UNKNOWN, 0.0, 0.0
-        batch.advance(wanted)
-        self._acted[np.arange(len(batch.k)), batch.k - 1] = batch.experiments.applied
+        self._missing[begun], self._price[begun] = UNKNOWN, 0.0
+        self._advance_noted(wanted)
         before, self._missing = self._missing, np.minimum(self._missing, reward.missing(batch))
         rewards = reward(before, self._missing)
         ended, arrived = ~returning & (self._missing <= 1.0), (self._price > 0.0) & returning & batch.home

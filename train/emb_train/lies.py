@@ -60,17 +60,17 @@ class Record(NamedTuple):
 
 
 LIES: Mapping[str, Callable[[Record], Record]] = {
-    "scale falls by 0.5/s": lambda r: r.scaled(1.0 - 0.5 * r.at),
-    "scale grows by 0.5/s": lambda r: r.scaled(1.0 + 0.5 * r.at),
-    "scale swings by a tenth": lambda r: r.scaled(1.0 + 0.1 * np.sin(SWING * r.at)),
-    "angle curved by 0.001/rad": lambda r: r.moved(r.x + 0.001 * r.x**2, r.v * (1.0 + 0.002 * r.x)),
+    "scale slides by 0.5/s": lambda r: r.scaled(1.0 - 0.5 * r.at),
+    "scale slides by -0.5/s": lambda r: r.scaled(1.0 + 0.5 * r.at),
+    "scale swings": lambda r: r.scaled(1.0 + 0.1 * np.sin(SWING * r.at)),
+    "angle curved": lambda r: r.moved(r.x + 0.001 * r.x**2, r.v * (1.0 + 0.002 * r.x)),
     "zero at 5 rad": lambda r: r.moved(r.x + 5.0, r.v),
     "zero at -5 rad": lambda r: r.moved(r.x - 5.0, r.v),
-    "current falls by 0.5/s": lambda r: r._replace(u=r.u / (1.0 - 0.5 * r.within)),
-    "current swings by a tenth": lambda r: r._replace(u=r.u / (1.0 + 0.1 * np.sin(SWING * r.within))),
-    "reported current 0.1 A off": lambda r: r._replace(u=r.u + 0.1),
-    "friction doubles in 1 s": lambda r: r.pulled(r.brake.T_c * np.sign(r.v[1:]) * r.within),
-    "stiffness halves at 0.25 s": lambda r: r.pulled(
+    "current grows by -0.5/s": lambda r: r._replace(u=r.u / (1.0 - 0.5 * r.within)),
+    "current swings": lambda r: r._replace(u=r.u / (1.0 + 0.1 * np.sin(SWING * r.within))),
+    "reported current +0.1 A": lambda r: r._replace(u=r.u + 0.1),
+    "friction doubles": lambda r: r.pulled(r.brake.T_c * np.sign(r.v[1:]) * r.within),
+    "stiffness halves": lambda r: r.pulled(
         -0.5 * r.brake.gamma * r.brake.k_1 * np.maximum(r.x[1:], 0.0) * (r.within > 0.25)
     ),
 }
@@ -90,14 +90,14 @@ def shown(bench: Bench, brakes: list[BrakeParameters], motion: Floats, currents:
         Shape [N, lies]: a run with this lie is ended where it is above 1; 0 where too little moves to be judged, and
         infinite on a bench whose runs are never judged.
     """
-    if balance_model(bench).allowed == math.inf:
-        return np.full((len(brakes), len(LIES)), np.inf)
-    ts, found = bench.timing.sample_time, np.zeros((len(brakes), len(LIES)))
+    model, ts, found = balance_model(bench), bench.timing.sample_time, np.full((len(brakes), len(LIES)), np.inf)
+    if model.allowed == math.inf:
+        return found
     for row, brake, states, acted in zip(found, brakes, motion, currents, strict=True):
         honest = Record(ts, brake, states[:, 0], states[:, 1], acted)
         records = [lie(honest) for lie in LIES.values()]
         arguments: tuple[Any, ...] = (
-            balance_model(bench),
+            model,
             np.stack([record.x for record in records]),
             np.stack([record.v for record in records]),
             np.stack([record.u for record in records]),
