@@ -354,7 +354,7 @@ def _bounds(dice: random.Random) -> Iterator[Any]:
 def _estimator(dice: random.Random) -> Iterator[Any]:
     """Estimates of a brake that moves about as it should, and the currents that follow a target speed."""
     while True:
-        model = Estimator(_bench()).model._replace(sticks=dice.random() < 0.7, derived=dice.random() < 0.3)
+        model = Estimator(_bench()).model._replace(derived=dice.random() < 0.3)
         state, gain = kalman.start(model), dice.choice((1.0, 0.4))
         angle, velocity, current, step = dice.uniform(-1.0, 40.0), dice.uniform(-200.0, 200.0), 0.0, 0
         for _ in range(30):

@@ -196,7 +196,7 @@ def results(bench: Bench, name: str, count: int, rng: np.random.Generator) -> Fl
         case = replace(bench, sensors=Sensors("observer", least))
         chosen = replace(chosen, instruments=chosen.instruments._replace(observer_bandwidth=true))
     law, prior = make_law(case), bench.range_set(bench.prior)
-    model = make_model(case, prior, sticks=True)
+    model = make_model(case, prior)
     actors = [target_speeds(load_policy(shipped_actor_path(quick), bench), bench) for quick in (False, True)]
     stop = Stop(
         late=math.ceil(case.node.watchdog / law.sample_time - 1e-9),

@@ -204,7 +204,7 @@ def results(bench: Bench, mechanics: Mechanics, instruments: Instruments, script
         response_model(bench, law),
         mechanics,
         instruments,
-        make_model(bench, prior, sticks=True),
+        make_model(bench, prior),
         target_speeds(load_policy(shipped_actor_path(), bench), bench),
         scripted,
         script,

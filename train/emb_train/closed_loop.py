@@ -436,7 +436,7 @@ class Batch:
         require_possible(self._plant, conditions)
         self._deviations = np.array([bench.noise.angle, bench.noise.velocity])
         self._advance, self._advance_speeds = compiled(advance), compiled(advance_speeds)
-        self.model = make_model(bench, bench.range_set(bench.prior), sticks=True)  # as the runtime's
+        self.model = make_model(bench, bench.range_set(bench.prior))  # as the runtime's
         self._every, self.most = np.arange(count), MOST * np.abs(np.array(self.model.nominal * 2))
         e = self.experiments = no_experiments(count, len(parameters), self.setup.rules.horizon)
         self.brakes, self.x, self.y, self.m, self.k = e.brakes, e.x, e.y, e.m, e.k

@@ -5,13 +5,11 @@ with the velocity, which for independent noise is the joint correction (Simon, O
 6 and 13). The velocity of an observer is a function of the angles and no measurement: there the angle alone corrects.
 The parameters are constant. docs/explanation/runtime.md says why each of the following is as it is.
 
-- **Direction of motion.** For a velocity v ± σ, sign(v) has the mean s ≈ tanh(0.8 v/σ) and the variance 1 − s². The
-  mean goes into the prediction, the variance into that of the velocity.
 - **Ranges.** The filter's parameters are not bounded: values are cut off at their ranges where they are used.
 - **Gaps.** The current in lost periods is the newest reported one, with an uncertainty of the current limit for each.
-- **Stiction.** A brake that is solved exactly stops and sticks, see :mod:`emb_runtime.estimator.stick_slip`. Its
-  prediction is of second order: f_v v and k_1 x have another mean where both factors are uncertain and correlated
-  (Gelb, Applied Optimal Estimation, 1974, chapter 6.1).
+- **Stiction.** The brake stops and sticks within a period, see :mod:`emb_runtime.estimator.stick_slip`.
+- **Second order.** f_v v and k_1 x have another mean where both factors are uncertain and correlated (Gelb, Applied
+  Optimal Estimation, 1974, chapter 6.1).
 - **Misfit.** If the model is right, the normalised squares of the innovations have the mean 1. Once their running mean
   exceeds :data:`MISFIT`, the deviations are those of the prior, to the end of the run.
 
@@ -29,7 +27,6 @@ from emb_runtime.estimator.stick_slip import Accelerations, contact, move
 
 MEMORY: Final = 128.0  # Memory of the running mean of the squared innovations, of which a sample has one or two
 MISFIT: Final = 1.6  # The right model reached a running mean of 1.48 in one of 10,000 experiments
-SLOPE: Final = 0.8  # tanh(SLOPE z) is within 0.03 of the mean sign of a Gaussian number with mean z and deviation 1
 LEAST_VARIANCE: Final = 1e-12  # Of a velocity, where it is divided by its standard deviation [rad²/s²]
 COHERENCE: Final = 10.0
 """Factor on the variance that the terms of second order add in one sample: their error lasts for many samples."""
@@ -53,7 +50,6 @@ class Model(NamedTuple):
     """Prior knowledge of the filter. Four numbers are of k_m, k_1, T_c and f_v, in this order."""
 
     sample_time: float  # t_s [s]
-    sticks: bool  # True if the brake is solved within a period, and sticks; else it is stepped by forward Euler
     nominal: Four  # Nominal parameters, SI units
     motor: float  # k_m/J of the nominal brake [rad/(s²·A)]
     spring: float  # γ k_1/J [1/s²]
@@ -80,27 +76,14 @@ class State(NamedTuple):
     worst: float  # Its greatest value so far
 
 
-class Prediction(NamedTuple):
-    """Prediction of one sample from the one before."""
-
-    angle: float
-    velocity: float
-    angle_slopes: Six  # Derivatives of the angle to the six unknowns at the sample before
-    velocity_slopes: Six  # Derivatives of the velocity to them
-    angle_noise: float  # Noise of the prediction, which is added to the variance of the angle,
-    common_noise: float  # to its covariance with the velocity,
-    velocity_noise: float  # and to the variance of the velocity
-
-
-def make_model(bench: Bench, ranges: Ranges, *, sticks: bool) -> Model:
-    """Prior knowledge of the filter on a bench. J and γ have their nominal values; for ``sticks`` see :class:`Model`.
+def make_model(bench: Bench, ranges: Ranges) -> Model:
+    """Prior knowledge of the filter on a bench. J and γ have their nominal values.
 
     The other parameters are taken to be uniform in their ranges: ±50 % have the variance 1/12.
     """
     brake, t_s = bench.brake, bench.timing.sample_time
     return Model(
         sample_time=t_s,
-        sticks=sticks,
         nominal=(brake.k_m, brake.k_1, brake.T_c, brake.f_v),
         motor=brake.k_m / brake.J,
         spring=brake.gamma * brake.k_1 / brake.J,
@@ -170,13 +153,67 @@ def predict(model: Model, state: State, periods: float, applied: float) -> tuple
     if periods <= 0.0:
         return mean, p
     t, lost = periods * model.sample_time, max(periods - 1.0, 0.0) * model.lost
-    to = stuck(model, mean, p, applied, t, lost) if model.sticks else slid(model, mean, p, applied, t, lost)
-    return (to.angle, to.velocity, mean[2], mean[3], mean[4], mean[5]), _spread(p, to)
-
-
-def direction(v: float, variance: float) -> float:
-    """Mean of the sign of a velocity ``v`` [rad/s] with this variance, −1..1."""
-    return math.tanh(SLOPE * v / math.sqrt(max(variance, LEAST_VARIANCE)))
+    x, v, km, k1, tc, fv = mean
+    driving, by_friction = model.motor * applied, t * model.coulomb
+    spring, damping = model.spring * k1, model.viscous * fv
+    now = Accelerations(driving * km - spring * max(x, 0.0), model.coulomb * tc, damping, spring)
+    # Variance of the velocity after sliding, by the motion and by friction, and the covariance of these two parts.
+    b0, b1, b2 = -spring if x >= 0.0 else 0.0, -damping, driving
+    b3, b5 = -model.spring * max(x, 0.0), -model.viscous * v
+    c0, c1, c2, c3, _, c5 = _product(p, (b0, b1, b2, b3, 0.0, b5))
+    p11, p14 = p[6], p[9]
+    sliding = p11 + by_friction * by_friction * p[18]
+    sliding += t * b0 * (2.0 * p[1] + t * c0)
+    sliding += t * b1 * (2.0 * p11 + t * c1)
+    sliding += t * b2 * (2.0 * p[7] + t * c2)
+    sliding += t * b3 * (2.0 * p[8] + t * c3)
+    sliding += t * b5 * (2.0 * p[10] + t * c5)
+    common = p14 + t * b0 * p[4] + t * b1 * p14 + t * b2 * p[13] + t * b3 * p[16] + t * b5 * p[19]
+    common *= by_friction
+    shared = 2.0 * common if now.pull >= 0.0 else -2.0 * common
+    ahead = move(
+        now,
+        x,
+        v,
+        t,
+        math.sqrt(max(p11, LEAST_VARIANCE)),
+        math.sqrt(max(sliding + shared, LEAST_VARIANCE)),
+        math.sqrt(max(sliding - shared, LEAST_VARIANCE)),
+    )
+    share, to_velocity, to_angle = contact(x, ahead.angle, t, v, ahead.velocity)
+    stiff = model.spring * share
+    # Second order: the mean and the variance of the products f_v v and k_1 x.
+    drifting, softening = model.viscous * p[10], stiff * p[3]
+    doubtful = drifting * drifting + model.viscous * model.viscous * p11 * p[20]
+    doubtful += softening * softening + stiff * stiff * p[0] * p[15]
+    half_square, bias = 0.5 * t * t, drifting + softening
+    unsure = 2.0 * COHERENCE * (half_square * doubtful) + ahead.kinked
+    crossed = CONTACT_VARIANCE if 0.0 < share < 1.0 else 0.0
+    missed, touched, sums = t * lost, spring * share, v + ahead.velocity
+    by_angle, by_velocity = ahead.angle_by_pull, ahead.velocity_by_pull
+    angle_slopes = (
+        1.0 - by_angle * touched,
+        ahead.angle_by_velocity - by_angle * damping,
+        by_angle * driving,
+        by_angle * (-model.spring * to_angle),
+        ahead.angle_by_friction * model.coulomb,
+        by_angle * (-model.viscous / 3.0 * (v + sums)),
+    )
+    velocity_slopes = (
+        -by_velocity * touched,
+        ahead.velocity_by_velocity * (1.0 - half_square * touched) - by_velocity * damping,
+        by_velocity * driving,
+        by_velocity * (-model.spring * to_velocity),
+        ahead.velocity_by_friction * model.coulomb,
+        by_velocity * (-0.5 * model.viscous * sums),
+    )
+    noise = (
+        0.5 * (half_square * unsure) + missed * missed + ahead.stopped * STOP_VARIANCE,
+        0.5 * t * unsure,
+        unsure + lost * lost + crossed,
+    )
+    end = ahead.angle - half_square * bias, ahead.velocity - t * bias, km, k1, tc, fv
+    return end, _spread(p, angle_slopes, velocity_slopes, noise)
 
 
 def believed(model: Model, state: State) -> Four:
@@ -217,94 +254,6 @@ def _deviation(variance: float, beyond: float, width: float, doubted: bool) -> f
     return max(known, width / math.sqrt(12.0)) if doubted else known
 
 
-def slid(model: Model, mean: Six, p: Packed, applied: float, t: float, lost: float) -> Prediction:
-    """A step of forward Euler over ``t`` [s] with a current [A], as the brake with sign() moves.
-
-    After lost samples the velocity is uncertain by ``lost`` [rad/s].
-    """
-    x, v, km, k1, tc, fv = mean
-    toward = direction(v, p[6])
-    by_motor, by_spring = model.motor * applied, -model.spring * max(x, 0.0)
-    by_friction, by_damping = -model.coulomb * toward, -model.viscous * v
-    a = by_motor * km + by_spring * k1 + by_friction * tc + by_damping * fv
-    touching = -model.spring * k1 if x >= 0.0 else 0.0
-    turning, missed = t * model.coulomb * tc, t * lost
-    return Prediction(
-        x + t * v,
-        v + t * a,
-        (1.0, t, 0.0, 0.0, 0.0, 0.0),
-        (t * touching, 1.0 - t * model.viscous * fv, t * by_motor, t * by_spring, t * by_friction, t * by_damping),
-        missed * missed,
-        0.0,
-        turning * turning * (1.0 - toward * toward) + lost * lost,
-    )
-
-
-def stuck(model: Model, mean: Six, p: Packed, applied: float, t: float, lost: float) -> Prediction:
-    """A period of a brake that stops and sticks; arguments as of :func:`slid`."""
-    x, v, km, k1, tc, fv = mean
-    driving, by_friction = model.motor * applied, t * model.coulomb
-    spring, damping = model.spring * k1, model.viscous * fv
-    now = Accelerations(driving * km - spring * max(x, 0.0), model.coulomb * tc, damping, spring)
-    # Variance of the velocity after sliding, by the motion and by friction, and the covariance of these two parts.
-    b0, b1, b2 = -spring if x >= 0.0 else 0.0, -damping, driving
-    b3, b5 = -model.spring * max(x, 0.0), -model.viscous * v
-    c0, c1, c2, c3, _, c5 = _product(p, (b0, b1, b2, b3, 0.0, b5))
-    p11, p14 = p[6], p[9]
-    sliding = p11 + by_friction * by_friction * p[18]
-    sliding += t * b0 * (2.0 * p[1] + t * c0)
-    sliding += t * b1 * (2.0 * p11 + t * c1)
-    sliding += t * b2 * (2.0 * p[7] + t * c2)
-    sliding += t * b3 * (2.0 * p[8] + t * c3)
-    sliding += t * b5 * (2.0 * p[10] + t * c5)
-    common = p14 + t * b0 * p[4] + t * b1 * p14 + t * b2 * p[13] + t * b3 * p[16] + t * b5 * p[19]
-    common *= by_friction
-    shared = 2.0 * common if now.pull >= 0.0 else -2.0 * common
-    ahead = move(
-        now,
-        x,
-        v,
-        t,
-        math.sqrt(max(p11, LEAST_VARIANCE)),
-        math.sqrt(max(sliding + shared, LEAST_VARIANCE)),
-        math.sqrt(max(sliding - shared, LEAST_VARIANCE)),
-    )
-    share, to_velocity, to_angle = contact(x, ahead.angle, t, v, ahead.velocity)
-    stiff = model.spring * share
-    # Second order: the mean and the variance of the products f_v v and k_1 x.
-    drifting, softening = model.viscous * p[10], stiff * p[3]
-    doubtful = drifting * drifting + model.viscous * model.viscous * p11 * p[20]
-    doubtful += softening * softening + stiff * stiff * p[0] * p[15]
-    half_square, bias = 0.5 * t * t, drifting + softening
-    unsure = 2.0 * COHERENCE * (half_square * doubtful) + ahead.kinked
-    crossed = CONTACT_VARIANCE if 0.0 < share < 1.0 else 0.0
-    missed, touched, sums = t * lost, spring * share, v + ahead.velocity
-    by_angle, by_velocity = ahead.angle_by_pull, ahead.velocity_by_pull
-    return Prediction(
-        ahead.angle - half_square * bias,
-        ahead.velocity - t * bias,
-        (
-            1.0 - by_angle * touched,
-            ahead.angle_by_velocity - by_angle * damping,
-            by_angle * driving,
-            by_angle * (-model.spring * to_angle),
-            ahead.angle_by_friction * model.coulomb,
-            by_angle * (-model.viscous / 3.0 * (v + sums)),
-        ),
-        (
-            -by_velocity * touched,
-            ahead.velocity_by_velocity * (1.0 - half_square * touched) - by_velocity * damping,
-            by_velocity * driving,
-            by_velocity * (-model.spring * to_velocity),
-            ahead.velocity_by_friction * model.coulomb,
-            by_velocity * (-0.5 * model.viscous * sums),
-        ),
-        0.5 * (half_square * unsure) + missed * missed + ahead.stopped * STOP_VARIANCE,
-        0.5 * t * unsure,
-        unsure + lost * lost + crossed,
-    )
-
-
 def _product(p: Packed, a: Six) -> Six:
     """P a."""
     p00, p01, p02, p03, p04, p05, p11, p12, p13, p14, p15, p22, p23, p24, p25, p33, p34, p35, p44, p45, p55 = p
@@ -319,18 +268,21 @@ def _product(p: Packed, a: Six) -> Six:
     )
 
 
-def _spread(p: Packed, to: Prediction) -> Packed:
-    """P' = F P Fᵀ + Q, where the rows of F but those of angle and velocity are those of the unit matrix."""
+def _spread(p: Packed, angle_slopes: Six, velocity_slopes: Six, noise: tuple[float, float, float]) -> Packed:
+    """P' = F P Fᵀ + Q, where the rows of F but those of angle and velocity are those of the unit matrix.
+
+    Noise is that of the angle, common to both, and that of the velocity.
+    """
     _, _, _, _, _, _, _, _, _, _, _, p22, p23, p24, p25, p33, p34, p35, p44, p45, p55 = p
-    a0, a1, a2, a3, a4, a5 = to.angle_slopes
-    v0, v1, v2, v3, v4, v5 = to.velocity_slopes
-    x0, x1, x2, x3, x4, x5 = _product(p, to.angle_slopes)
-    y0, y1, y2, y3, y4, y5 = _product(p, to.velocity_slopes)
+    a0, a1, a2, a3, a4, a5 = angle_slopes
+    v0, v1, v2, v3, v4, v5 = velocity_slopes
+    x0, x1, x2, x3, x4, x5 = _product(p, angle_slopes)
+    y0, y1, y2, y3, y4, y5 = _product(p, velocity_slopes)
     return (
-        a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3 + a4 * x4 + a5 * x5 + to.angle_noise,
-        a0 * y0 + a1 * y1 + a2 * y2 + a3 * y3 + a4 * y4 + a5 * y5 + to.common_noise,
+        a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3 + a4 * x4 + a5 * x5 + noise[0],
+        a0 * y0 + a1 * y1 + a2 * y2 + a3 * y3 + a4 * y4 + a5 * y5 + noise[1],
         x2, x3, x4, x5,
-        v0 * y0 + v1 * y1 + v2 * y2 + v3 * y3 + v4 * y4 + v5 * y5 + to.velocity_noise,
+        v0 * y0 + v1 * y1 + v2 * y2 + v3 * y3 + v4 * y4 + v5 * y5 + noise[2],
         y2, y3, y4, y5,
         p22, p23, p24, p25,
         p33, p34, p35,

@@ -8,7 +8,7 @@ A scalar function, as in :mod:`emb_runtime.estimator.kalman`.
 
 from __future__ import annotations
 
-from emb_runtime.estimator.kalman import Four, Model, State, direction
+from emb_runtime.estimator.kalman import Four, Model, State
 from emb_runtime.estimator.stick_slip import sign
 
 
@@ -17,11 +17,10 @@ def current_for(model: Model, state: State, parameters: Four, speed: float, gain
 
     The parameters are relative, within their ranges.
     """
-    x, v, variance = state.mean[0], state.mean[1], state.covariance[6]
+    x, v = state.mean[0], state.mean[1]
     km, k1, tc, fv = parameters
     change = gain * (speed - v)
     drive = change / model.sample_time + model.spring * k1 * max(x, 0.0)
     # A brake that may stick has the friction of where it is to go, also at rest.
-    toward = sign(v + change) if model.sticks else direction(v, variance)
-    drive += model.coulomb * tc * toward + model.viscous * fv * v
+    drive += model.coulomb * tc * sign(v + change) + model.viscous * fv * v
     return min(max(drive / (model.motor * km), -model.current), model.current)

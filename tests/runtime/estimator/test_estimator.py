@@ -43,7 +43,6 @@ def test_a_bench_file_may_name_the_set_or_leave_the_shields() -> None:
 
 def test_it_takes_samples_and_begins_anew() -> None:
     estimator = Estimator(BENCH)
-    assert estimator.model.sticks
     fresh = estimator.state
     for sample in SAMPLES:
         before = estimator.state

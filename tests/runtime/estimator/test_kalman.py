@@ -16,11 +16,9 @@ from emb_bench.brake.motion import advance, no_sensitivity, rest
 from emb_bench.information.symmetric import Floats, unpack
 from emb_runtime.config.bench import PARAMETER_NAMES, Sensors
 from emb_runtime.estimator.kalman import (
-    Model,
     State,
     believed,
     deviations,
-    direction,
     follow,
     make_model,
     predict,
@@ -30,8 +28,8 @@ from tests.benches import SENSOR_BENCH
 
 BENCH = SENSOR_BENCH
 PM50 = BENCH.range_set("pm50")
-EULER, EXACT = (make_model(BENCH, PM50, sticks=sticks) for sticks in (False, True))
-OBSERVED = make_model(replace(BENCH, sensors=Sensors("observer", 1520.0)), PM50, sticks=True)
+EXACT = make_model(BENCH, PM50)
+OBSERVED = make_model(replace(BENCH, sensors=Sensors("observer", 1520.0)), PM50)
 NOMINAL = np.array([getattr(BENCH.brake, n) for n in PARAMETER_NAMES])
 T_S = BENCH.timing.sample_time
 UNIT = (1.0, 1.0, 1.0, 1.0)
@@ -55,21 +53,19 @@ def random_state(seed: int, velocity: float) -> State:
     return state_of((rng.uniform(1.0, 90.0), velocity, *rng.uniform(0.6, 1.4, 4)), root @ root.T)
 
 
-def after(model: Model, unknowns: Floats, current: float) -> Floats:
+def after(unknowns: Floats, current: float) -> Floats:
     """One period of the bench's own brake from angle, velocity and relative parameters."""
     brake = BENCH.brake._replace(**dict(zip(PARAMETER_NAMES, unknowns[2:] * NOMINAL, strict=True)))
-    if not model.sticks:
-        return np.array([*euler.step(brake, unknowns[0], unknowns[1], current, T_S), *unknowns[2:]])
     x, (chosen, s) = rest(), no_sensitivity(["k_m"])
     x[0], x[1] = unknowns[0], unknowns[1]
     advance(BENCH.plant("exact").mechanics, brake, x, current, T_S, chosen, s)
     return np.array([x[0], x[1], *unknowns[2:]])
 
 
-def jacobian(model: Model, unknowns: Floats, current: float, steps: Floats) -> Floats:
+def jacobian(unknowns: Floats, current: float, steps: Floats) -> Floats:
     """Derivatives of what comes after a period to what was before, by central differences."""
     columns = [
-        (after(model, unknowns + h * e, current) - after(model, unknowns - h * e, current)) / (2.0 * h)
+        (after(unknowns + h * e, current) - after(unknowns - h * e, current)) / (2.0 * h)
         for h, e in zip(steps, np.eye(6), strict=True)
     ]
     return np.array(columns).T
@@ -77,26 +73,29 @@ def jacobian(model: Model, unknowns: Floats, current: float, steps: Floats) -> F
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([-300.0, 300.0]), st.floats(-6.0, 6.0))
-def test_a_prediction_of_eulers_brake_is_its_step_and_its_derivatives(seed: int, v: float, current: float) -> None:
+def test_a_prediction_spreads_a_full_covariance_by_the_derivatives_of_the_brake(
+    seed: int, v: float, current: float
+) -> None:
     state = random_state(seed, v)
-    mean, covariance = predict(EULER, state, 1.0, current)
     unknowns, p = np.array(state.mean), unpack(np.array(state.covariance), 6)
-    f = jacobian(EULER, unknowns, current, np.full(6, 1e-4))
-    assert mean == pytest.approx(after(EULER, unknowns, current), rel=1e-12)
-    assert unpack(np.array(covariance), 6) == pytest.approx(f @ p @ f.T, rel=1e-6, abs=1e-9)
+    f = jacobian(unknowns, current, np.array([1e-6, 1e-5, 1e-6, 1e-6, 1e-6, 1e-6]))
+    _, packed = predict(EXACT, state_of(state.mean, 1e-10 * p), 1.0, current)
+    found, expected = unpack(np.array(packed), 6) / 1e-10, f @ p @ f.T
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert found / scale == pytest.approx(expected / scale, abs=1e-3)
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(0.5, 95.0), st.floats(-490.0, 490.0), st.floats(-6.0, 6.0))
 def test_a_prediction_of_the_exact_brake_is_its_period_and_its_derivatives(x: float, v: float, current: float) -> None:
     unknowns = np.array([x, v, *UNIT])
-    end = after(EXACT, unknowns, current)
+    end = after(unknowns, current)
     mean, _ = predict(EXACT, known(x, v), 1.0, current)
     assert mean[0] == pytest.approx(end[0], abs=3e-5)
     assert mean[1] == pytest.approx(end[1], abs=3e-4)
     pull = EXACT.motor * current - EXACT.spring * x
     assume(min(abs(v), abs(end[1])) > 0.05 and abs(abs(pull) - EXACT.coulomb) > 50.0)  # no derivative at a kink
-    f = jacobian(EXACT, unknowns, current, np.array([1e-6, 1e-5, 1e-6, 1e-6, 1e-6, 1e-6]))
+    f = jacobian(unknowns, current, np.array([1e-6, 1e-5, 1e-6, 1e-6, 1e-6, 1e-6]))
     _, packed = predict(EXACT, known(x, v, 1e-12), 1.0, current)
     covariance = unpack(np.array(packed), 6) / 1e-12
     assert covariance[0, 2:] == pytest.approx(f[0, 2:], rel=2e-2, abs=1e-5)
@@ -108,9 +107,9 @@ def test_a_prediction_of_the_exact_brake_is_its_period_and_its_derivatives(x: fl
 def test_two_corrections_in_turn_are_the_textbooks_joint_one(seed: int) -> None:
     state = random_state(seed, 100.0)
     mean, p = np.array(state.mean), unpack(np.array(state.covariance), 6)
-    y, noise = mean[:2] + np.array([0.003, -0.7]), np.diag([EULER.angle_variance, EULER.velocity_variance])
+    y, noise = mean[:2] + np.array([0.003, -0.7]), np.diag([EXACT.angle_variance, EXACT.velocity_variance])
     gain = p[:, :2] @ np.linalg.inv(p[:2, :2] + noise)
-    found = follow(EULER, state, y[0], y[1], state.step, 0.0)
+    found = follow(EXACT, state, y[0], y[1], state.step, 0.0)
     assert found.mean == pytest.approx(mean + gain @ (y - mean[:2]), rel=1e-9)
     assert unpack(np.array(found.covariance), 6) == pytest.approx(p - gain @ p[:2], rel=1e-6, abs=1e-12)
 
@@ -137,7 +136,7 @@ def test_with_a_declared_observer_the_angle_alone_corrects_whatever_the_velocity
     rng, x, v, samples = np.random.default_rng(5), 0.0, 0.0, []
     for k in range(60):
         current = 6.0 if k < 30 else -6.0
-        x, v = after(EXACT, np.array([x, v, *UNIT]), current)[:2]
+        x, v = after(np.array([x, v, *UNIT]), current)[:2]
         samples.append((x + 1e-3 * rng.standard_normal(), current))
     mean, p, squares = with_angles(start(OBSERVED), samples)
     running, worst = 1.0, 1.0
@@ -156,7 +155,7 @@ def test_with_a_declared_observer_the_angle_alone_corrects_whatever_the_velocity
 
 def test_the_prior_is_uniform_in_the_ranges_and_at_home() -> None:
     ranges = BENCH.range_set("viscous")
-    state = start(make_model(BENCH, ranges, sticks=True))
+    state = start(make_model(BENCH, ranges))
     assert state.mean == pytest.approx((0.0, 0.0, 1.0, 1.0, 1.0, 3.0e-5 / 2.16e-5))
     deviation = np.array([0.5, 5.0, 0.0, 0.0, 0.0, 4.0e-5 / 2.16e-5 / math.sqrt(12.0)])
     assert unpack(np.array(state.covariance), 6) == pytest.approx(np.diag(deviation**2))
@@ -173,7 +172,7 @@ def test_the_model_has_the_numbers_of_the_bench() -> None:
         acceleration
     )
     noisy = replace(BENCH, noise=replace(BENCH.noise, angle=2e-3, velocity=1.3))
-    noise = make_model(noisy, PM50, sticks=True)
+    noise = make_model(noisy, PM50)
     assert (noise.angle_variance, noise.velocity_variance) == pytest.approx((4e-6, 1.69))
     assert (noise.derived, OBSERVED) == (False, EXACT._replace(derived=True))
     assert (model.start_angle_variance, model.start_velocity_variance) == pytest.approx((0.25, 25.0))
@@ -182,21 +181,14 @@ def test_the_model_has_the_numbers_of_the_bench() -> None:
     assert model.high == pytest.approx([1.5] * 4)
 
 
-def test_the_direction_of_an_uncertain_velocity_has_the_mean_sign_of_a_gaussian_number() -> None:
-    for v, sigma in [(0.0, 1.0), (0.5, 1.0), (-2.0, 1.5), (3.0, 0.2)]:
-        assert direction(v, sigma**2) == pytest.approx(math.erf(v / sigma / math.sqrt(2.0)), abs=0.03)
-    assert direction(1e-6, 0.0) == pytest.approx(math.tanh(0.8))
-
-
 def test_lost_samples_leave_it_less_sure_by_the_currents_that_may_have_acted() -> None:
-    for model in (EULER, EXACT):
-        state = known(10.0, 100.0, 1e-8)
-        variances = [unpack(np.array(predict(model, state, n, 0.0)[1]), 6)[1, 1] for n in (1.0, 2.0, 4.0)]
-        assert variances[1] - variances[0] == pytest.approx(model.lost**2, rel=1e-2)
-        assert variances[2] - variances[0] == pytest.approx((3.0 * model.lost) ** 2, rel=1e-2)
-        assert predict(model, state, 0.5, 1.0) == predict(model._replace(lost=0.0), state, 0.5, 1.0)
-        for periods in (0.0, -3.0):
-            assert predict(model, state, periods, 6.0) == (state.mean, state.covariance)
+    state = known(10.0, 100.0, 1e-8)
+    variances = [unpack(np.array(predict(EXACT, state, n, 0.0)[1]), 6)[1, 1] for n in (1.0, 2.0, 4.0)]
+    assert variances[1] - variances[0] == pytest.approx(EXACT.lost**2, rel=1e-2)
+    assert variances[2] - variances[0] == pytest.approx((3.0 * EXACT.lost) ** 2, rel=1e-2)
+    assert predict(EXACT, state, 0.5, 1.0) == predict(EXACT._replace(lost=0.0), state, 0.5, 1.0)
+    for periods in (0.0, -3.0):
+        assert predict(EXACT, state, periods, 6.0) == (state.mean, state.covariance)
     late = follow(EXACT, start(EXACT), 0.5, 3.0, 40.0, 0.0)
     assert late.mean[0] == pytest.approx(0.5, abs=2e-3)
 
