@@ -7,8 +7,8 @@ saturates.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
 from importlib import resources
@@ -19,8 +19,7 @@ from emb_runtime.can.generated import Field, generate_codec
 from emb_runtime.records import CurrentCommand, Frame, NodeState
 
 CHARGE: Final = "EMB_Charge"
-GATEWAY: Final = "EMB_Gateway"  # Names of the messages that a node need not send
-OPTIONAL_VERSION: Final = 1  # Version of each of the two
+OPTIONAL_VERSION: Final = 1  # Version of each of the two messages that a node need not send
 
 
 class StopReason(IntEnum):
@@ -62,69 +61,40 @@ class StatusFrame(NamedTuple):
     bench_identity: int  # :func:`bench_identity` of the node's bench file
 
 
-class ChargeFrame(NamedTuple):
-    """Content of the charge message."""
-
-    counter: int  # Alive counter of the sample, 0..14
-    version: int  # :data:`OPTIONAL_VERSION`
-    charge: float  # Integral of the current up to the sample, wrapped [A·s]
-
-
-class GatewayFrame(NamedTuple):
-    """Content of the gateway's message: counts since it started, saturated."""
-
-    counter: int  # Alive counter, 0..14
-    version: int  # :data:`OPTIONAL_VERSION`
-    not_sent: int  # Commands for which the drive's bus had no room
-    braked: int  # Periods without an answer in time, while a run was active
-    not_believed: int  # Frames of the drive that were refused
-    refused: int  # Frames to the drive that the second guard refused
-
-
-_FIELDS: Mapping[str, tuple[type[Any], tuple[Field, ...]]] = {
-    "EMB_Command": (
-        CurrentCommand,
-        (Field("Counter"), Field("Answers"), Field("Current"), Field("Enable", choices=(False, True))),
-    ),
-    "EMB_Angle": (
-        AngleFrame,
-        (Field("Counter"), Field("Angle"), Field("DeviceTime", scale=10**9, wraps=True)),
-    ),
-    "EMB_Velocity": (
-        VelocityFrame,
-        (
-            Field("Counter"),
-            Field("Velocity"),
-            Field("AppliedCurrent"),
-            Field("NodeState", choices=tuple(NodeState)),
-            Field("CommandCounter"),
+def _fields(version: int) -> dict[str, tuple[type[Any], tuple[Field, ...]]]:
+    """Record of each message, and the signal of each of its fields: all but the CRC. Nobody decodes the last two."""
+    node_state, optional = Field("NodeState", choices=tuple(NodeState)), Field("Version", fixed=OPTIONAL_VERSION)
+    return {
+        "EMB_Command": (
+            CurrentCommand,
+            (*map(Field, ("Counter", "Answers", "Current")), Field("Enable", choices=(False, True))),
         ),
-    ),
-    "EMB_Status": (
-        StatusFrame,
-        (
-            Field("Counter"),
-            Field("NodeState", choices=tuple(NodeState)),
-            Field("ProtocolVersion"),
-            Field("StopReason", choices=tuple(StopReason)),
-            Field("RejectedCommands", saturates=True),
-            Field("BenchIdentity"),
+        "EMB_Angle": (AngleFrame, (Field("Counter"), Field("Angle"), Field("DeviceTime", scale=10**9, wraps=True))),
+        "EMB_Velocity": (
+            VelocityFrame,
+            (*map(Field, ("Counter", "Velocity", "AppliedCurrent")), node_state, Field("CommandCounter")),
         ),
-    ),
-    CHARGE: (ChargeFrame, (Field("Counter"), Field("Version", fixed=OPTIONAL_VERSION), Field("Charge", wraps=True))),
-    GATEWAY: (
-        GatewayFrame,
-        (
-            Field("Counter"),
-            Field("Version", fixed=OPTIONAL_VERSION),
-            Field("NotSent", saturates=True),
-            Field("Braked", saturates=True),
-            Field("NotBelieved", saturates=True),
-            Field("Refused", saturates=True),
+        "EMB_Status": (
+            StatusFrame,
+            (
+                Field("Counter"),
+                node_state,
+                Field("ProtocolVersion", fixed=version),
+                Field("StopReason", choices=tuple(StopReason)),
+                Field("RejectedCommands", saturates=True),
+                Field("BenchIdentity"),
+            ),
         ),
-    ),
-}
-"""Record of each message, and the signal of each of its fields: all but the CRC."""
+        CHARGE: (tuple, (Field("Counter"), optional, Field("Charge", wraps=True))),
+        "EMB_Gateway": (
+            tuple,
+            (
+                Field("Counter"),
+                optional,
+                *(Field(name, saturates=True) for name in ("NotSent", "Braked", "NotBelieved", "Refused")),
+            ),
+        ),
+    }
 
 
 @dataclass(frozen=True)
@@ -137,29 +107,38 @@ class Layout:
 
     text: str
     protocol_version: int
-    messages: Mapping[str, Message]  # Those that every node takes or sends, by name
     command: Message
     angle: Message
     velocity: Message
     status: Message
     charge: Message  # A node may send it
     gateway: Message  # A gateway sends it
-    device_time_period_ns: int  # Period after which the device time wraps [ns]
     encode_command: Callable[[int, int, float, bool], Frame]
     encode_angle: Callable[[int, float, int], Frame]
     encode_velocity: Callable[[int, float, float, NodeState, int], Frame]
     encode_status: Callable[[int, NodeState, StopReason, int, int], Frame]  # The version is the layout's
-    encode_charge: Callable[[int, float], Frame]
-    encode_gateway: Callable[[int, int, int, int, int], Frame]
+    encode_charge: Callable[[int, float], Frame]  # Counter of the sample, and the integral of the current up to it
+    encode_gateway: Callable[[int, int, int, int, int], Frame]  # Counter, and counts since the gateway started
     decode_command: Callable[[Frame], CurrentCommand]
     decode_angle: Callable[[Frame], AngleFrame]
     decode_velocity: Callable[[Frame], VelocityFrame]
     decode_status: Callable[[Frame], StatusFrame]
 
     @property
+    def messages(self) -> dict[str, Message]:
+        """Messages that every node takes or sends, by name."""
+        return {message.name: message for message in (self.command, self.angle, self.velocity, self.status)}
+
+    @property
     def known(self) -> tuple[Message, ...]:
         """All messages, those included that need not be sent."""
         return (*self.messages.values(), self.charge, self.gateway)
+
+    @property
+    def device_time_period_ns(self) -> int:
+        """Period after which the device time wraps [ns]."""
+        time = self.angle.signal("DeviceTime")
+        return round(time.factor * 1e9) * (time.mask + 1)
 
     def current_within(self, limit: float) -> float:
         """The largest current that a command can carry and that is not beyond a limit [A]."""
@@ -182,35 +161,8 @@ def load_layout() -> Layout:
     text = resources.files("emb_runtime.can").joinpath("emb.dbc").read_text(encoding="utf-8")
     database: Any = parse(text)
     version = int(database.dbc.attributes["EmbProtocolVersion"].value)
-    messages = {name: describe(database.get_message_by_name(name)) for name in _FIELDS}
-    codecs = {name: generate_codec(message, *_fields(name, version)) for name, message in messages.items()}
-    command, angle, velocity, status, charge, gateway = codecs.values()
-    optional = messages.pop(CHARGE), messages.pop(GATEWAY)
-    time = messages["EMB_Angle"].signal("DeviceTime")
-    return Layout(
-        text=text,
-        protocol_version=version,
-        messages=messages,
-        command=messages["EMB_Command"],
-        angle=messages["EMB_Angle"],
-        velocity=messages["EMB_Velocity"],
-        status=messages["EMB_Status"],
-        charge=optional[0],
-        gateway=optional[1],
-        device_time_period_ns=round(time.factor * 1e9) * (time.mask + 1),
-        encode_command=command.encode,
-        encode_angle=angle.encode,
-        encode_velocity=velocity.encode,
-        encode_status=status.encode,
-        encode_charge=charge.encode,
-        encode_gateway=gateway.encode,
-        decode_command=command.decode,
-        decode_angle=angle.decode,
-        decode_velocity=velocity.decode,
-        decode_status=status.decode,
-    )
-
-
-def _fields(name: str, version: int) -> tuple[type[Any], tuple[Field, ...]]:
-    record, fields = _FIELDS[name]
-    return record, tuple(replace(f, fixed=version) if f.signal == "ProtocolVersion" else f for f in fields)
+    fields = _fields(version)
+    messages = [describe(database.get_message_by_name(name)) for name in fields]
+    codecs = [generate_codec(message, *fields[message.name]) for message in messages]
+    parts: list[Any] = [*messages, *(codec.encode for codec in codecs), *(codec.decode for codec in codecs[:4])]
+    return Layout(text, version, *parts)

@@ -21,11 +21,11 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Final
+from typing import Final, TypeVar
 
 from emb_runtime.can.codec import FrameRejectedError, Message
 from emb_runtime.can.e2e import CounterCheck
-from emb_runtime.can.messages import AngleFrame, Layout, StatusFrame, StopReason
+from emb_runtime.can.messages import AngleFrame, Layout, StatusFrame, StopReason, VelocityFrame
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame, NodeState, SensorSample
 from emb_runtime.system.clock import TimeUnwrapper
@@ -33,6 +33,8 @@ from emb_runtime.system.clock import TimeUnwrapper
 FRESH_PERIODS: Final = 2  # Age of a message, in its own periods, up to which it permits a current
 
 _NEVER: Final = -(1 << 62)
+
+Content = TypeVar("Content", bound=AngleFrame | VelocityFrame | StatusFrame)
 
 # What an error frame reports, by <linux/can/error.h>. It is the kernel's own message, never on the bus. Its identifier
 # has one bit per kind of error, so it must be told apart first: the bit of a bus error, 0x080, is also our command.
@@ -99,18 +101,43 @@ def fresh_ns(message: Message) -> int:
     return FRESH_PERIODS * round(message.cycle_time * 1e9)
 
 
+class Trapezium:
+    """Check that an angle follows from the last one by the velocities, within noise and motion.
+
+    Both the exact flow and an Euler step lie within half a period's acceleration of the trapezium. That is at most the
+    one that any brake of the bench's shield ranges reaches inside its limits.
+    """
+
+    def __init__(self, bench: Bench) -> None:
+        noise, sigmas, limits, box = (
+            bench.noise,
+            bench.shield.noise_sigmas,
+            bench.limits,
+            bench.range_set(bench.shield.ranges),
+        )
+        spring = box.high.gamma * box.high.k_1 * max(-limits.angle[0], limits.angle[1])
+        friction = box.high.T_c + box.high.f_v * limits.velocity
+        top_acceleration = (box.high.k_m * limits.current + spring + friction) / box.low.J
+        self._half_top_acceleration = 0.5 * top_acceleration
+        self._angle_noise, self._velocity_noise = sigmas * 1.5 * noise.angle, sigmas * noise.velocity
+        self._velocity_noise += bench.sensors.longest_lag(bench.timing.sample_time) * top_acceleration
+
+    def follows(self, last: SensorSample, sample: SensorSample, elapsed: float) -> bool:
+        """Returns True if the travelled angle agrees with the mean velocity over the elapsed time [s]."""
+        travelled = sample.angle - last.angle
+        expected = 0.5 * elapsed * (sample.velocity + last.velocity)
+        tolerance = self._angle_noise + elapsed * (self._velocity_noise + elapsed * self._half_top_acceleration)
+        return abs(travelled - expected) <= tolerance
+
+
 class Reception:
     """Takes every frame that was on the bus, and gives the samples; each rejected frame is told with the reason."""
 
     def __init__(self, layout: Layout, bench: Bench, on_rejected: Callable[[Frame, str], None]) -> None:
         self._layout = layout
         self._on_rejected = on_rejected
-        noise, sigmas = bench.noise, bench.shield.noise_sigmas
-        self._angle_noise, self._velocity_noise = sigmas * 1.5 * noise.angle, sigmas * noise.velocity
+        self._motion = Trapezium(bench)
         self._period_ns = bench.timing.sample_time_ns
-        top_acceleration = _top_acceleration(bench)
-        self._half_top_acceleration = 0.5 * top_acceleration
-        self._velocity_noise += bench.sensors.longest_lag(bench.timing.sample_time) * top_acceleration
         self._angle, self._velocity, self._status = (
             MessageState(m.name, m.identifier, fresh_ns(m), CounterCheck(bench.watch.rejected))
             for m in (layout.angle, layout.velocity, layout.status)
@@ -119,9 +146,7 @@ class Reception:
         self.states = (self._angle, self._velocity, self._status, self._pair)
         """State of each message, and of the pairs: a pair is complete when its velocity has come."""
         self._unwrap = TimeUnwrapper(layout.device_time_period_ns).unwrap
-        self._apart_ns = self._pair.fresh_ns
-        self._waiting: AngleFrame | None = None
-        self._waiting_since_ns = 0
+        self._waiting: tuple[AngleFrame, int] | None = None  # Angle without its velocity, and its arrival [ns]
         self._last: SensorSample | None = None
         self.rejected = 0  # Frames rejected so far
         self.too_many_rejected = False  # Too many, in a row or by their share: the source is not trusted again
@@ -170,108 +195,68 @@ class Reception:
             return None
         identifier, layout = frame.identifier, self._layout
         if identifier == layout.angle.identifier:
-            self._take_angle(frame)
+            if (angle := self._accepted(frame, self._angle, layout.decode_angle)) is not None:
+                self._waiting = angle, frame.time_ns
         elif identifier == layout.velocity.identifier:
-            return self._take_velocity(frame)
+            if (velocity := self._accepted(frame, self._velocity, layout.decode_velocity)) is not None:
+                return self._paired(frame, velocity)
         elif identifier == layout.status.identifier:
-            self._take_status(frame)
+            self.status = self._accepted(frame, self._status, layout.decode_status) or self.status
         elif identifier == layout.command.identifier:
             self.foreign_command = True
         return None
 
-    def _take_angle(self, frame: Frame) -> None:
+    def _accepted(self, frame: Frame, state: MessageState, decode: Callable[[Frame], Content]) -> Content | None:
+        """Content of a frame that is valid and new; None of one that is rejected."""
         try:
-            angle = self._layout.decode_angle(frame)
+            content = decode(frame)
         except FrameRejectedError as err:
-            self._reject(frame, self._angle, err.fault, str(err))
-            return
-        if self._accepted(frame, self._angle, angle.counter):
-            self._waiting, self._waiting_since_ns = angle, frame.time_ns
+            state.errors.reject()
+            self._count_rejected(frame, state, err.fault, str(err))
+            return None
+        if state.errors.step(content.counter) == 0:
+            self._count_rejected(frame, state, Rejection.REPEATED, Rejection.REPEATED)
+            return None
+        state.valid_ns = frame.time_ns
+        return content
 
-    def _take_velocity(self, frame: Frame) -> SensorSample | None:
-        try:
-            velocity = self._layout.decode_velocity(frame)
-        except FrameRejectedError as err:
-            self._reject(frame, self._velocity, err.fault, str(err))
-            return None
+    def _paired(self, frame: Frame, velocity: VelocityFrame) -> SensorSample | None:
+        """The sample of a velocity and the angle that waits for it; None if there is none, or it does not follow."""
         counter, speed, applied_current, node_state, command_counter = velocity
-        if not self._accepted(frame, self._velocity, counter):
-            return None
-        angle, since_ns, now_ns = self._waiting, self._waiting_since_ns, frame.time_ns
+        waiting, pair, now_ns = self._waiting, self._pair, frame.time_ns
         # An angle that has waited long is of another round of the counter: 15 periods old, and of no use.
-        if angle is None or angle.counter != counter or not -self._apart_ns <= now_ns - since_ns <= self._apart_ns:
-            return None  # the angle frame of this pair did not come; the missing pair is counted by its time
+        if waiting is None or waiting[0].counter != counter or not abs(now_ns - waiting[1]) <= pair.fresh_ns:
+            return None  # the missing pair is counted by its time
         self._waiting = None
-        device_time_ns = self._unwrap(angle.device_time_ns, since_ns)
-        receive_time_ns = now_ns if now_ns > since_ns else since_ns
-        times = device_time_ns, receive_time_ns
+        angle, since_ns = waiting
+        times = self._unwrap(angle.device_time_ns, since_ns), (now_ns if now_ns > since_ns else since_ns)
         sample = tuple.__new__(
             SensorSample, (counter, angle.angle, speed, *times, applied_current, command_counter, node_state)
         )
-        return sample if self._believed(frame, sample) else None
-
-    def _take_status(self, frame: Frame) -> None:
-        try:
-            status = self._layout.decode_status(frame)
-        except FrameRejectedError as err:
-            self._reject(frame, self._status, err.fault, str(err))
-            return
-        if self._accepted(frame, self._status, status.counter):
-            self.status = status
-
-    def _accepted(self, frame: Frame, state: MessageState, counter: int) -> bool:
-        """Returns True if a valid frame is a new one."""
-        if state.errors.step(counter) == 0:
-            self._rejected(frame, state, Rejection.REPEATED, Rejection.REPEATED)
-            return False
-        state.valid_ns = frame.time_ns
-        return True
-
-    def _believed(self, frame: Frame, sample: SensorSample) -> bool:
-        """Returns True if a sample follows from the last one; the first is believed."""
-        last, pair = self._last, self._pair
-        if last is not None:
-            elapsed_ns = sample.device_time_ns - last.device_time_ns
-            if elapsed_ns < self._period_ns // 2:
-                self._reject(frame, pair, Rejection.TIME, Rejection.TIME)
-                return False
-            if not self.follows(last, sample, elapsed_ns * 1e-9):
-                self._reject(frame, pair, Rejection.IMPLAUSIBLE, Rejection.IMPLAUSIBLE)
-                return False
+        if (reason := self._contradiction(sample)) is not None:
+            pair.errors.reject()
+            self._count_rejected(frame, pair, reason, reason)
+            return None
         self._last = sample
         pair.valid_ns = sample.receive_time_ns
         pair.errors.forgive()
-        return True
+        return sample
 
-    def follows(self, last: SensorSample, sample: SensorSample, elapsed: float) -> bool:
-        """Returns True if the travelled angle agrees with the mean velocity (trapezium) within noise and motion.
+    def _contradiction(self, sample: SensorSample) -> Rejection | None:
+        """Reason why a sample cannot follow the last one; None if it can, as the first does."""
+        if self._last is None:
+            return None
+        elapsed_ns = sample.device_time_ns - self._last.device_time_ns
+        if elapsed_ns < self._period_ns // 2:
+            return Rejection.TIME
+        return None if self._motion.follows(self._last, sample, elapsed_ns * 1e-9) else Rejection.IMPLAUSIBLE
 
-        Both the exact flow and an Euler step lie within half a period's acceleration of the trapezium.
-        """
-        travelled = sample.angle - last.angle
-        expected = 0.5 * elapsed * (sample.velocity + last.velocity)
-        tolerance = self._angle_noise + elapsed * (self._velocity_noise + elapsed * self._half_top_acceleration)
-        return abs(travelled - expected) <= tolerance
-
-    def _reject(self, frame: Frame, state: MessageState, reason: str, why: str) -> None:
-        state.errors.reject()
-        self._rejected(frame, state, reason, why)
-
-    def _rejected(self, frame: Frame, state: MessageState, reason: str, why: str) -> None:
-        """Count a rejection that the leaky count knows already."""
+    def _count_rejected(self, frame: Frame, state: MessageState, reason: str, why: str) -> None:
         self.rejected += 1
         state.rejections[reason] = state.rejections.get(reason, 0) + 1
         if state.errors.exceeded:
             self.too_many_rejected = True
         self._on_rejected(frame, why)
-
-
-def _top_acceleration(bench: Bench) -> float:
-    """The most that any brake of the bench's shield ranges reaches inside its limits [rad/s²]."""
-    box = bench.range_set(bench.shield.ranges)
-    spring = box.high.gamma * box.high.k_1 * max(-bench.limits.angle[0], bench.limits.angle[1])
-    friction = box.high.T_c + box.high.f_v * bench.limits.velocity
-    return (box.high.k_m * bench.limits.current + spring + friction) / box.low.J
 
 
 def _overdue(state: MessageState, now_ns: int) -> str:

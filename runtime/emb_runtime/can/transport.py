@@ -71,31 +71,16 @@ class Transport(Protocol):
         ...
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """The next frame, waiting for it no longer than until the deadline.
+        """The next frame, error frames and the echo of own frames included; None if none came by the deadline.
 
-        Args:
-            deadline_ns: on the monotonic clock that came with the transport; one in the past, 0 say, only looks.
-
-        Returns:
-            None if no frame came in time. Error frames and the echo of own frames are frames too.
-
-        Raises:
-            BusError: the bus is lost.
+        That is on the monotonic clock that came with the transport; one in the past, 0 say, only looks. BusError if the
+        bus is lost.
         """
         ...
 
     def close(self) -> None:
         """Give the bus back."""
         ...
-
-
-def _raw_socket() -> socket.socket:
-    return socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-
-
-def _wait_readable(descriptor: int, timeout_s: float) -> bool:
-    # select() and not poll(), whose timeout has a resolution of one millisecond: a whole sample time.
-    return bool(select.select([descriptor], [], [], timeout_s)[0])
 
 
 class SocketCan:
@@ -109,8 +94,11 @@ class SocketCan:
         clock: Clock,
         identifiers: tuple[int, ...] | None = None,
         *,
-        open_socket: Callable[[], socket.socket] = _raw_socket,
-        wait_readable: Callable[[int, float], bool] = _wait_readable,
+        open_socket: Callable[[], socket.socket] = lambda: socket.socket(
+            socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW
+        ),
+        # select() and not poll(), whose timeout has a resolution of one millisecond: a whole sample time.
+        wait_readable: Callable[[int, float], object] = lambda fd, timeout_s: select.select([fd], [], [], timeout_s)[0],
     ) -> None:
         """Open and bind the socket of a network interface.
 
@@ -142,9 +130,10 @@ class SocketCan:
     def _set_up(self, interface: str, identifiers: tuple[int, ...] | None) -> None:
         sock = self._socket
         sock.setblocking(False)
-        self._descriptor = sock.fileno()
-        if self._descriptor >= _SELECT_LIMIT:
-            raise BusError(f"{interface}: file descriptor {self._descriptor} is too high; close some files first")
+        self.descriptor = sock.fileno()
+        """The socket's file descriptor, for the watchdog that may have to take the bus away from it."""
+        if self.descriptor >= _SELECT_LIMIT:
+            raise BusError(f"{interface}: file descriptor {self.descriptor} is too high; close some files first")
         try:
             sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
         except PermissionError:  # without CAP_NET_ADMIN, as much as net.core.rmem_max allows
@@ -174,11 +163,6 @@ class SocketCan:
         if (pending := sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)) != 0:
             raise self._loss(pending)
 
-    @property
-    def descriptor(self) -> int:
-        """The socket's file descriptor, for the watchdog that may have to take the bus away from it."""
-        return self._descriptor
-
     def send(self, frame: Frame) -> None:
         """See :meth:`Transport.send`."""
         identifier = frame.identifier
@@ -200,22 +184,15 @@ class SocketCan:
     def receive(self, deadline_ns: int) -> Frame | None:
         """See :meth:`Transport.receive`; the kernel reports that the interface has gone down once."""
         frame = self._read()
-        if frame is None and deadline_ns > 0:
-            frame = self._wait(deadline_ns)
+        while frame is None and deadline_ns > 0 and (now_ns := self._clock.now_ns()) < deadline_ns:
+            if not self._wait_readable(self.descriptor, (deadline_ns - now_ns) * 1e-9):
+                return None
+            frame = self._read()
         return frame
 
     def close(self) -> None:
         """See :meth:`Transport.close`."""
         self._socket.close()
-
-    def _wait(self, deadline_ns: int) -> Frame | None:
-        """Wait for a frame until a deadline [ns]."""
-        while (now_ns := self._clock.now_ns()) < deadline_ns:
-            if not self._wait_readable(self._descriptor, (deadline_ns - now_ns) * 1e-9):
-                return None
-            if (frame := self._read()) is not None:
-                return frame
-        return None
 
     def _read(self) -> Frame | None:
         """The next frame that waits, if one does."""
@@ -241,19 +218,11 @@ class SocketCan:
         time_ns, own = self._arrival_ns(wall_ns), bool(flags & _MSG_CONFIRM)
         if identifier <= _SFF_MASK:  # nearly all of them
             return tuple.__new__(Frame, (identifier, data[:length], time_ns, False, False, False, own, self._dropped))
-        remote = bool(identifier & socket.CAN_RTR_FLAG)
-        extended = bool(identifier & socket.CAN_EFF_FLAG)
-        error = bool(identifier & socket.CAN_ERR_FLAG)
-        return Frame(
-            identifier=identifier & (socket.CAN_EFF_MASK if extended or error else socket.CAN_SFF_MASK),
-            data=b"" if remote else data[:length],
-            time_ns=time_ns,
-            extended=extended,
-            remote=remote,
-            error=error,
-            own=own,
-            dropped=self._dropped,
-        )
+        kinds = socket.CAN_EFF_FLAG, socket.CAN_RTR_FLAG, socket.CAN_ERR_FLAG
+        extended, remote, error = (bool(identifier & kind) for kind in kinds)
+        identifier &= socket.CAN_EFF_MASK if extended or error else _SFF_MASK
+        data = b"" if remote else data[:length]
+        return Frame(identifier, data, time_ns, extended, remote, error, own, self._dropped)
 
     def _arrival_ns(self, wall_ns: int) -> int:
         """Arrival of a frame that has just been read, by the kernel's stamp; both [ns].

@@ -51,7 +51,7 @@ class DriveNode:
         self.receiver = Receiver(mapping, bench.watch.stop_missed)
         self.outlet = Outlet(mapping, bench.limits.current, send)
         self.answers = Answers(layout, bench)
-        self._sensors = SensorCheck(layout, bench)
+        self._sensors = SensorCheck(bench)
         self._poll = Poll() if mapping.polled else None
         box = bench.range_set(bench.shield.ranges)
         self._moves_none = box.low.T_c / box.high.k_m  # current that moves no brake of the bench [A]

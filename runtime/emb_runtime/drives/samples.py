@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 from emb_runtime.can.e2e import NO_COUNTER, LeakyCount
-from emb_runtime.can.messages import Layout
-from emb_runtime.can.receiver import Reception
+from emb_runtime.can.receiver import Trapezium
 from emb_runtime.config.bench import Bench
 from emb_runtime.drives.mapping import Mapping
 from emb_runtime.drives.wire import DriveSample
@@ -19,12 +18,7 @@ CONTRADICTIONS = 3  # Samples in a row that contradict the one before, or a shar
 
 
 class SampleTimes:
-    """Times of one drive's samples, which it does not stamp, and of their answers.
-
-    Args:
-        mapping: the drive.
-        bench: sample time, and the age of frames that the shield assumes.
-    """
+    """Times of one drive's samples, which it does not stamp, and of their answers."""
 
     def __init__(self, mapping: Mapping, bench: Bench) -> None:
         self._polled = mapping.polled
@@ -79,9 +73,9 @@ class SampleTimes:
 class SensorCheck:
     """Check that the angle follows from the velocity, and that both are within the bench's limits and noise."""
 
-    def __init__(self, layout: Layout, bench: Bench) -> None:
+    def __init__(self, bench: Bench) -> None:
         self._bench = bench
-        self._follows = Reception(layout, bench, lambda _frame, _why: None).follows
+        self._motion = Trapezium(bench)
         self._last: SensorSample | None = None
         self.contradictions = LeakyCount(CONTRADICTIONS)
 
@@ -90,7 +84,7 @@ class SensorCheck:
         angle, velocity, _, time_ns = sample
         last = self._last
         self._last = SensorSample(0, angle, velocity, device_ns, time_ns, 0.0, NO_COUNTER, NodeState.IDLE)
-        if last is None or self._follows(last, self._last, (device_ns - last.device_time_ns) * 1e-9):
+        if last is None or self._motion.follows(last, self._last, (device_ns - last.device_time_ns) * 1e-9):
             self.contradictions.forgive()
         else:
             self.contradictions.reject()

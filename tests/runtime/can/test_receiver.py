@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from emb_runtime.can.codec import Fault
 from emb_runtime.can.messages import Layout, StopReason
-from emb_runtime.can.receiver import BUS_OFF, UNKNOWN, WITHOUT_DETAILS, Reception, Rejection, classify
+from emb_runtime.can.receiver import BUS_OFF, UNKNOWN, WITHOUT_DETAILS, Reception, Rejection, Trapezium, classify
 from emb_runtime.config.bench import Bench, Sensors
 from emb_runtime.records import Frame, NodeState, SensorSample
 from tests.independent import protected
@@ -218,7 +218,7 @@ def test_the_latest_status_is_kept_and_a_repeated_counter_is_none(harness: Harne
 
 
 @pytest.mark.parametrize("declared", [Sensors("observer", 800.0), Sensors("observer", velocity_lag=9e-4 / 0.8)])
-def test_a_velocity_may_lag_as_the_bench_declares_and_no_more(layout: Layout, bench: Bench, declared: Sensors) -> None:
+def test_a_velocity_may_lag_as_the_bench_declares_and_no_more(bench: Bench, declared: Sensors) -> None:
     """Of the strongest brake at full current, which a critically damped observer shows 2/ω late."""
     strongest = bench.range_set(bench.shield.ranges)
     acceleration = strongest.high.k_m * bench.limits.current / strongest.low.J
@@ -228,8 +228,7 @@ def test_a_velocity_may_lag_as_the_bench_declares_and_no_more(layout: Layout, be
             angle, shown = 0.5 * acceleration * at**2, acceleration * (at - late)
             return SensorSample(0, angle, shown, round(at * 1e9), 0, 0.0, 0, IDLE)
 
-        reception = Reception(layout, replace(bench, sensors=sensors), lambda *_: None)
-        return reception.follows(sample(0.006), sample(0.007), 1e-3)
+        return Trapezium(replace(bench, sensors=sensors)).follows(sample(0.006), sample(0.007), 1e-3)
 
     assert follows(Sensors(), 0.0)
     assert not follows(Sensors(), 2.0 / 800.0)

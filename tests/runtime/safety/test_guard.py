@@ -15,7 +15,7 @@ import pytest
 
 import emb_runtime
 from emb_runtime.can.generated import generate_codec
-from emb_runtime.can.messages import _FIELDS, Layout, load_layout
+from emb_runtime.can.messages import Layout, _fields, load_layout
 from emb_runtime.config.bench import Bench, parse_bench, shipped_bench_text
 from emb_runtime.errors import EXIT_SAFETY_STOP, BusError
 from emb_runtime.records import Frame, NodeState, RunState, SensorSample
@@ -136,7 +136,7 @@ def test_no_bench_no_limit_and_no_dbc_reaches_beyond_the_ceiling_of_six_ampere(b
     current = command.signal("Current")
     wider = replace(current, minimum=-6.5, maximum=6.5, raw_minimum=-32_500, raw_maximum=32_500)
     command = replace(command, signals=tuple(wider if s is current else s for s in command.signals))
-    encode = generate_codec(command, *_FIELDS["EMB_Command"]).encode
+    encode = generate_codec(command, *_fields(1)["EMB_Command"]).encode
     wide = replace(load_layout(), command=command, encode_command=encode)
     guard = Guard(wide, replace(bench, limits=replace(bench.limits, current=6.5)), bus.send, limit=6.5)
     refused(guard, bus, wide.encode_command(0, 0, 6.0002, True), "beyond 6 A")
