@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from importlib import resources
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -100,76 +101,25 @@ def _node(node: Any) -> Node:
     )
 
 
-# The part of onnx.proto3 that is read, as (field, number, type): a type with a star repeats, a type that names a row of
-# this table is a message. A message that is only looked for is bytes. The rest of a file stays unread, for ONNX Runtime
-# to judge.
-_ONNX_PART: dict[str, tuple[tuple[str, int, str], ...]] = {
-    "Model": (("graph", 7, "Graph"), ("metadata_props", 14, "*Entry"), ("functions", 25, "*bytes")),
-    "Entry": (("key", 1, "string"), ("value", 2, "string")),
-    "Graph": (("node", 1, "*Node"), ("initializer", 5, "*Tensor"), ("sparse_initializer", 15, "*bytes")),
-    "Node": (
-        ("input", 1, "*string"),
-        ("output", 2, "*string"),
-        ("op_type", 4, "string"),
-        ("attribute", 5, "*Attribute"),
-        ("domain", 7, "string"),
-    ),
-    "Attribute": (
-        ("name", 1, "string"),
-        ("t", 5, "Tensor"),
-        ("g", 6, "bytes"),
-        ("tensors", 10, "*bytes"),
-        ("graphs", 11, "*bytes"),
-        ("sparse_tensor", 22, "bytes"),
-        ("sparse_tensors", 23, "*bytes"),
-    ),
-    "Tensor": (
-        ("name", 8, "string"),
-        ("external_data", 13, "*bytes"),
-        ("data_location", 14, "int32"),
-    ),
-}
+_PART = resources.files("emb_runtime.policy").joinpath("onnx_part.binpb").read_bytes()
+_POOL = descriptor_pool.DescriptorPool()
+_POOL.Add(descriptor_pb2.FileDescriptorSet.FromString(_PART).file[0])
+_MODEL: Any = message_factory.GetMessageClass(_POOL.FindMessageTypeByName("emb_onnx_part.Model"))
 
 
-def _build_reader() -> Any:
-    """A message class that reads :data:`_ONNX_PART`."""
-    field_type = descriptor_pb2.FieldDescriptorProto
-    scalars = {name: getattr(field_type, f"TYPE_{name.upper()}") for name in ("string", "bytes", "int32")}
-    # Syntax proto2, for only there a number that is absent is told from zero.
-    file = descriptor_pb2.FileDescriptorProto(name="emb_onnx_part.proto", package="emb_onnx_part", syntax="proto2")
-    for name, fields in _ONNX_PART.items():
-        message = file.message_type.add(name=name)
-        for field_name, number, kind in fields:
-            label = field_type.LABEL_REPEATED if kind.startswith("*") else field_type.LABEL_OPTIONAL
-            kind = kind.removeprefix("*")
-            entry = message.field.add(name=field_name, number=number, label=label)
-            if kind in scalars:
-                entry.type = scalars[kind]
-            else:
-                entry.type, entry.type_name = field_type.TYPE_MESSAGE, f".{file.package}.{kind}"
-    pool = descriptor_pool.DescriptorPool()
-    pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName("emb_onnx_part.Model"))
-
-
-_MODEL = _build_reader()
-
-
-def _of(names: str, inputs: slice) -> dict[str, slice]:
-    return dict.fromkeys(names.split(), inputs)
-
-
+_NO_NUMBERS = """
+    Abs Acos Acosh Add And Asin Asinh Atan Atanh Cast Ceil Celu Clip Concat Constant Cos Cosh Div Elu Equal Erf Exp
+    Flatten Floor Gather Gelu Gemm Greater GreaterOrEqual HardSigmoid HardSwish Identity IsInf IsNaN LayerNormalization
+    LeakyRelu Less LessOrEqual Log LogSoftmax MatMul Max Mean Min Mish Mul Neg Not Or PRelu Pow Reciprocal Relu Round
+    Selu Shrink Sigmoid Sign Sin Sinh Softmax Softplus Softsign Sqrt Sub Sum Swish Tan Tanh ThresholdedRelu Transpose
+    Where Xor
+"""
+_NUMBERS = """
+    Expand ReduceL1 ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare
+    Reshape Slice Split Squeeze Unsqueeze
+"""
 FIXED: Mapping[str, slice] = MappingProxyType(
-    _of("Abs Acos Acosh Add And Asin Asinh Atan Atanh Cast Ceil Celu Clip Concat Constant Cos Cosh", slice(0, 0))
-    | _of("Div Elu Equal Erf Exp Flatten Floor Gather Gelu Gemm Greater GreaterOrEqual HardSigmoid", slice(0, 0))
-    | _of("HardSwish Identity IsInf IsNaN LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax", slice(0, 0))
-    | _of("MatMul Max Mean Min Mish Mul Neg Not Or PRelu Pow Reciprocal Relu Round Selu Shrink Sigmoid", slice(0, 0))
-    | _of("Sign Sin Sinh Softmax Softplus Softsign Sqrt Sub Sum Swish Tan Tanh ThresholdedRelu", slice(0, 0))
-    | _of("Transpose Where Xor", slice(0, 0))
-    | _of(
-        "Expand ReduceL1 ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare", slice(1, None)
-    )
-    | _of("Reshape Slice Split Squeeze Unsqueeze", slice(1, None))
+    dict.fromkeys(_NO_NUMBERS.split(), slice(0, 0)) | dict.fromkeys(_NUMBERS.split(), slice(1, None))
 )
 """By operator: which of its inputs must be numbers in the file: none, or all but the first."""
 

@@ -6,13 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 from google.protobuf.descriptor import FieldDescriptor
 
 from emb_runtime.estimator.estimate import UNITS
 from emb_runtime.log import ring_buffer, topics
 from emb_runtime.records import Call, CycleRecord, NodeState, Reason, RunState
 from tests.independent import DATABASE
-from tools.compile_proto import FOLDER, compile_proto
+from tools.compile_proto import SOURCES, compile_proto
 
 
 def fields(message: str) -> dict[str, Any]:
@@ -23,9 +24,10 @@ def units(message: str) -> dict[str, str]:
     return dict(json.loads(topics.metadata(message).get("units", "{}")))
 
 
-def test_the_compiled_messages_are_those_of_the_proto_file(tmp_path: Path) -> None:
-    assert compile_proto(tmp_path / "emb.binpb") == 0
-    assert (tmp_path / "emb.binpb").read_bytes() == (FOLDER / "emb.binpb").read_bytes()
+@pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.name)
+def test_the_compiled_messages_are_those_of_the_proto_file(source: Path, tmp_path: Path) -> None:
+    assert compile_proto(source, tmp_path / "it.binpb") == 0
+    assert (tmp_path / "it.binpb").read_bytes() == source.with_suffix(".binpb").read_bytes()
 
 
 def test_every_field_has_presence_and_no_number_was_left_out() -> None:
