@@ -16,12 +16,7 @@ from typing import Any, Final, NamedTuple
 from msgspec import to_builtins
 
 from emb_runtime.errors import LogError
-from emb_runtime.log.ring_buffer import (
-    LogHeader,
-    Record,
-    Ring,
-    pack,
-)
+from emb_runtime.log.ring_buffer import LogHeader, Record, Ring, pack
 from emb_runtime.system.child_process import HAS_CHILD_PROCESSES, Child
 
 START_TIMEOUT: Final = 30.0  # Longest wait for the recorder process to have the file on disk [s]
@@ -128,11 +123,9 @@ class Recorder:
         with contextlib.suppress(OSError):  # if the process is gone, what it last said follows
             self._child.tell(trailer)
         answer = self._child.answer(timeout + self._size / READ_BACK)
-        dropped = self._ring.dropped
-        backlog = len(self._ring)
+        lost = self._ring.dropped + int(answer.get("lost", len(self._ring)))
         self._child.end()
         self._ring.close()
-        lost = dropped + int(answer.get("lost", backlog))
         error = str(answer.get("error", ""))
         if not error and lost:
             error = f"{lost} records did not fit into the ring"

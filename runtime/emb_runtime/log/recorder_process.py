@@ -44,7 +44,6 @@ from emb_runtime.log.ring_buffer import (
     encodable,
     unpack,
 )
-from emb_runtime.records import Frame
 from emb_runtime.system import child_process
 from emb_runtime.system.clock import MonotonicClock
 from emb_runtime.system.input_file import open_regular
@@ -79,9 +78,8 @@ class LogWriter:
         begin = self._offset + header.start_ns
         for name, entries in header.metadata.items():
             self._add_metadata(name, entries)
-        self._attach(begin, "emb.dbc", "text/plain", header.dbc.encode())
-        for attachment in header.attachments:
-            self._attach(begin, *attachment)
+        for name, media_type, data in (("emb.dbc", "text/plain", header.dbc.encode()), *header.attachments):
+            self._mcap.add_attachment(create_time=begin, log_time=begin, name=name, media_type=media_type, data=data)
         there = {*header.topics, "/drive/rx"} if header.drive_bus else header.topics
         for topic in topics.TOPICS:
             if topic not in OPTIONAL or topic in there:
@@ -93,20 +91,38 @@ class LogWriter:
     def write(self, record: Record, log_time: int) -> None:
         """Write one record of monotonic times, and what it decodes to, at a Unix time [ns]."""
         if isinstance(record, FrameRecord):
-            self._write_frame(record, log_time)
+            self.write_frame("/can/tx" if record.frame.own else "/can/rx", record, log_time)
+            try:
+                message = self._messages[record.frame.identifier]
+                signals = message.decode(record.frame)
+            except (KeyError, FrameRejectedError):
+                self.undecoded += 1
+            else:
+                self._add(f"/emb/{message.name}", log_time, record.time_ns, signals)
             return
         values: tuple[Any, ...] = record
         if isinstance(record, EventRecord | InputRecord):
             values = record[1:]
         elif isinstance(record, EstimateRecord):
             values = record.step, *record.numbers
-        topic, message = TOPICS[type(record)]
-        names = topics.message_class(message).DESCRIPTOR.fields_by_name
+        topic, name = TOPICS[type(record)]
+        names = topics.message_class(name).DESCRIPTOR.fields_by_name
         self._add(topic, log_time, record.time_ns, dict(zip(names, values, strict=True)))
 
-    def write_drive(self, frame: Frame, read_ns: int, log_time: int) -> None:
-        """Write a frame of a mapped drive's bus, whose identifiers have another meaning."""
-        self._add("/drive/rx", log_time, frame.time_ns, _frame_values(frame, read_ns))
+    def write_frame(self, topic: str, record: FrameRecord, log_time: int) -> None:
+        """Write a frame as it is; one of a mapped drive's bus has another meaning."""
+        frame = record.frame
+        values = {
+            "id": frame.identifier,
+            "is_rtr": frame.remote,
+            "is_extended": frame.extended,
+            "is_error": frame.error,
+            "dlc": len(frame.data),
+            "data": frame.data,
+            "dropped": frame.dropped,
+            "read_time_ns": record.read_ns,
+        }
+        self._add(topic, log_time, frame.time_ns, values)
 
     def flush(self) -> None:
         """Hand everything written so far to the operating system."""
@@ -117,17 +133,6 @@ class LogWriter:
         self.flush()  # a log that is cut before its last message must not say how the run ended
         self._add_metadata(END, {**trailer, "undecoded_frames": str(self.undecoded)})
         self._mcap.finish()  # type: ignore[no-untyped-call]
-
-    def _write_frame(self, record: FrameRecord, log_time: int) -> None:
-        frame, read_ns = record
-        self._add("/can/tx" if frame.own else "/can/rx", log_time, frame.time_ns, _frame_values(frame, read_ns))
-        try:
-            message = self._messages[frame.identifier]
-            signals = message.decode(frame)
-        except (KeyError, FrameRejectedError):
-            self.undecoded += 1
-            return
-        self._add(f"/emb/{message.name}", log_time, frame.time_ns, signals)
 
     def _register(self, topic: str) -> None:
         message = topics.TOPICS[topic]
@@ -141,9 +146,6 @@ class LogWriter:
     def _add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         self._mcap.add_metadata(name, {key: encodable(text) for key, text in entries.items()})
 
-    def _attach(self, when: int, name: str, media_type: str, data: bytes) -> None:
-        self._mcap.add_attachment(create_time=when, log_time=when, name=name, media_type=media_type, data=data)
-
     def _add(self, topic: str, log_time: int, time_ns: int, values: Mapping[str, Any]) -> None:
         if topic not in self._channels:
             self._register(topic)
@@ -152,19 +154,6 @@ class LogWriter:
         data = topics.message_class(topics.TOPICS[topic])(**values).SerializeToString()
         self._mcap.add_message(channel, log_time, data, time_ns + self._offset, sequence)
         self.messages += 1
-
-
-def _frame_values(frame: Frame, read_ns: int) -> dict[str, Any]:
-    return {
-        "id": frame.identifier,
-        "is_rtr": frame.remote,
-        "is_extended": frame.extended,
-        "is_error": frame.error,
-        "dlc": len(frame.data),
-        "data": frame.data,
-        "dropped": frame.dropped,
-        "read_time_ns": read_ns,
-    }
 
 
 class NewFile(io.FileIO):
@@ -247,14 +236,13 @@ class Recording:
             if frame is None:
                 return False
             log_time = max(read_ns, frame.time_ns) + self._offset
-            self._guarded(partial(self.writer.write_drive, frame, read_ns, log_time))
+            self._guarded(partial(self.writer.write_frame, "/drive/rx", FrameRecord(frame, read_ns), log_time))
         return True
 
     def finish(self, trailer: dict[str, str]) -> dict[str, Any]:
         """Write the rest, close the file and report."""
         self.drain()
-        unreadable = len(self._ring)  # only a producer that died between two stores leaves any
-        self.lost += unreadable
+        self.lost += len(self._ring)  # only a producer that died between two stores leaves any
         trailer["dropped_records"] = str(self._ring.dropped + self.lost)
         if self.drive_error:
             trailer["drive_bus_error"] = self.drive_error

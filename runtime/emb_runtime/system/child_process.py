@@ -102,7 +102,9 @@ class Child:
                 return {"error": f"the {self._name} process did not answer within {timeout:g} s"}
             chunk = os.read(pipe.fileno(), 65536)
             if not chunk:
-                return {"error": f"the {self._name} process died ({_ending(self._process.wait())})"}
+                code = self._process.wait()
+                ending = f"signal {-code}" if code < 0 else f"exit status {code}"
+                return {"error": f"the {self._name} process died ({ending})"}
             self._answers += chunk
             if len(self._answers) > MAX_ANSWER:
                 return {"error": f"the {self._name} process said more than {MAX_ANSWER} bytes at once"}
@@ -141,10 +143,6 @@ class Child:
         if self.alive:
             self._process.kill()
         self._process.wait()
-
-
-def _ending(code: int) -> str:
-    return f"signal {-code}" if code < 0 else f"exit status {code}"
 
 
 # --- the child's side ------------------------------------------------------------------------------------------------
