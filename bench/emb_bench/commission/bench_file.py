@@ -144,7 +144,7 @@ def _rounded(value: float, *, up: bool = False) -> float:
 
 def _draft(sheet: Bench) -> TOMLDocument:
     """The data sheet's document with its ranges as one whole set."""
-    document = parse_toml(sheet.text)
+    document = parse_toml(sheet.text, sheet.name, BenchFileError)
     document["ranges"] = {SHEET: {name: list(sheet_range(sheet, name)) for name in PARAMETER_NAMES}}
     document["shield"] = {**document["shield"], "ranges": SHEET}
     document.pop("estimator", None)  # it begins with the shield's ranges

@@ -13,7 +13,7 @@ from msgspec import Meta
 import emb_runtime.config.bench as driven
 from emb_bench.config.machine import Machine
 from emb_bench.config.plants import BUILT_IN, Plant, read_plant
-from emb_runtime.config.bench import PARAMETER_NAMES, REMEDY, checked_bench, parse_document, read_bench_text
+from emb_runtime.config.bench import PARAMETER_NAMES, REMEDY, checked_bench, read_bench_text
 from emb_runtime.config.typed import parse_toml, read
 from emb_runtime.errors import BenchFileError, near
 
@@ -106,7 +106,7 @@ def parse_bench(text: str, source: str, *, analysis: bool = False) -> Bench:
     """Turn the text of a bench file into checked records; ``source`` and ``analysis`` as for :func:`load_bench`."""
     if not analysis:
         return with_tables(driven.parse_bench(text, source), source)
-    document = parse_document(text, source)
+    document = parse_toml(text, source, BenchFileError)
     is_machine = "machine" in document
     if is_machine:
         document = _never_driven(document, source)
@@ -136,7 +136,7 @@ def _never_driven(document: Mapping[str, Any], source: str) -> dict[str, Any]:
     for key in DRIVEN:
         if key in document:
             raise BenchFileError(f"{source}: {key}: does not go with [machine], with which nothing is driven")
-    shipped = parse_toml(driven.shipped_bench_text())
+    shipped = parse_toml(driven.shipped_bench_text(), "shipped bench.toml", BenchFileError)
     nominal = document.get("brake")
     around = {}
     for parameter in PARAMETER_NAMES:

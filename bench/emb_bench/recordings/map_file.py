@@ -278,8 +278,4 @@ def read_map(path: Path) -> tuple[RecordingMap, str]:
 
 def parse_map(text: str, source: str) -> RecordingMap:
     """The map file's text, TOML, as a checked record; messages call it ``source``."""
-    try:
-        document = parse_toml(text)
-    except ValueError as err:
-        raise UsageError(f"{source}: {err}") from err
-    return typed.read(RecordingMap, document, source, UsageError)
+    return typed.read(RecordingMap, parse_toml(text, source, UsageError), source, UsageError)

@@ -362,19 +362,11 @@ def read_bench_text(path: str | Path | None = None) -> tuple[str, str]:
 
 def parse_bench(text: str, source: str) -> Bench:
     """Checked records of the text of a bench file; BenchFileError calls it ``source``."""
-    document = parse_document(text, source)
+    document = parse_toml(text, source, BenchFileError)
     if "machine" in document:
         reason = "a machine for the analysis of recordings: nothing is driven or designed with it"
         raise BenchFileError(f"{source}: machine: {reason}")
     return checked_bench(document, text, source)
-
-
-def parse_document(text: str, source: str) -> dict[str, Any]:
-    """The tables of a bench file, unchecked; BenchFileError if the text is not TOML, or too large."""
-    try:
-        return parse_toml(text)
-    except ValueError as err:
-        raise BenchFileError(f"{source}: {err}") from err
 
 
 def checked_bench(document: Mapping[str, Any], text: str, source: str, *, driven: bool = True) -> Bench:
@@ -384,21 +376,17 @@ def checked_bench(document: Mapping[str, Any], text: str, source: str, *, driven
     """
     found = read(_Document, document, source, BenchFileError, remedy=REMEDY)
     try:
-        return _checked(found, document, text, driven)
+        bench = Bench(
+            **{field.name: getattr(found, field.name) for field in fields(_Tables)},
+            ranges={name: _ranges(name, table, found.brake) for name, table in found.ranges.items()},
+            prior=found.shield.ranges if found.estimator is None else found.estimator.ranges,
+            text=text,
+            tables={key: document[key] for key in ANALYSIS if key in document},
+        )
+        for key, reason in (*_limit_problems(bench, driven), *_setting_problems(bench, driven)):
+            raise FieldError(key, reason)
     except FieldError as err:
         raise BenchFileError(f"{source}: {err.key}: {err}") from err
-
-
-def _checked(found: _Document, document: Mapping[str, Any], text: str, driven: bool) -> Bench:
-    bench = Bench(
-        **{field.name: getattr(found, field.name) for field in fields(_Tables)},
-        ranges={name: _ranges(name, table, found.brake) for name, table in found.ranges.items()},
-        prior=found.shield.ranges if found.estimator is None else found.estimator.ranges,
-        text=text,
-        tables={key: document[key] for key in ANALYSIS if key in document},
-    )
-    for key, reason in (*_limit_problems(bench, driven), *_setting_problems(bench, driven)):
-        raise FieldError(key, reason)
     return bench
 
 

@@ -24,6 +24,7 @@ SMALLEST = 1e-30  # No number but 0 is smaller, or larger than its inverse; beyo
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
+LONGEST_TEXT = 200  # Characters of a text
 LONGEST_VALUE = 120  # Characters of a foreign value that a message repeats
 MAX_TOML_BYTES = 64 * 1024  # A bench file has a few KiB
 MAX_DOTS = 500  # Most dots in a line: for a key of n parts tomllib takes time and memory that grow with n²
@@ -41,18 +42,11 @@ class FieldError(ValueError):
 
 
 class _RefusedError(Exception):
-    """A value that is refused: its keys, what was expected there, what came, and another problem before these."""
+    """A value that is refused: its keys, and the reason."""
 
-    def __init__(self, keys: Keys, expected: str, got: str = "", problem: str = "") -> None:
+    def __init__(self, keys: Keys, reason: str) -> None:
+        super().__init__(reason)
         self.keys = keys
-        self.expected = expected
-        self.got = got
-        self.problem = problem
-
-    def __str__(self) -> str:
-        expected = f"expected {self.expected}" if self.expected else ""
-        came = f", got {self.got}" if self.got else ""
-        return "; ".join(filter(None, (self.problem, expected + came)))
 
 
 def read(
@@ -63,48 +57,42 @@ def read(
     *,
     at: Keys = (),
     remedy: str = "add it",
-    longest_text: int = 200,
 ) -> Record:
-    """Convert a document into a record.
+    """Convert a document, as a TOML or JSON parser returns it, into a record.
 
     Args:
         kind: the record's type.
-        document: as a TOML or JSON parser returns it.
+        document: all texts are printable, and none is empty.
         source: name of the document in messages.
-        error: makes the error that is raised from its message.
+        error: makes the error of a key that is missing or unknown, or a value of another type or out of bounds.
         at: place of the value in the document, where it is part of one.
         remedy: advice where a key is missing.
-        longest_text: most characters of a text; all are printable, and none is empty.
-
-    Raises:
-        EmbError: of the given kind: a key is missing or unknown, or a value has another type or is out of bounds.
     """
-    reader = _Reader(longest_text)
+    reader = _Reader()
     try:
         record = reader.convert(document, kind, ())
         if reader.missing:
-            raise _RefusedError((), "", problem=_missing(reader.missing, remedy))
+            raise _RefusedError((), _missing(reader.missing, remedy))
         return cast("Record", record)
     except _RefusedError as err:
         reason = ": ".join(filter(None, (source, key_text((*at, *err.keys)), str(err))))
     raise error(reason)
 
 
-def parse_toml(text: str) -> dict[str, Any]:
-    """The document of a text of unknown origin, read within bounds of time and memory; else ValueError."""
+def parse_toml(text: str, source: str, error: Callable[[str], EmbError]) -> dict[str, Any]:
+    """The document of a text of unknown origin, read within bounds of time and memory; source and error as above."""
     if text.startswith("\ufeff"):
-        raise ValueError("it begins with a byte-order mark: save it as UTF-8 without one")
+        raise error(f"{source}: it begins with a byte-order mark: save it as UTF-8 without one")
     if len(text) > MAX_TOML_BYTES:
-        raise ValueError(f"expected at most {MAX_TOML_BYTES} characters, got {len(text)}")
+        raise error(f"{source}: expected at most {MAX_TOML_BYTES} characters, got {len(text)}")
     for number, line in enumerate(text.split("\n"), 1):
         if (dots := line.count(".")) > MAX_DOTS:
-            raise ValueError(f"line {number}: expected at most {MAX_DOTS} dots, got {dots}")
+            raise error(f"{source}: line {number}: expected at most {MAX_DOTS} dots, got {dots}")
     try:
         return tomllib.loads(text)
-    except RecursionError as err:
-        raise ValueError("not valid TOML: nested too deeply") from err
-    except ValueError as err:  # TOMLDecodeError, and what tomllib lets through
-        raise ValueError(f"not valid TOML: {err}") from err
+    except (RecursionError, ValueError) as err:  # of the latter TOMLDecodeError, and what tomllib lets through
+        reason = "nested too deeply" if isinstance(err, RecursionError) else err
+        raise error(f"{source}: not valid TOML: {reason}") from err
 
 
 def key_text(keys: Keys) -> str:
@@ -135,8 +123,7 @@ def _fields(kind: type[Any]) -> dict[str, tuple[Any, bool]] | None:
 class _Reader:
     """Converts tables and lists part by part; msgspec converts each value in them."""
 
-    def __init__(self, longest_text: int) -> None:
-        self._longest_text = longest_text
+    def __init__(self) -> None:
         self.missing: list[tuple[Keys, Any]] = []  # Required keys that are not there; then no record is made
 
     def convert(self, value: Any, kind: Any, keys: Keys) -> Any:
@@ -153,14 +140,15 @@ class _Reader:
             return {self._key(key, named, keys): self.convert(v, inner, (*keys, key)) for key, v in value.items()}
         if isinstance(value, list) and get_origin(plain) in (list, tuple):
             return self._list(value, kind, get_args(plain), keys)
-        self._check_text_or_number(value, kind, keys)
+        if problem := _problem(value, kind):
+            raise _RefusedError(keys, problem)
         return _by_msgspec(value, kind, keys)
 
     def _record(self, value: dict[str, Any], kind: Any, fields: dict[str, tuple[Any, bool]], keys: Keys) -> Any:
         for key in value:
             if key not in fields:
                 known = f"{', '.join(sorted(fields))}{near(key, fields)}"
-                raise _RefusedError((*keys, key), f"some of {known}", problem="unknown key")
+                raise _RefusedError((*keys, key), f"unknown key; expected some of {known}")
         self.missing += [((*keys, n), hint) for n, (hint, required) in fields.items() if required and n not in value]
         converted = {key: self.convert(inner, fields[key][0], (*keys, key)) for key, inner in value.items()}
         if self.missing:
@@ -168,13 +156,14 @@ class _Reader:
         try:
             return kind(**converted)
         except FieldError as err:
-            raise _RefusedError((*keys, err.key), "", problem=str(err)) from err
+            raise _RefusedError((*keys, err.key), str(err)) from err
 
     def _key(self, key: str, kind: Any, keys: Keys) -> str:
         try:
             return cast("str", msgspec.convert(key, kind))
         except msgspec.ValidationError:
-            raise _RefusedError((*keys, key), _wanted(inspect.type_info(kind)), problem="unknown key") from None
+            expected = _wanted(inspect.type_info(kind))
+            raise _RefusedError((*keys, key), f"unknown key; expected {expected}") from None
 
     def _list(self, value: list[Any], kind: Any, kinds: tuple[Any, ...], keys: Keys) -> Any:
         if kinds[-1] is ... or len(kinds) == 1:
@@ -182,14 +171,6 @@ class _Reader:
         if len(kinds) == len(value):
             value = [self.convert(v, k, (*keys, i)) for i, (v, k) in enumerate(zip(value, kinds, strict=True))]
         return value if self.missing else _by_msgspec(value, kind, keys)  # which looks at the length
-
-    def _check_text_or_number(self, value: object, kind: Any, keys: Keys) -> None:
-        """Refuse texts that are not printable and numbers that are not finite, which msgspec takes."""
-        if isinstance(value, str):
-            if not value or not value.isprintable() or len(value) > self._longest_text:
-                raise _RefusedError(keys, f"a printable text of 1 to {self._longest_text} characters", shown(value))
-        elif isinstance(value, int | float) and not isinstance(value, bool) and _is_number(inspect.type_info(kind)):
-            _refuse_size(value, keys)
 
 
 def _takes(kind: Any, value: object) -> bool:
@@ -201,12 +182,29 @@ def _takes(kind: Any, value: object) -> bool:
     return False
 
 
+def _problem(value: object, kind: Any) -> str:
+    """Reason to refuse a text that is not printable or a number that is not finite, which msgspec takes."""
+    if isinstance(value, str):
+        if not value or not value.isprintable() or len(value) > LONGEST_TEXT:
+            return f"expected a printable text of 1 to {LONGEST_TEXT} characters, got {shown(value)}"
+    elif isinstance(value, int | float) and not isinstance(value, bool) and _is_number(inspect.type_info(kind)):
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if not math.isfinite(number):
+            return "expected a finite number"
+        if number and not SMALLEST <= abs(number) <= 1.0 / SMALLEST:
+            return f"expected 0 or a size from {SMALLEST:g} to {1.0 / SMALLEST:g}, got {number:g}"
+    return ""
+
+
 def _by_msgspec(value: object, kind: Any, keys: Keys) -> Any:
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError:
         info = inspect.type_info(kind)
-        raise _RefusedError(keys, _wanted(info), _got(value, info)) from None
+        raise _RefusedError(keys, f"expected {_wanted(info)}, got {_got(value, info)}") from None
 
 
 _KINDS: Mapping[type, tuple[str, tuple[str, ...]]] = {
@@ -241,24 +239,10 @@ def _is_number(kind: inspect.Type) -> bool:
     return isinstance(kind, inspect.FloatType | inspect.IntType)
 
 
-def _refuse_size(value: float, keys: Keys) -> None:
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise _RefusedError(keys, "a finite number")
-    if number and not SMALLEST <= abs(number) <= 1.0 / SMALLEST:
-        raise _RefusedError(keys, f"0 or a size from {SMALLEST:g} to {1.0 / SMALLEST:g}", f"{number:g}")
-
-
 _NOUNS: Mapping[type, str] = {
     inspect.StrType: "a text",
     inspect.BoolType: "true or false",
-    inspect.StructType: "a table",
-    inspect.DataclassType: "a table",
-    inspect.NamedTupleType: "a table",
-    inspect.DictType: "a table",
+    **dict.fromkeys((*_RECORDS, inspect.DictType), "a table"),
 }
 
 

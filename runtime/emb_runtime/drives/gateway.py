@@ -33,13 +33,7 @@ class Port(NamedTuple):
 class Gateway:
     """Passes samples and commands on until it is ended, or the drive is let go.
 
-    Args:
-        mapping: the drive.
-        bench: limits, timing, the stop.
-        drive_bus: open.
-        node_bus: open.
-        clock: the time on both buses.
-        wait: waits at most a time [ns], until something has come.
+    Both buses are open, and ``clock`` is theirs. ``wait`` waits at most a time [ns], until something has come.
     """
 
     def __init__(
@@ -66,12 +60,9 @@ class Gateway:
         self._layout, self._counter = load_layout(), 0
 
     def run(self, stop_requested: Callable[[], bool], ready: Callable[[], None], *, arms: bool) -> None:
-        """Arm the drive, serve, and let the drive go.
+        """Arm the drive, tell that it is ``ready``, serve, and let the drive go.
 
-        Args:
-            stop_requested: True if the operator wants an end.
-            ready: called when the drive is armed, or at once where it is not to be.
-            arms: False only listens: nothing is sent to the drive.
+        Where it is not to be armed, nothing is sent to it.
 
         Raises:
             BusError: the drive cannot be armed, or a bus is lost.

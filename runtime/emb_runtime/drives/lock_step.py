@@ -18,17 +18,9 @@ from emb_runtime.system.clock import Clock
 
 
 class LockStepDrive:
-    """A mapped drive behind its gateway, armed when it is made. Time moves while the host waits for a frame.
+    """A mapped drive on a simulated bus, behind its gateway. Time moves while the host waits for a frame.
 
-    Args:
-        mapping: the drive.
-        bench: limits, timing, the stop.
-        bus: the drive's, simulated.
-        clock: the time on it.
-        name: as given by the user.
-
-    Raises:
-        BusError: the drive cannot be armed.
+    It is armed when it is made; BusError if it cannot be.
     """
 
     obtained: Dictionary[str, str] = {}

@@ -16,6 +16,7 @@ from emb_runtime.can.codec import worst_bits
 from emb_runtime.config.bench import HIGHEST_BUS_LOAD, Bench, Sensors
 from emb_runtime.drives.signals import Field, Protection
 from emb_runtime.errors import BenchFileError, UsageError
+from emb_runtime.records import Frame
 from emb_runtime.safety.end_stop import released_speed
 
 if TYPE_CHECKING:
@@ -102,6 +103,10 @@ class MessageInfo:
         """Most bits that one frame takes on the bus, see :func:`emb_runtime.can.codec.worst_bits`."""
         return worst_bits(self.length, extended=self.extended)
 
+    def frame(self, data: bytes) -> Frame:
+        """A frame with this payload."""
+        return Frame(self.identifier, data, extended=self.extended)
+
 
 @dataclass(frozen=True)
 class ConstantFrame:
@@ -167,18 +172,19 @@ class Mapping:
         return tuple(name for name in PROPERTIES if not has.get(name))
 
     @property
+    def measured(self) -> tuple[Measured, ...]:
+        """Signals that make a sample."""
+        return self.angle, self.velocity, *([] if self.current is None else [self.current])
+
+    @property
     def sensor_messages(self) -> frozenset[str]:
         """Names of the messages that make a sample."""
-        measured = (self.angle, self.velocity, self.current)
-        return frozenset(one.message for one in measured if one is not None)
+        return frozenset(measured.message for measured in self.measured)
 
     def bus_load(self, sample_time: float) -> float:
-        """Worst-case share of the drive's bus that a run takes, 1.0 being all of it.
+        """Worst-case share of the drive's bus that a run takes at a sample time [s], 1.0 being all of it.
 
         Sensor messages and command come each sample; what says the state alone comes as often as it is believed.
-
-        Args:
-            sample_time: [s].
         """
         each = sum(self.messages[name].worst_bits for name in (*self.sensor_messages, self.command.message))
         load = each / sample_time

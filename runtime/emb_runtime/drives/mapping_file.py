@@ -178,20 +178,12 @@ def load_mapping(path: str | Path) -> Mapping:
 
 
 def parse_mapping(text: str, dbc_text: str, source: str) -> Mapping:
-    """Turn the texts of a mapping file and its DBC into checked records.
-
-    Raises:
-        MappingError: see :func:`load_mapping`.
-    """
+    """Turn the texts of a mapping file and its DBC into checked records; raises as :func:`load_mapping`."""
     return _made(_file(text, source), text, dbc_text, source)
 
 
 def _file(text: str, source: str) -> _File:
-    try:
-        document = parse_toml(text)
-    except ValueError as err:
-        raise MappingError(f"{source}: {err}") from err
-    return read(_File, document, source, MappingError)
+    return read(_File, parse_toml(text, source, MappingError), source, MappingError)
 
 
 def _text(path: str | Path, most: int, encoding: str = "") -> str:
@@ -263,7 +255,7 @@ def _require_carried(reader: _Reader, made: Mapping) -> None:
     for name, steps in (("arm", made.arm), ("disarm", made.disarm)):
         for number, constant in ((n, frame) for n, step in enumerate(steps) for frame in step.frames):
             try:
-                guard.constant(encoder.constant(constant), constant)
+                guard.constant(made.messages[constant.message].frame(constant.data), constant)
             except WireGuardError as err:
                 message = made.messages[constant.message].dbc.name
                 raise reader.error(f"can.{name}[{number}].send.{message}", f"the DBC cannot carry it: {err}") from err

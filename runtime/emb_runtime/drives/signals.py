@@ -77,24 +77,12 @@ class Field:
 
 def make_field(signal: DbcSignal) -> Field:
     """The place of a signal of a DBC."""
-    return Field(
-        name=signal.name,
-        start=signal.start,
-        length=signal.length,
-        big_endian=signal.byte_order == "big_endian",
-        signed=signal.is_signed,
-        is_float=signal.is_float,
-        scale=float(signal.scale),
-        offset=float(signal.offset),
-    )
+    kind = signal.byte_order == "big_endian", signal.is_signed, signal.is_float
+    return Field(signal.name, signal.start, signal.length, *kind, float(signal.scale), float(signal.offset))
 
 
 def raw_value(field: Field, data: bytes) -> int:
-    """The signal's bits as a whole number, sign included; of a float, its bit pattern.
-
-    Raises:
-        IndexError: the payload is too short.
-    """
+    """The signal's bits as a whole number, sign included; of a float, its bit pattern. IndexError: too few bytes."""
     raw = 0
     for position in field.positions:
         raw = raw << 1 | data[position >> 3] >> (position & 7) & 1
@@ -104,11 +92,7 @@ def raw_value(field: Field, data: bytes) -> int:
 
 
 def physical_value(field: Field, data: bytes) -> float:
-    """The signal's value [DBC units]; NaN and infinity where a float says so.
-
-    Raises:
-        IndexError: the payload is too short.
-    """
+    """The signal's value [DBC units]; NaN and infinity where a float says so. IndexError: too few bytes."""
     raw = raw_value(field, data)
     value = struct.unpack(_FLOATS[field.length], raw.to_bytes(field.length // 8, "big"))[0] if field.is_float else raw
     return float(value * field.scale + field.offset)
@@ -166,14 +150,7 @@ def crc8_h2f(data: bytes) -> int:
     """CRC-8 with the polynomial 0x2F, start value and final XOR 0xFF: 0xDF for ``b"123456789"``."""
     state = 0xFF
     for byte in data:
-        state = _H2F[state ^ byte]
+        state ^= byte
+        for _ in range(8):
+            state = (state << 1 ^ 0x2F if state & 0x80 else state << 1) & 0xFF
     return state ^ 0xFF
-
-
-def _h2f(state: int) -> int:
-    for _ in range(8):
-        state = (state << 1 ^ 0x2F if state & 0x80 else state << 1) & 0xFF
-    return state
-
-
-_H2F = tuple(map(_h2f, range(256)))

@@ -38,24 +38,15 @@ class DriveSample(NamedTuple):
 
 
 class Encoder:
-    """Makes the drive's frames.
-
-    Args:
-        mapping: the drive.
-    """
+    """Makes the frames that command a drive."""
 
     def __init__(self, mapping: Mapping) -> None:
         self._mapping = mapping
-        command = mapping.command
-        self._info = mapping.messages[command.message]
+        self._info = mapping.messages[mapping.command.message]
         self._counter = 0
 
     def command(self, current: float) -> Frame:
-        """The frame that commands a current [A].
-
-        Raises:
-            FrameError: it is not finite, or beyond the file's range.
-        """
+        """The frame that commands a current [A]; FrameError if it is not finite, or beyond the file's range."""
         command = self._mapping.command
         value = current * command.factor
         if not command.low <= value <= command.high:  # this way round, NaN is refused
@@ -65,11 +56,7 @@ class Encoder:
         return self.value(value)
 
     def value(self, value: float) -> Frame:
-        """The frame with a value of the command's signal [DBC units].
-
-        Raises:
-            FrameError: it cannot be encoded.
-        """
+        """The frame with a value of the command's signal [DBC units]; FrameError if it cannot be encoded."""
         command, protection = self._mapping.command, self._info.protection
         values = {**command.others, command.field.name: value}
         for field, raw in ((protection.counter, self._counter), (protection.checksum, 0)):
@@ -85,16 +72,7 @@ class Encoder:
             data[first : first + size] = protection.checksum_of(bytes(data)).to_bytes(size, "big" if big else "little")
         if protection.counter is not None:
             self._counter = protection.next_counter(self._counter)
-        return frame_of(self._info, bytes(data))
-
-    def constant(self, constant: ConstantFrame) -> Frame:
-        """A frame of a sequence."""
-        return frame_of(self._mapping.messages[constant.message], constant.data)
-
-
-def frame_of(info: MessageInfo, data: bytes) -> Frame:
-    """A frame of a message."""
-    return Frame(info.identifier, data, extended=info.extended)
+        return self._info.frame(bytes(data))
 
 
 class Outlet:
@@ -126,7 +104,7 @@ class Outlet:
     def send(self, constant: ConstantFrame) -> str:
         """Send a frame of a sequence; returns the reason if it is refused, else nothing."""
         try:
-            self.guard.constant(self._encoder.constant(constant), constant)
+            self.guard.constant(self._mapping.messages[constant.message].frame(constant.data), constant)
         except TransmitQueueFullError:
             self.not_sent += 1
         except WireGuardError as refused:
@@ -145,11 +123,8 @@ class Outlet:
 class Receiver:
     """Makes samples of the drive's frames.
 
-    A sample is complete when every message with a part of it has come once, all within ``pair_within``.
-
-    Args:
-        mapping: the drive.
-        tolerated: frames missing in a row by a message's counter that are too many; fewer if they are a share.
+    A sample is complete when every message with a part of it has come once, all within ``pair_within``. By a message's
+    counter, so many frames missing in a row as are ``tolerated`` are too many; fewer if they are a share.
     """
 
     def __init__(self, mapping: Mapping, tolerated: int) -> None:
@@ -202,13 +177,12 @@ class Receiver:
 
     def _believed(self, info: MessageInfo, frame: Frame) -> dict[str, float] | None:
         """Values of a frame, None if it is not to be believed."""
-        if (
-            why := "wrong length"
-            if frame.remote or len(frame.data) != info.length
-            else info.protection.fault(frame.data)
-        ):
-            lengths = f": {len(frame.data)} bytes came, the DBC says {info.length}" if why == "wrong length" else ""
-            self._reject(why, f"{info.name}: {why}{lengths}")
+        if frame.remote or len(frame.data) != info.length:
+            lengths = f"{len(frame.data)} bytes came, the DBC says {info.length}"
+            self._reject("wrong length", f"{info.name}: wrong length: {lengths}")
+            return None
+        if why := info.protection.fault(frame.data):
+            self._reject(why, f"{info.name}: {why}")
             return None
         counter = info.protection.counter
         if counter is not None:
@@ -223,9 +197,8 @@ class Receiver:
         decoded = info.dbc.decode(frame.data, decode_choices=False)
         assert isinstance(decoded, dict)
         values = {name: float(value) for name, value in decoded.items() if isinstance(value, int | float)}
-        mapping = self._mapping
-        for measured in (mapping.angle, mapping.velocity, mapping.current):
-            if measured is not None and measured.message == info.name:
+        for measured in self._mapping.measured:
+            if measured.message == info.name:
                 value = values[measured.field.name]
                 if not measured.low <= value <= measured.high:  # this way round, NaN is refused
                     name, ends = measured.field.name, f"{measured.low:g} to {measured.high:g}"

@@ -22,12 +22,9 @@ class WireGuardError(SafetyStopError):
 
 
 class WireGuard:
-    """Lets frames out to the drive that say what was meant.
+    """Lets frames out to the drive that say what was meant, with currents up to a limit [A].
 
-    Args:
-        mapping: the drive.
-        limit: largest current [A].
-        send: puts a frame on the bus; nobody else holds it.
+    Nobody else holds ``send``, which puts a frame on the bus.
     """
 
     def __init__(self, mapping: Mapping, limit: float, send: Callable[[Frame], None]) -> None:
@@ -42,11 +39,7 @@ class WireGuard:
         self.rejected = 0
 
     def command(self, frame: Frame, meant: float) -> float:
-        """Check a command against the current that it is to carry, and send it.
-
-        Args:
-            frame: for the bus.
-            meant: [A].
+        """Check a command against the current that it is to carry [A], and send it.
 
         Returns:
             The current that the bytes say, which may differ from the one meant by half a step [A].
@@ -61,12 +54,7 @@ class WireGuard:
         return current
 
     def constant(self, frame: Frame, constant: ConstantFrame) -> None:
-        """Check a frame of a sequence, and send it.
-
-        Raises:
-            WireGuardError: nothing was sent.
-            BusError: the bus did not take it.
-        """
+        """Check a frame of a sequence, and send it; raises as :meth:`command`."""
         info = self._mapping.messages[constant.message]
         self._check_kind(frame, info)
         for name, value in (constant.values or {}).items():

@@ -114,10 +114,9 @@ def test_a_number_other_than_0_has_a_size_with_which_arithmetic_does_not_overflo
     assert read(Machine, {"gear": SPUR, "load": 0}, "f", UsageError).load == 0.0
 
 
-def test_the_longest_text_and_the_remedy_are_given_by_the_caller() -> None:
-    assert refusal({"gear": SPUR, "name": "abcd"}, longest_text=3).startswith(
-        "name: expected a printable text of 1 to 3"
-    )
+def test_a_text_has_200_characters_at_most_and_the_remedy_is_given_by_the_caller() -> None:
+    assert read(Machine, {"gear": SPUR, "name": "a" * 200}, "f", UsageError).name == "a" * 200
+    assert refusal({"gear": SPUR, "name": "a" * 201}).startswith("name: expected a printable text of 1 to 200 ")
     assert refusal({"gear": {}}, remedy="export it anew").endswith("; export it anew")
     with pytest.raises(PolicyRefusedError, match=r"^contract: gear: missing"):
         read(Machine, {}, "contract", PolicyRefusedError)

@@ -208,7 +208,7 @@ def test_multiplexed_signals_are_read_by_the_value_of_their_multiplexor_and_sent
         guard.command(frame._replace(data=b"\x04" + frame.data[1:]), 2.0)
     for step in mapping.disarm:
         for constant in step.frames:
-            guard.constant(encoder.constant(constant), constant)
+            guard.constant(mapping.messages[constant.message].frame(constant.data), constant)
     assert sent[1].data == b"\x03" + bytes(6)
 
 
