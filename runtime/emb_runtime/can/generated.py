@@ -36,12 +36,9 @@ class Codec(NamedTuple):
 
 
 def generate_codec(message: Message, record: type[Any], fields: tuple[Field, ...]) -> Codec:
-    """The codec of a message.
+    """The codec of a message, from and to a named tuple whose fields stand for every signal but the CRC, in order.
 
-    Args:
-        message: its description.
-        record: named tuple that a frame is decoded to; its fields, but fixed ones, are the arguments of the encoder.
-        fields: of the record, in order: every signal but the CRC, once.
+    Those that are not fixed are the arguments of the encoder.
     """
     coded = [_Coded(message.signal(field.signal), field, f"v{at}") for at, field in enumerate(fields)]
     known: dict[str, Any] = {

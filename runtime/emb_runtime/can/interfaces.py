@@ -20,11 +20,8 @@ ENTRY_POINTS = "emb_runtime.transports"
 def open_transport(iface: str, bench: Bench, identifiers: tuple[int, ...] | None = None) -> tuple[Transport, Clock]:
     """The transport that a user names, and the clock that its time stamps and deadlines are on.
 
-    Args:
-        iface: ``can0`` or ``vcan0`` for SocketCAN; ``NAME`` or ``NAME:OPTIONS`` of a registered transport, ``sim``
-            among them.
-        bench: handed to registered transports.
-        identifiers: the only 11-bit identifiers that a SocketCAN socket should pass on; None for all frames.
+    That is ``can0`` or ``vcan0`` for SocketCAN, which passes on these 11-bit ``identifiers`` only; or ``NAME`` or
+    ``NAME:OPTIONS`` of a registered transport, ``sim`` among them.
 
     Raises:
         UsageError: no interface can have that name, or this system has no bus.

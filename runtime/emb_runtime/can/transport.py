@@ -62,12 +62,7 @@ class Transport(Protocol):
         ...
 
     def send(self, frame: Frame) -> None:
-        """Hand one frame to the bus.
-
-        Raises:
-            TransmitQueueFullError: it was dropped for want of room.
-            BusError: the bus is lost.
-        """
+        """Hand one frame to the bus; TransmitQueueFullError if it was dropped, another BusError if the bus is lost."""
         ...
 
     def receive(self, deadline_ns: int) -> Frame | None:
@@ -100,12 +95,9 @@ class SocketCan:
         # select() and not poll(), whose timeout has a resolution of one millisecond: a whole sample time.
         wait_readable: Callable[[int, float], object] = lambda fd, timeout_s: select.select([fd], [], [], timeout_s)[0],
     ) -> None:
-        """Open and bind the socket of a network interface.
+        """Open and bind the socket of a network interface; BusError where that cannot be.
 
         The kernel passes on these 11-bit identifiers only; all frames for None, none for an empty tuple.
-
-        Raises:
-            BusError: this kernel has no CAN, or the interface does not exist or is down.
         """
         self.name = interface
         self._clock = clock

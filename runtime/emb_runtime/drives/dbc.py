@@ -42,11 +42,7 @@ class MessageText(NamedTuple):
 
 
 def find_messages(text: str) -> dict[str, MessageText]:
-    """The messages of the text of a DBC, by name.
-
-    Raises:
-        FrameError: it is too long or cut off, or is none.
-    """
+    """The messages of the text of a DBC, by name; FrameError if it is too long or cut off, or is none."""
     if len(text) > MAX_DBC_BYTES:
         raise FrameError(f"DBC: expected at most {MAX_DBC_BYTES} characters")
     bare = _NOISE.sub(lambda m: '""' if m[1] else '"' if m[0][0] == '"' else " ", text)
@@ -70,7 +66,8 @@ def find_messages(text: str) -> dict[str, MessageText]:
         if fault and end >= ended:
             raise FrameError(f"DBC: not readable: it ends within the message {name}")
         said = more.get(identifier, [])
-        pages = sum(map(_page_count, said))
+        ranges = re.findall(r"(\d+)-(\d+)", " ".join(said))
+        pages = sum(max(int(last) - int(first), 0) + 1 for first, last in ranges)
         fault = _excess(int(identifier), len(signals) + len(said), pages, name in found) or fault
         lines = [f"BO_ {identifier} {name}: {length} X"]
         for signal_name, page, start, bits, order, sign, scale, offset in signals[:MOST_STATEMENTS]:
@@ -108,8 +105,3 @@ def _statements(bare: str) -> dict[str, list[str]]:
         if len(statements) != bare.count(f"{keyword} "):
             raise FrameError(f"DBC: not readable: a statement {keyword} is not of the form that it should have")
     return found
-
-
-def _page_count(statement: str) -> int:
-    """Values of a multiplexor that a statement lists."""
-    return sum(max(int(last) - int(first), 0) + 1 for first, last in re.findall(r"(\d+)-(\d+)", statement))

@@ -115,11 +115,7 @@ class Gateway:
         return problem and f"{problem}; switch it off"
 
     def arm(self, stop_requested: Callable[[], bool]) -> bool:
-        """Arm the drive; False if the end came first, and nothing was sent.
-
-        Raises:
-            BusError: the drive cannot be armed, or its bus is lost.
-        """
+        """Arm the drive, or raise BusError; False if the end came first, and nothing was sent."""
         listened_ns, silent_ns = self._after(LISTEN), self._after(LONGEST_SILENCE)
         while not (stop_requested() or self._node_lost):
             if self.node.may_arm and self._clock.now_ns() > listened_ns:
@@ -144,11 +140,7 @@ class Gateway:
         return True
 
     def step(self) -> None:
-        """Wait for what comes first, take what has come, and do what is due.
-
-        Raises:
-            BusError: the drive's bus is lost.
-        """
+        """Wait for what comes first, take what has come, and do what is due; BusError if the drive's bus is lost."""
         now_ns = self._clock.now_ns()
         self._wait(self.node.due_ns(now_ns + 1) - now_ns)
         for _ in range(MOST_FRAMES):

@@ -58,6 +58,15 @@ class Measured:
     high: float  # Least and largest value that is believed [DBC units]
     wrap: float  # Period after which it begins anew [DBC units]; 0 if it does not
 
+    def si(self, value: float) -> float:
+        """A value in DBC units in SI units."""
+        return value * self.factor + self.offset
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Values that it may have [SI units]; all where it begins anew."""
+        return (-math.inf, math.inf) if self.wrap else (self.si(self.low), self.si(self.high))
+
 
 @dataclass(frozen=True)
 class Commanded:
@@ -237,8 +246,8 @@ def _fit_problems(mapping: Mapping, bench: Bench) -> Iterator[tuple[str, str]]:
     wanted_current = -limits.current, limits.current
     for name, ends, wanted, unit in (
         ("command", (command.low / command.factor, command.high / command.factor), wanted_current, "A"),
-        ("angle", _si_range(mapping.angle), limits.angle, "rad"),
-        ("velocity", _si_range(mapping.velocity), (-limits.velocity, limits.velocity), "rad/s"),
+        ("angle", mapping.angle.ends, limits.angle, "rad"),
+        ("velocity", mapping.velocity.ends, (-limits.velocity, limits.velocity), "rad/s"),
     ):
         low, high = sorted(ends)
         covers = low <= wanted[0] and wanted[1] <= high
@@ -265,10 +274,3 @@ def _fit_problems(mapping: Mapping, bench: Bench) -> Iterator[tuple[str, str]]:
     if (load := mapping.bus_load(bench.timing.sample_time)) > HIGHEST_BUS_LOAD:
         taken = f"at {mapping.bitrate} bit/s its frames take {load:.0%} of its bus at worst"
         yield "can.bitrate", f"{taken}, expected at most {HIGHEST_BUS_LOAD:.0%}"
-
-
-def _si_range(measured: Measured) -> tuple[float, float]:
-    """Values that a signal may have [SI units]; one that begins anew has all."""
-    if measured.wrap:
-        return -math.inf, math.inf
-    return measured.low * measured.factor + measured.offset, measured.high * measured.factor + measured.offset

@@ -167,11 +167,7 @@ class _File(Struct, kw_only=True):
 
 
 def load_mapping(path: str | Path) -> Mapping:
-    """Read a mapping file and its DBC, which lies beside it.
-
-    Raises:
-        MappingError: a file cannot be read, or is refused; the message has the file, the key and the reason.
-    """
+    """Read a mapping file and its DBC, which lies beside it; MappingError has the file, the key and the reason."""
     text = _text(path, MAX_TOML_BYTES, "utf-8-sig")
     file = _file(text, str(path))
     return _made(file, text, _text(Path(path).parent / file.can.dbc, MAX_DBC_BYTES), str(path))

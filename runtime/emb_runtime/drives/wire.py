@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from emb_runtime.can.e2e import LeakyCount
 from emb_runtime.can.transport import TransmitQueueFullError
-from emb_runtime.drives.mapping import ConstantFrame, Mapping, Measured, MessageInfo
+from emb_runtime.drives.mapping import ConstantFrame, Mapping, MessageInfo
 from emb_runtime.drives.signals import raw_value
 from emb_runtime.drives.wire_guard import WireGuard, WireGuardError
 from emb_runtime.errors import FrameError
@@ -233,15 +233,11 @@ class Receiver:
             del waiting[other]  # its partner did not come
         if waiting.keys() != self._sensors:
             return None
-        mapping = self._mapping
-        sample = DriveSample(
-            angle=self._angle(waiting[mapping.angle.message][0][mapping.angle.field.name]),
-            velocity=_si(mapping.velocity, waiting[mapping.velocity.message][0]),
-            current=math.nan if mapping.current is None else _si(mapping.current, waiting[mapping.current.message][0]),
-            time_ns=min(since_ns for _, since_ns in waiting.values()),
-        )
+        angle, *others = (waiting[of.message][0][of.field.name] for of in self._mapping.measured)
+        velocity, *current = (of.si(v) for of, v in zip(self._mapping.measured[1:], others, strict=True))
+        begun_ns = min(since_ns for _, since_ns in waiting.values())
         waiting.clear()
-        return sample
+        return DriveSample(self._angle(angle), velocity, current[0] if current else math.nan, begun_ns)
 
     def _angle(self, value: float) -> float:
         """Angle [rad]; one that begins anew after a turn is continued from the last one, the first within half a turn.
@@ -253,15 +249,10 @@ class Receiver:
             last = 0.0 if self._wrapped is None else self._wrapped
             self._turns -= measured.wrap * round((value + self._turns - last) / measured.wrap)
             value = self._wrapped = value + self._turns
-        return value * measured.factor + measured.offset
+        return measured.si(value)
 
 
 def _is_of(info: MessageInfo, frame: Frame) -> bool:
     """True if a frame of the message's identifier has its value of the multiplexor, or is too short to tell."""
-    if info.page is None or frame.remote or len(frame.data) != info.length:
-        return True
-    return raw_value(info.page, frame.data) == info.page_value
-
-
-def _si(measured: Measured, values: dict[str, float]) -> float:
-    return values[measured.field.name] * measured.factor + measured.offset
+    is_whole = not frame.remote and len(frame.data) == info.length
+    return info.page is None or not is_whole or raw_value(info.page, frame.data) == info.page_value

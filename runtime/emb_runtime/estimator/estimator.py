@@ -19,8 +19,7 @@ class Estimator:
 
     def __init__(self, bench: Bench) -> None:
         """Make the model, and begin."""
-        ranges = bench.range_set(bench.prior)
-        self.model = make_model(bench, ranges)
+        self.model = make_model(bench, bench.range_set(bench.prior))
         self.state: State = start(self.model)
 
     def begin(self) -> None:

@@ -72,8 +72,7 @@ class Recorder:
     ) -> Recorder:
         """Start the recorder process and wait until the new file's first chunk is on disk; slots are a power of two.
 
-        Raises:
-            LogError: the file exists or cannot be made, or the process did not start in time.
+        LogError if the file exists or cannot be made, or the process did not start in time.
         """
         path = Path(path)
         document = {"path": str(path), "parent": os.getpid(), "header": to_builtins(header, str_keys=True)}
@@ -95,11 +94,6 @@ class Recorder:
     def pid(self) -> int:
         """Process id of the recorder."""
         return self._child.pid
-
-    @property
-    def dropped(self) -> int:
-        """Records that did not fit into the ring so far."""
-        return self._ring.dropped
 
     def wait_for_room(self) -> None:
         """Wait until the ring is less than half full: for a simulated run, whose time can stand still meanwhile."""

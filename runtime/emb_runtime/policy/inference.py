@@ -20,11 +20,7 @@ CODE = "f"  # Of single precision
 
 
 class Inference:
-    """A graph of an ONNX file, with the input and the output that its contract has.
-
-    Raises:
-        PolicyRefusedError: ONNX Runtime refuses it, or it has other inputs or outputs.
-    """
+    """A graph of an ONNX file, with the input and the output that its contract has; else PolicyRefusedError."""
 
     def __init__(self, data: bytes, contract: Contract) -> None:
         self._session = open_session(data)

@@ -9,7 +9,7 @@ replayed: there are no inputs for which it loops, or an array grows.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib import resources
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -133,21 +133,13 @@ def require_bounded(graph: Graph) -> None:
     for node in graph.nodes:
         inputs = FIXED.get(node.operator)
         if inputs is None:
+            operator = re.sub(r"[^!-~]", "?", node.operator)[:60]
             raise PolicyRefusedError(
-                f"the policy has the operator {_printable(node)}, which is none of those whose work is known to be the "
-                "same for every sample: make it of others"
+                f"the policy has the operator '{operator}', which is none of those whose work is known to be the same "
+                "for every sample: make it of others"
             )
-        if _unknown(node.inputs[inputs], fixed):
+        if any(name and name not in fixed for name in node.inputs[inputs]):  # an empty name is an input left out
             raise PolicyRefusedError(
                 f"the policy's operator {node.operator} takes a size or a place from a computation, "
                 "so its work could grow with what is measured: make that a constant of the file"
             )
-
-
-def _unknown(names: Iterable[str], fixed: frozenset[str]) -> bool:
-    """Returns True if one of these inputs is computed; an empty name is an input that is left out."""
-    return any(name and name not in fixed for name in names)
-
-
-def _printable(node: Node) -> str:
-    return "'" + re.sub(r"[^!-~]", "?", node.operator)[:60] + "'"

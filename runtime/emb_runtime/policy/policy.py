@@ -19,7 +19,7 @@ from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.speed_loop import current_for
 from emb_runtime.policy.contract import CONTRACT_KEY, ROUNDING, SAMPLE, VECTOR_TOLERANCE, Contract, read_contract
 from emb_runtime.policy.inference import Inference
-from emb_runtime.policy.onnx_file import Graph, read_graph, require_bounded
+from emb_runtime.policy.onnx_file import read_graph, require_bounded
 from emb_runtime.system.input_file import open_regular
 
 MAX_FILE_BYTES = 4 * 1024 * 1024  # A policy is a few to hundreds of kilobytes
@@ -54,15 +54,10 @@ class Policy:
     def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
         """Current for the period that begins at a sample [A]; finite and within limits only if the caller checks it.
 
+        The sample, ``step`` samples after the experiment began, is measured [rad, rad/s], and in the estimate.
         The speed loop cuts off every current at the limit. So a target speed that is not finite gives NaN, and one
         beyond the contract a current that is so many times beyond its limit. PolicyRefusedError if ONNX Runtime could
         not evaluate the graph.
-
-        Args:
-            angle: measured [rad].
-            velocity: measured [rad/s].
-            step: samples since the experiment began.
-            estimator: with the sample taken in.
         """
         inputs = self._inference.inputs
         inputs[0], inputs[1], inputs[2] = angle, velocity, step * self._sample_time
@@ -95,7 +90,13 @@ def load_policy(source: str | Path | bytes, bench: Bench) -> Policy:
     if len(data) > MAX_FILE_BYTES:
         raise PolicyRefusedError(f"the policy file is larger than {MAX_FILE_BYTES} bytes: not a policy of ours")
     graph = read_graph(data)
-    contract = read_contract(_contract_text(graph))
+    texts = [value for key, value in graph.texts if key == CONTRACT_KEY]
+    if len(texts) != 1:
+        raise PolicyRefusedError(
+            f"expected one '{CONTRACT_KEY}' in the ONNX metadata, got {len(texts)}: export it first, "
+            "by emb-export FILE --output policy.onnx"
+        )
+    contract = read_contract(texts[0])
     if problem := contract.bench_problem(bench):
         raise PolicyRefusedError(f"the policy does not fit this bench: {problem}: narrow the bench, or make one for it")
     require_bounded(graph)
@@ -130,13 +131,3 @@ def read_policy(path: Path) -> bytes:
             return file.read(MAX_FILE_BYTES + 1)
     except OSError as err:
         raise UsageError(f"{path}: cannot read the policy file: {err.strerror}") from err
-
-
-def _contract_text(graph: Graph) -> str:
-    texts = [value for key, value in graph.texts if key == CONTRACT_KEY]
-    if len(texts) != 1:
-        raise PolicyRefusedError(
-            f"expected one '{CONTRACT_KEY}' in the ONNX metadata, got {len(texts)}: export it first, "
-            "by emb-export FILE --output policy.onnx"
-        )
-    return texts[0]

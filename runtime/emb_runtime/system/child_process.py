@@ -29,17 +29,9 @@ _PR_SET_PDEATHSIG = 1
 
 
 class Child:
-    """A running process ``python -m MODULE FD... DOCUMENT_FD`` that has said that it is ready.
+    """A running process ``python -m MODULE FD... DOCUMENT_FD`` that has said that it is ready, within a time-out [s].
 
-    Args:
-        name: of the process, in messages.
-        module: its program.
-        document: handed to it.
-        fds: file descriptors that it inherits.
-        timeout: longest wait for its first answer, ``ready`` or ``error`` [s].
-
-    Raises:
-        OSError: it cannot be started, or did not become ready; the message says why.
+    OSError if it cannot be started, or has said ``error``; the message says why, and has the name.
     """
 
     def __init__(

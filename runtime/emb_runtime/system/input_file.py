@@ -99,8 +99,7 @@ def read_text(path: str | Path, most: int) -> str:
 def decode(data: bytes, encoding: str = "") -> str:
     """Text of a tool that does not say its encoding: by its mark, else in UTF-8, else in cp1252, that of Windows.
 
-    Raises:
-        UnicodeDecodeError: it is in none of them, or not in the ``encoding`` that is given.
+    UnicodeDecodeError if it is in none of them, or not in the ``encoding`` that is given.
     """
     if encoding:
         return data.decode(encoding).removeprefix("\ufeff")

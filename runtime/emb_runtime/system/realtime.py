@@ -68,12 +68,8 @@ def _stay_awake() -> str:
 
 def _set(option: int, obtained: str) -> str:
     """Set a switch of this process to 1: prctl(2)."""
-    libc = ctypes.CDLL(None, use_errno=True)
     # As long as the kernel reads them: where an argument that must be zero is not, it refuses.
-    zeros = (ctypes.c_ulong(0),) * 3
-    if libc.prctl(option, ctypes.c_ulong(1), *zeros) != 0:
-        return f"not obtained: {os.strerror(ctypes.get_errno())}"
-    return obtained
+    return _called("prctl", option, *map(ctypes.c_ulong, (1, 0, 0, 0)), obtained=obtained)
 
 
 def _lock_memory() -> str:
@@ -83,10 +79,12 @@ def _lock_memory() -> str:
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if soft != resource.RLIM_INFINITY and os.geteuid() != 0:
         return f"not obtained: the memlock limit is {soft} bytes"
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
-        return f"not obtained: {os.strerror(ctypes.get_errno())}"
-    return "current and future pages"
+    return _called("mlockall", _MCL_CURRENT | _MCL_FUTURE, obtained="current and future pages")
+
+
+def _called(function: str, *arguments: object, obtained: str) -> str:
+    result = getattr(ctypes.CDLL(None, use_errno=True), function)(*arguments)
+    return obtained if result == 0 else f"not obtained: {os.strerror(ctypes.get_errno())}"
 
 
 def _fifo(priority: int) -> str:

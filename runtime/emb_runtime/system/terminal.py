@@ -61,22 +61,18 @@ def one_line(text: str, most: int = LONGEST_STRING) -> str:
 def show(text: str, dressed: Callable[[str], str] = str) -> None:
     """Print a result, dressed with colours; a reader that has had enough (``| head``) is no error.
 
-    Of the characters that control a terminal only newlines in the text reach it.
-
-    Raises:
-        UsageError: standard output takes nothing: it is closed, or the disk behind it is full.
+    Of the characters that control a terminal only newlines in the text reach it. UsageError if standard output takes
+    nothing: it is closed, or the disk behind it is full.
     """
     if sys.stdout is None:  # closed before the program began
         raise UsageError("the result cannot be written to standard output: it is closed")
     try:
         sys.stdout.write(dressed(escaped(text, "\n")) + "\n")
         sys.stdout.flush()
-    except BrokenPipeError:
-        # Nothing may be written to the pipe at exit either.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as err:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise UsageError(f"the result cannot be written to standard output: {err.strerror}") from err
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing may be written to it at exit either
+        if not isinstance(err, BrokenPipeError):
+            raise UsageError(f"the result cannot be written to standard output: {err.strerror}") from err
 
 
 def mention(text: str) -> None:

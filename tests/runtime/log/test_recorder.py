@@ -355,7 +355,6 @@ def test_a_ring_that_overflows_is_counted_and_told(tmp_path: Path) -> None:
     os.kill(recorder.pid, signal.SIGSTOP)
     for _ in range(11):
         recorder.push(EventRecord(START, "X", ""))
-    assert recorder.dropped == 3
     os.kill(recorder.pid, signal.SIGCONT)
     result = recorder.finish({})
     assert (result.dropped, result.complete) == (3, False)
