@@ -80,7 +80,7 @@ class Message:
     crc_start: int  # :func:`emb_runtime.can.e2e.profile1_start` of the data id
 
     def decode(self, frame: Frame) -> dict[str, Number]:
-        """The physical value of every signal of a frame that is valid in all respects, by name; FrameRejectedError."""
+        """Physical value of every signal by name, of a frame that is valid in all respects; else FrameRejectedError."""
         data = frame.data
         if frame.identifier != self.identifier or frame.extended or frame.remote or frame.error:
             raise self._rejected(Fault.KIND, f"expected 11-bit identifier {self.identifier:#05x}, got {frame}")

@@ -164,5 +164,6 @@ def load_layout() -> Layout:
     fields = _fields(version)
     messages = [describe(database.get_message_by_name(name)) for name in fields]
     codecs = [generate_codec(message, *fields[message.name]) for message in messages]
+    # In the order of the layout's fields.
     parts: list[Any] = [*messages, *(codec.encode for codec in codecs), *(codec.decode for codec in codecs[:4])]
     return Layout(text, version, *parts)

@@ -109,12 +109,8 @@ class Trapezium:
     """
 
     def __init__(self, bench: Bench) -> None:
-        noise, sigmas, limits, box = (
-            bench.noise,
-            bench.shield.noise_sigmas,
-            bench.limits,
-            bench.range_set(bench.shield.ranges),
-        )
+        noise, sigmas, limits = bench.noise, bench.shield.noise_sigmas, bench.limits
+        box = bench.range_set(bench.shield.ranges)
         spring = box.high.gamma * box.high.k_1 * max(-limits.angle[0], limits.angle[1])
         friction = box.high.T_c + box.high.f_v * limits.velocity
         top_acceleration = (box.high.k_m * limits.current + spring + friction) / box.low.J
@@ -225,7 +221,7 @@ class Reception:
         counter, speed, applied_current, node_state, command_counter = velocity
         waiting, pair, now_ns = self._waiting, self._pair, frame.time_ns
         # An angle that has waited long is of another round of the counter: 15 periods old, and of no use.
-        if waiting is None or waiting[0].counter != counter or not abs(now_ns - waiting[1]) <= pair.fresh_ns:
+        if waiting is None or waiting[0].counter != counter or abs(now_ns - waiting[1]) > pair.fresh_ns:
             return None  # the missing pair is counted by its time
         self._waiting = None
         angle, since_ns = waiting
