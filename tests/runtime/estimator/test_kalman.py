@@ -193,6 +193,14 @@ def test_lost_samples_leave_it_less_sure_by_the_currents_that_may_have_acted() -
     assert late.mean[0] == pytest.approx(0.5, abs=2e-3)
 
 
+def test_a_velocity_without_variance_counts_as_known_to_a_millionth_of_a_radian_a_second() -> None:
+    def reversing(variance: float) -> Any:
+        """Mean after a period in which a velocity just below rest, known so well, is reversed."""
+        return predict(EXACT, state_of((0.2, -9e-6, *UNIT), np.diag([0.0, variance, *[0.0] * 4])), 1.0, 6.0)[0]
+
+    assert reversing(0.0) == reversing(1e-12) != reversing(1.02e-12)
+
+
 def test_a_brake_that_surely_sticks_stands_still_and_tells_nothing_of_the_friction() -> None:
     state = before = state_of((0.2, 0.0, *UNIT), np.diag([0.0, 0.0, *[0.02**2] * 4]))
     for k in range(1, 20):
