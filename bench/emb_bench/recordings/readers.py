@@ -20,11 +20,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emb_bench.config.plants import Instruments
 from emb_bench.experiment.experiment import Experiment, Lack
 from emb_bench.recordings.faults import ANGLES, HUGE, TIMES, VALUES, WRAPPED, Motion, Series, contradictions, require
 from emb_bench.recordings.map_file import TIME, TIMED, Place, RecordingMap, Signal, Source
-from emb_bench.sim.instruments import MEMORY, observe, observer_noise, settle
+from emb_bench.sim.instruments import Tracked, observe, observer_noise
 from emb_runtime.can.codec import parse
 from emb_runtime.drives.dbc import MAX_DBC_BYTES, find_messages
 from emb_runtime.errors import EmbError, FrameError, UsageError, needs
@@ -671,11 +670,12 @@ def _means(times: Floats, values: Floats, begin: Floats, end: Floats, held: bool
 
 def _derived(step: Integers, angle: Floats, t_s: float, bandwidth: float) -> Floats:
     """Velocity at each step that a tracking observer makes of angles; between them it goes along a line [rad/s]."""
-    memory = np.zeros(MEMORY)
-    settle(Instruments(), memory, float(angle[0]))
-    instruments = Instruments(observer_bandwidth=bandwidth)
-    every = np.interp(np.arange(step[-1] + 1), step, angle)
-    return np.array([observe(instruments, memory, t_s, y1) for y1 in every.tolist()])
+    every = np.interp(np.arange(step[-1] + 1), step, angle).tolist()
+    tracked, found = Tracked(every[0], 0.0), []
+    for y1 in every:
+        tracked = observe(bandwidth, tracked, t_s, y1)
+        found.append(tracked.velocity)
+    return np.array(found)
 
 
 def _lacks(wanted: RecordingMap, kind: str, bandwidth: float, lost: int) -> dict[Lack, tuple[float, ...]]:

@@ -19,7 +19,7 @@ The limit of a large bandwidth is the difference of two angles, √2 σ/T with a
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from emb_bench.brake.parameters import OFFSET, VELOCITY_GAIN
 from emb_bench.config.plants import LONGEST_DELAY, Instruments
@@ -28,20 +28,23 @@ from emb_runtime.estimator.observer import observer_gains
 _COMMANDS = 0
 _ANGLES = LONGEST_DELAY
 _VELOCITIES = 2 * LONGEST_DELAY
-_TRACKED_ANGLE = 3 * LONGEST_DELAY
-_TRACKED_VELOCITY = 3 * LONGEST_DELAY + 1
 MEMORY = 3 * LONGEST_DELAY + 2
-"""Length of a row of memory: commands on their way, measurements on theirs, and what the observer tracks."""
+"""Length of a row of memory: commands on their way, measurements on theirs, and last what the observer tracks."""
+
+
+class Tracked(NamedTuple):
+    """Angle and velocity that an observer tracks."""
+
+    angle: float  # [rad]
+    velocity: float  # [rad/s]
 
 
 def settle(instruments: Instruments, memory: Any, angle: float) -> None:
     """Begin with a brake that has long rested at an angle [rad] without a command; overwrites ``memory``."""
+    shown = angle + instruments.encoder_offset
     for i in range(LONGEST_DELAY):
-        memory[_COMMANDS + i] = 0.0
-        memory[_ANGLES + i] = angle + instruments.encoder_offset
-        memory[_VELOCITIES + i] = 0.0
-    memory[_TRACKED_ANGLE] = angle + instruments.encoder_offset
-    memory[_TRACKED_VELOCITY] = 0.0
+        memory[_COMMANDS + i], memory[_ANGLES + i], memory[_VELOCITIES + i] = 0.0, shown, 0.0
+    memory[-2], memory[-1] = shown, 0.0
 
 
 def command(instruments: Instruments, memory: Any, wanted: float) -> float:
@@ -90,20 +93,21 @@ def measure(
     To be called once a period. A sample is taken ``late`` [s], see :func:`reading`.
     """
     y1, y2 = reading(x1, x2, acceleration, late, instruments.encoder_offset, 1.0)
-    y1 += angle_error
-    y2 = observe(instruments, memory, t_s, y1) if instruments.observer_bandwidth > 0.0 else y2 + velocity_error
+    y1, y2 = y1 + angle_error, y2 + velocity_error
+    if instruments.observer_bandwidth > 0.0:
+        before = Tracked(float(memory[-2]), float(memory[-1]))
+        memory[-2], y2 = observe(instruments.observer_bandwidth, before, t_s, y1)
+        memory[-1] = y2
     delay = instruments.measurement_delay
     return _delayed(memory, _ANGLES, delay, y1), _delayed(memory, _VELOCITIES, delay, y2)
 
 
-def observe(instruments: Instruments, memory: Any, t_s: float, y1: float) -> float:
-    """The observer's velocity after one more measured angle [rad/s]."""
-    alpha, beta = observer_gains(instruments.observer_bandwidth, t_s)
-    ahead = memory[_TRACKED_ANGLE] + t_s * memory[_TRACKED_VELOCITY]
+def observe(bandwidth: float, tracked: Tracked, t_s: float, y1: float) -> Tracked:
+    """Angle and velocity that the observer tracks after one more measured angle [rad]."""
+    alpha, beta = observer_gains(bandwidth, t_s)
+    ahead = tracked.angle + t_s * tracked.velocity
     surprise = y1 - ahead
-    memory[_TRACKED_ANGLE] = ahead + alpha * surprise
-    memory[_TRACKED_VELOCITY] += beta / t_s * surprise
-    return float(memory[_TRACKED_VELOCITY])
+    return Tracked(ahead + alpha * surprise, tracked.velocity + beta / t_s * surprise)
 
 
 def observer_noise(bandwidth: float, t_s: float, angle_noise: float) -> float:
