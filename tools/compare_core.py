@@ -160,7 +160,7 @@ def _laws() -> list[Any]:
     return [
         law,
         law._replace(age_high=2),
-        law._replace(age_low=1, age_high=1, lag=2e-4, kept=math.exp(-5.0)),
+        law._replace(age_low=1, age_high=1, delay=law.delay._replace(lag=2e-4, kept=math.exp(-5.0))),
         law._replace(coasting=True, damping_velocity=math.inf),
     ]
 
@@ -290,10 +290,10 @@ def _response(dice: random.Random) -> Iterator[Any]:
     models = [proof.response_model(_bench(), law) for law in laws]
     yield models, [proof.unproven_law(_bench(), law) for law in laws]
     while True:
-        model, memory = dice.choice(models), [0.0] * proof.MEMORY
+        model = dice.choice(models)
         angle, velocity, command = dice.uniform(-5.0, 20.0), dice.uniform(-9.0, 9.0), 0.0
-        motor, past = dice.uniform(0.8 * model.motor_low, 1.2 * model.motor_high), [0.0] * dice.randrange(1, 5)
-        proof.begin(model, memory, angle, velocity)
+        motor, past = dice.uniform(0.8 * model.box.motor_low, 1.2 * model.box.motor_high), [0.0] * dice.randrange(1, 5)
+        state = proof.begin(model, angle, velocity)
         for _ in range(40):
             if dice.random() < 0.3:
                 command = dice.choice((0.0, model.holds, model.moves, _number(dice, 6.0), 6.0, -6.0))
@@ -301,8 +301,8 @@ def _response(dice: random.Random) -> Iterator[Any]:
             velocity += model.sample_time * motor * past[-1] + dice.gauss(0.0, 1.0)
             angle += model.sample_time * velocity
             measured = (_number(dice, 100.0), _number(dice, 500.0)) if dice.random() < 0.02 else (angle, velocity)
-            verdict = _tried(proof.take, model, memory, dice.random() < 0.95, *measured, command)
-            yield verdict, list(memory), proof.overshoot(model, memory, model.extra), proof.fits(model, memory)
+            state, verdict = proof.take(model, state, dice.random() < 0.95, *measured, command)
+            yield verdict, state, proof.overshoot(model, state, model.extra), proof.fits(model, state)
 
 
 def _guard(dice: random.Random) -> Iterator[Any]:

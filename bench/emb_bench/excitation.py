@@ -40,8 +40,8 @@ from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.control.actor import Actor
 from emb_runtime.errors import UsageError, near
 from emb_runtime.estimator.estimator import Estimator
-from emb_runtime.safety.response import MEMORY as RESPONSE
-from emb_runtime.safety.response import OPEN, PROVEN, VERDICT, response_model, take, unproven_law
+from emb_runtime.safety.response import OPEN, PROVEN, response_model, take, unproven_law
+from emb_runtime.safety.response import State as ProofState
 from emb_runtime.safety.response import begin as begin_response
 from emb_runtime.safety.sensor_monitor import begin, judge, largest_current
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
@@ -191,31 +191,32 @@ def run_excitation(
     limit, t_s = bench.limits.current, bench.timing.sample_time
     law = make_law(bench) if shielded else None
     thresholds, monitor = None if law is None else sensor_thresholds(bench, law), begin(0.0, 0.0)
-    proof = None if law is None else (response_model(bench, law), unproven_law(bench, law), [0.0] * RESPONSE)
+    proof = None if law is None else (response_model(bench, law), unproven_law(bench, law))
+    response: ProofState | None = None
+    verdict = OPEN
     states = np.zeros((count + 1, 2))
     wanted, currents = np.empty(count), np.empty(count)
     reasons, obeyed = np.zeros(count, np.int64), np.ones(count, np.bool_)
     past, estimator = NO_PAST, Estimator(bench)
 
     def answer(x1: float, x2: float, k: int) -> float:
-        nonlocal past, monitor
+        nonlocal past, monitor, response, verdict
         y1, y2 = x1 + float(errors[k, 0]), x2 + float(errors[k, 1])
         estimator.take(y1, y2, k, float(currents[k - 1]) if k else 0.0)
         wanted[k] = excited.act(y1, y2, k, estimator)
         if law is None or thresholds is None or proof is None:
             u = clipped(float(wanted[k]), limit)
         else:
-            model, slow, response = proof
+            model, slow = proof
             if k == 0:
-                monitor = begin(y1, y2)
-                begin_response(model, response, y1, y2)
-            elif response[VERDICT] == OPEN:
-                take(model, response, bool(obeyed[k - 1]), y1, y2, past[0])
+                monitor, response = begin(y1, y2), begin_response(model, y1, y2)
+            elif response is not None and verdict == OPEN:
+                response, verdict = take(model, response, bool(obeyed[k - 1]), y1, y2, past[0])
             if k > 0 and not monitor.confirmed:
                 told = bool(obeyed[k - 1]), past[0], float(currents[k - 1])
                 monitor, _ = judge(law, thresholds, monitor, t_s, y1, y2, *told)
             most = largest_current(law, thresholds, monitor, limit)
-            allowed = slow if monitor.obeys and response[VERDICT] != PROVEN else law
+            allowed = slow if monitor.obeys and verdict != PROVEN else law
             u, reasons[k] = sent_current(allowed, True, y1, y2, float(wanted[k]), past, k, most)
         obeyed[k] = not math.isnan(u)
         past = (u if obeyed[k] else 0.0, *past[:4])

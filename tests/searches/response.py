@@ -49,12 +49,12 @@ from emb_runtime.safety.response import (
     OPEN,
     PROVEN,
     ResponseModel,
+    State,
     begin,
     response_model,
     take,
     unproven_law,
 )
-from emb_runtime.safety.response import MEMORY as RESPONSE_MEMORY
 from emb_runtime.safety.sensor_monitor import HONEST, judge, largest_current
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
 from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresholds
@@ -109,16 +109,14 @@ def fly(
 ) -> None:
     """Play each experiment of a script to its end, or to the first verdict against it and then to rest."""
     ts = law.sample_time
-    proof, instrument = np.zeros(RESPONSE_MEMORY), np.zeros(INSTRUMENTS_MEMORY)
-    x = np.zeros(STATES)
+    x, instrument = np.zeros(STATES), np.zeros(INSTRUMENTS_MEMORY)
     for m in range(out.shape[0]):
         b, row = script.brakes[m], out[m]
         p = BrakeParameters(b[0], b[1], b[2], b[3], b[4], b[5])
         x[:], state = 0.0, start(model)
         settle(instruments, instrument, 0.0)
         angle, velocity = script.errors[m, 0, 0] + instruments.encoder_offset, script.errors[m, 0, 1]
-        monitor = begin_monitor(angle, velocity)
-        begin(response, proof, angle, velocity)
+        monitor, proof = begin_monitor(angle, velocity), begin(response, angle, velocity)
         verdict, past, periods, obeyed, given, felt, wanted, rest = OPEN, NO_PAST, 0, False, 0.0, 0.0, 0.0, -1
         for k in range(law.steps):
             if periods == 0 and rest < 0:
@@ -149,7 +147,7 @@ def fly(
             follows = obeyed and periods == 1
             monitor, found = judge(law, limits, monitor, periods * ts, angle, velocity, follows, given, felt)
             row[DISHONEST] = found != HONEST
-            verdict = judged(response, proof, verdict, follows, angle, velocity, given, k + 1, row)
+            proof, verdict = judged(response, proof, verdict, follows, angle, velocity, given, k + 1, row)
             periods = 0
             if verdict == CONTRADICTED or row[DISHONEST] != 0.0:
                 rest = 0
@@ -157,7 +155,7 @@ def fly(
 
 def judged(
     response: ResponseModel,
-    proof: Floats,
+    proof: State,
     verdict: int,
     follows: bool,
     angle: float,
@@ -165,14 +163,14 @@ def judged(
     given: float,
     samples: int,
     row: Floats,
-) -> int:
-    """Verdict of the proof after one more of so many samples."""
+) -> tuple[State, int]:
+    """State and verdict of the proof after one more of so many samples."""
     if verdict == OPEN:
-        verdict = take(response, proof, follows, angle, velocity, given)
+        proof, verdict = take(response, proof, follows, angle, velocity, given)
         row[VERDICT] = verdict
         if verdict == PROVEN:
             row[PROVEN_AT] = samples
-    return verdict
+    return proof, verdict
 
 
 def sent(

@@ -25,6 +25,7 @@ import tools.proof.windows as windows_module
 from emb_bench.brake.euler import step as euler_step
 from emb_runtime.config.bench import BrakeParameters, Ranges
 from tests.benches import SENSOR_BENCH
+from tests.laws import with_numbers
 from tests.properties.shield_search import bench_with, damped
 from tools.proof.__main__ import main
 from tools.proof.boxes import cover, slack_of
@@ -51,7 +52,7 @@ def declared(**keys: Any) -> Case:
 
 
 def law_with(**changed: Any) -> Case:
-    return SHIPPED._replace(law=SHIPPED.law._replace(**changed))
+    return SHIPPED._replace(law=with_numbers(SHIPPED.law, **changed))
 
 
 LAGGING = declared(current_lag=0.002)
@@ -126,22 +127,22 @@ def test_each_law_is_judged_by_the_lemmas_of_what_it_declares() -> None:
 
 BROKEN_LAWS: list[tuple[str, str, Case]] = [
     ("L4b", "margin too small", law_with(top=SHIPPED.law.top + 0.2, bottom=SHIPPED.law.bottom - 0.2)),
-    ("L5a", "braking 1 % too strong", law_with(braking=1.01 * SHIPPED.law.braking)),
-    ("L5d", "braking 10 % too strong", law_with(braking=1.1 * SHIPPED.law.braking)),
-    ("L5b", "braking 10 % too strong", law_with(braking=1.1 * SHIPPED.law.braking)),
+    ("L5a", "braking 1 % too strong", law_with(braking=1.01 * SHIPPED.law.box.braking)),
+    ("L5d", "braking 10 % too strong", law_with(braking=1.1 * SHIPPED.law.box.braking)),
+    ("L5b", "braking 10 % too strong", law_with(braking=1.1 * SHIPPED.law.box.braking)),
     ("L3a", "damping that reverses", law_with(damping_velocity=30.0)),
-    ("L5c", "friction that holds the spring", law_with(friction_high=SHIPPED.law.spring_low * 101.0)),
+    ("L5c", "friction that holds the spring", law_with(friction_high=SHIPPED.law.box.spring_low * 101.0)),
     ("L5e", "damping that turns a motion around", law_with(damping_velocity=44.0)),
     ("L5f", "coming home too fast for the stroke", law_with(homeward_speed=560.0)),
-    ("L5g", "spring stronger than braking", law_with(spring_high=1.2 * SHIPPED.law.spring_high)),
+    ("L5g", "spring stronger than braking", law_with(spring_high=1.2 * SHIPPED.law.box.spring_high)),
     ("L5h", "speed beyond the limit", law_with(outward_speed=500.1)),
     ("L6", "no room between the limits", law_with(top=2.0, bottom=1.9)),
-    ("L1a", "law for a weaker spring", law_with(spring_high=0.99 * SHIPPED.law.spring_high)),
-    ("L1d", "four times the viscous friction", law_with(viscous_high=4.0 * SHIPPED.law.viscous_high)),
+    ("L1a", "law for a weaker spring", law_with(spring_high=0.99 * SHIPPED.law.box.spring_high)),
+    ("L1d", "four times the viscous friction", law_with(viscous_high=4.0 * SHIPPED.law.box.viscous_high)),
     (
         "L12c",
         "apex from which no brake coasts home",
-        COASTING._replace(law=COASTING.law._replace(apex=COASTING.law.apex + 5.0)),
+        COASTING._replace(law=with_numbers(COASTING.law, apex=COASTING.law.home.apex + 5.0)),
     ),
 ]
 
@@ -161,17 +162,17 @@ def test_a_brake_outside_the_laws_set_is_refused() -> None:
 
 
 BROKEN_FUNCTIONS = [
-    ("L1b", "drives", "law.spring_low * max(xl", "law.spring_high * max(xl"),
-    ("L1b", "drives", "min(law.motor_high * u_low, law.motor_low * u_low)", "law.motor_low * u_low"),
-    ("L1c", "fastest_next", "drive + law.friction_high -", "drive - law.friction_high -"),
+    ("L1b", "drives", "box.spring_low * max(xl", "box.spring_high * max(xl"),
+    ("L1b", "drives", "min(box.motor_high * u_low, box.motor_low * u_low)", "box.motor_low * u_low"),
+    ("L1c", "fastest_next", "drive + box.friction_high -", "drive - box.friction_high -"),
     ("L1c", "fastest_next", "if vl <= 0.0:", "if vl <= -1e6:"),
     ("L1c", "_moved", "max(vh, high)", "high"),
     ("L1d", "fastest_next", ", 0.0)", ", -1e6)"),
     ("L1e", "_moved", "min(vl, low)", "low"),
     ("L2a", "stoppable", "9.0 * half * half", "10.0 * half * half"),
     ("L2a", "stoppable", "rest = room - ts * v", "rest = room"),
-    ("L2b", "_highest_current", "law.motor_high if drive > 0.0 else law.motor_low", "law.motor_low"),
-    ("L2b", "_highest_current", "min(drive, v / ts - law.friction_high)", "drive"),
+    ("L2b", "_highest_current", "box.motor_high if drive > 0.0 else box.motor_low", "box.motor_low"),
+    ("L2b", "_highest_current", "min(drive, v / ts - box.friction_high)", "drive"),
     ("L2b", "_braking_window", "- VELOCITY_PAD\n    bottom", "\n    bottom"),
     ("L2b", "_braking_window", "law.top - xh", "law.top - xl"),
     ("L3b", "damped_current", "-limit * velocity", "-0.99 * limit * velocity"),
@@ -180,9 +181,9 @@ BROKEN_FUNCTIONS = [
     ("L9b", "damped_current", "-limit * velocity", "-0.99 * limit * velocity"),
     ("L10a", "_flowing", "max(flowing - u, 0.0)", "0.0"),
     ("L10a", "_flowing", "(i + 1) * law.change", "0.0"),
-    ("L10b", "_lagging_current", "law.lag * motor * (flowing + law.current)", "law.lag * motor * flowing"),
-    ("L10b", "_lagging_current", "vh + law.lag * max(rising, 0.0)", "vh"),
-    ("L12a", "_coasting_window", "- 0.5 * law.spring_high * squeezed * squeezed", ""),
+    ("L10b", "_lagging_current", "law.delay.lag * motor * (flowing + law.current)", "law.delay.lag * motor * flowing"),
+    ("L10b", "_lagging_current", "vh + law.delay.lag * max(rising, 0.0)", "vh"),
+    ("L12a", "_coasting_window", "- 0.5 * box.spring_high * squeezed * squeezed", ""),
     ("L12a", "_coasting_window", "max(vh + law.change, 0.0)", "max(vh, 0.0)"),
     ("L12a", "_coasting_window", "return min(bottom, 0.0)", "return max(bottom, 0.0)"),
     (
@@ -195,7 +196,7 @@ BROKEN_FUNCTIONS = [
     ("L13", "_unseen", "* ts * max(_moved_by(law, slow", "* 0.99 * ts * max(_moved_by(law, slow"),
     ("L13", "_unseen", "risen = -blind, blind", "risen = -blind, 0.9 * blind"),
     ("L13", "_unseen", "xl - i * law.reach", "xl + law.reach"),
-    ("L13", "_moved_by", "- law.friction_low", "- law.friction_high"),
+    ("L13", "_moved_by", "- box.friction_low", "- box.friction_high"),
     ("L5b", "reserve", "v + limit if v >= limit else v + v", "limit if v >= limit else v"),
 ]
 
@@ -243,26 +244,26 @@ def test_a_law_without_its_pad_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
 
 def stop_distance(law: envelope_module.ShieldLaw, x: float, v: float) -> float:
     """What the damped stop of the weakest brake needs from a speed at an angle [rad], integrated by hand."""
-    slope, slow = law.motor_low * law.current / law.damping_velocity, min(v, law.damping_velocity)
-    friction = law.friction_low + law.spring_low * max(x, 0.0)
+    slope, slow = law.box.motor_low * law.current / law.damping_velocity, min(v, law.damping_velocity)
+    friction = law.box.friction_low + law.box.spring_low * max(x, 0.0)
     distance = slow / slope - friction / (slope * slope) * math.log1p(slope * slow / friction) + law.sample_time * slow
-    full = law.motor_low * law.current + friction
+    full = law.box.motor_low * law.current + friction
     return distance + 0.5 * (v * v - slow * slow) / full + 0.5 * law.sample_time * (v - slow)
 
 
 def test_the_stop_that_is_counted_is_the_integral_by_hand() -> None:
     law, rng = SHIPPED.law, np.random.default_rng(1)
     for x, v in zip(rng.uniform(-10.0, 100.0, 20_000), rng.uniform(0.0, 500.0, 20_000), strict=True):
-        helped = law.spring_low * max(x, 0.0)
-        assert damped_way(law, law.friction_low + helped, v) == pytest.approx(stop_distance(law, x, v), rel=1e-12)
+        helped = law.box.spring_low * max(x, 0.0)
+        assert damped_way(law, law.box.friction_low + helped, v) == pytest.approx(stop_distance(law, x, v), rel=1e-12)
 
 
 def test_the_proofs_reserve_is_never_below_the_envelopes_and_never_far_above_the_damped_stop() -> None:
     law, rng = SHIPPED.law, np.random.default_rng(2)
-    most = 0.5 * 60.0**2 / law.braking + 0.5 * law.sample_time * 60.0 + 1e-12
+    most = 0.5 * 60.0**2 / law.box.braking + 0.5 * law.sample_time * 60.0 + 1e-12
     for v in rng.uniform(0.0, 500.0, 20_000):
-        envelope = 0.5 * v * v / law.braking + 0.5 * law.sample_time * v
-        assert envelope <= reserve(law, law.braking, v) <= envelope + most
+        envelope = 0.5 * v * v / law.box.braking + 0.5 * law.sample_time * v
+        assert envelope <= reserve(law, law.box.braking, v) <= envelope + most
 
 
 def test_the_thrown_brake_of_the_proof_moves_like_eulers() -> None:

@@ -20,6 +20,7 @@ from emb_bench.sim.simulated_brake import sent_current
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
 from emb_runtime.errors import UsageError
+from emb_runtime.safety import response
 from emb_runtime.safety.command_limits import LEFT
 from emb_runtime.safety.response import begin as begin_response
 from emb_runtime.safety.sensor_monitor import begin as begin_monitor
@@ -27,7 +28,15 @@ from emb_runtime.safety.sensor_monitor import largest_current
 from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield import NO_PAST
 from emb_runtime.safety.shield_design import make_law
-from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Conditions, delayed, monitor_of, store_monitor
+from emb_train.closed_loop import (
+    BENCH_CONDITIONS,
+    Batch,
+    Conditions,
+    delayed,
+    monitor_of,
+    store_monitor,
+    store_response,
+)
 from emb_train.play import Played, fresh_draws, play
 from tests.benches import SENSOR_BENCH, SENSOR_TEXT
 
@@ -175,7 +184,8 @@ def test_a_batch_that_hears_what_a_run_heard_sends_what_that_sent(plant: str, tm
     batch.experiments.noise[:] = 0.0
     batch.y[0] = heard[0]
     store_monitor(begin_monitor(*heard[0].tolist()), batch.experiments.monitor[0])
-    begin_response(batch.setup.response, batch.experiments.response[0], *heard[0].tolist())
+    proof = begin_response(batch.setup.response, *heard[0].tolist())
+    store_response(proof, response.OPEN, batch.experiments.response[0])
     for k in range(HORIZON - 1):
         # The noise that makes the batch's next measurement the run's.
         asked = float(of["policy_current"][active[k]])

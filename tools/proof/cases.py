@@ -43,7 +43,7 @@ class Case(NamedTuple):
         """Greatest T_c / J: forward Euler is of the thesis's brake, and has no other friction [rad/s²]."""
         shield = self.bench.shield
         more = shield.break_away > 1.0 or shield.f_l > 0.0
-        return float(self.bounds()["friction"][1]) if more else self.law.friction_high
+        return float(self.bounds()["friction"][1]) if more else self.law.box.friction_high
 
     def bounds(self) -> dict[str, tuple[Fraction, Fraction]]:
         """Torques over the inertia of every brake of the bench's set, exactly: motor, spring, friction, viscous."""

@@ -10,14 +10,14 @@ from emb_runtime.safety.shield_design import ANGLE_PAD, ShieldLaw, damped_excess
 from tools.proof.boxes import Covered, Slack, cover
 from tools.proof.cases import Case
 from tools.proof.intervals import Boxes, Interval, greater
+from tools.proof.terms import with_floats
 
 MOST = 2_000_000  # Boxes for one lemma
 
 
 def interval_law(boxes: Boxes, law: ShieldLaw) -> Any:
     """A law whose floats are intervals, so that sums of them are rounded outward as well."""
-    exact: dict[str, Any] = {n: boxes.constant(v) for n, v in law._asdict().items() if isinstance(v, float)}
-    return law._replace(**exact)
+    return with_floats(law, boxes.constant)
 
 
 def some_current_is_left(case: Case) -> Covered:
@@ -61,15 +61,15 @@ def some_current_is_left(case: Case) -> Covered:
 def _most_unseen(case: Case) -> float:
     """Greatest change of the velocity that :func:`emb_runtime.safety.shield._unseen` reckons with [rad/s]."""
     law = case.law
-    if law.observer == 0.0:
+    if law.delay.observer == 0.0:
         return 0.0
-    rest = unseen(law.observer, PAST - law.age_high) * law.change
-    away = rest + (2.0 / law.observer + PAST) * law.change
+    rest = unseen(law.delay.observer, PAST - law.age_high) * law.change
+    away = rest + (2.0 / law.delay.observer + PAST) * law.change
     fastest = law.outward_speed + 2.0 * law.velocity_noise + away
     farthest = case.top + 2.0 * law.angle_noise + PAST * law.reach
-    accelerated = law.motor_high * law.current + law.friction_high
-    accelerated += law.viscous_high * fastest + law.spring_high * farthest
-    return rest + 2.0 / law.observer * law.sample_time * accelerated
+    accelerated = law.box.motor_high * law.current + law.box.friction_high
+    accelerated += law.box.viscous_high * fastest + law.box.spring_high * farthest
+    return rest + 2.0 / law.delay.observer * law.sample_time * accelerated
 
 
 def damped_stop_is_counted(case: Case) -> Covered:
@@ -82,26 +82,26 @@ def damped_stop_is_counted(case: Case) -> Covered:
     def statement(boxes: Boxes) -> Slack:
         exact = interval_law(boxes, law)
         counted = boxes.lift(damped_excess)(
-            exact.motor_low, exact.friction_low, exact.current, exact.damping_velocity, exact.sample_time
+            exact.box.motor_low, exact.box.friction_low, exact.current, exact.damping_velocity, exact.sample_time
         )
         way = boxes.lift(damped_way)
 
         def slack(speed: Interval, helped: Interval) -> Any:
-            friction = exact.friction_low + helped
-            full = exact.motor_low * exact.current + friction
+            friction = exact.box.friction_low + helped
+            full = exact.box.motor_low * exact.current + friction
             envelope = speed * speed * 0.5 / full + speed * 0.5 * exact.sample_time
             return counted + ANGLE_PAD - (way(exact, friction, speed) - envelope)
 
         return slack
 
     fastest = max(law.outward_speed, law.homeward_speed)
-    region = {"speed": (0.0, fastest), "helped": (0.0, law.spring_low * case.bench.limits.angle[1])}
+    region = {"speed": (0.0, fastest), "helped": (0.0, law.box.spring_low * case.bench.limits.angle[1])}
     return cover(statement, region, MOST)
 
 
 def damped_way(law: Any, friction: Any, v: Any) -> Any:
     """Way of the weakest motor's damped stop from a speed v ≥ 0, in its sampled form [rad]."""
-    slope = law.motor_low * law.current / law.damping_velocity
+    slope = law.box.motor_low * law.current / law.damping_velocity
     slow = min(v, law.damping_velocity)
     way = slow / slope - friction / (slope * slope) * math.log1p(slope * slow / friction) + law.sample_time * slow
     if v > slow:

@@ -38,9 +38,9 @@ def coasting_window_is_kept(case: Case) -> Answer:
 
 def _left(law: Any, above: Real, below: Real, squeezed: Real) -> tuple[Real, Real]:
     """Half the squared speed from which friction and the softest spring stop it, up; from which friction does, down."""
-    up = law.friction_low * (law.apex - above)
-    up += 0.5 * law.spring_low * (law.apex * law.apex - squeezed * squeezed)
-    return up, law.friction_low * (below - law.bottom) - 0.5 * law.spring_high * squeezed * squeezed
+    up = law.box.friction_low * (law.home.apex - above)
+    up += 0.5 * law.box.spring_low * (law.home.apex * law.home.apex - squeezed * squeezed)
+    return up, law.box.friction_low * (below - law.bottom) - 0.5 * law.box.spring_high * squeezed * squeezed
 
 
 def _less_is_left_beyond(facts: Facts, case: Case) -> None:
@@ -58,7 +58,7 @@ def _coasting(facts: Facts, case: Case, end: int) -> None:
     law = lifted_law(facts, case.law)
     xl, xh, vl, vh = any_box(facts, case)
     fastest = case.bench.limits.velocity + law.velocity_noise
-    facts.at_least(law.apex + (2.0 + law.age_high) * law.reach, xh)  # no brake of the set gets beyond the apex
+    facts.at_least(law.home.apex + (2.0 + law.age_high) * law.reach, xh)  # no brake of the set gets beyond the apex
     facts.at_least(vl, -fastest)
     facts.at_least(fastest, vh)
     roots: list[tuple[Real, ...]] = []
@@ -99,17 +99,17 @@ def coasting_loses_energy(case: Case) -> Answer:
         law = lifted_law(facts, case.law)
         x = facts.real("x", case.bottom, case.top)
         squeezed = facts.greater(x, 0.0)
-        spring = facts.real("spring", law.spring_low, law.spring_high)
-        friction = facts.real("friction", law.friction_low, law.friction_high)
-        viscous = facts.real("viscous", law.viscous_low, law.viscous_high)
+        spring = facts.real("spring", law.box.spring_low, law.box.spring_high)
+        friction = facts.real("friction", law.box.friction_low, law.box.friction_high)
+        viscous = facts.real("viscous", law.box.viscous_low, law.box.viscous_high)
         against = facts.real("against", 0.0)
         v = facts.real("v", -law.homeward_speed, law.outward_speed)
         if v > 0.0:
             rate = v * (-against - spring * squeezed - friction - viscous * v)
-            facts.claim("up", 0.0, rate + law.spring_low * squeezed * v + law.friction_low * v)
+            facts.claim("up", 0.0, rate + law.box.spring_low * squeezed * v + law.box.friction_low * v)
         else:
             rate = v * (against - spring * squeezed + friction - viscous * v)
-            facts.claim("down", 0.0, rate + law.spring_high * squeezed * v - law.friction_low * v)
+            facts.claim("down", 0.0, rate + law.box.spring_high * squeezed * v - law.box.friction_low * v)
 
     return prove(statement)
 
@@ -119,10 +119,10 @@ def coasting_turns_inside(case: Case) -> Answer:
 
     def statement(facts: Facts) -> None:
         law = lifted_law(facts, case.law)
-        facts.claim("apex", law.top, law.apex)
-        x = facts.real("x", case.law.bottom, law.apex)
+        facts.claim("apex", law.top, law.home.apex)
+        x = facts.real("x", case.law.bottom, law.home.apex)
         squeezed = facts.greater(x, 0.0)
-        facts.claim("turned", law.friction_low * (x - law.bottom), 0.5 * law.spring_high * squeezed * squeezed)
+        facts.claim("turned", law.box.friction_low * (x - law.bottom), 0.5 * law.box.spring_high * squeezed * squeezed)
 
     return prove(statement)
 
@@ -154,28 +154,29 @@ def _lagging(facts: Facts, case: Case, part: int) -> None:
     window = facts.lift(_lagging_window, _flowing=lambda *_: flowing, _lagging_current=watched)
     lowest, highest = window(law, xl, xh, low, high, None)
     up = part < 2
-    motor, braking = (law.motor_low, law.braking) if part in (0, 2) else (law.motor_high, law.braking_high)
+    box = law.box
+    motor, braking = (box.motor_low, box.braking) if part in (0, 2) else (box.motor_high, box.braking_high)
     end, limit = (highest, law.outward_speed) if up else (-lowest, law.homeward_speed)
     vl, vh = (low, high) if up else (-high, -low)
     allowed, room, stopping, counted, _ = asked[0]
     v = facts.real("v", vl, vh)
     current = facts.real("current", -law.current, flowing)
-    lag = facts.real("lag", 0.0, law.lag)
+    lag = facts.real("lag", 0.0, law.delay.lag)
     u = facts.real("u", -law.current, law.current)
-    soft = law.spring_low * facts.greater(xl - law.reach, 0.0)
-    stiff = law.spring_high * facts.greater(xh + law.reach, 0.0)
+    soft = law.box.spring_low * facts.greater(xl - law.reach, 0.0)
+    stiff = law.box.spring_high * facts.greater(xh + law.reach, 0.0)
     away = v - law.change
-    resisted = law.friction_low + law.viscous_low * away
+    resisted = law.box.friction_low + law.box.viscous_low * away
     if away <= 0.0:
-        resisted = -law.friction_high + law.viscous_high * away
+        resisted = -law.box.friction_high + law.box.viscous_high * away
     gained = law.sample_time * (motor * u - resisted - (soft if up else -stiff))
     if end > -law.current and u <= end:
         e = v + motor * lag * (current + law.current)
         facts.claim("speed that is asked for", stopping, e)
         facts.claim("room", (law.top - xh) if up else (xl - law.bottom), room)
-        facts.claim("braking", braking + (law.spring_low * facts.greater(xl, 0.0) if up else 0.0), counted)
+        facts.claim("braking", braking + (law.box.spring_low * facts.greater(xl, 0.0) if up else 0.0), counted)
         facts.claim("can be stopped", allowed, e + gained)
-        driven = facts.greater(stiff - law.friction_low, 0.0) if not up else 0.0
+        driven = facts.greater(stiff - law.box.friction_low, 0.0) if not up else 0.0
         facts.claim("speed", limit, v + lag * (motor * current + driven) + gained)
 
 
@@ -191,13 +192,13 @@ def motors_between_stop_too(case: Case) -> Answer:
         share, helped = facts.real("share", 0.0, 1.0), facts.real("helped", 0.0)
         rest = 1.0 - share
         weak, strong = facts.real("weak", 0.0), facts.real("strong", 0.0)
-        a, b = law.braking + helped, law.braking_high + helped
+        a, b = law.box.braking + helped, law.box.braking_high + helped
         between, mixed = rest * a + share * b, rest * a * weak + share * b * strong
         counted = rest * a * weak * weak + share * b * strong * strong
         missing = share * rest * a * b * (weak - strong) * (weak - strong)
         facts.claim("convex", between * counted, mixed * mixed + missing)
         facts.claim("convex", mixed * mixed + missing, between * counted)
-        facts.claim("motor", law.motor_high, law.motor_low)
+        facts.claim("motor", law.box.motor_high, law.box.motor_low)
         facts.claim("not negative", share * rest, 0.0)
 
     return prove(statement)
@@ -227,7 +228,7 @@ def _flows(facts: Facts, case: Case, i: int) -> None:
     v = facts.real("v", slowest - (i + 1) * law.change)
     braked = facts.lift(damped_current)(v, law.current, law.damping_velocity)
     command = facts.real("command", -law.current, facts.greater(own[i], braked))
-    kept = facts.real("kept", 0.0, law.kept)  # grows with the lag
+    kept = facts.real("kept", 0.0, law.delay.kept)  # grows with the lag
     facts.claim("flowing", bound(range(PAST - 1, i - 1, -1)), command + kept * (current - command))
 
 
@@ -236,10 +237,10 @@ def lagging_stop_stays(case: Case) -> Answer:
 
     def statement(facts: Facts) -> None:
         law = lifted_law(facts, case.law)
-        motor = facts.real("motor", law.motor_low, law.motor_high)
-        friction = law.friction_low + facts.real("spring", 0.0, law.spring_low * case.bench.limits.angle[1])
+        motor = facts.real("motor", law.box.motor_low, law.box.motor_high)
+        friction = law.box.friction_low + facts.real("spring", 0.0, law.box.spring_low * case.bench.limits.angle[1])
         current = facts.real("current", -law.current, law.current)
-        lag = facts.real("lag", 0.0, law.lag)
+        lag = facts.real("lag", 0.0, law.delay.lag)
         v = facts.real("v", 0.0, law.outward_speed)
         e = v + motor * lag * (current + law.current)
         facts.claim("behind", e, v)
@@ -268,7 +269,8 @@ def _observed(
     facts: Facts, case: Case, age: int, asked: Any, own: tuple[Real, ...], shown: Real
 ) -> tuple[Any, tuple[Real, Real], Real, Real]:
     """The law; least and greatest change by its :func:`_unseen`; least and greatest angle of the measurement."""
-    law = lifted_law(facts, case.law)._replace(observer=case.law.observer)
+    law = lifted_law(facts, case.law)
+    law = law._replace(delay=law.delay._replace(observer=case.law.delay.observer))
     x = facts.real("angle", case.bottom, case.top)
     xl, xh = x - law.angle_noise, x + law.angle_noise
     run = facts.lift(_unseen, math=math, min=facts.smaller, max=facts.greater, _moved_by=asked)
@@ -292,23 +294,23 @@ def _accelerates(facts: Facts, case: Case, end: int, age: int, i: int) -> None:
     away = law.velocity_noise + (_total(case, 0) + i + 1) * law.change
     v, begun = facts.real("v", shown - away, shown + away), facts.real("begun", shown - away, shown + away)
     x = facts.real("x", xl - (i + 1) * law.reach, xh + (i + 1) * law.reach)
-    motor = facts.real("motor", law.motor_low, law.motor_high)
-    spring = facts.real("spring", law.spring_low, law.spring_high)
-    viscous = facts.real("viscous", law.viscous_low, law.viscous_high)
+    motor = facts.real("motor", law.box.motor_low, law.box.motor_high)
+    spring = facts.real("spring", law.box.spring_low, law.box.spring_high)
+    viscous = facts.real("viscous", law.box.viscous_low, law.box.viscous_high)
     braked = facts.lift(damped_current)(begun, law.current, law.damping_velocity)
     current = facts.real("current", facts.smaller(own[age + i], braked), facts.greater(own[age + i], braked))
-    friction = facts.real("friction", -law.friction_high, law.friction_high)
+    friction = facts.real("friction", -law.box.friction_high, law.box.friction_high)
     if v > 0.0:
-        facts.at_least(friction, law.friction_low)
+        facts.at_least(friction, law.box.friction_low)
     elif v < 0.0:
-        facts.at_least(-law.friction_low, friction)
+        facts.at_least(-law.box.friction_low, friction)
     a = motor * current - spring * facts.greater(x, 0.0) - friction - viscous * v
     facts.claim("acceleration", bounds[2 * i + end], -a if end else a)
 
 
 def _total(case: Case, periods: int) -> float:
     """Samples by which an observer lags for what acted more than so many samples ago, and overshoots."""
-    scaled = case.law.observer
+    scaled = case.law.delay.observer
     return (2.0 + scaled * periods) * math.exp(-scaled * periods) / scaled + OVERSHOOT / min(scaled, 1.5)
 
 

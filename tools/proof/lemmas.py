@@ -91,9 +91,9 @@ def lemmas(case: Case) -> tuple[Lemma, ...]:
     """Returns the lemmas for a law."""
     if case.law.coasting:
         return COASTING
-    if case.law.lag > 0.0:
+    if case.law.delay.lag > 0.0:
         return LAGGING
-    return OBSERVED if case.law.observer > 0.0 else BRAKING
+    return OBSERVED if case.law.delay.observer > 0.0 else BRAKING
 
 
 def judge(lemma: Lemma, case: Case) -> Verdict:

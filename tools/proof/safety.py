@@ -28,7 +28,8 @@ ROUNDING = 1e-12
 
 def _euler_law(facts: Facts, case: Case) -> Any:
     """The law of brakes as forward Euler's are: the thesis's, with no friction beyond T_c."""
-    return lifted_law(facts, case.law, friction_high=facts.constant(case.coulomb))
+    law = lifted_law(facts, case.law)
+    return law._replace(box=law.box._replace(friction_high=facts.constant(case.coulomb)))
 
 
 def _braking_current(facts: Facts, law: Any, v: Term, how: str) -> Real:
@@ -40,7 +41,7 @@ def _braking_current(facts: Facts, law: Any, v: Term, how: str) -> Real:
 
 def _least_brake(facts: Facts, law: Any, speed: Term) -> Real:
     """Least deceleration by the damped stop of the weakest motor at that speed [rad/s²]."""
-    return law.motor_low * facts.smaller(law.current, law.current * speed / law.damping_velocity)
+    return law.box.motor_low * facts.smaller(law.current, law.current * speed / law.damping_velocity)
 
 
 def set_is_covered(case: Case) -> Answer:
@@ -48,7 +49,7 @@ def set_is_covered(case: Case) -> Answer:
 
     def statement(facts: Facts) -> None:
         for name, (low, high) in case.bounds().items():
-            given_low, given_high = getattr(case.law, f"{name}_low"), getattr(case.law, f"{name}_high")
+            given_low, given_high = getattr(case.law.box, f"{name}_low"), getattr(case.law.box, f"{name}_high")
             facts.claim(f"{name} low", facts.constant(low), facts.constant(given_low) * facts.constant(1.0 - 1e-12))
             facts.claim(f"{name} high", facts.constant(given_high) * facts.constant(1.0 + 1e-12), facts.constant(high))
 
@@ -65,16 +66,16 @@ def envelope_is_safe(case: Case) -> Answer:
     def above(facts: Facts) -> None:
         law = lifted_law(facts, case.law)
         v = facts.real("v", 0.0, law.outward_speed)
-        turned = law.sample_time * (law.motor_high * law.current + law.friction_high)
-        now = facts.real("now", law.braking)
-        counted = facts.real("counted", now, now + (law.spring_high * law.reach if v <= turned else 0.0))
+        turned = law.sample_time * (law.box.motor_high * law.current + law.box.friction_high)
+        now = facts.real("now", law.box.braking)
+        counted = facts.real("counted", now, now + (law.box.spring_high * law.reach if v <= turned else 0.0))
         facts.claim("above", case.top - law.top, reserve(law, now, v) - _counted_way(law, counted, v))
 
     def below(facts: Facts, euler: bool) -> None:
         law = _euler_law(facts, case)
         down = facts.real("down", 0.0, law.homeward_speed)
-        way = Thrown(facts, law).down(down) if euler else reserve(law, law.braking, down)
-        facts.claim("below", law.bottom - case.bottom, way - _counted_way(law, law.braking, down))
+        way = Thrown(facts, law).down(down) if euler else reserve(law, law.box.braking, down)
+        facts.claim("below", law.bottom - case.bottom, way - _counted_way(law, law.box.braking, down))
 
     def moving_up(facts: Facts) -> None:
         law = _euler_law(facts, case)
@@ -104,10 +105,10 @@ def braking_is_enough(case: Case) -> Answer:
             _, after = facts.lift(euler_step)(brake, x, v, u, law.sample_time)
             squeezed = facts.greater(x, 0.0)
             if v > 0.0:
-                least = _least_brake(facts, law, v) + law.friction_low + law.spring_low * squeezed
+                least = _least_brake(facts, law, v) + law.box.friction_low + law.box.spring_low * squeezed
                 facts.claim(f"{how} up", v - law.sample_time * least, after)
             else:
-                least = _least_brake(facts, law, -v) + law.friction_low - law.spring_high * squeezed
+                least = _least_brake(facts, law, -v) + law.box.friction_low - law.box.spring_high * squeezed
                 facts.claim(f"{how} down", after, v + law.sample_time * least)
 
     return prove(statement)
@@ -115,7 +116,7 @@ def braking_is_enough(case: Case) -> Answer:
 
 def _any_brake(facts: Facts, law: Any) -> BrakeParameters:
     names = {"k_m": "motor", "k_1": "spring", "T_c": "friction", "f_v": "viscous"}
-    values = {p: facts.real(n, getattr(law, f"{n}_low"), getattr(law, f"{n}_high")) for p, n in names.items()}
+    values = {p: facts.real(n, getattr(law.box, f"{n}_low"), getattr(law.box, f"{n}_high")) for p, n in names.items()}
     return BrakeParameters(J=1.0, gamma=1.0, **values)  # type: ignore[arg-type]
 
 
@@ -124,10 +125,10 @@ def euler_stop_stays_above(case: Case) -> Answer:
 
     def statement(facts: Facts) -> None:
         law = lifted_law(facts, case.law)
-        helped = facts.real("spring", 0.0, law.spring_low * case.bench.limits.angle[1])
-        a = law.braking + helped
+        helped = facts.real("spring", 0.0, law.box.spring_low * case.bench.limits.angle[1])
+        a = law.box.braking + helped
         v = facts.real("v", 0.0, law.outward_speed)
-        after = v - law.sample_time * (_least_brake(facts, law, v) + law.friction_low + helped)
+        after = v - law.sample_time * (_least_brake(facts, law, v) + law.box.friction_low + helped)
         left = reserve(law, a, after) if after > 0.0 else facts.constant(0.0)
         facts.claim("reserve", reserve(law, a, v) + ROUNDING, law.sample_time * v + left)
         stronger = facts.real("stronger", a)  # the angle has grown, so has the spring
@@ -146,10 +147,10 @@ def flow_of_a_stop_stays(case: Case) -> Answer:
 
     def statement(facts: Facts) -> None:
         law = lifted_law(facts, case.law)
-        helped = facts.real("spring", 0.0, law.spring_low * case.bench.limits.angle[1])
-        a = law.braking + helped
+        helped = facts.real("spring", 0.0, law.box.spring_low * case.bench.limits.angle[1])
+        a = law.box.braking + helped
         v = facts.real("v", 0.0, law.outward_speed)
-        slowing = _least_brake(facts, law, v) + law.friction_low + helped
+        slowing = _least_brake(facts, law, v) + law.box.friction_low + helped
         steepness = facts.greater(v, 0.0) / a if v >= law.damping_velocity else law.damping_velocity / a
         facts.claim("falls", (steepness + 0.5 * law.sample_time) * slowing, v)
 
@@ -170,9 +171,9 @@ class Thrown:
 
     def __init__(self, facts: Facts, law: Any) -> None:
         self.law = law
-        self.motor: Real = facts.real("motor", law.motor_low, law.motor_high)
-        self.friction: Real = facts.real("friction", law.friction_low, law.friction_high)
-        self.viscous: Real = facts.real("viscous", law.viscous_low, law.viscous_high)
+        self.motor: Real = facts.real("motor", law.box.motor_low, law.box.motor_high)
+        self.friction: Real = facts.real("friction", law.box.friction_low, law.box.friction_high)
+        self.viscous: Real = facts.real("viscous", law.box.viscous_low, law.box.viscous_high)
         facts.assume(self.r.z >= 0)  # a lemma of its own
         self.turning = self.w / (1.0 + self.r)
 
@@ -189,12 +190,12 @@ class Thrown:
 
     def down(self, v: Real) -> Real:
         """Reserve from a speed down, v ≥ 0 [rad]."""
-        return reserve(self.law, self.law.braking, self.turning if v <= self.turning else v)
+        return reserve(self.law, self.law.box.braking, self.turning if v <= self.turning else v)
 
     def up(self, v: Real) -> Real:
         """Reserve from a speed up, v ≥ 0; may be negative [rad]."""
         thrown = self.w - self.r * v
-        landing = self.down(thrown) if thrown > 0.0 else reserve(self.law, self.law.braking, self.w)
+        landing = self.down(thrown) if thrown > 0.0 else reserve(self.law, self.law.box.braking, self.w)
         return landing - self.law.sample_time * v
 
     def damped(self, v: Real) -> Real:
@@ -268,7 +269,7 @@ def damping_does_not_reverse(case: Case) -> Answer:
 
     def statement(facts: Facts) -> None:
         law = lifted_law(facts, case.law)
-        slope = law.motor_high * law.current / law.damping_velocity + law.viscous_high
+        slope = law.box.motor_high * law.current / law.damping_velocity + law.box.viscous_high
         facts.claim("r", 1.0, law.sample_time * slope)
 
     return prove(statement)
@@ -287,11 +288,11 @@ def nothing_is_thrown_up(case: Case) -> Answer:
         u = facts.lift(damped_current)(v, law.current, law.damping_velocity) if how == DAMPED else -law.current
         x_after, after = facts.lift(euler_step)(brake, x, v, u, law.sample_time)
         if after > 0.0:
-            facts.claim(f"{how} thrown up", case.top, x_after + reserve(law, law.braking, after))
+            facts.claim(f"{how} thrown up", case.top, x_after + reserve(law, law.box.braking, after))
 
     def flow(facts: Facts) -> None:
         law = lifted_law(facts, case.law)
-        facts.claim("motor above friction", law.motor_low * law.current, law.friction_high)
+        facts.claim("motor above friction", law.box.motor_low * law.current, law.box.friction_high)
 
     return together(prove(part) for part in (lambda f: euler(f, DAMPED), lambda f: euler(f, FULL), flow))
 
@@ -313,7 +314,7 @@ def flow_may_turn(case: Case) -> Answer:
             rest, fall = law.sample_time - stopped, held - brake.friction
             if rest > 0.0 and fall > 0.0:
                 after = fall * rest
-                claimed = 0.5 * after * rest + reserve(law, law.braking, after)
+                claimed = 0.5 * after * rest + reserve(law, law.box.braking, after)
                 facts.claim("turned", 0.5 * up * stopped, claimed)
 
     return prove(statement)
@@ -324,9 +325,10 @@ def entering_the_stroke(case: Case) -> Answer:
 
     def statement(facts: Facts) -> None:
         law = lifted_law(facts, case.law)
-        turned = law.sample_time * (law.motor_high * law.current + law.friction_high)  # where it moved up before
-        fastest = facts.greater(law.homeward_speed, turned) + law.sample_time * law.spring_high * law.reach
-        facts.claim("stop", -case.bottom, reserve(law, law.braking, fastest) + law.sample_time * fastest)
+        # Where it moved up before.
+        turned = law.sample_time * (law.box.motor_high * law.current + law.box.friction_high)
+        fastest = facts.greater(law.homeward_speed, turned) + law.sample_time * law.box.spring_high * law.reach
+        facts.claim("stop", -case.bottom, reserve(law, law.box.braking, fastest) + law.sample_time * fastest)
 
     return prove(statement)
 
@@ -346,10 +348,10 @@ def speeds_stay(case: Case) -> Answer:
     def flow(facts: Facts) -> None:
         law = lifted_law(facts, case.law)
         home = law.homeward_speed
-        change = law.motor_high * law.current + law.friction_high + law.spring_high * case.top
-        begun = home - law.sample_time * (change + law.viscous_high * home)
-        slowing = _least_brake(facts, law, begun) + law.friction_low + law.viscous_low * home
-        facts.claim("flow homeward", slowing, law.spring_high * case.top)
+        change = law.box.motor_high * law.current + law.box.friction_high + law.box.spring_high * case.top
+        begun = home - law.sample_time * (change + law.box.viscous_high * home)
+        slowing = _least_brake(facts, law, begun) + law.box.friction_low + law.box.viscous_low * home
+        facts.claim("flow homeward", slowing, law.box.spring_high * case.top)
 
     return together(prove(part) for part in (lambda f: euler(f, DAMPED), lambda f: euler(f, FULL), flow))
 

@@ -22,8 +22,8 @@ def any_box(facts: Facts, case: Case) -> tuple[Term, Term, Term, Term]:
     low, high = case.bench.limits.angle
     widest = (1 + law.age_high) * law.reach
     fastest = case.bench.limits.velocity + law.velocity_noise + (1 + law.age_high) * law.change
-    if law.observer > 0.0:
-        fastest += (2.0 / law.observer + unseen(law.observer, 0)) * law.change
+    if law.delay.observer > 0.0:
+        fastest += (2.0 / law.delay.observer + unseen(law.delay.observer, 0)) * law.change
     xl = facts.real("xl", low - widest, high + widest)
     xh = facts.real("xh", xl, high + widest)
     vl = facts.real("vl", -fastest, fastest)
@@ -69,20 +69,20 @@ def drive_is_bounded(case: Case) -> Answer:
         box = Box(facts, case)
         law = box.law
         x = facts.real("x", box.xl - law.reach, box.xh + law.reach)
-        motor = facts.real("motor", law.motor_low, law.motor_high)
-        spring = facts.real("spring", law.spring_low, law.spring_high)
+        motor = facts.real("motor", law.box.motor_low, law.box.motor_high)
+        spring = facts.real("spring", law.box.spring_low, law.box.spring_high)
         error = facts.real("error", -case.rounding, case.rounding)
         drive = motor * (box.u + error) - spring * facts.greater(x, 0.0)
-        facts.claim("from above", box.drive_high + law.motor_high * case.rounding, drive)
-        facts.claim("from below", drive, box.drive_low - law.motor_high * case.rounding)
+        facts.claim("from above", box.drive_high + law.box.motor_high * case.rounding, drive)
+        facts.claim("from below", drive, box.drive_low - law.box.motor_high * case.rounding)
 
     return prove(statement)
 
 
 def _friction(facts: Facts, law: Any) -> tuple[Term, Term]:
     return (
-        facts.real("friction", law.friction_low, law.friction_high),
-        facts.real("viscous", law.viscous_low, law.viscous_high),
+        facts.real("friction", law.box.friction_low, law.box.friction_high),
+        facts.real("viscous", law.box.viscous_low, law.box.viscous_high),
     )
 
 
@@ -92,7 +92,7 @@ def euler_is_contained(case: Case) -> Answer:
     def statement(facts: Facts) -> None:
         box = Box(facts, case)
         law = box.law
-        slack = law.motor_high * case.rounding
+        slack = law.box.motor_high * case.rounding
         drive = facts.real("drive", box.drive_low - slack, box.drive_high + slack)
         friction, viscous = _friction(facts, law)
         x = facts.real("x", box.xl, box.xh)
@@ -127,7 +127,7 @@ def _growth(facts: Facts, case: Case, side: int) -> None:
     line, drive = (-box.next_vl, -box.drive_low) if side else (box.next_vh, box.drive_high)
     ts = facts.constant(case.law.sample_time)
     line += facts.constant(-VELOCITY_PAD)
-    drive += law.motor_high * case.rounding
+    drive += law.box.motor_high * case.rounding
     begin = Term(facts, z3.substitute(line.z, (t.z, z3.RealVal(0))))
     slope = Term(facts, z3.substitute(line.z, (t.z, z3.RealVal(1)))) - begin
     facts.claim("straight", begin + slope * t, line)
@@ -221,9 +221,9 @@ def change_is_bounded(case: Case) -> Answer:
     def statement(facts: Facts) -> None:
         law = lifted_law(facts, case.law)
         fastest = case.bench.limits.velocity
-        highest = law.apex if case.law.coasting else case.top
-        motor = facts.real("motor", law.motor_low, law.motor_high)
-        spring = facts.real("spring", law.spring_low, law.spring_high)
+        highest = law.home.apex if case.law.coasting else case.top
+        motor = facts.real("motor", law.box.motor_low, law.box.motor_high)
+        spring = facts.real("spring", law.box.spring_low, law.box.spring_high)
         friction, viscous = _friction(facts, law)
         drive = motor * facts.real("u", -law.current, law.current)
         drive -= spring * facts.greater(facts.real("x", case.bottom, highest), 0.0)

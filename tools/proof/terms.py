@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from fractions import Fraction
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -371,9 +371,13 @@ def _decimal(value: Any) -> str:
         return str(value)
 
 
-def lifted_law(facts: Facts, law: Any, **changed: Real) -> Any:
+def lifted_law(facts: Facts, law: Any) -> Any:
     """A law whose floats are exact; whole numbers stay what they are."""
-    exact: Mapping[str, Any] = {
-        name: facts.constant(value) for name, value in law._asdict().items() if isinstance(value, float)
-    }
-    return law._replace(**{**exact, **changed})
+    return with_floats(law, facts.constant)
+
+
+def with_floats(law: Any, of: Callable[[float], Any]) -> Any:
+    """A law, or part of it, with something else for each float."""
+    if isinstance(law, tuple):
+        return type(law)(*(with_floats(value, of) for value in law))
+    return of(law) if isinstance(law, float) else law

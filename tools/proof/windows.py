@@ -40,14 +40,14 @@ def _kept(facts: Facts, case: Case, end: int) -> None:
     if end == 0:
         facts.claim("upper room", law.top - xh, room)
         facts.claim("upper speed", speed, vh)
-        facts.claim("upper braking", law.braking + law.spring_low * facts.greater(xl, 0.0), braking)
+        facts.claim("upper braking", law.box.braking + law.box.spring_low * facts.greater(xl, 0.0), braking)
         facts.claim("highest is a current", highest, -law.current)
         if highest > -law.current and u <= highest:
             facts.claim("upper", facts.smaller(allowed, law.outward_speed), next_vh)
     else:
         facts.claim("lower room", xl - law.bottom, room)
         facts.claim("lower speed", speed, -vl)
-        facts.claim("lower braking", law.braking, braking)
+        facts.claim("lower braking", law.box.braking, braking)
         facts.claim("lowest is a current", law.current, lowest)
         if lowest < law.current and u >= lowest:
             facts.claim("lower", facts.smaller(allowed, law.homeward_speed), -next_vl)
@@ -65,7 +65,7 @@ def stoppable_stops(case: Case) -> Answer:
         room = facts.real("room", -5.0, high - low + 5.0)
         fastest = case.bench.limits.velocity + law.velocity_noise + (1.0 + law.age_high) * law.change
         v = facts.real("v", -fastest, fastest)
-        braking = facts.real("braking", law.braking, law.braking + law.spring_low * (high + 1.0))
+        braking = facts.real("braking", law.box.braking, law.box.braking + law.box.spring_low * (high + 1.0))
         ts = law.sample_time
         allowed = facts.lift(stoppable)(room, v, braking, ts)
         if allowed >= 0.0:

@@ -28,11 +28,11 @@ from emb_bench.sim.instruments import MEMORY, command, measure, settle
 from emb_bench.sim.simulated_brake import pass_period, sent_current
 from emb_runtime.config.bench import OLDEST_FRAME, PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import UsageError
-from emb_runtime.estimator.kalman import Model, State, believed, deviations, follow, make_model, start
+from emb_runtime.estimator.kalman import Model, Packed, Six, State, believed, deviations, follow, make_model, start
 from emb_runtime.estimator.speed_loop import current_for
 from emb_runtime.policy.contract import SAMPLE
-from emb_runtime.safety.response import MEMORY as RESPONSE
-from emb_runtime.safety.response import OPEN, PROVEN, VERDICT, ResponseModel, response_model, take, unproven_law
+from emb_runtime.safety.response import OPEN, PROVEN, ResponseModel, response_model, take, unproven_law
+from emb_runtime.safety.response import State as ResponseState
 from emb_runtime.safety.response import begin as begin_response
 from emb_runtime.safety.sensor_monitor import Cusum, Opposed, judge, largest_current
 from emb_runtime.safety.sensor_monitor import State as MonitorState
@@ -51,6 +51,7 @@ Bools = NDArray[np.bool_]
 MOST = 100.0  # Greatest estimate or deviation that is observed, of the nominal value
 ESTIMATES = 30  # Numbers of an estimator's state
 MONITOR = 29  # Numbers of a sensor monitor's state
+RESPONSE = 44  # Verdict on the response, and numbers of its proof's state
 
 
 class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -204,7 +205,8 @@ class Experiments(NamedTuple):
     returning: Bools  # Mask of the experiments that have ended before their horizon and are on the way home, shape [N]
     monitor: Floats
     """State of the sensor monitor until it confirms the polarity, see :func:`monitor_of`; shape [N, MONITOR]."""
-    response: Floats  # Memory of the proof of the response, until it is proven, shape [N, RESPONSE]
+    response: Floats
+    """Verdict on the response, and the state of its proof until then, see :func:`response_of`; shape [N, RESPONSE]."""
     estimate: Floats  # State of the estimator, see :func:`state_of`; shape [N, ESTIMATES]
     told: Floats
     """Its values, then their deviations, of k_m, k_1, T_c and f_v in SI units, shape [N, 8]."""
@@ -236,27 +238,49 @@ def no_experiments(count: int, n: int, steps: int) -> Experiments:
     )
 
 
+def six(row: Any, at: int) -> Six:
+    """Six stored numbers, from a place on."""
+    return (
+        float(row[at]), float(row[at + 1]), float(row[at + 2]),
+        float(row[at + 3]), float(row[at + 4]), float(row[at + 5]),
+    )  # fmt: skip
+
+
+def packed(row: Any, at: int) -> Packed:
+    """A stored covariance of six unknowns, from a place on."""
+    a, b, c = six(row, at), six(row, at + 6), six(row, at + 12)
+    return a + b + c + (float(row[at + 18]), float(row[at + 19]), float(row[at + 20]))
+
+
 def state_of(row: Any) -> State:
     """The state of an estimator as it is stored, shape [ESTIMATES]."""
-    mean = (float(row[1]), float(row[2]), float(row[3]), float(row[4]), float(row[5]), float(row[6]))
-    covariance = (
-        float(row[7]), float(row[8]), float(row[9]), float(row[10]), float(row[11]), float(row[12]),
-        float(row[13]), float(row[14]), float(row[15]), float(row[16]), float(row[17]),
-        float(row[18]), float(row[19]), float(row[20]), float(row[21]),
-        float(row[22]), float(row[23]), float(row[24]),
-        float(row[25]), float(row[26]),
-        float(row[27]),
-    )  # fmt: skip
-    return State(float(row[0]), mean, covariance, float(row[28]), float(row[29]))
+    return State(float(row[0]), six(row, 1), packed(row, 7), float(row[28]), float(row[29]))
+
+
+def fill(row: Any, numbers: tuple[float, ...]) -> None:
+    """Store numbers in a row of that length."""
+    for j in range(len(numbers)):
+        row[j] = numbers[j]
 
 
 def store(state: State, row: Any) -> None:
     """Store the state of an estimator, shape [ESTIMATES]."""
-    row[0], row[28], row[29] = state.step, state.innovation, state.worst
-    for j in range(6):
-        row[1 + j] = state.mean[j]
-    for j in range(21):
-        row[7 + j] = state.covariance[j]
+    fill(row, (state.step, *state.mean, *state.covariance, state.innovation, state.worst))
+
+
+def response_of(row: Any) -> ResponseState:
+    """The state of the proof of the response as it is stored behind the verdict, shape [RESPONSE]."""
+    return ResponseState(
+        float(row[1]), float(row[2]), six(row, 3), *six(row, 9), float(row[15]), float(row[16]), six(row, 17),
+        packed(row, 23),
+    )  # fmt: skip
+
+
+def store_response(state: ResponseState, verdict: int, row: Any) -> None:
+    """Store the verdict on the response and the state of its proof, shape [RESPONSE]."""
+    _, _, commands, flowing, largest, lagging, doubts, slides, number, misfit, likelihood, mean, covariance = state
+    sums = (flowing, largest, lagging, doubts, slides, number, misfit, likelihood)
+    fill(row, (float(verdict), state.angle, state.velocity, *commands, *sums, *mean, *covariance))
 
 
 def monitor_of(row: Any) -> MonitorState:
@@ -264,24 +288,19 @@ def monitor_of(row: Any) -> MonitorState:
     travel, motion = Cusum(float(row[2]), float(row[3])), Cusum(float(row[6]), float(row[7]))
     against = Cusum(float(row[11]), float(row[12]))
     opposed = Opposed(float(row[8]), float(row[9]), float(row[10]), against)
-    lows = float(row[13]), float(row[14]), float(row[15]), float(row[16]), float(row[17]), float(row[18])
-    highs = float(row[19]), float(row[20]), float(row[21]), float(row[22]), float(row[23]), float(row[24])
     flowing, obeys, confirmed = (float(row[25]), float(row[26])), bool(row[27]), bool(row[28])
     start, rise, fall = (float(row[0]), float(row[1])), float(row[4]), float(row[5])
+    lows, highs = six(row, 13), six(row, 19)
     return MonitorState(*start, travel, rise, fall, motion, opposed, lows, highs, flowing, obeys, confirmed)
 
 
 def store_monitor(state: MonitorState, row: Any) -> None:
     """Store the state of a sensor monitor, shape [MONITOR]."""
-    opposed = state.opposed
-    row[0], row[1], row[2], row[3] = state.angle, state.velocity, state.travel.up, state.travel.down
-    row[4], row[5], row[6], row[7] = state.up_from, state.down_from, state.motion.up, state.motion.down
-    row[8], row[9], row[10] = opposed.travel, opposed.integral, opposed.begin
-    row[11], row[12] = opposed.motion.up, opposed.motion.down
-    for j in range(OLDEST_FRAME + 1):
-        row[13 + j], row[19 + j] = state.lows[j], state.highs[j]
-    row[25], row[26] = state.flowing
-    row[27], row[28] = 1.0 if state.obeys else 0.0, 1.0 if state.confirmed else 0.0
+    angle, velocity, travel, rise, fall, motion, opposed, lows, highs, flowing, obeys, confirmed = state
+    measured = (angle, velocity, travel.up, travel.down, rise, fall, motion.up, motion.down)
+    against = (opposed.travel, opposed.integral, opposed.begin, opposed.motion.up, opposed.motion.down)
+    shown = (1.0 if obeys else 0.0, 1.0 if confirmed else 0.0)
+    fill(row, (*measured, *against, *lows, *highs, *flowing, *shown))
 
 
 def delayed(instruments: Instruments, delay: int, offset: float = 0.0) -> Instruments:
@@ -321,7 +340,7 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     u1, u2, u3, u4, u5 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2]), float(past[i, 3]), float(past[i, 4])
     seen = monitor_of(monitor[i])
     most = largest_current(setup.law, setup.thresholds, seen, setup.law.current)
-    unproven = seen.obeys and response[i, VERDICT] != PROVEN
+    unproven = seen.obeys and response[i, 0] != PROVEN
     law = setup.unproven if unproven else setup.law
     step = int(k[i])
     if returning[i]:
@@ -349,8 +368,9 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
     past[i, 0], past[i, 1], past[i, 2], past[i, 3], past[i, 4] = sent, u1, u2, u3, u4
     y[i, 0], y[i, 1], applied[i] = y1, y2, current
     obeyed = not math.isnan(asked)
-    if response[i, VERDICT] == OPEN:
-        take(setup.response, response[i], obeyed, y1, y2, sent)
+    if response[i, 0] == OPEN:
+        proof, verdict = take(setup.response, response_of(response[i]), obeyed, y1, y2, sent)
+        store_response(proof, verdict, response[i])
     if not seen.confirmed:
         seen, _ = judge(setup.law, setup.thresholds, seen, rules.sample_time, y1, y2, obeyed, sent, current)
         store_monitor(seen, monitor[i])
@@ -478,7 +498,7 @@ class Batch:
         for of_the_past in (e.applied, e.s, e.m, e.past, e.k, e.reasons, e.violated, e.returning):
             of_the_past[i] = 0
         store_monitor(begin_monitor(*e.y[i].tolist()), e.monitor[i])
-        begin_response(self.setup.response, e.response[i], *e.y[i].tolist())
+        store_response(begin_response(self.setup.response, *e.y[i].tolist()), OPEN, e.response[i])
         if self.conditions.estimates:
             store(start(self.model), e.estimate[i])
             compiled(estimate_all)(self.model, e, self._every[i : i + 1])

@@ -29,11 +29,11 @@ def released_speed(bench: Bench, hold: float) -> float:
     the end stops among them, and for every brake of the shield's set.
     """
     law = make_law(bench)
-    low, high = bench.limits.angle
+    box, (low, high) = law.box, bench.limits.angle
     most = 0.0
     for i in range(ANGLES):  # in each piece the fastest of either direction, and the spring of its upper end
         begin, end = low + (high - low) * i / ANGLES, low + (high - low) * (i + 1) / ANGLES
-        up = min(law.outward_speed, math.sqrt(2.0 * (law.braking + law.spring_low * max(end, 0.0)) * (high - begin)))
-        down = min(law.homeward_speed, math.sqrt(2.0 * law.braking * (end - low)))
-        most = max(most, max(up, down) ** 2 + law.spring_high * max(end, 0.0) ** 2)
-    return math.sqrt(most) + (hold + law.lag) * law.motor_high * law.current
+        up = min(law.outward_speed, math.sqrt(2.0 * (box.braking + box.spring_low * max(end, 0.0)) * (high - begin)))
+        down = min(law.homeward_speed, math.sqrt(2.0 * box.braking * (end - low)))
+        most = max(most, max(up, down) ** 2 + box.spring_high * max(end, 0.0) ** 2)
+    return math.sqrt(most) + (hold + law.delay.lag) * box.motor_high * law.current

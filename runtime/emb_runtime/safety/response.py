@@ -10,19 +10,21 @@ observer all have one. The filter's state is the velocity, the four uncertain pa
 measurement is the velocity less the overshoot's share of the current. Where the direction of friction, or the current,
 is not certain, the velocity's variance grows by what that may change (process noise).
 
-Plain scalar functions on one row of memory, so that the runtime, a simulation and a compiled batch run the same code.
+Plain scalar functions from one state to the next: the runtime, a simulation and a compiled batch run the same code.
 Formulas, figures and what it cannot see: ``docs/explanation/sensor-monitor.md``.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from collections import deque
+from typing import Final, NamedTuple
 
 from emb_runtime.can.e2e import next_counter
 from emb_runtime.config.bench import OLDEST_FRAME, Bench
+from emb_runtime.estimator.kalman import Four, Packed, Six
 from emb_runtime.records import SensorSample
-from emb_runtime.safety.shield_design import ShieldLaw
+from emb_runtime.safety.shield_design import Box, ShieldLaw
 from emb_runtime.safety.state_machine import Fault, StopError
 
 # Verdicts; plain integers, because a compiled function cannot see an enum.
@@ -46,25 +48,23 @@ LEAST_ERROR: Final = 0.02  # Of the brake's equation, as a share of what full cu
 KEPT: Final = 32  # Samples of a run, and of its stop, that are kept to find the cause of a contradiction
 OUTSIDE: Final = 0.1  # Share by which the estimated motor may lie outside the set
 
-# Places in the row of memory.
-VERDICT: Final = 0
-ANGLE: Final = 1  # Last measurement [rad]
-VELOCITY: Final = 2  # Last measurement [rad/s]
-FLOWING: Final = 3  # Mean current of the periods that the velocity may not show yet [A]
-LARGEST: Final = 4  # Largest of these so far [A]
-DOUBTS: Final = 5  # Periods from now on in which the current is not known
-SLIDES: Final = 6  # Periods so far in which the brake slid
-COUNT: Final = 7  # Innovations so far
-MISFIT: Final = 8  # Sum of the squares of the normalised innovations
-LIKELIHOOD: Final = 9  # The same and the logarithms of their variances: minus twice a log-likelihood
-LAGGING: Final = 10  # Current that follows the oldest command with the declared lag [A]
-COMMANDS: Final = 11  # Commands of the last periods, newest first [A]
-STATE: Final = COMMANDS + OLDEST_FRAME + 1  # Velocity [rad/s], motor, friction, spring, viscous, overshoot [rad/s]
-SIZE: Final = 6
-MATRIX: Final = STATE + SIZE  # Covariance of the state, by rows
-MEMORY: Final = MATRIX + SIZE * SIZE  # Length of the row
-MOTOR: Final = 1
-OVERSHOOT: Final = 5
+
+class State(NamedTuple):
+    """State of the filter after a sample, and what the verdict counts."""
+
+    angle: float  # Last measurement [rad]
+    velocity: float  # Last measurement [rad/s]
+    commands: Six  # Of the last OLDEST_FRAME + 1 periods, newest first [A]
+    flowing: float  # Mean current of the periods that the velocity may not show yet [A]
+    largest: float  # Largest of these so far [A]
+    lagging: float  # Current that follows the oldest command with the declared lag [A]
+    doubts: float  # Periods from now on in which the current is not known
+    slides: float  # Periods so far in which the brake slid
+    innovations: float  # Number of innovations so far
+    misfit: float  # Sum of the squares of the normalised innovations
+    likelihood: float  # The same and the logarithms of their variances: minus twice a log-likelihood
+    mean: Six  # Velocity [rad/s], motor, friction, spring, viscous, overshoot [rad/s]
+    covariance: Packed  # Of the mean
 
 
 class ResponseModel(NamedTuple):
@@ -84,11 +84,9 @@ class ResponseModel(NamedTuple):
     holds: float  # Current that moves no brake of the set [A]
     moves: float  # Current that moves every brake of the set [A]
     change: float  # Largest change of the velocity in a sample [rad/s]
-    motor_low: float  # k_m / J [rad/(s²·A)]
-    motor_high: float
-    friction_high: float  # [rad/s²]
-    prior: tuple[float, float, float, float]  # Mean of k_m, T_c, γ k_1 and f_v, all over J
-    deviations: tuple[float, float, float, float]  # Their standard deviations
+    box: Box
+    prior: Four  # Mean of k_m, T_c, γ k_1 and f_v, all over J
+    deviations: Four  # Their standard deviations
     widest: float  # Standard deviation of the overshoot before the first sample [rad/s]
 
 
@@ -96,16 +94,16 @@ def declared_response(bench: Bench, law: ShieldLaw) -> float:
     """Longest declared response beyond the least age of a frame [s]."""
     bandwidth = bench.sensors.bandwidth
     observed = 2.0 / bandwidth if bandwidth is not None else 0.0
-    return (law.age_high - law.age_low) * law.sample_time + law.lag + observed
+    return (law.age_high - law.age_low) * law.sample_time + law.delay.lag + observed
 
 
 def response_model(bench: Bench, law: ShieldLaw) -> ResponseModel:
     """The model of a bench and the law of its shield."""
-    t, extra = law.sample_time, declared_response(bench, law)
+    t, box, extra = law.sample_time, law.box, declared_response(bench, law)
     frames = (law.age_high - law.age_low) * t
-    deviation = max(bench.noise.velocity, LEAST_ERROR * t * law.motor_high * law.current)
-    low = law.motor_low, law.friction_low, law.spring_low, law.viscous_low
-    high = law.motor_high, law.friction_high, law.spring_high, law.viscous_high
+    deviation = max(bench.noise.velocity, LEAST_ERROR * t * box.motor_high * law.current)
+    low = box.motor_low, box.friction_low, box.spring_low, box.viscous_low
+    high = box.motor_high, box.friction_high, box.spring_high, box.viscous_high
     a, b, c, d = (0.5 * (least + most) for least, most in zip(low, high, strict=True))
     e, f, g, h = ((most - least) / math.sqrt(12.0) for least, most in zip(low, high, strict=True))
     return ResponseModel(
@@ -120,15 +118,13 @@ def response_model(bench: Bench, law: ShieldLaw) -> ResponseModel:
         early=(EARLY if law.age_low > 0 else LONGEST) * t,
         deviation=deviation,
         slides=max(law.velocity_noise, 6.0 * deviation),
-        holds=law.friction_low / law.motor_high,
-        moves=law.friction_high / law.motor_low,
+        holds=box.friction_low / box.motor_high,
+        moves=box.friction_high / box.motor_low,
         change=law.change,
-        motor_low=law.motor_low,
-        motor_high=law.motor_high,
-        friction_high=law.friction_high,
+        box=box,
         prior=(a, b, c, d),
         deviations=(e, f, g, h),
-        widest=0.5 * LONGEST * t * law.motor_high * law.current,
+        widest=0.5 * LONGEST * t * box.motor_high * law.current,
     )
 
 
@@ -138,97 +134,137 @@ def unproven_law(bench: Bench, law: ShieldLaw) -> ShieldLaw:
     What is faster than its speed by the strongest motor at full current for that time, less what is declared, which the
     law covers itself.
     """
-    unknown = LONGEST * law.sample_time - law.age_low * law.sample_time - declared_response(bench, law)
-    fastest = max(bench.limits.velocity - unknown * law.motor_high * law.current, SLOWEST * law.homeward_speed)
+    home, unknown = law.home, LONGEST * law.sample_time - law.age_low * law.sample_time - declared_response(bench, law)
+    fastest = max(bench.limits.velocity - unknown * law.box.motor_high * law.current, SLOWEST * law.homeward_speed)
     homeward = min(math.sqrt(STROKE) * law.homeward_speed, fastest)  # from it a brake stops within that share
     return law._replace(
         bottom=STROKE * law.bottom,
         outward_speed=min(law.outward_speed, fastest),
         homeward_speed=homeward,
-        cruise=law.cruise * (homeward - law.creep) / (law.homeward_speed - law.creep),
+        home=home._replace(cruise=home.cruise * (homeward - home.creep) / (law.homeward_speed - home.creep)),
     )
 
 
-def begin(model: ResponseModel, memory: Any, angle: float, velocity: float) -> None:
-    """Begin a run with its first measurement, in a row of length MEMORY that is overwritten [rad, rad/s]."""
-    for i in range(MEMORY):
-        memory[i] = 0.0
-    memory[ANGLE] = angle
-    memory[VELOCITY] = memory[STATE] = velocity
-    memory[MATRIX] = model.deviation * model.deviation
-    for i in range(SIZE - 2):
-        memory[STATE + 1 + i] = model.prior[i]
-        memory[MATRIX + (SIZE + 1) * (1 + i)] = model.deviations[i] * model.deviations[i]
-    memory[MATRIX + (SIZE + 1) * OVERSHOOT] = model.widest * model.widest
+def begin(model: ResponseModel, angle: float, velocity: float) -> State:
+    """State at the first measurement of a run [rad, rad/s]."""
+    (b, c, d, e), (sb, sc, sd, se), sa, sf = model.prior, model.deviations, model.deviation, model.widest
+    return State(
+        angle, velocity, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+        (velocity, b, c, d, e, 0.0),
+        (
+            sa * sa, 0.0, 0.0, 0.0, 0.0, 0.0,
+            sb * sb, 0.0, 0.0, 0.0, 0.0,
+            sc * sc, 0.0, 0.0, 0.0,
+            sd * sd, 0.0, 0.0,
+            se * se, 0.0,
+            sf * sf,
+        ),
+    )  # fmt: skip
 
 
-def take(model: ResponseModel, memory: Any, follows: bool, angle: float, velocity: float, command: float) -> int:
+def take(
+    model: ResponseModel, state: State, follows: bool, angle: float, velocity: float, command: float
+) -> tuple[State, int]:
     """Take one more sample.
 
     Args:
         model: of the bench.
-        memory: row of the run, changed.
+        state: after the sample before.
         follows: it is the next sample, and the command acted between the two, by the node's account.
         angle: measured [rad].
         velocity: measured [rad/s].
         command: that answered the sample before; 0 if none was sent [A].
 
     Returns:
-        OPEN, PROVEN (no command acts later than declared) or CONTRADICTED.
+        The next state, and OPEN, PROVEN (no command acts later than declared) or CONTRADICTED.
     """
-    for i in range(OLDEST_FRAME, 0, -1):
-        memory[COMMANDS + i] = memory[COMMANDS + i - 1]
-    memory[COMMANDS] = command
-    _predict(model, memory, follows, angle, velocity)
-    _correct(model, memory, velocity)
-    memory[ANGLE], memory[VELOCITY] = angle, velocity
-    memory[VERDICT] = verdict = _verdict(model, memory)
-    return verdict
-
-
-def _predict(model: ResponseModel, memory: Any, follows: bool, angle: float, velocity: float) -> None:
-    """The state a period later: the velocity changes by the brake's equation, nothing else does."""
-    ts, v, u = model.sample_time, memory[VELOCITY], memory[COMMANDS + model.age]
-    before, flowing = memory[FLOWING], _flowing(model, memory)
-    if model.lag == 0.0 and model.oldest == model.age:
-        before = u
-    memory[FLOWING] = flowing
-    memory[LARGEST] = max(memory[LARGEST], abs(flowing))
-    current, friction, noise = _driven(model, u, before, _transient(model, memory), v, velocity)
-    memory[SLIDES] += 1.0 if min(abs(v), abs(velocity)) > model.slides and friction != 0.0 else 0.0
+    c0, c1, c2, c3, c4, _ = state.commands
+    commands = command, c0, c1, c2, c3, c4
+    ts, v, u = model.sample_time, state.velocity, commands[model.age]
+    flowing, lagging = _flowing(model, commands, state.lagging)
+    transient = _transient(model, commands, flowing)
+    before = u if model.lag == 0.0 and model.oldest == model.age else state.flowing
+    current, friction, noise = _driven(model, u, before, transient, v, velocity)
+    slides = state.slides + (1.0 if min(abs(v), abs(velocity)) > model.slides and friction != 0.0 else 0.0)
+    doubts = state.doubts
     if not follows:
-        memory[DOUBTS] = model.doubts
-        memory[SLIDES] = -SETTLES
-    if memory[DOUBTS] > 0.0:
-        memory[DOUBTS] -= 1.0
+        doubts, slides = model.doubts, -SETTLES
+    if doubts > 0.0:
+        doubts -= 1.0
         noise += 3.0 * model.change
     moves = 1.0 if current != 0.0 or friction != 0.0 else 0.0
-    pressed, speed = moves * 0.5 * (max(memory[ANGLE], 0.0) + max(angle, 0.0)), moves * 0.5 * (v + velocity)
+    pressed, speed = moves * 0.5 * (max(state.angle, 0.0) + max(angle, 0.0)), moves * 0.5 * (v + velocity)
     gains = (ts * current, -ts * friction, -ts * pressed, -ts * speed)
-    for i in range(SIZE - 2):
-        memory[STATE] += gains[i] * memory[STATE + 1 + i]
-    for j in range(SIZE):
-        for i in range(SIZE - 2):
-            memory[MATRIX + j] += gains[i] * memory[MATRIX + SIZE * (1 + i) + j]
-    for j in range(SIZE):
-        for i in range(SIZE - 2):
-            memory[MATRIX + SIZE * j] += gains[i] * memory[MATRIX + SIZE * j + 1 + i]
-    memory[MATRIX] += noise * noise
+    # Measured is the velocity of the state, less the overshoot's share of the current.
+    share, least = -flowing / model.current, model.deviation * model.deviation + transient * transient
+    mean, covariance, innovation, variance = _filtered(state, gains, noise, velocity, share, least)
+    square = innovation * innovation / variance
+    after = State(
+        angle, velocity, commands, flowing, max(state.largest, abs(flowing)), lagging, doubts, slides,
+        state.innovations + 1.0, state.misfit + square, state.likelihood + (square + math.log(variance)), mean,
+        covariance,
+    )  # fmt: skip
+    return after, _verdict(model, after)
 
 
-def _flowing(model: ResponseModel, memory: Any) -> float:
-    """Mean current of what the slowest declared response does not show yet [A]; the command itself if it has none."""
-    ts, oldest = model.sample_time, memory[COMMANDS + model.oldest]
+def _filtered(
+    state: State, gains: Four, noise: float, velocity: float, share: float, least: float
+) -> tuple[Six, Packed, float, float]:
+    """Mean and covariance after a period and its measurement, the innovation, and its variance.
+
+    Args:
+        state: after the sample before.
+        gains: change of the velocity in the period, by each of motor, friction, spring and viscous.
+        noise: standard deviation of this change [rad/s].
+        velocity: measured [rad/s].
+        share: of the overshoot in it.
+        least: its variance [rad²/s²].
+    """
+    v, motor, friction, spring, viscous, over = state.mean
+    p00, p01, p02, p03, p04, p05, p11, p12, p13, p14, p15, p22, p23, p24, p25, p33, p34, p35, p44, p45, p55 = (
+        state.covariance
+    )
+    a, b, c, d = gains
+    v = v + a * motor + b * friction + c * spring + d * viscous
+    p00 = p00 + a * p01 + b * p02 + c * p03 + d * p04
+    p01 = p01 + a * p11 + b * p12 + c * p13 + d * p14
+    p02 = p02 + a * p12 + b * p22 + c * p23 + d * p24
+    p03 = p03 + a * p13 + b * p23 + c * p33 + d * p34
+    p04 = p04 + a * p14 + b * p24 + c * p34 + d * p44
+    p05 = p05 + a * p15 + b * p25 + c * p35 + d * p45
+    p00 = p00 + a * p01 + b * p02 + c * p03 + d * p04 + noise * noise
+    a, b, c = p00 + share * p05, p01 + share * p15, p02 + share * p25
+    d, e, f = p03 + share * p35, p04 + share * p45, p05 + share * p55
+    s = max(least + a + share * f, least)  # rounding must not make it negative
+    y = velocity - v - share * over
+    v, motor, friction = v + a / s * y, motor + b / s * y, friction + c / s * y
+    spring, viscous, over = spring + d / s * y, viscous + e / s * y, over + f / s * y
+    return (v, motor, friction, spring, viscous, over), (
+        p00 - a * a / s, p01 - a * b / s, p02 - a * c / s, p03 - a * d / s, p04 - a * e / s, p05 - a * f / s,
+        p11 - b * b / s, p12 - b * c / s, p13 - b * d / s, p14 - b * e / s, p15 - b * f / s,
+        p22 - c * c / s, p23 - c * d / s, p24 - c * e / s, p25 - c * f / s,
+        p33 - d * d / s, p34 - d * e / s, p35 - d * f / s,
+        p44 - e * e / s, p45 - e * f / s,
+        p55 - f * f / s,
+    ), y, s  # fmt: skip
+
+
+def _flowing(model: ResponseModel, commands: Six, lagging: float) -> tuple[float, float]:
+    """Mean current of what the slowest declared response does not show yet, and the lagging current [A].
+
+    The first is the command itself where no response is declared.
+    """
+    ts, oldest = model.sample_time, commands[model.oldest]
     unseen = (model.oldest - model.age) * ts + model.lag
     if unseen == 0.0:
-        return float(memory[COMMANDS + model.age])
+        return commands[model.age], lagging
     total = 0.0
     for i in range(model.age, model.oldest):
-        total += ts * memory[COMMANDS + i]
+        total += ts * commands[i]
     if model.lag > 0.0:
-        memory[LAGGING] = oldest + math.exp(-ts / model.lag) * (memory[LAGGING] - oldest)
-        total += model.lag * memory[LAGGING]
-    return float(total / unseen)
+        lagging = oldest + math.exp(-ts / model.lag) * (lagging - oldest)
+        total += model.lag * lagging
+    return total / unseen, lagging
 
 
 def _driven(
@@ -239,7 +275,7 @@ def _driven(
     From the command, the current that flowed before it, and the velocities before and after the period.
     """
     way = 1.0 if u > 0.0 else -1.0
-    turned = model.sample_time * model.friction_high
+    turned = model.sample_time * model.box.friction_high
     if min(v, velocity) > model.slides:
         return u, 1.0, 0.0
     if max(v, velocity) < -model.slides:
@@ -250,78 +286,51 @@ def _driven(
         return 0.0, 0.0, transient
     if min(way * u, way * before) >= model.moves:
         return u, way, 0.0
-    return 0.5 * u, 0.0, turned + 0.5 * model.sample_time * model.motor_high * abs(u) + transient  # it may stick
+    return 0.5 * u, 0.0, turned + 0.5 * model.sample_time * model.box.motor_high * abs(u) + transient  # it may stick
 
 
-def _transient(model: ResponseModel, memory: Any) -> float:
+def _transient(model: ResponseModel, commands: Six, flowing: float) -> float:
     """Deviation of what a response shows that is shorter than the longest declared one [rad/s].
 
     After a change of the current it lasts as long as any response may take: a later one looks like it at first.
     """
-    u = memory[COMMANDS + model.age]
-    changed: float = abs(u - memory[FLOWING])
+    u = commands[model.age]
+    changed = abs(u - flowing)
     for i in range(model.age, OLDEST_FRAME + 1):
-        changed = max(changed, abs(u - memory[COMMANDS + i]))
-    return model.transient * model.motor_high * changed
+        changed = max(changed, abs(u - commands[i]))
+    return model.transient * model.box.motor_high * changed
 
 
-def _correct(model: ResponseModel, memory: Any, velocity: float) -> None:
-    """Take in the measured velocity: that of the state, less the overshoot's share of the current."""
-    share = -memory[FLOWING] / model.current
-    transient = _transient(model, memory)
-    variance = model.deviation * model.deviation + transient * transient
-    last = MATRIX + OVERSHOOT
-    r0 = memory[MATRIX] + share * memory[last]
-    r1 = memory[MATRIX + SIZE] + share * memory[last + SIZE]
-    r2 = memory[MATRIX + 2 * SIZE] + share * memory[last + 2 * SIZE]
-    r3 = memory[MATRIX + 3 * SIZE] + share * memory[last + 3 * SIZE]
-    r4 = memory[MATRIX + 4 * SIZE] + share * memory[last + 4 * SIZE]
-    r5 = memory[MATRIX + 5 * SIZE] + share * memory[last + 5 * SIZE]
-    row = (r0, r1, r2, r3, r4, r5)
-    variance = max(variance + r0 + share * r5, variance)  # rounding must not make it negative
-    innovation = velocity - memory[STATE] - share * memory[STATE + OVERSHOOT]
-    for i in range(SIZE):
-        memory[STATE + i] += row[i] / variance * innovation
-        for j in range(SIZE):
-            memory[MATRIX + SIZE * i + j] -= row[i] * row[j] / variance
-    memory[COUNT] += 1.0
-    memory[MISFIT] += innovation * innovation / variance
-    memory[LIKELIHOOD] += innovation * innovation / variance + math.log(variance)
-
-
-def overshoot(model: ResponseModel, memory: Any, response: float) -> tuple[float, float]:
+def overshoot(model: ResponseModel, state: State, response: float) -> tuple[float, float]:
     """Overshoot beyond that of a response time [s], and its standard deviation [rad/s]."""
-    share = model.current * response
-    motor, cross = MATRIX + (SIZE + 1) * MOTOR, MATRIX + SIZE * MOTOR + OVERSHOOT
-    own = MATRIX + (SIZE + 1) * OVERSHOOT
-    variance = memory[own] - 2.0 * share * memory[cross] + share * share * memory[motor]
-    return memory[STATE + OVERSHOOT] - share * memory[STATE + MOTOR], math.sqrt(max(variance, 0.0))
+    share, p = model.current * response, state.covariance
+    variance = p[20] - 2.0 * share * p[10] + share * share * p[6]
+    return state.mean[5] - share * state.mean[1], math.sqrt(max(variance, 0.0))
 
 
-def fits(model: ResponseModel, memory: Any) -> bool:
+def fits(model: ResponseModel, state: State) -> bool:
     """Returns True if the filter's brake is one of the set, and explains what was measured."""
-    motor = memory[STATE + MOTOR]
-    inside = (1.0 - OUTSIDE) * model.motor_low < motor < (1.0 + OUTSIDE) * model.motor_high
-    return bool(inside and memory[MISFIT] <= LEAST_FIT * memory[COUNT])
+    inside = (1.0 - OUTSIDE) * model.box.motor_low < state.mean[1] < (1.0 + OUTSIDE) * model.box.motor_high
+    return inside and state.misfit <= LEAST_FIT * state.innovations
 
 
-def _verdict(model: ResponseModel, memory: Any) -> int:
+def _verdict(model: ResponseModel, state: State) -> int:
     """Verdict on the samples so far.
 
     What the shield allows for errors of the velocity covers an overshoot as well: half of it is tolerated.
     """
     covered = model.slides
-    late, late_error = overshoot(model, memory, BEYOND * model.extra)
-    early, early_error = overshoot(model, memory, -model.early)
+    late, late_error = overshoot(model, state, BEYOND * model.extra)
+    early, early_error = overshoot(model, state, -model.early)
     # The estimate is one for the full current: a model error of some rad/s is more of it under a smaller one.
-    applied = memory[LARGEST] / model.current
+    applied = state.largest / model.current
     if applied * (late - CONTRADICTS * late_error) > 0.5 * covered:
         return CONTRADICTED
     if applied * (early + CONTRADICTS * early_error) < -0.5 * covered:
         return CONTRADICTED
-    if memory[SLIDES] < LEAST_SLIDES or not fits(model, memory):
+    if state.slides < LEAST_SLIDES or not fits(model, state):
         return OPEN
-    least, least_error = overshoot(model, memory, 0.0)
+    least, least_error = overshoot(model, state, 0.0)
     # No command acts before it is sent: where the least declared age is 0, a low estimate is an error of the model.
     follows = model.age == 0 or least - PROVES * least_error > -covered
     return PROVEN if follows and late + PROVES * late_error < covered else OPEN
@@ -341,59 +350,66 @@ class Response:
 
     Attributes:
         law: of the shield, :func:`unproven_law` until the response is proven.
-        rows: the newest samples.
         stop: the first samples of the node's own stop; their command is the current by the node's account [A].
     """
 
-    __slots__ = ("_counter", "_full", "_memory", "_slow", "law", "model", "rows", "stop")
+    __slots__ = ("_counter", "_full", "_rows", "_slow", "_state", "_verdict", "law", "model", "stop")
 
     def __init__(self, bench: Bench, law: ShieldLaw) -> None:
         self._full = law
         self._slow = self.law = unproven_law(bench, law)
         self.model = response_model(bench, law)
-        self._memory = [0.0] * MEMORY
-        self.rows: list[Row] = []
+        self._state, self._verdict = begin(self.model, 0.0, 0.0), OPEN
+        self._rows: deque[Row] = deque(maxlen=KEPT)
         self.stop: list[Row] = []
 
     def begin(self, sample: SensorSample) -> None:
         """Begin a run with its first sample."""
-        begin(self.model, self._memory, sample.angle, sample.velocity)
-        self.rows, self._counter = [Row(False, sample.angle, sample.velocity, 0.0)], sample.counter
+        self._state, self._verdict = begin(self.model, sample.angle, sample.velocity), OPEN
+        self._rows.clear()
+        self._keep(self._rows, sample, False, 0.0)
         self.law = self._slow
+
+    def _keep(self, kept: deque[Row] | list[Row], sample: SensorSample, follows: bool, command: float) -> None:
+        kept.append(Row(follows, sample.angle, sample.velocity, command))
+        self._counter = sample.counter
+
+    @property
+    def rows(self) -> list[Row]:
+        """The newest samples."""
+        return list(self._rows)
 
     @property
     def proven(self) -> bool:
         """Returns True if the velocity follows the commands as declared."""
-        return self._memory[VERDICT] == PROVEN
+        return self._verdict == PROVEN
 
     def take(self, sample: SensorSample, follows: bool, command: float) -> None:
         """Take one more sample, as :func:`take`; once the response is proven it is only kept.
 
         Raises StopError if the velocity follows the commands later, or earlier, than declared.
         """
-        self.rows = [*self.rows[1 - KEPT :], Row(follows, sample.angle, sample.velocity, command)]
-        self._counter = sample.counter
+        self._keep(self._rows, sample, follows, command)
         if self.proven:
             return
-        verdict = take(self.model, self._memory, follows, sample.angle, sample.velocity, command)
-        if verdict == CONTRADICTED:
+        self._state, self._verdict = take(self.model, self._state, follows, sample.angle, sample.velocity, command)
+        if self._verdict == CONTRADICTED:
             raise StopError(Fault.RESPONSE_LATE, self.text)
-        if verdict == PROVEN:
+        if self._verdict == PROVEN:
             self.law = self._full
 
     def watch(self, sample: SensorSample) -> None:
         """Keep one sample of the stop."""
         if len(self.stop) < KEPT:
             follows = sample.counter == next_counter(self._counter)
-            self.stop.append(Row(follows, sample.angle, sample.velocity, sample.applied_current))
-            self._counter = sample.counter
+            self._keep(self.stop, sample, follows, sample.applied_current)
 
     @property
     def text(self) -> str:
         """Measured delay and what is declared of it [samples]."""
-        model, memory = self.model, self._memory
-        late, error = overshoot(model, memory, 0.0)
-        delay = memory[STATE + MOTOR] * model.current * model.sample_time
+        model, state = self.model, self._state
+        late, error = overshoot(model, state, 0.0)
+        delay = state.mean[1] * model.current * model.sample_time
         most = model.age + model.extra / model.sample_time
         found = f"{model.age + late / delay:z.1f} ± {error / delay:.1f}"
         return f"the velocity follows the commands {found} samples late, at most {most:.3g} are declared"

@@ -15,23 +15,7 @@ from typing import Final
 
 from emb_runtime.config.bench import OLDEST_FRAME, Bench
 from emb_runtime.estimator.observer import observer_gains
-from emb_runtime.safety.response import (
-    BEYOND,
-    DOUBTS,
-    LAGGING,
-    LIKELIHOOD,
-    MATRIX,
-    MEMORY,
-    MOTOR,
-    OVERSHOOT,
-    SIZE,
-    STATE,
-    ResponseModel,
-    Row,
-    begin,
-    fits,
-    take,
-)
+from emb_runtime.safety.response import BEYOND, ResponseModel, Row, begin, fits, take
 from emb_runtime.safety.shield_design import LONGEST_LAG
 
 LEADS: Final = 0.3  # Samples by which a sensor's velocity leads the mean of the last period, at least: in truth 0.5
@@ -121,23 +105,20 @@ def likelihood(
     doubts = age + 1.0 + math.ceil(3.0 * lag / model.sample_time)
     slides = 6.0 * model.deviation
     tried = model._replace(age=0, oldest=0, lag=lag, extra=0.0, transient=0.0, doubts=doubts, slides=slides)
-    memory = [0.0] * MEMORY
-    begin(tried, memory, rows[0].angle, rows[0].velocity)
-    share = model.current * lag
-    variance = memory[MATRIX + (SIZE + 1) * MOTOR]
-    memory[STATE + OVERSHOOT] = share * memory[STATE + MOTOR]
-    memory[MATRIX + SIZE * MOTOR + OVERSHOOT] = memory[MATRIX + SIZE * OVERSHOOT + MOTOR] = share * variance
-    memory[MATRIX + (SIZE + 1) * OVERSHOOT] = share * share * variance
+    state, share = begin(tried, rows[0].angle, rows[0].velocity), model.current * lag
+    mean, p = state.mean, state.covariance
+    known = (*p[:10], share * p[6], *p[11:20], share * share * p[6])
+    state = state._replace(mean=(*mean[:5], share * mean[1]), covariance=known)
     flowing = rows[0].command  # the run's first sample has none
     if rows[0].follows:  # the commands before it are not known
-        memory[DOUBTS], memory[LAGGING] = doubts, flowing
+        state = state._replace(doubts=doubts, lagging=flowing)
     commands = [flowing] * (age - seen) + [row.command for row in rows[1:]]
     acting = [flowing] * seen + commands[: len(rows) - 1] + [row.command for row in stop]
     if means:
         acting = [0.5 * (u + before) for before, u in pairwise([flowing, *acting])]
     for row, current in zip([*rows[1:], *stop], acting, strict=False):
-        take(tried, memory, row.follows, row.angle, row.velocity, current)
-    return memory[LIKELIHOOD] if fits(tried, memory) else math.inf
+        state, _ = take(tried, state, row.follows, row.angle, row.velocity, current)
+    return state.likelihood if fits(tried, state) else math.inf
 
 
 def mean_velocities(sample_time: float, rows: Sequence[Row]) -> list[Row]:

@@ -156,7 +156,7 @@ def judge(
     else:
         weakest, strongest = drives(law, min(xl, 0.0), xh, -most, -least)
         # Sensors of the wrong sign: a clamped brake seems to be below 0.
-        strongest += law.spring_high * max(law.reach - xl, 0.0)
+        strongest += law.box.spring_high * max(law.reach - xl, 0.0)
         against = add(opposed.motion, change, share * _gain(law, vl, strongest), share * _gain(law, -vh, -weakest))
         opposed = Opposed(opposed.travel + (travelled + expected), opposed.integral + expected, opposed.begin, against)
         if periods > 1:  # the integral is not known well enough: begin anew
@@ -188,13 +188,14 @@ def coasting_time(law: ShieldLaw, angle: float, velocity: float, unseen: float =
     help the motion by half of it; and what it takes of all of the speed, with the help of the spring from here. What is
     ``unseen``, by :func:`unseen_speed`, only makes the wait longer: the limit of the first move has kept the distance.
     """
-    speed, friction = abs(velocity) + law.velocity_noise, law.friction_low
+    box, friction = law.box, law.box.friction_low
+    speed = abs(velocity) + law.velocity_noise
     now = abs(angle) + law.angle_noise
     farthest = now + 0.5 * speed * speed / friction
-    near = now <= 0.5 * law.friction_low / law.spring_high
+    near = now <= 0.5 * box.friction_low / box.spring_high
     if not near or farthest > _held_stroke(law, friction):
         return 0.0
-    return max(speed / (0.5 * law.friction_low), (speed + unseen) / (law.friction_low - law.spring_high * now))
+    return max(speed / (0.5 * box.friction_low), (speed + unseen) / (box.friction_low - box.spring_high * now))
 
 
 def unseen_speed(law: ShieldLaw, limits: SensorThresholds, state: State) -> float:
@@ -202,26 +203,26 @@ def unseen_speed(law: ShieldLaw, limits: SensorThresholds, state: State) -> floa
 
     Causes are frames that act late, a current that lags, and a velocity that an observer derives from the angle.
     """
-    speed = acted = 0.0
+    motor, speed, acted = law.box.motor_high, 0.0, 0.0
     for i in range(law.age_high):
-        speed += law.motor_high * max(-state.lows[i], state.highs[i]) * law.sample_time
+        speed += motor * max(-state.lows[i], state.highs[i]) * law.sample_time
     for i in range(law.age_high, _oldest(law) + 1):
         acted = max(-state.lows[i], state.highs[i], acted)
-    speed += law.motor_high * acted * limits.lag
+    speed += motor * acted * limits.lag
     flowing: float = max(-state.flowing[0], state.flowing[1])
-    return speed + law.motor_high * law.lag * flowing
+    return speed + motor * law.delay.lag * flowing
 
 
 def _oldest(law: ShieldLaw) -> int:
     """Number of periods before the last two whose currents the velocity may show only now: late frames, an observer."""
-    if law.observer == 0.0:
+    if law.delay.observer == 0.0:
         return law.age_high
-    return min(law.age_high + int(1.0 / law.observer), OLDEST_FRAME)
+    return min(law.age_high + int(1.0 / law.delay.observer), OLDEST_FRAME)
 
 
 def _held_stroke(law: ShieldLaw, friction: float) -> float:
     """Distance from the origin within which such a friction holds any brake of the set [rad]."""
-    return min(-law.bottom, friction / law.spring_high)
+    return min(-law.bottom, friction / law.box.spring_high)
 
 
 def _stoppable_current(law: ShieldLaw, limits: SensorThresholds, state: State) -> float:
@@ -232,16 +233,16 @@ def _stoppable_current(law: ShieldLaw, limits: SensorThresholds, state: State) -
     command and its stop, with the wrong sign, drives the brake. 0 where there is no such current; the constant one so
     far from the origin that friction alone is no stop at all, as where a way home begins.
     """
-    ts, friction = law.sample_time, law.friction_low
+    ts, box, friction = law.sample_time, law.box, law.box.friction_low
     speed: float = abs(state.velocity) + law.velocity_noise + unseen_speed(law, limits, state)
     now = abs(state.angle) + 2.0 * law.angle_noise
     stroke = _held_stroke(law, friction)
     now += (law.age_high + 2) * ts * math.sqrt(2.0 * friction * max(stroke - now, 0.0))
-    if now > 0.5 * friction / law.spring_high or now > stroke:
+    if now > 0.5 * friction / box.spring_high or now > stroke:
         return limits.first_current
     after_stop = math.sqrt(2.0 * friction * (stroke - now)) - 2.0 * law.velocity_noise
-    before_stop = (after_stop + ts * friction) / (1.0 + ts * law.motor_high * law.current / law.damping_velocity)
-    return max(before_stop - speed, 0.0) / (ts * law.motor_high)
+    before_stop = (after_stop + ts * friction) / (1.0 + ts * box.motor_high * law.current / law.damping_velocity)
+    return max(before_stop - speed, 0.0) / (ts * box.motor_high)
 
 
 def lag_angle(limits: SensorThresholds, gained: float) -> float:
@@ -292,6 +293,7 @@ def _acting(law: ShieldLaw, state: State, low: float, high: float) -> tuple[floa
     That of the period before counts as well: a measured velocity lags. So do those of older ones where frames may be
     late, or an observer derives the velocity.
     """
+    delay = law.delay
     least, most = low, high
     for i in range(_oldest(law) + 1):
         if state.lows[i] < least:
@@ -299,8 +301,8 @@ def _acting(law: ShieldLaw, state: State, low: float, high: float) -> tuple[floa
         if state.highs[i] > most:
             most = state.highs[i]
     low, high = state.flowing
-    if law.lag > 0.0:
-        flowing = least + law.kept * min(low - least, 0.0), most + law.kept * max(high - most, 0.0)
+    if delay.lag > 0.0:
+        flowing = least + delay.kept * min(low - least, 0.0), most + delay.kept * max(high - most, 0.0)
         return min(least, low), max(most, high), flowing
     return least, most, state.flowing
 

@@ -36,19 +36,19 @@ class SensorThresholds(NamedTuple):
 
 def sensor_thresholds(bench: Bench, law: ShieldLaw) -> SensorThresholds:
     """Thresholds of a bench and the law of its shield."""
-    ts, deviation = law.sample_time, bench.noise.velocity
+    ts, box, deviation = law.sample_time, law.box, bench.noise.velocity
     offset = TOLERATED_OFFSET * deviation
     # Of a random walk with the standard deviation s per step and the mean -m, P(it ever reaches h) < exp(-2 m h / s^2);
     # it may begin anew at each sample, and in either direction.
     walk = ts * CORRELATION * deviation
     noise = math.log(2.0 * bench.timing.horizon / FALSE_ALARMS) * walk * walk / (2.0 * ts * offset)
-    mistaken = ts * (law.friction_low + law.friction_high)  # the sign of a lagging velocity, for one sample
+    mistaken = ts * (box.friction_low + box.friction_high)  # the sign of a lagging velocity, for one sample
     return SensorThresholds(
         travel=2.0 * law.angle_noise + noise,
         offset=offset,
-        lag=max(LAG, 2.0 / law.observer) * ts if law.observer > 0.0 else LAG * ts,
+        lag=max(LAG, 2.0 / law.delay.observer) * ts if law.delay.observer > 0.0 else LAG * ts,
         lead=LAG * ts,
         motion=2.0 * law.velocity_noise + mistaken,
         current_error=bench.guard.current_error,
-        first_current=min(FIRST_MOVE * law.friction_high / law.motor_low, law.current),
+        first_current=min(FIRST_MOVE * box.friction_high / box.motor_low, law.current),
     )

@@ -94,7 +94,7 @@ def _window(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[
         xl, xh, vl, vh = _rolled(law, angle, velocity, past, age, True)
         if law.coasting:
             bottom, top = _coasting_window(law, xl, xh, vl, vh)
-        elif law.lag > 0.0:
+        elif law.delay.lag > 0.0:
             bottom, top = _lagging_window(law, xl, xh, vl, vh, past)
         else:
             bottom, top = _braking_window(law, xl, xh, vl, vh)
@@ -107,12 +107,12 @@ def _window(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[
 
 def _braking_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float) -> tuple[float, float]:
     """The window for a box of states, each end cut at full braking (L2-L4 in ``docs/explanation/shield.md``)."""
-    ts = law.sample_time
-    braking = law.braking + law.spring_low * max(xl, 0.0)
+    ts, box = law.sample_time, law.box
+    braking = box.braking + box.spring_low * max(xl, 0.0)
     v = min(law.outward_speed, stoppable(law.top - xh, vh, braking, ts)) - VELOCITY_PAD
-    top = _highest_current(law, vl, vh, v, law.spring_low * max(xl - law.reach, 0.0))
-    v = min(law.homeward_speed, stoppable(xl - law.bottom, -vl, law.braking, ts)) - VELOCITY_PAD
-    bottom = -_highest_current(law, -vh, -vl, v, -law.spring_high * max(xh + law.reach, 0.0))
+    top = _highest_current(law, vl, vh, v, box.spring_low * max(xl - law.reach, 0.0))
+    v = min(law.homeward_speed, stoppable(xl - law.bottom, -vl, box.braking, ts)) - VELOCITY_PAD
+    bottom = -_highest_current(law, -vh, -vl, v, -box.spring_high * max(xh + law.reach, 0.0))
     return min(bottom, law.current), max(top, -law.current)
 
 
@@ -122,35 +122,36 @@ def _coasting_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float)
     Up, the energy of motion and of the softest spring must be gone by friction before the apex; down, that of the
     stiffest spring before the bottom.
     """
-    ts = law.sample_time
+    ts, box, home = law.sample_time, law.box, law.home
     above = xh + ts * max(vh + law.change, 0.0)
     below = xl + ts * min(vl - law.change, 0.0)
     squeezed = max(above, 0.0)
-    left = law.friction_low * (law.apex - above) + 0.5 * law.spring_low * (law.apex * law.apex - squeezed * squeezed)
+    left = box.friction_low * (home.apex - above) + 0.5 * box.spring_low * (home.apex * home.apex - squeezed * squeezed)
     v = min(law.outward_speed, math.sqrt(max(2.0 * left, 0.0))) - VELOCITY_PAD
-    top = _highest_current(law, vl, vh, v, law.spring_low * max(xl - law.reach, 0.0))
-    left = law.friction_low * (below - law.bottom) - 0.5 * law.spring_high * squeezed * squeezed
+    top = _highest_current(law, vl, vh, v, box.spring_low * max(xl - law.reach, 0.0))
+    left = box.friction_low * (below - law.bottom) - 0.5 * box.spring_high * squeezed * squeezed
     v = min(law.homeward_speed, math.sqrt(max(2.0 * left, 0.0))) - VELOCITY_PAD
-    bottom = -_highest_current(law, -vh, -vl, v, -law.spring_high * max(xh + law.reach, 0.0))
+    bottom = -_highest_current(law, -vh, -vl, v, -box.spring_high * max(xh + law.reach, 0.0))
     return min(bottom, 0.0), max(top, 0.0)
 
 
 def _lagging_window(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, past: Past) -> tuple[float, float]:
     """The window where the current follows the command with a lag, for either motor (L7-L9)."""
+    box = law.box
     strongest = _flowing(law, past, vl, 1.0)
     weakest = _flowing(law, past, -vh, -1.0)
     room = law.top - xh
-    soft = law.spring_low * max(xl - law.reach, 0.0)
-    held = law.spring_low * max(xl, 0.0)
-    weak = _lagging_current(law, vl, vh, room, law.outward_speed, soft, strongest, law.motor_low, law.braking + held)
+    soft = box.spring_low * max(xl - law.reach, 0.0)
+    held = box.spring_low * max(xl, 0.0)
+    weak = _lagging_current(law, vl, vh, room, law.outward_speed, soft, strongest, box.motor_low, box.braking + held)
     strong = _lagging_current(
-        law, vl, vh, room, law.outward_speed, soft, strongest, law.motor_high, law.braking_high + held
+        law, vl, vh, room, law.outward_speed, soft, strongest, box.motor_high, box.braking_high + held
     )
     top = min(weak, strong)
     room = xl - law.bottom
-    stiff = -law.spring_high * max(xh + law.reach, 0.0)
-    weak = _lagging_current(law, -vh, -vl, room, law.homeward_speed, stiff, weakest, law.motor_low, law.braking)
-    strong = _lagging_current(law, -vh, -vl, room, law.homeward_speed, stiff, weakest, law.motor_high, law.braking_high)
+    stiff = -box.spring_high * max(xh + law.reach, 0.0)
+    weak = _lagging_current(law, -vh, -vl, room, law.homeward_speed, stiff, weakest, box.motor_low, box.braking)
+    strong = _lagging_current(law, -vh, -vl, room, law.homeward_speed, stiff, weakest, box.motor_high, box.braking_high)
     bottom = -min(weak, strong)
     return min(bottom, law.current), max(top, -law.current)
 
@@ -166,7 +167,7 @@ def _flowing(law: ShieldLaw, past: Past, slowest: float, sign: float) -> float:
         slow = slowest - (i + 1) * law.change
         braked = damped_current(slow, law.current, law.damping_velocity)
         u = max(min(max(sign * past[i], -law.current), law.current), braked)
-        flowing = u + law.kept * max(flowing - u, 0.0)
+        flowing = u + law.delay.kept * max(flowing - u, 0.0)
     return flowing
 
 
@@ -197,23 +198,23 @@ def _lagging_current(
         motor: k_m / J [rad/(s²·A)].
         braking: deceleration of the weakest brake with this motor [rad/s²].
     """
-    ts = law.sample_time
-    rising = motor * flowing + max(-spring - law.friction_low, 0.0)
-    reached = vh + law.lag * max(rising, 0.0)
-    stopping = vh + law.lag * motor * (flowing + law.current)
+    ts, box = law.sample_time, law.box
+    rising = motor * flowing + max(-spring - box.friction_low, 0.0)
+    reached = vh + law.delay.lag * max(rising, 0.0)
+    stopping = vh + law.delay.lag * motor * (flowing + law.current)
     v = stoppable(room, stopping, braking, ts)
     if v < VELOCITY_PAD:
         return -law.current
     over = min(speed - reached, v - stopping) - VELOCITY_PAD
     # Where the motion may turn around within the sample, friction may help it, viscous friction while it goes back.
-    helping = law.viscous_high * min(vh - law.change, 0.0) - law.friction_high
-    friction = law.friction_low + law.viscous_low * vh if vl > law.change else helping
+    helping = box.viscous_high * min(vh - law.change, 0.0) - box.friction_high
+    friction = box.friction_low + box.viscous_low * vh if vl > law.change else helping
     return (over / ts + friction + spring) / motor
 
 
 def _believable(law: ShieldLaw, angle: float, velocity: float, past: Past) -> bool:
     total = abs(angle)
-    if law.age_high > 0 or law.lag > 0.0 or law.observer > 0.0:
+    if law.age_high > 0 or law.delay.lag > 0.0 or law.delay.observer > 0.0:
         total += abs(past[0]) + abs(past[1]) + abs(past[2]) + abs(past[3]) + abs(past[4])
     return abs(velocity) <= BELIEVABLE and total <= BELIEVABLE
 
@@ -229,7 +230,7 @@ def _rolled(
     xh = angle + law.angle_noise
     vl = velocity - law.velocity_noise
     vh = velocity + law.velocity_noise
-    if law.observer > 0.0:
+    if law.delay.observer > 0.0:
         fallen, risen = _unseen(law, xl, xh, vl, vh, past, age, lost)
         vl, vh = vl + fallen, vh + risen
     for i in range(age, 0, -1):
@@ -249,7 +250,7 @@ def _unseen(
     The share (1 + ωτ) exp(−ωτ) of what the acceleration has changed until the time τ before, at most; less what an
     observer overshoots by. ``lost`` as for :func:`_rolled`.
     """
-    ts, scaled = law.sample_time, law.observer
+    ts, scaled = law.sample_time, law.delay.observer
     blind = unseen(scaled, PAST - age) * law.change
     aside = blind + (2.0 / scaled) * law.change
     slow, fast = vl - aside, vh + aside
@@ -271,9 +272,10 @@ def _unseen(
 
 def _moved_by(law: ShieldLaw, slowest: float, drive: float) -> float:
     """Greatest acceleration from ``slowest`` or above, where ``drive`` bounds motor and spring [rad/s²]."""
+    box = law.box
     if slowest > 0.0:
-        return drive - law.friction_low - law.viscous_low * slowest
-    return drive + law.friction_high - law.viscous_high * slowest
+        return drive - box.friction_low - box.viscous_low * slowest
+    return drive + box.friction_high - box.viscous_high * slowest
 
 
 def damped_current(velocity: float, limit: float, damping_velocity: float) -> float:
@@ -289,16 +291,17 @@ def _now(law: ShieldLaw, angle: float, velocity: float, past: Past) -> tuple[flo
 
     Where the current lags, the velocities are those after what flows has decayed.
     """
+    box, delay = law.box, law.delay
     xl, xh, vl, vh = _rolled(law, angle, velocity, past, law.age_low, False)
     for age in range(law.age_low + 1, law.age_high + 1):
         x0, x1, v0, v1 = _rolled(law, angle, velocity, past, age, False)
         xl, xh, vl, vh = min(xl, x0), max(xh, x1), min(vl, v0), max(vh, v1)
-    if law.lag > 0.0:
+    if delay.lag > 0.0:
         flowing = 0.0
         for i in range(PAST - 1, -1, -1):
-            flowing = past[i] + law.kept * (flowing - past[i])
-        vl += law.lag * (law.motor_low if flowing > 0.0 else law.motor_high) * flowing
-        vh += law.lag * (law.motor_high if flowing > 0.0 else law.motor_low) * flowing
+            flowing = past[i] + delay.kept * (flowing - past[i])
+        vl += delay.lag * (box.motor_low if flowing > 0.0 else box.motor_high) * flowing
+        vh += delay.lag * (box.motor_high if flowing > 0.0 else box.motor_low) * flowing
     return xl, xh, vl, vh
 
 
@@ -327,8 +330,9 @@ def drives(law: ShieldLaw, xl: float, xh: float, u_low: float, u_high: float) ->
 
     Its angle begins within ``xl`` and ``xh`` [rad], and its current stays within ``u_low`` and ``u_high`` [A].
     """
-    drive_high = max(law.motor_high * u_high, law.motor_low * u_high) - law.spring_low * max(xl - law.reach, 0.0)
-    drive_low = min(law.motor_high * u_low, law.motor_low * u_low) - law.spring_high * max(xh + law.reach, 0.0)
+    box = law.box
+    drive_high = max(box.motor_high * u_high, box.motor_low * u_high) - box.spring_low * max(xl - law.reach, 0.0)
+    drive_low = min(box.motor_high * u_low, box.motor_low * u_low) - box.spring_high * max(xh + law.reach, 0.0)
     return drive_low, drive_high
 
 
@@ -338,12 +342,12 @@ def fastest_next(law: ShieldLaw, vl: float, vh: float, drive: float) -> float:
     Euler's map is monotone on either side of zero and jumps at it, so the two corners and the jump bound it. A brake
     that would come to rest may stick: hence not below zero from above.
     """
-    ts = law.sample_time
+    ts, box = law.sample_time, law.box
     if vh <= 0.0:
-        return vh + ts * (drive + law.friction_high - law.viscous_high * vh)
-    fastest = max(vh + ts * (drive - law.friction_low - law.viscous_low * vh), 0.0)
+        return vh + ts * (drive + box.friction_high - box.viscous_high * vh)
+    fastest = max(vh + ts * (drive - box.friction_low - box.viscous_low * vh), 0.0)
     if vl <= 0.0:
-        fastest = max(fastest, ts * (drive + law.friction_high))
+        fastest = max(fastest, ts * (drive + box.friction_high))
     return fastest
 
 
@@ -354,17 +358,17 @@ def _highest_current(law: ShieldLaw, vl: float, vh: float, v: float, spring: flo
     mirrored velocities. ``spring`` is what the clamping force takes from the motion, at least [rad/s²]; negative where
     it drives it.
     """
-    ts = law.sample_time
+    ts, box = law.sample_time, law.box
     if v < 0.0:
         return -law.current
     if vh > 0.0:
-        drive = (v - vh) / ts + law.friction_low + law.viscous_low * vh
+        drive = (v - vh) / ts + box.friction_low + box.viscous_low * vh
         if vl <= 0.0:
-            drive = min(drive, v / ts - law.friction_high)
+            drive = min(drive, v / ts - box.friction_high)
     else:
-        drive = (v - vh) / ts - law.friction_high + law.viscous_high * vh
+        drive = (v - vh) / ts - box.friction_high + box.viscous_high * vh
     drive += spring
-    return drive / (law.motor_high if drive > 0.0 else law.motor_low)
+    return drive / (box.motor_high if drive > 0.0 else box.motor_low)
 
 
 def _blind_current(law: ShieldLaw, velocity: float) -> float:
@@ -374,16 +378,17 @@ def _blind_current(law: ShieldLaw, velocity: float) -> float:
 
 def _must_return(law: ShieldLaw, xl: float, xh: float, vl: float, vh: float, current: float, left: float) -> bool:
     """Returns True if after ``current`` the worst brake could be home too late, with ``left`` seconds left."""
-    if left < law.committed:
+    if left < law.home.committed:
         return True
     xl, xh, vl, vh = successor(law, xl, xh, vl, vh, current)
-    return max(_arrival(law, xl, vl), _arrival(law, xh, vh)) + law.reserve > left
+    return max(_arrival(law, xl, vl), _arrival(law, xh, vh)) + law.home.reserve > left
 
 
 def _arrival(law: ShieldLaw, x: float, v: float) -> float:
     """Time in which the worst brake of the box is at rest at the origin by the way home [s]."""
+    way = law.home
     out = v
-    spring = law.spring_low * x
+    spring = law.box.spring_low * x
     if x < 0.0:
         x = -x
         out = -v
@@ -391,25 +396,25 @@ def _arrival(law: ShieldLaw, x: float, v: float) -> float:
     t = 0.0
     home = -out
     if out > 0.0:  # stop the outward motion first
-        braking = law.braking + spring
+        braking = law.box.braking + spring
         t = out / braking
         x += 0.5 * out * (t + law.sample_time)
         home = 0.0
-    beyond = 0.5 * home * home / law.landing - x
+    beyond = 0.5 * home * home / way.landing - x
     if beyond > 0.0:  # too fast to stop at the origin: come back from the other side
-        t += home / law.landing
+        t += home / way.landing
         x = beyond
         home = 0.0
         spring = 0.0
-    ramp = law.ramp + 0.5 * spring
-    peak = math.sqrt((x + 0.5 * home * home / ramp) / (0.5 / ramp + 0.5 / law.landing))
-    peak = max(min(peak, law.cruise), home)
-    cruising = x - 0.5 * (peak * peak - home * home) / ramp - 0.5 * peak * peak / law.landing
+    ramp = way.ramp + 0.5 * spring
+    peak = math.sqrt((x + 0.5 * home * home / ramp) / (0.5 / ramp + 0.5 / way.landing))
+    peak = max(min(peak, way.cruise), home)
+    cruising = x - 0.5 * (peak * peak - home * home) / ramp - 0.5 * peak * peak / way.landing
     if cruising > 0.0:
-        t += cruising / law.cruise
+        t += cruising / way.cruise
     if law.coasting:
         t += _climbing_down(law, x)
-    return t + (peak - home) / ramp + peak / law.landing
+    return t + (peak - home) / ramp + peak / way.landing
 
 
 def _climbing_down(law: ShieldLaw, x: float) -> float:
@@ -417,37 +422,39 @@ def _climbing_down(law: ShieldLaw, x: float) -> float:
 
     The speed limit is a concave function of the angle, so that the trapezoids lie above the integral.
     """
-    begin = 2.0 * law.friction_low / law.spring_high
-    width = (min(x, law.apex) - begin) / PIECES
+    box, home = law.box, law.home
+    begin = 2.0 * box.friction_low / box.spring_high
+    width = (min(x, home.apex) - begin) / PIECES
     lost = 0.0
     for i in range(PIECES + 1 if width > 0.0 else 0):
         at = begin + i * width
-        left = law.friction_low * (at - law.bottom) - 0.5 * law.spring_high * at * at
-        speed = max(math.sqrt(max(2.0 * left, 0.0)), CREEPS * law.creep) - law.creep
+        left = box.friction_low * (at - law.bottom) - 0.5 * box.spring_high * at * at
+        speed = max(math.sqrt(max(2.0 * left, 0.0)), CREEPS * home.creep) - home.creep
         weight = 0.5 if i in (0, PIECES) else 1.0
-        lost += weight * width * max(1.0 / speed - 1.0 / law.cruise, 0.0)
+        lost += weight * width * max(1.0 / speed - 1.0 / home.cruise, 0.0)
     return lost
 
 
 def _return_current(law: ShieldLaw, x: float, v: float, left: float) -> float:
     """The way home: follow the speed from which a planned deceleration lands at the origin [A]."""
-    motor = 0.5 * (law.motor_low + law.motor_high)
-    zone = law.settled_zone if left < law.settling else law.rest_zone
+    box, home = law.box, law.home
+    motor = 0.5 * (box.motor_low + box.motor_high)
+    zone = home.settled_zone if left < home.settling else home.rest_zone
     if abs(x) < zone:
         # Friction stops what it can in the time that is left; of more than that, what is certain is braked.
-        in_time = law.rest_velocity - 2.0 * law.velocity_noise + law.friction_low * left
-        if abs(v) < min(law.rest_velocity, max(law.velocity_noise, in_time)):
+        in_time = home.rest_velocity - 2.0 * law.velocity_noise + box.friction_low * left
+        if abs(v) < min(home.rest_velocity, max(law.velocity_noise, in_time)):
             return 0.0
         # The noise is left out: what chatters between the signs of a standing brake is not braked into moving.
         excess = v - law.velocity_noise if v > 0.0 else v + law.velocity_noise
-        return -law.gain * excess / (law.sample_time * motor)
+        return -home.gain * excess / (law.sample_time * motor)
     direction = -1.0 if x > 0.0 else 1.0
-    planned = math.sqrt(2.0 * law.landing * abs(x))
-    drive = 0.5 * (law.friction_low + law.friction_high) * direction + 0.5 * (law.viscous_low + law.viscous_high) * v
-    drive += 0.5 * (law.spring_low + law.spring_high) * max(x, 0.0)
+    planned = math.sqrt(2.0 * home.landing * abs(x))
+    drive = 0.5 * (box.friction_low + box.friction_high) * direction + 0.5 * (box.viscous_low + box.viscous_high) * v
+    drive += 0.5 * (box.spring_low + box.spring_high) * max(x, 0.0)
     if planned < law.homeward_speed:  # the planned speed falls as the origin comes nearer
-        drive -= law.landing * direction * min(max(direction * v / planned, 0.0), 1.0)
+        drive -= home.landing * direction * min(max(direction * v / planned, 0.0), 1.0)
     else:
         planned = law.homeward_speed
-    drive += law.gain * (direction * planned - v) / law.sample_time
+    drive += home.gain * (direction * planned - v) / law.sample_time
     return drive / motor

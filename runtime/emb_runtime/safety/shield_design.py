@@ -9,7 +9,9 @@ All accelerations are torques over the inertia [rad/s²]; a name that ends in ``
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from operator import ge, gt, le, lt
 from typing import Final, NamedTuple
 
 from emb_runtime.config.bench import FASTEST_OBSERVER, OLDEST_FRAME, PER_LAG, Bench
@@ -45,6 +47,50 @@ LATEST_OBSERVED: Final = 1  # Frame age; with older frames and an observer the l
 COMMITTED: Final = 16  # Samples before the reserve in which the policy does not get control back
 
 
+class Box(NamedTuple):
+    """Bounds of the set's brakes."""
+
+    motor_low: float  # k_m / J [rad/(s²·A)]
+    motor_high: float
+    spring_low: float  # γ k_1 / J [1/s²]
+    spring_high: float
+    friction_low: float  # T_c / J [rad/s²]
+    friction_high: float  # With what a brake that breaks away or is clamped may have beyond T_c
+    viscous_low: float  # f_v / J [1/s]
+    viscous_high: float
+    braking: float  # Deceleration that every brake of the box reaches outside contact [rad/s²]
+    braking_high: float  # Deceleration that the brakes with the strongest motor reach there [rad/s²]
+
+
+class Delay(NamedTuple):
+    """Delay of current and velocity behind the commands, frames that are late apart."""
+
+    lag: float  # Largest time constant of the current loop [s]
+    kept: float  # Share of a difference between current and command that the longest lag keeps over a sample
+    observer: float
+    """Least bandwidth of the observer that derives the velocity from the angle, times the sample time; 0 for a sensor.
+
+    It is at most that of an observer that lags no less.
+    """
+
+
+class WayHome(NamedTuple):
+    """Numbers of the way home."""
+
+    apex: float  # Coasting: no brake of the box gets beyond this angle [rad]
+    creep: float  # Coasting: speed home that may be below its limit [rad/s]
+    cruise: float  # Homeward speed that every brake reaches inside this envelope [rad/s]
+    ramp: float  # Homeward acceleration that every brake reaches outside contact [rad/s²]
+    landing: float  # Deceleration planned for the landing [rad/s²]
+    gain: float  # Gain as in :class:`Landing`
+    reserve: float  # Time kept for the end of the landing [s]
+    committed: float  # Before the end the policy does not get control back [s]
+    settling: float  # Before the end no more hop is begun: what is inside a wider zone only stops [s]
+    rest_zone: float  # |angle| within which the landing stops [rad]
+    settled_zone: float  # |angle| within which the landing stops just before the end [rad]
+    rest_velocity: float  # |velocity| below which friction is left to stop the brake [rad/s]
+
+
 class ShieldLaw(NamedTuple):
     """Everything that :func:`shield` knows; floats and integers only. ``_low``/``_high``: bounds of the box."""
 
@@ -60,38 +106,16 @@ class ShieldLaw(NamedTuple):
     outward_speed: float  # Largest velocity that a successor may have [rad/s]
     homeward_speed: float  # Largest speed of a successor towards the origin from contact [rad/s]
     reach: float  # Largest change of the angle in one sample [rad]
-    motor_low: float  # k_m / J [rad/(s²·A)]
-    motor_high: float
-    spring_low: float  # γ k_1 / J [1/s²]
-    spring_high: float
-    friction_low: float  # T_c / J [rad/s²]
-    friction_high: float  # With what a brake that breaks away or is clamped may have beyond T_c
-    viscous_low: float  # f_v / J [1/s]
-    viscous_high: float
-    braking: float  # Deceleration that every brake of the box reaches outside contact [rad/s²]
-    braking_high: float  # Deceleration that the brakes with the strongest motor reach there [rad/s²]
+    box: Box
     damping_velocity: float  # The node's, also used when there is no believable angle [rad/s]
     change: float  # Largest change of the velocity in one sample [rad/s]
-    lag: float  # Largest time constant of the current loop [s]
-    kept: float  # Share of a difference between current and command that the longest lag keeps over a sample
-    observer: float
-    """Least bandwidth of the observer that derives the velocity from the angle, times the sample time; 0 for a sensor.
-
-    It is at most that of an observer that lags no less.
-    """
+    delay: Delay
     coasting: bool  # 0 A for ever must keep the limits, in place of the damped stop
-    apex: float  # Coasting: no brake of the box gets beyond this angle [rad]
-    creep: float  # Coasting: speed home that may be below its limit [rad/s]
-    cruise: float  # Homeward speed that every brake reaches inside this envelope [rad/s]
-    ramp: float  # Homeward acceleration that every brake reaches outside contact [rad/s²]
-    landing: float  # Deceleration planned for the landing [rad/s²]
-    gain: float  # Gain as in :class:`Landing`
-    reserve: float  # Time kept for the end of the landing [s]
-    committed: float  # Before the end the policy does not get control back [s]
-    settling: float  # Before the end no more hop is begun: what is inside a wider zone only stops [s]
-    rest_zone: float  # |angle| within which the landing stops [rad]
-    settled_zone: float  # |angle| within which the landing stops just before the end [rad]
-    rest_velocity: float  # |velocity| below which friction is left to stop the brake [rad/s]
+    home: WayHome
+
+
+Condition = tuple[float, Callable[[float, float], bool], float, str]
+"""Step of the argument: a value, its relation to a limit, the limit; what is wrong otherwise, with what to change."""
 
 
 def stoppable(room: float, v: float, braking: float, ts: float) -> float:
@@ -181,7 +205,7 @@ def make_law(bench: Bench) -> ShieldLaw:
 
 def late_step(law: ShieldLaw) -> int:
     """Step that a way home is always at for the shield: the end is as near as it may be while the brake still moves."""
-    return law.steps - 2 - math.ceil(law.settling / law.sample_time)
+    return law.steps - 2 - math.ceil(law.home.settling / law.sample_time)
 
 
 def _or_lower(bench: Bench) -> str:
@@ -194,37 +218,48 @@ def _or_lower(bench: Bench) -> str:
     return ""
 
 
+def _box(bench: Bench) -> Box:
+    shield, limits, brakes = bench.shield, bench.limits, bench.range_set(bench.shield.ranges)
+    low, high = brakes.low, brakes.high
+    motor_low, motor_high, friction_low = low.k_m / high.J, high.k_m / low.J, low.T_c / high.J
+    loaded = shield.f_l * high.k_1 * limits.angle[1]
+    return Box(
+        motor_low=motor_low,
+        motor_high=motor_high,
+        spring_low=low.gamma * low.k_1 / high.J,
+        spring_high=high.gamma * high.k_1 / low.J,
+        friction_low=friction_low,
+        friction_high=(shield.break_away * high.T_c + loaded) / low.J,
+        viscous_low=low.f_v / high.J,
+        viscous_high=high.f_v / low.J,
+        braking=limits.current * motor_low + friction_low,
+        braking_high=limits.current * motor_high + friction_low,
+    )
+
+
 def law_of(bench: Bench) -> ShieldLaw:
     """The law of a bench, as far as there is one: nothing is checked here."""
     shield, limits, ts = bench.shield, bench.limits, bench.timing.sample_time
-    brakes = bench.range_set(shield.ranges)
-    low, high = brakes.low, brakes.high
     current, coasting = limits.current, shield.envelope == "coasting"
-    lag, age_high = shield.current_lag, shield.frame_age[1]
-    motor_low, motor_high = low.k_m / high.J, high.k_m / low.J
-    spring_low, spring_high = low.gamma * low.k_1 / high.J, high.gamma * high.k_1 / low.J
-    loaded = shield.f_l * high.k_1 * limits.angle[1]
-    friction_low, friction_high = low.T_c / high.J, (shield.break_away * high.T_c + loaded) / low.J
-    viscous_low, viscous_high = low.f_v / high.J, high.f_v / low.J
-    braking, braking_high = current * motor_low + friction_low, current * motor_high + friction_low
+    lag, age_high, box = shield.current_lag, shield.frame_age[1], _box(bench)
     bottom = limits.angle[0] + shield.angle_margin
     noise = shield.noise_sigmas * bench.noise.velocity
     outward = limits.velocity - VELOCITY_PAD
     # A brake that enters the free stroke at this speed still stops above the bottom.
-    weak = stoppable(-bottom, 0.0, braking, ts) - lag * motor_low * current
-    strong = stoppable(-bottom, 0.0, braking_high, ts) - lag * motor_high * current
+    weak = stoppable(-bottom, 0.0, box.braking, ts) - lag * box.motor_low * current
+    strong = stoppable(-bottom, 0.0, box.braking_high, ts) - lag * box.motor_high * current
     homeward = min(outward, weak, strong)
     # At the homeward limit the clip lets a brake settle where the least and the greatest friction agree.
     periods = age_high + 1
-    ratio = motor_high / motor_low
-    uneven = VELOCITY_PAD + ts * (ratio * friction_high - friction_low)
+    ratio = box.motor_high / box.motor_low
+    uneven = VELOCITY_PAD + ts * (ratio * box.friction_high - box.friction_low)
     creep = noise + periods * uneven
     top = limits.angle[1] - shield.angle_margin
     apex = top
     if coasting:
-        homeward = min(homeward, math.sqrt(max(-2.0 * friction_low * bottom, 0.0)))
-        apex = min(apex, _apex(friction_low, spring_high, -bottom, CREEPS * creep))
-    driven = current * motor_high + friction_high + viscous_high * limits.velocity + spring_high * apex
+        homeward = min(homeward, math.sqrt(max(-2.0 * box.friction_low * bottom, 0.0)))
+        apex = min(apex, _apex(box.friction_low, box.spring_high, -bottom, CREEPS * creep))
+    driven = current * box.motor_high + box.friction_high + box.viscous_high * limits.velocity + box.spring_high * apex
     change = VELOCITY_PAD + ts * driven
     plan = FRESH_LANDING if age_high == 0 and lag == 0.0 else LATE_LANDING
     observer, reckoned, behind = 0.0, float(periods), lag
@@ -234,10 +269,10 @@ def law_of(bench: Bench) -> ShieldLaw:
         behind = 6.0 * ts / observer  # three times the longest lag, by search
         creep += 2.0 / observer * uneven + unseen(observer, OLDEST_FRAME - age_high) * change
         reckoned += 2.0 / observer
-    cruise = (homeward - creep) / (1.0 + reckoned * ts * (ratio * viscous_high - viscous_low))
+    cruise = (homeward - creep) / (1.0 + reckoned * ts * (ratio * box.viscous_high - box.viscous_low))
     reserve = plan.reserve * ts + 2.0 * behind
     rest = noise + shield.home_velocity
-    coast = (rest + noise) / friction_low
+    coast = (rest + noise) / box.friction_low
     return ShieldLaw(
         sample_time=ts,
         steps=bench.timing.horizon,
@@ -251,34 +286,25 @@ def law_of(bench: Bench) -> ShieldLaw:
         outward_speed=outward,
         homeward_speed=homeward,
         reach=ts * limits.velocity,
-        motor_low=motor_low,
-        motor_high=motor_high,
-        spring_low=spring_low,
-        spring_high=spring_high,
-        friction_low=friction_low,
-        friction_high=friction_high,
-        viscous_low=viscous_low,
-        viscous_high=viscous_high,
-        braking=braking,
-        braking_high=braking_high,
+        box=box,
         damping_velocity=bench.node.damping_velocity,
         change=change,
-        lag=lag,
-        kept=math.exp(-ts / lag) if lag > 0.0 else 0.0,
-        observer=observer,
+        delay=Delay(lag, math.exp(-ts / lag) if lag > 0.0 else 0.0, observer),
         coasting=coasting,
-        apex=apex,
-        creep=creep,
-        cruise=cruise,
-        ramp=current * motor_low - friction_high - 0.6 * viscous_high * cruise,
-        landing=plan.share * (braking - spring_high * min(0.5 * cruise * cruise / braking, 12.0)),
-        gain=plan.gain,
-        reserve=coast + reserve,
-        committed=coast + reserve + COMMITTED * ts,
-        settling=coast,
-        rest_zone=0.3 * shield.home_angle,
-        settled_zone=0.8 * shield.home_angle,
-        rest_velocity=rest,
+        home=WayHome(
+            apex=apex,
+            creep=creep,
+            cruise=cruise,
+            ramp=current * box.motor_low - box.friction_high - 0.6 * box.viscous_high * cruise,
+            landing=plan.share * (box.braking - box.spring_high * min(0.5 * cruise * cruise / box.braking, 12.0)),
+            gain=plan.gain,
+            reserve=coast + reserve,
+            committed=coast + reserve + COMMITTED * ts,
+            settling=coast,
+            rest_zone=0.3 * shield.home_angle,
+            settled_zone=0.8 * shield.home_angle,
+            rest_velocity=rest,
+        ),
     )
 
 
@@ -289,110 +315,104 @@ def _apex(friction: float, spring: float, stroke: float, speed: float) -> float:
 
 
 def unmet_condition(law: ShieldLaw, bench: Bench) -> str:
-    """The first step of the argument that does not hold for this law; "" if all do."""
-    ts = law.sample_time
-    speed, farthest = bench.limits.velocity, law.apex if law.coasting else bench.limits.angle[1]
-    if reason := _uncovered(law):
-        return reason
-    if law.coasting and law.apex <= 0.0:
-        return (
+    """The first step of the argument that does not hold for this law, with what to change; "" if all do."""
+    conditions = _conditions(law, bench)
+    return next((refusal for value, holds, limit, refusal in conditions if not holds(value, limit)), "")
+
+
+def _conditions(law: ShieldLaw, bench: Bench) -> Iterator[Condition]:
+    """The steps of the argument, in an order in which each has a value where those before it hold."""
+    ts, box, home, (lag, _, observer) = law.sample_time, law.box, law.home, law.delay
+    speed, farthest = bench.limits.velocity, home.apex if law.coasting else bench.limits.angle[1]
+    yield (lag > 0.0) + law.coasting + (law.age_high > 0), le, 1, (
+        "a lag of the current, frames that may be late and the coasting envelope are covered one at a time; choose one "
+        "of shield.current_lag, shield.frame_age and shield.envelope"
+    )  # fmt: skip
+    if observer > 0.0:
+        yield (lag > 0.0) + law.coasting + (law.age_high > LATEST_OBSERVED), le, 0, (
+            f"an observer's velocity is covered with frames of age {LATEST_OBSERVED} at most, and neither with a lag "
+            "of the current nor with the coasting envelope; change shield.frame_age, shield.current_lag or "
+            "shield.envelope, or delete [sensors] where a sensor measures the velocity"
+        )  # fmt: skip
+        least, got = SLOWEST_OBSERVER / ts, observer / ts
+        yield observer, ge, SLOWEST_OBSERVER, (
+            f"the way home works for a sensors.observer_bandwidth of {least:g} rad/s at least, or a "
+            f"sensors.velocity_lag of {PER_LAG / least:g} s at most, got {got:g} rad/s, or {PER_LAG / got:g} s; make "
+            "the observer faster"
+        )  # fmt: skip
+    yield lag, le, LONGEST_LAG * ts, (
+        f"the way home works for a shield.current_lag of {LONGEST_LAG * ts:g} s at most, got {lag:g} s; shorten the "
+        "lag of the current loop"
+    )  # fmt: skip
+    if law.coasting:
+        yield home.apex, gt, 0.0, (
             f"from no angle would a brake come to rest in {-law.bottom:.2f} rad of free stroke by friction alone; "
             "widen limits.angle, lower shield.angle_margin or narrow the set"
-        )
-    if law.homeward_speed <= law.velocity_noise or law.cruise <= law.velocity_noise:
-        return (
-            f"with {law.velocity_noise:g} rad/s of noise no homeward speed is left above the lower limit "
-            f"(homeward {law.homeward_speed:.1f} rad/s, cruise {law.cruise:.1f} rad/s); widen limits.angle or "
-            "limits.velocity, or narrow the set"
-        )
+        )  # fmt: skip
+    # The cruise is less than the homeward speed by more than the noise.
+    yield home.cruise, gt, law.velocity_noise, (
+        f"with {law.velocity_noise:g} rad/s of noise no homeward speed is left above the lower limit (homeward "
+        f"{law.homeward_speed:.1f} rad/s, cruise {home.cruise:.1f} rad/s); widen limits.angle or limits.velocity, or "
+        "narrow the set"
+    )  # fmt: skip
     # The extreme brakes of a successor box are those with the least acceleration.
-    change = law.braking + law.spring_low * farthest + law.viscous_high * speed
-    flow = 0.5 * ts * ts * law.viscous_high * change
-    if flow > VELOCITY_PAD:
-        return (
-            f"within a sample of {ts:g} s viscous friction changes by {flow:.2f} rad/s and {VELOCITY_PAD:g} are "
-            "allowed for; shorten timing.sample_time"
-        )
-    damped = law.motor_high * law.current / law.damping_velocity + law.viscous_high
-    if damped * ts >= 1.0 and (bench.node.stop == "damped" or not law.coasting):
-        return (
-            f"the damped stop takes {damped * ts:.2f} of the strongest brake's speed in one sample and would reverse "
-            "it; raise node.damping_velocity"
-        )
-    needed, why = _margin(law)
-    if bench.shield.angle_margin < needed:
-        return (
-            f"{why} needs {needed:.3f} rad beyond the envelope and shield.angle_margin is "
-            f"{bench.shield.angle_margin:g} rad; raise it"
-        )
-    slowed = law.motor_low * law.current * min(1.0, law.homeward_speed / law.damping_velocity)
-    held = slowed + law.friction_low + law.viscous_low * law.homeward_speed - law.spring_high * farthest
-    if held <= 0.0 and not law.coasting:
-        return (
-            f"coming home at {law.homeward_speed:.0f} rad/s from {farthest:g} rad, the stiffest spring accelerates "
-            f"the weakest motor by {-held:.0f} rad/s² against full braking; narrow k_m or k_1"
-        )
-    if law.ramp <= 0.0 or law.landing <= 0.0:
-        return (
-            "the weakest motor cannot bring the brake home against the greatest friction and the stiffest spring "
-            f"(it would accelerate with {law.ramp:.0f} rad/s² and land with {law.landing:.0f} rad/s²); narrow the set"
-        )
-    # Width of a successor box; the windows against the two angle limits must not both close on it.
-    spread = law.current * (law.motor_high - law.motor_low) + law.friction_low + law.friction_high
-    spread += (law.viscous_high - law.viscous_low) * speed + (law.spring_high - law.spring_low) * farthest
-    width = 2.0 * law.velocity_noise + (law.age_high + 1) * (2.0 * VELOCITY_PAD + ts * spread)
-    width += (4.0 * law.lag + 2.0 * ts * law.age_high) * law.motor_high * law.current
-    if law.observer > 0.0:
-        width += 2.0 * (2.0 / law.observer + unseen(law.observer, OLDEST_FRAME - law.age_high)) * law.change
-    room = 2.0 * (0.5 * width * width / law.braking + ts * width * (law.age_high + 2) + law.angle_noise)
-    if law.top - law.bottom <= room and not law.coasting:
-        return (
+    change = box.braking + box.spring_low * farthest + box.viscous_high * speed
+    flow = 0.5 * ts * ts * box.viscous_high * change
+    yield flow, le, VELOCITY_PAD, (
+        f"within a sample of {ts:g} s viscous friction changes by {flow:.2f} rad/s and {VELOCITY_PAD:g} are allowed "
+        "for; shorten timing.sample_time"
+    )  # fmt: skip
+    if bench.node.stop == "damped" or not law.coasting:
+        damped = (box.motor_high * law.current / law.damping_velocity + box.viscous_high) * ts
+        yield damped, lt, 1.0, (
+            f"the damped stop takes {damped:.2f} of the strongest brake's speed in one sample and would reverse it; "
+            "raise node.damping_velocity"
+        )  # fmt: skip
+    margin, (needed, why) = bench.shield.angle_margin, _margin(law)
+    yield margin, ge, needed, (
+        f"{why} needs {needed:.3f} rad beyond the envelope and shield.angle_margin is {margin:g} rad; raise it"
+    )  # fmt: skip
+    if not law.coasting:
+        slowed = box.motor_low * law.current * min(1.0, law.homeward_speed / law.damping_velocity)
+        held = slowed + box.friction_low + box.viscous_low * law.homeward_speed - box.spring_high * farthest
+        yield held, gt, 0.0, (
+            f"coming home at {law.homeward_speed:.0f} rad/s from {farthest:g} rad, the stiffest spring accelerates the "
+            f"weakest motor by {-held:.0f} rad/s² against full braking; narrow k_m or k_1"
+        )  # fmt: skip
+    yield min(home.ramp, home.landing), gt, 0.0, (
+        "the weakest motor cannot bring the brake home against the greatest friction and the stiffest spring (it would "
+        f"accelerate with {home.ramp:.0f} rad/s² and land with {home.landing:.0f} rad/s²); narrow the set"
+    )  # fmt: skip
+    if not law.coasting:
+        room, between = _room(law, speed, farthest), law.top - law.bottom
+        yield between, gt, room, (
             f"what one measurement leaves open needs {room:.2f} rad between the angle limits and there are "
-            f"{law.top - law.bottom:.2f} rad; widen limits.angle"
-        )
-    return ""
+            f"{between:.2f} rad; widen limits.angle"
+        )  # fmt: skip
 
 
-def _uncovered(law: ShieldLaw) -> str:
-    """Settings that are not covered, or not together; "" if all are."""
-    ts = law.sample_time
-    if (law.lag > 0.0) + law.coasting + (law.age_high > 0) > 1:
-        return (
-            "a lag of the current, frames that may be late and the coasting envelope are covered one at a time; choose "
-            "one of shield.current_lag, shield.frame_age and shield.envelope"
-        )
-    if law.observer > 0.0:
-        if law.lag > 0.0 or law.coasting or law.age_high > LATEST_OBSERVED:
-            return (
-                f"an observer's velocity is covered with frames of age {LATEST_OBSERVED} at most, and neither with a "
-                "lag of the current nor with the coasting envelope; change shield.frame_age, shield.current_lag or "
-                "shield.envelope, or delete [sensors] where a sensor measures the velocity"
-            )
-        if law.observer < SLOWEST_OBSERVER:
-            least, got = SLOWEST_OBSERVER / ts, law.observer / ts
-            return (
-                f"the way home works for a sensors.observer_bandwidth of {least:g} rad/s at least, or a "
-                f"sensors.velocity_lag of {PER_LAG / least:g} s at most, got {got:g} rad/s, or {PER_LAG / got:g} s; "
-                "make the observer faster"
-            )
-    if law.lag > LONGEST_LAG * ts:
-        return (
-            f"the way home works for a shield.current_lag of {LONGEST_LAG * ts:g} s at most, got {law.lag:g} s; "
-            "shorten the lag of the current loop"
-        )
-    return ""
+def _room(law: ShieldLaw, speed: float, farthest: float) -> float:
+    """Room in which the windows against the two angle limits do not both close on a successor box [rad]."""
+    ts, box, (lag, _, observer) = law.sample_time, law.box, law.delay
+    spread = law.current * (box.motor_high - box.motor_low) + box.friction_low + box.friction_high
+    spread += (box.viscous_high - box.viscous_low) * speed + (box.spring_high - box.spring_low) * farthest
+    width = 2.0 * law.velocity_noise + (law.age_high + 1) * (2.0 * VELOCITY_PAD + ts * spread)
+    width += (4.0 * lag + 2.0 * ts * law.age_high) * box.motor_high * law.current
+    if observer > 0.0:
+        width += 2.0 * (2.0 / observer + unseen(observer, OLDEST_FRAME - law.age_high)) * law.change
+    return 2.0 * (0.5 * width * width / box.braking + ts * width * (law.age_high + 2) + law.angle_noise)
 
 
 def _margin(law: ShieldLaw) -> tuple[float, str]:
     """Way that the true brake may need beyond the envelope [rad], and the brake that needs it."""
-    ts = law.sample_time
-    needed = chatter_excess(law.friction_low, law.friction_high, ts) + ANGLE_PAD
+    ts, box = law.sample_time, law.box
+    needed = chatter_excess(box.friction_low, box.friction_high, ts) + ANGLE_PAD
     if law.coasting:
-        needed += coasting_excess(law.spring_high, law.friction_low, law.viscous_low, -law.bottom, ts)
-        needed += 0.5 * ts * law.friction_high / law.viscous_low  # Euler's sign() lets it creep until this wears off
+        needed += coasting_excess(box.spring_high, box.friction_low, box.viscous_low, -law.bottom, ts)
+        needed += 0.5 * ts * box.friction_high / box.viscous_low  # Euler's sign() lets it creep until this wears off
         return needed, "a brake that coasts in samples"
-    motors = (law.motor_low, law.motor_high)[: 2 if law.lag > 0.0 else 1]
-    stops = [damped_excess(m, law.friction_low, law.current, law.damping_velocity, ts) for m in motors]
+    motors = (box.motor_low, box.motor_high)[: 2 if law.delay.lag > 0.0 else 1]
+    stops = [damped_excess(m, box.friction_low, law.current, law.damping_velocity, ts) for m in motors]
     # The node brakes against the velocity at the begin of a period, and a current that still flows raises it.
-    held = [ts * law.lag * m * law.current for m in motors]
+    held = [ts * law.delay.lag * m * law.current for m in motors]
     return needed + max(a + b for a, b in zip(stops, held, strict=True)), "the damped stop"

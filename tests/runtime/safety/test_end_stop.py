@@ -39,8 +39,8 @@ def coasted(bench: Bench, hold: float, dice: random.Random) -> float:
     )
     low, high = bench.limits.angle
     x = dice.uniform(low, high)
-    up = min(law.outward_speed, math.sqrt(2.0 * (law.braking + law.spring_low * max(x, 0.0)) * (high - x)))
-    down = min(law.homeward_speed, math.sqrt(2.0 * law.braking * (x - low)))
+    up = min(law.outward_speed, math.sqrt(2.0 * (law.box.braking + law.box.spring_low * max(x, 0.0)) * (high - x)))
+    down = min(law.homeward_speed, math.sqrt(2.0 * law.box.braking * (x - low)))
     v = dice.choice((up, -down))
     pull, fastest, t = math.copysign(motor * law.current, v), 0.0, 0.0
     while low - 20.0 < x < high + 50.0 and t < 0.5:

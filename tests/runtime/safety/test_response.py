@@ -15,13 +15,8 @@ import pytest
 from emb_runtime.config.bench import Bench, Sensors
 from emb_runtime.safety.response import (
     CONTRADICTED,
-    MATRIX,
-    MEMORY,
     OPEN,
-    OVERSHOOT,
     PROVEN,
-    SIZE,
-    STATE,
     Row,
     begin,
     fits,
@@ -93,24 +88,24 @@ def moved(
 
 def judged(bench: Bench, rows: Sequence[Row]) -> tuple[int, int]:
     """First verdict that is not open, and after how many samples."""
-    model, memory = response_model(bench, make_law(bench)), [math.nan] * MEMORY
-    begin(model, memory, rows[0].angle, rows[0].velocity)
+    model = response_model(bench, make_law(bench))
+    state = begin(model, rows[0].angle, rows[0].velocity)
     for k, row in enumerate(rows[1:], 1):
-        if verdict := take(model, memory, *row):
+        state, verdict = take(model, state, *row)
+        if verdict != OPEN:
             return verdict, k
     return OPEN, len(rows) - 1
 
 
 def test_the_estimate_is_that_of_least_squares_with_a_prior() -> None:
     rows = moved([6.0] * 6 + [5.0] * 6 + [3.0] * 6, late=1, noise=4)
-    memory = [math.nan] * MEMORY
-    begin(MODEL, memory, rows[0].angle, rows[0].velocity)
+    state = begin(MODEL, rows[0].angle, rows[0].velocity)
     unknown = np.array([rows[0].velocity, *MODEL.prior, 0.0])
     deviations = np.array([MODEL.deviation, *MODEL.deviations, MODEL.widest])
     lines, measured = [np.diag(1.0 / deviations)], [unknown / deviations]
     total = np.zeros(4)
     for before, row in pairwise(rows):
-        take(MODEL, memory, *row)
+        state, _ = take(MODEL, state, *row)
         pressed = 0.5 * (max(before.angle, 0.0) + max(row.angle, 0.0))
         total += TS * np.array([row.command, -1.0, -pressed, -0.5 * (before.velocity + row.velocity)])
         lines.append(np.array([[1.0, *total, -row.command / 6.0]]) / MODEL.deviation)
@@ -121,11 +116,11 @@ def test_the_estimate_is_that_of_least_squares_with_a_prior() -> None:
     now[0, 1:5] = total  # from the velocity at the begin to the newest
     found = now @ found
     covariance = now @ np.linalg.inv(matrix.T @ matrix) @ now.T
-    np.testing.assert_allclose(memory[STATE : STATE + SIZE], found, rtol=1e-6)
-    np.testing.assert_allclose(np.reshape(memory[MATRIX:], (SIZE, SIZE)), covariance, rtol=1e-4, atol=1e-9)
-    assert overshoot(MODEL, memory, 0.0) == pytest.approx((found[OVERSHOOT], math.sqrt(covariance[5, 5])), rel=1e-4)
+    np.testing.assert_allclose(state.mean, found, rtol=1e-6)
+    np.testing.assert_allclose(state.covariance, covariance[np.triu_indices(6)], rtol=1e-4, atol=1e-9)
+    assert overshoot(MODEL, state, 0.0) == pytest.approx((found[5], math.sqrt(covariance[5, 5])), rel=1e-4)
     share = np.array([0.0, -6.0 * TS, 0.0, 0.0, 0.0, 1.0])
-    assert overshoot(MODEL, memory, TS) == pytest.approx(
+    assert overshoot(MODEL, state, TS) == pytest.approx(
         (share @ found, math.sqrt(share @ covariance @ share)), rel=1e-4
     )
 
@@ -300,8 +295,8 @@ def test_until_then_the_speed_leaves_room_for_six_samples_of_full_current() -> N
     strongest = 3.255e-2 / 4.624e-6 * 6.0
     assert slow.outward_speed == slow.homeward_speed == pytest.approx(500.0 - 6e-3 * strongest)
     assert slow.bottom == 0.5 * LAW.bottom
-    assert slow.cruise == pytest.approx(
-        LAW.cruise * (slow.homeward_speed - LAW.creep) / (LAW.homeward_speed - LAW.creep)
+    assert slow.home.cruise == pytest.approx(
+        LAW.home.cruise * (slow.homeward_speed - LAW.home.creep) / (LAW.homeward_speed - LAW.home.creep)
     )
     late = declaring(frame_age=(1, 2), current_lag=0.0)
     assert unproven_law(late, make_law(late)).outward_speed == pytest.approx(500.0 - 4e-3 * strongest)
@@ -335,9 +330,8 @@ def test_a_sample_that_does_not_follow_begins_the_observer_anew() -> None:
 
 
 def test_a_filter_whose_innovations_are_too_large_does_not_fit() -> None:
-    memory = [0.0] * MEMORY
-    begin(MODEL, memory, 0.0, 0.0)
-    assert fits(MODEL, memory)
+    state = begin(MODEL, 0.0, 0.0)
+    assert fits(MODEL, state)
     for k in range(12):
-        take(MODEL, memory, True, 0.0, 40.0 * (-1.0) ** k + 60.0, 0.0)
-    assert not fits(MODEL, memory)
+        state, _ = take(MODEL, state, True, 0.0, 40.0 * (-1.0) ** k + 60.0, 0.0)
+    assert not fits(MODEL, state)

@@ -20,25 +20,12 @@ from emb_runtime.config.bench import Sensors
 from emb_runtime.records import NodeState, SensorSample
 from emb_runtime.safety.response import (
     CONTRADICTED,
-    COUNT,
-    DOUBTS,
-    LARGEST,
-    LIKELIHOOD,
-    MATRIX,
-    MEMORY,
-    MISFIT,
-    MOTOR,
     OPEN,
-    OVERSHOOT,
     PROVEN,
-    SIZE,
-    SLIDES,
-    STATE,
-    VELOCITY,
-    VERDICT,
     Response,
     ResponseModel,
     Row,
+    State,
     begin,
     overshoot,
     response_model,
@@ -48,9 +35,11 @@ from emb_runtime.safety.response import (
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from emb_runtime.safety.state_machine import Fault, StopError
 from tests.benches import SENSOR_BENCH
+from tests.laws import numbers, with_numbers
 
 BENCH = SENSOR_BENCH
 SHIPPED = make_law(BENCH)
+UPPER = np.triu_indices(6)
 
 
 class Reference:
@@ -70,7 +59,7 @@ class Reference:
         u, before = self.commands[m.age], self.unseen
         self.unseen = self.mean_of_unseen()
         immediate = m.oldest == m.age and not m.lag
-        transient = m.transient * m.motor_high * max(abs(u - c) for c in (self.unseen, *self.commands[m.age :]))
+        transient = m.transient * m.box.motor_high * max(abs(u - c) for c in (self.unseen, *self.commands[m.age :]))
         self.largest = max(self.largest, abs(self.unseen))
         speeds = self.velocity, velocity
         drive, way, noise = self.driven(u, u if immediate else before, transient, speeds)
@@ -114,7 +103,7 @@ class Reference:
         for way in (1.0, -1.0):
             if all(way * v > m.slides for v in speeds):
                 return u, way, 0.0
-        friction = m.sample_time * m.friction_high
+        friction = m.sample_time * m.box.friction_high
         pushed = math.copysign(1.0, u) if u else -1.0
         if any(pushed * v < -m.slides for v in speeds):
             return u, 0.0, friction + transient
@@ -122,7 +111,7 @@ class Reference:
             return 0.0, 0.0, transient
         if pushed * u >= m.moves and pushed * before >= m.moves:
             return u, pushed, 0.0
-        return u / 2.0, 0.0, friction + m.sample_time * m.motor_high * abs(u) / 2.0 + transient
+        return u / 2.0, 0.0, friction + m.sample_time * m.box.motor_high * abs(u) / 2.0 + transient
 
     def beyond(self, response: float) -> tuple[float, float]:
         share = np.array([0.0, -self.model.current * response, 0.0, 0.0, 0.0, 1.0])
@@ -134,7 +123,7 @@ class Reference:
         early, early_error = self.beyond(-m.early)
         if applied * (late - 4.5 * late_error) > n / 2.0 or applied * (early + 4.5 * early_error) < -n / 2.0:
             return CONTRADICTED
-        motor = 0.9 * m.motor_low < self.x[MOTOR] < 1.1 * m.motor_high
+        motor = 0.9 * m.box.motor_low < self.x[1] < 1.1 * m.box.motor_high
         at_once, error = self.beyond(0.0)
         bounded = late + 3.0 * late_error < n and (m.age == 0 or at_once - 3.0 * error > -n)
         return PROVEN if motor and bounded and self.slid >= 2.0 and self.misfit <= 3.0 * self.count else OPEN
@@ -143,8 +132,8 @@ class Reference:
 def drawn_law(dice: Random) -> ShieldLaw:
     low = dice.randrange(3)
     f = dice.uniform
-    return SHIPPED._replace(
-        sample_time=f(5e-4, 2e-3), current=f(3.0, 9.0), age_low=low, age_high=low + dice.choice((0, 0, 1, 3)),
+    return with_numbers(
+        SHIPPED, sample_time=f(5e-4, 2e-3), current=f(3.0, 9.0), age_low=low, age_high=low + dice.choice((0, 0, 1, 3)),
         lag=dice.choice((0.0, 0.0, f(5e-4, 3e-3))), velocity_noise=f(4.0, 9.0), change=f(20.0, 80.0),
         motor_low=f(2000.0, 3000.0), motor_high=f(5000.0, 8000.0), friction_low=f(500.0, 1500.0),
         friction_high=f(2000.0, 4000.0), spring_low=f(20.0, 40.0), spring_high=f(60.0, 120.0),
@@ -161,10 +150,11 @@ def test_the_model_is_that_of_the_page(seed: int) -> None:
     sensors = Sensors("observer", bandwidth) if bandwidth else BENCH.sensors
     bench = replace(BENCH, sensors=sensors, noise=replace(BENCH.noise, velocity=noise))
     model, t = response_model(bench, law), law.sample_time
-    sample = law.motor_high * law.current * t  # what the strongest motor adds in one
+    sample = law.box.motor_high * law.current * t  # what the strongest motor adds in one
     frames = (law.age_high - law.age_low) * t
-    lag = law.lag + (2.0 / bandwidth if bandwidth else 0.0)
-    bounds = [(getattr(law, f"{n}_low"), getattr(law, f"{n}_high")) for n in ("motor", "friction", "spring", "viscous")]
+    lag = law.delay.lag + (2.0 / bandwidth if bandwidth else 0.0)
+    of = numbers(law)
+    bounds = [(of[f"{n}_low"], of[f"{n}_high"]) for n in ("motor", "friction", "spring", "viscous")]
     assert model == ResponseModel(
         sample_time=t,
         current=law.current,
@@ -177,12 +167,10 @@ def test_the_model_is_that_of_the_page(seed: int) -> None:
         early=pytest.approx((0.7 if law.age_low else 6.0) * t),  # type: ignore[arg-type]
         deviation=pytest.approx(max(noise, 0.02 * sample)),  # type: ignore[arg-type]
         slides=pytest.approx(max(law.velocity_noise, 6.0 * max(noise, 0.02 * sample))),  # type: ignore[arg-type]
-        holds=pytest.approx(law.friction_low / law.motor_high),  # type: ignore[arg-type]
-        moves=pytest.approx(law.friction_high / law.motor_low),  # type: ignore[arg-type]
+        holds=pytest.approx(law.box.friction_low / law.box.motor_high),  # type: ignore[arg-type]
+        moves=pytest.approx(law.box.friction_high / law.box.motor_low),  # type: ignore[arg-type]
         change=law.change,
-        motor_low=law.motor_low,
-        motor_high=law.motor_high,
-        friction_high=law.friction_high,
+        box=law.box,
         prior=pytest.approx([np.mean(pair) for pair in bounds]),  # type: ignore[arg-type]
         deviations=pytest.approx([(b - a) / 12**0.5 for a, b in bounds]),  # type: ignore[arg-type]
         widest=pytest.approx(3.0 * sample),  # type: ignore[arg-type]
@@ -201,7 +189,7 @@ def drawn_model(dice: Random) -> ResponseModel:
 
 def samples(dice: Random, model: ResponseModel) -> Iterator[Row]:
     """A brake of about the set that moves with the commands of some periods ago, and jumps now and then."""
-    late, motor = dice.randrange(4), dice.uniform(0.8 * model.motor_low, 1.2 * model.motor_high)
+    late, motor = dice.randrange(4), dice.uniform(0.8 * model.box.motor_low, 1.2 * model.box.motor_high)
     ts, commands, angle, velocity, command = model.sample_time, [0.0] * 6, dice.uniform(-1.0, 1.0), 0.0, 0.0
     levels = [0.0, 0.1, model.holds, model.moves, 0.7, 0.5 * model.current, model.current]
     exact = [model.slides, -model.slides, 0.0, 2.0, -2.0]
@@ -222,49 +210,50 @@ def test_filter_and_verdicts_are_those_of_the_page(seed: int) -> None:
     dice = Random(seed)
     model = drawn_model(dice)
     angle, velocity = dice.uniform(-2.0, 2.0), dice.uniform(-9.0, 9.0)
-    memory, reference = [math.nan] * MEMORY, Reference(model, angle, velocity)
-    begin(model, memory, angle, velocity)
-    assert memory[VERDICT] == OPEN
+    state, reference = begin(model, angle, velocity), Reference(model, angle, velocity)
     for row in samples(dice, model):
-        expected, found = reference.take(*row), take(model, memory, *row)
+        expected = reference.take(*row)
+        state, found = take(model, state, *row)
         scale = np.sqrt(np.diag(reference.p))
-        assert np.abs((memory[STATE:MATRIX] - reference.x) / scale).max() < 1e-5
-        matrix = np.reshape(memory[MATRIX:], (SIZE, SIZE))
-        assert np.abs((matrix - reference.p) / np.outer(scale, scale)).max() < 1e-5
-        sums = memory[COUNT], memory[MISFIT], memory[LIKELIHOOD]
-        assert (memory[SLIDES], memory[DOUBTS]) == (reference.slid, reference.doubts)
-        assert memory[LARGEST] == pytest.approx(reference.largest)
+        assert np.abs((np.array(state.mean) - reference.x) / scale).max() < 1e-5
+        errors = (state.covariance - reference.p[UPPER]) / np.outer(scale, scale)[UPPER]
+        assert np.abs(errors).max() < 1e-5
+        sums = state.innovations, state.misfit, state.likelihood
+        assert (state.slides, state.doubts) == (reference.slid, reference.doubts)
+        assert state.largest == pytest.approx(reference.largest)
         assert sums == pytest.approx((reference.count, reference.misfit, reference.likelihood), rel=1e-6, abs=1e-6)
-        assert found == memory[VERDICT] == expected
+        assert found == expected
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_slow_law_is_that_of_the_page(seed: int) -> None:
     dice = Random(seed)
-    law = drawn_law(dice)._replace(
-        bottom=-dice.uniform(2.0, 5.0), creep=dice.uniform(1.0, 9.0), cruise=dice.uniform(0.1, 0.9),
+    law = with_numbers(
+        drawn_law(dice), bottom=-dice.uniform(2.0, 5.0), creep=dice.uniform(1.0, 9.0), cruise=dice.uniform(0.1, 0.9),
         outward_speed=dice.uniform(50.0, 600.0), homeward_speed=dice.uniform(50.0, 600.0),
     )  # fmt: skip
     limit, bandwidth = dice.uniform(200.0, 900.0), dice.uniform(400.0, 4000.0)
     bench = replace(BENCH, sensors=Sensors("observer", bandwidth), limits=replace(BENCH.limits, velocity=limit))
     t = law.sample_time
-    declared = (law.age_high - law.age_low) * t + law.lag + 2.0 / bandwidth
+    declared = (law.age_high - law.age_low) * t + law.delay.lag + 2.0 / bandwidth
     unknown = (6.0 - law.age_low) * t - declared
-    fastest = max(limit - unknown * law.motor_high * law.current, 0.25 * law.homeward_speed)
+    fastest = max(limit - unknown * law.box.motor_high * law.current, 0.25 * law.homeward_speed)
     homeward = min(math.sqrt(0.5) * law.homeward_speed, fastest)
     slow = unproven_law(bench, law)
     assert slow.outward_speed == pytest.approx(min(law.outward_speed, fastest))
     assert slow.homeward_speed == pytest.approx(homeward)
     assert slow.bottom == 0.5 * law.bottom
-    assert slow.cruise == pytest.approx(law.cruise * (homeward - law.creep) / (law.homeward_speed - law.creep))
-    same = {name: getattr(law, name) for name in ("outward_speed", "homeward_speed", "bottom", "cruise")}
-    assert slow._replace(**same) == law
+    home = law.home
+    assert slow.home.cruise == pytest.approx(home.cruise * (homeward - home.creep) / (law.homeward_speed - home.creep))
+    same = {name: numbers(law)[name] for name in ("outward_speed", "homeward_speed", "bottom", "cruise")}
+    assert with_numbers(slow, **same) == law
 
 
 NEAT = response_model(BENCH, SHIPPED)._replace(
     sample_time=2.0**-10, current=8.0, extra=0.0, transient=0.0, early=0.0, deviation=1.0, slides=8.0,
-    motor_low=1000.0, motor_high=2000.0,
+    box=SHIPPED.box._replace(motor_low=1000.0, motor_high=2000.0),
 )  # fmt: skip
+EXACT: State = begin(NEAT._replace(deviation=0.0, deviations=(0.0, 0.0, 0.0, 0.0), widest=0.0), 0.0, 100.0)
 KNOWN = {"overshoot": 0.0, "largest": 8.0, "motor": 1500.0, "slides": 1.0, "misfit": 0.0, "age": 0}
 
 
@@ -296,24 +285,19 @@ KNOWN = {"overshoot": 0.0, "largest": 8.0, "motor": 1500.0, "slides": 1.0, "misf
     ],
 )
 def test_verdicts_at_their_thresholds_where_all_is_known_exactly(known: dict[str, float], verdict: int) -> None:
-    state = KNOWN | known
-    memory = [0.0] * MEMORY
-    memory[VELOCITY] = memory[STATE] = 100.0
-    memory[STATE + MOTOR], memory[STATE + OVERSHOOT] = state["motor"], state["overshoot"]
-    memory[LARGEST], memory[SLIDES] = state["largest"], state["slides"]
-    memory[COUNT], memory[MISFIT] = 3.0, state["misfit"]
-    model = NEAT._replace(age=int(state["age"]), oldest=int(state["age"]))
-    assert take(model, memory, True, 0.0, 100.0, 0.0) == verdict
+    are = KNOWN | known
+    mean = 100.0, are["motor"], 0.0, 0.0, 0.0, are["overshoot"]
+    state = EXACT._replace(
+        mean=mean, largest=are["largest"], slides=are["slides"], innovations=3.0, misfit=are["misfit"]
+    )
+    model = NEAT._replace(age=int(are["age"]), oldest=int(are["age"]))
+    assert take(model, state, True, 0.0, 100.0, 0.0)[1] == verdict
 
 
 def test_a_variance_that_rounding_makes_negative_counts_as_none() -> None:
-    memory = [0.0] * MEMORY
-    memory[STATE + OVERSHOOT], memory[MATRIX + (SIZE + 1) * OVERSHOOT] = 2.0, -1e-9
-    assert overshoot(NEAT, memory, 0.0) == (2.0, 0.0)
-    memory[VELOCITY] = memory[STATE] = 100.0
-    memory[MATRIX] = -4.0
-    take(NEAT, memory, True, 0.0, 101.0, 0.0)
-    assert memory[MISFIT] == 1.0  # of the measurement's variance alone
+    state = EXACT._replace(mean=(100.0, 0.0, 0.0, 0.0, 0.0, 2.0), covariance=(-4.0, *EXACT.covariance[1:20], -1e-9))
+    assert overshoot(NEAT, state, 0.0) == (2.0, 0.0)
+    assert take(NEAT, state, True, 0.0, 101.0, 0.0)[0].misfit == 1.0  # of the measurement's variance alone
 
 
 def sample(row: Row) -> SensorSample:
@@ -347,7 +331,8 @@ def test_a_run_has_the_slow_law_until_its_response_is_proven_and_again_in_the_ne
         assert response.rows == [Row(False, 0.0, 0.0, 0.0), *sliding(0)[: len(response.rows) - 1]]
         assert response.text.startswith("the velocity follows the commands 0.0 ± 0.")
         assert response.text.endswith(" samples late, at most 0 are declared")
-        response._memory[STATE + OVERSHOOT] = -1e-3
+        state = response._state
+        response._state = state._replace(mean=(*state.mean[:5], -1e-3))
         assert response.text.startswith("the velocity follows the commands 0.0 ± 0.")
 
 

@@ -36,6 +36,7 @@ from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresh
 from emb_runtime.safety.shield_design import VELOCITY_PAD, ShieldLaw, make_law
 from emb_runtime.safety.state_machine import Fault, StopError
 from tests.benches import SENSOR_BENCH
+from tests.laws import with_numbers
 
 BENCH = SENSOR_BENCH
 SHIPPED = make_law(BENCH)
@@ -167,25 +168,25 @@ class Reference:
         may = [now, *self.acted]
         self.acted = ([now] * (missing + 1) + self.acted)[: shown_late(law) + 1]
         acting = min(low for low, _ in may), max(high for _, high in may)
-        if law.lag == 0.0:
+        if law.delay.lag == 0.0:
             return acting
         low, high = self.flowing
         self.flowing = (
-            min(acting[0], acting[0] + law.kept * (low - acting[0])),
-            max(acting[1], acting[1] + law.kept * (high - acting[1])),
+            min(acting[0], acting[0] + law.delay.kept * (low - acting[0])),
+            max(acting[1], acting[1] + law.delay.kept * (high - acting[1])),
         )
         return min(acting[0], low), max(acting[1], high)
 
 
 def shown_late(law: ShieldLaw) -> int:
     """Periods before the last two that count: those of late frames, and whole time constants of an observer."""
-    return min(law.age_high + (math.floor(1.0 / law.observer) if law.observer else 0), 5)
+    return min(law.age_high + (math.floor(1.0 / law.delay.observer) if law.delay.observer else 0), 5)
 
 
 def drives_of(law: ShieldLaw, angles: Range, currents: Range) -> Iterator[float]:
     """What motor and spring of the brakes at the corners of the set do [rad/s²]."""
     xs = angles[0] - law.reach, angles[1] + law.reach
-    motors, springs = (law.motor_low, law.motor_high), (law.spring_low, law.spring_high)
+    motors, springs = (law.box.motor_low, law.box.motor_high), (law.box.spring_low, law.box.spring_high)
     for m, k, x, u in itertools.product(motors, springs, xs, currents):
         yield m * u - k * max(x, 0.0)
 
@@ -195,8 +196,8 @@ def gain(law: ShieldLaw, v: float, drive: float) -> float:
     against = 1.0 if v > 0.0 else -1.0
     after = max(
         v + law.sample_time * (drive - against * c - d * v)
-        for c in (law.friction_low, law.friction_high)
-        for d in (law.viscous_low, law.viscous_high)
+        for c in (law.box.friction_low, law.box.friction_high)
+        for d in (law.box.viscous_low, law.box.viscous_high)
     )
     return (max(after, 0.0) if v > 0.0 else after) - v + VELOCITY_PAD
 
@@ -207,7 +208,8 @@ def drawn_law(rng: Random) -> ShieldLaw:
         for low, high in ((1500.0, 6000.0), (30.0, 140.0), (800.0, 3400.0), (2.0, 9.0))
     )
     lag, observer = rng.choice([(0.0, 0.0), (rng.uniform(5e-4, 3e-3), 0.0), (0.0, rng.uniform(0.3, 3.0))])
-    return SHIPPED._replace(
+    return with_numbers(
+        SHIPPED,
         sample_time=rng.uniform(0.8e-3, 1.2e-3),
         age_high=rng.choice([0, 0, 1, 2, OLDEST_FRAME]),
         current=rng.uniform(3.0, 6.0),
@@ -247,8 +249,8 @@ def drawn_samples(rng: Random, law: ShieldLaw, count: int) -> Iterator[Sample]:
     """A brake somewhere near the set, with signs, lies, gaps and disobedience that change now and then."""
     x, v, drift, offset = 0.0, 0.0, 0.0, 0.0
     signs = [rng.choice([1.0, 1.0, -1.0]) for _ in range(3)]
-    motor, friction = rng.uniform(0.5, 1.5) * law.motor_high, rng.uniform(0.5, 1.5) * law.friction_low
-    spring = rng.uniform(law.spring_low, law.spring_high)
+    motor, friction = rng.uniform(0.5, 1.5) * law.box.motor_high, rng.uniform(0.5, 1.5) * law.box.friction_low
+    spring = rng.uniform(law.box.spring_low, law.box.spring_high)
     gaps, disobeyed, lies = rng.choice([0.0, 0.2]), rng.choice([0.0, 0.2]), rng.choice([0.0, 0.1])
     command = angle_lie = 0.0
     for _ in range(count):
@@ -438,19 +440,20 @@ def test_the_thresholds_are_those_of_the_page() -> None:
             timing=replace(BENCH.timing, horizon=horizon),
             guard=replace(BENCH.guard, current_error=tolerated),
         )
-        law = drawn_law(rng)._replace(observer=0.0)
+        law = with_numbers(drawn_law(rng), observer=0.0)
         t = law.sample_time
         for observer, samples in ((0.5, 4.0), (2.0, 1.0), (3.0, 0.75)):
-            observed = sensor_thresholds(bench, law._replace(observer=observer))
+            observed = sensor_thresholds(bench, with_numbers(law, observer=observer))
             assert observed.lag == pytest.approx(samples * t)
             assert observed.lead == pytest.approx(0.75 * t)
         found = sensor_thresholds(bench, law)
         assert found.offset == pytest.approx(sigma / 2)
         assert found.travel == pytest.approx(2 * law.angle_noise + 4 * t * sigma * math.log(2 * horizon / 1e-9))
         assert found.lag == found.lead == pytest.approx(0.75 * t)
-        assert found.motion == pytest.approx(2 * law.velocity_noise + t * (law.friction_low + law.friction_high))
+        mistaken = law.box.friction_low + law.box.friction_high
+        assert found.motion == pytest.approx(2 * law.velocity_noise + t * mistaken)
         assert found.current_error == tolerated
-        gentle = 1.5 * law.friction_high / law.motor_low
+        gentle = 1.5 * law.box.friction_high / law.box.motor_low
         assert found.first_current == pytest.approx(gentle if gentle < law.current else law.current)
 
 
@@ -458,25 +461,25 @@ def test_the_thresholds_of_the_shipped_bench_are_those_that_the_page_states() ->
     limits = sensor_thresholds(BENCH, SHIPPED)
     stated = round(limits.travel, 2), limits.offset, round(limits.motion, 1), round(limits.first_current, 2)
     assert stated == (0.12, 0.5, 16.5, 2.15)
-    held = SHIPPED.friction_low / SHIPPED.spring_high
+    held = SHIPPED.box.friction_low / SHIPPED.box.spring_high
     missing = SHIPPED.change * SHIPPED.sample_time  # A T²/4 of one lost sample, T two periods
     assert (round(held, 1), round(held / 2.0, 1), round(missing, 3)) == (7.9, 4.0, 0.065)
     assert sensor_thresholds(BENCH, SHIPPED._replace(current=1.0)).first_current == 1.0
 
 
 def test_friction_alone_stops_a_brake_within_the_free_stroke_and_what_the_spring_allows() -> None:
-    law = SHIPPED._replace(friction_low=4.0, velocity_noise=0.0, angle_noise=0.0, bottom=-2.0, spring_high=0.5)
+    law = with_numbers(SHIPPED, friction_low=4.0, velocity_noise=0.0, angle_noise=0.0, bottom=-2.0, spring_high=0.5)
     assert coasting_time(law, 1.5, 2.0) == 1.0  # twice v / d_1; 1.5 rad and v² / 2 d_1 are the free stroke
     assert coasting_time(law, -1.5, -2.0) == 1.0
     assert coasting_time(law, -1.5, -2.0, 4.5) == 2.0  # with what is not seen yet, and the spring's 0.75 against it
     assert coasting_time(law, 1.501, 2.0) == 0.0
-    stiff = law._replace(bottom=-9.0, spring_high=2.0)
+    stiff = with_numbers(law, bottom=-9.0, spring_high=2.0)
     assert coasting_time(stiff, 1.0, 2.0 * math.sqrt(2.0)) == math.sqrt(2.0)  # and d_1 / w_2
     assert coasting_time(stiff, 1.0, 2.001 * math.sqrt(2.0)) == 0.0
     assert coasting_time(stiff, 1.0, 0.0) == 0.0  # at rest there is nothing to wait for
     assert coasting_time(stiff, -1.0, 1.0) == 0.5  # nor beyond d_1 / 2 w_2, where it would take too long
     assert coasting_time(stiff, -1.001, 1.0) == 0.0
-    noisy = law._replace(bottom=-90.0, spring_high=0.01, angle_noise=0.5, velocity_noise=1.0)
+    noisy = with_numbers(law, bottom=-90.0, spring_high=0.01, angle_noise=0.5, velocity_noise=1.0)
     assert coasting_time(noisy, 1.0, 3.0) == 2.0
     assert coasting_time(noisy._replace(bottom=-3.5), 1.0, 3.0) == 2.0
     assert coasting_time(noisy._replace(bottom=-3.49), 1.0, 3.0) == 0.0
@@ -544,26 +547,26 @@ def unseen_of_the_page(law: ShieldLaw, limits: SensorThresholds, state: State) -
     """Speed that currents add which have acted and are not in the sample yet."""
     acted = [max(map(abs, both)) for both in zip(state.lows, state.highs, strict=True)][: shown_late(law) + 1]
     unseen = law.sample_time * sum(acted[: law.age_high]) + limits.lag * max(acted[law.age_high :])
-    return law.motor_high * (unseen + law.lag * max(map(abs, state.flowing)))
+    return law.box.motor_high * (unseen + law.delay.lag * max(map(abs, state.flowing)))
 
 
 def most_of_the_page(law: ShieldLaw, limits: SensorThresholds, state: State) -> float:
     """Largest current of the first move, by bisection over what the worst brake does in two periods."""
-    t, d = law.sample_time, law.friction_low
+    t, d = law.sample_time, law.box.friction_low
     now = abs(state.velocity) + law.velocity_noise + unseen_of_the_page(law, limits, state)
-    stroke = min(-law.bottom, d / law.spring_high)
+    stroke = min(-law.bottom, d / law.box.spring_high)
     angle = abs(state.angle) + 2.0 * law.angle_noise
     if angle < stroke:  # within this and the next period, and the frames' age, by the greatest speed that ends there
         angle += (2 + law.age_high) * t * math.sqrt(2.0 * d * (stroke - angle))
 
     def is_stopped(u: float) -> bool:
-        after = now + t * law.motor_high * u
-        driven = after + t * (law.motor_high * law.current * after / law.damping_velocity - d)
+        after = now + t * law.box.motor_high * u
+        driven = after + t * (law.box.motor_high * law.current * after / law.damping_velocity - d)
         squared = (driven + 2.0 * law.velocity_noise) ** 2
-        return angle <= d / law.spring_high / 2.0 and angle + squared / (2.0 * d) <= stroke
+        return angle <= d / law.box.spring_high / 2.0 and angle + squared / (2.0 * d) <= stroke
 
     low, high = 0.0, 1000.0
-    if angle > min(d / law.spring_high / 2.0, stroke):  # nothing that moves there is stopped by friction for sure
+    if angle > min(d / law.box.spring_high / 2.0, stroke):  # nothing that moves there is stopped by friction for sure
         return limits.first_current
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -581,7 +584,7 @@ def test_the_first_move_is_what_friction_stops_by_the_page() -> None:
         pairs = [sorted(rng.choice([0.0, 1.0]) * rng.gauss(0.0, 1.0) for _ in "ab") for _ in NO_CURRENTS]
         lows, highs = zip(*pairs, strict=True)
         state = state._replace(lows=cast(Currents, lows), highs=cast(Currents, highs))
-        if law.lag:
+        if law.delay.lag:
             state = state._replace(flowing=(-rng.random(), rng.random()))
         assert unseen_speed(law, limits, state) == pytest.approx(unseen_of_the_page(law, limits, state))
         most = most_of_the_page(law, limits, state)
@@ -594,8 +597,8 @@ def test_the_first_move_is_what_friction_stops_by_the_page() -> None:
 
 
 def test_the_first_move_is_more_than_gentle_up_to_where_half_of_the_friction_holds_the_spring() -> None:
-    law = SHIPPED._replace(
-        friction_low=1024.0, spring_high=128.0, angle_noise=0.0, sample_time=2.0**-10, bottom=-5.875
+    law = with_numbers(
+        SHIPPED, friction_low=1024.0, spring_high=128.0, angle_noise=0.0, sample_time=2.0**-10, bottom=-5.875
     )  # half of the friction holds 4 rad, and friction stops 64 rad/s within the 2 rad from 3.875 to 5.875
     limits = sensor_thresholds(BENCH, law)._replace(first_current=0.25)
     assert largest_current(law, limits, begin(3.875, 0.0), 100.0) > 0.25  # and 64 rad/s for two periods are 0.125 rad

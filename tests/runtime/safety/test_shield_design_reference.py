@@ -30,6 +30,7 @@ from emb_runtime.safety.shield_design import (
     unseen,
 )
 from tests.benches import SENSOR_BENCH
+from tests.laws import numbers, with_numbers
 
 SHIPPED = SENSOR_BENCH
 PAD = 0.3  # rad/s, as docs/explanation/shield.md says
@@ -183,7 +184,7 @@ def test_a_law_s_numbers_are_those_of_their_definitions(kind: dict[str, Any]) ->
     rng = Random(3)
     for _ in range(4):
         bench = taken(drawn_bench(rng), **kind)
-        assert make_law(bench)._asdict() == pytest.approx(defined(bench), rel=1e-12)
+        assert numbers(make_law(bench)) == pytest.approx(defined(bench), rel=1e-12)
 
 
 # --- Refusals: just inside the inequality a law is made, just outside the bench is refused for it --------------------
@@ -444,8 +445,8 @@ def test_a_low_passed_difference_quotient_is_among_those_assumed_of_its_lag(kept
 
 def test_a_margin_of_just_what_is_needed_is_enough() -> None:
     law = make_law(SHIPPED)
-    needed = chatter_excess(law.friction_low, law.friction_high, law.sample_time) + 0.005
-    needed += damped_excess(law.motor_low, law.friction_low, law.current, law.damping_velocity, law.sample_time)
+    needed = chatter_excess(law.box.friction_low, law.box.friction_high, law.sample_time) + 0.005
+    needed += damped_excess(law.box.motor_low, law.box.friction_low, law.current, law.damping_velocity, law.sample_time)
     make_law(taken(SHIPPED, angle_margin=needed))
 
 
@@ -455,14 +456,14 @@ def test_a_bench_of_one_brake_and_hardly_any_stroke_has_a_law_too() -> None:
     bench = taken(bench, break_away=1.0, f_l=0.0, angle_low=-bench.shield.angle_margin - 0.0012, angle_high=5.0)
     law = make_law(bench)
     assert law.homeward_speed < 1.0
-    assert law._asdict() == pytest.approx(defined(bench), rel=1e-9)
+    assert numbers(law) == pytest.approx(defined(bench), rel=1e-9)
 
 
 @pytest.mark.parametrize(("angle_high", "apex"), [(0.5, False), (0.9, False), (1.5, True)])
 def test_a_coasting_bench_needs_an_apex_beyond_the_origin(angle_high: float, apex: bool) -> None:
     bench = taken(drawn_bench(Random(5)), **COASTING, angle_high=angle_high)
     if apex:
-        assert 0.0 < make_law(bench).apex < 1.0
+        assert 0.0 < make_law(bench).home.apex < 1.0
         return
     with pytest.raises(BenchFileError, match="from no angle would a brake come to rest"):
         make_law(bench)
@@ -572,5 +573,5 @@ def test_a_refusal_names_the_largest_whole_angle_that_the_shield_could_hold_if_t
 def test_a_way_home_is_always_two_samples_and_the_settling_time_before_its_end(
     steps: int, settling: float, sample_time: float, late: int
 ) -> None:
-    law = make_law(SENSOR_BENCH)._replace(steps=steps, settling=settling, sample_time=sample_time)
+    law = with_numbers(make_law(SENSOR_BENCH), steps=steps, settling=settling, sample_time=sample_time)
     assert late_step(law) == late

@@ -20,6 +20,7 @@ from emb_runtime.records import Reason
 from emb_runtime.safety.shield import LIMITED, NO_PAST, RETURNING, Past, _moved_by, shield, successor, window
 from emb_runtime.safety.shield_design import CREEPS, VELOCITY_PAD, ShieldLaw, make_law
 from tests.benches import SENSOR_BENCH
+from tests.laws import with_numbers
 
 Box = tuple[float, float, float, float]
 SHIPPED = make_law(SENSOR_BENCH)
@@ -36,7 +37,8 @@ def drawn_law(rng: Random) -> ShieldLaw:
         sorted((rng.uniform(low, high), rng.uniform(low, high)))
         for low, high in ((1500.0, 6000.0), (30.0, 140.0), (800.0, 3400.0), (2.0, 9.0))
     )
-    return SHIPPED._replace(
+    return with_numbers(
+        SHIPPED,
         sample_time=rng.uniform(0.8e-3, 1.2e-3),
         steps=500,
         current=current,
@@ -123,10 +125,10 @@ def corners(law: ShieldLaw, box: Box, u: float) -> Iterator[float]:
         yield 0.0  # it sticks
     for (v, sign), m, k, c, d, x in itertools.product(
         starts,
-        (law.motor_low, law.motor_high),
-        (law.spring_low, law.spring_high),
-        (law.friction_low, law.friction_high),
-        (law.viscous_low, law.viscous_high),
+        (law.box.motor_low, law.box.motor_high),
+        (law.box.spring_low, law.box.spring_high),
+        (law.box.friction_low, law.box.friction_high),
+        (law.box.viscous_low, law.box.viscous_high),
         (xl - law.reach, xh + law.reach),
     ):
         after = v + law.sample_time * (m * u - k * max(x, 0.0) - sign * c - d * v)
@@ -174,11 +176,11 @@ def held_by_braking(law: ShieldLaw, box: Box, u: float, sign: float) -> bool:
         room, before, braking, fastest = (
             law.top - xh,
             vh,
-            law.braking + law.spring_low * max(xl, 0.0),
+            law.box.braking + law.box.spring_low * max(xl, 0.0),
             law.outward_speed,
         )
     else:
-        room, before, braking, fastest = xl - law.bottom, -vl, law.braking, law.homeward_speed
+        room, before, braking, fastest = xl - law.bottom, -vl, law.box.braking, law.homeward_speed
     return v <= fastest and way(law, braking, max(v, VELOCITY_PAD), before) <= room
 
 
@@ -190,9 +192,10 @@ def held_by_friction(law: ShieldLaw, box: Box, u: float, sign: float) -> bool:
     above, below = xh + ts * max(vh + law.change, 0.0), xl + ts * min(vl - law.change, 0.0)
     squeezed = max(above, 0.0) ** 2 / 2.0
     if sign > 0.0:
-        taken = law.friction_low * (law.apex - above) + law.spring_low * (law.apex**2 / 2.0 - squeezed)
+        taken = law.box.friction_low * (law.home.apex - above)
+        taken += law.box.spring_low * (law.home.apex**2 / 2.0 - squeezed)
         return v <= law.outward_speed and v * v / 2.0 <= taken
-    return v <= law.homeward_speed and v * v / 2.0 + law.spring_high * squeezed <= law.friction_low * (
+    return v <= law.homeward_speed and v * v / 2.0 + law.box.spring_high * squeezed <= law.box.friction_low * (
         below - law.bottom
     )
 
@@ -237,7 +240,7 @@ def test_the_window_is_what_every_brake_of_the_box_can_be_held_from() -> None:
 def test_the_coasting_window_is_what_friction_alone_can_hold() -> None:
     for rng in draws():
         law = drawn_law(rng)._replace(coasting=True, homeward_speed=rng.uniform(50.0, 300.0))
-        angle, velocity = drawn_state(rng, law._replace(top=law.apex))
+        angle, velocity = drawn_state(rng, law._replace(top=law.home.apex))
         velocity *= rng.choice([1.0, 0.3])
         ends = window(law, angle, velocity, NO_PAST)
         assert ends[0] <= 0.0 <= ends[1]
@@ -269,7 +272,7 @@ def observed(law: ShieldLaw, angle: float, velocity: float, past: Past, age: int
 
     At the time τ before, a critically damped observer of the bandwidth ω shows 1 − (1 + ωτ) exp(−ωτ) of a change.
     """
-    scaled = law.observer
+    scaled = law.delay.observer
 
     def hidden(first: int, end: float) -> float:
         """Samples that an acceleration between these samples before counts for."""
@@ -288,12 +291,12 @@ def observed(law: ShieldLaw, angle: float, velocity: float, past: Past, age: int
         accelerations = [
             m * current - k * max(x, 0.0) - math.copysign(d, v) - c * v
             for m, current, k, x, d, c, v in itertools.product(
-                (law.motor_low, law.motor_high),
+                (law.box.motor_low, law.box.motor_high),
                 (min(u), max(u)),
-                (law.spring_low, law.spring_high),
+                (law.box.spring_low, law.box.spring_high),
                 (xl - (i + 1) * law.reach, xh + (i + 1) * law.reach),
-                (law.friction_low, law.friction_high),
-                (law.viscous_low, law.viscous_high),
+                (law.box.friction_low, law.box.friction_high),
+                (law.box.viscous_low, law.box.viscous_high),
                 (slowest, fastest),
             )
         ]
@@ -309,7 +312,7 @@ OBSERVED_AGES = [(0, 0), (0, 1), (1, 1)]
 def test_the_window_behind_an_observer_holds_whatever_it_does_not_show_yet(ages: tuple[int, int]) -> None:
     rng = Random(100 + 10 * ages[0] + ages[1])
     for _ in range(100):
-        law = drawn_law(rng)._replace(age_low=ages[0], age_high=ages[1], observer=rng.uniform(0.5, 3.0))
+        law = with_numbers(drawn_law(rng), age_low=ages[0], age_high=ages[1], observer=rng.uniform(0.5, 3.0))
         law = law._replace(change=rng.choice([law.change, 5.0]))
         angle, velocity = drawn_state(rng, law)
         past = drawn_past(rng, law)
@@ -322,8 +325,8 @@ def test_the_window_behind_an_observer_holds_whatever_it_does_not_show_yet(ages:
 
 def test_a_brake_at_rest_may_be_pushed_by_its_friction_the_next_moment() -> None:
     law = drawn_law(Random(13))
-    assert _moved_by(law, 0.0, 10.0) == 10.0 + law.friction_high
-    assert _moved_by(law, 0.5, 10.0) == 10.0 - law.friction_low - law.viscous_low * 0.5
+    assert _moved_by(law, 0.0, 10.0) == 10.0 + law.box.friction_high
+    assert _moved_by(law, 0.5, 10.0) == 10.0 - law.box.friction_low - law.box.viscous_low * 0.5
 
 
 def drawn_past(rng: Random, law: ShieldLaw) -> Past:
@@ -355,7 +358,7 @@ def flowing_at_most(law: ShieldLaw, past: Past, velocity: float) -> float:
         for periods_ago in (5, 4, 3, 2, 1):
             own = max(-law.current, min(law.current, past[periods_ago - 1]))
             u = own if which[periods_ago - 1] else damped(law, velocity - periods_ago * law.change)
-            flowing = max(u, u + (flowing - u) * law.kept)
+            flowing = max(u, u + (flowing - u) * law.delay.kept)
         greatest = max(greatest, flowing)
     return greatest
 
@@ -363,19 +366,21 @@ def flowing_at_most(law: ShieldLaw, past: Past, velocity: float) -> float:
 def held_with_lag(law: ShieldLaw, box: Box, u: float, sign: float, flowing: float) -> bool:
     """Whether a brake with either motor keeps its speed and can be stopped, though its current follows late."""
     xl, xh, vl, vh = box
-    ts, lag = law.sample_time, law.lag
+    ts, lag = law.sample_time, law.delay.lag
     if sign > 0.0:
         begin, fastest, room = (vl, vh), law.outward_speed, law.top - xh
-        soft, held = law.spring_low * max(xl - law.reach, 0.0), law.spring_low * max(xl, 0.0)
+        soft, held = law.box.spring_low * max(xl - law.reach, 0.0), law.box.spring_low * max(xl, 0.0)
     else:
         begin, fastest, room = (-vh, -vl), law.homeward_speed, xl - law.bottom
-        soft, held = -law.spring_high * max(xh + law.reach, 0.0), 0.0
+        soft, held = -law.box.spring_high * max(xh + law.reach, 0.0), 0.0
     turns = begin[0] <= law.change
-    going_back = law.viscous_high * max(law.change - begin[1], 0.0)
-    friction = -law.friction_high - going_back if turns else law.friction_low + law.viscous_low * begin[1]
-    for motor, braking in ((law.motor_low, law.braking + held), (law.motor_high, law.braking_high + held)):
+    going_back = law.box.viscous_high * max(law.change - begin[1], 0.0)
+    friction = -law.box.friction_high - going_back if turns else law.box.friction_low + law.box.viscous_low * begin[1]
+    weak, strong = (law.box.motor_low, law.box.braking), (law.box.motor_high, law.box.braking_high)
+    for motor, unhelped in (weak, strong):
+        braking = unhelped + held
         gained = ts * (motor * sign * u - friction - soft) + VELOCITY_PAD
-        rises = lag * max(motor * flowing + max(-soft - law.friction_low, 0.0), 0.0)
+        rises = lag * max(motor * flowing + max(-soft - law.box.friction_low, 0.0), 0.0)
         as_if = begin[1] + lag * motor * (flowing + law.current)
         if begin[1] + rises + gained > fastest or way(law, braking, max(as_if + gained, VELOCITY_PAD), as_if) > room:
             return False
@@ -384,7 +389,7 @@ def held_with_lag(law: ShieldLaw, box: Box, u: float, sign: float, flowing: floa
 
 def test_the_window_of_a_current_that_follows_late_is_what_either_motor_can_be_held_from() -> None:
     for rng in draws():
-        law = drawn_law(rng)._replace(lag=rng.uniform(0.5e-3, 2e-3), kept=rng.uniform(0.3, 0.7))
+        law = with_numbers(drawn_law(rng), lag=rng.uniform(0.5e-3, 2e-3), kept=rng.uniform(0.3, 0.7))
         angle, velocity = drawn_state(rng, law)
         past = drawn_past(rng, law)
         near = abs(velocity) - law.velocity_noise
@@ -412,14 +417,14 @@ def root(rising: Callable[[float], float], low: float, high: float) -> float:
 
 def lost_by_creeping(law: ShieldLaw, x: float) -> float:
     """Trapezoids of what the slower speed of the coasting envelope costs on the way from ``x`` [s]."""
-    begin, end = 2.0 * law.friction_low / law.spring_high, min(x, law.apex)
+    begin, end = 2.0 * law.box.friction_low / law.box.spring_high, min(x, law.home.apex)
     if end <= begin:
         return 0.0
 
     def costs(at: float) -> float:
-        energy = law.friction_low * (at - law.bottom) - 0.5 * law.spring_high * at**2
+        energy = law.box.friction_low * (at - law.bottom) - 0.5 * law.box.spring_high * at**2
         fastest = math.sqrt(2.0 * energy) if energy > 0.0 else 0.0
-        return max(0.0, 1.0 / (max(fastest, CREEPS * law.creep) - law.creep) - 1.0 / law.cruise)
+        return max(0.0, 1.0 / (max(fastest, CREEPS * law.home.creep) - law.home.creep) - 1.0 / law.home.cruise)
 
     nodes = [begin + (end - begin) * i / 8.0 for i in range(9)]
     return sum(0.5 * (b - a) * (costs(a) + costs(b)) for a, b in itertools.pairwise(nodes))
@@ -429,30 +434,32 @@ def arrival(law: ShieldLaw, x: float, v: float) -> float:
     """Time of the way home from a corner of the box, phase by phase [s]."""
     time = 0.0
     inside = x >= 0.0
-    spring = law.spring_low * x if inside else 0.0
+    spring = law.box.spring_low * x if inside else 0.0
     distance, homeward = abs(x), -v if inside else v
     if homeward < 0.0:  # away from home: stop first
-        stop = -homeward / (law.braking + spring)
+        stop = -homeward / (law.box.braking + spring)
         time += stop
         distance += -homeward * stop / 2.0 + law.sample_time * -homeward / 2.0
         homeward = 0.0
-    landing_way = homeward**2 / (2.0 * law.landing)
+    landing_way = homeward**2 / (2.0 * law.home.landing)
     if landing_way > distance:  # past the origin, and back from the other side, where there is no spring
-        time += homeward / law.landing
+        time += homeward / law.home.landing
         distance, homeward, spring = landing_way - distance, 0.0, 0.0
-    ramp = law.ramp + spring / 2.0
-    peak = root(lambda p: (p**2 - homeward**2) / (2.0 * ramp) + p**2 / (2.0 * law.landing) - distance, homeward, 1e5)
-    peak = max(min(peak, law.cruise), homeward)
-    at_cruise = distance - (peak**2 - homeward**2) / (2.0 * ramp) - peak**2 / (2.0 * law.landing)
-    time += (peak - homeward) / ramp + peak / law.landing + max(at_cruise, 0.0) / law.cruise
+    ramp = law.home.ramp + spring / 2.0
+    landing = law.home.landing
+    peak = root(lambda p: (p**2 - homeward**2) / (2.0 * ramp) + p**2 / (2.0 * landing) - distance, homeward, 1e5)
+    peak = max(min(peak, law.home.cruise), homeward)
+    at_cruise = distance - (peak**2 - homeward**2) / (2.0 * ramp) - peak**2 / (2.0 * law.home.landing)
+    time += (peak - homeward) / ramp + peak / law.home.landing + max(at_cruise, 0.0) / law.home.cruise
     return time + (lost_by_creeping(law, distance) if law.coasting else 0.0)
 
 
 def inner_state(rng: Random, law: ShieldLaw) -> tuple[float, float]:
     """An angle and a velocity well inside, near home or far, slow or fast, on either side."""
     span = rng.choice([0.3, 2.0, 1.0])
-    x = rng.choice([rng.uniform(-span, span), rng.uniform(0.0, 1.3 * law.apex), rng.uniform(0.4 * law.bottom, 0.0)])
-    v = rng.choice([rng.uniform(-15.0, 15.0), rng.uniform(-1.5, 1.5) * law.cruise, rng.uniform(-1.0, 1.0)])
+    apex = law.home.apex
+    x = rng.choice([rng.uniform(-span, span), rng.uniform(0.0, 1.3 * apex), rng.uniform(0.4 * law.bottom, 0.0)])
+    v = rng.choice([rng.uniform(-15.0, 15.0), rng.uniform(-1.5, 1.5) * law.home.cruise, rng.uniform(-1.0, 1.0)])
     return x, v
 
 
@@ -468,8 +475,8 @@ def assert_returns_at(law: ShieldLaw, state: tuple[float, float], past: Past, bo
     xl, xh, vl, vh = moved(law, box, wanted, wanted)
     left = 400 * law.sample_time
     reserve = left - max(arrival(law, xl, vl), arrival(law, xh, vh))
-    assert at_home_in_time(law._replace(reserve=reserve - CLOSE), *state, wanted, past, left)
-    assert not at_home_in_time(law._replace(reserve=reserve + CLOSE), *state, wanted, past, left)
+    assert at_home_in_time(with_numbers(law, reserve=reserve - CLOSE), *state, wanted, past, left)
+    assert not at_home_in_time(with_numbers(law, reserve=reserve + CLOSE), *state, wanted, past, left)
 
 
 def test_the_way_home_takes_over_when_the_worst_brake_would_come_too_late() -> None:
@@ -499,7 +506,7 @@ def test_late_measurements_are_rolled_on_to_where_the_way_home_begins(ages: tupl
 def test_the_way_home_begins_with_what_an_observer_does_not_show_yet(ages: tuple[int, int]) -> None:
     rng = Random(200 + 10 * ages[0] + ages[1])
     for _ in range(40):
-        law = drawn_law(rng)._replace(age_low=ages[0], age_high=ages[1], observer=rng.uniform(0.5, 3.0))
+        law = with_numbers(drawn_law(rng), age_low=ages[0], age_high=ages[1], observer=rng.uniform(0.5, 3.0))
         state, past = inner_state(rng, law), drawn_past(rng, law)
         boxes = [
             after_commands(law, observed(law, *state, past, age, False), past[:age][::-1], lost=False)
@@ -511,10 +518,10 @@ def test_the_way_home_begins_with_what_an_observer_does_not_show_yet(ages: tuple
 
 def test_the_way_home_of_a_late_current_begins_after_what_flows_has_decayed() -> None:
     for rng in draws():
-        law = drawn_law(rng)._replace(lag=rng.uniform(1e-3, 3e-3), kept=rng.uniform(0.2, 0.6))
+        law = with_numbers(drawn_law(rng), lag=rng.uniform(1e-3, 3e-3), kept=rng.uniform(0.2, 0.6))
         state, past = inner_state(rng, law), drawn_past(rng, law)
-        flowing = sum((1.0 - law.kept) * law.kept**n * u for n, u in enumerate(past))
-        more = [law.lag * motor * flowing for motor in (law.motor_low, law.motor_high)]
+        flowing = sum((1.0 - law.delay.kept) * law.delay.kept**n * u for n, u in enumerate(past))
+        more = [law.delay.lag * motor * flowing for motor in (law.box.motor_low, law.box.motor_high)]
         xl, xh, vl, vh = measured(law, *state)
         assert_returns_at(law, state, past, (xl, xh, vl + min(more), vh + max(more)))
 
@@ -522,32 +529,32 @@ def test_the_way_home_of_a_late_current_begins_after_what_flows_has_decayed() ->
 def homeward_current(law: ShieldLaw, x: float, v: float, left: float) -> float:
     """Current of the middle brake on the planned course [A]."""
 
-    motor = (law.motor_low + law.motor_high) / 2.0
-    spring = (law.spring_low + law.spring_high) / 2.0
-    friction = (law.friction_low + law.friction_high) / 2.0
-    viscous = (law.viscous_low + law.viscous_high) / 2.0
-    per_sample = law.gain / law.sample_time
-    if abs(x) < (law.settled_zone if left < law.settling else law.rest_zone):
+    motor = (law.box.motor_low + law.box.motor_high) / 2.0
+    spring = (law.box.spring_low + law.box.spring_high) / 2.0
+    friction = (law.box.friction_low + law.box.friction_high) / 2.0
+    viscous = (law.box.viscous_low + law.box.viscous_high) / 2.0
+    per_sample = law.home.gain / law.sample_time
+    if abs(x) < (law.home.settled_zone if left < law.home.settling else law.home.rest_zone):
         speed = abs(v)
-        allowed = law.rest_velocity - law.velocity_noise
-        at_the_end = speed + law.velocity_noise - law.friction_low * left  # as fast as it may be, by friction alone
+        allowed = law.home.rest_velocity - law.velocity_noise
+        at_the_end = speed + law.velocity_noise - law.box.friction_low * left  # as fast as it may be, by friction alone
         late = at_the_end >= allowed and speed >= law.velocity_noise
-        rests = speed < law.rest_velocity and not late
+        rests = speed < law.home.rest_velocity and not late
         acceleration = 0.0 if rests else per_sample * (law.velocity_noise - speed)
         return math.copysign(1.0, v) * acceleration / motor
     home = -1.0 if x > 0.0 else 1.0
     speed = home * v  # towards home
-    planned = math.sqrt(2.0 * law.landing * abs(x))
+    planned = math.sqrt(2.0 * law.home.landing * abs(x))
     acceleration = friction + viscous * speed - spring * max(x, 0.0)
     if planned < law.homeward_speed:
-        acceleration -= law.landing * (0.0 if speed < 0.0 else min(speed / planned, 1.0))
+        acceleration -= law.home.landing * (0.0 if speed < 0.0 else min(speed / planned, 1.0))
     acceleration += per_sample * (min(planned, law.homeward_speed) - speed)
     return home * acceleration / motor
 
 
 def test_on_the_way_home_the_current_follows_the_planned_speed() -> None:
     for rng in draws():
-        law = drawn_law(rng)._replace(committed=10.0, settling=0.1)
+        law = with_numbers(drawn_law(rng), committed=10.0, settling=0.1)
         law = law._replace(current=rng.choice([law.current, 500.0]))
         angle, velocity = inner_state(rng, law)
         left = rng.choice([2, 50, 200]) * law.sample_time
@@ -560,10 +567,10 @@ def test_on_the_way_home_the_current_follows_the_planned_speed() -> None:
 
 
 def test_from_the_committed_time_on_the_way_home_is_taken_wherever_the_brake_is() -> None:
-    law, left = drawn_law(Random(1))._replace(reserve=0.0), 0.25
+    law, left = with_numbers(drawn_law(Random(1)), reserve=0.0), 0.25
     law = law._replace(sample_time=1.0 / 1024.0)
     for committed, home in ((left, False), (math.nextafter(left, 1.0), True)):
-        _, bits = shield(law._replace(committed=committed), 0.0, 0.0, 0.0, NO_PAST, law.steps - 1 - 256)
+        _, bits = shield(with_numbers(law, committed=committed), 0.0, 0.0, 0.0, NO_PAST, law.steps - 1 - 256)
         assert bool(bits & RETURNING) == home
 
 
@@ -573,23 +580,23 @@ def returning(law: ShieldLaw, angle: float, velocity: float, left_samples: int =
 
 
 def test_the_borders_of_the_rest_are_counted_as_outside() -> None:
-    law = drawn_law(Random(2))._replace(committed=10.0, top=80.0, current=1e4, rest_velocity=5.0)
+    law = with_numbers(drawn_law(Random(2)), committed=10.0, top=80.0, current=1e4, rest_velocity=5.0)
     x, v = 0.5 * ((0.2 - law.angle_noise) + (0.2 + law.angle_noise)), 1.0
-    at_zone = law._replace(rest_zone=x, settling=0.0)
+    at_zone = with_numbers(law, rest_zone=x, settling=0.0)
     assert returning(at_zone, 0.2, v) == pytest.approx(homeward_current(at_zone, x, v, 1.0)) != 0.0
-    assert returning(at_zone._replace(rest_zone=math.nextafter(x, 1.0)), 0.2, v) == 0.0
+    assert returning(with_numbers(at_zone, rest_zone=math.nextafter(x, 1.0)), 0.2, v) == 0.0
     moving = 0.5 * ((7.0 - law.velocity_noise) + (7.0 + law.velocity_noise))
-    assert returning(law._replace(rest_velocity=moving), 0.0, 7.0) != 0.0
-    assert returning(law._replace(rest_velocity=math.nextafter(moving, 9.0)), 0.0, 7.0) == 0.0
+    assert returning(with_numbers(law, rest_velocity=moving), 0.0, 7.0) != 0.0
+    assert returning(with_numbers(law, rest_velocity=math.nextafter(moving, 9.0)), 0.0, 7.0) == 0.0
     left = 99 * law.sample_time
-    near = law._replace(rest_zone=0.1, settled_zone=0.5)
-    assert returning(near._replace(settling=left), 0.2, v) != 0.0
-    assert returning(near._replace(settling=math.nextafter(left, 1.0)), 0.2, v) == 0.0
+    near = with_numbers(law, rest_zone=0.1, settled_zone=0.5)
+    assert returning(with_numbers(near, settling=left), 0.2, v) != 0.0
+    assert returning(with_numbers(near, settling=math.nextafter(left, 1.0)), 0.2, v) == 0.0
 
 
 def test_what_friction_cannot_stop_in_the_time_that_is_left_is_braked_as_far_as_it_is_certain() -> None:
-    law = drawn_law(Random(3))._replace(committed=10.0, top=80.0, current=1e4, sample_time=1.0 / 1024.0)
-    law = law._replace(angle_noise=0.0, friction_low=1024.0, velocity_noise=4.0, rest_velocity=9.0)
+    law = with_numbers(drawn_law(Random(3)), committed=10.0, top=80.0, current=1e4, sample_time=1.0 / 1024.0)
+    law = with_numbers(law, angle_noise=0.0, friction_low=1024.0, velocity_noise=4.0, rest_velocity=9.0)
     assert returning(law, 0.0, 7.0, left_samples=6) != 0.0  # it may be 11 rad/s fast, friction takes 6, 5 are allowed
     assert returning(law, 0.0, 6.99, left_samples=6) == 0.0
     assert returning(law, 0.0, 8.5, left_samples=8) == 0.0
@@ -599,9 +606,9 @@ def test_what_friction_cannot_stop_in_the_time_that_is_left_is_braked_as_far_as_
 
 
 def test_at_the_greatest_homeward_speed_the_course_does_not_fall_yet() -> None:
-    law = drawn_law(Random(4))._replace(committed=10.0, top=80.0, current=1e4, gain=0.05)
+    law = with_numbers(drawn_law(Random(4)), committed=10.0, top=80.0, current=1e4, gain=0.05)
     x = 0.5 * ((5.0 - law.angle_noise) + (5.0 + law.angle_noise))
-    law = law._replace(homeward_speed=math.sqrt(2.0 * law.landing * x))
+    law = law._replace(homeward_speed=math.sqrt(2.0 * law.home.landing * x))
     assert returning(law, 5.0, -100.0) == pytest.approx(homeward_current(law, x, -100.0, 1.0))
 
 
@@ -647,7 +654,7 @@ def test_own_commands_are_believed_together_with_the_angle_where_a_law_looks_at_
         {"observer": 0.9},
     ]
     for which, kind in itertools.product(range(5), kinds):
-        law = drawn_law(Random(7))._replace(**kind)
+        law = with_numbers(drawn_law(Random(7)), **kind)
         stop = damped(law, 20.0)
         for sign in (-1.0, 1.0):
             past = [0.0] * 5
@@ -680,7 +687,7 @@ def test_where_both_sides_ask_for_full_braking_it_is_against_the_motion(velocity
 
 def test_what_is_wanted_is_cut_to_the_window_and_what_is_no_number_counts_as_zero() -> None:
     for rng in draws():
-        law = drawn_law(rng)._replace(reserve=-1e9, committed=0.0)
+        law = with_numbers(drawn_law(rng), reserve=-1e9, committed=0.0)
         state = drawn_state(rng, law)
         lowest, highest = window(law, *state, NO_PAST)
         wanted = rng.choice([rng.uniform(-2.0, 2.0) * law.current, math.nan, math.inf, -math.inf, lowest, highest])
@@ -711,27 +718,27 @@ def test_a_coasting_brake_on_its_way_up_is_judged_where_it_is(beside: float, fas
 @pytest.mark.parametrize(("beside", "free"), [(0.5, False), (-0.5, True)])
 def test_a_coasting_brake_on_its_way_down_is_judged_where_it_is(beside: float, free: bool) -> None:
     law = drawn_law(Random(9))._replace(coasting=True, change=30.0)
-    angle = law.apex - law.angle_noise + beside * law.sample_time
+    angle = law.home.apex - law.angle_noise + beside * law.sample_time
     _, highest = window(law, angle, -(law.change + law.velocity_noise + 200.0), NO_PAST)
     assert highest == (law.current if free else 0.0)
 
 
 def test_a_box_that_ends_at_rest_is_pulled_away_if_the_drive_is_stronger_than_the_friction() -> None:
     law = drawn_law(Random(10))
-    weak, strong = law.motor_low * law.current, law.motor_high * law.current
+    weak, strong = law.box.motor_low * law.current, law.box.motor_high * law.current
     below = successor(law, -5.0, -5.0, -1.0, 0.0, -law.current)
-    assert below[3] == pytest.approx(law.sample_time * (law.friction_high - weak) + VELOCITY_PAD)
+    assert below[3] == pytest.approx(law.sample_time * (law.box.friction_high - weak) + VELOCITY_PAD)
     begun = successor(law, -5.0, -5.0, 0.0, 0.01, law.current)
-    assert begun[3] == pytest.approx(law.sample_time * (law.friction_high + strong) + VELOCITY_PAD)
+    assert begun[3] == pytest.approx(law.sample_time * (law.box.friction_high + strong) + VELOCITY_PAD)
 
 
 @pytest.mark.parametrize(("lag", "room"), [(0.0, 0.0085), (1e-4, 0.0095)])
 def test_a_speed_that_the_noise_may_hide_is_braked_fully_though_the_brake_seems_to_go_away(
     lag: float, room: float
 ) -> None:
-    law = drawn_law(Random(11))._replace(sample_time=1e-3, current=3.0, velocity_noise=8.0, lag=lag, kept=1e-4)
-    law = law._replace(motor_low=1500.0, motor_high=1600.0, braking=1e4, braking_high=1e4)
-    law = law._replace(friction_low=900.0, friction_high=1000.0, spring_low=0.0, change=10.0)
+    law = with_numbers(drawn_law(Random(11)), sample_time=1e-3, current=3.0, velocity_noise=8.0, lag=lag, kept=1e-4)
+    law = with_numbers(law, motor_low=1500.0, motor_high=1600.0, braking=1e4, braking_high=1e4)
+    law = with_numbers(law, friction_low=900.0, friction_high=1000.0, spring_low=0.0, change=10.0)
     # From 7.5 rad/s to what the room allows takes more than full braking of the weakest motor.
     assert window(law, law.top - law.angle_noise - room, -0.5, NO_PAST) == (-3.0, -3.0)
     assert window(law, law.bottom + law.angle_noise + room, 0.5, NO_PAST) == (3.0, 3.0)
@@ -755,7 +762,7 @@ anything = st.floats(allow_nan=True, allow_infinity=True)
 def test_whatever_comes_in_a_finite_current_within_the_limit_comes_out(
     ages: tuple[int, int], angle: float, velocity: float, wanted: float, past: Past, step: int
 ) -> None:
-    law = SHIPPED._replace(age_low=ages[0], age_high=ages[1], observer=1.6 if step % 2 else 0.0)
+    law = with_numbers(SHIPPED, age_low=ages[0], age_high=ages[1], observer=1.6 if step % 2 else 0.0)
     current, bits = shield(law, angle, velocity, wanted, past, step)
     assert abs(current) <= law.current
     assert bits in {0, LIMITED, RETURNING, LIMITED | RETURNING}
