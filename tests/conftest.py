@@ -153,7 +153,6 @@ def make_loop(
         "law": make_law(bench)._replace(steps=steps),
         "actor": actor,
         "current_limit": 6.0,
-        "steps": steps,
         "guard": Guard(layout, bench, send, pulse, core.get("limit", CEILING_CURRENT)),
     }
     return Loop(Core(Setup(**(given | core))), receive, now_ns, push, stop_requested, pulse, overheard)

@@ -1,18 +1,29 @@
-"""A run again from its log: the same core with the same bench, policy and settings, see :mod:`emb_bench.playback`."""
+"""A run again from its log: its inputs go into the same core, and what the core records is compared with the log.
+
+Inputs are the frames, each read with its time, and the calls in ``/input``. The core records each before what comes of
+it: the order of the log is that of the core's records.
+"""
 
 from __future__ import annotations
 
+import contextlib
+from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from itertools import islice
+from operator import itemgetter
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import msgspec
 
+from emb_bench.logs.estimates import by_step
 from emb_bench.logs.log import RunLog, require_driven
-from emb_bench.playback import Difference, Playback
+from emb_runtime.can.e2e import COUNTER_MODULUS
+from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.config.bench import CEILING_CURRENT
 from emb_runtime.control.actor import Actor, Still, homing_steps
 from emb_runtime.control.core import Core
+from emb_runtime.control.loop import STOP_FRAME_NOT_SENT, detail_of, fault_of
 from emb_runtime.control.result import Outcome
 from emb_runtime.control.setup import Setup
 from emb_runtime.control.stop_condition import StopCondition, parse_stop_condition
@@ -20,20 +31,31 @@ from emb_runtime.drives.mapping import mapping_hash
 from emb_runtime.errors import LogError, UsageError
 from emb_runtime.estimator.estimator import estimated
 from emb_runtime.log.recorder_process import DIED
-from emb_runtime.records import RunState
-from emb_runtime.safety.guard import Guard
+from emb_runtime.log.ring_buffer import EstimateRecord, EventRecord, FrameRecord, InputRecord, Record, pack, unpack
+from emb_runtime.records import Call, CycleRecord, Frame, RunState
+from emb_runtime.safety.guard import Guard, GuardRejectedError
 from emb_runtime.safety.shield_design import make_law
+from emb_runtime.safety.state_machine import Fault
+from emb_runtime.system.terminal import one_line
 
 if TYPE_CHECKING:
     from emb_runtime.policy.policy import Policy
 
+Item = FrameRecord | CycleRecord | EventRecord | InputRecord
+ANSWER = Call.ANSWER.name
+CALLS = {call.value: call.name for call in Call}
+OF_THE_BUS = Fault.BUS_LOST.name, Fault.WATCHDOG_TRIPPED.name  # Faults that keep a command back
+OF_THE_DRIVER = (*OF_THE_BUS, Fault.INTERNAL.name)  # Faults that may come while it sends an answer
+AFTER_STOP_FRAME = Call.STOP_FRAME, Call.END
 
-class Recorded(msgspec.Struct, frozen=True):
-    """Part of a log's identity that the loop depends on."""
 
-    purpose: Literal["experiment", "homing"]
-    steps: Annotated[int, msgspec.Meta(ge=1)]  # Samples that the run was to answer
-    limit: Annotated[float, msgspec.Meta(ge=0.0, le=CEILING_CURRENT)]  # Largest current that might be sent [A]
+class Difference(NamedTuple):
+    """Difference between a log and its rerun."""
+
+    step: int | None  # Step of the experiment; None before and after it
+    what: str
+    recorded: str
+    came: str
 
 
 @dataclass(frozen=True)
@@ -56,16 +78,28 @@ class Rerun:
         return not self.differences
 
 
+class Recorded(msgspec.Struct, frozen=True):
+    """Part of a log's identity that the loop depends on."""
+
+    purpose: Literal["experiment", "homing"]
+    steps: Annotated[int, msgspec.Meta(ge=1)]  # Samples that the run was to answer
+    limit: Annotated[float, msgspec.Meta(ge=0.0, le=CEILING_CURRENT)]  # Largest current that might be sent [A]
+
+
 def rerun_as_recorded(log: RunLog) -> Rerun:
     """Run the loop of a log again with the policy that it carries, and compare what it carries with its hashes."""
+    recorded, came = dict(log.run), dict[str, str]()
     if recorded_run(log).purpose == "homing":
         again = rerun(log, Still(), log.bench.limits.current)
-        carried: dict[str, str] = {}
     else:
         policy = carried_policy(log)
+        came["policy_sha256"] = policy.sha256
         again = rerun(log, policy, policy.contract.limits.current, _stop_condition(log))
-        carried = {"policy_sha256": policy.sha256}
-    return replace(again, differences=(*_identity(log, carried), *again.differences))
+    came["bench_hash"] = log.bench.identity_hash
+    if log.drive_files is not None:
+        came["mapping_sha256"] = mapping_hash(*log.drive_files)
+        recorded["mapping_sha256"] = log.metadata["emb.drive"]["sha256"]
+    return replace(again, differences=(*_differences(recorded, came), *again.differences))
 
 
 def carried_policy(log: RunLog) -> Policy:
@@ -83,19 +117,17 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
     playback = Playback(log)
     guard = Guard(layout, bench, playback.send, limit=run.limit)
     law, homing = make_law(bench)._replace(steps=run.steps), run.purpose == "homing"
-    setup = Setup(bench, layout, law, actor, current_limit, run.steps, guard, run.limit, homing, stop_condition)
-    core = Core(setup)
+    core = Core(Setup(bench, layout, law, actor, current_limit, guard, run.limit, homing, stop_condition))
     playback.play(core)
-    outcome = core.outcome() if core.state is RunState.OVER and playback.at_end and not playback.cut else None
-    return Rerun(
-        log=log,
-        decisions=playback.counts["decisions"],
-        frames=playback.counts["frames"],
-        events=playback.counts["events"],
-        differences=(*playback.differences, *(() if outcome is None else _end(log.end, outcome))),
-        followed=playback.at_end,
-        outcome=outcome,
-    )
+    counts, differences, outcome = playback.counts, playback.differences, None
+    if core.state is RunState.OVER and playback.ended:
+        outcome = core.outcome()
+        end = {"exit_reason": outcome.fault.name if outcome.fault else "DONE"}
+        end |= {name: str(value) for name, value in asdict(outcome.counters).items()}
+        if log.end.get("exit_reason", DIED) != DIED:
+            differences += _differences(log.end, end)
+    compared = counts[CycleRecord], counts[FrameRecord], counts[EventRecord]
+    return Rerun(log, *compared, tuple(differences), not playback.items, outcome)
 
 
 def recorded_run(log: RunLog) -> Recorded:
@@ -112,7 +144,6 @@ def recorded_run(log: RunLog) -> Recorded:
 
 
 def _stop_condition(log: RunLog) -> StopCondition | None:
-    """Stop condition of the run, if it had one."""
     stop_when = log.run.get("stop_when")
     try:
         return None if stop_when is None else parse_stop_condition(stop_when, estimated(log.bench))
@@ -120,23 +151,230 @@ def _stop_condition(log: RunLog) -> StopCondition | None:
         raise LogError(f"{log.path}: emb.run: stop_when: {err}") from err
 
 
-def _end(recorded: Mapping[str, str], outcome: Outcome) -> list[Difference]:
-    """Differences between the outcome in the log's trailer and that of the rerun; a run whose process died has none."""
-    if recorded.get("exit_reason", DIED) == DIED:
-        return []
-    came = {"exit_reason": outcome.fault.name if outcome.fault else "DONE"}
-    return _differences(recorded, came | {name: str(value) for name, value in asdict(outcome.counters).items()})
-
-
-def _identity(log: RunLog, carried: Mapping[str, str]) -> list[Difference]:
-    """Differences between the hashes of what the log carries and those that it records."""
-    recorded, came = dict(log.run), {**carried, "bench_hash": log.bench.identity_hash}
-    if log.drive_files is not None:
-        came["mapping_sha256"] = mapping_hash(*log.drive_files)
-        recorded["mapping_sha256"] = log.metadata["emb.drive"]["sha256"]
-    return _differences(recorded, came)
-
-
 def _differences(recorded: Mapping[str, str], came: Mapping[str, str]) -> list[Difference]:
     found = ((name, recorded.get(name, value), value) for name, value in came.items())
     return [Difference(None, name, said, value) for name, said, value in found if said != value]
+
+
+def read_items(log: RunLog) -> deque[Item]:
+    """Inputs and records of the core of a log, in its order, but estimates; times are monotonic [ns]."""
+    if "/input" not in log.topics:
+        found = "expected the topic /input, with what went into the core, and it has none"
+        raise LogError(f"{log.path}: {found}: record the run anew, or rerun it with the version that made it")
+    log.require("/cycle", CycleRecord._fields)
+    reads = sorted(row for topic in ("/can/rx", "/can/tx") for row in log.rows(topic, "order", "read_time_ns"))
+    placed: list[tuple[int, Item]] = []
+    placed += [(at, FrameRecord(frame, read_ns)) for (at, read_ns), frame in zip(reads, log.frames, strict=True)]
+    placed += [(at, CycleRecord._make(row)) for at, *row in log.rows("/cycle", "order", *CycleRecord._fields)]
+    kinds: tuple[tuple[str, type[EventRecord | InputRecord]], ...] = (("/safety", EventRecord), ("/input", InputRecord))
+    for topic, kind in kinds:
+        rows = log.rows(topic, "order", "publish_time", *kind._fields[1:])
+        placed += [(at, kind(time_ns - log.wall_offset_ns, *row)) for at, time_ns, *row in rows]
+    items = deque(item for _, item in sorted(placed, key=itemgetter(0)))
+    if not items or not isinstance(items[0], InputRecord) or items[0].call != Call.BEGIN:
+        raise LogError(f"{log.path}: the beginning of the run is not in this log, and a rerun starts there")
+    return items
+
+
+class DivergedError(Exception):
+    """The core has left the log: nothing after this can be compared."""
+
+
+class Playback:
+    """Inputs of a log for a core, and a comparison of what the core records with what the log has."""
+
+    def __init__(self, log: RunLog) -> None:
+        self.items = read_items(log)  # What was not played yet
+        self.ended = True  # False if the log ends before the run does
+        self.counts = Counter[type[Record]]()  # Records that were compared
+        self.differences: list[Difference] = []  # In the order in which they came
+        self._estimates = by_step(log)
+        self._due, self._came = tuple[str, ...](), ""  # inputs of which one comes next, and what the core has done
+        self._lost = ""  # why the bus has no room for the next frame
+        self._sent = deque[tuple[int | None, Frame, bool]]()  # not found on the bus yet: step, frame, it was there
+        self._step: int | None = None
+
+    def send(self, frame: Frame) -> None:
+        """Take a frame that the guard has let out."""
+        if self._lost:
+            raise TransmitQueueFullError(self._lost)
+
+    def play(self, core: Core) -> None:
+        """Play all that was recorded, or until the core leaves it."""
+        with contextlib.suppress(DivergedError):
+            while self.items:
+                self._give(core, self.items[0])
+                for record in core.records:
+                    self._compare(record)
+                core.records.clear()
+            if core.state is RunState.OVER:
+                for step, numbers in self._estimates.items():
+                    self._check(step, "estimate", numbers, None)
+                if core.fault is not Fault.BUS_LOST:  # else the last may have been lost
+                    self._miss_sent(len(self._sent))
+
+    # --- what goes in -----------------------------------------------------------------------------------------------
+
+    def _give(self, core: Core, item: Item) -> None:
+        """Give an input to the core: the next item must be one, and one that is due."""
+        name = _name(item)
+        if name not in self._due if self._due else name in (ANSWER, None):
+            raise self._diverged(item, self._came or "nothing")
+        self._due, self._came = (), ""
+        try:
+            if isinstance(item, InputRecord):
+                self._call(core, item)
+            else:
+                self._read(core)
+        except DivergedError:
+            raise
+        except Exception as err:  # of the actor; of the core, in a log of nonsense
+            fault = fault_of(err).name
+            self._due, self._came = (fault, Fault.WATCHDOG_TRIPPED.name), f"{fault} ({detail_of(err)})"
+
+    def _read(self, core: Core) -> None:
+        """Give the frames of one read."""
+        frames: list[Frame] = []
+        for item in self.items:
+            if isinstance(item, FrameRecord):
+                frames.append(item.frame)
+                if item.read_ns:
+                    break
+        else:
+            if other := next((item for item in self.items if isinstance(item, CycleRecord | InputRecord)), None):
+                raise self._diverged(other, "frames without the time of their read")
+            self.items.clear()  # the log was cut within it
+            return
+        if core.take(frames, item.read_ns) and (sample := core.setup.memory.newest) is not None:
+            self._step = core.setup.memory.step_of(sample)
+            self._due, self._came = (ANSWER, *OF_THE_BUS), f"the record of step {self._step}"
+
+    def _call(self, core: Core, item: InputRecord) -> None:
+        time_ns, call, _, code, text = item
+        match call:
+            case Call.ANSWER:
+                self._answer(core, core.answer(time_ns), item)
+            case Call.LATCH:
+                core.latch(Fault[code], time_ns)
+            case Call.EXPLAIN:
+                core.explain(Fault[code], time_ns, text)
+            case Call.NOTE:
+                core.note(time_ns, code, text)
+            case Call.STOP_FRAME:
+                with contextlib.suppress(GuardRejectedError):
+                    frame = core.stop_frame(time_ns)
+                    core.guard.send(frame)
+                    self._sent.append((self._step, frame, self._is_stop_frame_sent()))
+            case _:
+                {Call.BEGIN: core.begin, Call.TIMEOUT: core.timeout, Call.END: core.end}[Call(call)](time_ns)
+
+    def _answer(self, core: Core, frame: Frame | None, item: InputRecord) -> None:
+        """Send or lose the frame of an answer as it was; where neither was recorded a fault came between."""
+        if frame is None:
+            return
+        self._lost = item.text
+        try:
+            core.guard.send(frame)
+        except TransmitQueueFullError:
+            self._lost = ""
+            core.sent(item.time_ns, item.text)
+            return
+        self._sent.append((self._step, frame, item.send_time_ns > 0))
+        if item.send_time_ns:
+            core.sent(item.send_time_ns)
+        else:
+            self._due, self._came = OF_THE_DRIVER, f"the record of step {self._step}"
+
+    def _is_stop_frame_sent(self) -> bool:
+        """Returns False if the log says that the stop frame in hand was not sent: it does so before the next one."""
+        for item in islice(self.items, 1, None):
+            if isinstance(item, InputRecord) and (item.code == STOP_FRAME_NOT_SENT or item.call in AFTER_STOP_FRAME):
+                return item.code != STOP_FRAME_NOT_SENT
+        return True
+
+    # --- what comes out ---------------------------------------------------------------------------------------------
+
+    def _compare(self, came: Record) -> None:
+        if isinstance(came, EstimateRecord):
+            recorded = self._estimates.pop(came.step, None)
+            if recorded is not None or self.items:  # else the log was cut just there
+                self._check(came.step, "estimate", recorded, came.numbers)
+            return
+        if not self.items:
+            self.ended = False
+            return
+        match self.items.popleft(), came:
+            case CycleRecord() as item, CycleRecord() as record:
+                self.counts[CycleRecord] += 1
+                for name, recorded, value in zip(item._fields, item, record, strict=True):
+                    self._check(item.step, name, recorded, value)
+            case EventRecord() as item, EventRecord() as record if item.code == record.code:
+                self.counts[EventRecord] += 1
+                self._check(self._step, f"time of {item.code}", item.time_ns, record.time_ns)
+                self._check(self._step, f"text of {item.code}", _cut(item.text), _cut(record.text))
+            case InputRecord() as item, InputRecord() as record:
+                self._check(self._step, f"sending of {CALLS.get(item.call)}", item.send_time_ns, record.send_time_ns)
+            case FrameRecord() as item, FrameRecord():
+                if item.frame.own:
+                    self._find_sent(item.frame)
+            case item, _:
+                raise self._diverged(item, _words(came))
+
+    def _find_sent(self, echo: Frame) -> None:
+        """Find the sent frame whose echo was recorded; those before it were not on the bus."""
+        bare = echo._replace(time_ns=0, own=False, dropped=0)
+        waiting = [frame for _, frame, _ in islice(self._sent, COUNTER_MODULUS)]
+        if bare in waiting:
+            self._miss_sent(waiting.index(bare))
+            self.counts[FrameRecord] += 1
+        step, came, _ = self._sent.popleft() if self._sent else (self._step, None, True)
+        self._check(step, "sent frame", _hex(echo), _hex(came))
+
+    def _miss_sent(self, count: int) -> None:
+        """Compare sent frames of which no echo was recorded."""
+        for _ in range(count):
+            step, frame, left = self._sent.popleft()
+            if left:
+                self._check(step, "sent frame", _hex(None), _hex(frame))
+
+    def _check(self, step: int | None, what: str, recorded: object, came: object) -> None:
+        """Compare to the last bit: NaN is NaN, and minus zero is not zero."""
+        if str(recorded) != str(came):
+            self.differences.append(Difference(step, what, str(recorded), str(came)))
+
+    def _diverged(self, item: Item, came: str) -> DivergedError:
+        self.differences.append(Difference(self._step, "what came next", _words(item), one_line(came)))
+        return DivergedError()
+
+
+def _name(item: Item) -> str | None:
+    """Name of an input that may be due, an answer or a fault; empty of another one, None of what is none."""
+    if not isinstance(item, InputRecord):
+        return "" if isinstance(item, FrameRecord) else None
+    return item.code if item.call == Call.LATCH else ANSWER if item.call == Call.ANSWER else ""
+
+
+def _hex(frame: Frame | None) -> str:
+    return f"{frame.identifier:03x}#{frame.data.hex()}" if frame else "no such frame"
+
+
+def _cut(text: str) -> str:
+    """A text as it gets into a log: cut where the ring has no more room."""
+    record = unpack(*pack(EventRecord(0, "", text)))
+    assert isinstance(record, EventRecord)
+    return record.text
+
+
+def _words(record: Record) -> str:
+    match record:
+        case FrameRecord():
+            return f"frame {_hex(record.frame)}"
+        case InputRecord() | EventRecord():
+            name = (
+                record.code or CALLS.get(record.call, "an unknown call")
+                if isinstance(record, InputRecord)
+                else record.code
+            )
+            return one_line(f"{name} ({record.text})" if record.text else name)
+        case CycleRecord() | EstimateRecord():
+            return f"the record of step {record.step}"

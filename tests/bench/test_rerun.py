@@ -14,12 +14,13 @@ import pytest
 
 from emb_bench.logs.log import read_log
 from emb_bench.rerun import Rerun, carried_policy, rerun
+from emb_bench.sim.transport import SimTransport
 from emb_runtime.can.messages import Layout, load_layout
 from emb_runtime.cli.main import main as emb_run
 from emb_runtime.config.bench import Bench, parse_bench
-from emb_runtime.log.ring_buffer import EventRecord, FrameRecord, InputRecord, Record
+from emb_runtime.log.ring_buffer import EventRecord, FrameRecord, InputRecord, Record, pack, unpack
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
-from emb_runtime.records import CycleRecord, Reason, RunState
+from emb_runtime.records import Call, CycleRecord, Frame, Reason, RunState
 from emb_runtime.safety.state_machine import Fault
 from tests.actors import constant_actor
 from tests.bench.conftest import Replay
@@ -189,6 +190,66 @@ def test_an_error_that_does_not_come_again_is_reported(recorded: Callable[..., D
     assert mended.differences[-1].came == "the record of step 70"
 
 
+def failing_to_send(number: int, leaves: bool) -> dict[str, Any]:
+    """A bus that raises an error of its own at a frame, before it or after it has left."""
+    buses: list[SimTransport] = []
+    sent: list[Frame] = []
+
+    def receive(frame: Frame | None, bus: SimTransport, _clock: object) -> Frame | None:
+        buses[:] = [bus]
+        return frame
+
+    def send(frame: Frame) -> None:
+        sent.append(frame)
+        if len(sent) == number:
+            if leaves:
+                buses[0].send(frame)
+            raise OSError("a driver's own error")
+
+    return {"on_receive": receive, "on_send": send}
+
+
+@pytest.mark.parametrize("leaves", [False, True])
+@pytest.mark.parametrize("number", [1, 70, 149, 151, 152, 153])  # of 150 commands and three stop frames
+def test_a_frame_whose_sending_failed_may_have_left_or_not(
+    recorded: Callable[..., Driven], again: Again, number: int, leaves: bool
+) -> None:
+    run = recorded(**failing_to_send(number, leaves))
+    assert run.outcome.fault is (Fault.INTERNAL if number < 150 else None)
+    assert ("STOP_FRAME_NOT_SENT" in run.journal.codes) == (number > 150)
+    assert_reproduced(again(run), run)
+
+
+def test_after_a_command_that_was_not_sent_only_a_fault_of_the_driver_can_come(
+    recorded: Callable[..., Driven], again: Again
+) -> None:
+    run = recorded(**failing_to_send(70, leaves=False))
+
+    def rename(fault: Fault, records: list[Record]) -> None:
+        renamed = [r._replace(code=fault.name) if isinstance(r, InputRecord) and r.code else r for r in records]
+        records[:] = [r for r in renamed if not (isinstance(r, EventRecord) and r.code == "INTERNAL")]
+
+    for fault in (Fault.POLICY_NOT_FINITE, Fault.OUT_OF_LIMITS, Fault.INTERRUPTED):
+        difference = again(run, alter=partial(rename, fault)).differences[-1]
+        assert (difference.step, difference.what, difference.recorded) == (69, "what came next", fault.name)
+        assert difference.came == "the record of step 69"
+
+
+def test_a_text_that_was_cut_to_fit_into_the_log_is_compared_as_far_as_it_goes(
+    recorded: Callable[..., Driven], again: Again
+) -> None:
+    def broken(_angle: float, _velocity: float, _step: float) -> float:
+        raise ValueError("ß" * 300)
+
+    def cut(records: list[Record]) -> None:
+        records[:] = [unpack(*pack(record)) for record in records]
+
+    run = recorded(broken)
+    assert max(len(event.text) for event in run.journal.events) > 300
+    result = again(run, broken, cut)
+    assert (result.differences, result.followed) == ((), True)
+
+
 def test_a_log_that_was_cut_anywhere_is_followed_up_to_there(hostile: Callable[..., Driven], again: Again) -> None:
     run = hostile(1, slow=0.05, backlog_ms=50)
     total = len(run.journal.records)
@@ -310,6 +371,32 @@ def test_a_missing_event_or_another_one_is_reported(recorded: Callable[..., Driv
         assert not result.followed
         assert result.outcome is None
         assert "ACTIVE" in result.differences[-1].came
+
+
+def test_an_event_with_another_text_or_time_is_reported(recorded: Callable[..., Driven], again: Again) -> None:
+    run = recorded()
+
+    def change(code: str, records: list[Record]) -> None:
+        for n, record in enumerate(records):
+            if isinstance(record, EventRecord) and record.code == code:
+                records[n] = EventRecord(record.time_ns + 1, code, record.text + ".")
+
+    for event in run.journal.events:
+        result = again(run, alter=partial(change, event.code))
+        assert [d.what for d in result.differences] == [f"time of {event.code}", f"text of {event.code}"]
+        assert result.differences[1].recorded == result.differences[1].came + "." == event.text + "."
+        assert result.followed
+
+
+def test_an_answer_that_was_sent_at_another_time_is_reported(recorded: Callable[..., Driven], again: Again) -> None:
+    def change(records: list[Record]) -> None:
+        at = [n for n, r in enumerate(records) if isinstance(r, InputRecord) and r.call == Call.ANSWER][60]
+        record = records[at]
+        assert isinstance(record, InputRecord)
+        records[at] = record._replace(time_ns=record.time_ns + 3_000_000)  # so late that nothing is sent
+
+    result = again(recorded(), alter=change)
+    assert (result.differences[0].step, result.differences[0].what) == (60, "sending of ANSWER")
 
 
 def test_a_sensor_frame_that_is_missing_or_other_is_reported(recorded: Callable[..., Driven], again: Again) -> None:

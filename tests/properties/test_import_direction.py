@@ -26,7 +26,7 @@ OURS = set.union(*MAY_IMPORT.values())
 ROOMS = {
     "runtime/emb_runtime": "errors records numbers system config can estimator policy log safety drives control cli",
     "bench/emb_bench": "config documents numbers compiled output figures parallel brake sim logs experiment "
-    "information excitation recordings hil playback rerun estimate design export analysis report commission live batch "
+    "information excitation recordings hil rerun estimate design export analysis report commission live batch "
     "api cli",
     "train/emb_train": "presets rewards closed_loop intervals lies env play ppo plan training network optimum evaluate "
     "cli",

@@ -114,6 +114,7 @@ class Layout:
     charge: Message  # A node may send it
     gateway: Message  # A gateway sends it
     encode_command: Callable[[int, int, float, bool], Frame]
+    write_command: Callable[[int, int, float, bool], tuple[Frame, CurrentCommand]]  # With the command as it is read
     encode_angle: Callable[[int, float, int], Frame]
     encode_velocity: Callable[[int, float, float, NodeState, int], Frame]
     encode_status: Callable[[int, NodeState, StopReason, int, int], Frame]  # The version is the layout's
@@ -165,5 +166,6 @@ def load_layout() -> Layout:
     messages = [describe(database.get_message_by_name(name)) for name in fields]
     codecs = [generate_codec(message, *fields[message.name]) for message in messages]
     # In the order of the layout's fields.
-    parts: list[Any] = [*messages, *(codec.encode for codec in codecs), *(codec.decode for codec in codecs[:4])]
+    encoders = [codecs[0].encode, codecs[0].write, *(codec.encode for codec in codecs[1:])]
+    parts: list[Any] = [*messages, *encoders, *(codec.decode for codec in codecs[:4])]
     return Layout(text, version, *parts)

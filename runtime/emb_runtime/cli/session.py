@@ -107,10 +107,9 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
             setup = Setup(
                 bench=plan.bench,
                 layout=plan.layout,
-                law=experiment.law,
+                law=experiment.law._replace(steps=steps),
                 actor=actor,
                 current_limit=experiment.policy.contract.limits.current,
-                steps=steps,
                 guard=Guard(plan.layout, plan.bench, bus.transport.send, pulse, plan.limit),
                 limit=plan.limit,
                 homing=homing,

@@ -2,7 +2,7 @@
 
 A driver does all that blocks (:mod:`emb_runtime.control.loop`; a rerun plays a log instead):
 
-* :meth:`Core.take` gets the frames of one read, and gives a proposal for the newest sample among them;
+* :meth:`Core.take` gets the frames of one read, and decides on a command for the newest sample among them;
 * :meth:`Core.answer` gives the frame to send, checked by the guard, unless it is too late or not permitted;
 * :meth:`Core.sent` records the cycle;
 * :meth:`Core.timeout` counts a period without a sample.
@@ -25,7 +25,7 @@ from emb_runtime.control.phases import Phase, Silent, Stopping
 from emb_runtime.control.result import Outcome
 from emb_runtime.control.setup import Setup
 from emb_runtime.log.ring_buffer import FrameRecord, InputRecord, Record
-from emb_runtime.records import Call, CurrentCommand, Frame, Reason, RunState
+from emb_runtime.records import Call, Frame, Reason, RunState
 from emb_runtime.safety.response_cause import cause
 from emb_runtime.safety.state_machine import Event, Fault, StopError
 
@@ -58,7 +58,8 @@ class Core:
         self._phase: Phase = Silent(setup)
         self._stopping: Stopping | None = None  # the last phase
         self._latest_answer_ns = latest_answer_ns(setup.bench)
-        self._current_step = setup.layout.command.signal("Current").factor
+        self._proposal: Proposal | None = None  # to be answered
+        self._pending: Proposal | None = None  # its frame was given to the driver
         self._permitted = True
         self._detail = ""  # of the fault
         self._answer_at = 0  # place of the newest answer in the records
@@ -110,9 +111,9 @@ class Core:
         self._memory.read_ns = now_ns
         self._machine.handle_event(Event.PREPARED, now_ns)
 
-    def take(self, frames: Sequence[Frame], now_ns: int) -> Proposal | None:
-        """Take the frames of one read, in hand at a monotonic time [ns]; gives a command for the newest sample."""
-        memory = self._memory
+    def take(self, frames: Sequence[Frame], now_ns: int) -> bool:
+        """Take the frames of one read, in hand at a monotonic time [ns]; True if :meth:`answer` comes next."""
+        memory, self._proposal = self._memory, None
         memory.read_ns = now_ns
         for left, frame in enumerate(frames, 1 - len(frames)):
             memory.records.append(tuple.__new__(FrameRecord, (frame, now_ns if left == 0 else 0)))
@@ -122,24 +123,27 @@ class Core:
             except StopError as stop:
                 self._fail(stop, now_ns)
         if not self.running:
-            return None
+            return False
         try:
             check_bus(self.setup.layout, self._reception)
-            if (proposal := self._phase.propose()) is not None:
-                return proposal
-            self._follow_state()
+            self._proposal = self._phase.propose()
+            if self._proposal is None:
+                self._follow_state()
         except StopError as ended:
             self._fail(ended, now_ns)
-        return None
+        return self._proposal is not None
 
-    def answer(self, proposal: Proposal, now_ns: int) -> Frame | None:
-        """Frame that answers a sample, decided at a monotonic time [ns]; None if it is left to the node.
+    def answer(self, now_ns: int) -> Frame | None:
+        """Frame that answers the newest sample, decided at a monotonic time [ns]; None if it is left to the node.
 
         If there is one, :meth:`sent` comes next, before the driver takes the records.
 
         Raises:
             GuardRejectedError: the frame is not in the guard's contract.
         """
+        proposal, self._proposal = self._proposal, None  # nothing is answered twice
+        if proposal is None:
+            return None
         records = self._memory.records
         self._answer_at = len(records)
         records.append(tuple.__new__(InputRecord, (now_ns, ANSWER, 0, "", "")))
@@ -150,19 +154,20 @@ class Core:
             self._memory.unanswered(sample, self._memory.missed, now_ns, left)
             self._end_cycle(proposal)
             return None
-        current = round(decision.current / self._current_step) * self._current_step  # the bus has whole steps
-        command = tuple.__new__(CurrentCommand, (self.guard.next_counter, sample.counter, current, True))
+        write, counter = self.setup.layout.write_command, self.guard.next_counter
+        frame, command = write(counter, sample.counter, decision.current, True)
         self._memory.decided(command, now_ns)
-        frame = self.setup.layout.encode_command(*command)
+        self._pending = proposal
         return self.guard.check(frame, self.state, sample.receive_time_ns, now_ns)
 
-    def sent(self, proposal: Proposal, now_ns: int, lost: str = "") -> None:
+    def sent(self, now_ns: int, lost: str = "") -> None:
         """Record the cycle of a command that was handed to the bus at a monotonic time [ns].
 
         Where the bus had no room for it, ``lost`` says so, and the time is that of the decision: sent later, it would
         answer an old sample.
         """
-        memory, at = self._memory, self._answer_at
+        memory, at, proposal = self._memory, self._answer_at, self._pending
+        assert proposal is not None
         decide_ns = memory.records[at].time_ns
         memory.records[at] = tuple.__new__(InputRecord, (decide_ns, ANSWER, 0 if lost else now_ns, "", lost))
         if lost:
@@ -245,7 +250,7 @@ class Core:
             model_fits=estimate.estimator.fits,
             unexplained=setup.sensors.unexplained,
             response=response.text if response.proven else "",
-            goal_ns=estimate.reached_ns if estimate.reached else None,
+            goal_ns=estimate.goal_ns,
         )
 
     # --- what the bus says ------------------------------------------------------------------------------------------

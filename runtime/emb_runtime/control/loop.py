@@ -17,7 +17,6 @@ from typing import Final, cast
 
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.control.core import SILENT, Core
-from emb_runtime.control.memory import Proposal
 from emb_runtime.control.result import Outcome
 from emb_runtime.errors import BusError, PolicyRefusedError
 from emb_runtime.log.ring_buffer import Record
@@ -87,8 +86,8 @@ class Loop:
             core.explain(fault, self._now_ns)
         if not frames:
             core.timeout(self._now_ns)
-        elif (proposal := core.take(frames, self._now_ns)) is not None:
-            self._answer(proposal)
+        elif core.take(frames, self._now_ns):
+            self._answer()
         elif len(core.records) < HELD_RECORDS:
             return
         self._push_records()
@@ -118,21 +117,21 @@ class Loop:
                 return Fault.WATCHDOG_LOST
         return None
 
-    def _answer(self, proposal: Proposal) -> None:
-        """Write the frame that answers a sample, unless it is left to the node."""
+    def _answer(self) -> None:
+        """Write the frame that answers the newest sample, unless it is left to the node."""
         if not self._watched:
             self.pulse.arm(self._now_ns)
             self._watched = True
         core, decide_ns = self.core, self._read_clock()
-        frame = core.answer(proposal, decide_ns)
+        frame = core.answer(decide_ns)
         if frame is None:
             return
         try:
             core.guard.send(frame)
         except TransmitQueueFullError as err:
-            core.sent(proposal, decide_ns, lost=str(err))
+            core.sent(decide_ns, lost=str(err))
         else:
-            core.sent(proposal, self._read_clock())
+            core.sent(self._read_clock())
 
     def _push_records(self) -> None:
         """Record what has happened."""

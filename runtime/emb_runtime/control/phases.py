@@ -49,7 +49,8 @@ class Phase:
         raise NotImplementedError
 
     def propose(self) -> Proposal | None:
-        """Decide on a command for the newest sample, when all of a read have been taken."""
+        """Decide on a command for the newest sample, when all of a read have been taken; without any, time passes."""
+        self.miss()
         return None
 
     def miss(self) -> None:
@@ -85,11 +86,6 @@ class Silent(Phase):
             return self
         self.machine.handle_event(Event.NODE_READY, memory.read_ns)
         return self._control
-
-    def propose(self) -> Proposal | None:
-        """Give up a node that has not shown itself in time."""
-        self.miss()
-        return None
 
     def miss(self) -> None:
         """Give up a node that has not shown itself in time."""
@@ -142,7 +138,7 @@ class Control(Phase):
         if self.machine.run.state is ARMED:
             self._begin(sample)
         else:
-            returns = setup.homing or estimate.reached
+            returns = setup.homing or estimate.goal_ns is not None
             self._at_home = self._at_home + 1 if returns and setup.bounds.is_home(sample) else 0
         step = memory.step_of(sample)
         if self._is_last(step):
@@ -169,7 +165,7 @@ class Control(Phase):
         setup.estimate.estimator.begin()
 
     def _is_last(self, step: int) -> bool:
-        return step >= self.setup.steps or self._at_home >= HOME_PAIRS
+        return step >= self.setup.law.steps or self._at_home >= HOME_PAIRS
 
     def _check_sensors(self, sample: SensorSample) -> Control:
         """Coast if the sign is not known to be right and friction alone can stop the brake.
@@ -191,15 +187,15 @@ class Control(Phase):
     def _command(self, sample: SensorSample, requested: float, step: int) -> Decision:
         """Command for a sample, in the shield's view of time: on the way home the end is always near."""
         setup, memory, sensors, limits = self.setup, self.memory, self.setup.sensors, self.setup.command_limits
-        last, reached = memory.slew_reference(sample), setup.estimate.reached
+        last, returns = memory.slew_reference(sample), setup.estimate.goal_ns is not None
         if setup.homing:
             step = setup.late_step
-        elif reached:
+        elif returns:
             step, requested = max(step, setup.late_step), 0.0
         if (most := sensors.monitor.largest_current(limits.current)) < limits.current:
             limits = limits._replace(current=max(most, abs(last) - limits.slew))  # down to it as fast as may be
         decision = decide(sensors.law, limits, sample.angle, sample.velocity, requested, memory.past, last, step)
-        return decision._replace(reasons=decision.reasons | Reason.RETURNING) if reached else decision
+        return decision._replace(reasons=decision.reasons | Reason.RETURNING) if returns else decision
 
     def _finish(self, sample: SensorSample, step: int) -> None:
         """Check the whole run at its last sample."""
@@ -208,7 +204,7 @@ class Control(Phase):
         if setup.homing and self._at_home < HOME_PAIRS:
             raise StopError(Fault.NOT_HOME, f"at {sample.angle:.2f} rad after {step} periods")
         if not setup.homing:
-            self._check_complete(sample, min(step, setup.steps))
+            self._check_complete(sample, min(step, setup.law.steps))
             setup.sensors.check_balance()
         self.machine.handle_event(Event.FINISHED, memory.read_ns)
 

@@ -17,8 +17,9 @@ class RunningEstimate:
     def __init__(self, bench: Bench, condition: StopCondition | None, *, homing: bool) -> None:
         self.estimator = Estimator(bench)
         self.numbers: tuple[float, ...] = ()  # The latest estimate; empty if there is none
-        self.reached = False  # The stop condition was met: all that is left is the way home
-        self.reached_ns = 0  # Device time from the first sample to that at which it was met [ns]
+        self.goal_ns: int | None = None
+        """Device time from the first sample to that at which the stop condition was met [ns]; from then on all that is
+        left is the way home."""
         self._condition = condition
         self._available = not homing and bool(estimated(bench))  # there is an estimate, and it was finite so far
 
@@ -34,7 +35,6 @@ class RunningEstimate:
             return
         memory.records.append(EstimateRecord(sample.receive_time_ns, step, numbers))
         condition = self._condition
-        if condition is not None and not self.reached and condition.reached(numbers):
-            self.reached = True
-            self.reached_ns = sample.device_time_ns - memory.start_ns
+        if condition is not None and self.goal_ns is None and condition.reached(numbers):
+            self.goal_ns = sample.device_time_ns - memory.start_ns
             memory.note(sample.receive_time_ns, REACHED, condition.describe(numbers))

@@ -25,10 +25,9 @@ class Setup:
 
     bench: Bench
     layout: Layout
-    law: ShieldLaw
+    law: ShieldLaw  # Its steps are the samples to answer; on the way home, at most
     actor: Actor
     current_limit: float  # Largest current that the policy's contract allows it to ask for [A]
-    steps: int  # Samples to answer; on the way home, at most
     guard: Guard
     limit: float = CEILING_CURRENT  # A current narrower than the bench's, where the operator asked for one [A]
     homing: bool = False  # Begin anywhere, let the shield bring the brake home, and end when it rests there

@@ -104,7 +104,9 @@ def test_a_run_that_ended_early_decides_and_estimates_the_same_again(write: Writ
     assert result.outcome.goal_reached
 
 
-def test_an_estimate_that_is_other_in_its_last_bit_or_missing_is_reported(write: Write, bench: Bench) -> None:
+def test_an_estimate_that_is_other_in_its_last_bit_or_missing_or_of_no_sample_is_reported(
+    write: Write, bench: Bench
+) -> None:
     def change(records: list[Record]) -> None:
         record = records[estimates(records)[50]]
         assert isinstance(record, EstimateRecord)
@@ -114,6 +116,12 @@ def test_an_estimate_that_is_other_in_its_last_bit_or_missing_is_reported(write:
     def remove(records: list[Record]) -> None:
         del records[estimates(records)[50]]
 
+    def add(records: list[Record]) -> None:
+        record = records[estimates(records)[50]]
+        assert isinstance(record, EstimateRecord)
+        records.append(record._replace(step=STEPS))
+
+    assert [(d.step, d.what) for d in again(write(add), bench).differences] == [(STEPS, "estimate")]
     for alter in (change, remove):
         assert [(d.step, d.what) for d in again(write(alter), bench).differences] == [(50, "estimate")]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -9,7 +10,6 @@ import pytest
 
 from emb_runtime.can.transport import TransmitQueueFullError
 from emb_runtime.control.core import Core
-from emb_runtime.control.memory import Proposal
 from emb_runtime.log.ring_buffer import FrameRecord, InputRecord, Record
 from emb_runtime.records import Call, Frame
 from emb_runtime.safety.state_machine import Fault
@@ -24,28 +24,25 @@ STEPS = 200
 def records_of(core: Core, inputs: Iterable[Record], lost: list[str]) -> list[Record]:
     """Records of a core that gets these inputs; ``lost`` holds why the bus has no room for the next frame."""
     frames, found = list[Frame](), list[Record]()
-    proposal: Proposal | None = None
     for record in inputs:
         if isinstance(record, FrameRecord):
             frames.append(record.frame)
             if record.read_ns:
-                proposal = taken(core, frames, record.read_ns)
+                take(core, frames, record.read_ns)
                 frames = []
         elif isinstance(record, InputRecord):
-            call(core, record, proposal, lost)
+            call(core, record, lost)
         found += core.records
         core.records.clear()
     return found
 
 
-def taken(core: Core, frames: list[Frame], read_ns: int) -> Proposal | None:
-    try:
-        return core.take(frames, read_ns)
-    except ZeroDivisionError:  # of the actor
-        return None
+def take(core: Core, frames: list[Frame], read_ns: int) -> None:
+    with contextlib.suppress(ZeroDivisionError):  # of the actor
+        core.take(frames, read_ns)
 
 
-def call(core: Core, record: InputRecord, proposal: Proposal | None, lost: list[str]) -> None:
+def call(core: Core, record: InputRecord, lost: list[str]) -> None:
     """Make a call of the driver again."""
     time_ns, number, send_ns, code, text = record
     match number:
@@ -54,16 +51,15 @@ def call(core: Core, record: InputRecord, proposal: Proposal | None, lost: list[
         case Call.TIMEOUT:
             core.timeout(time_ns)
         case Call.ANSWER:
-            assert proposal is not None
-            frame = core.answer(proposal, time_ns)
+            frame = core.answer(time_ns)
             if frame is not None and (send_ns or text):
                 lost[:] = [text] if text else []
                 try:
                     core.guard.send(frame)
                 except TransmitQueueFullError:
-                    core.sent(proposal, time_ns, text)
+                    core.sent(time_ns, text)
                 else:
-                    core.sent(proposal, send_ns)
+                    core.sent(send_ns)
         case Call.LATCH:
             core.latch(Fault[code], time_ns)
         case Call.EXPLAIN:
