@@ -65,7 +65,7 @@ lint: $(VENV)/.dev
 
 PYTEST := $(BIN)/python -m pytest
 PARALLEL := --numprocesses=$(WORKERS) --dist=worksteal --ignore=tests/hil
-QUICK := 'not slow and not browser'
+QUICK := 'not slow and not browser and not compiled'
 
 # mypy takes one processor for a minute: the tests begin beside it.
 test: $(VENV)/.dev
@@ -101,7 +101,7 @@ night: $(VENV)/.dev
 	$(BIN)/python -m tests.searches.hostile_files --count 2000
 	$(BIN)/python -m tests.searches.damaged_logs
 	$(BIN)/python -m tests.searches.interrupt
-	$(BIN)/python tools/compare_core.py
+	$(PYTEST) $(PARALLEL) -m compiled tests/compiled --inputs 1000000 --timeout 7200
 	$(BIN)/python -m tools.proof
 	$(BIN)/python -m tests.mutation
 
@@ -110,7 +110,7 @@ night: $(VENV)/.dev
 compiled: $(VENV)/.dev
 	@mkdir -p build && rm -f build/compiled.mcap build/python.mcap
 	$(BIN)/python -m tools.compile_core
-	$(BIN)/python tools/compare_core.py --inputs 20000
+	$(PYTEST) $(PARALLEL) -m compiled tests/compiled
 	EMB_CORE=compiled $(BIN)/emb-run --iface sim --log build/compiled.mcap
 	EMB_CORE=python $(BIN)/emb-run --iface sim --log build/python.mcap
 	$(BIN)/python .ci/same_run.py build/compiled.mcap build/python.mcap

@@ -1,8 +1,4 @@
-"""The records that cross boundaries: small, typed, immutable, SI units.
-
-What is made in every cycle is made there by ``tuple.__new__(Frame, (...))``, with all fields in their order: the
-constructor of a named tuple is interpreted, also where it is called from compiled code, and takes twice as long.
-"""
+"""The records that cross boundaries: small, typed, immutable, SI units."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Memory of a run by sampling periods: what came, what was missed, what was sent, and the record of each cycle.
+"""Memory of a run by sampling periods: newest sample, missed periods, sent commands, and the record of each cycle.
 
-The one place that counts periods by device time: it says how many lie between two samples. By arrival
-:func:`emb_runtime.safety.state_machine.missed` counts them, at the deadlines of a grid that runs on from the last one.
+Here periods are counted by device time, between two samples. By arrival time
+:func:`emb_runtime.safety.state_machine.missed` counts them, at the deadlines after the last sample.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from emb_runtime.safety.command_limits import Decision
 from emb_runtime.safety.guard import OLDEST_SAMPLE_PERIODS
 from emb_runtime.safety.shield import NO_PAST
 
-MISSED: Final = int(Reason.MISSED)  # an enumeration combines its members in Python
+MISSED: Final = int(Reason.MISSED)
 NONE_SENT: Final = (math.nan, math.nan, math.nan)
 NO_COMMAND: Final = CurrentCommand(NO_COUNTER, NO_COUNTER, 0.0, False)
 
@@ -90,7 +90,7 @@ class Memory:
 
     def miss(self) -> int:
         """Move the deadline on by a period; returns the old one."""
-        # The deadline and not the clock: a computer that stood still has frames waiting, and they come first.
+        # Not the clock: after a stall frames are waiting in the socket, and they come first.
         deadline_ns = self.deadline_ns
         self.deadline_ns += self.period_ns
         return deadline_ns
@@ -110,7 +110,7 @@ class Memory:
         command, obeyed = 0.0, False
         if self._answered:
             command, obeyed = self._command.current, sample.command_counter == self._command.counter
-            # Across a gap the node does not tell: it names the command of the last period only.
+            # Unknown across a gap: the node names the command of the last period only.
             if periods == 1 and obeyed:
                 self.unobeyed.forgive()
             elif periods == 1:
@@ -126,12 +126,12 @@ class Memory:
         return self.past[0] if sample.counter == next_counter(self._command.answers) else 0.0
 
     def pass_missed(self, missed: int) -> None:
-        """Note that nothing was sent in the missed periods before a sample."""
+        """Store 0 A for the missed periods before a sample: nothing was sent."""
         for _ in range(min(missed, len(NO_PAST))):
             self._remember(0.0)
 
     def decided(self, command: CurrentCommand, decide_ns: int) -> None:
-        """Keep a command that was decided at a monotonic time [ns]."""
+        """Store a command that was decided at a monotonic time [ns]."""
         self._command, self._decide_ns = command, decide_ns
 
     def answered(self, proposal: Proposal, send_ns: int) -> None:

@@ -11,7 +11,6 @@ from emb_runtime.can.messages import StopReason
 from emb_runtime.records import Reason, SensorSample
 from emb_runtime.safety.state_machine import Fault
 
-# As whole numbers: the enumeration combines its members in Python.
 _CLIPPED: Final = int(Reason.CLIPPED)
 _LIMITED: Final = int(Reason.LIMITED)
 _RETURNING: Final = int(Reason.RETURNING)

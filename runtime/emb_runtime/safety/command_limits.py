@@ -10,7 +10,7 @@ from emb_runtime.safety.shield import LIMITED, Past, shield, window
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_runtime.safety.state_machine import Fault, StopError
 
-CLIPPED: Final = int(Reason.CLIPPED)  # an enumeration combines its members in Python
+CLIPPED: Final = int(Reason.CLIPPED)
 LEFT: Final = int(Reason.LEFT)
 
 ROUNDING: Final = 1e-6  # Relative: single precision in the policy may pass its contract's limit by so much

@@ -1,12 +1,24 @@
 """The compiled core: the modules of the cycle as machine code, in place of their sources.
 
 A wheel for one kind of processor has them beside the sources, from which mypyc compiled them
-(``tools/compile_core.py``); whoever builds it compares both, bit for bit (``tools/compare_core.py``). Nothing
+(``tools/compile_core.py``); whoever builds it compares both, bit for bit (``tests/compiled``). Nothing
 imports them by itself: :func:`choose`, which ``emb-run`` calls before it imports anything else, puts a finder in front
 of Python's own. Every other command works with the sources.
 
 ``EMB_CORE`` decides otherwise: ``python`` takes the sources, ``compiled`` the compiled core in every command of this
 environment. The processes that a command starts take the sources.
+
+Idioms that only speed or the compiler asks for, in the modules that are compiled:
+
+* ``tuple.__new__(Frame, (...))``, all fields in their order: the constructor of a named tuple is interpreted, also
+  where compiled code calls it, and takes twice as long.
+* ``PAIR: Final = Event.PAIR``, ``MISSED: Final = int(Reason.MISSED)``: in Python 3.11 a member of an enumeration takes
+  as long as a call, and an ``IntFlag`` combines its members in Python.
+* A name of its own for each ``except … as name``: mypyc gives a name the type of the function's first clause, and
+  another exception becomes a TypeError.
+* ``Number`` (``can/codec.py``) for what may be an int or a float: the annotation ``float`` converts ints.
+* No ``cached_property``, which is computed at each access; no subclass of a compiled class and no replaced method:
+  functions and protocols are handed in.
 """
 
 from __future__ import annotations

@@ -1,29 +1,18 @@
-"""Equality of the compiled core and its sources, bit for bit, on a million drawn inputs of each function.
-
-    python -m tools.compile_core                               # first: it takes about a minute
-    python tools/compare_core.py [--inputs 1000000] [--seed 1] [--only NAME]
+"""Functions of the compiled core with inputs drawn for them: their answers, in whichever core a process runs.
 
 Among the inputs are the edges (zeros of both signs, infinities, NaN, subnormals) and any pattern of 64 bits; what a
-function raises is compared as well, and one NaN is as good as another. Each core runs in processes of its own, which
-give a digest of each block of answers. Exit code 0 if nothing differs.
+function raises is an answer as well.
 """
 
 from __future__ import annotations
 
-import argparse
-import hashlib
 import math
-import os
 import random
 import struct
-import sys
-import time
 from collections.abc import Callable, Iterator
 from functools import cache
 from itertools import islice
-from multiprocessing import get_context
-from textwrap import shorten
-from typing import Any, NamedTuple
+from typing import Any
 
 from emb_runtime.can import e2e, receiver
 from emb_runtime.can.messages import load_layout
@@ -45,77 +34,18 @@ from emb_runtime.safety import (
 from emb_runtime.safety.guard import Guard
 from emb_runtime.system import compiled_core
 
-BLOCK = 1000  # Answers to a digest
+BLOCK = 1000  # Answers that are drawn from one seed
 EDGES = (0.0, -0.0, 1.0, -6.0, 6.0, 5e-324, -2.2e-308, 1e6, 1e308, math.inf, -math.inf, math.nan)
 
 
-class Task(NamedTuple):
-    """Answers of the core that a process runs."""
-
-    name: str  # Of the comparison
-    inputs: int
-    seed: int  # Of the drawing
-
-
-def main() -> int:
-    """Compare and print; gives the exit code."""
-    p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    p.add_argument("--inputs", type=int, default=1_000_000, metavar="N", help="of each (default: %(default)d)")
-    p.add_argument("--seed", type=int, default=1, metavar="N", help="of the drawing (default: %(default)d)")
-    p.add_argument("--only", choices=COMPARISONS, metavar="NAME", help="one comparison (default: all)")
-    args = p.parse_args()
-    pools = []
-    for choice in ("compiled", "python"):
-        os.environ["EMB_CORE"] = choice  # of the processes that are started now
-        pools.append(get_context("spawn").Pool(max(1, (os.cpu_count() or 2) // 2)))
-    compiled, plain = pools
-    with compiled, plain:
-        if (found := compiled.apply(core), plain.apply(core)) != (True, False):
-            raise SystemExit(f"expected the compiled core and its sources, got {found}")
-        differing = 0
-        for name in [args.only] if args.only else COMPARISONS:
-            began, task = time.monotonic(), Task(name, args.inputs, args.seed)
-            one, other = [pool.apply_async(digests, task) for pool in pools]
-            difference = first_difference(task, one.get(), other.get(), compiled.apply, plain.apply)
-            told = difference or "the same, bit for bit"
-            print(f"{name:24}{args.inputs:10} inputs in {time.monotonic() - began:6.1f} s: {told}", flush=True)
-            differing += bool(difference)
-    print(f"| compiled core beside its sources, {args.inputs:,} inputs: functions that differ | 0 | {differing} |")
-    return 1 if differing else 0
-
-
-def core() -> bool:
+def is_compiled() -> bool:
     """Returns True if this process runs the compiled core."""
     return compiled_core.running().compiled
 
 
-def first_difference(
-    task: Task, one: list[bytes], other: list[bytes], compiled: Callable[..., Any], plain: Callable[..., Any]
-) -> str:
-    """First answer that differs between two lists of digests; empty if none does."""
-    for block, pair in enumerate(zip(one, other, strict=True)):
-        if pair[0] != pair[1]:
-            answers = (ask(block_of, (*task, block)) for ask in (compiled, plain))
-            for number, (a, b) in enumerate(zip(*answers, strict=True)):
-                if a != b:
-                    said = [shorten(text, 80, placeholder=" …") for text in (a, b)]
-                    return f"input {BLOCK * block + number}: compiled {said[0]}, Python {said[1]}"
-    return ""
-
-
-def digests(name: str, count: int, seed: int) -> list[bytes]:
-    """Digest of each block of answers."""
-    answers = islice(COMPARISONS[name](random.Random(seed)), count)
-    found = []
-    while block := [repr(bits(answer)) for answer in islice(answers, BLOCK)]:
-        found.append(hashlib.sha256("\n".join(block).encode()).digest())
-    return found
-
-
-def block_of(name: str, count: int, seed: int, block: int) -> list[str]:
-    """The answers of one block."""
-    answers = islice(COMPARISONS[name](random.Random(seed)), count)
-    return [repr(bits(answer)) for answer in islice(answers, BLOCK * block, BLOCK * (block + 1))]
+def answers(name: str, seed: int) -> list[str]:
+    """Answers of a function to a block of inputs, in such a form that equal means bit for bit."""
+    return [repr(bits(answer)) for answer in islice(FUNCTIONS[name](random.Random(seed)), BLOCK)]
 
 
 def bits(answer: Any) -> Any:
@@ -155,6 +85,7 @@ def _bench() -> Bench:
     return load_bench()
 
 
+@cache
 def _laws() -> list[Any]:
     law = shield_design.make_law(_bench())
     return [
@@ -370,7 +301,7 @@ def _estimator(dice: random.Random) -> Iterator[Any]:
             velocity += 1e-3 * (push - math.copysign(model.coulomb, velocity))
 
 
-COMPARISONS: dict[str, Callable[[random.Random], Iterator[Any]]] = {
+FUNCTIONS: dict[str, Callable[[random.Random], Iterator[Any]]] = {
     "shield": _shield,
     "successor": _successor,
     "command limits": _decide,
@@ -385,8 +316,4 @@ COMPARISONS: dict[str, Callable[[random.Random], Iterator[Any]]] = {
     "bounds and counters": _bounds,
     "estimator": _estimator,
 }
-"""Answers without end to inputs drawn from the dice, by what they compare."""
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+"""Answers without end to inputs drawn from the dice, by function."""
