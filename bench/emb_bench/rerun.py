@@ -120,7 +120,7 @@ def rerun(log: RunLog, actor: Actor, current_limit: float, stop_condition: StopC
     core = Core(Setup(bench, layout, law, actor, current_limit, guard, run.limit, homing, stop_condition))
     playback.play(core)
     counts, differences, outcome = playback.counts, playback.differences, None
-    if core.state is RunState.OVER and playback.ended:
+    if core.state is RunState.OVER and playback.ended and not playback.items:
         outcome = core.outcome()
         end = {"exit_reason": outcome.fault.name if outcome.fault else "DONE"}
         end |= {name: str(value) for name, value in asdict(outcome.counters).items()}
@@ -195,7 +195,7 @@ class Playback:
         self._step: int | None = None
 
     def send(self, frame: Frame) -> None:
-        """Take a frame that the guard has let out."""
+        """Bus of the rerun: takes a frame, or has no room for it, as recorded."""
         if self._lost:
             raise TransmitQueueFullError(self._lost)
 
@@ -245,7 +245,7 @@ class Playback:
                 raise self._diverged(other, "frames without the time of their read")
             self.items.clear()  # the log was cut within it
             return
-        if core.take(frames, item.read_ns) and (sample := core.setup.memory.newest) is not None:
+        if core.process_frames(frames, item.read_ns) and (sample := core.setup.memory.newest) is not None:
             self._step = core.setup.memory.step_of(sample)
             self._due, self._came = (ANSWER, *OF_THE_BUS), f"the record of step {self._step}"
 
@@ -296,9 +296,9 @@ class Playback:
 
     def _compare(self, came: Record) -> None:
         if isinstance(came, EstimateRecord):
-            recorded = self._estimates.pop(came.step, None)
-            if recorded is not None or self.items:  # else the log was cut just there
-                self._check(came.step, "estimate", recorded, came.numbers)
+            numbers = self._estimates.pop(came.step, None)
+            if numbers is not None or self.items:  # else the log was cut just there
+                self._check(came.step, "estimate", numbers, came.numbers)
             return
         if not self.items:
             self.ended = False
@@ -366,15 +366,10 @@ def _cut(text: str) -> str:
 
 
 def _words(record: Record) -> str:
-    match record:
-        case FrameRecord():
-            return f"frame {_hex(record.frame)}"
-        case InputRecord() | EventRecord():
-            name = (
-                record.code or CALLS.get(record.call, "an unknown call")
-                if isinstance(record, InputRecord)
-                else record.code
-            )
-            return one_line(f"{name} ({record.text})" if record.text else name)
-        case CycleRecord() | EstimateRecord():
-            return f"the record of step {record.step}"
+    if isinstance(record, FrameRecord):
+        return f"frame {_hex(record.frame)}"
+    if isinstance(record, CycleRecord):
+        return f"the record of step {record.step}"
+    assert isinstance(record, InputRecord | EventRecord)  # the core makes no other
+    name = record.code or CALLS.get(getattr(record, "call", -1), "an unknown call")
+    return one_line(f"{name} ({record.text})" if record.text else name)

@@ -106,7 +106,7 @@ def guard(draw: Random) -> Played:
         demand(bus[before:] in ([], [frame]), "the guard changed", frame)
         if chance(draw, 20):
             with suppress(StopError):
-                watched.judge(report(draw))
+                watched.check_drive(report(draw))
     return Played(LENGTH, len(bus))
 
 

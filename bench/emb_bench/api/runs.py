@@ -176,9 +176,9 @@ def rerun(run: Source) -> Rerun:
 
     The core of the control loop runs again with the policy, bench file and DBC of the log. What went into it goes in
     again: the frames of each read, and the calls in ``/input``. Each decision (policy, clip, shield, sent current, its
-    reason), each estimate, each sent frame, each safety event and the outcome must be the same, numbers to the last
-    bit. A cut log is compared up to its end. Rounding may differ with another ONNX Runtime, numpy, Python or processor.
-    If a decision differs, the versions of the log are printed too.
+    reason), each estimate, each sent frame, each safety event with its time and text, and the outcome must be the same,
+    numbers to the last bit. A cut log is compared up to its end. Rounding may differ with another ONNX Runtime, numpy,
+    Python or processor. If a decision differs, the versions of the log are printed too.
 
     Args:
         run: MCAP file of emb-run.

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 ENOUGH_PAIRS = 200  # Sensor pairs from which a standard deviation is known to within a twentieth
 RECENT_PAIRS = 4000  # Pairs that the scatter is taken from
+NO_SCATTER = (math.nan, math.nan)  # Of fewer than two pairs
 OTHERS_BITS = worst_bits(8)  # Bits of a foreign frame, counted as one of 8 bytes with an 11-bit identifier
 
 
@@ -31,8 +32,8 @@ def planned_load(bench: Bench, layout: Layout, drive: DriveMapping | None) -> fl
 
 
 @dataclass(frozen=True)
-class Traffic:
-    """Frames that were on the bus."""
+class BusStatistics:
+    """Statistics of a bus."""
 
     duration: float  # Time from the first frame to the last [s]
     frames: Mapping[str, int]  # Frames by message name
@@ -40,39 +41,18 @@ class Traffic:
     others: int  # Data and remote frames that are none of the DBC's
     load: float
     """Share of the bus that all frames took, with every stuff bit that there can be; of a mapped drive's its own."""
-
-
-@dataclass(frozen=True)
-class Disturbances:
-    """Frames that no undisturbed bus has."""
-
     rejections: Mapping[str, Mapping[str, int]]  # Rejections as in :class:`~emb_runtime.control.result.Outcome`
     distrusted: bool  # True after so many of them that a run would have been stopped
     bus_errors: Mapping[str, int]  # Bus errors as in :class:`~emb_runtime.control.result.Outcome`
     dropped: int  # Frames that the kernel dropped
-    commanded: bool  # Somebody sends commands to the node
+    commanded: bool  # Another sender commands the node
     pairing_problem: str  # :attr:`~emb_runtime.can.receiver.Reception.pairing_problem`
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """Times and scatter of the sensor pairs."""
-
-    pairs: int  # Valid pairs
+    pairs: int  # Valid sensor pairs
     missing: int  # Pairs that did not come, by the node's own clock
     period: float  # Median time between samples by the node's own clock [s]; NaN with fewer than two
     resting: int  # Number of the newest pairs, all of an idle node, that the next two are of
     angle_scatter: float  # Standard deviation of the angles; NaN for fewer than two [rad]
     velocity_scatter: float  # The same of the velocities [rad/s]
-
-
-@dataclass(frozen=True)
-class BusStatistics:
-    """Statistics of what was on the bus."""
-
-    traffic: Traffic
-    disturbances: Disturbances
-    sampling: Sampling
     status: StatusFrame | None  # The node's latest
     sample: SensorSample | None  # The newest valid one
 
@@ -82,7 +62,7 @@ class BusStatistics:
             name: record and {key: getattr(value, "name", value) for key, value in record._asdict().items()}
             for name, record in (("status", self.status), ("sample", self.sample))
         }
-        return asdict(self.traffic) | asdict(self.disturbances) | asdict(self.sampling) | node
+        return asdict(self) | node
 
 
 class Seen(NamedTuple):
@@ -117,7 +97,7 @@ class BusMonitor:
         """The node's latest status."""
         return self._reception.status
 
-    def take(self, frame: Frame) -> SensorSample | None:
+    def add_frame(self, frame: Frame) -> SensorSample | None:
         """Take one frame; gives a sample when it completes a valid pair."""
         if not frame.error:
             name = None if frame.extended else self._names.get(frame.identifier)
@@ -128,7 +108,7 @@ class BusMonitor:
             self._follow(sample)
         return sample
 
-    def take_old(self, frame: Frame) -> None:
+    def add_old_frame(self, frame: Frame) -> None:
         """Take a frame from before: it counts only if it must not be missed."""
         if is_alarming(frame, self._layout):
             self._reception.take(frame)
@@ -141,31 +121,26 @@ class BusMonitor:
         known = {name: s for name, s in seen.items() if name is not None}
         frames, others = {name: s.frames for name, s in known.items()}, seen[None].frames if None in seen else 0
         bits = OTHERS_BITS * others + sum(m.worst_bits * frames.get(m.name, 0) for m in self._layout.known)
-        resting = len(self._at_rest)
-        scatter = map(statistics.stdev, zip(*self._at_rest, strict=True)) if resting > 1 else (math.nan, math.nan)
+        scatter = map(statistics.stdev, zip(*self._at_rest, strict=True)) if len(self._at_rest) > 1 else NO_SCATTER
+        angle_scatter, velocity_scatter = scatter
         return BusStatistics(
-            traffic=Traffic(
-                duration=duration,
-                frames=frames,
-                rates={name: s.rate() for name, s in known.items() if s.last_ns > s.first_ns},
-                others=others,
-                load=bits / duration / self._bench.can.bitrate if duration > 0.0 else 0.0,
-            ),
-            disturbances=Disturbances(
-                rejections=reception.rejections(),
-                distrusted=reception.too_many_rejected,
-                bus_errors=dict(reception.bus_errors),
-                dropped=reception.dropped,
-                commanded=reception.foreign_command,
-                pairing_problem=reception.pairing_problem,
-            ),
-            sampling=Sampling(
-                self.pairs,
-                self._missing,
-                statistics.median(self._periods_ns) * 1e-9 if self._periods_ns else math.nan,
-                resting,
-                *scatter,
-            ),
+            duration=duration,
+            frames=frames,
+            rates={name: s.rate() for name, s in known.items() if s.last_ns > s.first_ns},
+            others=others,
+            load=bits / duration / self._bench.can.bitrate if duration > 0.0 else 0.0,
+            rejections=reception.rejections(),
+            distrusted=reception.too_many_rejected,
+            bus_errors=dict(reception.bus_errors),
+            dropped=reception.dropped,
+            commanded=reception.foreign_command,
+            pairing_problem=reception.pairing_problem,
+            pairs=self.pairs,
+            missing=self._missing,
+            period=statistics.median(self._periods_ns) * 1e-9 if self._periods_ns else math.nan,
+            resting=len(self._at_rest),
+            angle_scatter=angle_scatter,
+            velocity_scatter=velocity_scatter,
             status=reception.status,
             sample=self.sample,
         )
@@ -218,6 +193,6 @@ def listen(
         if frame is None:
             continue
         if frame.time_ns < begin_ns:
-            monitor.take_old(frame)
-        elif (sample := monitor.take(frame)) is not None:
+            monitor.add_old_frame(frame)
+        elif (sample := monitor.add_frame(frame)) is not None:
             ready = ready + 1 if enough(sample, now_ns) else 0

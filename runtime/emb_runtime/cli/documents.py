@@ -108,7 +108,7 @@ class Reading:
     """Result of ``--read-only``."""
 
     plan: Plan
-    heard: BusStatistics
+    statistics: BusStatistics
     checks: tuple[Check, ...]
     refused: RefusedError | None  # Why a run could not begin
 
@@ -121,7 +121,7 @@ class Reading:
 
     def trailer(self) -> dict[str, str]:
         """Trailer of its log."""
-        end = {"exit_reason": self.exit_reason, "detail": str(self.refused or ""), "heard": self.heard.document()}
+        end = {"exit_reason": self.exit_reason, "detail": str(self.refused or ""), "heard": self.statistics.document()}
         return log_entries(end | {"preflight": [check.document() for check in self.checks]})
 
     def document(self, log: RecorderResult) -> dict[str, Any]:
@@ -134,7 +134,7 @@ class Reading:
             "result": self.exit_reason if refused else DONE,
             **plan.document(RunType.LISTEN_ONLY, 0),
             "bench": plan.bench.name,
-            "heard": self.heard.document(),
+            "heard": self.statistics.document(),
             "preflight": [check.document() for check in self.checks],
             **log_document(log),
         }

@@ -60,19 +60,19 @@ def _observe(plan: Plan, bus: Bus, console: Console) -> BusStatistics:
     return observe(plan, bus, plan.start_conditions(anywhere=True), console.stop_requested)
 
 
-def _is_away(plan: Plan, heard: BusStatistics) -> bool:
+def _is_away(plan: Plan, statistics: BusStatistics) -> bool:
     """Returns True if the brake is not at home, or its place is unknown: the pre-flight of a way home says why."""
-    return heard.sample is None or not Bounds(plan.bench).is_home(heard.sample)
+    return statistics.sample is None or not Bounds(plan.bench).is_home(statistics.sample)
 
 
 def _go_home(plan: Plan, bus: Bus, path: Path, console: Console, homing: dict[str, Any]) -> int:
     """The way home after an experiment, if one is needed; its exit code. Whatever fails here, the experiment counts."""
     try:
-        heard = _observe(plan, bus, console)
+        statistics = _observe(plan, bus, console)
         # The run may have ended before the node told why it stopped: the status is rarer than the samples.
-        if heard.status is not None and heard.status.stop_reason is StopReason.LIMIT:
+        if statistics.status is not None and statistics.status.stop_reason is StopReason.LIMIT:
             return EXIT_SAFETY_STOP
-        if not _is_away(plan, heard):
+        if not _is_away(plan, statistics):
             return EXIT_DONE
         way = conduct(plan, bus, RunType.HOMING, _beside(path, "after"), console)
     except EmbError as err:

@@ -130,19 +130,22 @@ def parser() -> argparse.ArgumentParser:
 
     stage = p.add_argument_group("stage: how much of the chain may act (default: all of it)")
     one = stage.add_mutually_exclusive_group()
-    one.add_argument("--read-only", action="store_true", help="only listen, log, and list the traffic on the bus")
-    one.add_argument("--zero", action="store_true", help="the whole chain, but only 0 A is sent")
+    one.add_argument("--read-only", dest="stage", action="store_const", const=Stage.READ_ONLY,
+        help="only listen, log, and list the traffic on the bus")
+    one.add_argument("--zero", dest="stage", action="store_const", const=Stage.ZERO,
+        help="the whole chain, but only 0 A is sent")
     one.add_argument("--limit", type=float, metavar="A",
         help="send at most this current [A]; if the shield needs more, the node brakes by itself")
     asking = stage.add_mutually_exclusive_group()
-    asking.add_argument("--confirm", action="store_true",
+    asking.add_argument("--confirm", action="store_true", default=None,
         help="show the pre-flight and ask before anything is armed (default where the bus is real and standard input "
         "is a terminal)")
-    asking.add_argument("--yes", action="store_true", help="do not ask")
+    asking.add_argument("--yes", dest="confirm", action="store_false", default=None, help="do not ask")
 
     machine = p.add_argument_group("real time")
-    machine.add_argument("--no-rt", action="store_true", help="do not change scheduling and memory locking")
-    machine.add_argument("--no-watchdog", action="store_true",
+    machine.add_argument("--no-rt", dest="real_time", action="store_false",
+        help="do not change scheduling and memory locking")
+    machine.add_argument("--no-watchdog", dest="watchdog", action="store_false",
         help="no watchdog process: for a bus without a brake")
     machine.add_argument("--long-timeouts", action="store_true",
         help="accept longer time-outs of the bench file than the shipped ones: for a bus without a brake on a computer "
@@ -177,7 +180,7 @@ def prepare(args: argparse.Namespace) -> Plan:
         duration=duration,
         experiment=experiment,
         strict=args.strict,
-        precautions=Precautions(not args.no_rt, not args.no_watchdog, args.confirm or (False if args.yes else None)),
+        precautions=Precautions(args.real_time, args.watchdog, args.confirm),
         output=Output(args.log, args.json, args.verbose, args.quiet, args.live, args.open, args.report),
         label=Label(args.typed, one_line(args.operator, LONGEST_LABEL), one_line(args.serial, LONGEST_LABEL)),
     )
@@ -201,7 +204,7 @@ def _refuse_contradictions(args: argparse.Namespace, stage: Stage) -> None:
 def _experiment(args: argparse.Namespace, bench: Bench, duration: float) -> Experiment | None:
     """The experiment; None where nothing is sent: then a policy that was named is checked all the same."""
     law = make_law(bench)  # before the policy: where no shield can be made, no policy helps
-    if args.read_only:
+    if args.stage is Stage.READ_ONLY:
         if args.policy is not None:
             _policy(args, bench)
         return None
@@ -244,18 +247,18 @@ def names_a_file(path: Path) -> bool:
 
 
 @contextmanager
-def log_folder(wanted: Path) -> Iterator[None]:
+def log_folder(log: Path) -> Iterator[None]:
     """The folder for the logs that the user wants; where it was made for nothing, it is removed again."""
-    folder = wanted.parent if names_a_file(wanted) else wanted
+    folder = log.parent if names_a_file(log) else log
     try:
         made = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as err:
         raise UsageError(
-            f"--log {wanted}: {folder} is no folder; expected one for the logs, or a new file with a suffix: .mcap"
+            f"--log {log}: {folder} is no folder; expected one for the logs, or a new file with a suffix: .mcap"
         ) from err
     except OSError as err:
-        raise UsageError(f"--log {wanted}: {err.strerror}") from err
+        raise UsageError(f"--log {log}: {err.strerror}") from err
     try:
         yield
     finally:
@@ -264,12 +267,12 @@ def log_folder(wanted: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-def log_path(wanted: Path, ending: str = "") -> Path:
+def log_path(log: Path, ending: str = "") -> Path:
     """Path of the next log, which must not exist; the time names it, with this ending, where the user did not."""
-    path = wanted
-    if not names_a_file(wanted):
+    path = log
+    if not names_a_file(log):
         name = time.strftime("%Y%m%d-%H%M%S") + f"-{time.time_ns() // 1_000_000 % 1000:03d}"
-        path = wanted / f"run-{name}{ending}.mcap"
+        path = log / f"run-{name}{ending}.mcap"
     if os.path.lexists(path):  # also a link that leads nowhere
         raise UsageError(f"--log: {path}: the file exists; logs are never overwritten, choose another name")
     return path
@@ -294,10 +297,8 @@ def _policy(args: argparse.Namespace, bench: Bench) -> Policy:
 def _stage(args: argparse.Namespace, bench: Bench) -> tuple[Stage, float]:
     """The stage, and the largest current that it lets out [A]."""
     most = min(bench.limits.current, CEILING_CURRENT)
-    if args.read_only:
-        return Stage.READ_ONLY, 0.0
-    if args.zero:
-        return Stage.ZERO, 0.0
+    if args.stage is not None:
+        return args.stage, 0.0
     if args.limit is None:
         return Stage.FULL, most
     if not 0.0 < args.limit <= most:
@@ -308,9 +309,10 @@ def _stage(args: argparse.Namespace, bench: Bench) -> tuple[Stage, float]:
 def _duration(args: argparse.Namespace, bench: Bench) -> float:
     """Duration of the experiment, or how long to listen [s]."""
     shortest, horizon = bench.timing.sample_time, bench.timing.horizon * bench.timing.sample_time
-    longest = LONGEST_READING if args.read_only else horizon
-    wanted: float = horizon if args.duration is None else args.duration
-    if not shortest <= wanted <= longest:
-        what = "a day" if args.read_only else "the horizon of the bench"
-        raise UsageError(f"--duration: expected {shortest:g} to {longest:g} s, {what}, got {wanted:g}")
-    return wanted
+    longest, what = horizon, "the horizon of the bench"
+    if args.stage is Stage.READ_ONLY:
+        longest, what = LONGEST_READING, "a day"
+    duration: float = horizon if args.duration is None else args.duration
+    if not shortest <= duration <= longest:
+        raise UsageError(f"--duration: expected {shortest:g} to {longest:g} s, {what}, got {duration:g}")
+    return duration

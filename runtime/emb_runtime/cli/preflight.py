@@ -85,7 +85,7 @@ class Findings:
     plan: Plan
     start_conditions: StartConditions
     duration: float  # Duration of the run [s]
-    heard: BusStatistics
+    statistics: BusStatistics
     bus: str  # Interface, in words
     in_process: bool  # Only this process can be on it
     end_stop_speed: float  # End-stop speed after a loss of all commands at the worst moment [rad/s]
@@ -149,7 +149,7 @@ def _stage(f: Findings) -> Check:
 
 
 def _interface(f: Findings) -> Check:
-    seen = f.heard.disturbances
+    seen = f.statistics
     if seen.commanded:
         found = f"{f.bus}; commands of another sender"
         return Check("interface", found, "no other sender", ok=False, fault=Fault.FOREIGN_COMMAND)
@@ -159,7 +159,7 @@ def _interface(f: Findings) -> Check:
 
 
 def _node(f: Findings) -> Check:
-    status, silent = f.heard.status, not f.heard.traffic.frames
+    status, silent = f.statistics.status, not f.statistics.frames
     identity = f"protocol {f.plan.layout.protocol_version}, bench {f.start_conditions.identity:#06x}"
     if problem := "no frame came" if silent else f.start_conditions.mismatch(status):
         return Check("node", problem, identity, ok=False, fault=Fault.NO_NODE if silent else Fault.NODE_NOT_READY)
@@ -169,12 +169,12 @@ def _node(f: Findings) -> Check:
 
 
 def _state(f: Findings) -> Check:
-    sample, status, home = f.heard.sample, f.heard.status, f.plan.bench.shield
+    sample, status, home = f.statistics.sample, f.statistics.status, f.plan.bench.shield
     expected = f"IDLE, within {home.home_angle:g} rad and {home.home_velocity:g} rad/s of the origin"
     if f.start_conditions.anywhere:
         expected = "IDLE, inside the limits"
     if sample is None:
-        problem = f.heard.disturbances.pairing_problem
+        problem = f.statistics.pairing_problem
         fault = Fault.NODE_NOT_READY if problem else Fault.NO_NODE
         return Check("node state", problem or "no valid sensor pair came", expected, ok=False, fault=fault)
     if problem := f.start_conditions.not_at_rest(sample):
@@ -185,17 +185,17 @@ def _state(f: Findings) -> Check:
 
 
 def _samples(f: Findings) -> Check:
-    seen, disturbances, period = f.heard.sampling, f.heard.disturbances, f.plan.bench.timing.sample_time
+    seen, period = f.statistics, f.plan.bench.timing.sample_time
     expected = f"a sample each {period * 1e3:g} ms, none missing or rejected"
     if not math.isfinite(seen.period):
         return Check("samples", f"{seen.pairs} sensor pairs", expected, ok=False, fault=Fault.NO_NODE)
     lost = seen.missing / max(1, seen.pairs + seen.missing)
     rejected = ", ".join(
-        f"{name}: {why} ({n})" for name, reasons in disturbances.rejections.items() for why, n in reasons.items()
+        f"{name}: {why} ({n})" for name, reasons in seen.rejections.items() for why, n in reasons.items()
     )
     found = f"{seen.pairs}, each {seen.period * 1e3:g} ms, {seen.missing} missing ({100 * lost:.2g} %), "
     found += f"rejected {rejected}" if rejected else "none rejected"
-    fault = Fault.FRAMES_REJECTED if disturbances.distrusted else None
+    fault = Fault.FRAMES_REJECTED if seen.distrusted else None
     if fault is None and abs(seen.period / period - 1.0) > RATE_TOLERANCE:
         fault = Fault.NODE_NOT_READY
     if fault is None and f.plan.stage is Stage.READ_ONLY and lost > MOST_MISSING:
@@ -204,7 +204,11 @@ def _samples(f: Findings) -> Check:
 
 
 def _noise(f: Findings) -> Check:
-    angle, velocity, noise = f.heard.sampling.angle_scatter, f.heard.sampling.velocity_scatter, f.plan.bench.noise
+    angle, velocity, noise = (
+        f.statistics.angle_scatter,
+        f.statistics.velocity_scatter,
+        f.plan.bench.noise,
+    )
     expected = (
         f"at most {SCATTER_TOLERANCE:g} times {noise.angle:g} rad and {noise.velocity:g} rad/s; the shield allows "
         f"for {f.plan.bench.shield.noise_sigmas:g} times that"
@@ -217,7 +221,7 @@ def _noise(f: Findings) -> Check:
 
 
 def _bus_load(f: Findings) -> Check:
-    plan, layout, seen, drive = f.plan, f.plan.layout, f.heard.traffic, f.plan.drive
+    plan, layout, seen, drive = f.plan, f.plan.layout, f.statistics, f.plan.drive
     bitrate, expected = plan.bench.can.bitrate, f"at most {HIGHEST_BUS_LOAD:.0%}"
     of_drive = ""
     if drive is not None:  # that it fits was checked with the mapping file

@@ -44,7 +44,7 @@ class Bus:
     transport: Transport
     clock: Clock
     overheard: dict[tuple[bool, int], Frame] = field(default_factory=dict)
-    """Alarming frames that came while nobody listened, the first of each kind: the next run's loop takes them."""
+    """Alarming frames that came between two runs, the first of each kind: the next run's loop takes them."""
 
     @property
     def simulated(self) -> bool:
@@ -91,9 +91,9 @@ def conduct(plan: Plan, bus: Bus, run_type: RunType, path: Path, console: Consol
         watchdog = _watch(plan, bus, stack)
         obtained = realtime.obtain() if plan.precautions.real_time and not bus.simulated else None
         start_conditions = plan.start_conditions(anywhere=homing)
-        heard = observe(plan, bus, start_conditions, console.stop_requested)
+        statistics = observe(plan, bus, start_conditions, console.stop_requested)
         duration = steps * plan.bench.timing.sample_time
-        checks = run_checks(findings(plan, bus, start_conditions, heard, duration, path, watchdog, obtained))
+        checks = run_checks(findings(plan, bus, start_conditions, statistics, duration, path, watchdog, obtained))
         console.show(checks, bus)
         if (refused := first_refusal(checks)) is not None:
             raise refused
@@ -143,9 +143,9 @@ def drop_backlog(bus: Bus, layout: Layout) -> tuple[Frame, ...]:
         bus.pass_over(frame, layout)
         if frame.time_ns >= begin_ns:
             break
-    kept = tuple(bus.overheard.values())
+    alarming = tuple(bus.overheard.values())
     bus.overheard.clear()
-    return kept
+    return alarming
 
 
 def observe(
@@ -169,7 +169,7 @@ def findings(
     plan: Plan,
     bus: Bus,
     start_conditions: StartConditions,
-    heard: BusStatistics,
+    statistics: BusStatistics,
     duration: float,
     path: Path,
     watchdog: WatchdogHandle | None = None,
@@ -185,7 +185,7 @@ def findings(
         plan=plan,
         start_conditions=start_conditions,
         duration=duration,
-        heard=heard,
+        statistics=statistics,
         bus=f"{bus.transport.name}{', in lock-step' if bus.simulated else ''}{', ' if settings else ''}{settings}",
         in_process=bus.in_process,
         end_stop_speed=end_stop_speed(plan.bench),
@@ -243,7 +243,7 @@ def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dic
     """Listen for as long as was asked for, and log all that comes; nothing is ever sent.
 
     Returns:
-        The result as a document, and the pre-flight of what was heard.
+        The result as a document, and the pre-flight of the bus.
     """
     recorder = start_recorder(plan, bus, RunType.LISTEN_ONLY, path, (), 0)
     clock, receive = bus.clock, paced_receive(bus, recorder)
@@ -268,13 +268,13 @@ def listen_only(plan: Plan, bus: Bus, path: Path, console: Console) -> tuple[dic
             listen(monitor, receive_and_record, clock, period_ns, deadline_ns, lambda *_: False, console.stop_requested)
         except BusError as err:
             refused = RefusedError(str(err), err.exit_code, fault=Fault.BUS_LOST)
-        heard, start_conditions = monitor.statistics(), plan.start_conditions(anywhere=False)
-        checks = run_checks(findings(plan, bus, start_conditions, heard, plan.duration, path))
+        statistics, start_conditions = monitor.statistics(), plan.start_conditions(anywhere=False)
+        checks = run_checks(findings(plan, bus, start_conditions, statistics, plan.duration, path))
         refused = refused or first_refusal(checks)
         if refused is not None and refused.fault is not None:
             note(refused.fault.name, str(refused))
         push_clock(recorder, clock)
-        reading = Reading(plan, heard, checks, refused)
+        reading = Reading(plan, statistics, checks, refused)
         end = reading.trailer()
     finally:
         log = recorder.finish(end)

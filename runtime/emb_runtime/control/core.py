@@ -2,14 +2,15 @@
 
 A driver does all that blocks (:mod:`emb_runtime.control.loop`; a rerun plays a log instead):
 
-* :meth:`Core.take` gets the frames of one read, and decides on a command for the newest sample among them;
+* :meth:`Core.process_frames` gets the frames of one read, and decides on a command for the newest sample among them;
 * :meth:`Core.answer` gives the frame to send, checked by the guard, unless it is too late or not permitted;
 * :meth:`Core.sent` records the cycle;
 * :meth:`Core.timeout` counts a period without a sample.
 
-What goes in is recorded before what comes of it: each frame with the time of its read, each other call as an input.
-What happened lies in :attr:`Core.records`, in its order, until the driver takes it. A fault is a value of the state,
-not an error. A command answers the newest sample, or none is sent: nothing repeats a command.
+Each input is recorded before its consequences: a frame with the time of its read, any other call as an
+:class:`~emb_runtime.log.ring_buffer.InputRecord`. :attr:`Core.records` holds the records in order until the driver
+removes them. A fault is a value of the state, not an error. A command answers the newest sample, or none is sent:
+nothing repeats a command.
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ from emb_runtime.records import Call, Frame, Reason, RunState
 from emb_runtime.safety.response_cause import cause
 from emb_runtime.safety.state_machine import Event, Fault, StopError
 
-# Names of their own, as in :mod:`emb_runtime.safety.state_machine`.
 SILENT: Final = RunState.SILENT
 OVER: Final = RunState.OVER
 IN_CONTROL: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)
@@ -64,11 +64,11 @@ class Core:
         self._detail = ""  # of the fault
         self._answer_at = 0  # place of the newest answer in the records
 
-    # --- what the driver asks ---------------------------------------------------------------------------------------
+    # --- state ------------------------------------------------------------------------------------------------------
 
     @property
     def records(self) -> list[Record]:
-        """Records of what happened, in its order, until the driver takes them."""
+        """Records in order; the driver removes those that it has passed on."""
         return self._memory.records
 
     @property
@@ -106,20 +106,20 @@ class Core:
     # --- the run ----------------------------------------------------------------------------------------------------
 
     def begin(self, now_ns: int) -> None:
-        """Begin to listen for the node."""
-        self._take_in(Call.BEGIN, now_ns)
+        """Begin the run: listen for the node."""
+        self._record_call(Call.BEGIN, now_ns)
         self._memory.read_ns = now_ns
         self._machine.handle_event(Event.PREPARED, now_ns)
 
-    def take(self, frames: Sequence[Frame], now_ns: int) -> bool:
-        """Take the frames of one read, in hand at a monotonic time [ns]; True if :meth:`answer` comes next."""
+    def process_frames(self, frames: Sequence[Frame], now_ns: int) -> bool:
+        """Process the frames of one read at a monotonic time [ns]; returns True if :meth:`answer` comes next."""
         memory, self._proposal = self._memory, None
         memory.read_ns = now_ns
         for left, frame in enumerate(frames, 1 - len(frames)):
             memory.records.append(tuple.__new__(FrameRecord, (frame, now_ns if left == 0 else 0)))
             try:
                 if self.state is not OVER:
-                    self._take(frame)
+                    self._process_frame(frame)
             except StopError as stop:
                 self._fail(stop, now_ns)
         if not self.running:
@@ -148,7 +148,7 @@ class Core:
         self._answer_at = len(records)
         records.append(tuple.__new__(InputRecord, (now_ns, ANSWER, 0, "", "")))
         sample, _, _, decision = proposal
-        in_time = now_ns - sample.receive_time_ns <= self._latest_answer_ns  # else the sample that it answers is stale
+        in_time = now_ns - sample.receive_time_ns <= self._latest_answer_ns  # else the sample is stale
         if not in_time or not self._may_answer(now_ns) or math.isnan(decision.current):
             left = decision.reasons & Reason.LEFT if in_time else 0
             self._memory.unanswered(sample, self._memory.missed, now_ns, left)
@@ -180,7 +180,7 @@ class Core:
 
     def timeout(self, now_ns: int) -> None:
         """Count that no frame came until :attr:`deadline_ns`."""
-        self._take_in(Call.TIMEOUT, now_ns)
+        self._record_call(Call.TIMEOUT, now_ns)
         self._memory.read_ns = now_ns
         try:
             self._phase.miss()
@@ -189,13 +189,13 @@ class Core:
 
     def latch(self, fault: Fault, now_ns: int) -> None:
         """Latch a fault of the driver; :meth:`explain` records it, where it was raised once a stop frame has left."""
-        self._take_in(Call.LATCH, now_ns, fault.name)
+        self._record_call(Call.LATCH, now_ns, fault.name)
         self._machine.latch(fault, now_ns)
         self._follow_state()
 
     def explain(self, fault: Fault, now_ns: int, detail: str = "") -> None:
         """Record a fault that was latched."""
-        self._take_in(Call.EXPLAIN, now_ns, fault.name, detail)
+        self._record_call(Call.EXPLAIN, now_ns, fault.name, detail)
         self._explain(fault, detail)
 
     def stop_frame(self, now_ns: int) -> Frame:
@@ -204,13 +204,13 @@ class Core:
         Raises:
             GuardRejectedError: the frame is not in the guard's contract.
         """
-        self._take_in(Call.STOP_FRAME, now_ns)
+        self._record_call(Call.STOP_FRAME, now_ns)
         frame = self.setup.layout.encode_command(self.guard.next_counter, self.newest_counter, 0.0, False)
         return self.guard.check(frame, self.state, now_ns, now_ns)
 
     def end(self, now_ns: int) -> None:
         """Check how the node came to rest; the run is over."""
-        self._take_in(Call.END, now_ns)
+        self._record_call(Call.END, now_ns)
         setup, self._memory.read_ns = self.setup, now_ns
         if self.fault in OF_RESPONSE:
             response = setup.sensors.response
@@ -225,7 +225,7 @@ class Core:
 
     def note(self, time_ns: int, code: str, text: str) -> None:
         """Record an event of the driver."""
-        self._take_in(Call.NOTE, time_ns, code, text)
+        self._record_call(Call.NOTE, time_ns, code, text)
         self._memory.note(time_ns, code, text)
 
     def outcome(self) -> Outcome:
@@ -253,10 +253,10 @@ class Core:
             goal_ns=estimate.goal_ns,
         )
 
-    # --- what the bus says ------------------------------------------------------------------------------------------
+    # --- frames -----------------------------------------------------------------------------------------------------
 
-    def _take(self, frame: Frame) -> None:
-        """Take a frame; a sample that it completes is the phase's."""
+    def _process_frame(self, frame: Frame) -> None:
+        """Process a frame, and the sample that it completes."""
         memory, reception = self._memory, self._reception
         while frame.time_ns >= memory.deadline_ns and self.state in IN_CONTROL:
             self._phase.miss()
@@ -272,7 +272,7 @@ class Core:
             self._machine.note(Fault.FRAMES_DROPPED, f"{reception.dropped} so far", frame.time_ns)
         if sample is not None:
             self._machine.handle_event(PAIR, sample.receive_time_ns)
-            self._phase = self._phase.take(sample)
+            self._phase = self._phase.process_sample(sample)
 
     def _count_error(self, frame: Frame) -> None:
         counters, errors = self._memory.counters, self._reception.bus_errors
@@ -293,14 +293,14 @@ class Core:
         return not why
 
     def _end_cycle(self, proposal: Proposal) -> None:
-        """Record the estimate, and check the motion so far: the command has left."""
+        """Record the estimate and update the motion balance, after the command was sent."""
         self.setup.estimate.record(proposal.sample, proposal.step, self._memory)
         try:
             self.setup.sensors.update_balance()
         except StopError as stop:
             self._fail(stop, self._memory.read_ns)
 
-    def _take_in(self, call: Call, now_ns: int, code: str = "", text: str = "") -> None:
+    def _record_call(self, call: Call, now_ns: int, code: str = "", text: str = "") -> None:
         """Record a call of the driver."""
         self._memory.records.append(InputRecord(now_ns, call, 0, code, text))
 

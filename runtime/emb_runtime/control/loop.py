@@ -31,7 +31,7 @@ STOP_LISTEN_NS: Final = 1_500_000_000
 lets its drive go."""
 MOST_FRAMES: Final = 64  # Of one read: a babbling node must not hold the loop
 STOP_FRAME_NOT_SENT: Final = "STOP_FRAME_NOT_SENT"  # Code of the event that says so
-HELD_RECORDS: Final = 4  # Without a command they wait for more, so that nothing is packed between a pair's two frames
+HELD_RECORDS: Final = 4  # Without a command fewer records are not passed on yet: not between a pair's two frames
 
 
 @dataclass
@@ -61,7 +61,7 @@ class Loop:
         core = self.core
         try:
             core.begin(self._read_clock())
-            core.take(self.overheard, self._now_ns)
+            core.process_frames(self.overheard, self._now_ns)
             while core.running:
                 self._cycle()
         except BaseException as err:
@@ -86,7 +86,7 @@ class Loop:
             core.explain(fault, self._now_ns)
         if not frames:
             core.timeout(self._now_ns)
-        elif core.take(frames, self._now_ns):
+        elif core.process_frames(frames, self._now_ns):
             self._answer()
         elif len(core.records) < HELD_RECORDS:
             return
@@ -106,7 +106,7 @@ class Loop:
         return frames
 
     def _fault_from_outside(self, now_ns: int) -> Fault | None:
-        """Exchange signs of life with the watchdog, and ask all who may end the run."""
+        """Beat the watchdog's heartbeat; returns a fault of the watchdog or the operator."""
         if self.pulse.tripped:
             return Fault.WATCHDOG_TRIPPED
         if self.stop_requested():
@@ -142,11 +142,11 @@ class Loop:
     # --- STOPPING ---------------------------------------------------------------------------------------------------
 
     def _latch(self, err: BaseException) -> None:
-        """Take the fault of an error; it is described when the first stop frame has left."""
+        """Latch the fault of an error; :meth:`_stop` explains it after the first stop frame."""
         self._cause = err
         self._keep(err)
         self._attempt("CLOCK_FAILED", self._read_clock)
-        # It takes the bus from this process: that is the cause of what fails here.
+        # A watchdog that tripped has unbound the socket: that is the cause of the error.
         self._fault = Fault.WATCHDOG_TRIPPED if self._has_tripped() else fault_of(err)
         self.core.latch(self._fault, self._now_ns)
 
@@ -169,7 +169,7 @@ class Loop:
         self._record()
 
     def _end_stop(self) -> None:
-        """Let the watchdog go, and watch the node come to rest."""
+        """Disarm the watchdog, and wait until the node is at rest."""
         core = self.core
         self._attempt("DISARM_FAILED", self.pulse.disarm)
         self._attempt("CLOCK_FAILED", self._read_clock)
@@ -190,19 +190,19 @@ class Loop:
     def _listen(self, deadline_ns: int, *, until_rest: bool = False) -> None:
         """Record what comes until a deadline, or until the node is at rest."""
 
-        def take() -> None:
+        def listen() -> None:
             while not (until_rest and self.core.at_rest):
                 frames = self._read(deadline_ns)
-                self.core.take(frames, self._now_ns)
+                self.core.process_frames(frames, self._now_ns)
                 self._push_records()
                 if not frames or frames[-1].time_ns >= deadline_ns:
                     break  # on a babbling bus there is always one more
 
-        self._attempt("LISTENING_FAILED", take)
+        self._attempt("LISTENING_FAILED", listen)
         self._record()
 
     def _attempt(self, failure: str, call: Callable[[], object]) -> None:
-        """Run a step of the stop; keep its failure for :meth:`_record`, and go on."""
+        """Run one step of the stop; store its exception for :meth:`_record`, and continue."""
         try:
             call()
         except BaseException as err:
@@ -226,7 +226,7 @@ class Loop:
             return False
 
     def _keep(self, err: BaseException) -> None:
-        """Keep the first error that is to be raised once the run has stopped: no Exception, and no request to exit."""
+        """Store the first error that is raised after the stop: neither an Exception nor SystemExit."""
         if self._leaving is None and not issubclass(type(err), Exception | SystemExit):
             self._leaving = err
 

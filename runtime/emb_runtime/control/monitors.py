@@ -28,7 +28,6 @@ from emb_runtime.safety.sensor_thresholds import sensor_thresholds
 from emb_runtime.safety.shield_design import ShieldLaw
 from emb_runtime.safety.state_machine import Fault, StopError
 
-# Names of their own, as in :mod:`emb_runtime.safety.state_machine`.
 IDLE: Final = NodeState.IDLE
 OBEYING: Final = NodeState.ACTIVE
 UNFIT: Final = (NodeState.STOPPING, NodeState.FAULT)
@@ -46,7 +45,7 @@ def monitors(bounds: Bounds, conditions: StartConditions, reception: Reception, 
             raise StopError(Fault.OUT_OF_LIMITS, outside)
 
     def check_drive(sample: SensorSample, memory: Memory) -> None:
-        guard.judge(sample)
+        guard.check_drive(sample)
 
     return check_limits, Node(conditions, reception).check, check_obeyed, check_lost, check_drive
 
@@ -79,7 +78,7 @@ def check_lost(sample: SensorSample, memory: Memory) -> None:
 
 
 class Node:
-    """Monitor of the node: it obeys, and is the one that it was."""
+    """Monitor of the node: its state, and its identity since the run began."""
 
     def __init__(self, conditions: StartConditions, reception: Reception) -> None:
         self._conditions = conditions
@@ -97,7 +96,7 @@ class Node:
 
     def _change(self, sample: SensorSample) -> str:
         """Property of the node that has changed since the run began, in words; empty if none has."""
-        # Until it has obeyed the first command it may be idle: the first ones may be lost.
+        # Before the first obeyed command it may be idle: the first ones may be lost.
         self._was_active |= sample.node_state is OBEYING
         if sample.node_state is IDLE and (self._was_active or sample.command_counter != NO_COUNTER):
             return "the node's state is IDLE after it has obeyed a command of this run"
@@ -155,7 +154,7 @@ class Sensors:
             self._pending = sample, interval.follows
 
     def update_balance(self) -> None:
-        """Take the newest sample into the motion balance, once its command has left: no command depends on it."""
+        """Update the motion balance with the newest sample, after its command was sent (not time critical)."""
         if self._pending is not None:
             (sample, follows), self._pending = self._pending, None
             self._balance.take(sample, follows)

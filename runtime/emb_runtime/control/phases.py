@@ -1,11 +1,11 @@
-"""Phases of a run: each takes a sample and returns the next phase, or itself.
+"""Phases of a run: each processes a sample and returns the next phase, or itself.
 
     Silent -> Control -> Stopping
               Control -> Coasting -> Stopping
 
-Silent listens until the node has shown itself. Control checks each sample and answers it. Coasting lets friction stop a
-brake of which motor or sensors may have the wrong sign. Stopping watches the node come to rest. No phase returns it:
-the core enters it when the state machine says that the run has ended, or has failed by a StopError.
+Silent waits until the node is ready. Control checks each sample and answers it. Coasting lets friction stop a brake of
+which motor or sensors may have the wrong sign. Stopping observes the node until it is at rest. No phase returns
+Stopping: the core enters it when the run has ended, or has failed by a StopError.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ UNSTEADY: Final = "its samples come earlier and earlier by its own clock: they h
 """Reason why a node is not ready."""
 SILENT_WAIT: Final = 10  # Periods after which a driver that waits for the node asks again for the operator's wish
 COVERAGE: Final = 0.8
-"""Least share of an experiment's periods with a sample and a command that acted."""
+"""Minimum share of periods with a sample and an applied command."""
 ARMED: Final = RunState.ARMED
 
 
@@ -44,17 +44,17 @@ class Phase:
         """Time until which the next frames are waited for, monotonic [ns]."""
         return self.memory.deadline_ns
 
-    def take(self, sample: SensorSample) -> Phase:
-        """Take a valid sample; gives the next phase."""
+    def process_sample(self, sample: SensorSample) -> Phase:
+        """Process a valid sample; returns the next phase."""
         raise NotImplementedError
 
     def propose(self) -> Proposal | None:
-        """Decide on a command for the newest sample, when all of a read have been taken; without any, time passes."""
+        """Decide on a command for the newest sample, after all frames of a read; a phase without commands: None."""
         self.miss()
         return None
 
     def miss(self) -> None:
-        """Count that nothing came until the deadline."""
+        """Count a period in which no sample came until the deadline."""
 
 
 class Silent(Phase):
@@ -72,7 +72,7 @@ class Silent(Phase):
         give_up_ns = self.machine.run.since_ns + round(self.setup.bench.watch.start_timeout * 1e9)
         return min(give_up_ns, self.memory.read_ns + SILENT_WAIT * self.memory.period_ns)
 
-    def take(self, sample: SensorSample) -> Phase:
+    def process_sample(self, sample: SensorSample) -> Phase:
         """Arm, if the node is ready."""
         setup, memory = self.setup, self.memory
         before = memory.add_sample(sample)
@@ -113,7 +113,7 @@ class Control(Phase):
         estimator.take(sample.angle, sample.velocity, 0, sample.applied_current)
         decide(setup.law, setup.command_limits, sample.angle, sample.velocity, 0.0, NO_PAST, 0.0, 0)
 
-    def take(self, sample: SensorSample) -> Phase:
+    def process_sample(self, sample: SensorSample) -> Phase:
         """Count the periods since the sample before, and check that the sensors can be right."""
         setup, memory = self.setup, self.memory
         before, missed, phase = memory.add_sample(sample), memory.missed, self
@@ -134,7 +134,7 @@ class Control(Phase):
             return None
         setup, memory, estimate = self.setup, self.memory, self.setup.estimate
         # Before its device time says which step it is, or that it is the last one. A stamp may be just ahead of now.
-        setup.guard.judge_time(sample, max(memory.read_ns, sample.receive_time_ns))
+        setup.guard.check_time(sample, max(memory.read_ns, sample.receive_time_ns))
         if self.machine.run.state is ARMED:
             self._begin(sample)
         else:
@@ -250,7 +250,7 @@ class Coasting(Control):
 
 
 class Stopping(Phase):
-    """Phase after the end, or a fault: watches the node come to rest."""
+    """Phase after the end, or a fault: observes the node until it is at rest."""
 
     def __init__(self, setup: Setup, end: SensorSample | None) -> None:
         super().__init__(setup)
@@ -259,8 +259,8 @@ class Stopping(Phase):
         self._left = False  # the node has left ACTIVE since then
         self._samples: list[SensorSample] = []  # the last ones since then
 
-    def take(self, sample: SensorSample) -> Phase:
-        """Keep what tells how the node stops."""
+    def process_sample(self, sample: SensorSample) -> Phase:
+        """Store the newest samples, and whether the node has left ACTIVE."""
         self.memory.newest = sample  # not added: from the end on no deadline runs
         self.setup.sensors.response.watch(sample)
         if sample.node_state is not OBEYING and not self._left:

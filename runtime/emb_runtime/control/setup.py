@@ -27,7 +27,7 @@ class Setup:
     layout: Layout
     law: ShieldLaw  # Its steps are the samples to answer; on the way home, at most
     actor: Actor
-    current_limit: float  # Largest current that the policy's contract allows it to ask for [A]
+    current_limit: float  # Largest current that the policy's contract allows it to request [A]
     guard: Guard
     limit: float = CEILING_CURRENT  # A current narrower than the bench's, where the operator asked for one [A]
     homing: bool = False  # Begin anywhere, let the shield bring the brake home, and end when it rests there

@@ -1,11 +1,11 @@
 """The guard: the one place that can reach the bus, independent of all that computes a command.
 
-It takes a frame as bytes, decodes it by the table of signals, not by the generated code that encoded it, and rejects:
-it never mends. A rejection is an error in the program and ends the run. What may pass is a command frame of the right
-identifier and length, with a valid CRC and the next counter, whose enable bit and current agree, within the current
-limit and the slew, permitted by the run's state, computed from a sample no older than two periods, and not faster than
-the bench's rate. It also holds what the drive reports against what it let out, and device time against this computer's.
-Once the watchdog process has spoken, nothing passes any more.
+It decodes the bytes of a frame by the table of signals, not by the generated code that encoded it, and rejects or
+passes: it changes nothing. A rejection is an error in the program and ends the run. A frame that passes is a command of
+the right identifier and length, with a valid CRC and the next counter, whose enable bit and current agree, within the
+current limit and the slew, permitted by the run's state, computed from a sample no older than two periods, and not
+faster than the bench's rate. The guard also compares the current that the drive reports with the commands that passed,
+and device time with this computer's. After the watchdog process has tripped nothing passes.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ OLDEST_SAMPLE_PERIODS: Final = 2
 
 
 class GuardRejectedError(SafetyStopError):
-    """A command that the guard did not let out."""
+    """A command that the guard rejected."""
 
 
 class Guard:
-    """Lets commands out that satisfy its contract, and counts.
+    """Passes commands that satisfy its contract to the bus, and counts.
 
     Args:
         layout: the bus layout, whose command message it decodes.
         bench: for the limits and the sample time.
-        send: puts a frame on the bus; nobody else holds it.
+        send: puts a frame on the bus; the only reference to it.
         pulse: to the watchdog process.
         limit: a current narrower than the bench's, where the operator asked for one [A].
     """
@@ -118,8 +118,8 @@ class Guard:
         if allowed is not frame:
             self.rejected += 1
             raise _rejected("it is not the one that was checked last")
-        # Asked last. What slips through between this and the bus answers a sample that is not the newest any more
-        # (the watchdog waits for periods), so the node does not obey it.
+        # Last check. A frame sent after a trip answers an old sample (the watchdog waits for periods), so that the node
+        # does not obey it.
         if self._pulse.tripped:
             raise StopError(Fault.WATCHDOG_TRIPPED)
         try:
@@ -130,22 +130,22 @@ class Guard:
             raise
         self.passed += 1
 
-    def judge(self, sample: SensorSample) -> None:
-        """Hold what the drive reports against what was let out; raises StopError if it does not apply that."""
+    def check_drive(self, sample: SensorSample) -> None:
+        """Compare the reported current with the commands that passed; raises StopError if it does not follow them."""
         if problem := self._drive.current_problem(sample.command_counter, sample.applied_current):
             raise StopError(Fault.CURRENT_MISMATCH, problem)
 
     def learn_time(self, sample: SensorSample, *, first: bool) -> bool:
-        """Take a sample before arming as a reference of the two clocks; with ``first`` those before it do not count.
+        """Add a sample before arming to the reference of the two clocks; with ``first`` begin a new reference.
 
-        Gives False if it cannot continue the reference, and begins a new one.
+        Returns False if it does not continue the reference; it then begins a new one.
         """
         if first:
             self._device_clock.restart()
         return self._device_clock.learn(sample.device_time_ns, sample.receive_time_ns)
 
-    def judge_time(self, sample: SensorSample, seen_ns: int) -> None:
-        """Hold a sample's device time against this computer's, monotonic, when it was in hand [ns].
+    def check_time(self, sample: SensorSample, seen_ns: int) -> None:
+        """Compare a sample's device time with this computer's monotonic time at which it was read [ns].
 
         Raises:
             StopError: the node's clock is wrong; from then on no enabled command passes.

@@ -73,7 +73,7 @@ class Run(NamedTuple):
 
     state: RunState = RunState.INIT
     since_ns: int = 0  # Beginning of this state, monotonic [ns]
-    heard_ns: int = 0  # Arrival of the last valid pair; 0 before the first [ns]
+    last_pair_ns: int = 0  # Arrival of the last valid pair; 0 before the first [ns]
     late: bool = False  # The soft limit of missed periods has been reached since then
     fault: Fault | None = None  # The first one that latched
 
@@ -89,7 +89,6 @@ _NEXT: Final[dict[tuple[RunState, Event], RunState]] = {
 }
 _LISTENING: Final = (RunState.SILENT, RunState.ARMED, RunState.ACTIVE, RunState.HOMING, RunState.STOPPING)
 _WATCHED: Final = (RunState.ARMED, RunState.ACTIVE, RunState.HOMING)  # States in which the node must be heard
-# What each cycle asks for, by a name of its own: in Python 3.11 a member of an enumeration takes as long as a call.
 _PAIR: Final = Event.PAIR
 _ENABLING: Final = (RunState.ACTIVE, RunState.HOMING)
 _SENDING: Final = (*_ENABLING, RunState.STOPPING)
@@ -116,7 +115,7 @@ def step(bench: Bench, run: Run, event: Event | Fault, now_ns: int) -> Run:
 def missed(bench: Bench, run: Run, now_ns: int) -> int:
     """Sampling periods in a row that have passed without a valid pair; one counts when it is half a period overdue."""
     period_ns = bench.timing.sample_time_ns
-    return max(0, (2 * (now_ns - run.heard_ns) - period_ns) // (2 * period_ns))
+    return max(0, (2 * (now_ns - run.last_pair_ns) - period_ns) // (2 * period_ns))
 
 
 def _faulted(run: Run, fault: Fault, now_ns: int) -> Run:
@@ -132,7 +131,7 @@ def _faulted(run: Run, fault: Fault, now_ns: int) -> Run:
 
 def _waited(bench: Bench, run: Run, now_ns: int) -> Run:
     if run.state is RunState.SILENT and now_ns - run.since_ns >= round(bench.watch.start_timeout * 1e9):
-        return _faulted(run, Fault.NODE_NOT_READY if run.heard_ns else Fault.NO_NODE, now_ns)
+        return _faulted(run, Fault.NODE_NOT_READY if run.last_pair_ns else Fault.NO_NODE, now_ns)
     if run.state in _WATCHED:
         silent = missed(bench, run, now_ns)
         if silent >= bench.watch.stop_missed:

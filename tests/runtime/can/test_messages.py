@@ -365,6 +365,16 @@ def test_the_enable_bit_is_read_as_it_was_written() -> None:
         assert LAYOUT.decode_command(LAYOUT.encode_command(*command)) == command
 
 
+def test_a_command_is_written_with_the_record_that_the_node_reads() -> None:
+    for current in (0.0, -0.0, 1.00009, 1.00011, -3.3333, 6.0, -6.0):
+        frame, command = LAYOUT.write_command(3, 4, current, True)
+        assert frame == LAYOUT.encode_command(3, 4, current, True)
+        assert repr(command) == repr(LAYOUT.decode_command(frame))
+        assert command.current == pytest.approx(current, abs=1e-4 + 1e-12)
+    with pytest.raises(FrameError):
+        LAYOUT.write_command(3, 4, 6.0002, True)
+
+
 def test_the_current_within_a_limit_lies_on_a_step_of_the_signal() -> None:
     for limit, within in [(6.0, 30_000), (0.6, 3_000), (1.0001, 5_000), (1.00019, 5_000), (0.0002, 1), (0.0001, 0)]:
         assert LAYOUT.current_within(limit) == pytest.approx(within * 2e-4, abs=1e-12)

@@ -90,5 +90,5 @@ def test_the_pre_flight_sees_an_alarming_frame_that_came_before_it_listened(
     monitor = BusMonitor(layout, bench, lambda _frame, _why: None)
     listen(monitor, waiting.receive, bus.clock, MS, NOW + 9 * MS, lambda *_: False, lambda: not waiting.frames)
     heard = monitor.statistics()
-    assert (heard.disturbances.commanded, len(heard.disturbances.bus_errors)) == (commanded, errors)
-    assert (heard.traffic.frames, heard.traffic.others) == ({}, 0)
+    assert (heard.commanded, len(heard.bus_errors)) == (commanded, errors)
+    assert (heard.frames, heard.others) == ({}, 0)

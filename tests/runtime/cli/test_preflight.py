@@ -16,9 +16,6 @@ from emb_runtime.cli.bus_monitor import (
     ENOUGH_PAIRS,
     BusMonitor,
     BusStatistics,
-    Disturbances,
-    Sampling,
-    Traffic,
     listen,
 )
 from emb_runtime.cli.options import parser, prepare
@@ -53,23 +50,27 @@ SAMPLE = SensorSample(3, 0.001, 0.5, 0, 0, 0.0, 15, NodeState.IDLE)
 def heard(bench: Bench, layout: Layout) -> BusStatistics:
     """A healthy node."""
     status = STATUS._replace(protocol_version=layout.protocol_version, bench_identity=int(bench.identity_hash[:4], 16))
-    traffic = Traffic(
+    return BusStatistics(
         duration=0.2,
         frames={"EMB_Angle": 200, "EMB_Velocity": 200, "EMB_Status": 2},
         rates={"EMB_Angle": 1000.0, "EMB_Velocity": 1000.0, "EMB_Status": 10.0},
         others=0,
         load=0.27,
-    )
-    none = Disturbances(rejections={}, distrusted=False, bus_errors={}, dropped=0, commanded=False, pairing_problem="")
-    sampling = Sampling(
+        rejections={},
+        distrusted=False,
+        bus_errors={},
+        dropped=0,
+        commanded=False,
+        pairing_problem="",
         pairs=200,
         missing=0,
         period=1e-3,
         resting=ENOUGH_PAIRS,
         angle_scatter=bench.noise.angle,
         velocity_scatter=bench.noise.velocity,
+        status=status,
+        sample=SAMPLE,
     )
-    return BusStatistics(traffic, none, sampling, status, SAMPLE)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +81,7 @@ def healthy() -> Findings:
         plan=plan,
         start_conditions=StartConditions(plan.bench, plan.layout, Bounds(plan.bench), anywhere=False),
         duration=0.5,
-        heard=None,  # type: ignore[arg-type]  # see the next fixture
+        statistics=None,  # type: ignore[arg-type]  # see the next fixture
         bus="can0, receive buffer 8388608 bytes",
         in_process=False,
         end_stop_speed=0.0,
@@ -94,7 +95,7 @@ def healthy() -> Findings:
 
 @pytest.fixture
 def findings(healthy: Findings, heard: BusStatistics) -> Findings:
-    return replace(healthy, heard=heard)
+    return replace(healthy, statistics=heard)
 
 
 def planned(findings: Findings, **changes: Any) -> Findings:
@@ -107,12 +108,7 @@ def edited(findings: Findings, old: str, new: str) -> Bench:
 
 
 def hears(findings: Findings, **changes: Any) -> Findings:
-    heard = findings.heard
-    for part in ("traffic", "disturbances", "sampling"):
-        record = getattr(heard, part)
-        of_part = {name: changes.pop(name) for name in list(changes) if hasattr(record, name)}
-        heard = replace(heard, **{part: replace(record, **of_part)})
-    return replace(findings, heard=replace(heard, **changes))
+    return replace(findings, statistics=replace(findings.statistics, **changes))
 
 
 def reads_only(findings: Findings) -> Findings:
@@ -311,29 +307,29 @@ def listened(bench: Bench, layout: Layout) -> Callable[..., BusMonitor]:
 
 def test_a_node_that_is_ready_is_heard_just_long_enough(listened: Callable[..., BusMonitor], bench: Bench) -> None:
     heard = listened().statistics()
-    assert heard.sampling.pairs == ENOUGH_PAIRS
-    assert heard.sampling.period == pytest.approx(1e-3, abs=1e-12)
-    assert heard.traffic.rates["EMB_Angle"] == pytest.approx(1000.0)
-    assert heard.traffic.rates["EMB_Status"] == pytest.approx(10.0)
-    assert heard.sampling.angle_scatter == pytest.approx(bench.noise.angle, rel=0.2)
-    assert heard.sampling.velocity_scatter == pytest.approx(bench.noise.velocity, rel=0.2)
+    assert heard.pairs == ENOUGH_PAIRS
+    assert heard.period == pytest.approx(1e-3, abs=1e-12)
+    assert heard.rates["EMB_Angle"] == pytest.approx(1000.0)
+    assert heard.rates["EMB_Status"] == pytest.approx(10.0)
+    assert heard.angle_scatter == pytest.approx(bench.noise.angle, rel=0.2)
+    assert heard.velocity_scatter == pytest.approx(bench.noise.velocity, rel=0.2)
     assert (
-        heard.sampling.missing,
-        heard.traffic.others,
-        heard.disturbances.commanded,
-        heard.disturbances.distrusted,
+        heard.missing,
+        heard.others,
+        heard.commanded,
+        heard.distrusted,
     ) == (0, 0, False, False)
-    assert heard.disturbances.rejections == {}
+    assert heard.rejections == {}
 
 
 def test_the_load_that_is_heard_is_that_of_the_frames(listened: Callable[..., BusMonitor]) -> None:
     heard = listened().statistics()
-    assert heard.traffic.load == pytest.approx(135 * sum(heard.traffic.frames.values()) / heard.traffic.duration / 1e6)
+    assert heard.load == pytest.approx(135 * sum(heard.frames.values()) / heard.duration / 1e6)
 
 
 def test_a_node_that_is_not_ready_is_waited_for_until_the_deadline(listened: Callable[..., BusMonitor]) -> None:
     heard = listened(angle=3.0).statistics()
-    assert heard.traffic.duration == pytest.approx(0.999, abs=0.002)
+    assert heard.duration == pytest.approx(0.999, abs=0.002)
     assert heard.sample is not None
     assert heard.sample.angle == pytest.approx(3.0, abs=0.5)  # the clamped spring creeps
 
@@ -351,8 +347,8 @@ def test_the_scatter_is_that_of_the_samples_since_the_node_is_idle(listened: Cal
         return active._replace(time_ns=frame.time_ns)
 
     heard = listened(change=active_at_first).statistics()
-    assert (heard.sampling.pairs, heard.sampling.resting) == (ENOUGH_PAIRS, ENOUGH_PAIRS - 120)
-    assert heard.sampling.angle_scatter == pytest.approx(statistics.stdev(angles[120:ENOUGH_PAIRS]))
+    assert (heard.pairs, heard.resting) == (ENOUGH_PAIRS, ENOUGH_PAIRS - 120)
+    assert heard.angle_scatter == pytest.approx(statistics.stdev(angles[120:ENOUGH_PAIRS]))
 
 
 def test_lost_frames_are_missing_pairs_and_damaged_ones_are_rejections(listened: Callable[..., BusMonitor]) -> None:
@@ -366,8 +362,8 @@ def test_lost_frames_are_missing_pairs_and_damaged_ones_are_rejections(listened:
         return frame._replace(data=b"\x00" + frame.data[1:]) if count == 150 else frame
 
     heard = listened(change=disturb).statistics()
-    assert heard.sampling.missing == 2
-    assert sum(sum(reasons.values()) for reasons in heard.disturbances.rejections.values()) == 1
+    assert heard.missing == 2
+    assert sum(sum(reasons.values()) for reasons in heard.rejections.values()) == 1
 
 
 def test_frames_from_before_the_listening_and_error_frames_are_no_traffic(bench: Bench, monitor: BusMonitor) -> None:
@@ -381,8 +377,8 @@ def test_frames_from_before_the_listening_and_error_frames_are_no_traffic(bench:
 
     listen(monitor, receive, clock, MS, clock.now_ns() + 20 * MS, lambda *_: False, lambda: False)
     heard = monitor.statistics()
-    assert heard.traffic.others == 1
-    assert heard.disturbances.bus_errors == {"no acknowledgement": 1}
+    assert heard.others == 1
+    assert heard.bus_errors == {"no acknowledgement": 1}
 
 
 def test_the_listening_ends_when_the_operator_says_so(bench: Bench, monitor: BusMonitor) -> None:

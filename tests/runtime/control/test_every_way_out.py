@@ -76,8 +76,8 @@ OURS: dict[str, tuple[type, str]] = {
     "estimator": (Estimator, "take"),
     "guard": (Guard, "send"),
     "guard's check": (Guard, "check"),
-    "guard's judge": (Guard, "judge"),
-    "guard's clock": (Guard, "judge_time"),
+    "guard's drive": (Guard, "check_drive"),
+    "guard's clock": (Guard, "check_time"),
 }
 WHILE_STOPPING = (
     "clock",

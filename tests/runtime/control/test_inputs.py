@@ -39,7 +39,7 @@ def records_of(core: Core, inputs: Iterable[Record], lost: list[str]) -> list[Re
 
 def take(core: Core, frames: list[Frame], read_ns: int) -> None:
     with contextlib.suppress(ZeroDivisionError):  # of the actor
-        core.take(frames, read_ns)
+        core.process_frames(frames, read_ns)
 
 
 def call(core: Core, record: InputRecord, lost: list[str]) -> None:
@@ -129,6 +129,22 @@ def test_an_answer_that_was_lost_says_why_and_one_that_was_left_was_not_sent(sim
         unsent = [record for record in inputs if record.call == Call.ANSWER and not record.send_time_ns]
         assert len(unsent) == run.outcome.counters.unanswered > 0
         assert sum(bool(record.text) for record in unsent) == texts
+
+
+def test_a_sample_is_answered_once_and_without_one_nothing_is(simulate: Simulate) -> None:
+    journal = Journal()
+    run = simulate(lambda *_: 3.0, steps=STEPS, journal=journal)
+    inputs = [record for record in journal.records if isinstance(record, FrameRecord | InputRecord)]
+    at = next(n for n, r in enumerate(inputs) if isinstance(r, InputRecord) and r.call == Call.ANSWER)
+    driven: dict[str, Any] = dict.fromkeys(("send", "receive", "now_ns", "push"))
+    core = make_loop(run.bench, FunctionActor(lambda *_: 3.0), STEPS, **driven).core
+    assert core.answer(0) is None
+    records_of(core, inputs[:at], [])
+    time_ns = inputs[at].time_ns
+    assert core.answer(time_ns) is not None
+    core.records.clear()
+    assert core.answer(time_ns) is None
+    assert core.records == []
 
 
 def test_a_fault_is_latched_before_the_first_stop_frame_and_explained_after_it(simulate: Simulate) -> None:

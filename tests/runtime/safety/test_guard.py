@@ -304,11 +304,11 @@ def test_a_drive_that_does_not_apply_what_left_ends_the_run(guard: Guard, bus: B
     let_out(guard, command(4.0), ACTIVE, 100 * MS, 100 * MS)
     sample = SensorSample(1, 0.0, 0.0, 0, 0, 4.0, 0, NodeState.ACTIVE)
     for _ in range(20):
-        guard.judge(sample)
+        guard.check_drive(sample)
     for _ in range(4):
-        guard.judge(sample._replace(applied_current=-3.0))
+        guard.check_drive(sample._replace(applied_current=-3.0))
     with pytest.raises(StopError, match="CURRENT_MISMATCH"):
-        guard.judge(sample._replace(applied_current=-3.0))
+        guard.check_drive(sample._replace(applied_current=-3.0))
 
 
 def test_nothing_in_the_runtime_but_the_guard_and_the_watchdog_reaches_a_bus() -> None:
@@ -357,10 +357,10 @@ def sample_at(device_ns: int, receive_ns: int) -> SensorSample:
 def test_once_the_device_time_is_wrong_no_enabled_command_passes_and_stop_frames_do(guard: Guard, bus: Bus) -> None:
     for n in range(10):
         assert guard.learn_time(sample_at(n * MS, (50 + n) * MS), first=n == 0)
-    guard.judge_time(sample_at(10 * MS, 60 * MS), 60 * MS)
+    guard.check_time(sample_at(10 * MS, 60 * MS), 60 * MS)
     let_out(guard, command(), ACTIVE, 100 * MS, 100 * MS)
     with pytest.raises(StopError, match="DEVICE_TIME") as caught:
-        guard.judge_time(sample_at(24 * MS, 61 * MS), 61 * MS)
+        guard.check_time(sample_at(24 * MS, 61 * MS), 61 * MS)
     assert (caught.value.fault, caught.value.detail) == (
         Fault.DEVICE_TIME,
         "it has gained 13.000 ms on this computer's",
@@ -372,26 +372,26 @@ def test_once_the_device_time_is_wrong_no_enabled_command_passes_and_stop_frames
 
 def test_too_early_is_judged_by_when_the_sample_was_in_hand(guard: Guard) -> None:
     guard.learn_time(sample_at(0, 50 * MS), first=True)
-    guard.judge_time(sample_at(MS, 41 * MS), 51 * MS)
+    guard.check_time(sample_at(MS, 41 * MS), 51 * MS)
     with pytest.raises(StopError):
-        guard.judge_time(sample_at(2 * MS, 42 * MS), 49 * MS)
+        guard.check_time(sample_at(2 * MS, 42 * MS), 49 * MS)
 
 
 def test_too_late_is_judged_by_the_sample_s_own_stamp(guard: Guard) -> None:
     guard.learn_time(sample_at(0, 50 * MS), first=True)
     for n in range(1, 20):
-        guard.judge_time(sample_at(n * MS, (53 + n) * MS), (54 + n) * MS)
+        guard.check_time(sample_at(n * MS, (53 + n) * MS), (54 + n) * MS)
     with pytest.raises(StopError, match="DEVICE_TIME"):
-        guard.judge_time(sample_at(20 * MS, 73 * MS), 74 * MS)
+        guard.check_time(sample_at(20 * MS, 73 * MS), 74 * MS)
 
 
 def test_samples_before_arming_that_had_piled_up_begin_the_reference_anew(guard: Guard) -> None:
     assert guard.learn_time(sample_at(0, 50 * MS), first=True)
     assert not guard.learn_time(sample_at(MS, 48 * MS), first=False)  # 3 ms earlier than the first by its own clock
-    guard.judge_time(sample_at(2 * MS, 47 * MS), 47 * MS)
+    guard.check_time(sample_at(2 * MS, 47 * MS), 47 * MS)
     assert guard.learn_time(sample_at(3 * MS, 70 * MS), first=True)
     with pytest.raises(StopError):
-        guard.judge_time(sample_at(4 * MS, 68 * MS), 68 * MS)
+        guard.check_time(sample_at(4 * MS, 68 * MS), 68 * MS)
 
 
 def test_the_rate_can_be_asked_for_before_a_command_is_refused(guard: Guard, bus: Bus) -> None:

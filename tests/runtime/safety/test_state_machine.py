@@ -47,7 +47,7 @@ OVER       -        -          -      -            -    =    -        -       = 
 @pytest.mark.parametrize("row", PICTURE.strip().splitlines())
 def test_every_transition_is_the_one_in_the_picture(row: str) -> None:
     name, *targets = row.split()
-    run = Run(RunState[name], since_ns=100 * MS, heard_ns=100 * MS)
+    run = Run(RunState[name], since_ns=100 * MS, last_pair_ns=100 * MS)
     for event, target in zip([*Event, Fault.INTERRUPTED, Fault.BUS_ERRORS], targets, strict=True):
         if target == "-":
             with pytest.raises(ValueError, match=f"{event.name} cannot happen in {name}"):
@@ -72,7 +72,7 @@ def test_a_time_in_seconds_is_rounded_to_nanoseconds() -> None:
 @pytest.mark.parametrize("state", [s for s in RunState if s is not RunState.SILENT])
 def test_the_time_to_show_itself_counts_while_the_run_waits_for_the_node_only(state: RunState) -> None:
     now_ns = 100_000 * MS
-    run = Run(state, since_ns=0, heard_ns=now_ns)
+    run = Run(state, since_ns=0, last_pair_ns=now_ns)
     assert step(BENCH, run, Event.TIME, now_ns) == run
 
 
@@ -82,18 +82,18 @@ def test_an_error_that_stops_a_run_carries_its_fault_and_the_detail() -> None:
     assert StopError(Fault.INTERNAL).detail == ""
 
 
-@pytest.mark.parametrize("heard_ns", [0, 7 * MS])
-def test_a_node_that_does_not_show_itself_in_time_ends_the_run_before_anything_has_left(heard_ns: int) -> None:
-    run = Run(RunState.SILENT, since_ns=3, heard_ns=heard_ns)
+@pytest.mark.parametrize("last_pair_ns", [0, 7 * MS])
+def test_a_node_that_does_not_show_itself_in_time_ends_the_run_before_anything_has_left(last_pair_ns: int) -> None:
+    run = Run(RunState.SILENT, since_ns=3, last_pair_ns=last_pair_ns)
     assert step(BENCH, run, Event.TIME, 2 + 5_000 * MS) == run
     over = step(BENCH, run, Event.TIME, 3 + 5_000 * MS)
     assert over.state is RunState.OVER
-    assert over.fault is (Fault.NODE_NOT_READY if heard_ns else Fault.NO_NODE)
+    assert over.fault is (Fault.NODE_NOT_READY if last_pair_ns else Fault.NO_NODE)
 
 
 @pytest.mark.parametrize("state", [RunState.ARMED, RunState.ACTIVE, RunState.HOMING])
 def test_missed_periods_are_told_at_the_soft_limit_and_stop_the_run_at_the_other(state: RunState) -> None:
-    run = Run(state, since_ns=0, heard_ns=100 * MS)
+    run = Run(state, since_ns=0, last_pair_ns=100 * MS)
     soft, stop = 105 * MS + MS // 2, 120 * MS + MS // 2
     assert step(BENCH, run, Event.TIME, soft - 1) == run
     late = step(BENCH, run, Event.TIME, soft)
@@ -104,20 +104,20 @@ def test_missed_periods_are_told_at_the_soft_limit_and_stop_the_run_at_the_other
 
 
 def test_a_pair_and_nothing_else_forgives_what_was_missed_before_it() -> None:
-    late = Run(RunState.ACTIVE, heard_ns=100 * MS, late=True)
+    late = Run(RunState.ACTIVE, last_pair_ns=100 * MS, late=True)
     assert step(BENCH, late, Event.TIME, 100 * MS) == late
-    assert step(BENCH, late, Event.PAIR, 117 * MS) == Run(RunState.ACTIVE, heard_ns=117 * MS)
+    assert step(BENCH, late, Event.PAIR, 117 * MS) == Run(RunState.ACTIVE, last_pair_ns=117 * MS)
 
 
 def test_time_stops_nothing_while_the_run_stops() -> None:
-    run = Run(RunState.STOPPING, since_ns=0, heard_ns=0, fault=Fault.SENSOR_LOST)
+    run = Run(RunState.STOPPING, since_ns=0, last_pair_ns=0, fault=Fault.SENSOR_LOST)
     assert step(BENCH, run, Event.TIME, 10**12) == run
 
 
 @given(st.integers(0, 10**7), st.integers(1, 10**9))
 def test_a_period_is_missed_when_it_is_half_a_period_overdue(n: int, period_ns: int) -> None:
     bench = replace(BENCH, timing=replace(BENCH.timing, sample_time=2e-9 * period_ns))
-    run = Run(RunState.ACTIVE, heard_ns=17)
+    run = Run(RunState.ACTIVE, last_pair_ns=17)
     overdue_ns = 17 + n * 2 * period_ns + period_ns
     assert missed(bench, run, overdue_ns) == n
     assert missed(bench, run, overdue_ns - 1) == max(0, n - 1)
