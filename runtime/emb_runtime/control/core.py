@@ -166,7 +166,8 @@ class Core:
         Where the bus had no room for it, ``lost`` says so, and the time is that of the decision: sent later, it would
         answer an old sample.
         """
-        memory, at, proposal = self._memory, self._answer_at, self._pending
+        memory, at = self._memory, self._answer_at
+        proposal, self._pending = self._pending, None
         assert proposal is not None
         decide_ns = memory.records[at].time_ns
         memory.records[at] = tuple.__new__(InputRecord, (decide_ns, ANSWER, 0 if lost else now_ns, "", lost))
