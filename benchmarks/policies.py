@@ -45,7 +45,7 @@ def excitation(name: str, bench: Bench, count: int) -> Excitation:
     if name in CLASSICAL:
         return Law(parse_excitation(name, bench).law)
     if name.endswith(".json"):
-        return Planned(load_plan(Path(name)), bench)
+        return Planned(load_plan(Path(name)).speeds, bench)
     return PolicyFile(load_policy(shipped_actor_path() if name == ACTOR else Path(name), bench), bench)
 
 

@@ -23,10 +23,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_train.env import EmbExcitationVectorEnv
-from emb_train.evaluate import Network
-from emb_train.play import Excitation, Outcome, Played, grid_draws, play
+from emb_train.play import APPLIED, Currents, Excitation, Outcome, Played, Seen, grid_draws, play
 from emb_train.ppo import DeployedActor, train
-from emb_train.training import Trained, Training, begin_training, load_preset, load_training, run_training
+from emb_train.training import Trained, Training, begin_training, load_preset, run_training
 
 WORTH = 2.737e7  # Mean information on the grid, at least
 RATIO = 1.5  # Steps per second over those of Stable-Baselines3, at least
@@ -116,9 +115,21 @@ def ours(training: Training, bench: Bench, seconds: float) -> float:
     return steps / (time.process_time() - start)
 
 
-def on_grid(trained: Trained) -> dict[str, Outcome]:
+class Network:
+    """A trained actor, without exploration."""
+
+    def __init__(self, actor: DeployedActor) -> None:
+        self._actor = actor
+
+    def __call__(self, seen: Seen) -> Currents:
+        """See :data:`emb_train.play.Excitation`."""
+        with torch.no_grad():
+            currents = self._actor(torch.from_numpy(np.ascontiguousarray(seen[:, :APPLIED])))
+        return np.array(currents[:, 0].numpy(), np.float64)
+
+
+def on_grid(trained: Trained, training: Training, bench: Bench) -> dict[str, Outcome]:
     """The trained actor and the best blind switch on the grid, with the same noise."""
-    training, bench = trained.training, trained.bench
     ranges, limit, horizon = bench.range_set(training.ranges), bench.limits.current, bench.timing.horizon
     draws = grid_draws(ranges, training.parameters[0], training.seed)
 
@@ -159,8 +170,8 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as directory:
             folder, training = Path(directory) / "run", load_preset("single-viscous", seed=seed)
             begin_training(folder, training, bench)
-            run_training(folder, training, bench)
-            outcomes = on_grid(load_training(folder))
+            *_, trained = run_training(folder, training, bench)
+        outcomes = on_grid(trained, training, bench)
         actors.append(outcomes["trained actor"])
         for name, o in outcomes.items():
             worth = f"{o.matrices[:, 0, 0].mean():.4e}"

@@ -14,6 +14,7 @@ from emb_bench.excitation import EXCITATIONS
 from emb_bench.output import replacing, require_place
 from emb_runtime.errors import EXIT_DONE, EmbError, UsageError, near, needs
 from emb_runtime.policy.contract import UNITS
+from emb_runtime.policy.trial import admit_policy
 from emb_runtime.safety.shield_design import make_law
 from emb_runtime.system.input_file import near_file
 from emb_runtime.system.terminal import Parser, complain, show
@@ -89,9 +90,7 @@ def _export(arguments: argparse.Namespace) -> str:
     path = path or source / "actor.onnx"
     require_place("--output", path, (".onnx",))
     if is_training:
-        from emb_train.network import network_file
-
-        data, what = network_file(source)
+        data, what = admit_policy(source / "actor.onnx", load_bench(source / "bench.toml")).data, "its test vectors"
     else:
         with needs("an export", "bench"):
             from emb_bench.export.own_policy import onnx_policy

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -16,17 +17,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from emb_bench.config.bench import Bench
+from emb_bench.config.bench import Bench, load_bench
 from emb_runtime.errors import UsageError
 from emb_train.closed_loop import Batch
 from emb_train.env import Scoring
 from emb_train.play import Draw, begin_all
 from emb_train.ppo import DeployedActor
 from emb_train.rewards import REWARDS, Reward
-from emb_train.training import CONFIGURATION, METRICS, begin_training, load_preset, load_training, run_training
+from emb_train.training import BENCH, CONFIGURATION, METRICS, begin_training, load_preset, run_training
 from emb_train.training import Training as Configuration
 
 Floats = NDArray[np.float64]
+AGENT = "agent.pt"  # File of a training: what was learned
 Wanted = Callable[[Batch], Floats]  # Currents [A], shape [N], for the experiments of a batch as they are
 
 
@@ -175,18 +177,22 @@ class Trainings:
                 raise SpentError("--minutes: the time is over before all trainings are made: the next call goes on")
             self._tell(f"training {folder.relative_to(self._folder)}, {config.ppo.iterations * config.ppo.batch} steps")
             begin_training(folder, config, self._bench)
-            run_training(folder, config, self._bench)
-        trained = load_training(folder)
-        if (trained.training, trained.bench.identity_hash) != (config, self._bench.identity_hash):
+            *_, best = run_training(folder, config, self._bench)
+            torch.save(best.actor.state_dict(), folder / AGENT)
+        if not _is_of(folder, config) or load_bench(folder / BENCH).identity_hash != self._bench.identity_hash:
             raise UsageError(f"{folder}: holds another training, of other steps or bench: choose another --output")
         records = _records(folder)
         horizon = config.conditions.applied(self._bench).timing.horizon
         rewards, violations = np.array(
             [(r["mean_return"] * max(r["ended"], 1), r["violations"]) for r in records], np.float64
         ).T
-        actor = DeployedActor(trained.actor, self._bench.limits.current)
+        actor = config.untrained_actor(self._bench)
+        try:
+            actor.load_state_dict(torch.load(folder / AGENT, weights_only=True))
+        except (OSError, RuntimeError, ValueError, pickle.UnpicklingError) as err:
+            raise UsageError(f"{folder / AGENT}: not a trained agent, remove {folder}: {err}") from err
         curve = rewards * horizon / (config.ppo.batch * config.scale)
-        return Training(config, self._bench, actor, curve, violations)
+        return Training(config, self._bench, DeployedActor(actor, self._bench.limits.current), curve, violations)
 
 
 def _records(folder: Path) -> list[dict[str, float]]:
@@ -205,11 +211,17 @@ def _records(folder: Path) -> list[dict[str, float]]:
     return records
 
 
-def _interrupted(folder: Path, config: Configuration) -> bool:
-    """True for a training of this configuration that has begun and was not finished."""
+def _is_of(folder: Path, config: Configuration) -> bool:
+    """True for the folder of a training of this configuration."""
     try:
         begun = msgspec.json.decode((folder / CONFIGURATION).read_bytes())
     except (OSError, msgspec.DecodeError):
         return False
-    same = begun == msgspec.json.decode(msgspec.json.encode(config))
-    return same and (not (folder / METRICS).exists() or len(_records(folder)) < config.ppo.iterations)
+    same: bool = begun == msgspec.json.decode(msgspec.json.encode(config))
+    return same
+
+
+def _interrupted(folder: Path, config: Configuration) -> bool:
+    """True for a training of this configuration that has begun and was not finished."""
+    finished = (folder / AGENT).exists() and len(_records(folder)) == config.ppo.iterations
+    return _is_of(folder, config) and not finished

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import json
-import shutil
 import socket
 import subprocess
 import sys
@@ -37,10 +36,10 @@ from emb_train.network import network_file
 from emb_train.play import target_speeds
 from emb_train.ppo import DeployedActor
 from emb_train.training import BENCH as BENCH_FILE
-from emb_train.training import CONFIGURATION, load_training, save_actor
+from emb_train.training import CONFIGURATION, METRICS, Trained, Training, load_preset, run_training
 from tests.actors import parsed
 from tests.commands import refused
-from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench
+from tests.train.trainings import HORIZON, make_tiny, short_bench
 
 BENCH = load_bench()
 
@@ -68,9 +67,12 @@ def exported(run: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-def deployed(run: Path) -> tuple[DeployedActor, Bench]:
-    trained = load_training(run)
-    return DeployedActor(trained.actor, trained.bench.limits.current), trained.bench
+@pytest.fixture(scope="module")
+def trained(run: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Trained, Training, Bench]:
+    """The training of ``run`` once more: its actor."""
+    bench, training = load_bench(run / BENCH_FILE), load_preset("single-viscous", seed=5)
+    *_, best = run_training(tmp_path_factory.mktemp("again"), training, bench)
+    return best, training, bench
 
 
 def contract_of(data: bytes) -> Contract:
@@ -85,21 +87,14 @@ def answers(data: bytes, seen: np.ndarray) -> np.ndarray:
     return np.concatenate([evaluator.run(None, {"inputs": row[None]})[0] for row in seen])
 
 
-def saved_beside(run: Path, actor: DeployedActor, name: str) -> Path:
-    """A folder as that of the training, with another actor."""
-    other = run.parent / name
-    other.mkdir()
-    for part in (CONFIGURATION, BENCH_FILE):
-        shutil.copy(run / part, other / part)
-    save_actor(other, actor.actor, 3, 0.0)
-    return other
-
-
 # A network ------------------------------------------------------------------------------------------------------------
 
 
-def test_the_runtime_takes_the_file_and_gives_what_the_network_gives(run: Path, exported: bytes) -> None:
-    actor, bench = deployed(run)
+def test_the_runtime_takes_the_file_and_gives_what_the_network_gives(
+    trained: tuple[Trained, Training, Bench], exported: bytes
+) -> None:
+    best, _, bench = trained
+    actor = DeployedActor(best.actor, bench.limits.current)
     policy, reference = load_policy(exported, bench), onnx.reference.ReferenceEvaluator(onnx.load_from_string(exported))
     for seen in observations(bench)[:200]:
         angle, velocity, time = map(float, seen)
@@ -113,7 +108,7 @@ def test_the_runtime_takes_the_file_and_gives_what_the_network_gives(run: Path, 
 
 
 def test_the_contract_has_what_the_actor_was_trained_for(run: Path, exported: bytes) -> None:
-    _, bench = deployed(run)
+    bench = load_bench(run / BENCH_FILE)
     contract = contract_of(exported)
     ranges: dict[Any, Any] = contract.ranges
     assert (contract.kind, contract.inputs) == ("current", ("angle", "velocity", "time"))
@@ -124,29 +119,32 @@ def test_the_contract_has_what_the_actor_was_trained_for(run: Path, exported: by
     for name, value in json.loads((run / CONFIGURATION).read_text()).items():
         found = contract.provenance.get(name)
         assert (json.loads(str(found)) if isinstance(value, dict | list) else found) == value
-    best = load_training(run)
-    assert contract.provenance["steps"] == best.iteration * ITERATION
-    assert contract.provenance["score"] == best.score
+    records = [json.loads(line) for line in (run / METRICS).read_text().splitlines()]
+    best = max(records, key=lambda record: record["score"])
+    assert (contract.provenance["steps"], contract.provenance["score"]) == (best["steps"], best["score"])
     assert len(contract.vectors) >= MIN_VECTORS
 
 
 def test_the_clip_is_in_the_graph_and_a_network_that_is_not_finite_is_not_exported(
-    run: Path, capsys: pytest.CaptureFixture[str]
+    trained: tuple[Trained, Training, Bench],
 ) -> None:
-    actor, bench = deployed(run)
+    best, training, bench = trained
+    other = best._replace(actor=copy.deepcopy(best.actor))
     with torch.no_grad():
-        actor.actor.layers[-1].bias.fill_(50.0)  # type: ignore[operator]  # the last layer is Linear
-    data, *_ = network_file(saved_beside(run, actor, "clip"))
+        other.actor.layers[-1].bias.fill_(50.0)  # type: ignore[operator]  # the last layer is Linear
+    data, said = network_file(other, training, bench)
+    assert f"are beyond {bench.limits.current:g} A: clipped" not in said  # its own clip
     assert load_policy(data, bench).act(0.0, 0.0, 0, Estimator(bench)) == bench.limits.current
-    for constant in actor.actor.features.buffers():
+    for constant in other.actor.features.buffers():
         constant.zero_()  # every weight is finite, and no answer is
-    other = saved_beside(run, actor, "infinite")
-    assert "not finite" in refused(lambda: main([str(other)]), capsys, code=5)
-    assert not (other / "actor.onnx").exists()
+    with pytest.raises(PolicyRefusedError, match="not finite"):
+        network_file(other, training, bench)
 
 
-def test_nothing_of_this_machine_is_in_the_file_and_it_is_the_same_each_time(run: Path, exported: bytes) -> None:
-    assert network_file(run)[0] == exported
+def test_nothing_of_this_machine_is_in_the_file_and_it_is_the_same_each_time(
+    run: Path, trained: tuple[Trained, Training, Bench], exported: bytes
+) -> None:
+    assert network_file(*trained)[0] == exported
     for trace in (str(run), str(Path.home()), str(Path.cwd()), socket.gethostname(), "site-packages", ".py", "stack"):
         assert trace.encode() not in exported
 
@@ -161,12 +159,15 @@ def speeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
-def test_a_training_for_speeds_gives_target_speeds_of_the_estimate_which_the_runtime_follows(speeds: Path) -> None:
-    data, said = network_file(speeds)
+def test_a_training_for_speeds_gives_target_speeds_of_the_estimate_which_the_runtime_follows(
+    speeds: Path, tmp_path: Path
+) -> None:
+    bench, training = load_bench(speeds / BENCH_FILE), load_preset("interval")
+    *_, best = run_training(tmp_path, training, bench)
+    data, said = network_file(best, training, bench)
     assert data == (speeds / "actor.onnx").read_bytes()
     assert "the trained network" in said
-    trained = load_training(speeds)
-    bench, policy = trained.bench, load_policy(data, trained.bench)
+    policy = load_policy(data, bench)
     contract = policy.contract
     assert (contract.kind, contract.inputs) == ("speed", INPUTS[1])
     low, high = bench.range_set("pm50").low, bench.range_set("pm50").high
@@ -176,8 +177,8 @@ def test_a_training_for_speeds_gives_target_speeds_of_the_estimate_which_the_run
         angle, velocity = float(rng.normal(0.0, 1e-3)), float(rng.normal(0.0, 1.0))
         estimator.take(angle, velocity, float(step), 0.0)
         with torch.no_grad():
-            action = trained.actor(torch.tensor([[angle, velocity, float(step), *estimator.parameters]]))
-            speed = bench.limits.velocity * trained.actor.part(action).item()
+            action = best.actor(torch.tensor([[angle, velocity, float(step), *estimator.parameters]]))
+            speed = bench.limits.velocity * best.actor.part(action).item()
         wanted = current_for(estimator.model, estimator.state, estimator.relative, speed, contract.gain)
         assert policy.act(angle, velocity, float(step), estimator) == pytest.approx(wanted, abs=1e-2)
     seen = np.zeros((HORIZON, 11), np.float32)
@@ -186,7 +187,7 @@ def test_a_training_for_speeds_gives_target_speeds_of_the_estimate_which_the_run
 
 
 def test_a_file_that_computes_something_else_is_not_written(
-    speeds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def wrong(actor: Any, width: int) -> Any:
         actor = copy.deepcopy(actor)
@@ -195,8 +196,9 @@ def test_a_file_that_computes_something_else_is_not_written(
         return torch_graph(actor, width)
 
     monkeypatch.setattr("emb_train.network.torch_graph", wrong)
-    assert refused(lambda: main([str(speeds), "--output", str(tmp_path / "x.onnx")]), capsys, code=5)
-    assert not (tmp_path / "x.onnx").exists()
+    command = ["ppo", "single-viscous", "--output", str(tmp_path / "run"), "--bench", str(short_bench(tmp_path))]
+    assert "differs" in refused(lambda: train_main(command), capsys, code=5)
+    assert not (tmp_path / "run" / "actor.onnx").exists()
 
 
 # A sequence -----------------------------------------------------------------------------------------------------------

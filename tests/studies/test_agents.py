@@ -15,7 +15,7 @@ import scipy.stats
 from emb_bench.config.bench import load_bench
 from emb_runtime.safety.shield_design import make_law
 from emb_train.play import Draw
-from emb_train.training import ACTOR, CONFIGURATION, METRICS, Training, load_preset
+from emb_train.training import CONFIGURATION, METRICS, Training, load_preset
 from studies.thesis import agents, choices, pictures, trainings
 from studies.thesis.agents import (
     FIGURES,
@@ -31,7 +31,7 @@ from studies.thesis.agents import (
     ways_home,
 )
 from studies.thesis.cli import TRAININGS, main
-from studies.thesis.trainings import Trainings
+from studies.thesis.trainings import AGENT, Trainings
 from tests.commands import refused
 
 BENCH = load_bench()
@@ -108,7 +108,7 @@ def test_an_interrupted_training_is_made_anew_and_another_folder_is_left_alone(
     monkeypatch.setattr(trainings, "load_preset", small)
     cut = shutil.copytree(folder / "thesis-fixed-0", tmp_path / "thesis-fixed-0")
     (cut / METRICS).write_text("")
-    (cut / ACTOR).unlink()
+    (cut / AGENT).unlink()
     assert main(["fig-5.2", "--output", str(tmp_path)]) == 0
     assert (cut / METRICS).read_text()
     foreign = tmp_path / "other" / "thesis-fixed-0"

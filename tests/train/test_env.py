@@ -193,7 +193,8 @@ def test_with_the_shield_every_brake_of_the_range_stays_inside_the_limits_and_co
     other = {"ranges": "viscous-stiffness", "parameters": ("k_1", "f_v"), "reward": trace_increment}
     with pytest.raises(UsageError):
         EmbExcitationVectorEnv(2, **other)  # type: ignore[arg-type]  # the shipped shield does not cover these
-    covered: dict[str, Any] = {**other, "conditions": Conditions(shield_ranges="viscous-stiffness")}
+    wider = dataclasses.replace(BENCH, shield=BENCH.shield._replace(ranges="viscous-stiffness"))
+    covered: dict[str, Any] = {**other, "bench": wider}
     wide: dict[str, Any] = {"ranges": "envelope", "parameters": PARAMETER_NAMES, "reward": trace_increment}
     for kind in (wide, covered):
         env = EmbExcitationVectorEnv(60, **kind)

@@ -29,10 +29,10 @@ from emb_train.closed_loop import Batch, Conditions
 from emb_train.evaluate import Settings, Subject, document, evaluate, open_subject, references, text
 from emb_train.optimum import followed, optima, searchable
 from emb_train.play import MEASURES, Draw, Law, Played, PolicyFile, fresh_draws, mean_score, play
-from emb_train.training import ONNX, PLAN, begin_training, save_actor
+from emb_train.training import ONNX, PLAN
 from tests.benches import SENSOR_BENCH
 from tests.commands import refused
-from tests.train.trainings import HORIZON, tiny
+from tests.train.trainings import HORIZON
 
 BENCH = load_bench()
 SHORT = parse_bench(shipped_bench_text().replace("horizon     = 500", f"horizon     = {HORIZON}"), "short")
@@ -99,23 +99,23 @@ def test_policies_that_cannot_be_played_are_refused(tmp_path: Path) -> None:
         open_subject(str(path), None)
 
 
-def test_a_plan_beside_its_training_has_the_bench_the_ranges_and_the_shield_of_that(
+def test_a_plan_has_its_ranges_with_it_and_the_bench_of_its_training_beside_it(
     finished_speeds: Path, tmp_path: Path
 ) -> None:
     trained, own = open_subject(str(finished_speeds), None), open_subject(str(finished_speeds / PLAN), None)
-    assert (own.bench, own.ranges, own.shield) == (trained.bench, trained.ranges, trained.shield)
-    with pytest.raises(UsageError, match="--bench"):
-        open_subject(str(finished_speeds / PLAN), finished_speeds / "bench.toml")
+    assert (own.bench, own.ranges) == (trained.bench, trained.ranges)
+    for given in (finished_speeds / PLAN, finished_speeds):
+        with pytest.raises(UsageError, match="--bench"):
+            open_subject(str(given), finished_speeds / "bench.toml")
     alone = shutil.copy(finished_speeds / PLAN, tmp_path)
-    assert open_subject(str(alone), finished_speeds / "bench.toml").ranges == ""
+    assert open_subject(str(alone), finished_speeds / "bench.toml").ranges == "pm50"
+    assert open_subject(str(alone), None).bench == BENCH
 
 
-def test_a_training_for_speeds_without_its_policy_file_is_refused_with_the_command_that_makes_it(
-    finished_speeds: Path, tmp_path: Path
-) -> None:
+def test_a_folder_without_a_policy_is_refused(finished_speeds: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(finished_speeds, tmp_path / "run")
     (folder / ONNX).unlink()
-    with pytest.raises(UsageError, match=f"emb-export {folder} -o {folder / ONNX}"):
+    with pytest.raises(UsageError, match=ONNX):
         open_subject(str(folder), None)
 
 
@@ -134,7 +134,6 @@ def test_the_measures_are_those_of_a_matrix_worked_out_by_hand_and_their_shares_
 def test_every_reference_asks_for_what_it_asks_for_in_the_runtime() -> None:
     rng = np.random.default_rng(1)
     for name, excitation in references(BENCH).items():
-        excitation.begin(3)
         excited = parse_excitation(name, BENCH)
         for k in (0, 17, 250, 499):
             seen = rng.uniform([-5.0, -400.0, k, -6.0], [90.0, 400.0, k, 6.0], (3, 4)).astype(np.float32)
@@ -274,20 +273,6 @@ def test_the_share_of_the_optimum_is_over_the_draws_that_have_one(searched: list
         assert row.against_optimum.value == pytest.approx(np.mean(row.values[:2] / plant.optima))
 
 
-def test_a_policy_is_evaluated_behind_the_shield_that_it_was_made_behind(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bench, folder = load_bench(finished / "bench.toml"), tmp_path / "narrow"
-    training = tiny(conditions={"shield_ranges": "viscous"})
-    begin_training(folder, training, bench)
-    save_actor(folder, training.untrained_actor(bench), 1, 0.0)
-    assert run(folder, "--criterion", "weighted", "--json") == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (said["ranges"], said["conditions"]["shield_ranges"]) == ("viscous", "viscous")
-    assert {row["left"] for row in said["plants"]["euler"]["rows"]} == {0}
-    assert "different shields" in refused(lambda: run(finished, folder), capsys)
-
-
 def test_a_training_for_speeds_is_evaluated_as_the_runtime_plays_its_policy(
     finished_speeds: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -297,8 +282,7 @@ def test_a_training_for_speeds_is_evaluated_as_the_runtime_plays_its_policy(
     bench = load_bench(finished_speeds / "bench.toml")
     policy = PolicyFile(load_policy(finished_speeds / "actor.onnx", bench), bench)
     draws = fresh_draws(bench.range_set("pm50"), 0, 4)
-    conditions = Conditions(information="physical", shield_ranges=said["conditions"]["shield_ranges"])
-    outcome = play(bench, bench.range_set("pm50"), PARAMETER_NAMES, policy, draws, "euler", conditions)
+    outcome = play(bench, bench.range_set("pm50"), PARAMETER_NAMES, policy, draws, "euler", PHYSICAL)
     assert row["values"] == MEASURES["D"].values(outcome.matrices).tolist()
     assert said["ranges"] == "pm50"
 

@@ -15,20 +15,19 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-import torch
-from safetensors.torch import load_file, save_file
 
 from emb_bench.config.bench import load_bench
+from emb_export.export import main as emb_export
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_USAGE, UsageError
 from emb_runtime.policy.policy import load_policy
 from emb_train.cli import main
+from emb_train.network import network_file
 from emb_train.plan import Found
 from emb_train.play import fresh_draws
 from emb_train.presets import preset_record, preset_summaries
 from emb_train.rewards import Transition, information_increment
 from emb_train.training import (
-    ACTOR,
     BENCH,
     CONFIGURATION,
     CURVE,
@@ -36,32 +35,44 @@ from emb_train.training import (
     ONNX,
     PLAN,
     Validation,
+    begin_training,
     hyper_parameters,
     load_preset,
-    load_training,
+    run_training,
     training_from,
 )
 from tests.commands import refused
 from tests.train.trainings import HORIZON, ITERATION, make_tiny, short_bench, tiny
 
-FILES = [ACTOR, ONNX, BENCH, CURVE, METRICS, CONFIGURATION]
+FILES = [ONNX, BENCH, CURVE, METRICS, CONFIGURATION]
+
+
+def policy_of(folder: Path) -> dict[str, Any]:
+    """What a training's policy says of its origin."""
+    return dict(load_policy(folder / ONNX, load_bench(folder / BENCH)).contract.provenance)
 
 
 def metrics_of(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / METRICS).read_text().splitlines()]
 
 
-def test_a_training_writes_all_that_its_result_depends_on_and_keeps_the_best_actor(finished: Path) -> None:
+def test_a_training_writes_all_that_its_result_depends_on_and_keeps_the_best_actor(
+    finished: Path, tmp_path: Path
+) -> None:
     assert sorted(p.name for p in finished.iterdir()) == sorted(FILES)
-    trained, metrics = load_training(finished), metrics_of(finished)
-    assert trained.training == tiny()
-    assert trained.bench == load_bench(finished.parent / "short.toml")
+    metrics, bench = metrics_of(finished), load_bench(finished.parent / "short.toml")
+    assert training_from(json.loads((finished / CONFIGURATION).read_text()), "it") == tiny()
+    assert load_bench(finished / BENCH) == bench
     assert [m["steps"] for m in metrics] == [ITERATION, 2 * ITERATION, 3 * ITERATION]
     scores = [m["score"] for m in metrics]
     best = scores.index(max(scores))
-    assert (trained.iteration, trained.score) == (best + 1, scores[best])
-    assert Validation(trained.training, trained.bench).score(trained.actor) == scores[best]
-    assert len({(finished / name).stat().st_mode for name in (CONFIGURATION, ACTOR)}) == 1
+    assert (policy_of(finished)["steps"], policy_of(finished)["score"]) == (metrics[best]["steps"], scores[best])
+    assert len({(finished / name).stat().st_mode for name in (CONFIGURATION, ONNX)}) == 1
+    begin_training(tmp_path / "again", tiny(), bench)
+    better = list(run_training(tmp_path / "again", tiny(), bench))
+    assert [one.score for one in better] == sorted({*np.maximum.accumulate(scores).tolist()})
+    assert Validation(tiny(), bench).score(better[-1].actor) == scores[best]
+    assert network_file(better[-1], tiny(), bench)[0] == (finished / ONNX).read_bytes()
 
 
 def test_a_training_for_speeds_begins_with_a_plan_and_is_never_worse(finished_speeds: Path) -> None:
@@ -69,11 +80,10 @@ def test_a_training_for_speeds_begins_with_a_plan_and_is_never_worse(finished_sp
     plan = json.loads((finished_speeds / PLAN).read_text())["speeds"]
     assert len(plan) == HORIZON
     assert max(map(abs, plan)) <= 1.0
-    trained, metrics = load_training(finished_speeds), metrics_of(finished_speeds)
+    metrics = metrics_of(finished_speeds)
     assert [m["steps"] for m in metrics] == [0, ITERATION, 2 * ITERATION]
-    assert trained.score >= max(m["score"] for m in metrics)
-    assert Validation(trained.training, trained.bench).score(trained.actor) == trained.score
-    policy = load_policy(finished_speeds / ONNX, trained.bench)
+    assert policy_of(finished_speeds)["score"] == max(m["score"] for m in metrics)
+    policy = load_policy(finished_speeds / ONNX, load_bench(finished_speeds / BENCH))
     assert (policy.contract.kind, len(policy.contract.inputs)) == ("speed", 11)
 
 
@@ -99,7 +109,7 @@ def test_hyper_parameters_are_set_by_their_names(
     options += ["--command-delay", "0", "2", "--plant", "exact,observer,stribeck"]
     folder, bench = tmp_path / "run", short_bench(tmp_path)
     assert main(["ppo", "--bench", str(bench), "--output", str(folder), *options]) == 0
-    training = load_training(folder).training
+    training = training_from(json.loads((folder / CONFIGURATION).read_text()), "it")
     assert load_policy(folder / ONNX, load_bench(bench)).contract.gain == training.conditions.gain == 0.2
     assert (training.conditions.command_delay, training.ppo.envs) == ((0, 2), 12)  # pairs of each of three plants
     assert (training.ppo.hidden, training.ppo.clip, training.ppo.clone_steps) == ((4, 4), 0.1, 2)
@@ -168,10 +178,9 @@ def test_ctrl_c_before_there_is_an_actor_leaves_none_and_after_that_the_best_one
         if not left:
             assert list(folder.iterdir()) == [], name
             continue
-        assert (load_training(folder).iteration, len(metrics_of(folder))) == (0, 1)
+        assert (policy_of(folder)["steps"], len(metrics_of(folder))) == (0, 1)
         assert (folder / CURVE).exists()
-        assert metrics_of(folder)[0]["score"] == load_training(folder).score
-        load_policy(folder / ONNX, load_bench(bench))
+        assert metrics_of(folder)[0]["score"] == policy_of(folder)["score"]
 
 
 def test_the_table_of_a_preset_is_its_callers_own() -> None:
@@ -203,16 +212,16 @@ def test_ctrl_c_and_divergence_leave_the_best_actor_so_far(
         assert main(["ppo", "single-viscous", "--bench", str(bench), "--output", str(folder)]) == code
         scores = [m["score"] for m in metrics_of(folder)]
         assert scores == [m["score"] for m in metrics_of(finished)][:2]
-        assert load_training(folder).score == max(scores)
+        assert policy_of(folder)["score"] == max(scores)
 
 
 def test_training_validation_and_evaluation_draw_other_brakes(finished: Path) -> None:
-    trained, f_v = load_training(finished), BrakeParameters._fields.index("f_v")
-    ranges = trained.bench.range_set("viscous")
+    bench, f_v = load_bench(finished / BENCH), BrakeParameters._fields.index("f_v")
+    ranges, actor = bench.range_set("viscous"), tiny().untrained_actor(bench)
     drawn: list[float] = []
     for seed in range(20):
-        validation = Validation(msgspec.structs.replace(trained.training, seed=seed), trained.bench)
-        validation.score(trained.actor)
+        validation = Validation(tiny(seed=seed), bench)
+        validation.score(actor)
         drawn += validation._envs[0].batch.brakes[:, f_v].tolist()
         drawn += [draw.brake.f_v for draw in fresh_draws(ranges, seed, 50)]
         for iteration in range(5):  # as emb_train.ppo draws its seeds
@@ -270,40 +279,23 @@ def test_a_bench_that_does_not_fit_the_training_is_refused_and_nothing_is_made(
         assert not (tmp_path / "x").exists()
 
 
-def test_a_damaged_folder_is_refused(finished: Path, tmp_path: Path) -> None:
-    def saved(folder: Path, metadata: dict[str, str] | None, **tensors: torch.Tensor) -> None:
-        save_file(load_file(folder / ACTOR) | tensors, folder / ACTOR, metadata)
-
-    def edited(folder: Path, name: str, old: str, new: str) -> None:
-        text = (folder / name).read_text()
-        assert old in text
-        (folder / name).write_text(text.replace(old, new))
-
-    data = (finished / ACTOR).read_bytes()
-    good = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]
-    damages: list[Callable[[Path], object]] = [
-        lambda d: (d / ACTOR).unlink(),
-        lambda d: (d / ACTOR).write_bytes(data[:1000]),
-        lambda d: (d / ACTOR).write_bytes(b"junk" * 100),
-        lambda d: saved(d, None),
-        lambda d: saved(d, {"training": "[]"}),
-        lambda d: saved(d, {"training": good["training"].replace("iteration", "iterations")}),
-        lambda d: saved(d, good, more=torch.zeros(1)),
-        lambda d: saved(d, good, log_deviation=torch.full((1,), math.nan)),
-        lambda d: (d / CONFIGURATION).write_text("{"),
-        lambda d: (d / BENCH).unlink(),
-        lambda d: edited(d, CONFIGURATION, '"epochs"', '"epoch"'),
-        lambda d: edited(d, CONFIGURATION, '"seed": 0', '"seed": "0"'),
-        lambda d: edited(d, CONFIGURATION, "increment", "excrement"),
-        lambda d: edited(d, CONFIGURATION, '"clip": 0.2', '"clip": 0.3'),  # of another training
-        lambda d: edited(d, BENCH, "angle    = 1.0e-3", "angle    = 1.1e-3"),
+def test_a_damaged_folder_is_refused(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = (finished / ONNX).read_bytes()
+    damages: list[tuple[int, Callable[[Path], object]]] = [
+        (2, lambda d: (d / ONNX).unlink()),
+        (2, lambda d: (d / BENCH).unlink()),
+        (2, lambda d: (d / BENCH).write_text("junk")),
+        (5, lambda d: (d / ONNX).write_bytes(data[:1000])),
+        (5, lambda d: (d / ONNX).write_bytes(b"junk" * 100)),
+        (5, lambda d: (d / BENCH).write_text((d / BENCH).read_text().replace("velocity = 500.0", "velocity = 400.0"))),
     ]
-    for i, damage in enumerate(damages):
+    for i, (code, damage) in enumerate(damages):
         folder = shutil.copytree(finished, tmp_path / str(i))
-        load_training(folder)
         damage(folder)
-        with pytest.raises(UsageError):
-            load_training(folder)
+        assert refused(lambda: main(["evaluate", str(folder)]), capsys, code=code)  # noqa: B023  # called at once
+        export = [str(folder), "--output", str(tmp_path / "x.onnx")]
+        assert refused(lambda: emb_export(export), capsys, code=code)  # noqa: B023  # called at once
+        assert not (tmp_path / "x.onnx").exists()
 
 
 def test_every_configuration_survives_json_and_impossible_values_are_refused_by_their_key() -> None:

@@ -40,10 +40,10 @@ PPO_EPILOG = """\
 presets:
 {presets}
 
-DIR contains actor.onnx (what emb-run takes), actor.safetensors (the actor with the best validation), training.json,
-bench.toml, metrics.jsonl and curve.png. The validation uses brakes that no training draws. A training for speeds finds
-a plan, lets the actor follow it, and improves that. Ctrl-C ends the training and keeps the best actor so far, or the
-actor that follows the best plan so far.
+DIR contains actor.onnx (what emb-run takes: the actor with the best validation so far), training.json, bench.toml,
+metrics.jsonl and curve.png. The validation uses brakes that no training draws. A training for speeds finds a plan,
+lets the actor follow it, and improves that. Ctrl-C ends the training and keeps the best actor so far, or the actor that
+follows the best plan so far.
 """
 EVALUATE_EPILOG = """\
 POLICY: the folder of a training, its plan.json, an ONNX file, or 'actor' for the shipped one
@@ -184,7 +184,7 @@ def ppo(arguments: argparse.Namespace) -> int:
     from emb_train.network import network_file
     from emb_train.plan import Found
     from emb_train.ppo import Metrics
-    from emb_train.training import ACTOR, CURVE, ONNX, begin_training, clear, draw_curve, load_preset, run_training
+    from emb_train.training import CURVE, ONNX, begin_training, clear, draw_curve, load_preset, run_training
 
     bench, folder = load_bench(arguments.bench), arguments.output
     changes = _settings(arguments.preset, arguments.set)
@@ -215,18 +215,18 @@ def ppo(arguments: argparse.Namespace) -> int:
             else:
                 advance(f"return {m.mean_return:.3f}, left {m.violations}, home {m.home} of {m.ended}")
 
+        what, ended = "", EXIT_DONE
         try:
-            run_training(folder, training, bench, note)
-            ended = EXIT_DONE
+            for best in run_training(folder, training, bench, note):
+                data, what = network_file(best, training, bench)
+                with replacing(folder / ONNX) as beside:
+                    beside.write_bytes(data)
         except KeyboardInterrupt:
-            if not (folder / ACTOR).exists():
+            if not what:
                 clear(folder)
                 said = f"emb-train: interrupted; nothing was trained, {folder} is empty"
                 raise KeyboardInterrupt(said) from None
             ended = EXIT_INTERRUPTED
-    data, what = network_file(folder)
-    with replacing(folder / ONNX) as beside:
-        beside.write_bytes(data)
     draw_curve(folder, folder / CURVE)
     alone = "" if conditions.shielded else "; trained without a shield, which changes its currents on a bench"
     show(
@@ -308,8 +308,6 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subjec
     if any(s.bench.identity_hash != bench.identity_hash for s in subjects):
         raise UsageError("the policies are for different benches: evaluate them apart")
     plants = _plants(arguments.plant, bench)
-    if any(s.shield != subjects[0].shield for s in subjects):
-        raise UsageError("the policies were made behind different shields: evaluate them apart")
     named = {arguments.ranges} if arguments.ranges else {s.ranges for s in subjects}
     if len(named) > 1 or "" in named:
         raise UsageError("--ranges: the policies do not say which, or not the same: name it")
@@ -323,11 +321,7 @@ def prepare(arguments: argparse.Namespace) -> tuple[Bench, Settings, list[Subjec
         draws=arguments.draws,
         seed=arguments.seed,
         optimum=min(arguments.optimum, arguments.draws),
-        conditions=Conditions(
-            information=measure.kind,
-            shield_ranges=subjects[0].shield,
-            command_delay=tuple(arguments.command_delay),
-        ),
+        conditions=Conditions(information=measure.kind, command_delay=tuple(arguments.command_delay)),
     )
     for name in plants:  # what no experiment can be made of is refused before anything is looked for
         Batch(bench, ranges, settings.parameters, 1, name, settings.conditions)

@@ -48,6 +48,7 @@ CURRENT: Literal["current"] = "current"
 SPEED: Literal["speed"] = "speed"
 
 Bools = NDArray[np.bool_]
+Gain = Annotated[float, msgspec.Meta(gt=0.0, le=1.0)]
 MOST = 100.0  # Greatest estimate or deviation that is observed, of the nominal value
 ESTIMATES = 30  # Numbers of an estimator's state
 MONITOR = 29  # Numbers of a sensor monitor's state
@@ -58,7 +59,6 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Conditions in which an experiment of the training may differ from one on the bench."""
 
     shielded: bool = True  # True if the shield is between actor and brake; without it an action is clipped, no more
-    shield_ranges: str | None = None  # Set of the bench that the shield covers; None for the one that the bench names
     horizon: int = 0  # Steps in one experiment; 0 for the bench's
     acts: Literal["current", "speed"] = CURRENT
     """Action of the actor: a current, or a target speed that the runtime's speed loop follows by the estimate."""
@@ -75,7 +75,7 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tracking: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0  # Factor of the weights of the deviation from the quintic
     command_delay: tuple[int, int] = (0, 0)
     """Least and most samples that a command waits beside the plant's own delay, drawn for each experiment."""
-    gain: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 1.0  # Of the speed loop; less where commands act late
+    gain: Gain = 1.0  # Of the speed loop; less where commands act late
 
     def __post_init__(self) -> None:
         """Refuse what does not exist.
@@ -107,13 +107,13 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.acts == SPEED or self.observes == ESTIMATE
 
     def applied(self, bench: Bench) -> Bench:
-        """The bench with this horizon, and a shield for this set of brakes that covers the drawn delays as well.
+        """The bench with this horizon, and a shield that covers the drawn delays as well.
 
         It covers what the bench's shield covers or what is drawn, not the sum of both: right for a plant without a
         delay of its own.
         """
         timing = replace(bench.timing, horizon=self.horizon or bench.timing.horizon)
-        shield = bench.shield._replace(ranges=self.shield_ranges or bench.shield.ranges)
+        shield = bench.shield
         if self.shielded and self.varies:
             (least, most), (low, high) = shield.frame_age, self.command_delay
             shield = shield._replace(frame_age=(min(least, low), max(most, high)))
@@ -327,14 +327,7 @@ def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -
         past, k, noise, late, reasons, violated, returning, monitor, response, _, _,
     ) = experiments  # fmt: skip
     rules = setup.rules
-    p = BrakeParameters(
-        float(brakes[i, 0]),
-        float(brakes[i, 1]),
-        float(brakes[i, 2]),
-        float(brakes[i, 3]),
-        float(brakes[i, 4]),
-        float(brakes[i, 5]),
-    )
+    p = BrakeParameters(brakes[i, 0], brakes[i, 1], brakes[i, 2], brakes[i, 3], brakes[i, 4], brakes[i, 5])
     instruments = delayed(setup.instruments, int(delay[i]), float(beside[i, 0]))
     y1, y2 = float(y[i, 0]), float(y[i, 1])
     u1, u2, u3, u4, u5 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2]), float(past[i, 3]), float(past[i, 4])
@@ -435,8 +428,8 @@ class Batch:
             conditions: shield or none, how many steps, which information.
 
         Raises:
-            BenchFileError: the bench has no such plant, or no such set for the shield, or the shield cannot hold the
-                limits there, as under a lag and a delay together.
+            BenchFileError: the bench has no such plant, or the shield cannot hold the limits, as under a lag and a
+                delay together.
             UsageError: a parameter is unknown or out of order, a brake of these ranges is not covered by the shield, or
                 the plant has a delay of its own beside a drawn one.
         """
@@ -544,26 +537,20 @@ class Batch:
         Returns:
             Shape [N, observation_size].
         """
-        if self.conditions.observes == MEASURED:
-            return self.actor_observation()
+        if self.conditions.observes == EVERYTHING:
+            return self.critic_observation()[:, : self.observation_size].copy()
+        measured = self.seen()[:, : len(SAMPLE)]
         if self.conditions.observes == ESTIMATE:
-            return np.hstack([self.actor_observation(), self.estimate()], dtype=np.float32)
-        return self.critic_observation()[:, : self.observation_size].copy()
+            return np.hstack([measured, self.estimate()], dtype=np.float32)
+        return measured.copy()
 
     def estimate(self) -> Floats:
         """Estimates of k_m, k_1, T_c and f_v in SI units, then their deviations, bounded; shape [N, 8]."""
         bounded: Floats = np.minimum(self.experiments.told, self.most)
         return bounded
 
-    def actor_observation(self) -> NDArray[np.float32]:
-        """Measured angle [rad], measured velocity [rad/s], step; raw, shape [N, 3]."""
-        out = np.empty((len(self.k), 3), np.float32)
-        out[:, :2] = self.y
-        out[:, 2] = self.k
-        return out
-
     def seen(self) -> NDArray[np.float32]:
-        """Observation of an excitation: the actor's three and the current that acted in the last period [A], [N, 4]."""
+        """Measured angle [rad] and velocity [rad/s], step, current that acted in the last period [A]; shape [N, 4]."""
         return np.column_stack((self.y, self.k, self.experiments.applied)).astype(np.float32)
 
     def information(self) -> Floats:
@@ -647,7 +634,6 @@ def require_covered(bench: Bench, ranges: Ranges, conditions: Conditions = BENCH
 
     Raises:
         UsageError: it does not; the message names the parameter and both ranges.
-        BenchFileError: the bench has no set of the name that the conditions have for the shield.
     """
     if not conditions.shielded:
         return

@@ -13,7 +13,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import torch
-from torch import nn
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.documents import to_json
@@ -27,40 +26,22 @@ from emb_runtime.errors import PolicyRefusedError, UsageError, near
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_runtime.policy.trial import admit_policy
 from emb_runtime.system.input_file import near_file
-from emb_train.closed_loop import EVERYTHING, SPEED, Conditions
+from emb_train.closed_loop import Conditions
 from emb_train.optimum import optima, searchable
 from emb_train.play import (
-    APPLIED,
-    Currents,
     Excitation,
     Law,
     Measure,
     Outcome,
     Planned,
     PolicyFile,
-    Seen,
     bounds,
     fresh_draws,
     mean_score,
     middle_of,
     play,
 )
-from emb_train.ppo import DeployedActor
-from emb_train.training import CONFIGURATION, ONNX, PLAN, load_configuration, load_plan, load_training
-
-
-class Network(Excitation):
-    """A network as an excitation, :class:`emb_train.ppo.DeployedActor` for one; no exploration."""
-
-    def __init__(self, module: nn.Module) -> None:
-        self._module = module
-
-    def __call__(self, seen: Seen) -> Currents:
-        """See :class:`Excitation`."""
-        with torch.no_grad():
-            currents = self._module(torch.from_numpy(np.ascontiguousarray(seen[:, :APPLIED])))
-        return np.array(currents[:, 0].numpy(), np.float64)
-
+from emb_train.training import BENCH, ONNX, PLAN, load_plan
 
 Tell = Callable[[str], object]
 
@@ -73,7 +54,6 @@ class Subject:
     bench: Bench
     excitation: Excitation
     ranges: str = ""  # Set of the bench that it was made for; empty if none of the bench's sets is that
-    shield: str | None = None  # Set of the bench that the shield covered then; None for the one that the bench names
 
 
 def open_subject(given: str, bench_file: Path | None) -> Subject:
@@ -92,41 +72,18 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
     torch.set_num_threads(1)  # more would get into each other's way at this size, and change the last digits
     if given == ACTOR or path.suffix == ".onnx":
         return _file(given, shipped_actor_path() if given == ACTOR else path, load_bench(bench_file))
+    own = (path if path.is_dir() else path.parent) / BENCH
+    if own.exists() and bench_file is not None:
+        raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
     if path.suffix == ".json":
-        speeds = load_plan(path)
-        if not (path.parent / CONFIGURATION).exists():
-            bench = load_bench(bench_file)
-            return Subject(given, bench, Planned(speeds, bench))
-        _require_own(given, bench_file)
-        training, bench = load_configuration(path.parent)
-        shield = _other_shield(training.conditions.shield_ranges, bench)
-        return Subject(given, bench, Planned(speeds, bench, training.conditions.gain), training.ranges, shield)
+        plan, bench = load_plan(path), load_bench(own if own.exists() else bench_file)
+        return Subject(given, bench, Planned(plan.speeds, bench, plan.gain), plan.ranges)
     if not path.is_dir():
         hint = near(given, [ACTOR]) or near_file(path)
         raise UsageError(f"{given}: expected '{ACTOR}', an .onnx file, the folder of a training or its {PLAN}{hint}")
-    _require_own(given, bench_file)
-    trained = load_training(path)
-    training, conditions = trained.training, trained.training.conditions
-    if conditions.observes == EVERYTHING:
-        raise UsageError(f"{given}: sees the parameters and the information, which no bench measures: it cannot be run")
-    shield = _other_shield(conditions.shield_ranges, trained.bench)
-    excitation: Excitation = Network(DeployedActor(trained.actor, trained.bench.limits.current))
-    if conditions.acts == SPEED:  # which the runtime's speed loop follows
-        if not (path / ONNX).exists():
-            raise UsageError(f"{path / ONNX}: expected the actor's policy file: emb-export {path} -o {path / ONNX}")
-        excitation = _file(given, path / ONNX, trained.bench).excitation
-    return Subject(given, trained.bench, excitation, training.ranges, shield)
-
-
-def _require_own(given: str, bench_file: Path | None) -> None:
-    """Refuse a bench beside that of a training."""
-    if bench_file is not None:
-        raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
-
-
-def _other_shield(name: str | None, bench: Bench) -> str | None:
-    """The set that a shield covered; None if it is the one that the bench names."""
-    return None if name == bench.shield.ranges else name
+    if not own.exists() or not (path / ONNX).exists():
+        raise UsageError(f"{given}: expected the folder of emb-train ppo, with {ONNX} and {BENCH}")
+    return _file(given, path / ONNX, load_bench(own))
 
 
 def _file(name: str, path: Path, bench: Bench) -> Subject:
@@ -260,7 +217,6 @@ def text(settings: Settings, results: Mapping[str, PlantResult]) -> str:
 
 def _scene(a: Settings) -> str:
     c = a.conditions
-    shield = f"shield, which covers '{c.shield_ranges}'" if c.shield_ranges else "shield"
     own = (
         f" Each experiment has its own delay of commands, {c.command_delay[0]} to {c.command_delay[1]} samples, which "
         "the shield covers."
@@ -268,7 +224,7 @@ def _scene(a: Settings) -> str:
     return (
         f"{a.measure.label} of {', '.join(a.parameters)}, relative to the true values; {a.draws} brakes drawn from the "
         f"ranges '{a.ranges}' for evaluation alone, seed {a.seed}; the same brakes and noise for all, all behind the "
-        f"same {shield}. Brackets are 95 % intervals over the draws. 'left': experiments that left the limits and were "
+        f"same shield. Brackets are 95 % intervals over the draws. 'left': experiments that left the limits and were "
         "stopped there; 'home': share that ended at the origin; 'ahead': the first policy's measure minus that of the "
         f"line, paired by draw.{own if c.varies else ''}"
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,14 +16,6 @@ from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import BrakeParameters
 
 PIECE = 8  # Experiments that a process takes at a time
-
-
-class Conditions(NamedTuple):
-    """Conditions that experiments share."""
-
-    bench: Bench
-    plant: Plant  # As a record of the bench is evaluated
-    parameters: tuple[str, ...]
 
 
 def intervals(
@@ -39,20 +30,12 @@ def intervals(
 
     Shape (N, horizon), or N rows of their own lengths. The ``pool`` has processes that share the work.
     """
-    alike = Conditions(bench, bench.model(plant), tuple(parameters))
-    pieces = [slice(i, i + PIECE) for i in range(0, len(brakes), PIECE)]
-    work = partial(_intervals, alike)
-    arguments = [brakes[piece] for piece in pieces], [currents[piece] for piece in pieces]
-    done = map(work, *arguments) if pool is None else pool.map(work, *arguments)
-    return [one for those in done for one in those]
+    work = partial(_interval, bench, bench.model(plant), Question(tuple(parameters)))
+    return list(map(work, brakes, currents) if pool is None else pool.map(work, brakes, currents, chunksize=PIECE))
 
 
-def _intervals(alike: Conditions, brakes: Sequence[BrakeParameters], currents: Sequence[Floats]) -> list[Interval]:
-    bench, plant, asked = alike.bench, alike.plant, Question(alike.parameters)
-    return [
-        of_experiment(bench, plant, brake, sampled(bench, plant, row), asked)
-        for brake, row in zip(brakes, currents, strict=True)
-    ]
+def _interval(bench: Bench, plant: Plant, asked: Question, brake: BrakeParameters, currents: Floats) -> Interval:
+    return of_experiment(bench, plant, brake, sampled(bench, plant, currents), asked)
 
 
 def finite(values: Sequence[float]) -> Floats:

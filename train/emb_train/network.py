@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -12,30 +11,23 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from emb_bench.config.bench import Bench
 from emb_bench.export.own_policy import finished
 from emb_bench.export.policy_file import versions
 from emb_bench.export.torch_policy import torch_graph
 from emb_bench.information.symmetric import Floats
-from emb_runtime.errors import UsageError
 from emb_runtime.policy.contract import greatest_output
-from emb_train.closed_loop import EVERYTHING
 from emb_train.play import bounds
 from emb_train.ppo import DeployedActor
-from emb_train.training import load_training
+from emb_train.training import Trained, Training
 
 
-def network_file(directory: Path) -> tuple[bytes, str]:
-    """The file of a training, and its origin in words.
+def network_file(trained: Trained, training: Training, bench: Bench) -> tuple[bytes, str]:
+    """The policy file of a trained actor that observes what a bench measures, and its origin in words.
 
     Raises:
-        UsageError: the directory holds no usable training.
         PolicyRefusedError: the network's answers are not finite, or the file would differ from it.
     """
-    trained = load_training(directory)
-    training, bench = trained.training, trained.bench
-    if training.conditions.observes == EVERYTHING:
-        raise UsageError(f"{directory}: observes the parameters and the information, which no bench measures")
-    torch.set_num_threads(1)
     kind, width = training.conditions.acts, training.conditions.observation_size(len(training.parameters))
     actor = DeployedActor(trained.actor, greatest_output(kind, bench.limits), bench.timing.sample_time).eval()
 

@@ -6,13 +6,12 @@ The brakes are drawn, or lie on the fixed grid of the thesis. The shield has the
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,18 +41,11 @@ Seen = NDArray[np.float32]
 Currents = NDArray[np.float64]
 
 
-class Excitation(ABC):
-    """Source of current requests, for N experiments side by side."""
-
-    def begin(self, count: int) -> None:  # noqa: B027  # one without memory has nothing to do
-        """Begin N experiments anew."""
-
-    @abstractmethod
-    def __call__(self, seen: Seen) -> Currents:
-        """Requested currents [A], shape [N], for observations of shape [N, 4]."""
+Excitation = Callable[[Seen], Currents]
+"""Requested currents [A], shape [N], for observations of N experiments side by side, shape [N, 4]."""
 
 
-class Played(Excitation):
+class Played:
     """Currents that are known beforehand, whatever is measured."""
 
     def __init__(self, currents: Sequence[float] | Currents) -> None:
@@ -61,58 +53,47 @@ class Played(Excitation):
         self._currents = np.array(currents, np.float64)
 
     def __call__(self, seen: Seen) -> Currents:
-        """See :class:`Excitation`."""
+        """See :data:`Excitation`."""
         step = seen[:, STEP].astype(np.int64)
         wanted: Currents = self._currents[(np.arange(len(step)), step) if self._currents.ndim > 1 else step]
         return wanted
 
 
-class Law(Excitation):
+class Law:
     """A reference excitation, which answers one measurement at a time."""
 
     def __init__(self, law: reference.Law) -> None:
         self._law = law
 
     def __call__(self, seen: Seen) -> Currents:
-        """See :class:`Excitation`."""
+        """See :data:`Excitation`."""
         return np.array([self._law(angle, velocity, int(step)) for angle, velocity, step, _ in seen.tolist()])
 
 
-class Estimating(Excitation):
+class Estimating:
     """An excitation as the runtime calls a policy: one sample of one experiment at a time, with its own estimator."""
 
-    def __init__(self, bench: Bench) -> None:
-        """Estimate as the bench says."""
-        self._bench = bench
+    def __init__(self, bench: Bench, act: Callable[[float, float, float, Estimator], float]) -> None:
+        """Ask ``act`` for currents [A], as :meth:`emb_runtime.policy.policy.Policy.act`; estimate as the bench says."""
+        self._bench, self._act = bench, act
         self._estimators: list[Estimator] = []
 
-    def begin(self, count: int) -> None:
-        """Begin N experiments anew."""
-        self._estimators = [Estimator(self._bench) for _ in range(count)]
-
     def __call__(self, seen: Seen) -> Currents:
-        """See :class:`Excitation`."""
+        """See :data:`Excitation`; in step 0 all experiments begin anew."""
+        if seen[0, STEP] == 0.0:
+            self._estimators = [Estimator(self._bench) for _ in seen]
         wanted: Currents = np.zeros(len(seen))
-        for i, (angle, velocity, step, applied) in enumerate(seen.tolist()):
-            self._estimators[i].take(angle, velocity, step, applied)
-            wanted[i] = self.act(angle, velocity, step, self._estimators[i])
+        for i, (estimator, (*sample, applied)) in enumerate(zip(self._estimators, seen.tolist(), strict=True)):
+            estimator.take(*sample, applied)
+            wanted[i] = self._act(*sample, estimator)
         return wanted
-
-    @abstractmethod
-    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
-        """Requested current [A], as :meth:`emb_runtime.policy.policy.Policy.act`."""
 
 
 class PolicyFile(Estimating):
     """A policy file."""
 
     def __init__(self, policy: Policy, bench: Bench) -> None:
-        super().__init__(bench)
-        self._policy = policy
-
-    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
-        """See :class:`Estimating`."""
-        return self._policy.act(angle, velocity, step, estimator)
+        super().__init__(bench, policy.act)
 
 
 class Planned(Estimating):
@@ -120,13 +101,12 @@ class Planned(Estimating):
 
     def __init__(self, speeds: Sequence[float], bench: Bench, gain: float = BENCH_CONDITIONS.gain) -> None:
         """Follow a plan, parts of the limit of the speed, one for each step, with this gain of the speed loop."""
-        super().__init__(bench)
-        self._speeds, self._gain = [bench.limits.velocity * part for part in speeds], gain
 
-    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
-        """See :class:`Estimating`."""
-        speed = self._speeds[min(int(step), len(self._speeds) - 1)]
-        return current_for(estimator.model, estimator.state, estimator.relative, speed, self._gain)
+        def act(_angle: float, _velocity: float, step: float, estimator: Estimator) -> float:
+            speed = bench.limits.velocity * speeds[min(int(step), len(speeds) - 1)]
+            return current_for(estimator.model, estimator.state, estimator.relative, speed, gain)
+
+        super().__init__(bench, act)
 
 
 def target_speeds(policy: Policy, bench: Bench) -> Floats:
@@ -140,8 +120,6 @@ def target_speeds(policy: Policy, bench: Bench) -> Floats:
         speeds[k] = inference.outputs[0]
     return speeds
 
-
-Results = TypeVar("Results", bound="Outcome")
 
 STREAM = 0x65766C
 """Spawn key of the evaluation's random numbers: training has none, and its validations have another one."""
@@ -200,12 +178,6 @@ def play(
     return Outcome(unpack(m, len(parameters)), left, batch.home & ~left, currents)
 
 
-def joined(parts: Sequence[Results]) -> Results:
-    """Results of all experiments of these parts, in their order."""
-    kind = type(parts[0])
-    return kind(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(kind)))
-
-
 def begin_all(batch: Batch, draws: Sequence[Draw]) -> None:
     """Begin the experiments of a batch, one for each draw."""
     for i, draw in enumerate(draws):
@@ -221,7 +193,6 @@ def followed(batch: Batch, excitation: Excitation) -> Iterator[Seen]:
     Raises:
         PolicyRefusedError: it requests no finite current, where the runtime stops.
     """
-    excitation.begin(len(batch.k))
     left = np.zeros(len(batch.k), np.bool_)
     for k in range(batch.setup.rules.horizon):
         seen = batch.seen()

@@ -11,7 +11,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -311,16 +311,15 @@ class Rollout:
     rewards: Tensor  # Shape [T, N]
     terminals: Tensor  # 1 where the step ended its experiment, shape [T, N]
     strayed: Tensor  # 1 where the step left the limits, shape [T, N]
-    ended: int  # Experiments that ended
-    home: int  # Experiments among these that ended at home
-    information: float  # Mean of the first diagonal element of the FIM over the experiments that ended; NaN if none did
+    homes: Tensor  # 1 where the step ended its experiment at home, shape [T, N]
     mean_return: float
     """Sum of the rewards per experiment that ended; that began, where the rollout is shorter than an experiment."""
 
     @property
-    def violations(self) -> int:
-        """Experiments among these that left the limits."""
-        return int(self.strayed.sum())
+    def counts(self) -> dict[str, int]:
+        """Experiments that ended, that left the limits, and that ended at home."""
+        of = {"ended": self.terminals, "violations": self.strayed, "home": self.homes}
+        return {name: int(where.sum()) for name, where in of.items()}
 
 
 @dataclass(frozen=True)
@@ -330,7 +329,6 @@ class Metrics:
     iteration: int
     steps: int  # Environment steps so far
     mean_return: float  # Sum of rewards per experiment that ended
-    information: float  # See :attr:`Rollout.information`
     violations: int
     home: int
     ended: int
@@ -369,7 +367,8 @@ def train(envs: Sequence[EmbExcitationVectorEnv], actor: Actor, ppo: Ppo, seed: 
                 f"training diverged in iteration {iteration + 1}: a weight is not finite: lower learning_rate or "
                 "scale with --set"
             )
-        early = early + 1 if rollout.ended == rollout.violations > 0 else 0
+        counts = rollout.counts
+        early = early + 1 if counts["ended"] == counts["violations"] > 0 else 0
         if early > max(10, ppo.iterations // 4):
             raise TrainingDivergedError(
                 f"training diverged in iteration {iteration + 1}: for {early} iterations every experiment has left "
@@ -379,10 +378,9 @@ def train(envs: Sequence[EmbExcitationVectorEnv], actor: Actor, ppo: Ppo, seed: 
             iteration=iteration + 1,
             steps=(iteration + 1) * ppo.batch,
             mean_return=rollout.mean_return,
-            information=rollout.information,
-            violations=rollout.violations,
-            home=rollout.home,
-            ended=rollout.ended,
+            violations=counts["violations"],
+            home=counts["home"],
+            ended=counts["ended"],
             **losses,
             deviation=float(actor.log_deviation.detach().exp()),
         )
@@ -437,23 +435,9 @@ def _less_mean(values: Tensor) -> Tensor:
 
 def joined(rollouts: Sequence[Rollout]) -> Rollout:
     """Several rollouts of the same steps as one, side by side."""
-
-    def beside(name: str) -> Tensor:
-        return torch.cat([getattr(one, name) for one in rollouts], 1)
-
-    return Rollout(
-        seen=beside("seen"),
-        states=beside("states"),
-        actions=beside("actions"),
-        log_densities=beside("log_densities"),
-        rewards=beside("rewards"),
-        terminals=beside("terminals"),
-        ended=sum(one.ended for one in rollouts),
-        strayed=beside("strayed"),
-        home=sum(one.home for one in rollouts),
-        information=float(np.mean([one.information for one in rollouts])),
-        mean_return=float(np.mean([one.mean_return for one in rollouts])),
-    )
+    names = [field.name for field in fields(Rollout) if field.name != "mean_return"]
+    beside = {name: torch.cat([getattr(one, name) for one in rollouts], 1) for name in names}
+    return Rollout(**beside, mean_return=float(np.mean([one.mean_return for one in rollouts])))
 
 
 @torch.no_grad()
@@ -472,10 +456,9 @@ def collect(env: EmbExcitationVectorEnv, actor: Actor, noise: Tensor, seeds: Seq
     observation, info = env.reset(seed=seeds)
     seen = torch.empty(steps, *observation.shape)
     states = torch.empty(steps + 1, *info["critic"].shape)
-    rewards, terminals, strayed = (torch.zeros(steps, env.num_envs) for _ in range(3))
+    rewards, terminals, strayed, homes = (torch.zeros(steps, env.num_envs) for _ in range(4))
     log_densities = actor.log_density_of(noise)
     actions = noise * actor.log_deviation.exp()
-    ended, home, gathered = 0, 0, 0.0
     for t in range(steps):
         seen[t], states[t] = torch.from_numpy(observation), torch.from_numpy(info["critic"])
         actions[t] += actor(seen[t])
@@ -484,16 +467,12 @@ def collect(env: EmbExcitationVectorEnv, actor: Actor, noise: Tensor, seeds: Seq
         rewards[t], terminals[t] = torch.from_numpy(reward), torch.from_numpy(over)
         if over.any():
             final = info.get("final_info", info)
-            ended, gathered = ended + int(over.sum()), gathered + float(final["fim"][over, 0].sum())
-            home += int(final["home"][over].sum())
-            strayed[t] = torch.from_numpy(over & final["violated"])
+            strayed[t], homes[t] = (torch.from_numpy(over & final[name]) for name in ("violated", "home"))
     states[steps] = torch.from_numpy(info["critic"])
-    information = gathered / ended if ended else math.nan
+    ended = int(terminals.sum())
     whole = ended and steps >= env.batch.setup.rules.horizon
     mean_return = float(rewards.sum()) / (ended if whole else env.num_envs + int(terminals[:-1].sum()))
-    return Rollout(
-        seen, states, actions, log_densities, rewards, terminals, strayed, ended, home, information, mean_return
-    )
+    return Rollout(seen, states, actions, log_densities, rewards, terminals, strayed, homes, mean_return)
 
 
 def exploration_noise(steps: int, envs: int, noise_memory: float, generator: torch.Generator, hold: int = 1) -> Tensor:

@@ -1,10 +1,9 @@
 """One training by PPO: its configuration, and the folder of its results.
 
-* ``training.json``: the configuration.
+* ``actor.onnx``: the actor that did best on brakes that no training draws, as a policy.
 * ``bench.toml``: the bench as it was read.
-* ``actor.safetensors``: the actor of the iteration that did best on brakes that no training draws.
-* ``metrics.jsonl``: a line for each iteration.
 * ``plan.json``: the plan that an actor of speeds began with.
+* ``training.json``, ``metrics.jsonl``: the configuration, and a line for each iteration, for people.
 
 A training for speeds has a plan before: it searches a coarse one (:mod:`emb_train.plan`), lets the actor follow it
 (:func:`emb_train.ppo.clone`), and improves that.
@@ -12,10 +11,9 @@ A training for speeds has a plan before: it searches a coarse one (:mod:`emb_tra
 
 from __future__ import annotations
 
-import hashlib
-import json
+import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import nullcontext
 from dataclasses import asdict
@@ -25,20 +23,18 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load, save
 
-from emb_bench.config.bench import Bench, load_bench
+from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.estimate.expected import NUMBERS, IntervalCriterion
 from emb_bench.figures import COLOURS, GREY, drawn
-from emb_bench.output import make_empty_folder, replacing
+from emb_bench.output import make_empty_folder
 from emb_bench.parallel import processes
 from emb_runtime.config.typed import read
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
 from emb_runtime.system.terminal import as_json
-from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, SPEED, Conditions, require_covered, require_possible
+from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, SPEED, Conditions, Gain
 from emb_train.env import (
     DEMANDS,
     PRECISION,
@@ -54,7 +50,7 @@ from emb_train.ppo import Actor, Count, Metrics, Positive, Ppo, at_once, clone, 
 from emb_train.presets import preset_record
 from emb_train.rewards import REWARDS
 
-ACTOR, CONFIGURATION, BENCH, METRICS = "actor.safetensors", "training.json", "bench.toml", "metrics.jsonl"
+CONFIGURATION, BENCH, METRICS = "training.json", "bench.toml", "metrics.jsonl"
 TIME = "time"  # Reward: until the estimates are precise
 PLAN, CURVE, ONNX = "plan.json", "curve.png", "actor.onnx"
 LARGEST_FILE = 1 << 26  # [bytes]
@@ -82,9 +78,12 @@ class PlanSearch(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A plan as it is kept: parts of the limit of the speed, one for each step."""
+    """A plan as it is kept."""
 
     speeds: Annotated[tuple[Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)], ...], msgspec.Meta(min_length=1)]
+    """Parts of the limit, one for each step."""
+    ranges: str = ""  # Set of the bench that it was found for
+    gain: Gain = BENCH_CONDITIONS.gain  # Of the speed loop
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -137,12 +136,10 @@ Show = Callable[[Metrics | Found | None], object]
 
 
 class Trained(NamedTuple):
-    """A training's result."""
+    """The best actor of a training so far."""
 
-    training: Training
-    bench: Bench
     actor: Actor
-    iteration: int  # Iteration after which it was the best
+    iteration: int  # After which it was the best
     score: float  # Mean return of an experiment with it on the brakes of the validation
 
 
@@ -222,9 +219,7 @@ def require_trainable(training: Training, bench: Bench) -> None:
             would not see the end of its experiments.
         BenchFileError: the bench lacks the ranges or the plant.
     """
-    for plant in training.plants:
-        require_possible(bench.plant(plant), training.conditions)
-    require_covered(bench, bench.range_set(training.ranges), training.conditions)
+    training.environments(bench, 1)
     rollout, horizon = training.ppo.rollout, training.conditions.applied(bench).timing.horizon
     if rollout > horizon and (training.plan is not None or training.reward == TIME):
         raise UsageError(f"rollout: expected at most the bench's horizon of {horizon} steps, got {rollout}")
@@ -237,8 +232,10 @@ def require_trainable(training: Training, bench: Bench) -> None:
         )
 
 
-def run_training(folder: Path, training: Training, bench: Bench, show: Show = lambda progress: None) -> None:
-    """Train in a folder that has begun. It has the best actor so far at any time: a training can be interrupted.
+def run_training(
+    folder: Path, training: Training, bench: Bench, show: Show = lambda progress: None
+) -> Iterator[Trained]:
+    """Train, with progress in a folder that has begun.
 
     One that is interrupted while it searches or clones a plan first lets the actor follow the best plan so far.
 
@@ -248,6 +245,9 @@ def run_training(folder: Path, training: Training, bench: Bench, show: Show = la
         bench: limits, noise, timing, shield.
         show: called after each step of the search for a plan, without one where the actor begins to follow it, and
             after each iteration.
+
+    Yields:
+        The actor, whenever it does better than before on the brakes of the validation.
 
     Raises:
         EmbError: see :func:`emb_train.ppo.train`; or the folder is not writable.
@@ -266,17 +266,17 @@ def run_training(folder: Path, training: Training, bench: Bench, show: Show = la
         if training.plan is not None:
             best = validation.score(actor)
             _note(folder, {"iteration": 0, "steps": 0, "score": best})
-            save_actor(folder, actor, 0, best)
+            yield Trained(copy.deepcopy(actor), 0, best)
             if stopped:
                 raise KeyboardInterrupt
         for metrics in train(envs, actor, training.ppo, training.seed):
             validated = metrics.iteration in (1, last) or metrics.iteration % every == 0
             score = validation.score(actor) if validated else None
             _note(folder, asdict(metrics) | {"score": score})
-            if score is not None and score > best:
-                save_actor(folder, actor, metrics.iteration, score)
-                best = score
             show(metrics)
+            if score is not None and score > best:
+                best = score
+                yield Trained(copy.deepcopy(actor), metrics.iteration, score)
 
 
 def _note(folder: Path, record: dict[str, Any]) -> None:
@@ -308,7 +308,8 @@ def follow_plan(
         numbers = np.clip(found[0].numbers, -1.0, 1.0)
         speeds = speeds_of(numbers, training.ppo.rollout)
         plan = np.pad(speeds, (0, max(bench.timing.horizon - len(speeds), 0)), "edge").tolist()
-        (folder / PLAN).write_bytes(msgspec.json.encode(Plan(tuple(plan))) + b"\n")
+        kept = Plan(tuple(plan), training.ranges, training.conditions.gain)
+        (folder / PLAN).write_bytes(msgspec.json.encode(kept) + b"\n")
         show(None)
         clone(actor, plan, bench, training.ppo, torch.Generator().manual_seed(training.seed))
 
@@ -364,14 +365,14 @@ def clear(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def load_plan(path: Path) -> tuple[float, ...]:
-    """The plan that an actor began with: parts of the limit of the speed, one for each step.
+def load_plan(path: Path) -> Plan:
+    """The plan that an actor began with.
 
     Raises:
         UsageError: the file cannot be read, or is something else.
     """
     try:
-        return msgspec.json.decode(read_bytes(path, LARGEST_FILE), type=Plan).speeds
+        return msgspec.json.decode(read_bytes(path, LARGEST_FILE), type=Plan)
     except OSError as err:
         raise UsageError(f"{path}: {err.strerror}") from err
     except msgspec.DecodeError as err:
@@ -391,63 +392,6 @@ def begin_training(folder: Path, training: Training, bench: Bench) -> None:
         (folder / CONFIGURATION).write_bytes(msgspec.json.format(msgspec.json.encode(training), indent=2) + b"\n")
     except OSError as err:
         raise UsageError(f"{folder}: cannot write: {err.strerror}") from err
-
-
-def save_actor(folder: Path, actor: Actor, iteration: int, score: float) -> None:
-    """Replace the actor of a training in one move.
-
-    Raises:
-        UsageError: it cannot be written.
-    """
-    tensors = {name: tensor.contiguous() for name, tensor in actor.state_dict().items()}
-    record = json.dumps({"iteration": iteration, "score": score, "origin": _origin(folder)})
-    with replacing(folder / ACTOR) as beside:  # as bytes: a file that safetensors writes can be read by its owner alone
-        beside.write_bytes(save(tensors, {"training": record}))
-
-
-def load_configuration(folder: Path) -> tuple[Training, Bench]:
-    """Configuration and bench of a training.
-
-    Raises:
-        UsageError: it is not a training's folder, or a file of these is damaged.
-    """
-    try:
-        training = training_from(
-            msgspec.json.decode(read_bytes(folder / CONFIGURATION, LARGEST_FILE)), f"{folder / CONFIGURATION}"
-        )
-    except (OSError, msgspec.DecodeError) as err:
-        why = err.strerror if isinstance(err, OSError) else err
-        raise UsageError(f"{folder}: not the folder of a training: cannot read {CONFIGURATION}: {why}") from err
-    return training, load_bench(folder / BENCH)
-
-
-def load_training(folder: Path) -> Trained:
-    """Configuration, bench and actor of a training.
-
-    Raises:
-        UsageError: it is not a training's folder, or a file in it is damaged or of another training.
-    """
-    training, bench = load_configuration(folder)
-    actor = training.untrained_actor(bench)
-    try:
-        data = read_bytes(folder / ACTOR, LARGEST_FILE)
-        tensors = load(data)
-        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-        record = json.loads(header["__metadata__"]["training"])
-        if record["origin"] != _origin(folder):
-            raise ValueError(f"{CONFIGURATION} or {BENCH} is not the one that it was trained with")
-        if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
-            raise ValueError("a weight is not finite")
-        actor.load_state_dict(tensors)
-        return Trained(training, bench, actor, int(record["iteration"]), float(record["score"]))
-    except (OSError, SafetensorError, RuntimeError, KeyError, ValueError, TypeError) as err:
-        reason = str(err).split("\n")[0]
-        raise UsageError(f"{folder / ACTOR}: no usable actor of this training: {reason}") from err
-
-
-def _origin(folder: Path) -> str:
-    """Digest that ties an actor to the two files beside it."""
-    return hashlib.sha256((folder / CONFIGURATION).read_bytes() + (folder / BENCH).read_bytes()).hexdigest()
 
 
 def draw_curve(folder: Path, path: Path) -> None:
