@@ -157,7 +157,8 @@ class Parser(argparse.ArgumentParser):
             found.typed = given
         if unknown:
             kind = "option" if unknown[0].startswith("-") else "argument"
-            self.error(f"unexpected {kind} {unknown[0]}{near(unknown[0].partition('=')[0], self._known())}")
+            name = unknown[0].partition("=")[0]  # it may be an option of another sub-command
+            self.error(f"unexpected {kind} {unknown[0]}{near(name, [one for one in self._known() if one != name])}")
         return found
 
     def error(self, message: str) -> NoReturn:
