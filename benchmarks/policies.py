@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from array import array
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +24,14 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.excitation import ACTOR, parse_excitation
+from emb_bench.information.symmetric import Floats
 from emb_bench.parallel import processes
 from emb_runtime.config.bench import PARAMETER_NAMES
-from emb_runtime.policy.policy import load_policy, shipped_actor_path
+from emb_runtime.policy.inference import Inference
+from emb_runtime.policy.policy import Policy, load_policy, shipped_actor_path
 from emb_train.closed_loop import Conditions
 from emb_train.intervals import intervals
-from emb_train.play import Excitation, Law, Planned, Played, PolicyFile, fresh_draws, play
+from emb_train.play import Estimating, Excitation, Law, Planned, Played, fresh_draws, play
 from emb_train.training import load_plan
 
 CLASSICAL = ("square:period=0.36", "constant-speed:turn=0.15", "chirp", "multisine")
@@ -45,8 +48,20 @@ def excitation(name: str, bench: Bench, count: int) -> Excitation:
     if name in CLASSICAL:
         return Law(parse_excitation(name, bench).law)
     if name.endswith(".json"):
-        return Planned(load_plan(Path(name)).speeds, bench)
-    return PolicyFile(load_policy(shipped_actor_path() if name == ACTOR else Path(name), bench), bench)
+        return Estimating(Planned(load_plan(Path(name)).speeds, bench), bench)
+    return Estimating(load_policy(shipped_actor_path() if name == ACTOR else Path(name), bench), bench)
+
+
+def target_speeds(policy: Policy, bench: Bench) -> Floats:
+    """Speeds that a policy asks for at each step [rad/s], at rest with the nominal estimate, shape [horizon]."""
+    inference, timing = Inference(policy.data, policy.contract), bench.timing
+    nominal, speeds = [getattr(bench.brake, name) for name in PARAMETER_NAMES], np.zeros(timing.horizon)
+    for k in range(timing.horizon):
+        seen = [0.0, 0.0, k * timing.sample_time, *nominal, *[0.0] * len(nominal)]
+        inference.inputs[:] = array(inference.inputs.typecode, seen[: len(inference.inputs)])
+        inference.run()
+        speeds[k] = inference.outputs[0]
+    return speeds
 
 
 def main() -> None:

@@ -14,11 +14,16 @@ experiment are not independent, and count as if they were.
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from scipy import stats
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.policies import target_speeds
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES, Sensors
@@ -26,7 +31,7 @@ from emb_runtime.estimator.estimate import NORMAL_95
 from emb_runtime.estimator.kalman import believed, deviations, fits
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train.closed_loop import Batch, Conditions, state_of
-from emb_train.play import begin_all, fresh_draws, target_speeds
+from emb_train.play import begin_all, fresh_draws
 
 COUNT = len(PARAMETER_NAMES)
 FITS, WORST, LEFT, WIDTH = 2 * COUNT, 2 * COUNT + 1, 2 * COUNT + 2, 2 * COUNT + 3  # After values and deviations
@@ -59,10 +64,10 @@ def results(bench: Bench, quick: bool, declared: float, true: float, count: int,
     out = np.zeros((count, WIDTH))
     for speed in target_speeds(load_policy(shipped_actor_path(quick), bench), bench):
         batch.advance(np.full(count, speed))
-        out[batch.violated, LEFT] = 1.0
+        out[batch.experiments.violated, LEFT] = 1.0
     for row, kept in zip(out, batch.experiments.estimate, strict=True):
         state = state_of(kept)
-        row[:FITS] = *believed(batch.model, state), *deviations(batch.model, state)
+        row[:FITS] = *believed(batch.setup.model, state), *deviations(batch.setup.model, state)
         row[FITS], row[WORST] = fits(state), state.worst
     truths = [[getattr(d.brake, name) / getattr(bench.brake, name) for name in PARAMETER_NAMES] for d in draws]
     return np.array(truths), out

@@ -605,13 +605,13 @@ from emb_bench.config.bench import load_bench
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.policy.policy import load_policy, shipped_actor_path
 from emb_train.closed_loop import Conditions
-from emb_train.play import MEASURES, PolicyFile, fresh_draws, play
+from emb_train.play import MEASURES, Estimating, fresh_draws, play
 bench = load_bench(sys.argv[2])
 ranges, out = bench.range_set("pm50"), {}
 draws = fresh_draws(ranges, 0, int(sys.argv[1]))
 for name in ("shipped", "quick"):
     policy = load_policy(shipped_actor_path(name == "quick"), bench)
-    actor = PolicyFile(policy, bench)
+    actor = Estimating(policy, bench)
     p = play(bench, ranges, PARAMETER_NAMES, actor, draws, "exact", Conditions(information="physical"))
     out[name] = {"left": int(p.left.sum()), "home": int(p.home.sum())}
     out[name] |= {m: MEASURES[m].values(p.matrices).round(4).tolist() for m in ("D", "E")}

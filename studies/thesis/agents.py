@@ -380,7 +380,7 @@ def tested(training: Training) -> tuple[float, float, float]:
 def square_wave(batch: Batch) -> Floats:
     """The manual input of 6.2.2: ±6 A with a period of 20 ms."""
     limit = batch.bench.limits.current
-    return np.where(batch.k // HALF_PERIOD % 2 == 0, limit, -limit)
+    return np.where(batch.experiments.k // HALF_PERIOD % 2 == 0, limit, -limit)
 
 
 def rises_early(curves: Sequence[Floats]) -> Statement:

@@ -82,16 +82,16 @@ class Training:
         """
         config, ranges = self.config, self.bench.range_set(self.config.ranges)
         batch = Batch(self.bench, ranges, config.parameters, len(draws), config.plants[0], config.conditions)
-        scoring = Scoring(batch, config.plants[0], reward or REWARDS[config.reward])
+        scoring = Scoring(batch, reward or REWARDS[config.reward])
         begin_all(batch, draws)
         over = np.zeros(len(draws), np.bool_)
-        series: tuple[list[Floats], ...] = ([batch.x[:, :2].copy()], [], [], [])
+        series: tuple[list[Floats], ...] = ([batch.experiments.x[:, :2].copy()], [], [], [])
         for _ in range(batch.setup.rules.horizon):
             worth = scoring.advance((wanted or self.agent)(batch))
-            now_all = (batch.x[:, :2], batch.past[:, 0], worth, batch.information())
+            now_all = (batch.experiments.x[:, :2], batch.experiments.past[:, 0], worth, batch.information())
             for kept, now in zip(series, now_all, strict=True):
                 kept.append(np.where(over if now.ndim == 1 else over[:, None], np.nan, now))
-            over |= batch.violated
+            over |= batch.experiments.violated
         x, current, rewards, information = map(np.array, series)
         return Trajectories(x, current, rewards, information, over)
 

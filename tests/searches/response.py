@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from benchmarks.policies import target_speeds
 from emb_bench.brake.motion import STATES
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench, load_bench
@@ -61,7 +62,6 @@ from emb_runtime.safety.sensor_thresholds import SensorThresholds, sensor_thresh
 from emb_runtime.safety.shield import NO_PAST, Past
 from emb_runtime.safety.shield_design import ShieldLaw, make_law
 from emb_train.closed_loop import BENCH_CONDITIONS
-from emb_train.play import target_speeds
 from tests.benches import SENSOR_BENCH
 from tests.searches.sensor_monitor import COMMAND_LOST, COVERED, MOVING, SAMPLE_LOST, Script, covered, draw, passed
 

@@ -217,7 +217,7 @@ def test_a_cut_training_makes_a_rehearsal(
 def test_agents_that_leave_the_limits_at_once_get_a_verdict_like_any_other(
     made: Trainings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trainings.Training, "agent", lambda _, batch: np.full(len(batch.k), 6.0))
+    monkeypatch.setattr(trainings.Training, "agent", lambda _, batch: np.full(len(batch.experiments.k), 6.0))
     for figure in ("fig-5.3", "fig-5.4", "fig-5.6", "table-6.2"):
         assert agents.agent_facts(figure, made)
     assert [f.found for f in agents.agent_facts("table-6.2", made)][2] == "100 (2 seeds: 100 to 100)"  # violations

@@ -65,7 +65,7 @@ def test_an_experiment_is_what_the_node_makes_of_the_same_commands(seed: int, de
     node = BrakeNode(
         SHORT,
         layout,
-        BrakeParameters(*batch.brakes[0].tolist()),
+        BrakeParameters(*batch.experiments.brakes[0].tolist()),
         lambda: next(noise),
         Plant("told", exact.mechanics, sides),
     )
@@ -73,14 +73,14 @@ def test_an_experiment_is_what_the_node_makes_of_the_same_commands(seed: int, de
     steps, frames = np.random.default_rng(seed).integers(-2000, 2000, SHORT.timing.horizon), node.tick()
     for k in range(SHORT.timing.horizon):
         said, applied = layout.decode_angle(frames[0]), layout.decode_velocity(frames[1])
-        assert batch.y[0, 0] == pytest.approx(said.angle, abs=1e-3)  # the frame's resolution
-        assert batch.y[0, 1] == pytest.approx(applied.velocity, abs=0.05)
+        assert batch.experiments.y[0, 0] == pytest.approx(said.angle, abs=1e-3)  # the frame's resolution
+        assert batch.experiments.y[0, 1] == pytest.approx(applied.velocity, abs=0.05)
         assert batch.experiments.applied[0] == pytest.approx(applied.applied_current, abs=1.01 * step)
         node.receive(layout.encode_command(k % 15, said.counter, steps[k] * step, True))
         batch.advance(np.array([steps[k] * step]))
         frames = node.tick()
-        assert batch.x[0, 0] == pytest.approx(node.angle, abs=1e-9)
-        assert batch.x[0, 1] == pytest.approx(node.velocity, abs=1e-6)
+        assert batch.experiments.x[0, 0] == pytest.approx(node.angle, abs=1e-9)
+        assert batch.experiments.x[0, 1] == pytest.approx(node.velocity, abs=1e-6)
 
 
 def test_every_delay_comes_equally_often_and_changes_neither_the_brakes_nor_the_noise() -> None:
@@ -88,7 +88,7 @@ def test_every_delay_comes_equally_often_and_changes_neither_the_brakes_nor_the_
     for batch in batches:
         for i in range(600):
             batch.begin(i, np.random.default_rng(i))
-    np.testing.assert_array_equal(batches[0].brakes, batches[1].brakes)
+    np.testing.assert_array_equal(batches[0].experiments.brakes, batches[1].experiments.brakes)
     np.testing.assert_array_equal(batches[0].experiments.noise, batches[1].experiments.noise)
     assert not batches[0].experiments.delay.any()
     assert np.bincount(batches[1].experiments.delay).tolist() == pytest.approx([0, 200, 200, 200], abs=45)
@@ -99,15 +99,15 @@ def test_normal_draws_lie_around_the_middle_of_their_ranges_and_within_them() ->
     for i in range(2000):
         batch.begin(i, np.random.default_rng(i))
     low, high = np.array(PM50.low), np.array(PM50.high)
-    assert (batch.brakes >= low).all()
-    assert (batch.brakes <= high).all()
+    assert (batch.experiments.brakes >= low).all()
+    assert (batch.experiments.brakes <= high).all()
     free = high > low
-    z = ((batch.brakes - 0.5 * (low + high))[:, free]) / (0.25 * (high - low)[free])
+    z = ((batch.experiments.brakes - 0.5 * (low + high))[:, free]) / (0.25 * (high - low)[free])
     # Of a normal distribution that is cut off at two standard deviations.
     assert np.abs(z.mean(axis=0)).max() < 0.08
     assert np.abs(z.var(axis=0) - 0.7737).max() < 0.1
     assert np.abs((np.abs(z) < 1.0).mean(axis=0) - 0.6827 / 0.9545).max() < 0.05
-    assert (batch.brakes[:, ~free] == low[~free]).all()
+    assert (batch.experiments.brakes[:, ~free] == low[~free]).all()
 
 
 def test_information_over_nominal_values_is_that_of_parameters_in_units_of_them() -> None:
@@ -117,7 +117,7 @@ def test_information_over_nominal_values_is_that_of_parameters_in_units_of_them(
         batch.begin(i, np.random.default_rng(i))
     for _ in range(40):
         batch.advance(np.full(3, 5.0))
-    for brake, own, seen in zip(batch.brakes, batch.m, batch.information(), strict=True):
+    for brake, own, seen in zip(batch.experiments.brakes, batch.experiments.m, batch.information(), strict=True):
         true = dict(zip(BrakeParameters._fields, brake.tolist(), strict=True))
         scale = np.diag([getattr(BENCH.brake, name) / true[name] for name in names])
         np.testing.assert_allclose(unpack(seen, 2), scale @ unpack(own, 2) @ scale, rtol=1e-12)
@@ -132,7 +132,7 @@ def test_the_critic_sees_what_an_experiment_has_of_its_own() -> None:
         batch.advance(np.array([u]))
     told = batch.critic_observation()[0, -7:]
     assert told[0] == 0.5  # its delay of at most 4
-    assert told[1] == pytest.approx(batch.x[0, 3] / 6.0)
+    assert told[1] == pytest.approx(batch.experiments.x[0, 3] / 6.0)
     assert told[2:] == pytest.approx([1.0, -0.5, 0.25, 0.0, 0.0])
 
 
@@ -182,7 +182,7 @@ def test_a_batch_that_hears_what_a_run_heard_sends_what_that_sent(plant: str, tm
     heard = np.column_stack([of["angle"], of["velocity"]])[active]
     batch = begun(plant, 0)
     batch.experiments.noise[:] = 0.0
-    batch.y[0] = heard[0]
+    batch.experiments.y[0] = heard[0]
     store_monitor(begin_monitor(*heard[0].tolist()), batch.experiments.monitor[0])
     proof = begin_response(batch.setup.response, *heard[0].tolist())
     store_response(proof, response.OPEN, batch.experiments.response[0])
@@ -193,9 +193,9 @@ def test_a_batch_that_hears_what_a_run_heard_sends_what_that_sent(plant: str, tm
         for mine, other in zip(ahead.experiments, batch.experiments, strict=True):
             mine[:] = other
         ahead.advance(np.array([asked]))
-        batch.experiments.noise[0, k + 1] = heard[k + 1] - ahead.y[0]
+        batch.experiments.noise[0, k + 1] = heard[k + 1] - ahead.experiments.y[0]
         batch.advance(np.array([asked]))
-        assert batch.past[0, 0] == pytest.approx(of["sent_current"][active[k]], abs=RESOLUTION)
+        assert batch.experiments.past[0, 0] == pytest.approx(of["sent_current"][active[k]], abs=RESOLUTION)
 
 
 def test_until_the_motion_has_shown_its_sign_a_batch_sends_no_more_than_friction_can_stop() -> None:
@@ -207,7 +207,7 @@ def test_until_the_motion_has_shown_its_sign_a_batch_sends_no_more_than_friction
         shown.append(monitor.obeys)
         most = largest_current(LAW, batch.setup.thresholds, monitor, 6.0)
         batch.advance(np.array([6.0]))
-        assert batch.past[0, 0] == most
+        assert batch.experiments.past[0, 0] == most
         assert FIRST <= most <= 6.0
         assert most == 6.0 or not shown[-1]
     assert 1 <= shown.index(True) <= 3

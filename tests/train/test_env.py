@@ -136,14 +136,14 @@ def test_brakes_and_noise_are_drawn_at_each_reset_and_nothing_else() -> None:
     batch, rng = Batch(BENCH, ranges, ("f_v",), 400), np.random.default_rng(0)
     for i in range(400):
         batch.begin(i, rng)
-    drawn = batch.brakes[:, f_v]
+    drawn = batch.experiments.brakes[:, f_v]
     assert ranges.low.f_v <= drawn.min() < 1.1e-5
     assert 4.9e-5 < drawn.max() <= ranges.high.f_v
     assert drawn.mean() == pytest.approx(3e-5, rel=0.05)
-    assert (np.delete(batch.brakes, f_v, axis=1) == np.array(BENCH.brake)[:-1]).all()
+    assert (np.delete(batch.experiments.brakes, f_v, axis=1) == np.array(BENCH.brake)[:-1]).all()
     errors = []
     for _ in range(50):
-        errors.append(batch.y - batch.x[:, :2])
+        errors.append(batch.experiments.y - batch.experiments.x[:, :2])
         batch.advance(np.zeros(400))
     deviations = np.std(np.concatenate(errors), axis=0)
     assert deviations == pytest.approx([BENCH.noise.angle, BENCH.noise.velocity], rel=0.03)
@@ -152,7 +152,7 @@ def test_brakes_and_noise_are_drawn_at_each_reset_and_nothing_else() -> None:
         rng = np.random.default_rng(0)
         fixed = Batch(MANY, MANY.range_set("nominal"), ("f_v",), 1, plant=plant)
         fixed.begin(0, rng)
-        assert (fixed.brakes == np.array(BENCH.brake)).all()
+        assert (fixed.experiments.brakes == np.array(BENCH.brake)).all()
         states.append(rng.random())
     assert states[0] == states[1] != states[2]
 
@@ -213,14 +213,14 @@ def test_the_critic_sees_the_truth_in_scales_of_order_one() -> None:
     seen = [info["critic"]]
     seen += [env.step(np.full((64, 1), 1.0 if k < 190 else -1.0, np.float32))[4]["critic"] for k in range(499)]
     everything = np.concatenate(seen)
-    assert everything.shape[1] == env.batch.critic_size == 7
+    assert everything.shape[1] == 7
     assert np.abs(everything).max() < 5.0
     batch = env.batch
-    np.testing.assert_allclose(seen[-1][:, 0], batch.x[:, 0] / 100.0, rtol=1e-6)
-    np.testing.assert_allclose(seen[-1][:, 1], batch.x[:, 1] / 500.0, rtol=1e-6)
+    np.testing.assert_allclose(seen[-1][:, 0], batch.experiments.x[:, 0] / 100.0, rtol=1e-6)
+    np.testing.assert_allclose(seen[-1][:, 1], batch.experiments.x[:, 1] / 500.0, rtol=1e-6)
     np.testing.assert_allclose(seen[-1][:, 2], 499 / 500)
-    np.testing.assert_allclose(seen[-1][:, 3], (batch.brakes[:, 5] - 3e-5) / 2e-5, rtol=1e-5)
-    np.testing.assert_allclose(seen[-1][:, 4], 0.1 * np.log1p(batch.m[:, 0]), rtol=1e-6)
+    np.testing.assert_allclose(seen[-1][:, 3], (batch.experiments.brakes[:, 5] - 3e-5) / 2e-5, rtol=1e-5)
+    np.testing.assert_allclose(seen[-1][:, 4], 0.1 * np.log1p(batch.experiments.m[:, 0]), rtol=1e-6)
 
 
 def test_parameters_that_cannot_be_trained_are_refused() -> None:
@@ -312,12 +312,12 @@ def test_a_speed_becomes_the_current_of_the_runtimes_loop_and_the_estimate_is_th
     seen, _ = env.reset(seed=4)
     batch, estimators, asked = env.batch, [Estimator(bench) for _ in range(3)], 0
     for action in held(1, 60, 3):
-        before = batch.k.copy()
+        before = batch.experiments.k.copy()
         for i, estimator in enumerate(estimators):
-            angle, velocity = batch.y[i].tolist()
+            angle, velocity = batch.experiments.y[i].tolist()
             estimator.take(angle, velocity, float(before[i]), float(batch.experiments.applied[i]))
             np.testing.assert_array_equal(
-                seen[i], np.array([*batch.y[i], before[i], *estimator.parameters], np.float32)
+                seen[i], np.array([*batch.experiments.y[i], before[i], *estimator.parameters], np.float32)
             )
         assert env.observation_space.contains(seen)
         seen, _, _, _, info = env.advance(action)
@@ -345,7 +345,8 @@ def test_the_reward_of_a_whole_experiment_is_the_criterion_of_the_interval_that_
             paid.append(rewards)
         assert not np.any(paid[:-1])
         assert env.batch.home.all()
-        for currents, brake, found in zip(np.transpose(acted), env.batch.brakes.tolist(), paid[-1], strict=True):
+        brakes = env.batch.experiments.brakes.tolist()
+        for currents, brake, found in zip(np.transpose(acted), brakes, paid[-1], strict=True):
             known = BrakeParameters(*brake)
             information = of_experiment(
                 SHORT,
@@ -369,14 +370,14 @@ def test_an_experiment_pays_for_the_release_side_for_what_lies_it_hides_and_for_
 
     def reward(**demands: float) -> np.ndarray:
         of = ExpectedInterval(criterion, Demands(**demands))
-        return of(batch, "exact", rows, np.transpose(acted), motion)
+        return of(batch, rows, np.transpose(acted), motion)
 
     assert (reward(hidden=0.0) - reward()).tolist() == pytest.approx([len(LIES) * 1.15 * 10.0] * 2)  # nothing moved
     motion[1, 30, 0] = 0.3 * SHORT.limits.angle[0] - 2.5
     np.testing.assert_allclose(reward(hidden=0.0, beyond=0.0) - reward(hidden=0.0), [0.0, 2.5], atol=1e-12)
-    batch.x[1, 0] = 20.0  # not at home
+    batch.experiments.x[1, 0] = 20.0  # not at home
     np.testing.assert_allclose(reward(hidden=0.0, astray=0.0) - reward(hidden=0.0), [0.0, 20.0], atol=1e-12)
-    assert ExpectedInterval(criterion)(batch, "exact", ~rows | [False, True], np.transpose(acted), motion).shape == (1,)
+    assert ExpectedInterval(criterion)(batch, ~rows | [False, True], np.transpose(acted), motion).shape == (1,)
 
 
 def test_the_reward_of_a_time_counts_periods_until_every_estimate_is_precise() -> None:
@@ -416,7 +417,7 @@ def test_an_experiment_whose_estimates_are_known_returns_and_pays_for_the_interv
         arrived = env.batch.experiments.returning & env.batch.home
         home = np.where(arrived, np.minimum(home, len(acted)), home)
     assert (home < 300).all()  # the shield alone would bring it home at the horizon of 500
-    for i, brake in enumerate(env.batch.brakes.tolist()):
+    for i, brake in enumerate(env.batch.experiments.brakes.tolist()):
         currents = np.array(acted)[: home[i], i]
         model = BENCH.model("exact")
         found = of_experiment(
@@ -435,7 +436,7 @@ def test_systematic_errors_are_drawn_from_the_benchs_priors_and_show_where_they_
     priors = SHORT.systematic
     expected = [priors.offset, priors.current_offset]
     np.testing.assert_allclose(many.experiments.errors.std(axis=0), expected, rtol=0.1)
-    assert many.y[:, 0].std() == pytest.approx(math.hypot(priors.offset, SHORT.noise.angle), rel=0.1)
+    assert many.experiments.y[:, 0].std() == pytest.approx(math.hypot(priors.offset, SHORT.noise.angle), rel=0.1)
     offset, current = 0.3, 0.5
     clean, marred = (
         Batch(SHORT, SHORT.range_set("pm50"), PARAMETER_NAMES, 1, conditions=Conditions(shielded=False))
@@ -447,6 +448,6 @@ def test_systematic_errors_are_drawn_from_the_benchs_priors_and_show_where_they_
     for wanted in (3.0, 3.0, -1.0, 2.0):
         clean.advance(np.array([wanted + current]))
         marred.advance(np.array([wanted]))
-        np.testing.assert_allclose(marred.x, clean.x, rtol=1e-12)
-        np.testing.assert_allclose(marred.y, clean.y + np.array([offset, 0.0]), rtol=1e-9)
+        np.testing.assert_allclose(marred.experiments.x, clean.experiments.x, rtol=1e-12)
+        np.testing.assert_allclose(marred.experiments.y, clean.experiments.y + np.array([offset, 0.0]), rtol=1e-9)
         assert marred.experiments.applied[0] == wanted

@@ -28,7 +28,7 @@ from emb_train.cli import main
 from emb_train.closed_loop import Batch, Conditions
 from emb_train.evaluate import Settings, Subject, document, evaluate, open_subject, references, text
 from emb_train.optimum import followed, optima, searchable
-from emb_train.play import MEASURES, Draw, Law, Played, PolicyFile, fresh_draws, mean_score, play
+from emb_train.play import MEASURES, Draw, Estimating, Law, Played, fresh_draws, mean_score, play
 from emb_train.training import ONNX, PLAN
 from tests.benches import SENSOR_BENCH
 from tests.commands import refused
@@ -84,8 +84,8 @@ def test_an_experiment_that_leaves_the_limits_keeps_what_it_had_and_is_not_home(
     batch = Batch(BENCH, WIDE, ("f_v",), 1)
     batch.begin(0, np.random.default_rng(0), strong.brake)
     before = 0.0
-    while not batch.violated[0]:
-        before = float(batch.m[0, 0])
+    while not batch.experiments.violated[0]:
+        before = float(batch.experiments.m[0, 0])
         batch.advance(np.array([6.0]))
     assert (outcome.left[0], outcome.home[0], outcome.matrices[0, 0, 0]) == (True, False, before)
 
@@ -229,17 +229,15 @@ def test_the_optimum_of_a_plant_is_that_of_its_mechanics() -> None:
 # What is evaluated
 
 
-def test_table_and_document_say_the_same(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(finished, "--criterion", "weighted", "--json", "--output", tmp_path / "out") == 0
-    said = capsys.readouterr().out
-    assert said == (tmp_path / "out" / "evaluation.json").read_text()
-    plant = json.loads(said)["plants"]["euler"]
+def test_table_and_document_say_the_same(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(finished, "--criterion", "weighted", "--json") == 0
+    plant = json.loads(capsys.readouterr().out)["plants"]["euler"]
     row = plant["rows"][0]
     assert row["measure"]["value"] == pytest.approx(np.mean(row["values"]))
     assert (row["left"], len(row["values"]), row["learned"]) == (0, 4, True)
     assert (plant["optima"], row["against_optimum"]) == ([], None)
-    table = (tmp_path / "out" / "evaluation.txt").read_text()
-    line = next(x for x in table.splitlines() if x.startswith(str(finished)))
+    assert run(finished, "--criterion", "weighted") == 0
+    line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith(str(finished)))
     assert f"{row['measure']['value']:.3e}" in line
 
 
@@ -280,7 +278,7 @@ def test_a_training_for_speeds_is_evaluated_as_the_runtime_plays_its_policy(
     said = json.loads(capsys.readouterr().out)
     row = said["plants"]["euler"]["rows"][0]
     bench = load_bench(finished_speeds / "bench.toml")
-    policy = PolicyFile(load_policy(finished_speeds / "actor.onnx", bench), bench)
+    policy = Estimating(load_policy(finished_speeds / "actor.onnx", bench), bench)
     draws = fresh_draws(bench.range_set("pm50"), 0, 4)
     outcome = play(bench, bench.range_set("pm50"), PARAMETER_NAMES, policy, draws, "euler", PHYSICAL)
     assert row["values"] == MEASURES["D"].values(outcome.matrices).tolist()

@@ -16,7 +16,7 @@ from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_train.closed_loop import Conditions
 from emb_train.env import EmbExcitationEnv, EmbExcitationVectorEnv, ExpectedInterval
-from emb_train.plan import Compared, Found, play, search, speeds_of
+from emb_train.plan import Compared, Found, PlanSearch, play, search, speeds_of
 from tests.benches import SENSOR_BENCH
 
 BENCH = SENSOR_BENCH
@@ -71,8 +71,8 @@ def distance(plans: Floats) -> Floats:
 
 def test_a_search_begins_with_the_best_plans_at_random_and_returns_the_best_of_all() -> None:
     landscape, shown = Landscape(distance), list[Found]()
-    asked = {"drawn": 90, "starts": 2, "steps": 30, "levels": LEVELS, "spread": SPREAD}
-    found = search(landscape, **asked, rng=np.random.default_rng(3), show=shown.append)  # type: ignore[arg-type]
+    asked = PlanSearch(drawn=90, starts=2, steps=30, levels=LEVELS, spread=SPREAD)
+    found = search(landscape, asked, np.random.default_rng(3), shown.append)
     assert [one.plans for one in shown] == [40, 80, 120, *(120 + 16 * (i + 1) for i in range(1 + 3 * 30))]
     assert (np.diff([one.best for one in shown[3:]]) >= 0.0).all()
     drawn = np.concatenate(landscape.screened)
@@ -88,7 +88,7 @@ def test_a_search_begins_with_the_best_plans_at_random_and_returns_the_best_of_a
     everything = np.concatenate(landscape.asked)
     assert found.tolist() == np.clip(everything[np.argmax(distance(everything))], -1.0, 1.0).tolist()
     assert distance(found[None])[0] > 0.2 * distance(drawn).max()
-    again = search(Landscape(distance), **asked, rng=np.random.default_rng(3))  # type: ignore[arg-type]
+    again = search(Landscape(distance), asked, np.random.default_rng(3))
     assert again.tolist() == found.tolist()
 
 
@@ -102,7 +102,7 @@ def test_a_plan_that_no_step_improves_is_kept() -> None:
         return returns
 
     landscape = Landscape(falling)
-    found = search(landscape, drawn=32, starts=1, steps=5, levels=4, spread=0.15, rng=np.random.default_rng(3))
+    found = search(landscape, PlanSearch(drawn=32, starts=1, steps=5, levels=4), np.random.default_rng(3))
     assert len(found) == 2 * 4
     assert found.tolist() == landscape.asked[0][-1].tolist()
 
@@ -121,10 +121,10 @@ def test_plans_are_compared_on_the_same_brakes_of_each_plant_and_worth_the_mean(
     found = Compared(both, 3, 60, 5).returns(plans)
     assert found[0] == found[2] != found[1]
     for env in both:
-        brakes = env.batch.brakes.reshape(3, 2, -1)
+        brakes = env.batch.experiments.brakes.reshape(3, 2, -1)
         assert (brakes[0] == brakes[1]).all()
         assert (brakes[0, 0] != brakes[0, 1]).any()
-    assert (both[0].batch.brakes != both[1].batch.brakes).any()
+    assert (both[0].batch.experiments.brakes != both[1].batch.experiments.brakes).any()
     screening = Compared(environments(6), 3, 60, 5).screening()
     many = screening.returns(np.repeat(plans[:1], screening.plans, axis=0))
     assert (screening.plans, len({*many.tolist()})) == (6, 1)

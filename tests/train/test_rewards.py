@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emb_bench.config.bench import load_bench
-from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.information.symmetric import pack, unpack
 from emb_runtime.errors import UsageError
 from emb_train.closed_loop import Batch
@@ -203,13 +202,13 @@ def test_a_reward_gets_the_state_in_which_the_way_home_began(monkeypatch: pytest
 
     bench = load_bench()
     batch = Batch(bench, bench.range_set("viscous"), ("f_v",), 1)
-    scoring = Scoring(batch, DEFAULT_PLANT, noted)
+    scoring = Scoring(batch, noted)
     batch.begin(0, np.random.default_rng(0))
-    states, informations = [batch.x[0, :2].copy()], [batch.m[0].copy()]
+    states, informations = [batch.experiments.x[0, :2].copy()], [batch.experiments.m[0].copy()]
     for _ in range(30):
         scoring.advance(np.full(1, 5.0))
-        states.append(batch.x[0, :2].copy())
-        informations.append(batch.m[0].copy())
+        states.append(batch.experiments.x[0, :2].copy())
+        informations.append(batch.experiments.m[0].copy())
     assert [turn.x.any() for turn in turns] == [False] * 19 + [True] * 11
     for turn in turns[19:]:
         np.testing.assert_array_equal(turn.x, states[20])
@@ -220,7 +219,7 @@ def test_a_reward_gets_the_state_in_which_the_way_home_began(monkeypatch: pytest
 def test_the_packed_matrix_of_the_environment_is_the_one_that_the_rewards_unpack() -> None:
     bench = load_bench()
     batch = Batch(bench, bench.range_set("pm50"), ("k_1", "f_v"), 1)
-    scoring = Scoring(batch, DEFAULT_PLANT, trajectory_return)
+    scoring = Scoring(batch, trajectory_return)
     batch.begin(0, np.random.default_rng(0))
     total = sum(float(scoring.advance(np.full(1, 2.0))[0]) for _ in range(100))
-    assert total == pytest.approx(np.linalg.eigvalsh(unpack(batch.m[0], 2))[0], rel=1e-9)
+    assert total == pytest.approx(np.linalg.eigvalsh(unpack(batch.experiments.m[0], 2))[0], rel=1e-9)

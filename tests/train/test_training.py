@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from emb_bench.config.bench import load_bench
-from emb_export.export import main as emb_export
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import EXIT_INTERRUPTED, EXIT_USAGE, UsageError
 from emb_runtime.policy.policy import load_policy
@@ -222,7 +221,7 @@ def test_training_validation_and_evaluation_draw_other_brakes(finished: Path) ->
     for seed in range(20):
         validation = Validation(tiny(seed=seed), bench)
         validation.score(actor)
-        drawn += validation._envs[0].batch.brakes[:, f_v].tolist()
+        drawn += validation._envs[0].batch.experiments.brakes[:, f_v].tolist()
         drawn += [draw.brake.f_v for draw in fresh_draws(ranges, seed, 50)]
         for iteration in range(5):  # as emb_train.ppo draws its seeds
             seeds = np.random.SeedSequence([seed, iteration]).generate_state(10, np.uint64).tolist()
@@ -293,9 +292,6 @@ def test_a_damaged_folder_is_refused(finished: Path, tmp_path: Path, capsys: pyt
         folder = shutil.copytree(finished, tmp_path / str(i))
         damage(folder)
         assert refused(lambda: main(["evaluate", str(folder)]), capsys, code=code)  # noqa: B023  # called at once
-        export = [str(folder), "--output", str(tmp_path / "x.onnx")]
-        assert refused(lambda: emb_export(export), capsys, code=code)  # noqa: B023  # called at once
-        assert not (tmp_path / "x.onnx").exists()
 
 
 def test_every_configuration_survives_json_and_impossible_values_are_refused_by_their_key() -> None:

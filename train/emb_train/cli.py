@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import EVERY
-from emb_bench.output import make_empty_folder, progress, replacing
+from emb_bench.output import progress, replacing
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EXIT_DONE, EXIT_INTERRUPTED, EmbError, UsageError, near, needs
 from emb_runtime.system.terminal import Parser, as_json, complain, mention, show
@@ -68,32 +68,36 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = p.add_subparsers(dest="command", metavar="COMMAND", required=True)
-
-    def command(name: str, summary: str, epilog: str) -> argparse.ArgumentParser:
-        return commands.add_parser(
-            name,
-            help=summary,
-            description=f"{summary[0].upper()}{summary[1:]}.",
-            epilog=epilog,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-
-    c = command(
-        "ppo",
-        "train an actor by proximal policy optimisation, and write it as actor.onnx",
-        PPO_EPILOG.format(presets=listed(preset_summaries())),
-    )
-    _add_ppo(c)
-    c = command(
-        "evaluate",
-        "compare policies with every reference excitation and the known-parameter optimum, on new brakes",
-        EVALUATE_EPILOG,
-    )
-    _add_evaluate(c)
+    for name, add, summary, epilog in (
+        (
+            "ppo",
+            _add_ppo,
+            "train an actor by proximal policy optimisation, and write it as actor.onnx",
+            PPO_EPILOG.format(presets=listed(preset_summaries())),
+        ),
+        (
+            "evaluate",
+            _add_evaluate,
+            "compare policies with every reference excitation and the known-parameter optimum, on new brakes",
+            EVALUATE_EPILOG,
+        ),
+    ):
+        said, raw = f"{summary[0].upper()}{summary[1:]}.", argparse.RawDescriptionHelpFormatter
+        add(commands.add_parser(name, help=summary, description=said, epilog=epilog, formatter_class=raw))
     return p
 
 
-def _add_common(p: argparse.ArgumentParser, seed: str) -> None:
+def _add_common(p: argparse.ArgumentParser, plants: str | None, seed: str) -> None:
+    own = plants or "the preset's"
+    p.add_argument("--plant", default=plants, metavar="NAMES", help=f"plants of the bench, or 'all' (default: {own})")
+    p.add_argument(
+        "--command-delay",
+        type=_at_least(0),
+        nargs=2,
+        metavar=("LEAST", "MOST"),
+        default=(0, 0),
+        help="delay of the commands, drawn for each experiment and covered by the shield [samples] (default: 0 0)",
+    )
     p.add_argument("--seed", type=_at_least(0), default=0, metavar="S", help=f"{seed} (default: %(default)s)")
     p.add_argument("--bench", type=Path, metavar="FILE", help="bench file (default: the shipped drum brake)")
 
@@ -113,7 +117,6 @@ def _add_ppo(p: argparse.ArgumentParser) -> None:
         metavar="N",
         help="environment steps in total, rounded up to whole iterations (default: the preset's)",
     )
-    p.add_argument("--plant", metavar="NAMES", help="plants of the bench, or 'all' (default: the preset's)")
     p.add_argument(
         "--set",
         action="append",
@@ -121,8 +124,7 @@ def _add_ppo(p: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help="a hyper-parameter, such as envs=448 or hidden=[32,32]; as often as needed",
     )
-    _add_late(p)
-    _add_common(p, "seed of everything random")
+    _add_common(p, None, "seed of everything random")
 
 
 def _add_evaluate(p: argparse.ArgumentParser) -> None:
@@ -130,15 +132,8 @@ def _add_evaluate(p: argparse.ArgumentParser) -> None:
         "policies", nargs="+", metavar="POLICY", help="policies to evaluate; the first is compared with the others"
     )
     p.add_argument("--criterion", choices=CRITERIA, default="T", help="measure of an experiment (default: %(default)s)")
-    p.add_argument(
-        "--ranges", metavar="NAME", help="name of the ranges that brakes are drawn from (default: the policy's)"
-    )
-    p.add_argument(
-        "--draws", type=_at_least(2), default=200, metavar="N", help="number of brakes (default: %(default)s)"
-    )
-    p.add_argument(
-        "--plant", default="euler,exact", metavar="NAMES", help="plants of the bench, or 'all' (default: %(default)s)"
-    )
+    p.add_argument("--ranges", metavar="NAME", help="ranges that brakes are drawn from (default: the policy's)")
+    p.add_argument("--draws", type=_at_least(2), default=200, metavar="N", help="brakes (default: %(default)s)")
     p.add_argument(
         "--optimum",
         type=_at_least(0),
@@ -147,22 +142,7 @@ def _add_evaluate(p: argparse.ArgumentParser) -> None:
         help="search the optimum for the first N brakes, which takes minutes (default: %(default)s)",
     )
     p.add_argument("--json", action="store_true", help="print JSON, with the values of every draw")
-    p.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="also write evaluation.txt and evaluation.json there"
-    )
-    _add_late(p)
-    _add_common(p, "seed of brakes and noise, which no training uses")
-
-
-def _add_late(p: argparse.ArgumentParser) -> None:
-    p.add_argument(
-        "--command-delay",
-        type=_at_least(0),
-        nargs=2,
-        metavar=("LEAST", "MOST"),
-        default=(0, 0),
-        help="delay of the commands, drawn for each experiment and covered by the shield [samples] (default: 0 0)",
-    )
+    _add_common(p, "euler,exact", "seed of brakes and noise, which no training uses")
 
 
 def _at_least(least: int) -> Callable[[str], int]:
@@ -184,7 +164,7 @@ def ppo(arguments: argparse.Namespace) -> int:
     from emb_train.network import network_file
     from emb_train.plan import Found
     from emb_train.ppo import Metrics
-    from emb_train.training import CURVE, ONNX, begin_training, clear, draw_curve, load_preset, run_training
+    from emb_train.training import CURVE, ONNX, begin_training, draw_curve, load_preset, run_training
 
     bench, folder = load_bench(arguments.bench), arguments.output
     changes = _settings(arguments.preset, arguments.set)
@@ -218,12 +198,14 @@ def ppo(arguments: argparse.Namespace) -> int:
         what, ended = "", EXIT_DONE
         try:
             for best in run_training(folder, training, bench, note):
-                data, what = network_file(best, training, bench)
+                data, learned = network_file(best, training, bench)
                 with replacing(folder / ONNX) as beside:
                     beside.write_bytes(data)
+                what = learned
         except KeyboardInterrupt:
-            if not what:
-                clear(folder)
+            if not what:  # and so the files of the beginning are of no use
+                for path in folder.iterdir():
+                    path.unlink()
                 said = f"emb-train: interrupted; nothing was trained, {folder} is empty"
                 raise KeyboardInterrupt(said) from None
             ended = EXIT_INTERRUPTED
@@ -278,15 +260,9 @@ def evaluate(arguments: argparse.Namespace) -> int:
     from emb_train.evaluate import document, evaluate, text
 
     bench, settings, subjects = prepare(arguments)
-    if arguments.output is not None:
-        make_empty_folder(arguments.output)
     with Console(stderr=True).status("") as status:
         results = evaluate(bench, settings, subjects, status.update)
-    table, record = text(settings, results), as_json(document(settings, results))
-    if arguments.output is not None:
-        (arguments.output / "evaluation.txt").write_text(table + "\n", encoding="utf-8")
-        (arguments.output / "evaluation.json").write_text(record + "\n", encoding="utf-8")
-    show(record if arguments.json else table)
+    show(as_json(document(settings, results)) if arguments.json else text(settings, results))
     return EXIT_DONE if len(results) == len(settings.plants) else EXIT_INTERRUPTED
 
 

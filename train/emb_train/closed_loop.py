@@ -28,7 +28,7 @@ from emb_bench.sim.instruments import MEMORY, command, measure, settle
 from emb_bench.sim.simulated_brake import pass_period, sent_current
 from emb_runtime.config.bench import OLDEST_FRAME, PARAMETER_NAMES, BrakeParameters, Ranges
 from emb_runtime.errors import UsageError
-from emb_runtime.estimator.kalman import Model, Packed, Six, State, believed, deviations, follow, make_model, start
+from emb_runtime.estimator.kalman import Model, State, believed, deviations, follow, make_model, start
 from emb_runtime.estimator.speed_loop import current_for
 from emb_runtime.policy.contract import SAMPLE
 from emb_runtime.safety.response import OPEN, PROVEN, ResponseModel, response_model, take, unproven_law
@@ -48,10 +48,17 @@ CURRENT: Literal["current"] = "current"
 SPEED: Literal["speed"] = "speed"
 
 Bools = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
+# Numbers of a configuration
+Count = Annotated[int, msgspec.Meta(ge=1, le=2**31)]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Price = Annotated[float, msgspec.Meta(ge=0.0)]
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Gain = Annotated[float, msgspec.Meta(gt=0.0, le=1.0)]
+
 MOST = 100.0  # Greatest estimate or deviation that is observed, of the nominal value
-ESTIMATES = 30  # Numbers of an estimator's state
-MONITOR = 29  # Numbers of a sensor monitor's state
+NUMBERS = 30  # Of a row that stores the state of an estimator or of a sensor monitor
 RESPONSE = 44  # Verdict on the response, and numbers of its proof's state
 
 
@@ -72,7 +79,7 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Distribution of the brakes in their ranges: normal is cut off at both ends, two standard deviations away."""
     normalised_by: Literal["true", "nominal"] = "true"
     """Values that the rewards divide the parameters by (eq. 4.17): those of each brake, or those of the bench."""
-    tracking: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0  # Factor of the weights of the deviation from the quintic
+    tracking: Positive = 1.0  # Factor of the weights of the deviation from the quintic
     command_delay: tuple[int, int] = (0, 0)
     """Least and most samples that a command waits beside the plant's own delay, drawn for each experiment."""
     gain: Gain = 1.0  # Of the speed loop; less where commands act late
@@ -123,9 +130,6 @@ class Conditions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 BENCH_CONDITIONS = Conditions()
 
 
-Integers = NDArray[np.int64]
-
-
 class Rules(NamedTuple):
     """The constants of an experiment; floats and integers only."""
 
@@ -139,6 +143,9 @@ class Rules(NamedTuple):
     angle_weight: float  # Of the angle in the FIM, see :func:`emb_bench.information.fisher.weights_of`
     velocity_weight: float  # Of the velocity
     damping_velocity: float  # Of the node that brakes by itself [rad/s]; infinite for one that lets go
+    estimates: bool  # True if the estimator is in the loop
+    follows: bool  # True if what is requested is a target speed, which the speed loop follows
+    gain: float  # Of the speed loop
 
 
 class Setup(NamedTuple):
@@ -153,29 +160,29 @@ class Setup(NamedTuple):
     mechanics: Mechanics  # Mechanics of the brakes
     instruments: Instruments  # Instruments between the brakes and the bus
     chosen: Integers  # Indices in ``PARAMETERS`` of the n parameters whose information is collected, shape [n]
+    model: Model  # Of the estimator, the runtime's
 
 
-def make_setup(
-    bench: Bench, law: ShieldLaw, plant: Plant, parameters: Sequence[str], kind: Kind, shielded: bool
-) -> Setup:
-    """The setup of experiments on a bench that collect this Fisher information of these parameters."""
-    timing, limits = bench.timing, bench.limits
+def make_setup(bench: Bench, plant: Plant, parameters: Sequence[str], conditions: Conditions) -> Setup:
+    """The setup of experiments on a bench, with conditions that are applied, that collect these parameters' FIM."""
+    law, timing, limits = make_law(bench), bench.timing, bench.limits
     damping = bench.node.damping_velocity if bench.node.stop == "damped" else math.inf
     rules = Rules(
-        shielded,
+        conditions.shielded,
         timing.sample_time,
         timing.horizon,
         late_step(law),
         *limits.angle,
         limits.velocity,
-        *weights_of(bench, kind),
+        *weights_of(bench, conditions.information),
         damping,
+        conditions.estimates,
+        conditions.acts == SPEED,
+        conditions.gain,
     )
-    thresholds = sensor_thresholds(bench, law)
-    slow, response = unproven_law(bench, law), response_model(bench, law)
-    return Setup(
-        law, slow, response, thresholds, rules, plant.mechanics, plant.instruments, no_sensitivity(parameters)[0]
-    )
+    safety = law, unproven_law(bench, law), response_model(bench, law), sensor_thresholds(bench, law)
+    model = make_model(bench, bench.range_set(bench.prior), sticks=True)
+    return Setup(*safety, rules, plant.mechanics, plant.instruments, no_sensitivity(parameters)[0], model)
 
 
 class Experiments(NamedTuple):
@@ -204,10 +211,10 @@ class Experiments(NamedTuple):
     violated: Bools  # Mask of the brakes outside their limits, shape [N]
     returning: Bools  # Mask of the experiments that have ended before their horizon and are on the way home, shape [N]
     monitor: Floats
-    """State of the sensor monitor until it confirms the polarity, see :func:`monitor_of`; shape [N, MONITOR]."""
+    """State of the sensor monitor until it confirms the polarity, see :func:`monitor_of`; shape [N, NUMBERS]."""
     response: Floats
     """Verdict on the response, and the state of its proof until then, see :func:`response_of`; shape [N, RESPONSE]."""
-    estimate: Floats  # State of the estimator, see :func:`state_of`; shape [N, ESTIMATES]
+    estimate: Floats  # State of the estimator, see :func:`state_of`; shape [N, NUMBERS]
     told: Floats
     """Its values, then their deviations, of k_m, k_1, T_c and f_v in SI units, shape [N, 8]."""
 
@@ -231,48 +238,42 @@ def no_experiments(count: int, n: int, steps: int) -> Experiments:
         reasons=np.zeros(count, np.int64),
         violated=np.zeros(count, np.bool_),
         returning=np.zeros(count, np.bool_),
-        monitor=np.zeros((count, MONITOR)),
+        monitor=np.zeros((count, NUMBERS)),
         response=np.zeros((count, RESPONSE)),
-        estimate=np.zeros((count, ESTIMATES)),
+        estimate=np.zeros((count, NUMBERS)),
         told=np.zeros((count, 2 * len(PARAMETER_NAMES))),
     )
 
 
-def six(row: Any, at: int) -> Six:
-    """Six stored numbers, from a place on."""
+def numbers_of(row: Any) -> Any:
+    """A row as a tuple, shape [NUMBERS]; compiled code makes none of an array."""
+    return six(row, 0) + six(row, 6) + six(row, 12) + six(row, 18) + six(row, 24)
+
+
+def six(row: Any, at: int) -> tuple[float, float, float, float, float, float]:
+    """Six numbers of a row, from a place on."""
     return (
-        float(row[at]), float(row[at + 1]), float(row[at + 2]),
-        float(row[at + 3]), float(row[at + 4]), float(row[at + 5]),
+        float(row[at]), float(row[at + 1]), float(row[at + 2]), float(row[at + 3]), float(row[at + 4]),
+        float(row[at + 5]),
     )  # fmt: skip
 
 
-def packed(row: Any, at: int) -> Packed:
-    """A stored covariance of six unknowns, from a place on."""
-    a, b, c = six(row, at), six(row, at + 6), six(row, at + 12)
-    return a + b + c + (float(row[at + 18]), float(row[at + 19]), float(row[at + 20]))
-
-
 def state_of(row: Any) -> State:
-    """The state of an estimator as it is stored, shape [ESTIMATES]."""
-    return State(float(row[0]), six(row, 1), packed(row, 7), float(row[28]), float(row[29]))
-
-
-def fill(row: Any, numbers: tuple[float, ...]) -> None:
-    """Store numbers in a row of that length."""
-    for j in range(len(numbers)):
-        row[j] = numbers[j]
+    """The state of an estimator as :func:`store` left it."""
+    f = numbers_of(row)
+    return State(f[0], f[1:7], f[7:28], f[28], f[29])
 
 
 def store(state: State, row: Any) -> None:
-    """Store the state of an estimator, shape [ESTIMATES]."""
-    fill(row, (state.step, *state.mean, *state.covariance, state.innovation, state.worst))
+    """Store the state of an estimator, shape [NUMBERS]."""
+    row[:] = (state.step, *state.mean, *state.covariance, state.innovation, state.worst)
 
 
 def response_of(row: Any) -> ResponseState:
     """The state of the proof of the response as it is stored behind the verdict, shape [RESPONSE]."""
     return ResponseState(
         float(row[1]), float(row[2]), six(row, 3), *six(row, 9), float(row[15]), float(row[16]), six(row, 17),
-        packed(row, 23),
+        six(row, 23) + six(row, 29) + six(row, 35) + (float(row[41]), float(row[42]), float(row[43])),
     )  # fmt: skip
 
 
@@ -280,27 +281,26 @@ def store_response(state: ResponseState, verdict: int, row: Any) -> None:
     """Store the verdict on the response and the state of its proof, shape [RESPONSE]."""
     _, _, commands, flowing, largest, lagging, doubts, slides, number, misfit, likelihood, mean, covariance = state
     sums = (flowing, largest, lagging, doubts, slides, number, misfit, likelihood)
-    fill(row, (float(verdict), state.angle, state.velocity, *commands, *sums, *mean, *covariance))
+    row[:] = (float(verdict), state.angle, state.velocity, *commands, *sums, *mean, *covariance)
 
 
 def monitor_of(row: Any) -> MonitorState:
-    """The state of a sensor monitor as it is stored, shape [MONITOR]."""
-    travel, motion = Cusum(float(row[2]), float(row[3])), Cusum(float(row[6]), float(row[7]))
-    against = Cusum(float(row[11]), float(row[12]))
-    opposed = Opposed(float(row[8]), float(row[9]), float(row[10]), against)
-    flowing, obeys, confirmed = (float(row[25]), float(row[26])), bool(row[27]), bool(row[28])
-    start, rise, fall = (float(row[0]), float(row[1])), float(row[4]), float(row[5])
-    lows, highs = six(row, 13), six(row, 19)
-    return MonitorState(*start, travel, rise, fall, motion, opposed, lows, highs, flowing, obeys, confirmed)
+    """The state of a sensor monitor as :func:`store_monitor` left it."""
+    f = numbers_of(row)
+    travel, motion, opposed = Cusum(f[2], f[3]), Cusum(f[6], f[7]), Opposed(f[8], f[9], f[10], Cusum(f[11], f[12]))
+    shown = f[27] > 0.0, f[28] > 0.0
+    return MonitorState(f[0], f[1], travel, f[4], f[5], motion, opposed, f[13:19], f[19:25], f[25:27], *shown)
 
 
 def store_monitor(state: MonitorState, row: Any) -> None:
-    """Store the state of a sensor monitor, shape [MONITOR]."""
-    angle, velocity, travel, rise, fall, motion, opposed, lows, highs, flowing, obeys, confirmed = state
-    measured = (angle, velocity, travel.up, travel.down, rise, fall, motion.up, motion.down)
-    against = (opposed.travel, opposed.integral, opposed.begin, opposed.motion.up, opposed.motion.down)
-    shown = (1.0 if obeys else 0.0, 1.0 if confirmed else 0.0)
-    fill(row, (*measured, *against, *lows, *highs, *flowing, *shown))
+    """Store the state of a sensor monitor, shape [NUMBERS]."""
+    travel, motion, opposed = state.travel, state.motion, state.opposed
+    obeys, confirmed = 1.0 if state.obeys else 0.0, 1.0 if state.confirmed else 0.0
+    row[:] = (
+        state.angle, state.velocity, travel.up, travel.down, state.up_from, state.down_from, motion.up, motion.down,
+        opposed.travel, opposed.integral, opposed.begin, opposed.motion.up, opposed.motion.down,
+        *state.lows, *state.highs, *state.flowing, obeys, confirmed, 0.0,
+    )  # fmt: skip
 
 
 def delayed(instruments: Instruments, delay: int, offset: float = 0.0) -> Instruments:
@@ -315,80 +315,61 @@ def delayed(instruments: Instruments, delay: int, offset: float = 0.0) -> Instru
 
 
 def advance(setup: Setup, experiments: Experiments, wanted: Floats) -> None:
-    """One sample period of all experiments, in place."""
+    """One sample period of all experiments with requested currents [A], or target speeds [rad/s], in place."""
+    rules, model = setup.rules, setup.model
     for i in range(experiments.k.shape[0]):
-        advance_one(setup, experiments, i, float(wanted[i]))
+        current = float(wanted[i])
+        if rules.follows:
+            state = state_of(experiments.estimate[i])
+            current = current_for(model, state, believed(model, state), current, rules.gain)
+        advance_one(setup, experiments, i, current)
+        if rules.estimates:
+            estimate_one(model, experiments, i)
 
 
-def advance_one(setup: Setup, experiments: Experiments, i: int, wanted: float) -> None:
-    """One sample period of experiment ``i``, in place; arguments as for :func:`advance`."""
-    (
-        brakes, delay, beside, x, s, m, memory, y, applied,
-        past, k, noise, late, reasons, violated, returning, monitor, response, _, _,
-    ) = experiments  # fmt: skip
-    rules = setup.rules
-    p = BrakeParameters(brakes[i, 0], brakes[i, 1], brakes[i, 2], brakes[i, 3], brakes[i, 4], brakes[i, 5])
-    instruments = delayed(setup.instruments, int(delay[i]), float(beside[i, 0]))
-    y1, y2 = float(y[i, 0]), float(y[i, 1])
-    u1, u2, u3, u4, u5 = float(past[i, 0]), float(past[i, 1]), float(past[i, 2]), float(past[i, 3]), float(past[i, 4])
-    seen = monitor_of(monitor[i])
+def advance_one(setup: Setup, e: Experiments, i: int, wanted: float) -> None:
+    """One sample period of experiment ``i`` with a requested current [A], in place."""
+    rules, x, memory, response, k = setup.rules, e.x[i], e.memory[i], e.response[i], int(e.k[i])
+    instruments = delayed(setup.instruments, int(e.delay[i]), float(e.errors[i, 0]))
+    y1, y2, u = float(e.y[i, 0]), float(e.y[i, 1]), e.past[i]
+    seen = monitor_of(e.monitor[i])
     most = largest_current(setup.law, setup.thresholds, seen, setup.law.current)
-    unproven = seen.obeys and response[i, 0] != PROVEN
-    law = setup.unproven if unproven else setup.law
-    step = int(k[i])
-    if returning[i]:
+    law = setup.unproven if seen.obeys and response[0] != PROVEN else setup.law
+    step = k
+    if e.returning[i]:
         wanted, step = 0.0, max(step, rules.late_step)
-    asked, reasons[i] = sent_current(law, rules.shielded, y1, y2, wanted, (u1, u2, u3, u4, u5), step, most)
+    past = float(u[0]), float(u[1]), float(u[2]), float(u[3]), float(u[4])
+    asked, e.reasons[i] = sent_current(law, rules.shielded, y1, y2, wanted, past, step, most)
     sent = 0.0 if math.isnan(asked) else asked
-    current = command(instruments, memory[i], asked)
+    current = command(instruments, memory, asked)
     if math.isnan(current):
-        current = damped_current(float(x[i, 1]), setup.law.current, rules.damping_velocity)
-    k[i] += 1
-    errors = (float(noise[i, k[i], 0]), float(noise[i, k[i], 1]), float(late[i, k[i]]))
-    y1, y2 = pass_period(
-        setup.mechanics,
-        instruments,
-        p,
-        rules.sample_time,
-        current + beside[i, 1],
-        errors,
-        x[i],
-        setup.chosen,
-        s[i],
-        memory[i],
-    )
-    add_increment(m[i], s[i], rules.angle_weight, rules.velocity_weight)
-    past[i, 0], past[i, 1], past[i, 2], past[i, 3], past[i, 4] = sent, u1, u2, u3, u4
-    y[i, 0], y[i, 1], applied[i] = y1, y2, current
+        current = damped_current(float(x[1]), setup.law.current, rules.damping_velocity)
+    errors = float(e.noise[i, k + 1, 0]), float(e.noise[i, k + 1, 1]), float(e.late[i, k + 1])
+    brake, acting = BrakeParameters(*six(e.brakes[i], 0)), current + e.errors[i, 1]
+    states = x, setup.chosen, e.s[i], memory
+    y1, y2 = pass_period(setup.mechanics, instruments, brake, rules.sample_time, acting, errors, *states)
+    add_increment(e.m[i], e.s[i], rules.angle_weight, rules.velocity_weight)
+    e.k[i], e.y[i, 0], e.y[i, 1], e.applied[i] = k + 1, y1, y2, current
+    u[0], u[1], u[2], u[3], u[4] = sent, past[0], past[1], past[2], past[3]
     obeyed = not math.isnan(asked)
-    if response[i, 0] == OPEN:
-        proof, verdict = take(setup.response, response_of(response[i]), obeyed, y1, y2, sent)
-        store_response(proof, verdict, response[i])
+    if response[0] == OPEN:
+        proof, verdict = take(setup.response, response_of(response), obeyed, y1, y2, sent)
+        store_response(proof, verdict, response)
     if not seen.confirmed:
         seen, _ = judge(setup.law, setup.thresholds, seen, rules.sample_time, y1, y2, obeyed, sent, current)
-        store_monitor(seen, monitor[i])
-    inside = rules.angle_low <= x[i, 0] <= rules.angle_high and abs(x[i, 1]) <= rules.velocity
-    violated[i] = not inside
+        store_monitor(seen, e.monitor[i])
+    inside = rules.angle_low <= x[0] <= rules.angle_high and abs(x[1]) <= rules.velocity
+    e.violated[i] = not inside
 
 
-def advance_speeds(setup: Setup, model: Model, gain: float, experiments: Experiments, speeds: Floats) -> None:
-    """As :func:`advance`, with currents by which the speed loop follows target speeds [rad/s]."""
-    for i in range(experiments.k.shape[0]):
-        state = state_of(experiments.estimate[i])
-        wanted = current_for(model, state, believed(model, state), float(speeds[i]), gain)
-        advance_one(setup, experiments, i, wanted)
-
-
-def estimate_all(model: Model, experiments: Experiments, rows: Integers) -> None:
-    """Take the newest sample into the estimators of these rows, in place."""
-    y, k, applied = experiments.y, experiments.k, experiments.applied
-    estimate, told = experiments.estimate, experiments.told
-    for i in rows:
-        state = follow(model, state_of(estimate[i]), y[i, 0], y[i, 1], float(k[i]), applied[i])
-        store(state, estimate[i])
-        values, widths = believed(model, state), deviations(model, state)
-        for j in range(4):
-            told[i, j], told[i, 4 + j] = values[j] * model.nominal[j], widths[j] * model.nominal[j]
+def estimate_one(model: Model, experiments: Experiments, i: int) -> None:
+    """Take the newest sample of experiment ``i`` into its estimator, in place."""
+    y, row, told = experiments.y[i], experiments.estimate[i], experiments.told[i]
+    state = follow(model, state_of(row), y[0], y[1], float(experiments.k[i]), experiments.applied[i])
+    store(state, row)
+    values, widths = believed(model, state), deviations(model, state)
+    for j in range(4):
+        told[j], told[4 + j] = values[j] * model.nominal[j], widths[j] * model.nominal[j]
 
 
 class Batch:
@@ -396,16 +377,9 @@ class Batch:
 
     Attributes:
         setup: what they have in common.
-        experiments: all of them; the following are some of its arrays.
-        brakes: shape [N, 6].
-        x: true states, shape [N, 4].
-        y: newest measurements, shape [N, 2].
-        m: packed FIMs, of the conditions' kind, shape [N, n (n + 1) / 2].
-        k: steps, shape [N].
-        past: last sent currents, newest first, shape [N, PAST].
+        plant: of the bench, that the brakes are.
+        experiments: all of them.
         most: greatest estimates and deviations that are observed, shape [8].
-        reasons: why the last sent current is not the requested one, shape [N].
-        violated: True where the brake is outside its limits after the last step, shape [N].
     """
 
     def __init__(
@@ -437,28 +411,16 @@ class Batch:
             raise UsageError(
                 f"expected some of {', '.join(PARAMETER_NAMES)} in this order, got {', '.join(parameters)}"
             )
-        require_covered(bench, ranges, conditions)
         self.bench = bench = conditions.applied(bench)
-        self.conditions = conditions
-        self.parameters = tuple(parameters)
-        self._ranges = ranges
-        self._plant = bench.plant(plant)
-        self.setup = make_setup(
-            bench, make_law(bench), self._plant, parameters, conditions.information, conditions.shielded
-        )
-        require_possible(self._plant, conditions)
-        self._deviations = np.array([bench.noise.angle, bench.noise.velocity])
-        self._advance, self._advance_speeds = compiled(advance), compiled(advance_speeds)
-        self.model = make_model(bench, bench.range_set(bench.prior))  # as the runtime's
-        self._every, self.most = np.arange(count), MOST * np.abs(np.array(self.model.nominal * 2))
-        e = self.experiments = no_experiments(count, len(parameters), self.setup.rules.horizon)
-        self.brakes, self.x, self.y, self.m, self.k = e.brakes, e.x, e.y, e.m, e.k
-        self.past, self.reasons, self.violated = e.past, e.reasons, e.violated
+        self.conditions, self.parameters = conditions, tuple(parameters)
+        self._ranges, self.plant = ranges, bench.plant(plant)
+        require_possible(bench, ranges, self.plant, conditions)
+        self.setup = make_setup(bench, self.plant, parameters, conditions)
+        self.most = MOST * np.abs(np.array(self.setup.model.nominal * 2))
+        self.experiments = no_experiments(count, len(parameters), self.setup.rules.horizon)
         self._columns = [BrakeParameters._fields.index(name) for name in parameters]
         low, high = np.array(ranges.low)[self._columns], np.array(ranges.high)[self._columns]
         self._middle, self._half = 0.5 * (low + high), np.where(high > low, 0.5 * (high - low), 1.0)
-        self.critic_size = self.critic_observation().shape[1]
-        self.observation_size = conditions.observation_size(len(parameters))
 
     def begin(self, i: int, rng: np.random.Generator, brake: BrakeParameters | None = None) -> None:
         """Begin a new experiment in row ``i``: at rest at the origin, with an estimator at its prior.
@@ -473,8 +435,8 @@ class Batch:
         e = self.experiments
         parameters = drawn(self._ranges, rng, self.conditions.draws)
         e.brakes[i] = parameters if brake is None else brake
-        e.noise[i] = rng.standard_normal(e.noise.shape[1:]) * self._deviations
-        jitter = self._plant.instruments.clock_jitter
+        e.noise[i] = rng.standard_normal(e.noise.shape[1:]) * (self.bench.noise.angle, self.bench.noise.velocity)
+        jitter = self.plant.instruments.clock_jitter
         if jitter > 0.0:
             e.late[i] = rng.normal(0.0, jitter, e.late.shape[1])
         if self.conditions.varies:
@@ -484,7 +446,7 @@ class Batch:
             priors = self.bench.systematic
             e.errors[i] = rng.standard_normal(2) * (priors.offset, priors.current_offset)
         e.x[i] = 0.0
-        instruments = delayed(self._plant.instruments, int(e.delay[i]), float(e.errors[i, 0]))
+        instruments = delayed(self.plant.instruments, int(e.delay[i]), float(e.errors[i, 0]))
         settle(instruments, e.memory[i], 0.0)
         errors = (float(error) for error in (e.late[i, 0], *e.noise[i, 0]))
         e.y[i] = measure(instruments, e.memory[i], self.setup.rules.sample_time, 0.0, 0.0, 0.0, *errors)
@@ -493,8 +455,8 @@ class Batch:
         store_monitor(begin_monitor(*e.y[i].tolist()), e.monitor[i])
         store_response(begin_response(self.setup.response, *e.y[i].tolist()), OPEN, e.response[i])
         if self.conditions.estimates:
-            store(start(self.model), e.estimate[i])
-            compiled(estimate_all)(self.model, e, self._every[i : i + 1])
+            store(start(self.setup.model), e.estimate[i])
+            compiled(estimate_one)(self.setup.model, e, i)
 
     def advance(self, wanted: Floats) -> None:
         """One sample period with the requested currents [A], or target speeds [rad/s], by the conditions; shape [N].
@@ -505,40 +467,34 @@ class Batch:
             UsageError: the shape is another, or a row was not begun or has reached the horizon. The compiled step would
                 not notice: it does not check its indices.
         """
-        if wanted.shape != self.k.shape:
-            raise UsageError(
-                f"expected one {self.conditions.acts} for each of the {len(self.k)} experiments, got shape "
-                f"{wanted.shape}"
-            )
-        if (self.k >= self.setup.rules.horizon).any():
+        k = self.experiments.k
+        if wanted.shape != k.shape:
+            acts, count = self.conditions.acts, len(k)
+            raise UsageError(f"expected one {acts} for each of the {count} experiments, got shape {wanted.shape}")
+        if (k >= self.setup.rules.horizon).any():
             raise UsageError("expected experiments that go on, got one that is over or was not begun: call reset first")
-        if self.conditions.acts == SPEED:
-            self._advance_speeds(self.setup, self.model, self.conditions.gain, self.experiments, wanted)
-        else:
-            self._advance(self.setup, self.experiments, wanted)
-        if self.conditions.estimates:
-            compiled(estimate_all)(self.model, self.experiments, self._every)
+        compiled(advance)(self.setup, self.experiments, wanted)
 
     @property
     def terminated(self) -> Bools:
         """Mask of the experiments that are over: horizon reached or limits left, shape [N]. Both are true terminals."""
-        return self.violated | (self.k >= self.setup.rules.horizon)
+        return self.experiments.violated | (self.experiments.k >= self.setup.rules.horizon)
 
     @property
     def home(self) -> Bools:
         """Mask of the brakes whose angle and velocity are those of home, inside the limits, shape [N]."""
-        shield_ = self.bench.shield
-        at_home = (np.abs(self.x[:, 0]) <= shield_.home_angle) & (np.abs(self.x[:, 1]) <= shield_.home_velocity)
-        return at_home & ~self.violated
+        e, shield_ = self.experiments, self.bench.shield
+        at_home = (np.abs(e.x[:, 0]) <= shield_.home_angle) & (np.abs(e.x[:, 1]) <= shield_.home_velocity)
+        return at_home & ~e.violated
 
     def observation(self) -> NDArray[np.float32]:
         """Observation of the actor, by the conditions: measured, with the estimate, or Table 4.2 without measurements.
 
         Returns:
-            Shape [N, observation_size].
+            Shape [N, :meth:`Conditions.observation_size`].
         """
         if self.conditions.observes == EVERYTHING:
-            return self.critic_observation()[:, : self.observation_size].copy()
+            return self.critic_observation()[:, : self.conditions.observation_size(len(self.parameters))].copy()
         measured = self.seen()[:, : len(SAMPLE)]
         if self.conditions.observes == ESTIMATE:
             return np.hstack([measured, self.estimate()], dtype=np.float32)
@@ -551,30 +507,25 @@ class Batch:
 
     def seen(self) -> NDArray[np.float32]:
         """Measured angle [rad] and velocity [rad/s], step, current that acted in the last period [A]; shape [N, 4]."""
-        return np.column_stack((self.y, self.k, self.experiments.applied)).astype(np.float32)
+        return np.column_stack((self.experiments.y, self.experiments.k, self.experiments.applied)).astype(np.float32)
 
     def information(self) -> Floats:
         """Packed FIMs as the rewards see them, by the conditions, shape [N, n (n + 1) / 2]; a copy."""
         if self.conditions.normalised_by == "true":
-            return self.m.copy()
+            return self.experiments.m.copy()
         nominal = np.array([getattr(self.bench.brake, name) for name in self.parameters])
-        ratio = nominal / self.brakes[:, self._columns]
+        ratio = nominal / self.experiments.brakes[:, self._columns]
         i, j = upper(len(self.parameters))
-        return self.m * ratio[:, i] * ratio[:, j]
+        return self.experiments.m * ratio[:, i] * ratio[:, j]
 
     def info(self) -> dict[str, NDArray[Any]]:
         """Outputs of an environment beside the observation, each with N as its first dimension; all of them copies."""
-        return {
-            "critic": self.critic_observation(),
-            "current": self.past[:, 0].copy(),
-            "reasons": self.reasons.copy(),
-            "fim": self.m.copy(),
-            "violated": self.violated.copy(),
-            "home": self.home,
-        }
+        e = self.experiments
+        kept = {"current": e.past[:, 0], "reasons": e.reasons, "fim": e.m, "violated": e.violated, "home": self.home}
+        return {"critic": self.critic_observation()} | {name: values.copy() for name, values in kept.items()}
 
     def critic_observation(self) -> NDArray[np.float32]:
-        """Observation of the critic: the true state in fixed scales of order one, shape [N, critic_size].
+        """Observation of the critic: the true state in fixed scales of order one, shape [N, size].
 
         Thesis Table 4.2 (x_1, x_2, k, θ, FIM) and the sensitivities: without them the next increment of the FIM is not
         a function of the state, which would not be Markov. Where the delay of the commands is drawn, also that, the
@@ -587,7 +538,7 @@ class Batch:
             e.k[:, None] / self.bench.timing.horizon,
             (e.brakes[:, self._columns] - self._middle) / self._half,
             0.1 * np.copysign(np.log1p(np.abs(e.m)), e.m),
-            (4.0 * e.s[:, :, :2] / outputs).reshape(len(self.k), 2 * len(self._columns)),
+            (4.0 * e.s[:, :, :2] / outputs).reshape(len(e.k), 2 * len(self._columns)),
         ]
         if self.conditions.varies:
             parts += [
@@ -610,13 +561,20 @@ def drawn(ranges: Ranges, rng: np.random.Generator, distribution: str) -> Floats
     return parameters
 
 
-def require_possible(plant: Plant, conditions: Conditions) -> None:
-    """Check that a plant can have the delay that is drawn.
+def require_possible(bench: Bench, ranges: Ranges, plant: Plant, conditions: Conditions) -> None:
+    """Check that the shield, if there is one, covers ranges and delays, and that the instruments hold the delays.
 
     Raises:
-        UsageError: it is longer than the instruments' memory, or comes on top of a delay of the plant, and the shield
-            covers only one of them.
+        UsageError: the shield does not hold the limits for every brake; the drawn delay is longer than the instruments'
+            memory, or comes on top of a delay of the plant, of which the shield covers only one.
     """
+    box = bench.range_set(bench.shield.ranges)
+    for name in box.uncovered(ranges.low, ranges.high) if conditions.shielded else ():
+        raise UsageError(
+            f"the set of ranges '{ranges.name}' has {name} from {getattr(ranges.low, name):g} to "
+            f"{getattr(ranges.high, name):g}, the shield's set '{box.name}' covers {getattr(box.low, name):g} to "
+            f"{getattr(box.high, name):g}: narrow the first or widen the second in the bench file"
+        )
     own, drawn = plant.instruments.command_delay + plant.instruments.measurement_delay, conditions.command_delay[1]
     if conditions.shielded and own > 0 and drawn > 0:
         raise UsageError(
@@ -626,22 +584,4 @@ def require_possible(plant: Plant, conditions: Conditions) -> None:
     if (most := plant.instruments.command_delay + drawn) > LONGEST_DELAY:
         raise UsageError(
             f"command_delay: with that of the plant '{plant.name}' at most {LONGEST_DELAY} samples, got {most}"
-        )
-
-
-def require_covered(bench: Bench, ranges: Ranges, conditions: Conditions = BENCH_CONDITIONS) -> None:
-    """Check that the shield, if there is one, holds the limits for every brake of these ranges.
-
-    Raises:
-        UsageError: it does not; the message names the parameter and both ranges.
-    """
-    if not conditions.shielded:
-        return
-    bench = conditions.applied(bench)
-    box = bench.range_set(bench.shield.ranges)
-    for name in box.uncovered(ranges.low, ranges.high):
-        raise UsageError(
-            f"the set of ranges '{ranges.name}' has {name} from {getattr(ranges.low, name):g} to "
-            f"{getattr(ranges.high, name):g}, the shield's set '{box.name}' covers {getattr(box.low, name):g} to "
-            f"{getattr(box.high, name):g}: narrow the first or widen the second in the bench file"
         )

@@ -23,7 +23,7 @@ import operator
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium
 import msgspec
@@ -39,7 +39,7 @@ from emb_bench.information.symmetric import Floats
 from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 from emb_train import register_environments
-from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, MEASURED, SPEED, Batch, Conditions
+from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, MEASURED, SPEED, Batch, Conditions, Positive, Price, Share
 from emb_train.intervals import finite, intervals
 from emb_train.lies import shown
 from emb_train.rewards import OUTWARD, Reward, Transition, Turn, information_increment, require_defined
@@ -51,10 +51,6 @@ SHORTEST = 20  # Samples of a record below which nothing counts as known
 
 Observations = NDArray[np.float32]
 Steps = tuple[Observations, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
-
-
-Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
-Price = Annotated[float, msgspec.Meta(ge=0.0)]
 
 
 class Demands(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -85,12 +81,11 @@ class ExpectedInterval:
     demands: Demands = DEMANDS
     pool: Executor | None = None  # Of processes that share the work
 
-    def __call__(self, batch: Batch, plant: str, rows: NDArray[np.bool_], acted: Floats, motion: Floats) -> Floats:
+    def __call__(self, batch: Batch, rows: NDArray[np.bool_], acted: Floats, motion: Floats) -> Floats:
         """The reward of the experiments of some rows.
 
         Args:
             batch: of N experiments.
-            plant: of the bench, that its brakes are.
             rows: mask of the R experiments that have ended, shape [N].
             acted: currents that acted [A], 0 after the end, shape [N, horizon].
             motion: true angles and velocities at each sample [rad, rad/s], 0 after the end, shape [N, horizon + 1, 2].
@@ -98,12 +93,12 @@ class ExpectedInterval:
         Returns:
             Shape [R].
         """
-        brakes = [BrakeParameters(*brake) for brake in batch.brakes[rows].tolist()]
-        found = intervals(batch.bench, plant, batch.parameters, brakes, acted[rows], self.pool)
+        brakes = [BrakeParameters(*brake) for brake in batch.experiments.brakes[rows].tolist()]
+        found = intervals(batch.bench, batch.plant.name, batch.parameters, brakes, acted[rows], self.pool)
         values = finite([self.criterion.of(one) for one in found])
         demands, free = self.demands, self.demands.release * batch.bench.limits.angle[0]
         told = shown(batch.bench, brakes, motion[rows], acted[rows])
-        told[batch.violated[rows]] = 0.0  # it was stopped in the middle
+        told[batch.experiments.violated[rows]] = 0.0  # it was stopped in the middle
         hidden = np.maximum(demands.shown - told, 0.0)
         beyond = np.maximum(free - motion[rows, :, 0].min(axis=1), 0.0)
         prices = demands.astray * ~batch.home[rows] + demands.beyond * beyond + demands.hidden * hidden.sum(axis=1)
@@ -114,8 +109,8 @@ class ExpectedInterval:
 class Precision(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Precision to be reached, as relative standard deviations; 95 % of the estimates are within twice that."""
 
-    repeatability: Annotated[float, msgspec.Meta(gt=0.0)] = 0.0065  # Of the running estimates, which ends an experiment
-    interval: Annotated[float, msgspec.Meta(gt=0.0)] = 0.0025  # Between runs, of the whole record
+    repeatability: Positive = 0.0065  # Of the running estimates, which ends an experiment
+    interval: Positive = 0.0025  # Between runs, of the whole record
     price: Price = 10.0  # Of an interval that is e times as wide [periods]
 
 
@@ -147,13 +142,13 @@ class TimeToPrecision:
         rewards: Floats = np.where(first <= 0.0, 0.0, -np.clip(share, 0.0, 1.0))
         return rewards
 
-    def price(self, batch: Batch, plant: str, rows: NDArray[np.bool_], acted: Floats) -> Floats:
+    def price(self, batch: Batch, rows: NDArray[np.bool_], acted: Floats) -> Floats:
         """Price of the interval of the records so far of some rows; arguments as for the expected interval, [R]."""
         at = np.flatnonzero(rows)
-        long = np.flatnonzero(batch.k[at] >= SHORTEST)
-        brakes = [BrakeParameters(*brake) for brake in batch.brakes[at[long]].tolist()]
-        records = [acted[row, : batch.k[row]] for row in at[long]]
-        found = intervals(batch.bench, plant, batch.parameters, brakes, records, self.pool)
+        long = np.flatnonzero(batch.experiments.k[at] >= SHORTEST)
+        brakes = [BrakeParameters(*brake) for brake in batch.experiments.brakes[at[long]].tolist()]
+        records = [acted[row, : batch.experiments.k[row]] for row in at[long]]
+        found = intervals(batch.bench, batch.plant.name, batch.parameters, brakes, records, self.pool)
         wide = np.full((len(at), len(batch.parameters)), UNKNOWN)
         for i, one in zip(long, found, strict=True):
             wide[i] = np.nan_to_num(one.between_runs[: one.count], nan=UNKNOWN) / self.precision.interval
@@ -164,15 +159,13 @@ class TimeToPrecision:
 class Scoring:
     """Rewards of the steps of a batch, with the state from before a step that a reward needs."""
 
-    def __init__(self, batch: Batch, plant: str, reward: AnyReward) -> None:
-        """Score the steps that :meth:`advance` makes, and no others; ``plant`` is the batch's."""
-        self._batch, self._plant = batch, plant
-        self._reward = reward
-        self._missing = np.full(len(batch.k), UNKNOWN)
-        self._acted = np.zeros_like(batch.experiments.late[:, 1:])
-        self._price = np.zeros(len(batch.k))
-        self._motion = np.zeros((*batch.experiments.late.shape, 2))
-        self._turn = Turn(np.zeros_like(batch.x[:, :2]), np.zeros(len(batch.k)), np.zeros_like(batch.m))
+    def __init__(self, batch: Batch, reward: AnyReward) -> None:
+        """Score the steps that :meth:`advance` makes, and no others."""
+        self._batch, self._reward = batch, reward
+        e, count = batch.experiments, len(batch.experiments.k)
+        self._missing, self._price, self._acted = np.full(count, UNKNOWN), np.zeros(count), np.zeros_like(e.late[:, 1:])
+        self._motion = np.zeros((*e.late.shape, 2))
+        self._turn = Turn(np.zeros_like(e.x[:, :2]), np.zeros(count), np.zeros_like(e.m))
 
     def advance(self, wanted: Floats) -> Floats:
         """One sample period with requested currents [A] or target speeds [rad/s], shape [N]; its rewards, shape [N].
@@ -185,39 +178,37 @@ class Scoring:
         if isinstance(self._reward, TimeToPrecision):
             return self._until_known(wanted, self._reward)
         batch, turn, rules = self._batch, self._turn, self._batch.setup.rules
-        before, velocity = batch.information(), batch.x[:, 1].copy()
+        e = batch.experiments
+        before, velocity = batch.information(), e.x[:, 1].copy()
         batch.advance(wanted)
-        after, tracking = batch.information(), batch.conditions.tracking
-        x, now = batch.x[:, :2], batch.k == OUTWARD
+        after, x, now = batch.information(), e.x[:, :2], e.k == OUTWARD
         if now.any():
             turn.x[now], turn.m[now] = x[now], after[now]
             turn.acceleration[now] = (x[now, 1] - velocity[now]) / rules.sample_time
-        return self._reward(
-            Transition(before, after, x, batch.k, batch.violated, turn, rules.horizon, rules.sample_time, tracking)
-        )
+        constants = rules.horizon, rules.sample_time, batch.conditions.tracking
+        return self._reward(Transition(before, after, x, e.k, e.violated, turn, *constants))
 
     def _advance_noted(self, wanted: Floats) -> None:
         """One sample period whose currents are noted."""
-        batch = self._batch
-        self._acted[batch.k == 0] = 0.0
-        batch.advance(wanted)
-        self._acted[np.arange(len(batch.k)), batch.k - 1] = batch.experiments.applied
+        e = self._batch.experiments
+        self._acted[e.k == 0] = 0.0
+        self._batch.advance(wanted)
+        self._acted[np.arange(len(e.k)), e.k - 1] = e.applied
 
     def _at_the_end(self, wanted: Floats, reward: ExpectedInterval) -> Floats:
-        batch = self._batch
-        begun = batch.k == 0
+        e, begun = self._batch.experiments, self._batch.experiments.k == 0
         self._motion[begun] = 0.0
-        self._motion[begun, 0] = batch.x[begun, :2]
+        self._motion[begun, 0] = e.x[begun, :2]
         self._advance_noted(wanted)
-        self._motion[np.arange(len(batch.k)), batch.k] = batch.x[:, :2]
-        rewards, over = np.zeros(len(batch.k)), batch.terminated
+        self._motion[np.arange(len(e.k)), e.k] = e.x[:, :2]
+        rewards, over = np.zeros(len(e.k)), self._batch.terminated
         if over.any():
-            rewards[over] = reward(batch, self._plant, over, self._acted, self._motion)
+            rewards[over] = reward(self._batch, over, self._acted, self._motion)
         return rewards
 
     def _until_known(self, wanted: Floats, reward: TimeToPrecision) -> Floats:
         batch, returning = self._batch, self._batch.experiments.returning
-        begun = batch.k == 0
+        begun = batch.experiments.k == 0
         self._missing[begun], self._price[begun] = UNKNOWN, 0.0
         self._advance_noted(wanted)
         before, self._missing = self._missing, np.minimum(self._missing, reward.missing(batch))
@@ -226,7 +217,7 @@ class Scoring:
         returning |= ended
         for rows, more in ((ended, 1.0), (arrived, 0.0)):
             if rows.any():
-                price = reward.price(batch, self._plant, rows, self._acted)
+                price = reward.price(batch, rows, self._acted)
                 rewards[rows] += self._price[rows] - price
                 self._price[rows] = more * price
         return rewards
@@ -276,7 +267,7 @@ class EmbExcitationVectorEnv(gymnasium.vector.VectorEnv[Observations, Observatio
             require_defined(reward, tuple(parameters))
         self.num_envs = num_envs
         self.batch = Batch(bench, bench.range_set(ranges), parameters, num_envs, plant, conditions)
-        self._scoring, self._scale = Scoring(self.batch, plant, reward), scale
+        self._scoring, self._scale = Scoring(self.batch, reward), scale
         self._generators: list[np.random.Generator] = []
         self.single_observation_space = _observation_space(self.batch)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -363,7 +354,7 @@ class EmbExcitationEnv(gymnasium.Env[Observations, Observations]):
     @property
     def state(self) -> Floats:
         """True angle [rad] and velocity [rad/s]: for evaluation, not for the actor."""
-        return np.array(self._rows.batch.x[0, :2])
+        return np.array(self._rows.batch.experiments.x[0, :2])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -386,7 +377,7 @@ def _first(info: dict[str, Any]) -> dict[str, Any]:
 def _observation_space(batch: Batch) -> gymnasium.spaces.Box[Any]:
     """Observations of one experiment. The bounds leave room for noise and for the violating step."""
     low, high = batch.bench.limits.angle
-    room, size = batch.bench.limits.velocity, batch.observation_size
+    room, size = batch.bench.limits.velocity, batch.conditions.observation_size(len(batch.parameters))
     least, greatest = [-SCALED] * size, [SCALED] * size
     if batch.conditions.observes == MEASURED:
         least, greatest = [low - room, -2.0 * room, 0.0], [high + room, 2.0 * room, batch.setup.rules.horizon]

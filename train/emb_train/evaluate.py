@@ -29,12 +29,12 @@ from emb_runtime.system.input_file import near_file
 from emb_train.closed_loop import Conditions
 from emb_train.optimum import optima, searchable
 from emb_train.play import (
+    Estimating,
     Excitation,
     Law,
     Measure,
     Outcome,
     Planned,
-    PolicyFile,
     bounds,
     fresh_draws,
     mean_score,
@@ -77,7 +77,7 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
         raise UsageError(f"--bench: {given} is evaluated on the bench that it was trained on; leave it out")
     if path.suffix == ".json":
         plan, bench = load_plan(path), load_bench(own if own.exists() else bench_file)
-        return Subject(given, bench, Planned(plan.speeds, bench, plan.gain), plan.ranges)
+        return Subject(given, bench, Estimating(Planned(plan.speeds, bench, plan.gain), bench), plan.ranges)
     if not path.is_dir():
         hint = near(given, [ACTOR]) or near_file(path)
         raise UsageError(f"{given}: expected '{ACTOR}', an .onnx file, the folder of a training or its {PLAN}{hint}")
@@ -93,7 +93,7 @@ def _file(name: str, path: Path, bench: Bench) -> Subject:
         raise PolicyRefusedError(f"{path}: {err}") from err
     made_for = {str(name): pair for name, pair in policy.contract.ranges.items()}
     sets = [ranges.name for ranges in bench.ranges.values() if made_for == bounds(ranges)]
-    return Subject(name, bench, PolicyFile(policy, bench), sets[0] if sets else "")
+    return Subject(name, bench, Estimating(policy, bench), sets[0] if sets else "")
 
 
 def references(bench: Bench) -> dict[str, Excitation]:

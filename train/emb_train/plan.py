@@ -13,12 +13,14 @@ from __future__ import annotations
 import copy
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import cma
+import msgspec
 import numpy as np
 
 from emb_bench.information.symmetric import Floats
+from emb_train.closed_loop import Count, Positive
 from emb_train.env import EmbExcitationVectorEnv
 from emb_train.ppo import at_once
 
@@ -26,6 +28,23 @@ BOUND = 1.05  # Beyond the ends of the numbers, so that full speed is inside
 NEAR = 0.3  # Half the levels drawn are this much smaller, for a creep
 WIDTHS = 3.0  # Logarithm of the longest time over the mean
 STREAM = 0x706C616E  # Spawn key of the brakes on which plans are compared
+
+
+class PlanSearch(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The search for the plan that an actor begins with."""
+
+    drawn: Count = 1600  # Plans at random, rounded up
+    starts: Count = 2  # Of these, from which CMA-ES begins
+    steps: Count = 60  # Of CMA-ES from each, and from the best of them on
+    population: Annotated[int, msgspec.Meta(ge=4, le=1000)] = 16  # Plans of a step
+    brakes: Count = 3  # Of each plant, on which they are compared
+    levels: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 9  # Of a plan; seven nearly suffice
+    spread: Positive = 0.15  # First standard deviation of its numbers, -1 to 1, in CMA-ES
+
+    @property
+    def rounds(self) -> int:
+        """Times that plans are compared."""
+        return -(-self.drawn // (self.population * self.brakes)) + 1 + (self.starts + 1) * self.steps
 
 
 class Found(NamedTuple):
@@ -97,12 +116,7 @@ def play(env: EmbExcitationVectorEnv, seeds: Sequence[int], actions: Floats) -> 
 
 def search(
     compared: Compared,
-    *,
-    drawn: int,
-    starts: int,
-    steps: int,
-    levels: int,
-    spread: float,
+    asked: PlanSearch,
     rng: np.random.Generator,
     show: Callable[[Found], object] = lambda found: None,
 ) -> Floats:
@@ -110,18 +124,14 @@ def search(
 
     Args:
         compared: brakes, as many plans at a time as a step of CMA-ES has.
-        drawn: plans at random, rounded up; the best are compared on all brakes.
-        starts: of these, from which CMA-ES begins.
-        steps: of CMA-ES from each; the one that is best then goes on for as many.
-        levels: of a plan.
-        spread: first standard deviation of its numbers, -1 to 1, in CMA-ES.
+        asked: how far to look; the best of the plans at random are compared on all brakes.
         rng: of the plans.
         show: called after each comparison.
 
     Returns:
         The best of all plans on these brakes; shape [2 n].
     """
-    found = Found(0, -np.inf, np.zeros(2 * levels))
+    found, levels = Found(0, -np.inf, np.zeros(2 * asked.levels)), asked.levels
 
     def note(plans: Floats, by: Compared, counts: bool = True) -> Floats:
         nonlocal found
@@ -136,26 +146,26 @@ def search(
     def improve(strategy: Any) -> float:
         """A step of CMA-ES after the other; gives the best return of the last."""
         last = -np.inf
-        for _ in range(steps):
-            asked = np.array(strategy.ask())
-            returns = note(asked, compared)
-            strategy.tell(list(asked), (-returns).tolist())
+        for _ in range(asked.steps):
+            plans = np.array(strategy.ask())
+            returns = note(plans, compared)
+            strategy.tell(list(plans), (-returns).tolist())
             last = float(returns.max())
         return last
 
     screening, plans, returns = compared.screening(), [], []
-    for _ in range(-(-drawn // screening.plans)):
+    for _ in range(-(-asked.drawn // screening.plans)):
         some = rng.uniform(-1.0, 1.0, (screening.plans, 2 * levels))
         some[:, :levels] *= np.where(rng.random((len(some), levels)) < 0.5, NEAR, 1.0)
         plans.append(some)
         returns.append(note(some, screening, counts=False))
     best, searches = _best(np.concatenate(plans), np.concatenate(returns), compared.plans), []
-    for begin in _best(best, note(best, compared), starts):
+    for begin in _best(best, note(best, compared), asked.starts):
         options: dict[str, Any] = {
             "popsize": compared.plans, "bounds": [-BOUND, BOUND], "verbose": -9, "seed": np.nan,
             "randn": lambda *shape: rng.standard_normal(shape),
         }  # fmt: skip
-        strategy = cma.CMAEvolutionStrategy(begin, spread, options)
+        strategy = cma.CMAEvolutionStrategy(begin, asked.spread, options)
         searches.append((improve(strategy), strategy))
     improve(max(searches, key=operator.itemgetter(0))[1])
     return np.clip(found.numbers, -1.0, 1.0)

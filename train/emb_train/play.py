@@ -6,8 +6,7 @@ The brakes are drawn, or lie on the fixed grid of the thesis. The shield has the
 from __future__ import annotations
 
 import math
-from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -25,11 +24,10 @@ from emb_bench.information.fisher import Kind
 from emb_bench.information.symmetric import Floats, unpack
 from emb_bench.numbers import LEVEL, Score
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters, Ranges
+from emb_runtime.control.actor import Actor
 from emb_runtime.errors import PolicyRefusedError
 from emb_runtime.estimator.estimator import Estimator
 from emb_runtime.estimator.speed_loop import current_for
-from emb_runtime.policy.inference import Inference
-from emb_runtime.policy.policy import Policy
 from emb_train.closed_loop import BENCH_CONDITIONS, Batch, Bools, Conditions
 from emb_train.intervals import finite, intervals
 from emb_train.rewards import PRIOR
@@ -71,11 +69,11 @@ class Law:
 
 
 class Estimating:
-    """An excitation as the runtime calls a policy: one sample of one experiment at a time, with its own estimator."""
+    """A policy as the runtime asks it: one sample of one experiment at a time, with an estimator for each."""
 
-    def __init__(self, bench: Bench, act: Callable[[float, float, float, Estimator], float]) -> None:
-        """Ask ``act`` for currents [A], as :meth:`emb_runtime.policy.policy.Policy.act`; estimate as the bench says."""
-        self._bench, self._act = bench, act
+    def __init__(self, actor: Actor, bench: Bench) -> None:
+        """Ask an actor for currents [A], with estimates as the bench says."""
+        self._actor, self._bench = actor, bench
         self._estimators: list[Estimator] = []
 
     def __call__(self, seen: Seen) -> Currents:
@@ -83,42 +81,24 @@ class Estimating:
         if seen[0, STEP] == 0.0:
             self._estimators = [Estimator(self._bench) for _ in seen]
         wanted: Currents = np.zeros(len(seen))
-        for i, (estimator, (*sample, applied)) in enumerate(zip(self._estimators, seen.tolist(), strict=True)):
-            estimator.take(*sample, applied)
-            wanted[i] = self._act(*sample, estimator)
+        for i, (estimator, row) in enumerate(zip(self._estimators, seen.tolist(), strict=True)):
+            angle, velocity, step, applied = row
+            estimator.take(angle, velocity, step, applied)
+            wanted[i] = self._actor.act(angle, velocity, step, estimator)
         return wanted
 
 
-class PolicyFile(Estimating):
-    """A policy file."""
-
-    def __init__(self, policy: Policy, bench: Bench) -> None:
-        super().__init__(bench, policy.act)
-
-
-class Planned(Estimating):
-    """A plan of speeds, followed as the runtime follows those of a policy."""
+class Planned:
+    """A plan of speeds as an actor, followed as the runtime follows the speeds of a policy."""
 
     def __init__(self, speeds: Sequence[float], bench: Bench, gain: float = BENCH_CONDITIONS.gain) -> None:
         """Follow a plan, parts of the limit of the speed, one for each step, with this gain of the speed loop."""
+        self._speeds, self._gain = [bench.limits.velocity * part for part in speeds], gain
 
-        def act(_angle: float, _velocity: float, step: float, estimator: Estimator) -> float:
-            speed = bench.limits.velocity * speeds[min(int(step), len(speeds) - 1)]
-            return current_for(estimator.model, estimator.state, estimator.relative, speed, gain)
-
-        super().__init__(bench, act)
-
-
-def target_speeds(policy: Policy, bench: Bench) -> Floats:
-    """Speeds that a policy asks for at each step [rad/s], at rest with the nominal estimate, shape [horizon]."""
-    inference, timing = Inference(policy.data, policy.contract), bench.timing
-    nominal, speeds = [getattr(bench.brake, name) for name in PARAMETER_NAMES], np.zeros(timing.horizon)
-    for k in range(timing.horizon):
-        seen = [0.0, 0.0, k * timing.sample_time, *nominal, *[0.0] * len(nominal)]
-        inference.inputs[:] = array(inference.inputs.typecode, seen[: len(inference.inputs)])
-        inference.run()
-        speeds[k] = inference.outputs[0]
-    return speeds
+    def act(self, angle: float, velocity: float, step: float, estimator: Estimator) -> float:
+        """See :class:`emb_runtime.control.actor.Actor`."""
+        speed = self._speeds[min(int(step), len(self._speeds) - 1)]
+        return current_for(estimator.model, estimator.state, estimator.relative, speed, self._gain)
 
 
 STREAM = 0x65766C
@@ -169,12 +149,16 @@ def play(
     """
     batch = Batch(bench, ranges, parameters, len(draws), plant, conditions)
     begin_all(batch, draws)
-    m, left = batch.m.copy(), np.zeros(len(draws), np.bool_)
-    currents = np.zeros((len(draws), batch.setup.rules.horizon))
-    for k, _ in enumerate(followed(batch, excitation)):
-        left |= batch.violated
-        m = np.where(left[:, None], m, batch.m)
-        currents[:, k] = np.where(left, 0.0, batch.experiments.applied)
+    e, left = batch.experiments, np.zeros(len(draws), np.bool_)
+    m, currents = e.m.copy(), np.zeros((len(draws), batch.setup.rules.horizon))
+    for k in range(batch.setup.rules.horizon):
+        wanted = excitation(batch.seen())
+        if not np.isfinite(wanted[~left]).all():
+            raise PolicyRefusedError(f"its current is not finite at step {k}: it cannot be played")
+        batch.advance(wanted)
+        left |= e.violated
+        m = np.where(left[:, None], m, e.m)
+        currents[:, k] = np.where(left, 0.0, e.applied)
     return Outcome(unpack(m, len(parameters)), left, batch.home & ~left, currents)
 
 
@@ -182,26 +166,6 @@ def begin_all(batch: Batch, draws: Sequence[Draw]) -> None:
     """Begin the experiments of a batch, one for each draw."""
     for i, draw in enumerate(draws):
         batch.begin(i, np.random.default_rng(draw.seed), draw.brake)
-
-
-def followed(batch: Batch, excitation: Excitation) -> Iterator[Seen]:
-    """Let the experiments of a batch that have begun follow an excitation to the horizon.
-
-    Yields:
-        After each step, the excitation's observation before it, see :meth:`emb_train.closed_loop.Batch.seen`.
-
-    Raises:
-        PolicyRefusedError: it requests no finite current, where the runtime stops.
-    """
-    left = np.zeros(len(batch.k), np.bool_)
-    for k in range(batch.setup.rules.horizon):
-        seen = batch.seen()
-        wanted = excitation(seen)
-        if not np.isfinite(wanted[~left]).all():
-            raise PolicyRefusedError(f"its current is not finite at step {k}: it cannot be played")
-        batch.advance(wanted)
-        left |= batch.violated
-        yield seen
 
 
 GRID = 40  # Brakes on the grid, as in the thesis (5.2.3)
@@ -277,14 +241,7 @@ MEASURES: Mapping[str, Measure] = MappingProxyType(
     {
         m.name: m
         for m in (
-            Measure(
-                "T",
-                "T (sum of -2 ln of the interval between runs)",
-                IntervalCriterion("T"),
-                "physical",
-                0.0,
-                "difference",
-            ),
+            Measure("T", "T (sum of -2 ln of the interval between runs)", _T, "physical", 0.0, "difference"),
             Measure("I", "I (sum of -2 ln of the repeatability)", _I, "physical", 0.0, "difference"),
             Measure("D", "ln det(M + 12 I)", Criterion("D"), "physical", PRIOR, "difference"),
             Measure("A", "-ln tr (M + 12 I)^-1", Criterion("A"), "physical", PRIOR, "log-ratio"),

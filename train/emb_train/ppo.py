@@ -24,13 +24,10 @@ from emb_bench.parallel import processors
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EmbError
 from emb_runtime.policy.contract import SAMPLE
+from emb_train.closed_loop import Count, Positive, Share
 from emb_train.env import EmbExcitationVectorEnv
 
 Result = TypeVar("Result")
-Count = Annotated[int, msgspec.Meta(ge=1, le=2**31)]
-Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
-
 
 STEPS = 128  # Soft steps in time that a network of time and estimate has
 SLOPE = 2.0  # Of the soft step in an estimate, at the nominal value and relative to it
@@ -225,7 +222,7 @@ class DeployedActor(nn.Module):
         return torch.clamp(self.limit * self.actor.part(self.actor(observation)), -self.limit, self.limit)
 
 
-def clone(actor: Actor, speeds: Sequence[float], bench: Bench, ppo: Ppo, generator: torch.Generator) -> float:
+def clone(actor: Actor, speeds: Sequence[float], bench: Bench, ppo: Ppo, generator: torch.Generator) -> None:
     """Let an untrained actor of speeds follow a plan, whatever the estimate is: supervised learning, in place.
 
     Args:
@@ -234,14 +231,10 @@ def clone(actor: Actor, speeds: Sequence[float], bench: Bench, ppo: Ppo, generat
         bench: of the actor; gives the estimates that are drawn around the nominal ones.
         ppo: number of steps, and learning rate, of the cloning.
         generator: of the estimates.
-
-    Returns:
-        Root mean square of what is left, of the action.
     """
     wanted = actor.action(torch.tensor(speeds, dtype=torch.float32))
     time, nominal = torch.arange(len(wanted), dtype=torch.float32)[:, None], torch.tensor(nominal_of(bench))
     optimiser = torch.optim.Adam(actor.layers.parameters(), ppo.clone_rate, fused=True)
-    loss = torch.zeros(())
     for step in range(ppo.clone_steps):
         optimiser.param_groups[0]["lr"] = ppo.clone_rate * (1.0 - step / ppo.clone_steps)
         estimate = nominal * (0.5 + torch.rand(len(wanted), len(nominal), generator=generator))
@@ -250,7 +243,6 @@ def clone(actor: Actor, speeds: Sequence[float], bench: Bench, ppo: Ppo, generat
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         optimiser.step()
-    return math.sqrt(float(loss.detach()))
 
 
 def nominal_of(bench: Bench) -> list[float]:
@@ -286,18 +278,13 @@ class Tanh(nn.Module):
 def perceptron(inputs: int, hidden: Sequence[int], gain: float, bias: float) -> nn.Sequential:
     """Linear layers with tanh between them and one output; orthogonal start, ``gain`` and ``bias`` for the last one."""
     layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [linear(inputs, width, math.sqrt(2.0), 0.0), Tanh()]
+    for width, scale, level in (*((width, math.sqrt(2.0), 0.0) for width in hidden), (1, gain, bias)):
+        layer = nn.Linear(inputs, width)
+        nn.init.orthogonal_(layer.weight, scale)
+        nn.init.constant_(layer.bias, level)
+        layers += [layer, Tanh()]
         inputs = width
-    return nn.Sequential(*layers, linear(inputs, 1, gain, bias))
-
-
-def linear(inputs: int, outputs: int, gain: float, bias: float) -> nn.Linear:
-    """A linear layer with orthogonal weights."""
-    layer = nn.Linear(inputs, outputs)
-    nn.init.orthogonal_(layer.weight, gain)
-    nn.init.constant_(layer.bias, bias)
-    return layer
+    return nn.Sequential(*layers[:-1])
 
 
 @dataclass(frozen=True)
@@ -348,7 +335,7 @@ def train(envs: Sequence[EmbExcitationVectorEnv], actor: Actor, ppo: Ppo, seed: 
         TrainingDivergedError: something is not finite any more, or for long every experiment has left the limits.
     """
     torch.set_num_threads(1)  # networks this small lose more by sharing out a product than they win
-    critic = Critic(envs[0].batch.critic_size, ppo.hidden, 0.01 if ppo.pairs else 1.0)
+    critic = Critic(envs[0].batch.critic_observation().shape[1], ppo.hidden, 0.01 if ppo.pairs else 1.0)
     learned = [weight for weight in (*actor.parameters(), *critic.parameters()) if weight.requires_grad]
     optimiser = torch.optim.Adam(learned, eps=1e-5, fused=True)
     early = 0
@@ -391,10 +378,8 @@ def collect_all(
 ) -> Rollout:
     """The rollouts of all environments side by side, each with its share of the seeds; see :func:`collect`."""
     noise = [exploration_noise(ppo.rollout, e.num_envs, ppo.noise_memory, generator, ppo.noise_hold) for e in envs]
-    own, left = [], list(seeds)
-    for env in envs:
-        own.append(left[: env.num_envs])
-        del left[: env.num_envs]
+    each = len(seeds) // len(envs)
+    own = [list(seeds[i : i + each]) for i in range(0, len(seeds), each)]
     if not ppo.pairs:
         return joined(at_once(collect, envs, [actor] * len(envs), noise, own))
     for of_env, values in zip(own, noise, strict=True):

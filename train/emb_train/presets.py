@@ -51,8 +51,3 @@ def listed(entries: Mapping[str, str]) -> str:
     column = max(map(len, entries)) + 4
     lines = [f"  {name:<{column - 2}}{meaning}" for name, meaning in entries.items()]
     return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent=" " * column) for line in lines)
-
-
-def wrapped(names: list[str]) -> str:
-    """Names side by side, in lines of a help text."""
-    return textwrap.fill(", ".join(names), WIDTH, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False)

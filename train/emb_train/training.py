@@ -34,7 +34,7 @@ from emb_runtime.config.typed import read
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import read_bytes
 from emb_runtime.system.terminal import as_json
-from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, SPEED, Conditions, Gain
+from emb_train.closed_loop import BENCH_CONDITIONS, ESTIMATE, SPEED, Conditions, Gain, Positive
 from emb_train.env import (
     DEMANDS,
     PRECISION,
@@ -45,8 +45,8 @@ from emb_train.env import (
     Precision,
     TimeToPrecision,
 )
-from emb_train.plan import Compared, Found, search, speeds_of
-from emb_train.ppo import Actor, Count, Metrics, Positive, Ppo, at_once, clone, collect, joined, train
+from emb_train.plan import Compared, Found, PlanSearch, search, speeds_of
+from emb_train.ppo import Actor, Metrics, Ppo, at_once, clone, collect, joined, train
 from emb_train.presets import preset_record
 from emb_train.rewards import REWARDS
 
@@ -58,23 +58,6 @@ VALIDATION_BRAKES = 64  # In a validation
 VALIDATIONS = 10  # Validations in a training, evenly spread
 PLAN_STREAM = 0x6E756D73  # Spawn key of the plans
 VALIDATION_STREAM = 0x6578616D  # Spawn key of the seeds of the validation; those of a training's iterations have none
-
-
-class PlanSearch(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The search for the plan that an actor begins with."""
-
-    drawn: Count = 1600  # Plans at random
-    starts: Count = 2  # Of these, from which CMA-ES begins
-    steps: Count = 60  # Of CMA-ES from each, and from the best of them on
-    population: Annotated[int, msgspec.Meta(ge=4, le=1000)] = 16  # Plans of a step
-    brakes: Count = 3  # Of each plant, on which they are compared
-    levels: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 9  # Of a plan; seven nearly suffice
-    spread: Positive = 0.15  # First standard deviation of its numbers, -1 to 1, in CMA-ES
-
-    @property
-    def rounds(self) -> int:
-        """Times that plans are compared."""
-        return -(-self.drawn // (self.population * self.brakes)) + 1 + (self.starts + 1) * self.steps
 
 
 class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -94,7 +77,7 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     ranges: str  # Set of the bench that brakes are drawn from, uniformly (thesis 4.7.2)
     parameters: tuple[str, ...]  # Parameters whose Fisher information is collected, in the order of ``PARAMETER_NAMES``
     reward: str  # One of :data:`emb_train.rewards.REWARDS`, a criterion of the expected interval, or ``time``
-    scale: Annotated[float, msgspec.Meta(gt=0.0)]  # Its factor: the thesis normalises, a fixed one needs no state
+    scale: Positive  # Its factor: the thesis normalises, a fixed one needs no state
     ppo: Ppo  # The hyper-parameters
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] = 0  # Seed of everything random
     plants: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)] = (DEFAULT_PLANT,)  # Of the bench, each alike
@@ -211,27 +194,6 @@ def hyper_parameters(training: Training) -> dict[str, Any]:
     return {"scale": training.scale} | msgspec.structs.asdict(training.ppo) | gain | in_tables
 
 
-def require_trainable(training: Training, bench: Bench) -> None:
-    """Check that a bench is one for a training.
-
-    Raises:
-        UsageError: the shield does not cover its brakes, the plant has a delay beside the drawn one, or an iteration
-            would not see the end of its experiments.
-        BenchFileError: the bench lacks the ranges or the plant.
-    """
-    training.environments(bench, 1)
-    rollout, horizon = training.ppo.rollout, training.conditions.applied(bench).timing.horizon
-    if rollout > horizon and (training.plan is not None or training.reward == TIME):
-        raise UsageError(f"rollout: expected at most the bench's horizon of {horizon} steps, got {rollout}")
-    if training.reward == TIME:  # what comes after the estimates are known does not count
-        return
-    if rollout < horizon or (training.conditions.shielded and rollout % horizon):  # else experiments end at any step
-        raise UsageError(
-            f"expected a rollout of whole experiments, got {rollout} steps for the bench's horizon of {horizon}: "
-            "use a bench file whose horizon divides it"
-        )
-
-
 def run_training(
     folder: Path, training: Training, bench: Bench, show: Show = lambda progress: None
 ) -> Iterator[Trained]:
@@ -313,8 +275,11 @@ def follow_plan(
         show(None)
         clone(actor, plan, bench, training.ppo, torch.Generator().manual_seed(training.seed))
 
+    environments = training.environments(bench, asked.population * asked.brakes, pool)
+    compared = Compared(environments, asked.population, training.ppo.rollout, training.seed)
+    rng = np.random.default_rng(np.random.SeedSequence(training.seed, spawn_key=(PLAN_STREAM,)))
     try:
-        search_plan(training, asked, bench, pool, searched)
+        search(compared, asked, rng, show=searched)
         follow()
     except KeyboardInterrupt:
         if not found or not math.isfinite(found[0].best):
@@ -322,21 +287,6 @@ def follow_plan(
         follow()
         return True
     return False
-
-
-def search_plan(
-    training: Training, asked: PlanSearch, bench: Bench, pool: Executor | None, show: Callable[[Found], object]
-) -> None:
-    """Search the plan that a training begins with; the last that is shown is the best."""
-    compared = Compared(
-        training.environments(bench, asked.population * asked.brakes, pool),
-        asked.population,
-        training.ppo.rollout,
-        training.seed,
-    )
-    rng = np.random.default_rng(np.random.SeedSequence(training.seed, spawn_key=(PLAN_STREAM,)))
-    own = {name: getattr(asked, name) for name in ("drawn", "starts", "steps", "levels", "spread")}
-    search(compared, **own, rng=rng, show=show)
 
 
 class Validation:
@@ -359,12 +309,6 @@ class Validation:
         return float(torch.where(over > 0.0, 0.0, seen.rewards).sum()) / seen.rewards.shape[1]
 
 
-def clear(folder: Path) -> None:
-    """Remove what a training wrote that has no actor yet."""
-    for name in (BENCH, CONFIGURATION, METRICS, PLAN):
-        (folder / name).unlink(missing_ok=True)
-
-
 def load_plan(path: Path) -> Plan:
     """The plan that an actor began with.
 
@@ -380,12 +324,23 @@ def load_plan(path: Path) -> Plan:
 
 
 def begin_training(folder: Path, training: Training, bench: Bench) -> None:
-    """Check that a training can be, and make its folder.
+    """Check that a bench is one for a training, and make its folder.
 
     Raises:
-        EmbError: see :func:`require_trainable`; or the folder holds something already, or cannot be written.
+        UsageError: the shield does not cover its brakes, the plant has a delay beside the drawn one, or an iteration
+            would not see the end of its experiments; or the folder holds something already, or cannot be written.
+        BenchFileError: the bench lacks the ranges or the plant.
     """
-    require_trainable(training, bench)
+    training.environments(bench, 1)
+    rollout, horizon = training.ppo.rollout, training.conditions.applied(bench).timing.horizon
+    timed = training.reward == TIME  # what comes after the estimates are known does not count
+    if rollout > horizon and (training.plan is not None or timed):
+        raise UsageError(f"rollout: expected at most the bench's horizon of {horizon} steps, got {rollout}")
+    if not timed and (rollout < horizon or (training.conditions.shielded and rollout % horizon)):
+        raise UsageError(  # else experiments end at any step
+            f"expected a rollout of whole experiments, got {rollout} steps for the bench's horizon of {horizon}: "
+            "use a bench file whose horizon divides it"
+        )
     make_empty_folder(folder)
     try:
         (folder / BENCH).write_text(bench.text, encoding="utf-8")
