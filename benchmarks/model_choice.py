@@ -31,8 +31,9 @@ from emb_bench.analysis.model_choice import choose_model, model_of
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT, Plant
+from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import STARTS, EstimationProblem, with_systematic
+from emb_bench.estimate.records import STARTS, EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 
 GOAL = 0.9  # Share of the records in which the right plant has to come first

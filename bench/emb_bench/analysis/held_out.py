@@ -22,7 +22,7 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.model_validation import taken
-from emb_bench.estimate.output_error import finished, search, settled
+from emb_bench.estimate.output_error import searched
 from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.search import minimise
 from emb_bench.estimate.windows import predict_windows
@@ -67,7 +67,7 @@ def held_out(e: Estimate, record: Experiment, *, among: int = 1) -> HeldOut:
     known[:, index] = _root(e.shared_information())
     weights = problem.weights(start)
     if record.gap_unknowns and e.method != "pem":
-        problem, _ = settled(problem, search(problem, start, weights), weights)
+        problem = searched(problem, [start]).problem
     parts = _errors(e, problem, start, weights)
 
     def residuals(z: Floats) -> tuple[Floats, Floats]:
@@ -96,10 +96,7 @@ def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
     problem, own = e.problem.part(chosen)
     if e.method != "oem":
         return method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit(problem.records)
-    start = np.clip(e.z[own], *problem.bounds)
-    weights = problem.weights(start)
-    problem, end = settled(problem, search(problem, start, weights), weights)
-    return finished(problem, end.z, weights, (end,), validation=e.validation)
+    return searched(problem, [np.clip(e.z[own], *problem.bounds)]).finished(e.validation)
 
 
 def leave_one_out(e: Estimate) -> tuple[HeldOut, ...]:

@@ -26,7 +26,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize, special
@@ -34,11 +33,12 @@ from scipy import optimize, special
 from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
+from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
-from emb_bench.estimate.output_error import finished, most, reweighted, search, settled
+from emb_bench.estimate.output_error import Fit, reweighted, search, with_gaps
 from emb_bench.estimate.prediction import Problem, make_problem
-from emb_bench.estimate.records import NORMAL_95, End, EstimationProblem, Unknown, has_time_for_a_delay, with_systematic
+from emb_bench.estimate.records import NORMAL_95, EstimationProblem, Unknown, has_time_for_a_delay
 from emb_bench.estimate.search import released
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.estimator.observer import observer_gains
@@ -162,40 +162,13 @@ def choose_model(
     return replace(choice, same=tuple(c.name for c in found if c.name not in names))
 
 
-class Fit(NamedTuple):
-    """End of a search, whose residuals have not been tested."""
-
-    problem: Problem
-    weights: list[Floats]
-    end: End
-
-    @property
-    def z(self) -> Floats:
-        """The unknowns, in the coordinates of ``problem``."""
-        return self.end.z
-
-    @property
-    def explains(self) -> bool:
-        """True if the residuals are no larger than the right model's."""
-        return self.end.cost <= most(self.weights, len(self.z))
-
-    @property
-    def ratio(self) -> float:
-        """χ²/n."""
-        return self.end.cost / max(sum(int(np.sum(root > 0.0)) for root in self.weights), 1)
-
-    def finished(self) -> Estimate:
-        """Estimate with its tests."""
-        return finished(self.problem, self.z, self.weights, (self.end,))
-
-
 def _from_the_best(fits: Sequence[Fit]) -> list[Fit]:
     """Fits what does not explain the records once more, from the best of the others."""
     near = min(fits, key=lambda fit: fit.ratio)
     again = []
     for fit in fits:
         worse = not fit.explains and fit is not near
-        again.append(min(fit, fit_from(fit.problem, near), key=lambda fit: fit.end.cost) if worse else fit)
+        again.append(min(fit, fit_from(fit.problem, near), key=lambda fit: fit.best.cost) if worse else fit)
     return again
 
 
@@ -217,17 +190,15 @@ def fit_from(problem: Problem, near: Estimate | Fit, *, follow: bool = False) ->
 
     With ``follow`` a filter leads there, which follows the measured brake and has few local minima.
     """
-    values = near.problem.values(near.z).tolist()
-    start = problem.started(dict(zip(near.problem.unknowns, values, strict=True)))
+    z = near.z if isinstance(near, Estimate) else near.best.z
+    start = problem.started(dict(zip(near.problem.unknowns, near.problem.values(z).tolist(), strict=True)))
     if follow:
         start = released(problem, start).z
     weights = problem.weights(start)
-    end = search(problem, start, weights, WRONG)
-    if not end.converged and end.cost <= 2.0 * most(weights, len(start)):
-        end = search(problem, end.z, weights)
-    problem, end = settled(problem, end, weights)
-    end, weights = reweighted(problem, end, weights, WRONG)
-    return Fit(problem, weights, end)
+    fit = Fit(problem, weights, (search(problem, start, weights, WRONG),))
+    if not fit.best.converged and fit.best.cost <= 2.0 * fit.limit:
+        fit = replace(fit, ends=(search(problem, fit.best.z, weights),))
+    return reweighted(with_gaps(fit), WRONG)
 
 
 def candidate(name: str, e: Estimate) -> Candidate:

@@ -23,10 +23,11 @@ from emb_bench.analysis.model_choice import Candidate, candidate, fit_from, rank
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EXACT, Plant
+from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import EstimationProblem, check_model, with_systematic
+from emb_bench.estimate.records import EstimationProblem, check_model
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.errors import UsageError
 
@@ -121,7 +122,7 @@ def _fitted(plant: Plant, asked: EstimationProblem, near: Estimate, names: Seque
     problem = _problem(plant, asked, near, names)
     fit = fit_from(problem, near)
     if fit.ratio > FOLLOWED:
-        fit = min(fit, fit_from(problem, near, follow=True), key=lambda one: one.end.cost)
+        fit = min(fit, fit_from(problem, near, follow=True), key=lambda one: one.best.cost)
     return _judged(plant, fit.finished(), names)
 
 
@@ -132,8 +133,8 @@ def _polished(plant: Plant, asked: EstimationProblem, found: Candidate, names: S
     around = [e.values * (1.0 + AROUND * rng.standard_normal(len(e.z))) for _ in range(POLISHED)]
     near = [replace(e, z=e.problem.coordinates(values)) for values in around]
     fits = [fit_from(problem, e, follow=True), *(fit_from(problem, start) for start in near)]
-    best = min(fits, key=lambda fit: fit.end.cost)
-    return _judged(plant, best.finished(), names) if best.end.cost < e.ends[0].cost - 1e-3 else found
+    best = min(fits, key=lambda fit: fit.best.cost)
+    return _judged(plant, best.finished(), names) if best.best.cost < e.ends[0].cost - 1e-3 else found
 
 
 def _pruned(

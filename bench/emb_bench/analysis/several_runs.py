@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from emb_bench.brake.parameters import quantity
+from emb_bench.estimate.effects import DRIFTS
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.records import DRIFTS
 
 DIFFERENT = 0.01  # Significance level of the test: with a smaller p-value, the number is not the same in all runs
 APART = 0.001  # Chance that a parameter of one and the same brake is said to differ, for all parameters together

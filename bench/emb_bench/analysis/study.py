@@ -23,11 +23,12 @@ from emb_bench.brake.parameters import least
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY, Plant
 from emb_bench.documents import ByName
+from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.intervals import bounded, union
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import SAME
-from emb_bench.estimate.records import DONE, STARTS, End, EstimationProblem, Suspect, Unknown, with_systematic
+from emb_bench.estimate.records import DONE, STARTS, End, EstimationProblem, Suspect, Unknown
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.figures import for_notebook

@@ -13,9 +13,10 @@ import numpy as np
 from emb_bench.batch.row import NONE, Options, Row, Source, failed
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench, parse_bench
+from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.expected import of_information
-from emb_bench.estimate.records import EstimationProblem, with_systematic
+from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.information.evaluation import Evaluation, Question, check_sample_time, default_model, evaluate

@@ -19,10 +19,11 @@ from emb_bench.commission.records import CurrentCheck, FirstMove, Identification
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
 from emb_bench.estimate.derived_velocity import derived
+from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import NORMAL_95, EstimationProblem, with_systematic
+from emb_bench.estimate.records import NORMAL_95, EstimationProblem
 from emb_bench.experiment.experiment import Booleans, Experiment, Floats
 from emb_bench.experiment.from_log import read_experiment, step_of
 from emb_bench.logs.log import read_log

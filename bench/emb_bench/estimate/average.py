@@ -46,7 +46,7 @@ class Average(NamedTuple):
         found[np.ix_(self.errors, self.errors)] = np.linalg.inv(self.covariance) - self.full
         return found
 
-    def biases(self, effects: Sequence[Effect]) -> tuple[Floats, Floats]:
+    def biases(self, effects: Sequence[Influence]) -> tuple[Floats, Floats]:
         """Root mean squares of effects' biases of the unknowns, with the signs of positive ones', and of their sizes.
 
         Shapes (effects, p) and (effects,).
@@ -72,7 +72,7 @@ class Average(NamedTuple):
         return np.copysign(roots, signs), np.sqrt(squares.sum(axis=1))
 
 
-class Effect(NamedTuple):
+class Influence(NamedTuple):
     """An effect that is not estimated, beside the fit with all priors in full."""
 
     moved: Floats  # Change of the unknowns by an effect of size 1, shape (p,)

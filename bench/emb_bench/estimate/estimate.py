@@ -12,17 +12,10 @@ from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import Quantity, quantity
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
+from emb_bench.estimate.effects import SCALES
 from emb_bench.estimate.intervals import deviations, unnoticed
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import (
-    NORMAL_95,
-    SCALES,
-    Contribution,
-    End,
-    EstimationProblem,
-    ModelValidation,
-    Unknown,
-)
+from emb_bench.estimate.records import NORMAL_95, Contribution, End, EstimationProblem, ModelValidation, Unknown
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Identifiability, Spectrum, judge, schur_complement
 from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters

@@ -24,25 +24,18 @@ from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
 from emb_bench.estimate.average import average
+from emb_bench.estimate.effects import Simulated, columns, lacked_sensitivities, with_systematic
 from emb_bench.estimate.estimate import OF_THE_BENCH
 from emb_bench.estimate.intervals import unnoticed
 from emb_bench.estimate.prediction import Problem, make_problem
-from emb_bench.estimate.records import Contribution, EstimationProblem, with_systematic
-from emb_bench.estimate.suspects import (
-    OF_THE_SPRING,
-    Simulated,
-    basis_and_inverse,
-    budget_of,
-    effect_of,
-    scales,
-    secants,
-)
+from emb_bench.estimate.records import Contribution, EstimationProblem
+from emb_bench.estimate.suspects import basis_and_inverse, budget_of, lacking
 from emb_bench.experiment.experiment import Experiment, planned
 from emb_bench.experiment.from_log import REST_SAMPLES
 from emb_bench.experiment.simulate import NO_ERRORS, SystematicErrors
 from emb_bench.information.evaluation import Evaluation, Information, Question
 from emb_bench.information.identifiability import Spectrum
-from emb_runtime.config.bench import PARAMETER_NAMES, BrakeParameters
+from emb_runtime.config.bench import BrakeParameters
 from emb_runtime.errors import UsageError
 
 NUMBERS = ("T", "I")
@@ -160,43 +153,22 @@ def of_experiment(
 
 def of_problem(problem: Problem, z: Floats) -> Interval:
     """The interval of a problem of one record, without noise, that is explained by ``z``."""
-    unknown = [one.name for one in problem.unknowns]
-    held = tuple(name for name in ("J", *PARAMETER_NAMES) if name not in unknown)
+    allowed = tuple(problem.asked.allowed)
+    held = lacked_sensitivities(problem, allowed)
     said = [problem.predict(z, i, held) for i in range(len(problem.records))]
     weights = problem.weights(z, said)
-    shown = Simulated(problem, z, weights, said)
     jacobian = problem.jacobian(z, weights, said)[1]
     averaged = average(problem, z, (np.zeros(len(jacobian)), jacobian))  # of records without noise
-    basis, pseudo = basis_and_inverse(jacobian)
+    basis, inverse = basis_and_inverse(jacobian)
     if any(record.gap_unknowns for record in problem.records):
         basis = np.concatenate([basis, problem.gap_basis(z, weights)], axis=1)
-    every = columns(problem, z, shown, held)
-    untested = scales(problem, z, jacobian, shown, every, problem.asked.allowed)
-    found = {name: column for name, column in (every | untested).items() if name in problem.asked.allowed}
-    whole = np.zeros((len(found), len(jacobian)))
-    for row, column in zip(whole, found.values(), strict=True):
-        row[: len(column)] = column
-    beside, moved = whole - whole @ basis @ basis.T, whole @ pseudo.T
-    effects = {
-        name: effect_of(problem, name, problem.asked.allowed[name], moved[i], information, math.sqrt(information))
-        for i, (name, information) in enumerate(zip(found, np.sum(beside**2, axis=1).tolist(), strict=True))
-    }
-    budget = budget_of(averaged, effects, untested)
+    shown = Simulated(problem, z, weights, said, held)
+    found = lacking(columns(problem, z, shown, jacobian, allowed), basis, inverse)
+    information = np.sum(found.beside**2, axis=1)
+    budget = budget_of(problem, averaged, found, information, np.sqrt(information))
     covariance = Spectrum(jacobian.T @ jacobian + averaged.added()).inverse()
+    unknown = [one.name for one in problem.unknowns]
     wanted = [i for i, name in enumerate(unknown) if name not in problem.asked.along]
     own = tuple(replace(one, bias=tuple(one.bias[i] for i in wanted)) for one in budget)
     names = tuple(unknown[i] for i in wanted)
     return Interval(names, len(problem.asked.params), covariance[np.ix_(wanted, wanted)], own)
-
-
-def columns(problem: Problem, z: Floats, shown: Simulated, held: Sequence[str]) -> dict[str, Floats]:
-    """Columns of the effects that the total allows for: samples per unit, in standard deviations.
-
-    The prediction has columns of parameters that are ``held``.
-    """
-    assert shown.said is not None
-    moved = shown.said[0].sensitivities[:, len(problem.unknowns) :] * shown.weights[0][:, None]
-    found = {name: [moved[:, k]] for k, name in enumerate(held)} | secants(problem, z, shown)
-    if problem.bench.brake.k_1 == 0.0:
-        found = {name: parts for name, parts in found.items() if name not in OF_THE_SPRING}
-    return {name: np.concatenate([part.ravel() for part in parts]) for name, parts in found.items()}

@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 from scipy import special
 
 from emb_bench.brake.motion import Floats
+from emb_bench.estimate.effects import LAGGING, Shown, Simulated
 from emb_bench.estimate.prediction import Problem, by_record
 from emb_bench.estimate.records import Disturbance, Independence, ModelValidation, Whiteness
-from emb_bench.estimate.suspects import DEPENDENT, LAGGING, Shown, Simulated, score
+from emb_bench.estimate.suspects import DEPENDENT, score
 
 Bools = NDArray[np.bool_]
 

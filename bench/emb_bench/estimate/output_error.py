@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -48,42 +48,111 @@ REWEIGHTED = 3  # Rounds in which the weights follow the motion, where the clock
 LEFT_OUT = 3  # Most times that outliers are looked for
 
 
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """State of output error: the problem, the weights of its samples, and the ends of local searches, best first."""
+
+    problem: Problem  # Its records lack outliers, and have in their gaps what was found there
+    weights: list[Floats]
+    ends: tuple[End, ...]
+
+    @property
+    def best(self) -> End:
+        """The end with the least sum of squares."""
+        return self.ends[0]
+
+    @property
+    def limit(self) -> float:
+        """Sum of squares that the right model stays below."""
+        freedom = self.samples - len(self.best.z)
+        return float(special.chdtri(max(freedom, 1), LEVEL / 2.0))
+
+    @property
+    def samples(self) -> int:
+        """Number of the samples that count, angles and velocities."""
+        return sum(int(np.sum(root > 0.0)) for root in self.weights)
+
+    @property
+    def explains(self) -> bool:
+        """True if the residuals are no larger than the right model's."""
+        return self.best.cost <= self.limit
+
+    @property
+    def ratio(self) -> float:
+        """χ²/n."""
+        return self.best.cost / max(self.samples, 1)
+
+    def moved(self, best: End) -> Fit:
+        """The fit with another best end, which is that of all searches in the same minimum, too."""
+        others = [
+            replace(end, z=best.z, cost=best.cost) if end.cost - self.best.cost <= SAME else end
+            for end in self.ends[1:]
+        ]
+        return replace(self, ends=(best, *others))
+
+    def finished(self, validation: ModelValidation | None = None) -> Estimate:
+        """Estimate, with its tests if there are none yet."""
+        return finished(self.problem, self.best.z, self.weights, self.ends, validation=validation)
+
+
 class OutputError(Method):
     """The simulation nearest to the samples, found from the nominal brake, from random starts, and along a filter."""
 
     systematic = True
 
     def solve(self, problem: Problem) -> Estimate:
-        """As :class:`Method`."""
+        """As :class:`Method`, in seven steps."""
         ideal = replace(problem, asked=replace(problem.asked, systematic={}))
-        points = start_points(ideal, self.starts, self.seed)
-        weights = ideal.weights(points[0])
-        ideal, ends = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
-        for _ in range(LEFT_OUT):
-            kept = _without_outliers(ideal, ends[0].z, weights)
-            if kept is ideal:
-                break
-            ideal, weights = kept, kept.weights(points[0])
-            ideal, ends = _settled(ideal, [search(ideal, point, weights) for point in points], weights)
-        problem, wider = _with_systematic(problem, ideal, ends, weights)
-        if wider[0].cost > most(weights, len(problem.unknowns)):
-            near = released(ideal, points[0])
-            end = search(ideal, near.z, weights)
-            end = replace(end, start=near.start, evaluations=near.evaluations + end.evaluations)
-            ideal, ends = _settled(ideal, [*ends, end], weights)
-            problem, wider = _with_systematic(problem, ideal, ends, weights)
-        problem, ends = _settled(problem, wider, weights)
-        first, weights = reweighted(problem, ends[0], weights)
-        return finished(problem, first.z, weights, (replace(first, start=ends[0].start), *ends[1:]))
+        points = start_points(ideal, self.starts, self.seed)  # 1. Start at the nominal brake, and at random ones.
+        fit = searched(ideal, points)  # 2. Search from each, without systematic errors.
+        fit = without_outliers(fit, points)  # 3. Leave outliers out, and search again.
+        full = with_systematic_errors(fit, problem)  # 4. Free the systematic errors, at the best minimum.
+        if not full.explains:  # 5. If that does not fit, let a filter lead to another minimum.
+            fit = along_filter(fit, points[0])
+            full = with_systematic_errors(fit, problem)
+        full = with_gaps(full)  # 6. Search along what happened in gaps of the reports.
+        full = reweighted(full)  # 7. Weigh the samples along the motion that was found.
+        return full.finished()
 
 
-def _without_outliers(problem: Problem, z: Floats, weights: Sequence[Floats]) -> Problem:
-    """The problem without the samples that lie apart from their neighbours; the same one if there are none, or many."""
-    residuals = by_record(problem.jacobian(z, weights)[0], weights)
-    found = [outliers(r, root > 0.0) for r, root in zip(residuals, weights, strict=True)]
-    if not few(found):
-        return problem
-    return replace(problem, records=tuple(r.lose(mask) for r, mask in zip(problem.records, found, strict=True)))
+def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
+    """Starts of the searches: the nominal brake, then uniform draws from the prior's or else the shield's ranges."""
+    if starts < 1:
+        raise UsageError(f"expected at least 1 start, got {starts}")
+    bench, first = problem.bench, problem.nominal()
+    ranges = problem.asked.prior or bench.range_set(bench.shield.ranges)
+    rng, points = np.random.default_rng(seed), [first]
+    for _ in range(starts - 1):
+        drawn, point = rng.random(len(first)), problem.values(first)
+        for i, unknown in enumerate(problem.unknowns):
+            low, high = getattr(ranges.low, unknown.name, 0.0), getattr(ranges.high, unknown.name, 0.0)
+            if low < high:
+                point[i] = low + drawn[i] * (high - low)
+        points.append(np.clip(problem.coordinates(point), *problem.bounds))
+    return points
+
+
+def search(problem: Problem, start: Floats, weights: Sequence[Floats], evaluations: int = EVALUATIONS) -> End:
+    """One local search of the simulation nearest to the samples."""
+    return minimise(problem, start, lambda z: problem.jacobian(z, weights), evaluations)
+
+
+def searched(problem: Problem, points: Sequence[Floats]) -> Fit:
+    """A local search from each point, with the weights of the first, and along gaps from the best end."""
+    weights = problem.weights(points[0])
+    return with_gaps(Fit(problem, weights, tuple(search(problem, point, weights) for point in points)))
+
+
+def without_outliers(fit: Fit, points: Sequence[Floats]) -> Fit:
+    """The searches again without the samples that lie apart from their neighbours, as long as there are a few."""
+    for _ in range(LEFT_OUT):
+        residuals = by_record(fit.problem.jacobian(fit.best.z, fit.weights)[0], fit.weights)
+        found = [outliers(r, root > 0.0) for r, root in zip(residuals, fit.weights, strict=True)]
+        if not few(found):
+            break
+        records = tuple(record.lose(mask) for record, mask in zip(fit.problem.records, found, strict=True))
+        fit = searched(replace(fit.problem, records=records), points)
+    return fit
 
 
 def outliers(residuals: Floats, counts: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -110,100 +179,56 @@ def few(found: Sequence[NDArray[np.bool_]]) -> bool:
     return 0 < count <= max(1.0, MOST * sum(len(mask) for mask in found))
 
 
-def settled(problem: Problem, end: End, weights: Sequence[Floats]) -> tuple[Problem, End]:
-    """The end of a search, with what the gaps of the records hold searched along from there.
-
-    A search sees the gaps linearly around what the records hold of them. Here the simulation follows each step in both,
-    and none is taken that does not lower the sum of squares.
-
-    Returns:
-        The problem whose records hold what was found in their gaps, and the search's new end. Without gaps, the same.
-    """
-    if not any(record.gap_unknowns for record in problem.records):
-        return problem, end
-    count = len(end.z)
-    after = minimise(
-        problem,
-        np.concatenate([end.z, problem.in_gaps()]),
-        lambda both: problem.filled(both[count:]).joint(both[:count], weights),
-    )
-    evaluations = end.evaluations + after.evaluations
-    found = replace(after, z=after.z[:count], start=end.start, evaluations=evaluations)
-    return problem.filled(after.z[count:]), found
-
-
-def reweighted(
-    problem: Problem, end: End, weights: list[Floats], evaluations: int = EVALUATIONS
-) -> tuple[End, list[Floats]]:
-    """The end of further searches with weights that follow the motion, and these; without jitter of the clock none."""
-    if problem.plant.instruments.clock_jitter > 0.0:
-        for _ in range(REWEIGHTED):
-            weights = problem.weights(end.z)
-            end = search(problem, end.z, weights, evaluations)
-    return end, weights
-
-
-def _settled(problem: Problem, ends: Sequence[End], weights: Sequence[Floats]) -> tuple[Problem, list[End]]:
-    """Searches best first, the best minimum with its new end by :func:`settled`."""
-    ordered = sorted(ends, key=lambda end: end.cost)
-    problem, best = settled(problem, ordered[0], weights)
-    return problem, _refined(ordered, best)
-
-
-def _refined(ends: Sequence[End], best: End) -> list[End]:
-    """Searches best first, those that ended where the best one did with its new end."""
-    lowest = ends[0].cost
-    others = [replace(end, z=best.z, cost=best.cost) if end.cost - lowest <= SAME else end for end in ends[1:]]
-    return [best, *others]
-
-
-def _with_systematic(
-    problem: Problem, ideal: Problem, ends: Sequence[End], weights: Sequence[Floats]
-) -> tuple[Problem, list[End]]:
-    """Searches best first, the best minimum once more with the systematic errors, which ``ideal`` lacks."""
-    problem = replace(problem, records=ideal.records)
-    ends = sorted(ends, key=lambda end: end.cost)
+def with_systematic_errors(fit: Fit, problem: Problem) -> Fit:
+    """The best minimum once more with the systematic errors of the ``problem``, which those of ``fit`` lack."""
+    problem = replace(problem, records=fit.problem.records)
     if not problem.asked.along:
-        return problem, ends
-    index = [problem.unknowns.index(unknown) for unknown in ideal.unknowns]
+        return Fit(problem, fit.weights, fit.ends)
+    index = [problem.unknowns.index(unknown) for unknown in fit.problem.unknowns]
 
-    def whole(own: Floats) -> Floats:
+    def wider(own: Floats) -> Floats:
         z = problem.nominal()
         z[index] = own
         return z
 
-    wider = [replace(end, z=whole(end.z), start=whole(end.start)) for end in ends]
-    best = search(problem, np.clip(wider[0].z, *problem.bounds), weights)
-    best = replace(best, start=wider[0].start, evaluations=wider[0].evaluations + best.evaluations)
-    return problem, _refined(wider, best)
+    ends = tuple(replace(end, z=wider(end.z), start=wider(end.start)) for end in fit.ends)
+    full = Fit(problem, fit.weights, ends)
+    return full.moved(full.best.then(search(problem, np.clip(full.best.z, *problem.bounds), fit.weights)))
 
 
-def most(weights: Sequence[Floats], unknowns: int) -> float:
-    """The sum of squares that the right model stays below."""
-    samples = sum(int(np.sum(root > 0.0)) for root in weights)
-    return float(special.chdtri(max(samples - unknowns, 1), LEVEL / 2.0))
+def along_filter(fit: Fit, point: Floats) -> Fit:
+    """One more search, from where a filter leads that follows the measured brake from a point."""
+    near = released(fit.problem, point)
+    return with_gaps(replace(fit, ends=(*fit.ends, near.then(search(fit.problem, near.z, fit.weights)))))
 
 
-def start_points(problem: Problem, starts: int, seed: int) -> list[Floats]:
-    """Starts of the searches: the nominal brake, then uniform draws from the prior's or else the shield's ranges."""
-    if starts < 1:
-        raise UsageError(f"expected at least 1 start, got {starts}")
-    bench, first = problem.bench, problem.nominal()
-    ranges = problem.asked.prior or bench.range_set(bench.shield.ranges)
-    rng, points = np.random.default_rng(seed), [first]
-    for _ in range(starts - 1):
-        drawn, point = rng.random(len(first)), problem.values(first)
-        for i, unknown in enumerate(problem.unknowns):
-            low, high = getattr(ranges.low, unknown.name, 0.0), getattr(ranges.high, unknown.name, 0.0)
-            if low < high:
-                point[i] = low + drawn[i] * (high - low)
-        points.append(np.clip(problem.coordinates(point), *problem.bounds))
-    return points
+def with_gaps(fit: Fit) -> Fit:
+    """The ends best first, the best one searched on along what happened in the gaps of the records.
+
+    A search sees the gaps linearly around what the records hold of them. Here the simulation follows each step in both,
+    and none is taken that does not lower the sum of squares. The records hold then what was found in their gaps.
+    """
+    problem, fit = fit.problem, replace(fit, ends=tuple(sorted(fit.ends, key=lambda end: end.cost)))
+    if not any(record.gap_unknowns for record in problem.records):
+        return fit.moved(fit.best)
+    count = len(fit.best.z)
+    after = minimise(
+        problem,
+        np.concatenate([fit.best.z, problem.in_gaps()]),
+        lambda both: problem.filled(both[count:]).joint(both[:count], fit.weights),
+    )
+    found = fit.moved(fit.best.then(replace(after, z=after.z[:count])))
+    return replace(found, problem=problem.filled(after.z[count:]))
 
 
-def search(problem: Problem, start: Floats, weights: Sequence[Floats], evaluations: int = EVALUATIONS) -> End:
-    """One local search of the simulation nearest to the samples."""
-    return minimise(problem, start, lambda z: problem.jacobian(z, weights), evaluations)
+def reweighted(fit: Fit, evaluations: int = EVALUATIONS) -> Fit:
+    """The best minimum with weights that follow the motion, where the clock jitters; else the same fit."""
+    if fit.problem.plant.instruments.clock_jitter > 0.0:
+        for _ in range(REWEIGHTED):
+            weights = fit.problem.weights(fit.best.z)
+            end = search(fit.problem, fit.best.z, weights, evaluations)
+            fit = Fit(fit.problem, weights, (replace(end, start=fit.best.start), *fit.ends[1:]))
+    return fit
 
 
 def finished(

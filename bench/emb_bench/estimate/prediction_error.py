@@ -53,8 +53,7 @@ class PredictionError(Method):
         for i, before in enumerate(followed):
             end = converge(found, near if i == first else before.z)
             deviance = found.deviance(end.z, problem.weights(end.z))
-            evaluations = before.evaluations + end.evaluations
-            ends.append(replace(end, cost=deviance, start=before.start, evaluations=evaluations))
+            ends.append(replace(before.then(end), cost=deviance))
         ends.sort(key=lambda end: end.cost)
         best = ends[0].z
         weights = problem.weights(best)

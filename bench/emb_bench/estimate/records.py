@@ -12,22 +12,11 @@ from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DIRECTED, EXACT, Plant
 from emb_bench.experiment.simulate import SystematicErrors
 from emb_bench.information.evaluation import Question
-from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator import estimate
 
 SYSTEMATIC = SystematicErrors._fields
 """Systematic errors that are estimated too by default, each with the prior of the bench file."""
-DRIFTS = tuple(f"{name}_drift" for name in PARAMETER_NAMES)
-"""Linear changes of the parameters, as shares of them from the begin of a run to its end."""
-SEVERAL: Mapping[str, tuple[str, ...]] = {
-    "slow_friction": ("friction_100", "friction_200"),
-    "ripple": ("ripple_sine", "ripple_cosine"),
-    "stiffness_ripple": ("stiffness_sine", "stiffness_cosine"),
-}
-"""Keys of ``[systematic]`` that stand for several effects."""
-ANGLE_SCALE, CURRENT_SCALE, TIME_SCALE = SCALES = "angle_scale", "current_scale", "time_scale"
-"""Relative errors of the scales of angle and current, and of the clock."""
 FREE = 0.05  # Standard deviation of J, as a share of it, where a parameter tells it that is known beforehand
 FACTOR = 10.0  # Brakes beyond nominal by this factor are not searched
 METHODS: Mapping[str, str] = {
@@ -111,28 +100,6 @@ def freed(asked: EstimationProblem, bench: Bench) -> EstimationProblem:
     return replace(asked, nuisances=(*asked.nuisances, "J"), known=known)
 
 
-def with_systematic(asked: EstimationProblem, bench: Bench, plant: Plant) -> EstimationProblem:
-    """The problem with what the bench cannot exclude and the plant can have: estimated too, or allowed for."""
-    known: dict[str, float] = dict(vars(bench.systematic))
-    if (measured := known.pop("k_m")) is not None and "k_m" in asked.names and not asked.known:
-        k_m = bench.brake.k_m
-        asked = freed(replace(asked, known={"k_m": (k_m, measured * k_m)}), bench)
-    timed = has_time_for_a_delay(plant) and "current_lag" not in asked.names
-    observed = plant.instruments.observer_bandwidth > 0.0  # its velocity is no measurement of its own
-    excluded = (set() if timed else {"delay"}) | ({"velocity_gain"} if observed else set())
-    possible = {name: known[name] for name in SYSTEMATIC if known[name] > 0.0 and name not in excluded}
-    known |= dict.fromkeys(PARAMETER_NAMES, known["held"]) | dict.fromkeys(DRIFTS, known["drift"])
-    known["J"] = known.pop("inertia")
-    del known["held"], known["drift"]
-    for name, rows in SEVERAL.items():
-        known |= dict.fromkeys(rows, known.pop(name))
-    return replace(
-        asked,
-        systematic={n: d for n, d in possible.items() if n not in asked.names},
-        allowed={n: d for n, d in known.items() if d > 0.0 and n not in {*SYSTEMATIC, *asked.names}},
-    )
-
-
 def check_model(plant: Plant, names: Sequence[str]) -> None:
     """Refuses unknowns that a model cannot estimate.
 
@@ -182,6 +149,10 @@ class End:
     start: Floats  # Start, in the form of ``z``
     converged: bool
     evaluations: int
+
+    def then(self, after: End) -> End:
+        """The end of a search that went on from this one."""
+        return replace(after, start=self.start, evaluations=self.evaluations + after.evaluations)
 
 
 @dataclass(frozen=True)

@@ -107,8 +107,7 @@ def converge(found: Filter, start: Floats) -> End:
 
 def released(problem: Problem, start: Floats) -> End:
     """Minimum that a filter leads to which follows the measured brake at first, and is the simulation in the end."""
-    z, evaluations = start, 0
-    for share in RELEASE:
-        end = converge(Filter(problem, share * strong(problem)), z)
-        z, evaluations = end.z, evaluations + end.evaluations
-    return replace(end, start=start, evaluations=evaluations)
+    end = converge(Filter(problem, RELEASE[0] * strong(problem)), start)
+    for share in RELEASE[1:]:
+        end = end.then(converge(Filter(problem, share * strong(problem)), end.z))
+    return end

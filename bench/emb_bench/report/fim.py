@@ -127,7 +127,7 @@ def _expected(e: Evaluation, prior: str) -> list[str]:
     interval = expected_interval(e)
     if isinstance(interval, str):
         return listed("no interval of an estimate: ", [interval])
-    from emb_bench.estimate.suspects import shown_as
+    from emb_bench.estimate.effects import shown_as
 
     machine, rows = e.bench.machine, []
     for i, name in enumerate(interval.names):

@@ -133,8 +133,8 @@ def intervals(e: Estimate) -> str:
 
 def effects(machine: Machine | None) -> dict[str, str]:
     """Effects of the score tests and of the uncertainty budget by the names that are shown, each in a line."""
-    from emb_bench.estimate.records import SCALES, Contribution
-    from emb_bench.estimate.suspects import EFFECTS, shown_as
+    from emb_bench.estimate.effects import EFFECTS, SCALES, shown_as
+    from emb_bench.estimate.records import Contribution
 
     said = {name: row.effect.removesuffix(",") for name, row in EFFECTS.items()}
     said |= {name: f"an error of the {name.removesuffix('_scale')}'s scale" for name in SCALES}
@@ -292,8 +292,8 @@ def models(study: Study) -> str:
 
 def limit(effect: Contribution, e: Estimate) -> str:
     """Effect that limits an interval most, with the prior of one that all runs share."""
+    from emb_bench.estimate.effects import shown_as
     from emb_bench.estimate.estimate import OF_THE_BENCH
-    from emb_bench.estimate.suspects import shown_as
 
     name, shared = shown_as(effect, e.bench.machine).name, effect.name in OF_THE_BENCH
     return f"{name}, known to {in_percent(e.asked.allowed[effect.name])}" if shared else name
@@ -419,7 +419,7 @@ def _coloured(m: ModelValidation) -> str:
 
 def explained(s: Suspect, machine: Machine | None = None) -> str:
     """A suspect in words that lead to the remedy; ``machine`` is that of a bench that has no brake."""
-    from emb_bench.estimate.suspects import EFFECTS, shown_as
+    from emb_bench.estimate.effects import EFFECTS, shown_as
 
     if s.observer:
         return derived_velocity(s.observer, machine)

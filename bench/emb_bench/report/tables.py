@@ -8,9 +8,9 @@ import numpy as np
 
 from emb_bench.analysis.study import Study
 from emb_bench.brake.parameters import UNITS
+from emb_bench.estimate.effects import shown_as
 from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
 from emb_bench.estimate.records import NORMAL_95
-from emb_bench.estimate.suspects import shown_as
 from emb_bench.information.identifiability import TRADED_OFF
 from emb_bench.numbers import amount, chance, percent, relative, signed
 from emb_bench.report.acceptance import Acceptance, Result

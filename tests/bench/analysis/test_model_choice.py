@@ -13,7 +13,8 @@ from emb_bench.analysis.study import StudyOptions, make_study
 from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EVERY, Plant
-from emb_bench.estimate.records import EstimationProblem, Unknown, with_systematic
+from emb_bench.estimate.effects import with_systematic
+from emb_bench.estimate.records import EstimationProblem, Unknown
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.estimate import document, text

@@ -6,8 +6,9 @@ import pytest
 
 from emb_bench.analysis.model_growth import ADDITIONS, grow_model, wanted
 from emb_bench.config.bench import Bench
+from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.records import EstimationProblem, with_systematic
+from emb_bench.estimate.records import EstimationProblem
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 

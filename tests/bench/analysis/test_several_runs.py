@@ -14,8 +14,9 @@ from emb_bench.analysis.drift import Earlier, Entry, drifts
 from emb_bench.analysis.held_out import GROUPS, leave_one_out
 from emb_bench.analysis.several_runs import apart, apart_by
 from emb_bench.config.bench import Bench
+from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.records import NORMAL_95, EstimationProblem, with_systematic
+from emb_bench.estimate.records import NORMAL_95, EstimationProblem
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 from tests.bench.measurements import currents_of, fit, record  # isort: skip

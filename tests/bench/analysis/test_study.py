@@ -18,9 +18,9 @@ from emb_bench.api import simulate as simulate_run
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import Options, Source
 from emb_bench.config.bench import Bench, parse_bench
+from emb_bench.estimate.effects import EFFECTS, possible
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import EstimationProblem
-from emb_bench.estimate.suspects import EFFECTS, possible
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.information.identifiability import Doubt
 from emb_bench.logs.log import RunLog, read_log

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.average import ABSENT, SHARES, Effect, average
+from emb_bench.estimate.average import ABSENT, SHARES, Influence, average
+from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.prediction import Problem, make_problem
-from emb_bench.estimate.records import EstimationProblem, with_systematic
+from emb_bench.estimate.records import EstimationProblem
 
 from tests.bench.measurements import Floats, currents_of, fit, record  # isort: skip
 
@@ -125,7 +126,7 @@ def test_a_bias_is_that_of_all_combinations_of_errors_and_effect(bench: Bench, s
     shifted = errors + size / length * beside  # the fit stays where it is
     averaged = average(its.problem, its.estimate.fit, (shifted, jacobian))
     none = np.zeros(len(its.names))
-    effect = Effect(pseudo @ whole, length**2, float(beside @ shifted), np.array(SHARES), HALF, none)
+    effect = Influence(pseudo @ whole, length**2, float(beside @ shifted), np.array(SHARES), HALF, none)
     names, z = [*its.names, "effect"], np.append(its.estimate.fit, 0.0)
     logs, squares, sizes = [], [], []
     for deviations, one in answers(names, z, -shifted[: len(y)], np.column_stack([a, -column])):

@@ -13,11 +13,12 @@ from emb_bench.api import fisher_information
 from emb_bench.brake.parameters import COMMAND, F_V, K_1, K_M, T_C
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
+from emb_bench.estimate.effects import EFFECTS, Linearised, Shown, Simulated, columns, with_systematic
 from emb_bench.estimate.expected import Interval, of_experiment, of_information
 from emb_bench.estimate.innovations import Filter, Followed
 from emb_bench.estimate.prediction import Problem, make_problem
-from emb_bench.estimate.records import EstimationProblem, with_systematic
-from emb_bench.estimate.suspects import TORQUES, Shown, Simulated, beside_model, secants, turning
+from emb_bench.estimate.records import EstimationProblem
+from emb_bench.estimate.suspects import basis_and_inverse, lacking
 from emb_bench.experiment.simulate import SystematicErrors
 from emb_bench.information.evaluation import Question, expected
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -61,8 +62,9 @@ def test_an_effect_that_acts_as_a_current_sums_the_derivatives_to_single_current
     """An estimate has these derivatives for reports that were lost."""
     problem, z = modelled(bench, bench.plant(name), late)
     model = Simulated(problem, z, [np.ones((len(CURRENTS), 2))])
-    turned = turning(problem, z, 0, model.motion(0))
-    assert {*turned} == {*TORQUES} - ({"play"} if name in ("play", "euler") else set())
+    turned = Linearised(problem, z, model, 0, np.zeros((0, len(z))), tuple(EFFECTS)).shares()
+    torques = {each for each, row in EFFECTS.items() if row.torque}
+    assert {*turned} == torques - ({"play"} if name in ("play", "euler") else set())
     acting = {each: (u, s) for each, (u, s) in turned.items() if u in (COMMAND, K_M)}
     rows = np.stack([s * (CURRENTS if u == K_M else 1.0) for u, s in acting.values()], axis=1)
     found = model.parts(0, np.array([u for u, _ in acting.values()]), np.stack([s for _, s in acting.values()], axis=1))
@@ -118,11 +120,13 @@ def test_what_a_friction_leaves_beside_the_model_is_that_of_a_brake_that_has_it(
     problem = problem_of(bench, PARAMETER_NAMES, record(bench, plant, TURNING[currents](bench), seed=None))
     z = problem.nominal()
     weights = problem.weights(z)
-    model, basis = Simulated(problem, z, weights), np.linalg.qr(problem.jacobian(z, weights)[1])[0]
+    model, jacobian = Simulated(problem, z, weights), problem.jacobian(z, weights)[1]
+    basis, inverse = basis_and_inverse(jacobian)
     changed = plant.mechanics._replace(tolerance=1e-12, break_away=1.0 + 1e-5, stribeck_velocity=FRICTION[name])
     (more, less) = (model.shown(0, m) for m in (changed, changed._replace(break_away=1.0)))
-    wanted = beside_model(((more - less) / 1e-5).ravel(), basis)[1]
-    found = beside_model(secants(problem, z, model)[name][0].ravel(), basis)[1]
+    change = ((more - less) / 1e-5).ravel()
+    wanted = change - basis @ (basis.T @ change)
+    found = lacking(columns(problem, z, model, jacobian, (name,)), basis, inverse).beside[0]
     assert np.linalg.norm(found - wanted) < 0.05 * np.linalg.norm(wanted)
 
 
@@ -169,7 +173,7 @@ def test_one_effect_moves_the_parameters_by_regression(bench: Bench) -> None:
     weights = problem.weights(z)
     jacobian = problem.jacobian(z, weights)[1]
     ones = Simulated(problem, z, weights)
-    column = secants(problem, z, ones)["k_m_drift"][0].ravel()
+    column = columns(problem, z, ones, jacobian, ("k_m_drift",))["k_m_drift"]
     moved, square, *_ = np.linalg.lstsq(jacobian, column, rcond=None)
     information, squares, weights_of = float(square[0]), 0.0, 0.5  # half the brakes have none
     for share in (1e-3, 1e-2, 0.1, 1.0):

@@ -104,7 +104,7 @@ def test_what_is_fitted_again_or_by_another_model_settles_its_own_gaps(bench: Be
         fit_from(Problem(bench, plant, EstimationProblem(), (raw,)), e),
         refit(replace(e, problem=replace(e.problem, records=(raw,))), [0]),
     )
-    assert [e.ends[0].cost] * 2 == pytest.approx([others[0].end.cost, others[1].ends[0].cost], abs=1e-2)
+    assert [e.ends[0].cost] * 2 == pytest.approx([others[0].best.cost, others[1].ends[0].cost], abs=1e-2)
     choice = choose_model(
         bench, [plant, bench.plant("hysteresis")], lambda _: [raw], EstimationProblem(), starts=1, seed=0
     )

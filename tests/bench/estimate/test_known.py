@@ -7,8 +7,9 @@ from dataclasses import replace
 import pytest
 
 from emb_bench.config.bench import Bench
+from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.records import NORMAL_95, EstimationProblem, freed, with_systematic
+from emb_bench.estimate.records import NORMAL_95, EstimationProblem, freed
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 

@@ -8,8 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from emb_bench.config.bench import Bench
+from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.least_squares import SURE
-from emb_bench.estimate.records import EstimationProblem, with_systematic
+from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.report.caveats import caveats
 from emb_runtime.config.bench import PARAMETER_NAMES

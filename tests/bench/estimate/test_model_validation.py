@@ -8,9 +8,10 @@ import pytest
 from scipy import stats
 
 from emb_bench.config.bench import Bench, load_bench
+from emb_bench.estimate.effects import DRIFTS, with_systematic
 from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
 from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
-from emb_bench.estimate.records import DRIFTS, NORMAL_95, EstimationProblem, with_systematic
+from emb_bench.estimate.records import NORMAL_95, EstimationProblem
 from emb_bench.experiment.experiment import planned
 from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.report.sentences import alarms, residual_notes

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from emb_bench.config.bench import Bench
+from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.output_error import search
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import EstimationProblem, with_systematic
+from emb_bench.estimate.records import EstimationProblem
 from emb_bench.estimate.search import converge, minimise
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.config.bench import PARAMETER_NAMES
