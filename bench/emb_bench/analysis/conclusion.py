@@ -68,12 +68,6 @@ class Conclusion:
         """Returns True if it is identified."""
         return self.finding.identified
 
-    @property
-    def notable(self) -> bool:
-        """Returns True if there is more to say than the value, its interval, and that it is identified."""
-        drifted = self.drift is not None and self.drift.drifted
-        return bool(self.finding.doubts or self.finding.traded_with) or drifted
-
 
 def conclude(
     e: Estimate,
@@ -143,11 +137,8 @@ def noise_deviations(e: Estimate) -> Floats:
     covariance C Λ C: what a prior is about is the same in every run. No more than C, which is of the errors as well.
     """
     spectrum = Spectrum(e.information)
-    inverse = spectrum.inverse()
-    inverse[spectrum.lost, spectrum.lost] = 0.0
-    variances = np.diag(inverse @ e.samples @ inverse)
-    deviations: Floats = np.sqrt(np.clip(variances, 0.0, np.diag(inverse)))
-    deviations[spectrum.lost] = math.inf
+    variances = np.diag(spectrum.sandwich(e.samples))
+    deviations: Floats = np.sqrt(np.clip(variances, 0.0, np.diag(spectrum.inverse())))
     return deviations
 
 

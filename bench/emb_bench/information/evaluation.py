@@ -87,7 +87,7 @@ def information_and_fit(
     totals: dict[Kind, Floats] = {"physical": nothing if start is None else start, "weighted": nothing}
     kept: dict[Kind, list[Floats]] = {kind: [np.empty((0, *nothing.shape))] for kind in KINDS}
     squares, count, done = np.zeros(2), 0, 0
-    pieces = list(replace(experiment, late=None, assumed=None, places=None).split(piece))
+    pieces = list(on_grid(experiment).split(piece))
     loop = fast_loop(experiment.periods)
     shown = simulate_parts(plant, theta, pieces, bench.timing.sample_time, names, loop) if pieces else ()
     for part, motion in zip(pieces, shown, strict=True):
@@ -103,6 +103,11 @@ def information_and_fit(
     angle, velocity = np.sqrt(squares / max(count, 1)).tolist()
     fit = Fit(angle, None if plant.instruments.observer_bandwidth > 0.0 else velocity, count)
     return {kind: np.concatenate(parts) for kind, parts in kept.items()}, fit
+
+
+def on_grid(experiment: Experiment) -> Experiment:
+    """The experiment with samples as on the grid, and with the currents that are assumed in gaps."""
+    return replace(experiment, late=None, assumed=None, places=None)
 
 
 @dataclass(frozen=True)
@@ -213,7 +218,9 @@ class Information:
         """
         if self.experiment is None:
             raise UsageError("each run has a trajectory of its own: expected the information of one of them")
-        return _motion(self.bench, self.plant, self.theta, self.errors, self.experiment, self.params)
+        experiment = on_grid(self.experiment)
+        at, loop = _placed(self.theta, self.errors, experiment, self.plant), fast_loop(experiment.periods)
+        return simulate(self.plant, at, experiment, self.bench.timing.sample_time, self.params, loop)
 
     @property
     def sensitivities(self) -> Floats:
@@ -313,30 +320,10 @@ def expected(
     experiment = planned(currents)
     if not experiment.periods:
         raise UsageError("expected at least one current")
-    shown = _motion(bench, plant, theta, errors, experiment, question.names)
-    starts: Mapping[Kind, Floats | None] = {"physical": question.start(theta), "weighted": None}
-    histories = {
-        kind: information_over_time(
-            shown.sensitivities, weights_along(bench, kind, plant.instruments, shown.states), start
-        )
-        for kind, start in starts.items()
-    }
-    instants = range(experiment.periods)
+    every, instants = replace(experiment, samples=np.zeros_like(experiment.samples)), range(experiment.periods)
+    at = _placed(theta, errors, experiment, plant)
+    histories, _ = information_and_fit(bench, plant, at, every, question.names, question.start(theta), instants)
     return Information(bench, plant, theta, errors, question, experiment, instants, histories)
-
-
-def _motion(
-    bench: Bench,
-    plant: Plant,
-    theta: BrakeParameters,
-    errors: SystematicErrors,
-    experiment: Experiment,
-    names: Sequence[str],
-) -> Trajectory:
-    """Motion and sensitivities of an experiment; samples as on the grid, what acted as it is assumed in gaps."""
-    experiment = replace(experiment, late=None, assumed=None, places=None)
-    at, loop = _placed(theta, errors, experiment, plant), fast_loop(experiment.periods)
-    return simulate(plant, at, experiment, bench.timing.sample_time, names, loop)
 
 
 def _placed(theta: BrakeParameters, errors: SystematicErrors, experiment: Experiment, plant: Plant) -> Theta:
