@@ -19,6 +19,7 @@ from emb_bench.commission.bench_file import WRITTEN, found_text, working_text
 from emb_bench.commission.records import Findings, Identification
 from emb_bench.commission.steps import EXPERIMENTS, Step, policy_file
 from emb_bench.config.bench import Bench, load_bench, parse_bench
+from emb_bench.logs.log import RunLog
 from emb_runtime.can.messages import bench_identity
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError, SafetyStopError, UsageError
@@ -82,7 +83,7 @@ class Commissioning:
     ) -> None:
         self._folder, self._sheet, self._iface, self._options = folder, sheet, iface, options
         self._make_run, self._say = run, say
-        self._logs: list[Path] = []
+        self._logs: list[RunLog] = []
         self._identified: Identification | None = None
         self._identity = sheet.identity_hash  # of the bench that the node is set up for
         self._runs = 0
@@ -120,12 +121,12 @@ class Commissioning:
             comparison.check_experiment(one, sheet, is_first=before is None)
             self._identified = one
         found = Findings(noise, current, move, one)
-        path = self._bench_file(FOUND, found_text(sheet, found, " and ".join(log.name for log in recent)))
+        path = self._bench_file(FOUND, found_text(sheet, found, " and ".join(log.path.name for log in recent)))
         bench = load_bench(path)
         log = self._log("9-full", steps.experiment(steps.FULL, bench, move), path)
         comparison.check_last(self._found(examination.identify([log], sheet, noise, one)), bench)
         ranges = {name: comparison.sheet_range(bench, name) for name in PARAMETER_NAMES}
-        return Commissioned(path, ranges, found, tuple(self._logs), self._runs)
+        return Commissioned(path, ranges, found, tuple(log.path for log in self._logs), self._runs)
 
     def _found(self, finding: Finding) -> Finding:
         self._say(f"  found: {finding}")
@@ -147,18 +148,18 @@ class Commissioning:
         path.write_text(text, encoding="utf-8")
         return path
 
-    def _log(self, name: str, step: Step, path: Path) -> Path:
+    def _log(self, name: str, step: Step, path: Path) -> RunLog:
         """The completed log of a step with a bench file: one that is there, else that of a new run."""
-        log, attempts = self._folder / f"{name}.mcap", 1
-        while log.exists() and not examination.is_completed(log):
+        file, attempts, log = self._folder / f"{name}.mcap", 1, None
+        while file.exists() and (log := examination.completed(file)) is None:
             attempts += 1
-            log = self._folder / f"{name}-attempt{attempts}.mcap"
-        if not log.exists():
-            self._run(name, step, path, log)
+            file = self._folder / f"{name}-attempt{attempts}.mcap"
+        if log is None:
+            log = self._run(name, step, path, file)
         self._logs.append(log)
         return log
 
-    def _run(self, name: str, step: Step, path: Path, log: Path) -> None:
+    def _run(self, name: str, step: Step, path: Path, log: Path) -> RunLog:
         self._say(f"{name}: {step.purpose}")
         bench = load_bench(path)
         if bench.identity_hash != self._identity:
@@ -170,8 +171,8 @@ class Commissioning:
         arguments += ["--policy", str(policy), "--log", str(log), "--duration", repr(step.duration)]
         self._runs += 1
         document = self._make_run([*arguments, *self._options, *step.stage, "--json"])
-        if document["exit_code"] == EXIT_DONE and examination.is_completed(log):
-            return
+        if document["exit_code"] == EXIT_DONE and (completed := examination.completed(log)) is not None:
+            return completed
         why, is_outside = _failure(document)
         advice = f"see {log}, and begin again in the same folder once the cause is removed"
         if is_outside:  # no brake of the set moves so

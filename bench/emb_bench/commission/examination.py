@@ -26,7 +26,7 @@ from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import NORMAL_95, EstimationProblem
 from emb_bench.experiment.experiment import Booleans, Experiment, Floats
 from emb_bench.experiment.from_log import read_experiment, step_of
-from emb_bench.logs.log import read_log
+from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report.sentences import alarms
 from emb_runtime.config.bench import PARAMETER_NAMES, Noise
 from emb_runtime.drives.mapping import Mapping as DriveMapping
@@ -44,27 +44,25 @@ LAGS_NO_LESS = 3.0  # Bandwidth times sample time beyond which no observer lags 
 UNIFORM = math.sqrt(1.0 / 12.0)  # Standard deviation of an error that may be anything within a step, in steps
 
 
-def is_completed(log: Path) -> bool:
-    """True if a run came to its planned end, its log is whole, and one that listened has samples enough at rest."""
+def completed(path: Path) -> RunLog | None:
+    """The log of a run that came to its planned end, whole, and with samples enough at rest if it listened; or None."""
     try:
-        opened = read_log(log)
+        log = read_log(path)
     except LogError:
-        return False
-    if not opened.complete or opened.exit_reason != "DONE":
-        return False
-    heard = opened.end.get("heard")
-    return heard is None or json.loads(heard).get("resting", 0) >= FEWEST
+        return None
+    heard = json.loads(log.end.get("heard", "null"))
+    is_whole = log.complete and log.exit_reason == "DONE"
+    return log if is_whole and (heard is None or heard.get("resting", 0) >= FEWEST) else None
 
 
-def noise_at_rest(log: Path, sheet: Bench) -> Noise:
+def noise_at_rest(log: RunLog, sheet: Bench) -> Noise:
     """Noise of the samples while the brake rests, as the run that listened has it, standard deviations.
 
     A drive's signal in steps that are coarser than the noise does not show it: that counts as the data sheet's.
     """
-    opened = read_log(log)
-    heard = json.loads(opened.end["heard"])
+    heard = json.loads(log.end["heard"])
     angle, velocity = max(heard["angle_scatter"], QUIET_ANGLE), max(heard["velocity_scatter"], QUIET_VELOCITY)
-    angle_step, velocity_step = _steps(opened.drive)
+    angle_step, velocity_step = _steps(log.drive)
     return Noise(
         sheet.noise.angle if angle_step > sheet.noise.angle else angle,
         sheet.noise.velocity if velocity_step > sheet.noise.velocity else velocity,
@@ -76,30 +74,27 @@ def _steps(drive: DriveMapping | None) -> tuple[float, float]:
     return (0.0, 0.0) if drive is None else (step_of(drive.angle), step_of(drive.velocity))
 
 
-def current(log: Path) -> CurrentCheck:
+def current(log: RunLog) -> CurrentCheck:
     """Scale and latency of the current, and how far the brake moved."""
-    opened = read_log(log)
-    experiment = read_experiment(opened)
+    experiment = read_experiment(log)
     late = experiment.command_delay
-    commands, reports = np.asarray(opened.cycles["sent_current"]), np.asarray(opened.cycles["applied_current"])
+    commands, reports = np.asarray(log.cycles["sent_current"]), np.asarray(log.cycles["applied_current"])
     sent, applied = commands[: len(commands) - 1 - late], reports[1 + late :]
     both = np.isfinite(sent) & np.isfinite(applied)
     power = float(sent[both] @ sent[both])
     if power == 0.0:
-        raise LogError(f"{log}: expected commands and reports of a current, got none")
+        raise LogError(f"{log.path}: expected commands and reports of a current, got none")
     angles = experiment.all_samples[:, 0]
     angles = angles[np.isfinite(angles)]
     smoothed = np.convolve(angles, np.full(SMOOTHED, 1.0 / SMOOTHED), "valid")
     moved = float(np.max(np.abs(smoothed - np.mean(angles[: 2 * SMOOTHED]))))
-    is_known = opened.drive_files is None or late > 0
+    is_known = log.drive_files is None or late > 0
     return CurrentCheck(late, late + (0 if is_known else 1), float(sent[both] @ applied[both]) / power, moved)
 
 
-def first_move(log: Path, noise: Noise) -> FirstMove:
+def first_move(log: RunLog, noise: Noise) -> FirstMove:
     """Currents at which the brake began to move, and the scale of the angle against the velocity."""
-    opened = read_log(log)
-    experiment = read_experiment(opened)
-    t_s = opened.bench.timing.sample_time
+    experiment, t_s = read_experiment(log), log.bench.timing.sample_time
     angle, velocity = experiment.all_samples.T
     seen = np.isfinite(angle) & np.isfinite(velocity)
     moving = seen & (np.abs(velocity) > MOVING * noise.velocity)
@@ -124,16 +119,15 @@ def _first(currents: Floats, chosen: Booleans) -> float:
 # --- identification -------------------------------------------------------------------------------------------------
 
 
-def identify(logs: Sequence[Path], sheet: Bench, noise: Noise, before: Identification | None) -> Identification:
+def identify(logs: Sequence[RunLog], sheet: Bench, noise: Noise, before: Identification | None) -> Identification:
     """Parameters from experiments, searched from the model that was found ``before``.
 
     The intervals allow for the systematic errors that the bench file does not exclude, but for those of J and of the
     angle's scale, which the shield shares: with them the parameters move the brake as it was measured.
     """
-    opened = [read_log(log) for log in logs]
-    experiments = [read_experiment(log) for log in opened]
+    experiments = [read_experiment(log) for log in logs]
     velocity = velocity_of(experiments, sheet.timing.sample_time)
-    bench = replace(sheet, noise=noise_in_motion(noise, opened[0].drive), sensors=velocity.sensors)
+    bench = replace(sheet, noise=noise_in_motion(noise, logs[0].drive), sensors=velocity.sensors)
     best = _best(bench, experiments, before, velocity.bandwidth)
     asked = with_systematic(best.asked, bench, best.plant)
     e = fit_from(Problem(bench, best.plant, asked, best.records), best).finished() if asked.systematic else best

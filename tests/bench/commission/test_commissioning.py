@@ -187,8 +187,8 @@ def test_an_observer_that_the_data_sheet_denies_ends_it_at_low_speed(tmp_path: P
 def test_a_mapped_drive_is_commissioned_up_to_its_first_move(tmp_path: Path) -> None:
     with pytest.raises(EnoughError):
         on_a_drive(tmp_path, up_to("5-free-stroke")).run()
-    assert examination.first_move(tmp_path / "4-first-move.mcap", NOISE).scale == pytest.approx(1.0, abs=0.05)
-    check = examination.current(tmp_path / "3-current.mcap")
+    assert examination.first_move(read_log(tmp_path / "4-first-move.mcap"), NOISE).scale == pytest.approx(1.0, abs=0.05)
+    check = examination.current(read_log(tmp_path / "3-current.mcap"))
     assert (check.delay, check.latest) == (1, 1)
     assert check.scale == pytest.approx(1.0, abs=1e-3)
 
@@ -207,7 +207,7 @@ def test_a_polled_drive_is_listened_to_as_any_other(tmp_path: Path) -> None:
     with pytest.raises(EnoughError):
         on_a_drive(tmp_path, up_to("3-current"), drive="mit", frame_age="[1, 3]").run()
     assert read_log(tmp_path / "1-listen.mcap").run["stage"] == "read-only"
-    assert examination.noise_at_rest(tmp_path / "1-listen.mcap", sheet()).angle > 0.0
+    assert examination.noise_at_rest(read_log(tmp_path / "1-listen.mcap"), sheet()).angle > 0.0
 
 
 def test_a_run_that_was_not_completed_is_done_again_under_another_name(tmp_path: Path) -> None:
@@ -227,7 +227,7 @@ def test_listening_counts_where_the_node_was_idle_for_long_enough_to_know_its_no
 ) -> None:
     log = SimpleNamespace(complete=True, exit_reason="DONE", end={"heard": json.dumps({"pairs": 2000, **heard})})
     monkeypatch.setattr(examination, "read_log", lambda _path: log)
-    assert examination.is_completed(Path("1-listen.mcap")) is enough
+    assert (examination.completed(Path("1-listen.mcap")) is not None) is enough
 
 
 def test_a_motion_of_no_brake_of_the_data_sheet_ends_it_with_what_to_look_at_and_its_exit_code(tmp_path: Path) -> None:
@@ -270,7 +270,7 @@ def test_a_start_that_a_few_samples_at_rest_tell_is_not_taken_for_exact(
         unlucky = replace(own, angle=-0.1 + error * own.slack)
         monkeypatch.setattr(examination, "read_experiment", lambda _log, unlucky=unlucky: unlucky)
         bench = load_bench()
-        one = examination.identify([log], bench, bench.noise, None)
+        one = examination.identify([read_log(log)], bench, bench.noise, None)
         assert one.fits
         for name, (low, high) in one.intervals.items():
             assert low <= getattr(bench.brake, name) <= high, name

@@ -10,6 +10,7 @@ import pytest
 from emb_bench.commission.examination import identify
 from emb_bench.commission.records import Identification
 from emb_bench.config.bench import Bench
+from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES
 
 from tests.bench.simulated_logs import square, write_log  # isort: skip
@@ -26,7 +27,7 @@ def logs_of(folder: Path, simulate: Simulate, plant: str, seeds: tuple[int, ...]
 
 def identified(bench: Bench, logs: list[Path], before: Identification | None = None) -> Identification:
     wide = replace(bench, shield=bench.shield._replace(ranges="pm50"))
-    return identify(logs, wide, bench.noise, before)
+    return identify([read_log(log) for log in logs], wide, bench.noise, before)
 
 
 def holds_the_truth(bench: Bench, one: Identification) -> bool:
