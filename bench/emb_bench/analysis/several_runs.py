@@ -81,7 +81,7 @@ def apart(e: Estimate) -> tuple[Differing, ...]:
     """
     if len(e.records) < 2 or e.validation.fits:
         return ()
-    from emb_bench.estimate.method import method_of
+    from emb_bench.estimate.methods import method_of
 
     every = [method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit([record]) for record in e.records]
     alone = [one for one in every if one.validation.fits]

@@ -26,7 +26,7 @@ from emb_bench.documents import ByName
 from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.intervals import bounded, union
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import SAME
 from emb_bench.estimate.records import DONE, STARTS, End, EstimationProblem, Suspect, Unknown
 from emb_bench.experiment.experiment import Experiment

@@ -70,7 +70,7 @@ def _steps(source: Source, options: Options) -> Iterator[Row]:
         yield {"T": interval.of_comparison, "I": interval.of_repeatability}
     if options.method == NONE:
         return
-    from emb_bench.estimate.method import method_of
+    from emb_bench.estimate.methods import method_of
 
     asked = with_systematic(EstimationProblem(options.params, options.nuisances, prior), bench, plant)
     method = method_of(options.method)(bench, plant, asked, starts=options.starts, seed=options.seed)

@@ -232,7 +232,7 @@ def other_model(now: Estimate, last: Earlier | None) -> str:
 
 def missing(study: Study) -> list[str]:
     """Defects of the logs; that a stopped run ended early is not repeated."""
-    from emb_bench.estimate.method import method_of
+    from emb_bench.estimate.methods import method_of
     from emb_bench.estimate.records import DONE
 
     found = []

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from emb_bench.config.bench import Bench
-from emb_bench.estimate.method import method_of
+from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import search, start_points
 from emb_bench.estimate.records import METHODS, EstimationProblem
 from emb_bench.experiment.experiment import Experiment, planned
