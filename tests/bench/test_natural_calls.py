@@ -285,12 +285,12 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], type[Exception], str]] = {
         "no column is called 'x'; it has: t, y, F",
     ),
     "estimate(t=, y=, u=)": (
-        lambda s: api.estimate(t=CURRENTS, y=CURRENTS, u=CURRENTS),  # type: ignore[call-arg]
+        lambda s: api.estimate(t=CURRENTS, y=CURRENTS, u=CURRENTS),
         UsageError,
         "arrays are a table: estimate({'t': t, 'y': y, 'u': u}, map='map.toml')",
     ),
     "estimate(run, parameters=)": (
-        lambda s: api.estimate(s.run, parameters="f_v"),  # type: ignore[call-arg]
+        lambda s: api.estimate(s.run, parameters="f_v"),
         UsageError,
         "estimate has no option 'parameters'; did you mean params?",
     ),
@@ -300,7 +300,7 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], type[Exception], str]] = {
         "report has no option 'pram'; did you mean params?",
     ),
     "fisher_information(run, thta=)": (
-        lambda s: api.fisher_information(s.run, thta="nominal"),  # type: ignore[call-arg]
+        lambda s: api.fisher_information(s.run, thta="nominal"),
         UsageError,
         "did you mean theta?",
     ),

@@ -29,7 +29,7 @@ def test_whatever_is_told_no_plant_takes_the_same(bench: Bench) -> None:
         open_sim("", bench)[0].truth["plant"],
         read_brake(node.parser().parse_args(["--iface", "vcan0"]).brake, bench, "").plant.name,
         *(inspect.signature(call).parameters["plant"].default for call in (api.simulate, Batch)),
-        *(inspect.signature(call).parameters["model"].default for call in (api.design, make_problem)),
+        *(inspect.signature(call).parameters["model"].default for call in (api.DesignOptions, make_problem)),
     ]
     assert set(defaults) == {DEFAULT_PLANT}
     assert bench.plant(DEFAULT_PLANT).mechanics.solver == EXACT

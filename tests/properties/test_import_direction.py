@@ -25,7 +25,7 @@ OWN = Path(__file__).relative_to(ROOT)
 OURS = set.union(*MAY_IMPORT.values())
 ROOMS = {
     "runtime/emb_runtime": "errors records numbers system config can estimator policy log safety drives control cli",
-    "bench/emb_bench": "config documents numbers compiled output figures parallel brake sim logs experiment "
+    "bench/emb_bench": "config documents numbers options compiled output figures parallel brake sim logs experiment "
     "information excitation recordings hil rerun estimate design export analysis report commission live batch "
     "api cli",
     "train/emb_train": "presets rewards closed_loop intervals lies env play ppo plan training network optimum evaluate "

@@ -1,14 +1,13 @@
-"""Study of logs: estimate, model validation, conclusions and drift."""
+"""Study of runs of one brake: experiments, joint estimate, checks, conclusions, and the verdict on all of it."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from html import escape
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from emb_bench.analysis.conclusion import Conclusion, conclude
 from emb_bench.analysis.drift import Drift, Earlier, drifts
 from emb_bench.analysis.held_out import HeldOut, leave_one_out
 from emb_bench.analysis.model_choice import ModelChoice, choose_model
+from emb_bench.analysis.options import EstimateOptions
 from emb_bench.analysis.profile import Profile, profiles
 from emb_bench.analysis.several_runs import Differing, apart
 from emb_bench.brake.motion import Floats
@@ -23,12 +23,12 @@ from emb_bench.brake.parameters import least
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, EVERY, Plant
 from emb_bench.documents import ByName
-from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.intervals import bounded, union
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import SAME
-from emb_bench.estimate.records import DONE, STARTS, End, EstimationProblem, Suspect, Unknown
+from emb_bench.estimate.prediction import too_few
+from emb_bench.estimate.records import DONE, End, Unknown
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.figures import for_notebook
@@ -36,19 +36,8 @@ from emb_bench.information.evaluation import check_sample_time, default_model
 from emb_bench.logs.log import RunLog, end_detail
 from emb_bench.numbers import amount
 from emb_runtime.config.bench import BrakeParameters
-from emb_runtime.errors import UsageError, needs
+from emb_runtime.errors import LogError, UsageError, needs
 from emb_runtime.safety.state_machine import FAULTS, Fault
-
-SHOWN = 3  # Most suspected effects that are named
-
-
-class ModelStanding(StrEnum):
-    """Verdict of the tests on the model."""
-
-    FITS = "fits"
-    BIASED_METHOD = "not judged by a method that is biased"
-    DOES_NOT_FIT = "DOES NOT FIT"
-    DOES_NOT_PREDICT = "DOES NOT PREDICT"
 
 
 @dataclass(frozen=True)
@@ -69,41 +58,55 @@ class Stop:
         return self.periods < self.planned
 
 
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One run of a study."""
+
+    log: RunLog
+    name: str  # Name to show: the file's, or its path where another one has that name
+    experiment: Experiment | None  # None if the log has none
+    why_not: str = ""  # Reason that it has no part in the estimate; empty if it has
+    alone: Study | None = None  # Study of this run by itself, where a report has several
+
+    @property
+    def stop(self) -> Stop | None:
+        """Its end; None if the log has no other reason for it than completion."""
+        if self.log.end.get("exit_reason", DONE) == DONE:
+            return None
+        reason, x = self.log.exit_reason, self.experiment
+        periods, planned = (0, 0) if x is None else (x.periods, x.planned)
+        fault = FAULTS[Fault[reason]] if reason in Fault.__members__ else None
+        cause, advice = ("", "") if fault is None else (fault.cause, fault.advice)
+        return Stop(self.name, reason, end_detail(self.log.end), periods, planned, cause, advice)
+
+
 @dataclass(frozen=True)
-class StudyOptions:
-    """Method and extent of a study."""
+class Checks:
+    """Checks of a joint estimate."""
 
-    asked: EstimationProblem
-    method: str = "oem"  # A key of ``records.METHODS``
-    model: str | None = None
-    """Name of a plant of the bench, or ``all`` for the one that explains the logs best; without, the one that was
-    simulated, or the exact one where logs name none."""
-    starts: int = STARTS
-    seed: int = 0  # Seed of the starting points of searches
-    profiles: bool = False
-    """True for profiles of all shared unknowns, False for only those whose verdict may depend on one."""
-    systematic: bool = True  # True to estimate the bench's systematic errors along
+    profiles: tuple[Profile, ...] = ()
+    """Profiles of the unknowns that the records share: all, or those whose verdict may depend on one."""
+    held_out: tuple[HeldOut, ...] = ()  # Prediction of each record from the others; empty for a single record
+    drifts: tuple[Drift, ...] = ()
+    choice: ModelChoice | None = None  # Models that were compared; None if one was given
+    apart: tuple[Differing, ...] = ()  # Parameters in which runs differ that each fit alone; empty if they fit together
 
-    def problem(self, bench: Bench, plant: Plant) -> EstimationProblem:
-        """The unknowns of a plant, with the systematic errors that it can have where they are estimated too."""
-        return with_systematic(self.asked, bench, plant) if self.systematic else self.asked
+    @property
+    def predicts(self) -> bool:
+        """Returns True if no prediction of a record rejects the model."""
+        return all(record.fits for record in self.held_out)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Study:
-    """Result of a study: the estimate from logs of one brake, its checks and the conclusions."""
+    """Runs of one brake, their joint estimate, its checks and the conclusions."""
 
-    estimate: Estimate
-    logs: tuple[RunLog, ...]  # In the order of the estimate's records
-    options: StudyOptions
-    last: Earlier | None  # Estimate that this one is compared with
-    profiles: tuple[Profile, ...]
-    """Profiles of the unknowns that the records share: all, or those whose verdict may depend on one."""
-    left_out: tuple[HeldOut, ...]  # Prediction of each record from the others; empty for a single record
-    drifts: tuple[Drift, ...]
+    runs: tuple[Run, ...]
+    joint: Estimate | None  # Of the runs that have a part in it, in their order; None in a report where none has
+    checks: Checks
     conclusions: tuple[Conclusion, ...]
-    choice: ModelChoice | None = None  # Models that were compared; None if one was given
-    apart: tuple[Differing, ...] = ()  # Parameters in which logs differ that each fit alone; empty if they fit together
+    options: EstimateOptions
+    last: Earlier | None = None  # Estimate that this one is compared with
 
     def __repr__(self) -> str:
         """Verdict and values in one line."""
@@ -122,7 +125,8 @@ class Study:
 
     @property
     def _verdict(self) -> str:
-        return f"model '{self.estimate.plant.name}' {self.standing}"
+        found = verdict(self)
+        return "no estimate" if self.joint is None else f"model '{self.joint.plant.name}' {found.standing}"
 
     @property
     def _cells(self) -> list[tuple[str, str, str]]:
@@ -202,9 +206,36 @@ class Study:
             return pa.Table.from_pylist(rows).to_pandas().set_index("name")
 
     @property
+    def estimate(self) -> Estimate:
+        """The joint estimate.
+
+        Raises:
+            LogError: no run has a part in one.
+        """
+        if self.joint is None:
+            raise LogError(self.why_not)
+        return self.joint
+
+    @property
+    def why_not(self) -> str:
+        """Reason that there is no estimate; empty if there is one."""
+        reasons = [f"{run.name}: {run.why_not}" if len(self.runs) > 1 else run.why_not for run in self.runs]
+        return "; ".join(reasons) if self.joint is None else ""
+
+    @property
+    def used(self) -> tuple[Run, ...]:
+        """The runs of the estimate, in the order of its records."""
+        return tuple(run for run in self.runs if not run.why_not)
+
+    @property
+    def logs(self) -> tuple[RunLog, ...]:
+        """The logs of the estimate, in the order of its records."""
+        return tuple(run.log for run in self.used)
+
+    @property
     def names(self) -> list[str]:
-        """Names to show for the logs."""
-        return file_names([log.path for log in self.logs])
+        """Names to show for the runs of the estimate, or for all where there is none."""
+        return [run.name for run in self.used or self.runs]
 
     @property
     def truth(self) -> BrakeParameters | None:
@@ -213,64 +244,29 @@ class Study:
         return truths.pop() if len(truths) == 1 else None
 
     @property
-    def stopped(self) -> list[Stop]:
+    def stops(self) -> list[Stop]:
         """Ends of the runs that were stopped."""
-        ends = map(stop_of, self.logs, self.estimate.records, self.names)
-        return [stop for stop in ends if stop is not None]
+        return [stop for run in self.runs if (stop := run.stop) is not None]
 
     @property
     def model_fits(self) -> bool:
         """Returns True if the residual tests do not reject the model."""
-        return self.estimate.validation.fits
+        return self.joint is not None and self.joint.validation.fits
 
     @property
-    def predicts(self) -> bool:
-        """Returns True if no prediction of a record rejects the model."""
-        return all(h.fits for h in self.left_out)
+    def outside(self) -> list[tuple[str, Conclusion]]:
+        """Parameters outside of the ranges for which the shield guarantees the limits, behind the name of the run.
 
-    @property
-    def holds(self) -> bool:
-        """Returns True if the model fits and predicts."""
-        return self.model_fits and self.predicts
-
-    @property
-    def identified(self) -> bool:
-        """Returns True if all parameters of interest are identified."""
-        return not self.unidentified
-
-    @property
-    def biased(self) -> bool:
-        """Returns True if the tests fail for recursive least squares, whose bias is no evidence against the model."""
-        return self.estimate.method == "rls" and not self.holds
-
-    @property
-    def standing(self) -> ModelStanding:
-        """Verdict of the tests on the model."""
-        if self.biased:
-            return ModelStanding.BIASED_METHOD
-        if not self.model_fits:
-            return ModelStanding.DOES_NOT_FIT
-        return ModelStanding.FITS if self.predicts else ModelStanding.DOES_NOT_PREDICT
-
-    @property
-    def aborted(self) -> bool:
-        """Returns True if no experiment came to its planned end: a cause is to be found before any value is used."""
-        return len(self.stopped) == len(self.logs) and all(stop.aborted for stop in self.stopped)
-
-    @property
-    def outside(self) -> tuple[Conclusion, ...]:
-        """Parameters outside of the ranges for which the shield guarantees the limits."""
-        return tuple(c for c in self.conclusions if c.outside is not None)
+        Of runs that are estimated alone, too, each one's.
+        """
+        found = [(run.name, c) for run in self.runs if run.alone is not None for c in run.alone.conclusions]
+        found = found or [(self.names[0], c) for c in self.conclusions]
+        return [(name, c) for name, c in found if c.outside is not None]
 
     @property
     def unidentified(self) -> tuple[str, ...]:
         """Parameters of interest that are not identified."""
         return tuple(c.label for c in self.conclusions if c.of_interest and not c.identified)
-
-    @property
-    def suspects(self) -> tuple[Suspect, ...]:
-        """Effects that the model lacks, as the residuals suggest; the most suspicious ones first."""
-        return self.estimate.validation.suspected[:SHOWN]
 
     @property
     def minima(self) -> list[list[End]]:
@@ -284,65 +280,180 @@ class Study:
         return groups
 
 
-def make_study(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions, *, last: Earlier | None = None) -> Study:
-    """Estimates from logs, checks the model and draws the conclusions.
+# ---- the verdict ----
+
+
+class Result(StrEnum):
+    """Result of an acceptance criterion, or of all together."""
+
+    PASS = "pass"
+    FAIL = "fail"
+    CANNOT_TELL = "cannot tell"
+
+
+class Code(StrEnum):
+    """Verdict on a study."""
+
+    ABORTED = "every experiment was cut short"
+    STOPPED = "a run was stopped"
+    REJECTED = "not accepted"
+    UNDECIDED = "acceptance not decided"
+    ACCEPTED = "accepted"
+    NO_ESTIMATE = "no estimate"
+    APART = "each run fits alone"
+    BIASED_METHOD = "not judged by a method that is biased"
+    DOES_NOT_FIT = "DOES NOT FIT"
+    DOES_NOT_PREDICT = "DOES NOT PREDICT"
+    NOT_IDENTIFIED = "not all parameters are identified"
+    FITS = "fits"
+
+
+Tone = Literal["good", "care", "bad"]
+
+
+class Verdict(NamedTuple):
+    """Answer to the question whether a study is good."""
+
+    code: Code
+    tone: Tone
+    model: Code  # Verdict on the model alone
+
+    @property
+    def holds(self) -> bool:
+        """Returns True if the model fits and predicts."""
+        return self.model in (Code.FITS, Code.NOT_IDENTIFIED)
+
+    @property
+    def biased(self) -> bool:
+        """Returns True if the tests fail for a method whose bias is no evidence against the model."""
+        return self.model is Code.BIASED_METHOD
+
+    @property
+    def standing(self) -> str:
+        """The verdict of the tests on the model."""
+        return Code.FITS.value if self.holds else self.model.value
+
+
+Held = Callable[["Study", Result | None], bool]
+VERDICTS: tuple[tuple[Code, Tone, Held], ...] = (
+    (Code.ABORTED, "bad", lambda s, _: bool(s.used) and all(run.stop and run.stop.aborted for run in s.used)),
+    (Code.STOPPED, "bad", lambda s, _: bool(s.stops)),
+    (Code.REJECTED, "bad", lambda _, accepted: accepted is Result.FAIL),
+    (Code.UNDECIDED, "care", lambda _, accepted: accepted is Result.CANNOT_TELL),
+    (Code.ACCEPTED, "good", lambda _, accepted: accepted is Result.PASS),
+    (Code.APART, "bad", lambda s, _: bool(s.checks.apart)),
+)
+"""Verdicts on a study as a whole, the most severe first, with their tones and conditions."""
+MODEL_VERDICTS: tuple[tuple[Code, Tone, Held], ...] = (
+    (Code.NO_ESTIMATE, "care", lambda s, _: s.joint is None),
+    (Code.BIASED_METHOD, "bad", lambda s, _: s.estimate.method == "rls" and not (s.model_fits and s.checks.predicts)),
+    (Code.DOES_NOT_FIT, "bad", lambda s, _: not s.model_fits),
+    (Code.DOES_NOT_PREDICT, "bad", lambda s, _: not s.checks.predicts),
+    (Code.NOT_IDENTIFIED, "care", lambda s, _: bool(s.unidentified)),
+    (Code.FITS, "good", lambda *_: True),
+)
+"""Those on its model, which follow."""
+
+
+def verdict(study: Study, accepted: Result | None = None) -> Verdict:
+    """The most severe verdict that holds; ``accepted`` is the result of acceptance criteria, if there are any.
+
+    A brake outside of the shield's ranges is never good, nor is a simulated one, or a log that lacks something.
+    """
+    model, tone = next((code, tone) for code, tone, held in MODEL_VERDICTS if held(study, accepted))
+    code, tone = next(((code, tone) for code, tone, held in VERDICTS if held(study, accepted)), (model, tone))
+    if study.outside:
+        tone = "bad"
+    elif tone == "good" and any(run.log.simulated or not run.log.complete for run in study.used or study.runs):
+        tone = "care"
+    return Verdict(code, tone, model)
+
+
+# ---- from logs to a study ----
+
+
+def make_study(
+    bench: Bench,
+    logs: Sequence[RunLog],
+    options: EstimateOptions,
+    *,
+    last: Earlier | None = None,
+    for_report: bool = False,
+) -> Study:
+    """Reads the experiments of logs, estimates from them together, checks the model and draws the conclusions.
+
+    For a report a log without an experiment is named instead of refused, and of several runs each is studied alone,
+    too.
 
     Raises:
         UsageError: logs do not go together, one run is given twice, or they are too few for the options.
         LogError: a log lacks what an estimate needs.
     """
-    for log in logs:
+    runs = [_read(bench, log, name, options, for_report) for log, name in zip(logs, _names(logs), strict=True)]
+    used = [run for run in runs if not run.why_not]
+    _check_different([run.experiment for run in used if run.experiment is not None])
+    if not used:
+        return Study(tuple(runs), None, Checks(), (), options, last)
+    study = _study(bench, runs, options, last)
+    if not for_report or len(used) == 1:
+        return study
+    single = replace(options, profile=False)
+    alone = (run if run.why_not else replace(run, alone=_study(bench, [run], single)) for run in runs)
+    return replace(study, runs=tuple(alone))
+
+
+def _read(bench: Bench, log: RunLog, name: str, options: EstimateOptions, for_report: bool) -> Run:
+    """A run with its experiment; for a report one without a part in the estimate where its log says too little."""
+    if not for_report:
         check_sample_time(log, bench)
-    if wanted.model == EVERY and wanted.method != "oem":
-        raise UsageError(f"--model {EVERY} compares models by output error: expected --method oem, got {wanted.method}")
-    plant = begun_with(bench, logs, wanted)
-    names = file_names([log.path for log in logs])
-    experiments = [read_experiment(log, bench, name) for log, name in zip(logs, names, strict=True)]
+        return Run(log, name, read_experiment(log, bench, name))
+    try:
+        experiment = read_experiment(log, bench, name)
+    except LogError as err:
+        return Run(log, name, None, str(err).removeprefix(f"{log.path}: "))
+    check_sample_time(log, bench)
+    plant = plant_of(bench, [log], options)
+    samples = int(experiment.measured.sum())
+    return Run(log, name, experiment, too_few(plant, options.problem(bench, plant), samples, 1))
+
+
+def _study(bench: Bench, runs: Sequence[Run], options: EstimateOptions, last: Earlier | None = None) -> Study:
+    """The study of runs, of which at least one has a part in the estimate."""
+    used = [run for run in runs if not run.why_not]
+    method = options.method_on(bench)
+    if options.model == EVERY and method != "oem":
+        raise UsageError(f"--model {EVERY} compares models by output error: expected --method oem, got {method}")
+    plant, choice = plant_of(bench, [run.log for run in used], options), None
 
     def records_of(plant: Plant) -> list[Experiment]:
-        return [own.seen_by(plant) for own in experiments]
+        return [run.experiment.seen_by(plant) for run in used if run.experiment is not None]
 
-    _check_different(experiments)
-    choice = None
-    if wanted.model == EVERY:
-        choice = choose_model(
-            bench,
-            [bench.model(name) for name in bench.plants],
-            records_of,
-            wanted.problem(bench, plant),
-            starts=wanted.starts,
-            seed=wanted.seed,
-        )
+    if options.model == EVERY:
+        plants, asked = [bench.model(name) for name in bench.plants], options.problem(bench, plant)
+        choice = choose_model(bench, plants, records_of, asked, starts=options.starts, seed=options.seed)
         e = choice.best.estimate
     else:
-        asked = wanted.problem(bench, plant)
-        e = method_of(wanted.method)(bench, plant, asked, starts=wanted.starts, seed=wanted.seed).fit(records_of(plant))
-    # The likelihood of a whole recording is none of windows.
-    found = profiles(e, of_all=wanted.profiles) if wanted.method != "windows" else ()
-    changes = () if last is None else drifts(e, last)
-    left_out = leave_one_out(e) if len(logs) > 1 else ()
-    return Study(
-        estimate=e,
-        logs=tuple(logs),
-        options=wanted,
-        last=last,
-        profiles=found,
-        left_out=left_out,
-        drifts=changes,
-        conclusions=covering(
-            conclude(e, found, changes, predicts=all(h.fits for h in left_out)),
-            [e.unknowns[i] for i in e.wanted()],
-            choice,
-        ),
+        estimator = method_of(method)(
+            bench, plant, options.problem(bench, plant), starts=options.starts, seed=options.seed
+        )
+        e = estimator.fit(records_of(plant))
+    checks = Checks(
+        # The likelihood of a whole recording is none of windows.
+        profiles=profiles(e, of_all=options.profile) if method != "windows" else (),
+        held_out=leave_one_out(e) if len(used) > 1 else (),
+        drifts=() if last is None else drifts(e, last),
         choice=choice,
-        apart=apart(e) if wanted.method == "oem" else (),
+        apart=apart(e) if method == "oem" else (),
     )
+    conclusions = conclude(e, checks.profiles, checks.drifts, predicts=checks.predicts)
+    conclusions = covering(conclusions, [e.unknowns[i] for i in e.wanted()], choice)
+    return Study(tuple(runs), e, checks, conclusions, options, last)
 
 
-def begun_with(bench: Bench, logs: Sequence[RunLog], wanted: StudyOptions) -> Plant:
+def plant_of(bench: Bench, logs: Sequence[RunLog], options: EstimateOptions) -> Plant:
     """The plant that a study of logs begins with: the one that was asked for, or that of the logs."""
-    if wanted.model is not None:
-        return bench.model(DEFAULT_PLANT if wanted.model == EVERY else wanted.model)
+    if options.model is not None:
+        return bench.model(DEFAULT_PLANT if options.model == EVERY else options.model)
     models = sorted({default_model(log)[0] for log in logs})
     if len(models) > 1:
         raise UsageError(
@@ -376,18 +487,7 @@ def _check_different(records: Sequence[Experiment]) -> None:
                 raise UsageError(f"{record.name}: the same samples as in {other.name}: expected each run once")
 
 
-def file_names(paths: Sequence[Path]) -> list[str]:
-    """Names to show for files: the file name where it is unique, else the path."""
-    counts = Counter(path.name for path in paths)
-    return [path.name if counts[path.name] == 1 else str(path) for path in paths]
-
-
-def stop_of(log: RunLog, experiment: Experiment | None, name: str) -> Stop | None:
-    """End of a run that was stopped; None if the log has no other reason for its end than completion."""
-    if log.end.get("exit_reason", DONE) == DONE:
-        return None
-    reason = log.exit_reason
-    periods, planned = (0, 0) if experiment is None else (experiment.periods, experiment.planned)
-    fault = FAULTS[Fault[reason]] if reason in Fault.__members__ else None
-    cause, advice = ("", "") if fault is None else (fault.cause, fault.advice)
-    return Stop(name, reason, end_detail(log.end), periods, planned, cause, advice)
+def _names(logs: Sequence[RunLog]) -> list[str]:
+    """Names to show for logs: the file's where it is unique, else the path."""
+    counts = Counter(log.path.name for log in logs)
+    return [log.path.name if counts[log.path.name] == 1 else str(log.path) for log in logs]

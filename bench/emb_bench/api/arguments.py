@@ -1,43 +1,39 @@
-"""Arguments that several functions have: runs, names and values of parameters, numbers with a least value."""
+"""Arguments that several functions have: runs, options, values of parameters."""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from functools import wraps
-from inspect import signature
+from dataclasses import fields
 from numbers import Real
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ParamSpec, TypeGuard, TypeVar
+from typing import Any, TypeGuard, TypeVar
 from weakref import finalize
 
-from emb_bench.config.bench import Bench
 from emb_bench.logs.log import RunLog, read_log, require_driven
-from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_bench.options import Options
 from emb_runtime.errors import UsageError, near, needs
 from emb_runtime.system.terminal import mention
 
 Source = RunLog | str | Path | Mapping[str, Any]
-Names = str | Sequence[str]
 MEANT: Mapping[str, str] = {"plant": "model", "parameters": "params"}
 """Options of one function by the names that others have for them."""
-P = ParamSpec("P")
-R = TypeVar("R")
+Record = TypeVar("Record", bound=Options)
 
 
-def refuses(function: Callable[P, R]) -> Callable[P, R]:
-    """The function, which says what was meant by an option that it does not have."""
-    known = [*signature(function).parameters]
+def options_of(function: str, record: type[Record], options: Record | None, more: Mapping[str, Any]) -> Record:
+    """Options of a call: a record of them, or its fields as keywords.
 
-    @wraps(function)
-    def checked(*runs: P.args, **options: P.kwargs) -> R:
-        require_options(function.__name__, options, known)
-        return function(*runs, **options)
-
-    return checked
+    Raises:
+        UsageError: a keyword is no field of the record, or there are both.
+    """
+    require_options(function, more, [one.name for one in fields(record)])
+    if options is not None and more:
+        raise UsageError(f"{function}: expected a record of options or keywords, got both")
+    return record(**more) if options is None else options
 
 
 def require_options(function: str, options: Mapping[str, Any], known: Sequence[str]) -> None:
@@ -120,39 +116,6 @@ def is_row(run: Any) -> TypeGuard[Sequence[float]]:
     """True for currents: an array, or a sequence of numbers."""
     numbers = isinstance(run, Sequence) and len(run) > 0 and all(isinstance(value, Real) for value in run)
     return numbers or (hasattr(run, "__array__") and not is_table(run))
-
-
-def names_of(names: Names) -> tuple[str, ...]:
-    """Names, or a text with commas between them."""
-    listed = names.split(",") if isinstance(names, str) else names
-    return tuple(name for entry in listed if (name := entry.strip()))
-
-
-def unknowns(
-    params: Names | None, nuisance: Names | None, bench: Bench | None
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Parameters and nuisances; those that are not given are the machine's of the bench, if it has one."""
-    machine = None if bench is None else bench.machine
-    default = (PARAMETER_NAMES, ()) if machine is None else (machine.unknown, machine.nuisances)
-    return default[0] if params is None else names_of(params), default[1] if nuisance is None else names_of(nuisance)
-
-
-def text_of(theta: str | Path | Mapping[str, float] | None) -> str:
-    """Parameters as the option ``--theta`` has them."""
-    if isinstance(theta, Mapping):
-        return ",".join(f"{name}={value}" for name, value in theta.items()) or "nominal"
-    return "" if theta is None else str(theta)
-
-
-def check(options: Mapping[str, tuple[int, int]]) -> None:
-    """Check numbers against the least that each may be.
-
-    Raises:
-        UsageError: one is smaller.
-    """
-    for option, (value, least) in options.items():
-        if value < least:
-            raise UsageError(f"{option}: expected a number from {least}, got {value}")
 
 
 def say(text: str) -> None:

@@ -3,47 +3,54 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, cast
 
-from emb_bench.api.arguments import Names, check, names_of, text_of
+from emb_bench.analysis.options import Names, names_of
+from emb_bench.api.arguments import options_of
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.design.kernel import COARSE_SEARCHES
+from emb_bench.options import Options, option
 from emb_bench.output import progress, say_if_compiling
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import needs
 
 if TYPE_CHECKING:
     from emb_bench.design.report import Report
+    from emb_bench.information.fisher import Kind
 
 
-def design(
-    *,
-    criterion: Literal["T", "I", "D", "A", "E", "k_m", "k_1", "T_c", "f_v"] = "T",
-    params: Names = PARAMETER_NAMES,
-    theta: str | Path | Mapping[str, float] | None = None,
-    model: str = DEFAULT_PLANT,
-    kind: Literal["physical", "weighted"] = "physical",
-    return_home: bool = True,
-    starts: int = COARSE_SEARCHES,
-    seed: int = 0,
-    bench: str | Path | None = None,
-    told: Callable[[str], object] | None = None,
-) -> Report:
+@dataclass(frozen=True)
+class DesignOptions(Options):
+    """Options of a design."""
+
+    criterion: str = option(
+        "T",
+        "what is optimised (default: T); for a parameter, its share in T",
+        choices=("T", "I", "D", "A", "E", *PARAMETER_NAMES),
+    )
+    params: Names = option(PARAMETER_NAMES, "unknown parameters (default: the four of the brake)", "NAMES")
+    theta: str | Path | Mapping[str, float] | None = option(
+        None, "the brake's parameters, as name=value,...; the others are nominal", "THETA"
+    )
+    model: str = option(DEFAULT_PLANT, "plant of the bench (default: exact)", "MODEL")
+    kind: str = option("physical", "which Fisher information (default: physical)", choices=("physical", "weighted"))
+    return_home: bool = option(True, "it may end anywhere within the limits")
+    starts: int = option(COARSE_SEARCHES, "coarse searches (default: 18)", "N", kind=int, least=1)
+    seed: int = option(0, "seed of the random starts (default: 0)", "N", kind=int, least=0)
+    bench: str | Path | None = option(None, "bench file (default: the shipped one)", "FILE", kind=Path)
+
+
+def design(options: DesignOptions | None = None, *, told: Callable[[str], object] | None = None, **more: Any) -> Report:
     """The current sequence with most information about parameters that are known, under the limits of the bench.
 
     Args:
-        criterion: what is optimised (default: T); for a parameter, its share in T.
-        params: unknown parameters (default: the four of the brake).
-        theta: the brake's parameters, as name=value,...; the others are nominal.
-        model: plant of the bench (default: exact).
-        kind: which Fisher information (default: physical).
-        return_home: the brake returns home at the end; without, it may end anywhere within the limits.
-        starts: coarse searches (default: 18).
-        seed: seed of the random starts (default: 0).
-        bench: bench file (default: the shipped one).
+        options: a record of options.
         told: called after each step of the search with what was done (default: a bar on a terminal).
+        more: fields of the record as keywords: ``design(criterion="A")``; without ``return_home`` the brake may end
+            anywhere within the limits.
 
     Returns:
         The report; ``report.found.best.currents`` are the currents [A], one per sample period.
@@ -54,17 +61,20 @@ def design(
     from emb_bench.information.criteria import Criterion
     from emb_bench.sim.simulated_brake import parse_assignments, true_parameters
 
-    check({"--starts": (starts, 1), "--seed": (seed, 0)})
-    its, names = load_bench(bench), names_of(params)
+    asked = options_of("design", DesignOptions, options, more)
+    its, names = load_bench(asked.bench), names_of(asked.params)
     with needs("a design", "bench"):
         from emb_bench.design.problem import make_problem
         from emb_bench.design.report import make_report
         from emb_bench.design.search import steps_of
         from emb_bench.estimate.expected import IntervalCriterion
-    goal = Criterion(criterion) if criterion in ("D", "A", "E") else IntervalCriterion(criterion)
-    given = parse_assignments(text_of(theta).replace("nominal", ""), "--theta: ")
-    brake = true_parameters(its, given, option="--theta: ")
-    problem = make_problem(its, goal, names, model=model, kind=kind, brake=brake, returns=return_home)
+    name: Any = asked.criterion
+    goal = Criterion(name) if name in ("D", "A", "E") else IntervalCriterion(name)
+    text = "" if asked.theta in (None, "nominal") else str(asked.theta)
+    theta = asked.theta if isinstance(asked.theta, Mapping) else parse_assignments(text, "--theta: ")
+    brake = true_parameters(its, theta, option="--theta: ")
+    kind = cast("Kind", asked.kind)
+    problem = make_problem(its, goal, names, model=asked.model, kind=kind, brake=brake, returns=asked.return_home)
     say_if_compiling()
-    with progress("design", steps_of(goal, starts)) as advance:
-        return make_report(its, problem, kind, starts=starts, seed=seed, told=told or advance)
+    with progress("design", steps_of(goal, asked.starts)) as advance:
+        return make_report(its, problem, kind, starts=asked.starts, seed=asked.seed, told=told or advance)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emb_bench.api.arguments import Names, Source, driven, is_row, listed, refuses, text_of, unknowns
+from emb_bench.analysis.options import Names, QuestionOptions
+from emb_bench.api.arguments import Source, driven, is_row, listed, options_of
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.experiment.experiment import planned
+from emb_bench.options import option
 from emb_runtime.errors import UsageError, needs
 
 if TYPE_CHECKING:
@@ -18,19 +21,29 @@ if TYPE_CHECKING:
     from emb_bench.information.evaluation import Information
 
 
-@refuses
+@dataclass(frozen=True)
+class FimOptions(QuestionOptions):
+    """Options of a Fisher information."""
+
+    theta: str | Path | Mapping[str, float] | None = option(
+        None,
+        "where to evaluate: 'log' for the running estimate in the log, 'nominal', 'true' of a simulated brake, "
+        "'name=value,...', or the JSON of an estimate or report (default: log, and nominal where it has no estimate)",
+        "THETA",
+    )
+    plant: str | None = None  # The model, by the name that ``simulate`` has for it
+    parameters: Mapping[str, float] | None = None  # The parameters, as ``simulate`` has them, in place of ``theta``
+
+    def __post_init__(self) -> None:
+        """Check all that needs no bench."""
+        super().__post_init__()
+        for name, one, other in (("model", self.model, self.plant), ("theta", self.theta, self.parameters)):
+            if one is not None and other is not None:
+                raise UsageError(f"{'plant' if name == 'model' else 'parameters'} is {name}: expected one of the two")
+
+
 def fisher_information(
-    run: Source | Sequence[Source] | Sequence[float] | Any,
-    *,
-    model: str | None = None,
-    params: Names | None = None,
-    nuisance: Names | None = None,
-    prior: str | None = None,
-    theta: str | Path | Mapping[str, float] | None = None,
-    bench: str | Path | None = None,
-    map: str | Path | None = None,  # noqa: A002  # as the option is called
-    plant: str | None = None,
-    parameters: Mapping[str, float] | None = None,
+    run: Source | Sequence[Source] | Sequence[float] | Any = (), options: FimOptions | None = None, **more: Any
 ) -> Information:
     """Fisher information of a run: how precisely its parameters can be known at best.
 
@@ -40,18 +53,8 @@ def fisher_information(
 
     Args:
         run: MCAP file of emb-run; with a map, a recording of others.
-        model: plant of the bench to evaluate with (default: the one that was simulated; exact where the log does not
-            say).
-        params: parameters to evaluate; all others are taken as known (default: the four of the brake).
-        nuisance: unknowns besides (default: none).
-        prior: name of ranges in the bench file in which the parameters are known to lie (default: none).
-        theta: where to evaluate: 'log' for the running estimate in the log, 'nominal', 'true' of a
-            simulated brake, 'name=value,...', or the JSON of an estimate or report (default: log, and
-            nominal where it has no estimate).
-        bench: bench file (default: the one in the log).
-        map: map file of a recording of others: which column of it is what, and what is known of the machine.
-        plant: the model, by the name that :func:`simulate` has for it.
-        parameters: the parameters by name, as :func:`simulate` has them, in place of ``theta``.
+        options: a record of options.
+        more: its fields as keywords: ``fisher_information(run, theta={"f_v": 3e-5})``.
 
     Returns:
         ``matrix``, ``covariance``, ``correlation`` and ``sensitivities`` of relative parameters; ``fisher("physical")``
@@ -65,24 +68,19 @@ def fisher_information(
     """
     from emb_bench.experiment.from_log import read_experiment
     from emb_bench.experiment.theta import read_theta
-    from emb_bench.information.evaluation import Question, bench_for, default_model, evaluate, expected, together
+    from emb_bench.information.evaluation import bench_for, default_model, evaluate, expected, together
 
-    for name, one, other in (("model", model, plant), ("theta", theta, parameters)):
-        if one is not None and other is not None:
-            raise UsageError(f"{'plant' if name == 'model' else 'parameters'} is {name}: expected one of the two")
-    model, choice = model or plant, text_of(parameters if theta is None else theta)
-    Question(*unknowns(params, nuisance, None))  # a wrong name needs no log to be refused
+    asked = options_of("fisher_information", FimOptions, options, more)
+    model, choice = asked.model or asked.plant, asked.parameters if asked.theta is None else asked.theta
     if is_row(run):
-        its = load_bench(bench, analysis=True)
-        question = Question(*unknowns(params, nuisance, its), None if prior is None else its.range_set(prior))
+        its = load_bench(asked.bench, analysis=True)
         _, brake, errors = read_theta(choice, None, its)
-        return expected(its, its.model(model or DEFAULT_PLANT), question, brake, errors, run)
+        return expected(its, its.model(model or DEFAULT_PLANT), asked.question(its), brake, errors, run)
     found = []
     for entry in listed(run):
-        log = driven(entry, map)
-        its = bench_for(log, bench)
-        question = Question(*unknowns(params, nuisance, its), None if prior is None else its.range_set(prior))
-        its_plant = its.model(model or default_model(log)[0])
+        log = driven(entry, asked.map)
+        its = bench_for(log, asked.bench)
+        question, its_plant = asked.question(its), its.model(model or default_model(log)[0])
         name, brake, errors = read_theta(choice, log, its)
         found += evaluate(log, read_experiment(log, its), its, [its_plant], question, name, brake, errors)
     if not found:

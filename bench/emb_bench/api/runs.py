@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 from weakref import WeakKeyDictionary, finalize
 
 from numpy.typing import NDArray
 
-from emb_bench.api.arguments import Source, listed, opened, text_of
+from emb_bench.api.arguments import Source, listed, opened, options_of
 from emb_bench.figures import for_notebook
 from emb_bench.logs.log import RunLog, read_log
+from emb_bench.options import Options, option
 from emb_runtime.errors import near, needs
 
 if TYPE_CHECKING:  # matplotlib and pyarrow come with the extra [bench]
@@ -142,13 +143,17 @@ def draw(run: Source, axes: Sequence[Axes]) -> None:
     draw_on(opened(run), axes)
 
 
-def export(
-    run: Source,
-    output: str | Path,
-    *,
-    topic: str | None = None,
-    theta: str | Path | Mapping[str, float] | None = None,
-) -> str:
+@dataclass(frozen=True)
+class ExportOptions(Options):
+    """Options of an export."""
+
+    topic: str | None = option(None, "of a table (default: /cycle, the control cycles)", "TOPIC")
+    theta: str | Path | Mapping[str, float] | None = option(
+        None, "parameters of a model, as for fim (default: log, and nominal where it has no estimate)", "THETA"
+    )
+
+
+def export(run: Source, output: str | Path, options: ExportOptions | None = None, **more: Any) -> str:
     """A part of a run for another tool: a picture, one topic as a table with units, or the brake as a MuJoCo model.
 
     The frames on the bus go to BLF, ASC and others by can_logconvert RUN FILE.
@@ -156,8 +161,8 @@ def export(
     Args:
         run: MCAP file of emb-run.
         output: file to write: a picture (.png, .svg, .pdf), a table (.csv, .parquet) or a model (.xml) by its ending.
-        topic: of a table (default: /cycle, the control cycles).
-        theta: parameters of a model, as for fim (default: log, and nominal where it has no estimate).
+        options: a record of options.
+        more: its fields as keywords: ``export(run, "rows.csv", topic="/safety")``.
 
     Returns:
         A description of what the file holds.
@@ -168,7 +173,8 @@ def export(
     """
     from emb_bench.export.export import write
 
-    return write(opened(run), Path(output), topic, text_of(theta))
+    asked = options_of("export", ExportOptions, options, more)
+    return write(opened(run), Path(output), asked.topic, asked.theta)
 
 
 def rerun(run: Source) -> Rerun:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from emb_bench.api.runs import Run, delete_with, open_run
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.experiment.experiment import planned
-from emb_bench.sim.simulated_brake import NOISES
+from emb_bench.sim.simulated_brake import NOISES, brake_of
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError, needs
 
@@ -53,6 +52,7 @@ def simulate(
     Raises:
         EmbError: an argument is wrong, the policy does not fit the bench, or the log cannot be written.
     """
+    from emb_bench.sim.transport import open_brake
     from emb_runtime.cli.experiment import experiment
     from emb_runtime.cli.options import parser, prepare
     from emb_runtime.cli.session import Console
@@ -63,24 +63,25 @@ def simulate(
         currents, policy = policy, None
     if currents is not None and (policy is not None or quick):
         raise UsageError("currents: expected them without policy and without quick")
-    names = (*PARAMETER_NAMES, *NOISES, *inspect.signature(simulate).parameters)
-    require_options("simulate", more_parameters, names)
-    options = {"plant": plant, "seed": seed, **(parameters or {}), **more_parameters}
-    iface = "sim:" + ",".join(f"{name}={value}" for name, value in options.items())
+    require_options("simulate", more_parameters, (*PARAMETER_NAMES, *NOISES, *_OPTIONS))
+    brake = {"plant": plant, "seed": seed, **(parameters or {}), **more_parameters}
     own = Path(mkdtemp(prefix="emb-run-")) if log is None else None
     path = Path(log or f"{own}/run.mcap")
     try:
         with TemporaryDirectory() as folder:
             if currents is not None:
                 policy, duration = _policy_of(currents, bench, Path(folder), duration)
-            arguments = ["--iface", iface, "--log", str(path)]
-            for option, value in (("--policy", policy), ("--bench", bench), ("--duration", duration)):
-                if value is not None:
-                    arguments += [option, str(value)]
-            if quick:
-                arguments.append("--quick")
-            plan = prepare(parser().parse_args(arguments))
-        experiment(plan, path, Console())
+            asked = parser().parse_args([])
+            asked.iface = "sim:" + ",".join(f"{name}={value}" for name, value in brake.items())
+            asked.policy, asked.bench = (None if name is None else Path(name) for name in (policy, bench))
+            asked.duration, asked.quick, asked.log = duration, quick, path
+            given = {"policy": policy, "bench": bench, "duration": duration}
+            asked.typed = ["--iface", asked.iface, "--log", str(path)]
+            for name, value in given.items():
+                asked.typed += [] if value is None else [f"--{name}", str(value)]
+            asked.typed += ["--quick"] if quick else []
+            plan = prepare(asked)
+            experiment(plan, path, Console(), open_brake(brake_of(brake, plan.bench, "sim: "), plan.bench))
         run = open_run(path)
     except BaseException:
         if own is not None:
@@ -89,6 +90,10 @@ def simulate(
     if own is not None:
         delete_with(run, own)
     return run
+
+
+_OPTIONS = tuple(simulate.__kwdefaults__ or ())
+"""Names of the keywords of :func:`simulate`."""
 
 
 def _policy_of(currents: Any, bench: str | Path | None, folder: Path, duration: float | None) -> tuple[Path, float]:

@@ -8,13 +8,16 @@ from __future__ import annotations
 import os
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePath
 
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import ENDINGS as ROWS
-from emb_bench.batch.row import Options, Row, Source, failed, write_rows
+from emb_bench.batch.row import CampaignOptions, Row, Source, failed, write_rows
 from emb_bench.batch.summary import Campaign, mark_copies, summarise
+from emb_bench.config.bench import load_bench
+from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.output import progress, replacing, require_place
 from emb_bench.parallel import Lost, processors, shared_out, shared_out_on_ray
 from emb_runtime.errors import UsageError, needs
@@ -26,27 +29,25 @@ SUFFIX = ".mcap"
 PASSED_OVER = (HOMING_LOG + SUFFIX, LISTEN_ONLY_LOG + SUFFIX)  # Logs of emb-run that hold no experiment
 
 
-def run_campaign(
-    paths: Sequence[Path],
-    output: Path,
-    options: Options,
-    *,
-    jobs: int | None,
-    time_limit: float,
-    ray: str | None,
-) -> Campaign:
+def run_campaign(paths: Sequence[Path], output: Path, options: CampaignOptions) -> Campaign:
     """Evaluate logs, and write their rows; the arguments are those of :func:`emb_bench.api.campaign`."""
+    if options.bench is not None:
+        its = load_bench(options.bench, analysis=True)
+        its.plant(options.model or DEFAULT_PLANT)
+        options.question(its)
+        options = replace(options, bench_text=its.text)
     require_place("--output", output, ROWS)
     with needs("a campaign", "bench"):
         import numba  # noqa: F401
         import pyarrow  # noqa: F401
         import scipy  # noqa: F401
     sources, evaluate = find(paths), partial(evaluate_one, options=options)
+    limit = options.time_limit
     with replacing(output) as beside:
-        if ray is None:
-            numbered = shared_out(evaluate, sources, jobs or processors(), time_limit)
+        if options.ray is None:
+            numbered = shared_out(evaluate, sources, options.jobs or processors(), limit)
         else:
-            numbered = shared_out_on_ray(evaluate, sources, jobs, time_limit, ray)
+            numbered = shared_out_on_ray(evaluate, sources, options.jobs, limit, options.ray)
         rows = mark_copies(in_order(sources, numbered))
         write_rows(beside, output.suffix.lower(), rows, options)
     return summarise(rows, options, str(output))

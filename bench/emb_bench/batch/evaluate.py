@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.batch.row import NONE, Options, Row, Source, failed
+from emb_bench.batch.row import NONE, CampaignOptions, Row, Source, failed
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.effects import with_systematic
@@ -19,7 +19,7 @@ from emb_bench.estimate.expected import of_information
 from emb_bench.estimate.records import EstimationProblem
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
-from emb_bench.information.evaluation import Evaluation, Question, check_sample_time, default_model, evaluate
+from emb_bench.information.evaluation import Evaluation, check_sample_time, default_model, evaluate
 from emb_bench.logs.info import cycle_summary
 from emb_bench.logs.log import RunLog, read_log, require_driven
 from emb_bench.report.caveats import caveats
@@ -32,7 +32,7 @@ from emb_runtime.system.terminal import escaped
 FIRST = 50  # Samples whose noise distinguishes a run from any other
 
 
-def evaluate_one(source: Source, options: Options) -> Row:
+def evaluate_one(source: Source, options: CampaignOptions) -> Row:
     """Evaluate one log. Whatever is wrong with it becomes the row's ``error``; what was found before that stays."""
     row = failed(source, "")
     try:
@@ -45,7 +45,7 @@ def evaluate_one(source: Source, options: Options) -> Row:
     return row | {"error": None}
 
 
-def _steps(source: Source, options: Options) -> Iterator[Row]:
+def _steps(source: Source, options: CampaignOptions) -> Iterator[Row]:
     """Fields of the row, as far as one gets."""
     if source.trouble:
         raise UsageError(f"{source.path}: {source.trouble}")
@@ -57,8 +57,7 @@ def _steps(source: Source, options: Options) -> Iterator[Row]:
     bench = log.bench if options.bench_text is None else parse_bench(options.bench_text, "--bench", analysis=True)
     check_sample_time(log, bench)
     plant = bench.model(options.model or default_model(log)[0])
-    prior = None if options.prior is None else bench.range_set(options.prior)
-    question = Question(options.params, options.nuisances, prior)
+    question = options.question(bench)
     experiment = read_experiment(log, bench, source.path)
     yield _of_the_experiment(log, experiment, bench) | {"model": plant.name}
     import numba  # noqa: F401  # what is loaded is used, which pays for many logs and not for one
@@ -72,7 +71,7 @@ def _steps(source: Source, options: Options) -> Iterator[Row]:
         return
     from emb_bench.estimate.methods import method_of
 
-    asked = with_systematic(EstimationProblem(options.params, options.nuisances, prior), bench, plant)
+    asked = with_systematic(EstimationProblem(**vars(question)), bench, plant)
     method = method_of(options.method)(bench, plant, asked, starts=options.starts, seed=options.seed)
     yield _of_the_estimate(method.fit([experiment.seen_by(plant)]), log.truth)
 

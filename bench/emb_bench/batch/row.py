@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from emb_bench.analysis.options import QuestionOptions
 from emb_bench.brake.parameters import SI, UNITS
-from emb_bench.estimate.records import STARTS
+from emb_bench.estimate.records import METHODS, STARTS
+from emb_bench.options import option
 from emb_bench.output import text_cells
-from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.errors import UsageError
 from emb_runtime.system.terminal import escaped
 
 ENDINGS = (".parquet", ".csv")  # Of the file of rows
@@ -31,22 +33,42 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Options:
-    """Options of the evaluation, equal for all logs."""
+class CampaignOptions(QuestionOptions):
+    """Options of a campaign, equal for all logs."""
 
-    method: str = "oem"  # Key of ``METHODS``, or ``none``
-    params: tuple[str, ...] = PARAMETER_NAMES
-    nuisances: tuple[str, ...] = ()
-    model: str | None = None  # Plant to evaluate with; None is the one that each log was made with
-    prior: str | None = None  # Set of ranges
-    bench_text: str | None = None  # A bench file for all logs; None is the one in each log
-    starts: int = STARTS  # Local searches
-    seed: int = 0
+    method: str = option("oem", "see above, or 'none' for information alone (default: oem)", choices=(NONE, *METHODS))
+    starts: int = option(STARTS, "local searches (default: 8)", "N", kind=int, least=1)
+    seed: int = option(0, "seed of the starts of these searches (default: 0)", "N", kind=int, least=0)
+    jobs: int | None = option(None, "logs at a time (default: one for each processor)", "N", kind=int, least=1)
+    time_limit: float = option(
+        600.0, "longest time for one log [s]; one that takes longer has failed (default: 600)", "X", kind=float
+    )
+    ray: str | None = option(
+        None,
+        "address of a Ray cluster, or 'local' for a Ray of this machine (default: processes of this machine)",
+        "ADDRESS",
+    )
+    map: None = None  # A campaign has no recordings of others
+    bench_text: str | None = None  # Text of the bench file, which other machines do not have; None of each log's own
+
+    def __post_init__(self) -> None:
+        """Check all that needs no bench."""
+        super().__post_init__()
+        if not 1e-3 <= self.time_limit <= 1e6:
+            raise UsageError(f"--time-limit: expected 0.001 to 1e6 s, got {self.time_limit:g}")
 
     @property
     def names(self) -> tuple[str, ...]:
         """All unknowns, nuisances last."""
-        return (*self.params, *self.nuisances)
+        params, nuisances = self.names_on(None)
+        return (*params, *nuisances)
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """Options that the rows depend on, for the file that has them."""
+        names = ("method", "model", "prior", "bench_text", "starts", "seed")
+        params, nuisances = self.names_on(None)
+        return {"params": params, "nuisances": nuisances, **{name: getattr(self, name) for name in names}}
 
 
 class Column(NamedTuple):
@@ -148,7 +170,7 @@ def failed(source: Source, why: str) -> Row:
     return {**places, "error": escaped(" ".join(why.split()))}
 
 
-def write_rows(path: Path, ending: str, rows: Sequence[Row], options: Options) -> None:
+def write_rows(path: Path, ending: str, rows: Sequence[Row], options: CampaignOptions) -> None:
     """Writes a Parquet or CSV file: one row for each log.
 
     Parquet has units in the columns' metadata and the options in the file's. CSV has neither, and the entries of a list
@@ -167,7 +189,7 @@ def write_rows(path: Path, ending: str, rows: Sequence[Row], options: Options) -
     }
     about = {
         "tool": f"emb-excite {metadata.version('emb-excite')}",
-        "options": json.dumps(asdict(options)),
+        "options": json.dumps(options.origin),
         "logs": str(len(rows)),
         "failed": str(sum(row["error"] is not None for row in rows)),
     }

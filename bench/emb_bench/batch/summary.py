@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from emb_bench.analysis.several_runs import Constancy, constancy
-from emb_bench.batch.row import NONE, Options, Row, unit_of
+from emb_bench.batch.row import NONE, CampaignOptions, Row, unit_of
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.documents import to_json
 from emb_bench.estimate.records import DONE
@@ -66,7 +66,7 @@ class Campaign:
     parameters: dict[str, ParameterSummary]
 
 
-def summarise(rows: Sequence[Row], options: Options, result: str) -> Campaign:
+def summarise(rows: Sequence[Row], options: CampaignOptions, result: str) -> Campaign:
     """Summary of a campaign; numbers may be infinite."""
     good = [row for row in rows if row["error"] is None]
     counted = [row for row in good if row.get("copy_of") is None]

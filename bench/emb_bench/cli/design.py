@@ -36,11 +36,11 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     p = Parser(
         prog="emb-design",
-        description=f"{summary(api.design)}.",
+        description=f"{summary(api.design.__doc__)}.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add(p, api.design, leave_out=("told",))
+    add(p, api.DesignOptions)
     p.add_argument("-o", "--output", type=Path, metavar="FILE", help="file to write: design.csv")
     add_output_options(p)
     return p
@@ -58,7 +58,7 @@ def main(argv: list[str] | None = None) -> int:
 def _design(args: argparse.Namespace) -> int:
     told = mention if args.verbose and sys.stderr is not None and not sys.stderr.isatty() else None
     require_place("--output", args.output, (".csv",))
-    report = api.design(**given(args, api.design), told=told)
+    report = api.design(given(args, api.DesignOptions), told=told)
     if args.output is not None:
         from emb_bench.design.report import write
 

@@ -1,108 +1,54 @@
-"""Options of a command from the function behind it: names, types and defaults by its signature, help by its docstring.
+"""Command lines from records of options (:mod:`emb_bench.options`), and the form of an answer.
 
-An argument that may be given by keyword only is an option ``--name``, another one stands by itself. An option that is
-not typed is not passed on, so that each default stands in the signature only. Every command that answers has the same
-options for the form of its answer.
+An option that is not typed is not passed on, so that each default stands in its record only.
 """
 
 from __future__ import annotations
 
 import argparse
-import inspect
-import re
-import sys
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, TypeVar
 
+from emb_bench.options import Options, told
 from emb_bench.report.text import show
 from emb_runtime.system.terminal import as_json
 
-Function = Callable[..., Any]
-METAVARS = {
-    "bench": "FILE",
-    "last": "FILE",
-    "known": "NAME=VALUE±HALF",
-    "acceptance": "FILE",
-    "junit": "FILE",
-    "plot": "FILE",
-    "output": "FILE",
-    "ray": "ADDRESS",
-    "map": "FILE",
-    "place": "DIR|LOG",
-}
-"""Words of ``--help`` for the values of options; without, those of the type."""
-LISTS = ("runs", "paths")  # Arguments that may be given several times
+Record = TypeVar("Record", bound=Options)
 HELP_WIDTH = 92  # Columns of a description
 
 
-def summary(function: Function) -> str:
-    """First sentence of a function's docstring, as a line of ``--help``."""
-    text = inspect.getdoc(function) or ""
-    return text.partition("\n\n")[0].replace("\n", " ").rstrip(".")
+def summary(text: str | None) -> str:
+    """First sentence of a docstring, as a line of ``--help``."""
+    return (text or "").partition("\n\n")[0].replace("\n    ", " ").rstrip(".")
 
 
-def description(function: Function) -> str:
-    """Text of a function's docstring before its arguments, as paragraphs of ``--help``."""
-    text = (inspect.getdoc(function) or "").partition("Args:\n")[0]
-    return "\n".join(textwrap.fill(part, HELP_WIDTH) for part in text.strip().split("\n\n")) + "\n"
+def description(text: str | None) -> str:
+    """A docstring before its arguments, as paragraphs of ``--help``."""
+    told = textwrap.dedent(f"    {text or ''}".partition("Args:\n")[0])
+    return "\n".join(textwrap.fill(part, HELP_WIDTH) for part in told.strip().split("\n\n")) + "\n"
 
 
-def add(p: argparse.ArgumentParser, function: Function, leave_out: Sequence[str] = ()) -> None:
-    """Add the arguments of a function to a command line."""
-    described = _described(function)
-    for name, parameter in inspect.signature(function).parameters.items():
-        if name in leave_out or parameter.kind is parameter.VAR_KEYWORD:
+def add(p: argparse.ArgumentParser, record: type[Options]) -> None:
+    """Add the options of a record to a command line."""
+    for one in fields(record):
+        if (row := told(one)) is None:
             continue
-        kind = eval(parameter.annotation, vars(sys.modules[function.__module__]))  # our own source
-        told = described[name].rpartition("; without, ")[2] if parameter.default is True else described[name]
-        p.add_argument(*_flags(name, parameter), help=told, **_form(name, parameter, kind))
+        form: dict[str, Any] = {"dest": one.name, "default": argparse.SUPPRESS, "help": row.text.replace("%", "%%")}
+        if isinstance(one.default, bool):
+            form["action"] = "store_false" if one.default else "store_true"
+        elif row.choices:
+            form["choices"] = row.choices
+        else:
+            form |= {"type": row.kind, "metavar": row.metavar}
+        p.add_argument(f"--{'no-' if one.default is True else ''}{one.name.replace('_', '-')}", **form)
 
 
-def given(args: argparse.Namespace, function: Function, leave_out: Sequence[str] = ()) -> dict[str, Any]:
-    """The arguments of a function that were typed."""
-    names = set(inspect.signature(function).parameters) - set(leave_out)
-    return {name: value for name, value in vars(args).items() if name in names}
-
-
-def _flags(name: str, parameter: inspect.Parameter) -> list[str]:
-    if name == "output":
-        return ["-o", "--output"]
-    if parameter.kind is not parameter.KEYWORD_ONLY:
-        return [name]
-    return [f"--{'no-' if parameter.default is True else ''}{name.replace('_', '-')}"]
-
-
-def _form(name: str, parameter: inspect.Parameter, kind: Any) -> dict[str, Any]:
-    """Keywords of ``add_argument`` for one argument."""
-    option = parameter.kind is parameter.KEYWORD_ONLY
-    form: dict[str, Any] = {"default": argparse.SUPPRESS}
-    form |= {"dest": name} if option else {} if parameter.default is parameter.empty else {"nargs": "?"}
-    if name == "output":
-        return {"required": True, "type": Path, "metavar": "FILE"}
-    if isinstance(parameter.default, bool):
-        return {**form, "action": "store_false" if parameter.default else "store_true"}
-    parts = (kind,) if get_origin(kind) is Literal else get_args(kind) or (kind,)
-    literal = next((part for part in parts if get_origin(part) is Literal), None)
-    if literal is not None:
-        return {**form, "choices": get_args(literal)}
-    if name in LISTS:
-        many = {"action": "append"} if option else {"nargs": "+"}
-        return {**form, **many, "type": Path, "metavar": "PATH" if name == "paths" else "RUN"}
-    for number, word in ((int, "N"), (float, "X")):
-        if number in parts:
-            return {**form, "type": number, "metavar": word}
-    if Path in parts and Mapping[str, float] not in parts:
-        return {**form, "type": Path, "metavar": METAVARS.get(name, "RUN")}
-    return {**form, "metavar": METAVARS.get(name, "NAMES" if Sequence[str] in parts else name.upper())}
-
-
-def _described(function: Function) -> dict[str, str]:
-    """Descriptions of arguments by name, from the part ``Args:`` of the docstring; as argparse takes them."""
-    section = (inspect.getdoc(function) or "").partition("Args:\n")[2].partition("\n\n")[0]
-    entries = re.findall(r"^    (\w+): ((?:.|\n(?!    \w+: ))*)", section, re.MULTILINE)
-    return {name: " ".join(text.split()).replace("%", "%%").rstrip(".") for name, text in entries}
+def given(args: argparse.Namespace, record: type[Record]) -> Record:
+    """The record of the options that were typed."""
+    names = {one.name for one in fields(record)}
+    return record(**{name: value for name, value in vars(args).items() if name in names})
 
 
 def add_output_options(p: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""``emb-replay``: evaluation of logs. The options of a command are the arguments of a function."""
+"""``emb-replay``: evaluation of logs. The options of a command are the record that the function behind it takes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import argparse
 import sys
 from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from emb_bench import api
 from emb_bench.brake.parameters import PARAMETERS
-from emb_bench.cli.live import live
+from emb_bench.cli.live import LiveOptions, live
 from emb_bench.cli.options import add, add_output_options, answer, description, given, summary
+from emb_bench.options import Options
 from emb_bench.output import reported_if_interrupted
 from emb_bench.report import fim, runs
 from emb_bench.report.text import show
@@ -30,9 +32,8 @@ from emb_runtime.errors import (
 from emb_runtime.system.terminal import Parser, complain
 
 if TYPE_CHECKING:
-    from emb_bench.analysis.study import Study
+    from emb_bench.analysis.study import Result, Study
     from emb_bench.information.evaluation import Evaluation
-    from emb_bench.report.content import Content
 
 METHODS = """\
 
@@ -49,57 +50,49 @@ UNKNOWNS = METHODS + "\nThe names of unknowns are in the help of emb-replay esti
 
 
 def _fim(args: argparse.Namespace) -> int:
-    found = cast("Evaluation", api.fisher_information(**given(args, api.fisher_information)))  # of one log
+    found = cast("Evaluation", api.fisher_information(args.run, given(args, api.FimOptions)))  # of one log
     answer(args, lambda: fim.document(found), lambda verbose: fim.text(found, verbose=verbose))
     return EXIT_DONE
 
 
 def _estimate(args: argparse.Namespace) -> int:
-    study = api.estimate(**given(args, api.estimate))
+    study = api.estimate(args.runs, given(args, api.EstimateOptions))
     from emb_bench.report.estimate import document, text
 
     answer(args, lambda: document(study), lambda verbose: text(study, verbose=verbose))
-    return _strict(study) if args.strict else _recorded(study)
+    return _exit_code(study, strict=args.strict)
 
 
-def _recorded(study: Study | None) -> int:
-    """Exit code without ``--strict``: only of a recording of others, whose faults a map may hold, is a misfit one."""
-    recorded = study is not None and study.estimate.bench.machine is not None
-    return EXIT_CHECK_FAILED if study is not None and recorded and not study.model_fits else EXIT_DONE
+def _exit_code(study: Study, accepted: Result | None = None, *, strict: bool) -> int:
+    """Exit code of a verdict. Without ``--strict`` only a recording's misfit is one, whose faults a map may hold."""
+    from emb_bench.analysis.study import Code, verdict
 
-
-def _strict(study: Study | None) -> int:
-    if study is None or study.stopped or not (study.holds and study.identified):
-        return EXIT_CHECK_FAILED
-    return EXIT_OUTSIDE if study.outside else EXIT_DONE
+    if not strict:
+        recorded = study.joint is not None and study.joint.bench.machine is not None
+        return EXIT_CHECK_FAILED if recorded and not study.model_fits else EXIT_DONE
+    fits = EXIT_OUTSIDE if study.outside else EXIT_DONE
+    codes = {Code.FITS: fits, Code.ACCEPTED: EXIT_DONE, Code.UNDECIDED: EXIT_CANNOT_TELL}
+    return codes.get(verdict(study, accepted).code, EXIT_CHECK_FAILED)
 
 
 def _report(args: argparse.Namespace) -> int:
-    content = api.report(**given(args, api.report), **given(args, api.estimate, leave_out=("runs",)))
+    made = api.report(args.runs, args.output, given(args, api.ReportOptions))
     from emb_bench.report.sentences import outside
 
-    for name, study in content.outside:
-        show("\n".join(f"{name}: {line}" for line in outside(study)))
-    show(f"{args.output} and {args.output.with_suffix('.json').name}: {content.verdict}")
-    for line in content.without_part:
+    for name, line in outside(made.study, made.bench):
+        show(f"{name}: {line}")
+    show(f"{args.output} and {args.output.with_suffix('.json').name}: {made.sentence}")
+    for line in made.without_part:
         complain("emb-replay", LogError(line))
-    return _accepted(content, strict=args.strict)
-
-
-def _accepted(content: Content, *, strict: bool) -> int:
-    if content.without_part:
+    if made.without_part:
         return EXIT_CHECK_FAILED
-    if not strict:
-        return _recorded(content.study)
-    if content.acceptance is not None:
-        codes = {"pass": EXIT_DONE, "fail": EXIT_CHECK_FAILED, "cannot tell": EXIT_CANNOT_TELL}
-        return codes[content.acceptance.result.value]
-    return EXIT_CHECK_FAILED if content.stops else _strict(content.study)
+    accepted = None if made.acceptance is None else made.acceptance.result
+    return _exit_code(made.study, accepted, strict=args.strict)
 
 
 def _export(args: argparse.Namespace) -> int:
     log = api.open_run(args.run)
-    holds = api.export(**given(args, api.export) | {"run": log})
+    holds = api.export(log, args.output, given(args, api.ExportOptions))
     warning = f"WARNING: {log.missing}\n" if log.missing else ""
     document = {"log": str(args.run), "file": str(args.output), "holds": holds, "missing": log.missing}
     answer(args, lambda: document, lambda _: f"{warning}{args.output}: {holds}")
@@ -107,7 +100,7 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _campaign(args: argparse.Namespace) -> int:
-    found = api.campaign(**given(args, api.campaign))
+    found = api.campaign(args.paths, args.output, given(args, api.CampaignOptions))
     from emb_bench.batch.summary import document, text
 
     answer(args, lambda: document(found), lambda verbose: text(found, verbose=verbose))
@@ -140,19 +133,28 @@ def _timing(args: argparse.Namespace) -> int:
 
 
 def _live(args: argparse.Namespace) -> int:
-    live(**given(args, live))
+    live(getattr(args, "place", Path("runs")), given(args, LiveOptions))
     return EXIT_DONE
 
 
 # ---- the commands ----
 
 
+ARGUMENTS = {"run": ("RUN", None), "runs": ("RUN", "+"), "paths": ("PATH", "+"), "place": ("DIR|LOG", "?")}
+"""Arguments behind the name of a command: how each is shown, and how many there may be."""
+
+
 class Command(NamedTuple):
     """One command."""
 
-    function: Callable[..., Any]  # Its signature and docstring are the command's options and help
+    function: Callable[..., Any]  # Its docstring is the command's description
     run: Callable[[argparse.Namespace], int]  # Gives the exit code
     codes: Collection[int]
+    example: str  # Arguments to begin with
+    argument: str = "run"
+    told: str = "MCAP file of emb-run"  # Help of the argument
+    options: type[Options] = Options
+    output: str = ""  # Help of ``--output``, if the command has it
     more: str = ""  # Help below what the docstring says
     strict: str = ""  # Help of ``--strict``, if the command has it
 
@@ -172,13 +174,18 @@ OF_A_LOG = (EXIT_DONE, EXIT_USAGE, EXIT_LOG, EXIT_INTERRUPTED)
 CHECKED = (*OF_A_LOG, EXIT_CHECK_FAILED)
 
 MISFIT = "a run was stopped, the model does not fit, does not predict a log, or a parameter is not identified"
+RUNS = "MCAP files of emb-run, of one brake; with a map, recordings of others"
 COMMANDS: Mapping[str, Command] = {
-    "info": Command(api.info, _info, OF_A_LOG),
+    "info": Command(api.info, _info, OF_A_LOG, "run.mcap"),
     "estimate": Command(
         api.estimate,
         _estimate,
         (*CHECKED, EXIT_OUTSIDE),
-        f"{METHODS}\nunknowns for --nuisance, besides the parameters:\n"
+        "run.mcap --json > estimate.json",
+        "runs",
+        f"{RUNS}; they are taken together",
+        api.EstimateOptions,
+        more=f"{METHODS}\nunknowns for --nuisance, besides the parameters:\n"
         + "".join(f"  {name:17} {row.about}\n" for name, row in PARAMETERS.items() if row.about),
         strict=f"exit with 1 if {MISFIT}; else with {EXIT_OUTSIDE} if the brake is outside the shield's ranges",
     ),
@@ -186,32 +193,63 @@ COMMANDS: Mapping[str, Command] = {
         api.report,
         _report,
         (*CHECKED, EXIT_CANNOT_TELL, EXIT_OUTSIDE),
+        "run.mcap -o report.html --acceptance acceptance.toml --strict",
+        "runs",
+        f"{RUNS}. What cannot be used is named on the page and left out",
+        api.ReportOptions,
+        "page to write, .html or .htm",
         UNKNOWNS,
         strict=f"exit with {EXIT_CHECK_FAILED} if a criterion failed, else {EXIT_CANNOT_TELL} if one is not "
         f"decided; without --acceptance as emb-replay estimate does",
     ),
-    "fim": Command(api.fisher_information, _fim, OF_A_LOG),
-    "timing": Command(api.timing, _timing, CHECKED, "\nExit code 2 also if a bench file has no [budgets].\n"),
-    "rerun": Command(api.rerun, _rerun, (*CHECKED, EXIT_POLICY_REFUSED)),
-    "export": Command(api.export, _export, OF_A_LOG),
-    "campaign": Command(api.campaign, _campaign, CHECKED, UNKNOWNS),
-    "live": Command(live, _live, (EXIT_DONE, EXIT_USAGE, EXIT_LOG)),
+    "fim": Command(
+        api.fisher_information,
+        _fim,
+        OF_A_LOG,
+        "run.mcap --theta nominal --params k_m,f_v",
+        told="MCAP file of emb-run; with a map, a recording of others",
+        options=api.FimOptions,
+    ),
+    "timing": Command(
+        api.timing,
+        _timing,
+        CHECKED,
+        "runs/*.mcap",
+        "runs",
+        "MCAP files of emb-run",
+        more="\nExit code 2 also if a bench file has no [budgets].\n",
+    ),
+    "rerun": Command(api.rerun, _rerun, (*CHECKED, EXIT_POLICY_REFUSED), "run.mcap"),
+    "export": Command(
+        api.export,
+        _export,
+        OF_A_LOG,
+        "run.mcap -o cycles.parquet --topic /cycle",
+        options=api.ExportOptions,
+        output="file to write: a picture (.png, .svg, .pdf), a table (.csv, .parquet) or a model (.xml) by its ending",
+    ),
+    "campaign": Command(
+        api.campaign,
+        _campaign,
+        CHECKED,
+        "runs -o campaign.parquet --jobs 4",
+        "paths",
+        "logs, or folders to search for *.mcap",
+        api.CampaignOptions,
+        "file to write, Parquet or CSV by its ending",
+        UNKNOWNS,
+    ),
+    "live": Command(
+        live,
+        _live,
+        (EXIT_DONE, EXIT_USAGE, EXIT_LOG),
+        "runs",
+        "place",
+        "folder whose logs are shown, or one log; its parent folder must exist (default: runs/)",
+        LiveOptions,
+    ),
 }
 """Commands in the order of ``--help``, which is that of their use."""
-EXAMPLES: Mapping[str, str] = {
-    "info": "run.mcap",
-    "estimate": "run.mcap --json > estimate.json",
-    "report": "run.mcap -o report.html --acceptance acceptance.toml --strict",
-    "fim": "run.mcap --theta nominal --params k_m,f_v",
-    "timing": "runs/*.mcap",
-    "rerun": "run.mcap",
-    "export": "run.mcap -o cycles.parquet --topic /cycle",
-    "campaign": "runs -o campaign.parquet --jobs 4",
-    "live": "runs",
-}
-"""Arguments of each to begin with."""
-
-
 CUT = "\nA cut log (kill -9, full disk) is read as far as it goes, and the missing part is named.\n"
 
 
@@ -231,22 +269,25 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
     )
     commands = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS if only is None else (only,):
-        _, _, codes, more, strict = found = COMMANDS[name]
+        one = COMMANDS[name]
         command = commands.add_parser(
             name,
-            help=summary(found.function),
-            description=f"{description(found.function)}\n{more}",
-            epilog=f"example:\n  emb-replay {name} {EXAMPLES[name]}\n\n{epilog(codes)}",
+            help=summary(one.function.__doc__),
+            description=f"{description(one.function.__doc__)}\n{one.more}",
+            epilog=f"example:\n  emb-replay {name} {one.example}\n\n{epilog(one.codes)}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        add(command, found.function, leave_out=("plant", "parameters"))
-        if name == "report":
-            add(command, api.estimate, leave_out=("runs", "profile"))
-        elif name != "live":
+        metavar, nargs = ARGUMENTS[one.argument]
+        form: dict[str, Any] = {"metavar": metavar, "nargs": nargs, "help": one.told}
+        command.add_argument(one.argument, type=Path, default=argparse.SUPPRESS, **form)
+        if one.output:
+            command.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=one.output)
+        add(command, one.options)
+        if name not in ("report", "live"):
             add_output_options(command)
-        if strict:
-            command.add_argument("--strict", action="store_true", help=strict)
-        command.set_defaults(start=found.run)
+        if one.strict:
+            command.add_argument("--strict", action="store_true", help=one.strict)
+        command.set_defaults(start=one.run)
     return p
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
@@ -20,13 +21,19 @@ LOG = "log"  # Name of the last running estimate in the log
 MAX_JSON_BYTES = 64 * 2**20  # Size limit of the JSON of an estimate or a report
 
 
-def read_theta(choice: str, log: RunLog | None, bench: Bench) -> tuple[str, BrakeParameters, SystematicErrors]:
+def read_theta(
+    given: str | Path | Mapping[str, float] | None, log: RunLog | None, bench: Bench
+) -> tuple[str, BrakeParameters, SystematicErrors]:
     """The name of the parameters to evaluate at, the parameters, and the systematic errors estimated with them.
 
-    The choice is ``log`` for the last running estimate in the log, empty for that or nominal where there is none,
-    ``nominal``, ``true``, ``name=value,name=value``, or the JSON of an estimate or a report; the others are nominal.
-    Planned currents have no log.
+    They are values by name, ``name=value,name=value``, ``log`` for the last running estimate in the log, nothing for
+    that or nominal where there is none, ``nominal``, ``true``, or the JSON of an estimate or a report; the others are
+    nominal. Planned currents have no log.
     """
+    if isinstance(given, Mapping):
+        named = ",".join(f"{name}={value}" for name, value in given.items()) or "nominal"
+        return named, true_parameters(bench, given, option="--theta: "), NO_ERRORS
+    choice = "" if given is None else str(given)
     if choice in ("", LOG):
         if log is not None and (values := _running(log, bench)):
             return LOG, bench.brake._replace(**values), NO_ERRORS
@@ -41,8 +48,7 @@ def read_theta(choice: str, log: RunLog | None, bench: Bench) -> tuple[str, Brak
             check_near_nominal(bench, name, value, "--theta true: ")
         return choice, log.truth, NO_ERRORS
     if "=" in choice:
-        given = parse_assignments(choice, "--theta: ")
-        return choice, true_parameters(bench, given, option="--theta: "), NO_ERRORS
+        return choice, true_parameters(bench, parse_assignments(choice, "--theta: "), option="--theta: "), NO_ERRORS
     values, errors = _from_file(choice, log, bench)
     for name, value in values.items():
         check_near_nominal(bench, name, value, f"{choice}: ")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -93,13 +93,13 @@ FORMATS = (*PICTURES, *TABLES, *MODEL)  # Endings of what is written
 CYCLE = "/cycle"
 
 
-def write(log: RunLog, path: Path, topic: str | None, theta: str) -> str:
+def write(log: RunLog, path: Path, topic: str | None, theta: str | Path | Mapping[str, float] | None) -> str:
     """Write a picture, a topic as a table, or the brake as a model, by the ending of the file; says what it holds."""
     ending = path.suffix.lower()
     require_place("--output", path, FORMATS)
     if topic is not None and ending not in TABLES:
         raise UsageError(f"--topic: expected with a file that ends in {' or '.join(TABLES)}, got {path}")
-    if theta and ending not in MODEL:
+    if theta is not None and ending not in MODEL:
         raise UsageError(f"--theta: expected with a file that ends in {' or '.join(MODEL)}, got {path}")
     if ending in PICTURES:
         return draw_run(log, path)

@@ -7,6 +7,7 @@ friction loss is a soft constraint that acts from step to step: a reversal is as
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from emb_bench.experiment.theta import read_theta
@@ -54,7 +55,7 @@ def mjcf(bench: Bench, brake: BrakeParameters) -> str:
     )
 
 
-def write_mjcf(log: RunLog, theta: str, path: Path) -> str:
+def write_mjcf(log: RunLog, theta: str | Path | Mapping[str, float] | None, path: Path) -> str:
     """Write the brake of a log; says which parameters it has, of :func:`emb_bench.experiment.theta.read_theta`."""
     name, brake, _ = read_theta(theta, log, log.bench)
     text = mjcf(log.bench, brake)

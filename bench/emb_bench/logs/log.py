@@ -6,11 +6,13 @@ tables, or of a long log in batches; the chunks are read again each time.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import cached_property, lru_cache, wraps
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -258,6 +260,30 @@ class RunLog:
             return "a simulated brake"
         virtual = bus.startswith(("vcan", "vxcan"))
         return f"a node on a virtual bus ({terminal.one_line(bus, LONGEST_BUS)})" if virtual else ""
+
+    @property
+    def source(self) -> str:
+        """Machine that was driven: a simulated one, or the bench on its interface; or a recording of others."""
+        if self.is_recording:
+            return "recording of another machine"
+        return self.simulated or f"bench on {self.run.get('iface', 'an unknown interface')}"
+
+    @property
+    def began(self) -> str:
+        """Begin of the run in UTC, by the clock of the computer that recorded it; empty if the log has none."""
+        first, _ = self.span
+        if not 0 < first < 2**62:
+            return ""
+        return datetime.fromtimestamp(first // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+    @cached_property
+    def sha256(self) -> str:
+        """SHA-256 of the file."""
+        try:
+            with open_regular(self.path) as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as err:
+            raise LogError(f"{self.path}: {err.strerror}") from err
 
     @property
     def drive_lacks(self) -> dict[str, str]:

@@ -12,21 +12,21 @@ import re
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 from xml.etree import ElementTree
 
 import msgspec
 
-from emb_bench.analysis.drift import Drift, Earlier
-from emb_bench.analysis.study import Study
+from emb_bench.analysis.drift import Drift
+from emb_bench.analysis.study import Code, Result, Run, Study, verdict
 from emb_bench.brake.parameters import OF_A_RECORD, PARAMETERS, SI, UNITS
 from emb_bench.estimate.records import DONE, NORMAL_95
+from emb_bench.logs.timing import timing
 from emb_bench.numbers import amount, share, share_between
 from emb_bench.report.sentences import doubts, other_model
 from emb_runtime.config.typed import FieldError, read
-from emb_runtime.errors import UsageError
+from emb_runtime.errors import LogError, UsageError
 from emb_runtime.numbers import between, plain
 from emb_runtime.system.input_file import read_text
 
@@ -35,14 +35,6 @@ NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")  #
 SHARED = tuple(name for name in PARAMETERS if name not in OF_A_RECORD)  # Unknowns that a tolerance can be stated for
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
-
-
-class Result(StrEnum):
-    """Result of a criterion, or of all together."""
-
-    PASS = "pass"
-    FAIL = "fail"
-    CANNOT_TELL = "cannot tell"
 
 
 class Tolerance(msgspec.Struct, frozen=True):
@@ -102,18 +94,6 @@ class Criterion:
 
 
 @dataclass(frozen=True)
-class RunFacts:
-    """Facts about one run that the criteria judge."""
-
-    name: str
-    exit_reason: str
-    complete: bool  # True if the log is
-    missing: str  # Parts of the log that are missing
-    missed: float | None  # Share of periods without a sample in time; None if it was not measured
-    lost: float | None  # Share of the samples that are not in the log; None without an experiment
-
-
-@dataclass(frozen=True)
 class Acceptance:
     """All criteria with their results."""
 
@@ -167,65 +147,75 @@ def read_criteria(path: Path) -> Criteria:
     return msgspec.structs.replace(found, source=path.name)
 
 
-def judge(
-    criteria: Criteria,
-    runs: Sequence[RunFacts],
-    left_out: Sequence[str],
-    study: Study | None,
-    why_no_study: str = "",
-    last: Earlier | None = None,
-) -> Acceptance:
-    """Results of all criteria. That each run came to its end and its log is whole is always one of them."""
-    results = [_completed(run, len(runs) > 1) for run in runs]
-    results += [Criterion("all logs used", "yes", "no", Result.FAIL, words) for words in left_out]
-    doubt = _doubt(study, why_no_study)
+def judge(criteria: Criteria, study: Study, without_part: Sequence[str]) -> Acceptance:
+    """Results of all criteria. That each run came to its end and its log is whole is always one of them.
+
+    ``without_part`` says of each log that is not used why.
+    """
+    runs, several = study.runs, len(study.runs) > 1
+    results = [_completed(run, several) for run in runs]
+    results += [Criterion("all logs used", "yes", "no", Result.FAIL, words) for words in without_part]
+    doubt = _doubt(study)
     if criteria.model_fit:
         results.append(_model_fit(study, doubt))
     results += [_tolerated(name, one, study, doubt) for name, one in criteria.parameters.items()]
-    drifts = {} if study is None else {drift.name: drift for drift in study.drifts}
-    why = "" if study is None else other_model(study.estimate, study.last)
+    changes = {drift.name: drift for drift in study.checks.drifts}
+    why = "" if study.joint is None else other_model(study.joint, study.last)
     earlier = f"the change may be the model's: {why}" if why else ""
     for name, most in criteria.drift.items():
-        results.append(_drifted(name, most, drifts.get(name), doubt or earlier, given=last is not None))
+        results.append(_drifted(name, most, changes.get(name), doubt or earlier, given=study.last is not None))
     for run in runs:
-        of = f", {run.name}" if len(runs) > 1 else ""
+        of = f", {run.name}" if several else ""
         if criteria.budgets.missed is not None:
-            results.append(_counted(f"missed periods{of}", criteria.budgets.missed, run.missed))
+            results.append(_counted(f"missed periods{of}", criteria.budgets.missed, _missed(run)))
         if criteria.budgets.lost is not None:
-            results.append(_counted(f"lost samples{of}", criteria.budgets.lost, run.lost))
+            results.append(_counted(f"lost samples{of}", criteria.budgets.lost, _lost(run)))
     return Acceptance(criteria, tuple(results))
 
 
-def _doubt(study: Study | None, why_no_study: str) -> str:
+def _missed(run: Run) -> float | None:
+    """Share of periods without a sample in time; None if it was not measured."""
+    try:
+        return timing(run.log).share("missed")
+    except LogError:
+        return None
+
+
+def _lost(run: Run) -> float | None:
+    """Share of the samples that are not in the log; None without an experiment."""
+    x = run.experiment
+    return None if x is None or x.planned == 0 else 1.0 - int(x.measured.sum()) / max(len(x.measured), 1)
+
+
+def _doubt(study: Study) -> str:
     """Reason that no number of the estimate decides anything; empty if they may."""
-    if study is None:
-        return f"no estimate: {why_no_study}"
-    if study.holds:
-        return ""
-    if study.biased:
-        return "recursive least squares is biased: use --method oem"
-    return "the model does not fit" if not study.model_fits else "the model does not predict all records"
+    return {
+        Code.NO_ESTIMATE: f"no estimate: {study.why_not}",
+        Code.BIASED_METHOD: "recursive least squares is biased: use --method oem",
+        Code.DOES_NOT_FIT: "the model does not fit",
+        Code.DOES_NOT_PREDICT: "the model does not predict all records",
+    }.get(verdict(study).model, "")
 
 
-def _completed(run: RunFacts, several: bool) -> Criterion:
-    name = f"completed, {run.name}" if several else "run completed"
+def _completed(run: Run, several: bool) -> Criterion:
+    name, log = f"completed, {run.name}" if several else "run completed", run.log
     required = "ran to its planned end, log complete"
-    if run.exit_reason != DONE:
-        return Criterion(name, required, run.exit_reason, Result.FAIL, f"the run was stopped: {run.exit_reason}")
-    if not run.complete:
-        return Criterion(name, required, "log NOT complete", Result.FAIL, run.missing)
+    if (reason := log.exit_reason) != DONE:
+        return Criterion(name, required, reason, Result.FAIL, f"the run was stopped: {reason}")
+    if not log.complete:
+        return Criterion(name, required, "log NOT complete", Result.FAIL, log.missing)
     return Criterion(name, required, "yes", Result.PASS)
 
 
-def _model_fit(study: Study | None, doubt: str) -> Criterion:
+def _model_fit(study: Study, doubt: str) -> Criterion:
     name, required = "model fit", "residuals are noise"
-    if study is None or study.biased:
+    if verdict(study).model in (Code.NO_ESTIMATE, Code.BIASED_METHOD):
         return Criterion(name, required, "not judged", Result.CANNOT_TELL, doubt)
     found = f"chi2/n {plain(study.estimate.validation.ratio)}"
     return Criterion(name, required, found, Result.FAIL if doubt else Result.PASS, doubt)
 
 
-def _tolerated(name: str, tolerance: Tolerance, study: Study | None, doubt: str) -> Criterion:
+def _tolerated(name: str, tolerance: Tolerance, study: Study, doubt: str) -> Criterion:
     unit, relative = SI[name], tolerance.relative or 0.0
     if tolerance.interval is not None:
         low, high = tolerance.interval
@@ -233,12 +223,12 @@ def _tolerated(name: str, tolerance: Tolerance, study: Study | None, doubt: str)
     else:
         nominal = "nominal" if tolerance.reference is None else "the reference"
         reference = tolerance.reference
-        if reference is None and study is not None:
-            reference = float(getattr(study.estimate.bench.brake, name))
+        if reference is None and study.joint is not None:
+            reference = float(getattr(study.joint.bench.brake, name))
         about = nominal if reference is None else f"{nominal} {plain(reference, 6)} {unit}"
         required = f"{about} ± {share(relative, 3)}"
         low, high = (math.nan if reference is None else reference * (1.0 + s * relative) for s in (-1.0, 1.0))
-    found = None if study is None else next((c for c in study.conclusions if c.label == name), None)
+    found = next((c for c in study.conclusions if c.label == name), None)
     if found is None:
         return Criterion(name, required, "not estimated", Result.CANNOT_TELL, doubt or "it was not estimated")
     value = amount(found.value, found.interval, found.unit)

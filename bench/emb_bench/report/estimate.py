@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.analysis.study import Study
+from emb_bench.analysis.study import Code, Study, verdict
 from emb_bench.brake.motion import Floats
 from emb_bench.documents import to_json
 from emb_bench.estimate.estimate import Estimate
@@ -27,23 +27,24 @@ NOTICED = 2.0  # Standard deviations from which on an effect that is no alarm is
 
 def text(study: Study, *, verbose: bool = False) -> str:
     """Verdict, parameters, what limits them, next step; with ``verbose`` the evidence, too."""
+    e, found = study.estimate, verdict(study)
     lines = [
         *stops(study),
-        *listed("", [*say.outside(study), say.simulated(study.logs, study.names)]),
+        *listed("", [*(line for _, line in say.outside(study, e.bench)), say.simulated(study.logs, study.names)]),
         *listed("WARNING: ", say.missing(study)),
     ]
-    if study.aborted and not verbose:
+    if found.code is Code.ABORTED and not verbose:
         return "\n".join([*lines, "next: find the cause before the next run   (-v shows values until the stop)"])
     against = list(_against(study))
     lines += wrapped(say.headline(study))
     lines += listed("  - ", against if verbose or study.model_fits else against[:1])
     lines += listed("NOTE: ", _notes(study))
     lines += ["", *tables.parameters(study, brief=True).lines()]
-    lines += listed("  - ", _remarks(study, trades=study.holds or verbose))
+    lines += listed("  - ", _remarks(study, trades=found.holds or verbose))
     if not any(math.isfinite(c.repeatability) for c in study.conclusions):
         lines += [""]
-    elif study.holds or verbose:
-        lines += [*wrapped(say.intervals(study.estimate), 0), "", *listed("", _limits(study))]
+    elif found.holds or verbose:
+        lines += [*wrapped(say.intervals(e), 0), "", *listed("", _limits(study))]
     else:
         lines += [say.without(study), ""]
     return "\n".join([*lines, *_next(study), *(_evidence(study) if verbose else ())])
@@ -51,21 +52,21 @@ def text(study: Study, *, verbose: bool = False) -> str:
 
 def stops(study: Study) -> Iterator[str]:
     """Lines on the runs that were stopped: cause and advice."""
-    for stop in study.stopped:
+    for stop in study.stops:
         yield from wrapped(say.stopped(stop))
         yield from facts(("  cause", stop.cause), ("  advice", stop.advice))
 
 
 def _against(study: Study) -> Iterator[str]:
     """Reasons against the model."""
-    if not study.biased:
+    if not verdict(study).biased:
         yield from say.alarms(study.estimate)
-    yield from (f"{h.name}: {say.held_out(h)}" for h in study.left_out if not h.fits)
+    yield from (f"{h.name}: {say.held_out(h)}" for h in study.checks.held_out if not h.fits)
 
 
 def _notes(study: Study) -> list[str]:
     """Qualifications of the values."""
-    apart = [say.apart(study)] if study.apart else []
+    apart = [say.apart(study)] if study.checks.apart else []
     return [*say.assumptions(study), *apart, say.changed_model(study), say.models(study), *caveats(study.estimate)]
 
 
@@ -104,8 +105,8 @@ def _limits(study: Study) -> Iterator[str]:
 
 def _next(study: Study) -> list[str]:
     """The next step, or several to choose from."""
-    found = say.remedies(study, stopped=bool(study.stopped))
-    found = ["find the cause of the stop before the next run"] if study.stopped else found
+    found = say.remedies(study, stopped=bool(study.stops))
+    found = ["find the cause of the stop before the next run"] if study.stops else found
     found = found or [f"emb-replay report {say.logs_of(study)} -o report.html   (-v shows the evidence)"]
     return listed("next: ", found) if len(found) == 1 else ["next", *listed("  - ", found)]
 
@@ -125,7 +126,7 @@ def _evidence(study: Study) -> Iterator[str]:
         ("prior", say.prior(e)),
         ("chi2/n", f"{expected} ({p_value(m.chi2_p)})"),
     )
-    yield from listed("NOTE: ", () if study.biased else say.residual_notes(e))
+    yield from listed("NOTE: ", () if verdict(study).biased else say.residual_notes(e))
     yield ""
     correlation, pairs = tables.correlation(e)
     found: list[Table | None] = [
@@ -137,12 +138,13 @@ def _evidence(study: Study) -> Iterator[str]:
         yield from [] if table is None else table.text("  ")
     yield from listed("NOTE: ", [say.pairs(pairs) if pairs else "", say.once(study)])
     yield from listed("", say.directions(e.verdict()))
-    yield from listed("", (f"profile of {p.label}: {say.profile(p, e)}" for p in study.profiles))
+    yield from listed("", (f"profile of {p.label}: {say.profile(p, e)}" for p in study.checks.profiles))
 
 
 def document(study: Study) -> dict[str, Any]:
     """Everything about a study; numbers may be infinite."""
-    e, choice = study.estimate, study.choice
+    e, checks = study.estimate, study.checks
+    choice = checks.choice
     wanted, validation = e.wanted(), e.validation
     found = {
         "simulated": any(log.simulated for log in study.logs),
@@ -182,7 +184,7 @@ def document(study: Study) -> dict[str, Any]:
         "directions": e.verdict().directions,
         "left_to_prior": e.verdict().left_to_prior,
         "profiles": [
-            _fields(p, "label", "values", "rise", "doubt") | {"interval_95": p.interval} for p in study.profiles
+            _fields(p, "label", "values", "rise", "doubt") | {"interval_95": p.interval} for p in checks.profiles
         ],
         "starts": [
             _fields(end, "cost", "converged", "evaluations")
@@ -197,7 +199,12 @@ def document(study: Study) -> dict[str, Any]:
         "other_model": say.other_model(e, study.last),
         "caveats": caveats(e),
     }
-    found |= _fields(study, "stopped", "model_fits", "predicts", "identified", "drifts", "left_out", "apart")
+    found |= {
+        "stopped": [run.stop for run in study.used if run.stop],
+        "model_fits": study.model_fits,
+        "identified": not study.unidentified,
+    }
+    found |= {"left_out": checks.held_out, **_fields(checks, "predicts", "drifts", "apart")}
     document: dict[str, Any] = to_json(found | _fields(e, "process_noise", "load_noise", "theta"))
     return document
 

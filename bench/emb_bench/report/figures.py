@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,8 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.model_validation import OUTPUTS
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.figures import COLOURS, DASHED, GREY, svg
-from emb_bench.report.content import ActiveCycles, Run, StopSamples
+from emb_bench.report.motion import ActiveCycles, Motion, StopSamples
+from emb_bench.report.page import Panel
 from emb_runtime.numbers import SMALL, SUPERSCRIPT
 from emb_runtime.records import Reason
 
@@ -31,16 +32,9 @@ _DOTTED: Any = {"color": "black", "linewidth": 0.7, "linestyle": (0, (2, 2))}
 _SAME = 1e-3  # of the bench's current; the CAN signal has steps
 
 
-class Panel(NamedTuple):
-    """One figure of several that stand beside each other."""
-
-    svg: bytes
-    shows: str  # Description for who cannot see it
-
-
-def excitation(run: Run, cycles: ActiveCycles) -> Panel:
+def excitation(motion: Motion, cycles: ActiveCycles) -> Panel:
     """Current as requested by the policy, sent and applied; below, the reasons for their difference over time."""
-    limit, period, after = run.bench.limits.current, run.bench.timing.sample_time, run.after
+    limit, period, after = motion.bench.limits.current, motion.bench.timing.sample_time, motion.after
     held = [reason for reason, where in cycles.reasons.items() if where.any()]
 
     def draw(axes: Any) -> None:
@@ -53,8 +47,8 @@ def excitation(run: Run, cycles: ActiveCycles) -> Panel:
         if cycles.reasons[Reason.CLIPPED].any():
             above.step(time, cycles.clipped, where="post", color=COLOURS[4], label="clipped", linewidth=1.6)
         above.step(time, cycles.sent, where="post", color=COLOURS[0], label="sent after the shield", linewidth=1.3)
-        if not applied_as_sent(run) and run.experiment is not None:
-            applied = np.append(run.experiment.currents, np.nan)
+        if not applied_as_sent(motion) and motion.experiment is not None:
+            applied = np.append(motion.experiment.currents, np.nan)
             at = 1e3 * period * np.arange(len(applied))
             above.step(at, applied, where="post", label="applied by the node", **_DOTTED)
         if after is not None:
@@ -83,29 +77,31 @@ def excitation(run: Run, cycles: ActiveCycles) -> Panel:
     )
 
 
-def applied(run: Run, experiment: Experiment) -> Panel:
+def applied(motion: Motion, experiment: Experiment) -> Panel:
     """Command or current that drove the machine of a recording of others, in its own unit."""
-    shown = quantity(run.bench.machine, "current")
+    shown = quantity(motion.bench.machine, "current")
 
     def draw(axes: Any) -> None:
         axis = axes[0, 0]
         values = np.append(experiment.currents, np.nan)
         axis.axhline(0.0, **FAINT)
-        axis.step(1e3 * run.bench.timing.sample_time * np.arange(len(values)), values, where="post", color=COLOURS[0])
+        axis.step(
+            1e3 * motion.bench.timing.sample_time * np.arange(len(values)), values, where="post", color=COLOURS[0]
+        )
         axis.set_ylabel(f"{shown.name} [{shown.unit}]")
         axis.set_xlabel("time [ms]")
 
     return Panel(svg(draw, 1, 1, (PANEL, 2.6)), f"{shown.name.capitalize()} that acted over time")
 
 
-def of_run(run: Run) -> list[Panel]:
+def of_run(motion: Motion) -> list[Panel]:
     """Figures of what the brake did."""
-    drawn = motion(run)
-    if run.cycles is not None:
-        drawn.append(excitation(run, run.cycles))
-    elif run.experiment is not None:
-        drawn.append(applied(run, run.experiment))
-    return drawn if run.residuals is None else [*drawn, residuals(run, run.residuals)]
+    drawn = angle_and_velocity(motion)
+    if motion.cycles is not None:
+        drawn.append(excitation(motion, motion.cycles))
+    elif motion.experiment is not None:
+        drawn.append(applied(motion, motion.experiment))
+    return drawn if motion.residuals is None else [*drawn, residuals(motion, motion.residuals)]
 
 
 def _end(cycles: ActiveCycles) -> float:
@@ -121,17 +117,17 @@ def _mark_stop(axis: Any, cycles: ActiveCycles, after: StopSamples) -> None:
     axis.annotate("stopped", (at, 0.7), ha=side, va="bottom", fontsize=8.0, color=STOP, **place)
 
 
-def applied_as_sent(run: Run) -> bool:
+def applied_as_sent(motion: Motion) -> bool:
     """Returns True if the node applied in every period the current sent for it; False if either is unknown in one."""
-    cycles = run.cycles
-    if run.experiment is None or cycles is None:
+    cycles = motion.cycles
+    if motion.experiment is None or cycles is None:
         return False
-    applied = run.experiment.currents
-    steps = np.rint(cycles.time / run.bench.timing.sample_time).astype(int)
+    applied = motion.experiment.currents
+    steps = np.rint(cycles.time / motion.bench.timing.sample_time).astype(int)
     sent = np.full(len(applied), np.nan)
     inside = steps < len(applied)
     sent[steps[inside]] = cycles.sent[inside]
-    return bool(np.all(np.abs(applied - sent) <= _SAME * run.bench.limits.current))
+    return bool(np.all(np.abs(applied - sent) <= _SAME * motion.bench.limits.current))
 
 
 def _spans(time: Floats, where: Any, period: float) -> list[tuple[float, float]]:
@@ -145,18 +141,18 @@ def _spans(time: Floats, where: Any, period: float) -> list[tuple[float, float]]
     return spans
 
 
-def motion(run: Run) -> list[Panel]:
+def angle_and_velocity(motion: Motion) -> list[Panel]:
     """Measured angle and velocity, and what the model predicts at the estimate, with the bench's limits."""
-    limits, period, cycles, after = run.bench.limits, run.bench.timing.sample_time, run.cycles, run.after
-    if run.experiment is None:
+    limits, period, cycles, after = motion.bench.limits, motion.bench.timing.sample_time, motion.cycles, motion.after
+    if motion.experiment is None:
         if cycles is None:
             return []
         time, measured = cycles.time, np.stack([cycles.angle, cycles.velocity], axis=1)
     else:
-        measured = run.experiment.all_samples
+        measured = motion.experiment.all_samples
         time = period * np.arange(len(measured), dtype=np.float64)
-    units = [quantity(run.bench.machine, name) for name in OUTPUTS]
-    driven = run.bench.machine is None
+    units = [quantity(motion.bench.machine, name) for name in OUTPUTS]
+    driven = motion.bench.machine is None
     borders = (limits.angle, (-limits.velocity, limits.velocity)) if driven else ((0.0, 0.0), (0.0, 0.0))
     last = max(float(time.max(initial=0.0)), period, 0.0 if after is None else after.end)
     panels = []
@@ -169,8 +165,8 @@ def motion(run: Run) -> list[Panel]:
             axis.axhline(0.0, **FAINT)
             axis.plot(1e3 * time, measured[:, i], ".", color=LIGHT, markersize=4.5, label="measured")
             seen = measured[np.isfinite(measured[:, i]), i]
-            if run.predicted is not None:
-                shown = run.predicted[:, i]
+            if motion.predicted is not None:
+                shown = motion.predicted[:, i]
                 at = 1e3 * period * np.arange(1, len(shown) + 1)
                 axis.plot(at, shown, color=COLOURS[1], label="predicted", linewidth=0.8)
             if after is not None and cycles is not None:
@@ -187,14 +183,14 @@ def motion(run: Run) -> list[Panel]:
             axis.set_xlabel("time [ms]")
             axis.set_xlim(0.0, 1e3 * last)
 
-        predicted = ", and predicted by the model at the estimate" if run.predicted is not None else ""
+        predicted = ", and predicted by the model at the estimate" if motion.predicted is not None else ""
         panels.append(Panel(svg(draw, 1, 1, (PANEL, 2.6)), f"{name.capitalize()} over time: measured{predicted}"))
     return panels
 
 
-def residuals(run: Run, errors: Floats) -> Panel:
+def residuals(motion: Motion, errors: Floats) -> Panel:
     """Measured less predicted over time, in standard deviations."""
-    time, measured = 1e3 * run.bench.timing.sample_time * np.arange(1, len(errors) + 1), _measured(errors)
+    time, measured = 1e3 * motion.bench.timing.sample_time * np.arange(1, len(errors) + 1), _measured(errors)
 
     def draw(axes: Any) -> None:
         axis = axes[0, 0]

@@ -101,7 +101,9 @@ EXPLAINS = 3.0  # Standard deviations from which on a parameter that is held fix
 
 def without(study: Study) -> str:
     """Kind of the intervals of a model that does not hold, and the error that is not in them."""
-    return f"± total (95 %, k=2), without the {'bias of the method' if study.biased else 'error of the model'}"
+    from emb_bench.analysis.study import verdict
+
+    return f"± total (95 %, k=2), without the {'bias of the method' if verdict(study).biased else 'error of the model'}"
 
 
 # ---- an experiment ----
@@ -160,23 +162,25 @@ def simulated(logs: Sequence[RunLog], names: Sequence[str]) -> str:
 
 def headline(study: Study) -> str:
     """Verdict on the model, and the worth of its values."""
-    name, e = study.estimate.plant.name, study.estimate
-    if study.biased:
-        return (
-            f"NOT JUDGED: recursive least squares does not reproduce the record (chi2/n {plain(e.validation.ratio)}). "
-            "Noise biases its values; the model is not tested. Use --method oem."
-        )
-    if not study.model_fits:
-        size = f" (chi2/n {plain(e.validation.ratio)}, at most {e.validation.expected[1]:.3f} expected)"
-        size = size if "size" in e.validation.alarming else ""
-        return f"THE MODEL '{name}' DOES NOT FIT{size}: the intervals do not include its error."
-    if not study.predicts:
-        return f"THE MODEL '{name}' DOES NOT PREDICT other records: the values hold only for their own records."
-    if study.identified:
-        return f"The model '{name}' fits. All parameters are identified: the values may be used."
-    others = len(study.unidentified) < len(e.asked.params)
-    end = "; the values of the others may be used" if others else ""
-    return f"The model '{name}' fits. NOT identified: {', '.join(study.unidentified)}{end}."
+    from emb_bench.analysis.study import Code, verdict
+
+    code = verdict(study).model
+    if code is Code.NO_ESTIMATE:
+        return f"NO ESTIMATE: {study.why_not}"
+    name, m = study.estimate.plant.name, study.estimate.validation
+    size = f" (chi2/n {plain(m.ratio)}, at most {m.expected[1]:.3f} expected)" if "size" in m.alarming else ""
+    missed = ", ".join(study.unidentified)
+    others = len(study.unidentified) < len(study.estimate.asked.params)
+    return {
+        Code.BIASED_METHOD: f"NOT JUDGED: recursive least squares does not reproduce the record (chi2/n "
+        f"{plain(m.ratio)}). Noise biases its values; the model is not tested. Use --method oem.",
+        Code.DOES_NOT_FIT: f"THE MODEL '{name}' DOES NOT FIT{size}: the intervals do not include its error.",
+        Code.DOES_NOT_PREDICT: f"THE MODEL '{name}' DOES NOT PREDICT other records: the values hold only for their own "
+        "records.",
+        Code.NOT_IDENTIFIED: f"The model '{name}' fits. NOT identified: {missed}"
+        f"{'; the values of the others may be used' if others else ''}.",
+        Code.FITS: f"The model '{name}' fits. All parameters are identified: the values may be used.",
+    }[code]
 
 
 ONLY_ALONE = (
@@ -191,30 +195,32 @@ def stopped(stop: Stop) -> str:
     return f"STOPPED: {stop.log}{after} ({stop.reason}){f': {stop.detail}' if stop.detail else ''}"
 
 
-def outside(study: Study) -> list[str]:
-    """Parameters outside of the ranges for which the shield guarantees the limits."""
+def outside(study: Study, bench: Bench) -> list[tuple[str, str]]:
+    """Parameters outside of the ranges for which the shield guarantees the limits, behind the name of the run."""
     found = []
-    for c in study.outside:
+    for name, c in study.outside:
         low, high = c.outside or (math.nan, math.nan)
-        ranges = f"ranges.{study.estimate.bench.shield.ranges} ({plain(low, 4)} to {plain(high, 4)})"
-        found.append(
+        ranges = f"ranges.{bench.shield.ranges} ({plain(low, 4)} to {plain(high, 4)})"
+        line = (
             f"OUTSIDE: {c.label} = {amount(c.value, c.interval, c.unit)} lies outside {ranges}: the limits were not "
             "guaranteed. Find the cause, or widen the range."
         )
+        found.append((name, line))
     return found
 
 
 def apart(study: Study) -> str:
     """Parameters in which logs differ that fit alone."""
-    values = "; ".join(f"{d.name}: {', '.join(plain(value, 5) for value in d.values)}" for d in study.apart)
-    alone, every = sum(map(math.isfinite, study.apart[0].values)), len(study.apart[0].values)
+    values = "; ".join(f"{d.name}: {', '.join(plain(value, 5) for value in d.values)}" for d in study.checks.apart)
+    first = study.checks.apart[0].values
+    alone, every = sum(map(math.isfinite, first)), len(first)
     which = "each log fits alone, but not with the others" if alone == every else f"{alone} of {every} logs fit alone"
     return f"{which}: two brakes, or one that changed. By each log: {values}."
 
 
 def changed_model(study: Study) -> str:
     """A warning where a drift may be one of the model instead of one of the brake; else empty."""
-    why = other_model(study.estimate, study.last) if any(d.drifted for d in study.drifts) else ""
+    why = other_model(study.estimate, study.last) if any(d.drifted for d in study.checks.drifts) else ""
     return f"the changes may be the model's: {why}" if why else ""
 
 
@@ -267,7 +273,7 @@ def model_reason(study: Study) -> str:
     """Reason for the model."""
     from emb_bench.information.evaluation import default_model
 
-    choice = study.choice
+    choice = study.checks.choice
     if choice is None:
         return "asked for" if study.options.model else default_model(study.logs[0])[1]
     why = f"the best of {len(choice.candidates)}"
@@ -277,13 +283,14 @@ def model_reason(study: Study) -> str:
 
 def models(study: Study) -> str:
     """Models that the records do not tell apart; empty if one is left."""
-    found: Sequence[Candidate] = study.choice.left_over if study.choice is not None else ()
-    if study.choice is None or len(found) < 2:
+    choice = study.checks.choice
+    found: Sequence[Candidate] = choice.left_over if choice is not None else ()
+    if choice is None or len(found) < 2:
         return ""
     names = ", ".join(c.name for c in found[:-1])
     weights = ", ".join(percent(c.weight) for c in found)
     every = "both" if len(found) == 2 else "all"
-    fit = f"{every} fit" if study.choice.best.fits else "do not fit"
+    fit = f"{every} fit" if choice.best.fits else "do not fit"
     return (
         f"{names} and {found[-1].name} {fit}, and the records do not separate them (weights {weights}): the "
         f"intervals cover {every}"
@@ -555,15 +562,17 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
 
     Where a run was ``stopped`` no further one is named: its cause comes first.
     """
+    from emb_bench.analysis.study import verdict
+
     e, again = study.estimate, f"emb-replay estimate {logs_of(study)}{_known(study)}"
-    if study.biased:
+    if verdict(study).biased:
         return [f"use another method: {again} --method oem"]
-    if study.model_fits and not study.predicts:
+    if study.model_fits and not study.checks.predicts:
         return ["find the difference between the runs: the brake, its homing (--nuisance offset); or use --model"]
-    if study.apart:
+    if study.checks.apart:
         return [f"estimate from each log alone: emb-replay campaign {logs_of(study)} -o rows.csv"]
     if study.model_fits:
-        if stopped or study.identified or e.bench.machine is not None:
+        if stopped or not study.unidentified or e.bench.machine is not None:
             return []
         weak = [c.label for c in study.conclusions if not (c.of_interest or c.identified)]
         return [f"estimate without {', '.join(weak)}: not determined by the record"] if weak else [MORE]
@@ -586,7 +595,9 @@ def remedies(study: Study, *, stopped: bool) -> list[str]:
 
 def _known(study: Study) -> str:
     """The option of a study for parameters that are known beforehand."""
-    known = ((name, one) for name, one in study.options.asked.known.items() if name != "J")
+    from emb_bench.analysis.options import known_values
+
+    known = known_values(study.options.known).items()
     said = ",".join(f"{name}={value:.6g}±{NORMAL_95 * deviation:.3g}" for name, (value, deviation) in known)
     return f" --known {said}" if said else ""
 
@@ -594,7 +605,7 @@ def _known(study: Study) -> str:
 def _options(study: Study) -> str:
     """Options of a study but those that name unknowns."""
     wanted, usual = study.options, "oem" if study.estimate.bench.machine is None else "windows"
-    given = {"--method": wanted.method if wanted.method != usual else "", "--model": wanted.model or ""}
+    given = {"--method": "" if wanted.method in (None, usual) else wanted.method, "--model": wanted.model or ""}
     return "".join(f" {option} {value}" for option, value in given.items() if value)
 
 

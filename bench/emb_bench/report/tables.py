@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 
-from emb_bench.analysis.study import Study
+from emb_bench.analysis.study import Result, Study, verdict
 from emb_bench.brake.parameters import UNITS
 from emb_bench.estimate.effects import shown_as
 from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
 from emb_bench.estimate.records import NORMAL_95
 from emb_bench.information.identifiability import TRADED_OFF
 from emb_bench.numbers import amount, chance, percent, relative, signed
-from emb_bench.report.acceptance import Acceptance, Result
+from emb_bench.report.acceptance import Acceptance
 from emb_bench.report.sentences import drift, limit
 from emb_bench.report.text import Cell, Table
 from emb_runtime.numbers import NOTHING, SMALL, around, plain
@@ -41,21 +41,22 @@ def acceptance_table(acceptance: Acceptance | None) -> Table | None:
 
 def parameters(study: Study, *, brief: bool = False) -> Table:
     """Values with total and repeatability, and whether each is identified."""
-    e = study.estimate
+    e, found = study.estimate, verdict(study)
     header = ["" if brief else "parameter", "value ± total", "total", "repeatability", "identified"]
-    if not study.holds:
+    if not found.holds:
         header.remove("repeatability")  # of a wrong model it means nothing
     words = (0, len(header) - 1)
     header += [] if brief else ["from nominal"]
     header += ["simulated", "error in sigma"] if study.truth is not None and not brief else []
-    yes = Cell("yes", "good") if study.holds else Cell("biased" if study.biased else "(yes)", "care")
+    biased = "biased" if found.biased else "(yes)"
+    yes = Cell("yes", "good") if found.holds else Cell(biased, "care")
     rows = []
     for i, c in zip(e.wanted(), study.conclusions, strict=True):
         unknown = e.unknowns[i]
         size = c.value if unknown.relative else 0.0
         row: list[str] = [c.label, amount(c.value, c.interval, c.unit)]
         row += [relative(0.5 * (c.interval[1] - c.interval[0]), size)]
-        row += [relative(c.repeatability, size)] if study.holds else []
+        row += [relative(c.repeatability, size)] if found.holds else []
         row.append(yes if c.identified else Cell("NO", "bad"))
         if not brief:
             nominal = getattr(e.bench.brake, unknown.name, None)
@@ -88,12 +89,13 @@ def errors(study: Study) -> Table | None:
 
 def models(study: Study) -> Table | None:
     """Models that were compared, best first, with what each would change."""
-    if study.choice is None:
+    choice = study.checks.choice
+    if choice is None:
         return None
-    best, rows = study.choice.best, []
-    names = [change.name for change in study.choice.changes(best)]
-    for c in study.choice.candidates:
-        changes = [f"{signed(change.percent)} % ({change.deviations:+.1f})" for change in study.choice.changes(c)]
+    best, rows = choice.best, []
+    names = [change.name for change in choice.changes(best)]
+    for c in choice.candidates:
+        changes = [f"{signed(change.percent)} % ({change.deviations:+.1f})" for change in choice.changes(c)]
         differences = [f"{value:.1f}" for value in (c.bic - best.bic, c.held_out - best.held_out)]
         cells = [NOTHING] * len(changes) if c is best else changes
         rows.append(
@@ -202,7 +204,9 @@ def checks(study: Study) -> list[Table | None]:
 
 def predicted(study: Study) -> Table | None:
     """Records predicted by an estimate of others."""
-    rows = [[h.name, plain(h.ratio, 4), str(h.freedom), chance(h.p_value), answer(h.fits)] for h in study.left_out]
+    rows = [
+        [h.name, plain(h.ratio, 4), str(h.freedom), chance(h.p_value), answer(h.fits)] for h in study.checks.held_out
+    ]
     header = ["record", "chi2/n", "samples", "p", "predicted"]
     return Table("Predictions of records that were held out", header, rows, words=(0, 4)) if rows else None
 
@@ -225,7 +229,7 @@ def correlation(e: Estimate) -> tuple[Table | None, list[str]]:
 def drifts(study: Study) -> Table:
     """Values of an earlier estimate and of this one."""
     rows = []
-    for d in study.drifts:
+    for d in study.checks.drifts:
         change = f"{signed(100.0 * d.relative_change)} %" if d.relative else f"{signed(d.relative_change)} {d.unit}"
         rows.append(
             [

@@ -9,6 +9,7 @@ import sys
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 from emb_runtime.system import terminal
 
@@ -19,7 +20,7 @@ GOOD = r"(?P<good>^The model '[^']*' fits\b|limits held|\byes$)"  # Words that s
 
 
 class Cell(str):
-    """Text of a cell that is to stand out: ``good``, ``bad`` or ``care``, and a background from -1 to 1."""
+    """Text that stands out: ``good``, ``bad``, ``care``, ``name`` or ``code``, and a background from -1 to 1."""
 
     tone: str
     shade: float
@@ -53,6 +54,7 @@ def listed(mark: str, texts: Iterable[str]) -> list[str]:
 class Table:
     """One table; its first column names the rows."""
 
+    kind: ClassVar[str] = "table"
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]

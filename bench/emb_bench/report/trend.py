@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from emb_bench.analysis.conclusion import Conclusion
 from emb_bench.analysis.several_runs import Constancy, constancy
-from emb_bench.analysis.study import Study
+from emb_bench.analysis.study import Run, Study, verdict
 from emb_bench.brake.parameters import UNITS
-from emb_bench.estimate.records import NORMAL_95
+from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.figures import COLOURS, svg
 from emb_bench.numbers import percent
-from emb_bench.report.content import Run
-from emb_bench.report.figures import FAINT, PANEL, Panel
+from emb_bench.report.figures import FAINT, PANEL
+from emb_bench.report.page import Panel
 from emb_bench.report.text import Cell, Table
 from emb_runtime.numbers import NOTHING, SMALL, around, plain
 
@@ -49,7 +49,7 @@ def trends(runs: Sequence[Run]) -> list[Trend]:
 
 def _trend(studies: Sequence[Study], label: str) -> Trend:
     found = [_conclusion(study, label) for study in studies]
-    usable = np.array([c.identified and study.holds for c, study in zip(found, studies, strict=True)])
+    usable = np.array([c.identified and verdict(study).holds for c, study in zip(found, studies, strict=True)])
     values, half = np.array([c.value for c in found]), np.array([_half(study, label) for study in studies])
     ends = np.stack([values - half, values + half], axis=1)
     reference = 0.0 if label in UNITS else float(np.median(values[usable] if usable.any() else values))
@@ -111,16 +111,17 @@ def table(runs: Sequence[Run], found: Sequence[Trend]) -> Table:
     """One row for each run, those without an estimate included."""
     rows, at = [], 0
     for n, run in enumerate(runs, 1):
-        outcome = Cell(run.log.exit_reason, "" if run.done else "bad")
-        row: list[str] = [f"{n}: {run.name}", run.began.removesuffix(" UTC") or "not recorded", outcome, _lost(run)]
+        outcome = Cell(run.log.exit_reason, "" if run.log.exit_reason == DONE else "bad")
+        row: list[str] = [f"{n}: {run.name}", run.log.began.removesuffix(" UTC") or "not recorded", outcome, _lost(run)]
         if run.alone is None:
             rows.append([*row, Cell("no estimate", "care"), *[NOTHING] * len(found)])
             continue
-        row.append(Cell("yes", "good") if run.alone.holds else Cell("NO", "bad"))
+        holds = verdict(run.alone).holds
+        row.append(Cell("yes", "good") if holds else Cell("NO", "bad"))
         for trend in found:
             low, high = trend.ends[at]
             shown = around(float(trend.values[at]), 0.5 * float(high - low))
-            row.append(shown if trend.usable[at] or not run.alone.holds else Cell(f"{shown} (not identified)", "care"))
+            row.append(shown if trend.usable[at] or not holds else Cell(f"{shown} (not identified)", "care"))
         rows.append(row)
         at += 1
     less = ", ".join(trend.less for trend in found if trend.less)

@@ -8,8 +8,9 @@ through :func:`sent_current` and :func:`pass_period`. They are plain scalar Pyth
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from operator import index
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -145,17 +146,17 @@ def parse_assignments(text: str, option: str = "") -> dict[str, str]:
 
 
 def true_parameters(
-    bench: Bench, assignments: dict[str, str], besides: Sequence[str] = (), option: str = ""
+    bench: Bench, assignments: Mapping[str, Any], besides: Sequence[str] = (), option: str = ""
 ) -> BrakeParameters:
-    """The bench's nominal brake with some parameters replaced; a message begins with ``option``."""
+    """The bench's nominal brake with some parameters replaced, by numbers or texts; ``option`` begins a message."""
     theta = bench.brake
-    for name, text in assignments.items():
+    for name, given in assignments.items():
         if name not in PARAMETER_NAMES:
             known = (*PARAMETER_NAMES, *besides)
             said = f"'{name}' is not a parameter; expected one of {', '.join(known)}{near(name, known)}"
             raise UsageError(f"{option}{said}")
-        value = _number(text)
-        check_near_nominal(bench, name, value, option, got=f"'{text}'")
+        value = _number(given)
+        check_near_nominal(bench, name, value, option, got=f"'{given}'")
         theta = theta._replace(**{name: value})
     return theta
 
@@ -189,11 +190,16 @@ def read_brake(text: str, bench: Bench, option: str) -> BrakeToSimulate:
     ``charge=1`` has the node send the integral of its current; ``angle_noise`` [rad] and ``velocity_noise`` [rad/s] are
     standard deviations of sensors that are not as the bench file says. ``option`` begins a message.
     """
-    given = parse_assignments(text, option)
-    plant = with_tables(bench, "bench file").plant(given.pop("plant", DEFAULT_PLANT))
-    seed, charge = given.pop("seed", "1"), given.pop("charge", "0")
-    if not seed.isdecimal() or len(seed) > LONGEST_SEED:
-        raise UsageError(f"{option}seed: expected a whole number from 0 of up to {LONGEST_SEED} digits, got '{seed}'")
+    return brake_of(parse_assignments(text, option), bench, option)
+
+
+def brake_of(options: Mapping[str, Any], bench: Bench, option: str) -> BrakeToSimulate:
+    """The brake of options by name, of numbers or texts; see :func:`read_brake`."""
+    given = dict(options)
+    plant = with_tables(bench, "bench file").plant(str(given.pop("plant", DEFAULT_PLANT)))
+    told, charge = given.pop("seed", 1), str(given.pop("charge", 0))
+    if (seed := _seed(told)) is None:
+        raise UsageError(f"{option}seed: expected a whole number from 0 of up to {LONGEST_SEED} digits, got '{told}'")
     if charge not in ("0", "1"):
         raise UsageError(f"{option}charge: expected 0 or 1, got '{charge}'")
     angle, velocity = (_deviation(given, name, option) for name in NOISES)
@@ -203,25 +209,35 @@ def read_brake(text: str, bench: Bench, option: str) -> BrakeToSimulate:
         velocity=bench.noise.velocity if velocity is None else velocity,
     )
     theta = true_parameters(bench, given, ("plant", "seed", "charge", *NOISES), option)
-    noise = gaussian_noise(sensors, int(seed), plant.instruments.clock_jitter)
-    return BrakeToSimulate(theta, plant, noise, int(seed), charge == "1")
+    noise = gaussian_noise(sensors, seed, plant.instruments.clock_jitter)
+    return BrakeToSimulate(theta, plant, noise, seed, charge == "1")
 
 
-def _number(text: str) -> float:
+def _number(given: Any) -> float:
     """NaN for what is none."""
     try:
-        return float(text)
-    except ValueError:
+        return float(given)
+    except (TypeError, ValueError):
         return math.nan
 
 
-def _deviation(given: dict[str, str], name: str, option: str) -> float | None:
-    text = given.pop(name, None)
-    if text is None:
+def _seed(given: Any) -> int | None:
+    """None for what is none."""
+    if isinstance(given, str):
+        return int(given) if given.isdecimal() and len(given) <= LONGEST_SEED else None
+    try:
+        return seed if 0 <= (seed := index(given)) < 10**LONGEST_SEED else None
+    except TypeError:
         return None
-    value = _number(text)
+
+
+def _deviation(given: dict[str, Any], name: str, option: str) -> float | None:
+    if name not in given:
+        return None
+    told = given.pop(name)
+    value = _number(told)
     if not 0.0 <= value < math.inf:
-        raise UsageError(f"{option}{name}: expected a standard deviation from 0 on, got '{text}'")
+        raise UsageError(f"{option}{name}: expected a standard deviation from 0 on, got '{told}'")
     return value
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from emb_bench.sim.node import BrakeNode
-from emb_bench.sim.simulated_brake import read_brake
+from emb_bench.sim.simulated_brake import BrakeToSimulate, read_brake
 from emb_runtime.can.messages import load_layout
 from emb_runtime.config.bench import Bench
 from emb_runtime.records import Frame
@@ -100,7 +100,11 @@ class SimTransport(LockstepBus):
 
 def open_sim(options: str, bench: Bench) -> tuple[SimTransport, SteppedClock]:
     """Open the simulated bus with the options of :func:`~emb_bench.sim.simulated_brake.read_brake`."""
-    brake = read_brake(options, bench, "sim: ")
+    return open_brake(read_brake(options, bench, "sim: "), bench)
+
+
+def open_brake(brake: BrakeToSimulate, bench: Bench) -> tuple[SimTransport, SteppedClock]:
+    """Open a bus with a simulated brake on it."""
     node = BrakeNode(bench, load_layout(), brake.theta, brake.noise, brake.plant, charge=brake.charge)
     # Monotonic time starts where the computer's stands, so that a log has the date of its run.
     now_ns = time.monotonic_ns()

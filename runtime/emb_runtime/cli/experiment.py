@@ -7,6 +7,7 @@ from typing import Any
 
 from emb_runtime.can.interfaces import open_transport
 from emb_runtime.can.messages import StopReason
+from emb_runtime.can.transport import Transport
 from emb_runtime.cli.bus_monitor import BusStatistics
 from emb_runtime.cli.documents import refusal
 from emb_runtime.cli.plan import Plan
@@ -15,12 +16,16 @@ from emb_runtime.control.result import may_go_home
 from emb_runtime.control.start_conditions import Bounds
 from emb_runtime.errors import EXIT_DONE, EXIT_SAFETY_STOP, EmbError
 from emb_runtime.records import HOMING_LOG, RunType
+from emb_runtime.system.clock import Clock
 
 
-def experiment(plan: Plan, path: Path, console: Console) -> tuple[dict[str, Any], int]:
+def experiment(
+    plan: Plan, path: Path, console: Console, opened: tuple[Transport, Clock] | None = None
+) -> tuple[dict[str, Any], int]:
     """Run one experiment on a bus, and bring the brake home before and after it where that is asked for and needed.
 
-    The log must not exist; those of the ways home are called alike.
+    The log must not exist; those of the ways home are called alike. A bus that is ``opened`` already stands for that of
+    the plan, and is closed too.
 
     Returns:
         The document, see :meth:`emb_runtime.cli.documents.RunResult.document`; of the way home, where that failed
@@ -34,7 +39,7 @@ def experiment(plan: Plan, path: Path, console: Console) -> tuple[dict[str, Any]
     # The kernel keeps what is not in the DBC away: a babbling stranger must not cost the loop its period. Another
     # commander still shows, for he uses an identifier of the DBC; --read-only shows all that is on the bus.
     identifiers = tuple(message.identifier for message in plan.layout.known)
-    transport, clock = open_transport(plan.iface, plan.bench, identifiers)
+    transport, clock = opened or open_transport(plan.iface, plan.bench, identifiers)
     bus = Bus(plan.iface, transport, clock)
     assert plan.experiment is not None
     home = plan.experiment.home

@@ -9,7 +9,8 @@ import pytest
 from scipy import stats
 
 from emb_bench.analysis.model_choice import ModelChoice, choose_model, mixture_interval
-from emb_bench.analysis.study import StudyOptions, make_study
+from emb_bench.analysis.options import EstimateOptions
+from emb_bench.analysis.study import make_study
 from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EVERY, Plant
@@ -100,7 +101,7 @@ def test_the_interval_of_one_model_is_gaussian_and_that_of_two_holds_95_percent_
 
 def test_a_study_with_all_models_says_which_it_took_and_why(bench: Bench, tmp_path: Path, simulate: Simulate) -> None:
     log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave, options="plant=stribeck")))
-    found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=1))
+    found = make_study(bench, [log], EstimateOptions(model=EVERY, starts=1))
     assert found.estimate.plant.name == "stribeck"
     said = document(found)
     # With the encoder's offset estimated too, 'offset' is 'exact'.
@@ -121,15 +122,16 @@ def test_two_models_that_a_record_cannot_tell_apart_are_named_in_one_sentence(
 ) -> None:
     """In 200 samples play of 0.3 rad explains no less than the brake that was there, and comes first by chance."""
     log = square_log(tmp_path, simulate, "exact", 200)
-    found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=1))
+    found = make_study(bench, [log], EstimateOptions(model=EVERY, starts=1))
     assert document(found)["not_told_apart"] == ["play", "exact"]
-    assert found.choice is not None
-    assert all(c.fits for c in found.choice.left_over)
+    choice = found.checks.choice
+    assert choice is not None
+    assert all(c.fits for c in choice.left_over)
     sentence = models(found)
     assert sentence in " ".join(text(found).split())
     page = make(tmp_path / "a.html", log.path, "--model", EVERY, "--starts", "1")
     assert sentence[1:] in page.reader.text
-    alone = found.choice.best.estimate.intervals()
+    alone = choice.best.estimate.intervals()
     for i, (name, c) in enumerate(zip(PARAMETER_NAMES, found.conclusions, strict=True)):
         assert c.interval[0] < getattr(bench.brake, name) < c.interval[1]
         assert c.interval[0] <= alone[i][0] < alone[i][1] <= c.interval[1]
@@ -140,7 +142,7 @@ def test_of_models_that_are_all_alike_the_simplest_one_answers(
 ) -> None:
     """A brake that goes away from the clamp has no curve, no hysteresis and no play."""
     log = square_log(tmp_path, simulate, "exact", 100, -1.0)
-    found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=1))
+    found = make_study(bench, [log], EstimateOptions(model=EVERY, starts=1))
     assert found.estimate.plant.name == "exact"
     assert {"exact", "cubic", "hysteresis", "play"} <= {*document(found)["not_told_apart"]}
 
@@ -166,11 +168,9 @@ def test_the_answer_allows_for_the_errors_of_the_bench_as_with_one_model(
     bench: Bench, tmp_path: Path, simulate: Simulate
 ) -> None:
     log = read_log(write_log(tmp_path / "a.mcap", simulate(square_wave, options="plant=stribeck")))
-    found = make_study(bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=2)).estimate
-    one = make_study(bench, [log], StudyOptions(EstimationProblem(), model="stribeck", starts=2)).estimate
+    found = make_study(bench, [log], EstimateOptions(model=EVERY, starts=2)).estimate
+    one = make_study(bench, [log], EstimateOptions(model="stribeck", starts=2)).estimate
     assert found.unknowns == one.unknowns
     assert found.intervals() == pytest.approx(one.intervals(), rel=1e-5)
-    ideal = make_study(
-        bench, [log], StudyOptions(EstimationProblem(), model=EVERY, starts=2, systematic=False)
-    ).estimate
+    ideal = make_study(bench, [log], EstimateOptions(model=EVERY, starts=2, systematic="none")).estimate
     assert len(ideal.unknowns) < len(found.unknowns)

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from emb_bench.analysis.conclusion import Standing, conclude
+from emb_bench.analysis.options import EstimateOptions
 from emb_bench.analysis.profile import profile
-from emb_bench.analysis.study import ModelStanding, StudyOptions, make_study
+from emb_bench.analysis.study import Code, make_study, verdict
 from emb_bench.api import simulate as simulate_run
 from emb_bench.batch.evaluate import evaluate_one
-from emb_bench.batch.row import Options, Source
+from emb_bench.batch.row import CampaignOptions, Source
 from emb_bench.config.bench import Bench, parse_bench
 from emb_bench.estimate.effects import EFFECTS, possible
 from emb_bench.estimate.estimate import Estimate
@@ -37,7 +38,7 @@ from tests.conftest import Simulate  # isort: skip
 from tests.benches import SENSOR_TEXT
 
 Log = Callable[[str], RunLog]
-PAIR = EstimationProblem(("k_m", "f_v"))
+PAIR = ("k_m", "f_v")
 
 
 @pytest.fixture
@@ -57,15 +58,18 @@ def estimated(bench: Bench, *records: Experiment, **asked: object) -> Estimate:
 
 
 def test_a_record_that_is_not_predicted_decides_like_residuals_that_do_not_fit(bench: Bench, log: Log) -> None:
-    together = make_study(bench, [log("plant=exact,seed=1"), log("plant=exact,seed=3")], StudyOptions(PAIR, starts=1))
-    assert len(together.left_out) == 2
-    assert together.holds
-    found = replace(together, left_out=(replace(together.left_out[0], fits=False), together.left_out[1]))
-    assert (found.model_fits, found.predicts, found.holds) == (True, False, False)
+    together = make_study(
+        bench, [log("plant=exact,seed=1"), log("plant=exact,seed=3")], EstimateOptions(PAIR, starts=1)
+    )
+    assert len(together.checks.held_out) == 2
+    assert verdict(together).holds
+    first, second = together.checks.held_out
+    found = replace(together, checks=replace(together.checks, held_out=(replace(first, fits=False), second)))
+    assert found.model_fits
     assert all(c.standing is Standing.IF_MODEL_RIGHT for c in conclude(found.estimate, (), (), predicts=False))
     got = document(found)
     assert (got["model_fits"], got["predicts"]) == (True, False)
-    assert found.standing is ModelStanding.DOES_NOT_PREDICT
+    assert verdict(found).model is Code.DOES_NOT_PREDICT
 
 
 def test_logs_have_to_be_of_one_brake_and_time_grid_and_each_run_is_given_once(
@@ -80,7 +84,7 @@ def test_logs_have_to_be_of_one_brake_and_time_grid_and_each_run_is_given_once(
         (bench, [first, log("plant=exact,seed=2"), copy], "each run once"),
     ):
         with pytest.raises(UsageError, match=said):
-            make_study(its, logs, StudyOptions(PAIR, starts=1))
+            make_study(its, logs, EstimateOptions(PAIR, starts=1))
 
 
 def test_a_conclusion_takes_the_profile_s_interval_and_its_doubts(bench: Bench) -> None:
@@ -108,8 +112,8 @@ def test_nuisances_are_concluded_on_but_do_not_decide(bench: Bench, log: Log) ->
     interest, nuisance = conclude(e, (), ())
     assert (interest.of_interest, interest.identified) == (True, True)
     assert (nuisance.of_interest, nuisance.identified) == (False, False)
-    study = make_study(bench, [log("plant=exact")], StudyOptions(PAIR, starts=1))
-    assert replace(study, conclusions=(interest, nuisance)).identified
+    study = make_study(bench, [log("plant=exact")], EstimateOptions(PAIR, starts=1))
+    assert replace(study, conclusions=(interest, nuisance)).unidentified == ()
 
 
 def test_estimate_report_and_campaign_agree_on_what_is_identified(
@@ -125,22 +129,20 @@ def test_estimate_report_and_campaign_agree_on_what_is_identified(
     ]
     verdicts = []
     for one in logs:
-        plain, profiled = (
-            make_study(bench, [one], StudyOptions(EstimationProblem(), starts=2, profiles=p)) for p in (False, True)
-        )
-        row = evaluate_one(Source(str(one.path), "", one.path.name, "."), Options(starts=2))
+        plain, profiled = (make_study(bench, [one], EstimateOptions(starts=2, profile=p)) for p in (False, True))
+        row = evaluate_one(Source(str(one.path), "", one.path.name, "."), CampaignOptions(starts=2))
         identified = [c.identified for c in plain.conclusions]
         assert identified == [c.identified for c in profiled.conclusions]
         assert identified == [row[f"{c.label}_identified"] for c in plain.conclusions]
         verdicts.append(identified)
     assert all(verdicts[0])
     assert not all(verdicts[1])
-    assert make_study(bench, logs[2:], StudyOptions(EstimationProblem(), starts=2)).stopped[0].reason == "INTERRUPTED"
+    assert make_study(bench, logs[2:], EstimateOptions(starts=2)).stops[0].reason == "INTERRUPTED"
 
 
 def test_the_bias_of_recursive_least_squares_is_not_held_against_the_model(bench: Bench, log: Log) -> None:
-    study = make_study(bench, [log("plant=exact,seed=1")], StudyOptions(PAIR, method="rls"))
-    assert study.standing is ModelStanding.BIASED_METHOD
+    study = make_study(bench, [log("plant=exact,seed=1")], EstimateOptions(PAIR, method="rls"))
+    assert verdict(study).model is Code.BIASED_METHOD
     assert {c.standing for c in study.conclusions} <= {Standing.BIASED, Standing.NOT_IDENTIFIED}
     assert study.minima == []
 
@@ -153,20 +155,19 @@ def test_an_interval_that_holds_zero_identifies_nothing(bench: Bench) -> None:
 
 
 def test_two_brakes_in_one_call_are_said_to_fit_each_alone(bench: Bench, log: Log) -> None:
-    options = StudyOptions(EstimationProblem(), starts=1, model="exact")
+    options = EstimateOptions(starts=1, model="exact")
     first, other = log("plant=exact,seed=1"), log("plant=exact,seed=2,k_m=0.0225")
     study = make_study(bench, [first, other], options)
-    assert study.apart[0].name == "k_m"
+    assert study.checks.apart[0].name == "k_m"
     assert " ".join(apart(study).split()) in " ".join(text(study).split())
     for second in ("plant=exact,seed=2", "plant=stribeck,seed=2"):  # one brake, and one that the model does not know
-        assert make_study(bench, [first, log(second)], options).apart == ()
+        assert make_study(bench, [first, log(second)], options).checks.apart == ()
 
 
 def test_a_nuisance_at_the_border_of_its_search_cuts_the_interval_of_a_parameter(bench: Bench, log: Log) -> None:
-    sticking = EstimationProblem(nuisances=("break_away", "stribeck_velocity"))
-    study = make_study(bench, [log("plant=exact,seed=2")], StudyOptions(sticking))
+    study = make_study(bench, [log("plant=exact,seed=2")], EstimateOptions(nuisance="break_away,stribeck_velocity"))
     assert study["k_1"].finding.doubts == (Doubt.CUT,)
-    (cut,) = (profile for profile in study.profiles if profile.label == "k_1")
+    (cut,) = (profile for profile in study.checks.profiles if profile.label == "k_1")
     assert DOUBTS[Doubt.CUT] in sentence(cut, study.estimate)
     (remedy,) = remedies(study, stopped=False)
     assert "break_away, stribeck_velocity" in remedy
@@ -183,11 +184,11 @@ def test_the_first_remedy_for_each_choice_of_parameters_is_a_command_that_gives_
     run = log(f"plant=exact,seed=3,{name}={1.4 * getattr(bench.brake, name)!r}")
     commands = set()
     for chosen in SUBSETS:
-        study = make_study(bench, [run], StudyOptions(EstimationProblem(chosen), starts=1))
+        study = make_study(bench, [run], EstimateOptions(chosen, starts=1))
         assert all(s.possible for s in study.estimate.validation.suspected)
         assert all(c.interval[0] in (-np.inf, 0.0) or c.interval[0] > 0.0 for c in study.conclusions)
-        assert study.holds == (name in chosen)
-        if not study.holds:
+        assert verdict(study).holds == (name in chosen)
+        if not verdict(study).holds:
             assert name in alarms(study.estimate)[0]
             assert alarms(study.estimate)[0].endswith("estimate all four: leave --params out")
             commands.add(remedies(study, stopped=False)[0].partition(": ")[2])
@@ -200,8 +201,8 @@ def test_the_first_remedy_for_each_choice_of_parameters_is_a_command_that_gives_
 def test_a_remedy_keeps_the_model_and_the_method_that_were_asked_for(bench: Bench, log: Log) -> None:
     run = log("plant=stribeck,f_v=3e-5,seed=2")
     for options, end in (
-        (StudyOptions(EstimationProblem(("k_1",)), starts=1, model="exact"), " --model exact"),
-        (StudyOptions(EstimationProblem(("k_1",)), "pem", "exact", starts=1), " --method pem --model exact"),
+        (EstimateOptions("k_1", starts=1, model="exact"), " --model exact"),
+        (EstimateOptions("k_1", method="pem", model="exact", starts=1), " --method pem --model exact"),
     ):
         study = make_study(bench, [run], options)
         assert remedies(study, stopped=False)[0] == f"estimate all four: emb-replay estimate {run.path}{end}"
@@ -273,9 +274,8 @@ def test_every_nuisance_of_a_remedy_can_be_asked_for() -> None:
 def test_profiles_with_all_priors_in_full_do_not_widen_averaged_intervals(bench: Bench, log: Log) -> None:
     run = log("plant=exact,seed=7")
     plain, profiled = (
-        make_study(bench, [run], StudyOptions(EstimationProblem(), starts=1, profiles=profiles))
-        for profiles in (False, True)
+        make_study(bench, [run], EstimateOptions(starts=1, profile=profile)) for profile in (False, True)
     )
-    agreeing = [profile.label for profile in profiled.profiles if profile.agrees]
+    agreeing = [profile.label for profile in profiled.checks.profiles if profile.agrees]
     assert len(agreeing) >= 3
     assert [profiled[label].interval for label in agreeing] == [plain[label].interval for label in agreeing]

@@ -17,7 +17,7 @@ from pyarrow import parquet
 
 from emb_bench.analysis.several_runs import constancy
 from emb_bench.batch.campaign import find
-from emb_bench.batch.row import Options, Row, Source, failed, write_rows
+from emb_bench.batch.row import CampaignOptions, Row, Source, failed, write_rows
 from emb_bench.batch.summary import Campaign, mark_copies, summarise, text
 from emb_bench.output import replacing
 from emb_runtime.errors import UsageError
@@ -160,13 +160,13 @@ def test_the_rows_are_a_csv_file_where_the_name_says_so(tmp_path: Path) -> None:
     cut = failed(Source("logs/a.mcap", "logs", "a.mcap", "."), "cut")
     rows = [cut, {"log": "b.mcap", "error": None, "warnings": ("one", "two")}]
     path = tmp_path / "rows"
-    write_rows(path, ".csv", rows, Options())
+    write_rows(path, ".csv", rows, CampaignOptions())
     with path.open(newline="", encoding="utf-8") as file:
         found = list(csv.DictReader(file))
     assert [row["log"] for row in found] == ["a.mcap", "b.mcap"]
     assert [row["error"] for row in found] == ["cut", ""]
     assert [row["warnings"] for row in found] == ["", "one; two"]
-    write_rows(path, ".parquet", rows, Options())
+    write_rows(path, ".parquet", rows, CampaignOptions())
     table = parquet.read_table(path)
     assert table.column_names == list(found[0])
     assert table["warnings"].to_pylist() == [None, ["one", "two"]]
@@ -175,7 +175,7 @@ def test_the_rows_are_a_csv_file_where_the_name_says_so(tmp_path: Path) -> None:
 HOUR = 3600 * 10**9
 FIRST = 1_700_000_000 * 10**9
 DEVIATION = 1e-5  # Relative standard deviation of an estimate of k_m
-OPTIONS = Options(params=("k_m",))
+OPTIONS = CampaignOptions(params=("k_m",))
 
 
 def row(number: int, value: float, *, fits: bool = True, half: float = 0.0) -> Row:

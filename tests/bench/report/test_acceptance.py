@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -12,12 +13,13 @@ import msgspec
 import pytest
 
 from emb_bench.analysis.drift import Earlier
-from emb_bench.analysis.study import Study, StudyOptions, make_study
+from emb_bench.analysis.options import EstimateOptions
+from emb_bench.analysis.study import Result, Study, make_study
 from emb_bench.cli.replay import main
 from emb_bench.config.bench import load_bench
-from emb_bench.estimate.records import EstimationProblem
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.logs.log import read_log
-from emb_bench.report.acceptance import Result, RunFacts, judge, read_criteria
+from emb_bench.report.acceptance import judge, read_criteria
 from emb_bench.report.estimate import document
 from emb_runtime.errors import UsageError
 
@@ -25,8 +27,6 @@ from tests.bench.conftest import Replay  # isort: skip
 from tests.bench.simulated_logs import square, write_log  # isort: skip
 from tests.conftest import Simulate  # isort: skip
 from tests.benches import SENSOR_BENCH
-
-GOOD = RunFacts("run.mcap", "DONE", complete=True, missing="", missed=0.0, lost=0.002)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, simulate: Simulate) -> Path
 
 
 def study_of(path: Path, model: str | None = None, last: Any = None) -> Study:
-    options = StudyOptions(EstimationProblem(), starts=1, model=model)
+    options = EstimateOptions(starts=1, model=model)
     return make_study(SENSOR_BENCH, [read_log(path)], options, last=last)
 
 
@@ -58,10 +58,8 @@ def written(tmp_path: Path, text: str) -> Path:
     return path
 
 
-def results(
-    tmp_path: Path, text: str, study: Study | None, run: RunFacts = GOOD, last: Any = None
-) -> dict[str, Result]:
-    found = judge(read_criteria(written(tmp_path, text)), [run], [], study, "no experiment", last)
+def results(tmp_path: Path, text: str, study: Study) -> dict[str, Result]:
+    found = judge(read_criteria(written(tmp_path, text)), study, [])
     assert all(bool(one.why) == (one.result is not Result.PASS) for one in found.results)
     return {one.name: one.result for one in found.results}
 
@@ -98,20 +96,36 @@ def test_drift_is_judged_against_an_earlier_estimate_and_not_without_one(
     changed = msgspec.structs.replace(last, parameters=moved)
     for earlier, expected in ((last, Result.PASS), (changed, Result.FAIL)):
         now = study_of(folder / "good.mcap", last=earlier)
-        assert results(tmp_path, "drift.k_1 = 0.01", now, last=earlier)["drift of k_1"] is expected
+        assert results(tmp_path, "drift.k_1 = 0.01", now)["drift of k_1"] is expected
     doubted = msgspec.structs.replace(changed, model_fits=False)
     now = study_of(folder / "good.mcap", last=doubted)
-    doubtful = results(tmp_path, "drift.k_1 = 0.01", now, last=doubted)
+    doubtful = results(tmp_path, "drift.k_1 = 0.01", now)
     assert doubtful["drift of k_1"] is Result.CANNOT_TELL
     assert results(tmp_path, "drift.k_1 = 0.01", study)["drift of k_1"] is Result.CANNOT_TELL
 
 
-def test_a_budget_is_counted_per_run_and_open_where_nothing_was_measured(tmp_path: Path, study: Study) -> None:
+def test_a_budget_is_counted_per_run_and_open_where_nothing_was_measured(
+    tmp_path: Path, folder: Path, study: Study
+) -> None:
     text = "budgets = {missed = 0.0, lost = 0.001}"
-    found = results(tmp_path, text, study)
-    assert (found["missed periods"], found["lost samples"]) == (Result.PASS, Result.FAIL)
-    unknown = results(tmp_path, text, study, GOOD.__class__("run.mcap", "DONE", True, "", None, None))
+    lost = results(tmp_path, text, with_run(study, experiment=without_a_sample(study)))
+    assert (lost["missed periods"], lost["lost samples"]) == (Result.PASS, Result.FAIL)
+    nothing = replace(study.logs[0], topics={})
+    unknown = results(tmp_path, text, with_run(study, log=nothing, experiment=None))
     assert (unknown["missed periods"], unknown["lost samples"]) == (Result.CANNOT_TELL, Result.CANNOT_TELL)
+
+
+def with_run(study: Study, **changes: Any) -> Study:
+    """The study, of a run that is another in some respects."""
+    return replace(study, runs=(replace(study.runs[0], **changes),))
+
+
+def without_a_sample(study: Study) -> Experiment:
+    x = study.runs[0].experiment
+    assert x is not None
+    samples = x.samples.copy()
+    samples[7] = math.nan
+    return replace(x, samples=samples)
 
 
 def test_nothing_rests_on_a_model_that_does_not_fit_and_a_misfit_fails(tmp_path: Path, folder: Path) -> None:
@@ -120,16 +134,18 @@ def test_nothing_rests_on_a_model_that_does_not_fit_and_a_misfit_fails(tmp_path:
     assert found == {"run completed": Result.PASS, "model fit": Result.FAIL, "k_m": Result.CANNOT_TELL}
     allowed = results(tmp_path, "model_fit = false", wrong)
     assert allowed == {"run completed": Result.PASS}
-    assert set(results(tmp_path, "parameters.k_m.relative = 0.9", None).values()) == {Result.PASS, Result.CANNOT_TELL}
+    none = replace(with_run(wrong, experiment=None, why_not="no experiment"), joint=None, conclusions=())
+    assert set(results(tmp_path, "parameters.k_m.relative = 0.9", none).values()) == {Result.PASS, Result.CANNOT_TELL}
 
 
 def test_a_stopped_run_or_a_log_that_is_not_whole_fails_whatever_the_model_says(tmp_path: Path, study: Study) -> None:
-    for run in (
-        RunFacts("run.mcap", "SENSOR_LOST", complete=True, missing="", missed=0.0, lost=0.0),
-        RunFacts("run.mcap", "DONE", complete=False, missing="cut", missed=0.0, lost=0.0),
+    log = study.logs[0]
+    for other in (
+        replace(log, metadata={**log.metadata, "emb.end": {"exit_reason": "SENSOR_LOST"}}),
+        replace(log, complete=False, missing="cut"),
     ):
-        assert results(tmp_path, "", study, run)["run completed"] is Result.FAIL
-    left_out = judge(read_criteria(written(tmp_path, "")), [GOOD], ["x.mcap: left out: no log"], study)
+        assert results(tmp_path, "", with_run(study, log=other))["run completed"] is Result.FAIL
+    left_out = judge(read_criteria(written(tmp_path, "")), study, ["x.mcap: left out: no log"])
     assert left_out.result is Result.FAIL
 
 

@@ -15,23 +15,26 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from emb_bench.analysis.study import StudyOptions, make_study
+from emb_bench.analysis.options import EstimateOptions
+from emb_bench.analysis.study import make_study
 from emb_bench.batch.evaluate import evaluate_one
-from emb_bench.batch.row import Options, Source
+from emb_bench.batch.row import CampaignOptions, Source
 from emb_bench.batch.summary import summarise
 from emb_bench.batch.summary import text as text_of_campaign
 from emb_bench.brake.parameters import quantity
 from emb_bench.cli.replay import main
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.records import EstimationProblem, Unknown
+from emb_bench.estimate.records import Unknown
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.figures import COLOURS
 from emb_bench.logs.log import read_log
 from emb_bench.report import figures
-from emb_bench.report.content import Content, gather
 from emb_bench.report.figures import applied_as_sent
-from emb_bench.report.page import document, intervals, report_page, with_units
+from emb_bench.report.motion import Motion
+from emb_bench.report.page import html
+from emb_bench.report.report import Report as Made
+from emb_bench.report.report import document, intervals, page_of, timing_of, with_units
 from emb_bench.report.sentences import MORE, effects
 from emb_runtime.errors import EXIT_OUTSIDE
 from emb_runtime.log.ring_buffer import Attachment, EventRecord
@@ -184,7 +187,7 @@ def test_the_pale_line_of_a_profile_is_the_parabola_of_the_fisher_information(
     good: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = read_log(good)
-    study = make_study(log.bench, [log], StudyOptions(EstimationProblem(), profiles=True))
+    study = make_study(log.bench, [log], EstimateOptions(profile=True))
     e = study.estimate
     assert (e.deviations()[:4] > 1.01 * e.cramer_rao()[:4]).all()  # the model's uncertainty is in the former
     drawn: list[Any] = []
@@ -196,8 +199,8 @@ def test_the_pale_line_of_a_profile_is_the_parabola_of_the_fisher_information(
         return b""
 
     monkeypatch.setattr(figures, "svg", keep)
-    figures.profiles(study.profiles, e)
-    for profile, axis in zip(study.profiles, drawn, strict=False):
+    figures.profiles(study.checks.profiles, e)
+    for profile, axis in zip(study.checks.profiles, drawn, strict=False):
         (line,) = [line for line in axis.lines if line.get_color() == COLOURS[4]]
         unit = 1e6 if "ppm" in axis.get_xlabel() else 100.0
         bound = unit * e.cramer_rao()[e.labels.index(profile.label)]
@@ -276,10 +279,10 @@ def test_what_was_left_out_or_is_missing_comes_before_the_verdict(joint: Report)
     assert lost["experiment"]["measured"] == 497
 
 
-def gathered(bench: Bench, *paths: Path) -> Content:
+def gathered(bench: Bench, *paths: Path) -> Made:
     """What a report would say, without the figures."""
-    options = StudyOptions(EstimationProblem(), starts=1)
-    return gather(bench, [read_log(path) for path in paths], [], options, "x")
+    options = EstimateOptions(starts=1)
+    return Made(make_study(bench, [read_log(path) for path in paths], options, for_report=True), bench, [], "x")
 
 
 def test_a_further_run_is_named_where_a_parameter_is_not_identified_and_none_was_stopped(
@@ -289,7 +292,7 @@ def test_a_further_run_is_named_where_a_parameter_is_not_identified_and_none_was
     for fails_at in (math.inf, 40):
         run = simulate(lambda _a, _v, k, at=fails_at: math.nan if k >= at else 0.02, options="plant=exact", steps=60)
         path = write_log(folder / f"stands-{fails_at}.mcap", run, steps=60)
-        pages.append(report_page(gathered(bench, path)))
+        pages.append(html(page_of(gathered(bench, path))))
     assert [MORE[1:] in page for page in pages] == [True, False]
 
 
@@ -326,7 +329,8 @@ def test_what_a_log_says_does_not_become_markup(folder: Path, simulate: Simulate
 def test_a_difference_between_sent_and_applied_current_is_drawn(
     bench: Bench, good: Path, folder: Path, joint: Report
 ) -> None:
-    obeyed, lossy = (applied_as_sent(run) for run in gathered(bench, good, folder / "other.mcap").runs)
+    runs = gathered(bench, good, folder / "other.mcap").study.runs
+    obeyed, lossy = (applied_as_sent(Motion.of(run, bench)) for run in runs)
     assert obeyed
     assert not lossy
     assert joint.reader.text.count("The node applied the sent current in every period.") == 1
@@ -343,10 +347,12 @@ def test_real_time_is_in_the_table(folder: Path, bench: Bench, simulate: Simulat
     ]
     metadata = {"emb.run": {"steps": "60", "iface": "can0"}}
     real = gathered(bench, write_log(folder / "real.mcap", run, steps=60, metadata=metadata))
-    table = intervals(real.runs[0])
+    punctual = timing_of(real.study.runs[0])
+    assert punctual is not None
+    table = intervals(punctual)
     assert table is not None
     assert "343 µs" in [cell for row in table.rows for cell in row]
-    page = report_page(real)
+    page = html(page_of(real))
     assert "bench on can0" in page
     assert "Time was simulated" not in page
     assert document(real)["runs"][0]["timing"]["intervals"]["response"]["p100"] == pytest.approx(343.001e-6)
@@ -394,5 +400,5 @@ def test_a_brake_outside_of_the_shield_s_ranges_is_said_everywhere(
     }
     made = make(folder / "stiff.html", path, "--starts", "1", "--strict", code=EXIT_OUTSIDE)
     assert any(line.startswith("OUTSIDE: k_1") for line in made.reader.texts[:4])
-    row = evaluate_one(Source(str(path), "", path.name, "."), Options(starts=1))
-    assert "OUTSIDE: stiff.mcap: k_1" in text_of_campaign(summarise([row], Options(), "rows.csv"))
+    row = evaluate_one(Source(str(path), "", path.name, "."), CampaignOptions(starts=1))
+    assert "OUTSIDE: stiff.mcap: k_1" in text_of_campaign(summarise([row], CampaignOptions(), "rows.csv"))

@@ -1,0 +1,158 @@
+"""Options of what is asked about a brake: of an information, an estimate, a report, a campaign."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from emb_bench.config.bench import Bench
+from emb_bench.config.plants import Plant
+from emb_bench.estimate.records import METHODS, STARTS, EstimationProblem, freed, with_systematic
+from emb_bench.information.evaluation import Question
+from emb_bench.options import Options, option
+from emb_runtime.config.bench import PARAMETER_NAMES
+from emb_runtime.errors import UsageError
+from emb_runtime.estimator.estimate import NORMAL_95
+
+Names = str | Sequence[str]
+"""Names, or one text with commas between them."""
+NUMBER = r"(?:[0-9]+[.]?[0-9]*|[.][0-9]+)(?:[eE][-+]?[0-9]+)?"  # Without a sign
+
+
+@dataclass(frozen=True)
+class QuestionOptions(Options):
+    """Model, unknowns and prior; wrong names are refused before a log is read."""
+
+    params: Names | None = option(
+        None, "parameters of interest (default: the four of the brake; what the map of a recording guesses)", "NAMES"
+    )
+    nuisance: Names | None = option(
+        None, "further unknowns (default: none, or what the map of a recording says)", "NAMES"
+    )
+    model: str | None = option(
+        None, "plant of the bench (default: the one that was simulated; exact where a log does not say)", "MODEL"
+    )
+    prior: str | None = option(
+        None, "name of ranges in the bench file in which the parameters are known to lie (default: none)", "PRIOR"
+    )
+    bench: str | Path | None = option(None, "bench file (default: the one in the log)", "FILE", kind=Path)
+    map: str | Path | None = option(
+        None,
+        "map file of a recording of others: which column of it is what, and what is known of the machine",
+        "FILE",
+        kind=Path,
+    )
+
+    def __post_init__(self) -> None:
+        """Check all that needs no bench."""
+        super().__post_init__()
+        Question(*self.names_on(None))
+
+    def names_on(self, bench: Bench | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Parameters and nuisances; those that are not given are the machine's of the bench, if it has one."""
+        machine = None if bench is None else bench.machine
+        default = (PARAMETER_NAMES, ()) if machine is None else (machine.unknown, machine.nuisances)
+        given = zip((self.params, self.nuisance), default, strict=True)
+        params, nuisances = (usual if names is None else names_of(names) for names, usual in given)
+        return params, nuisances
+
+    def question(self, bench: Bench) -> Question:
+        """The unknowns, and what is known of them before."""
+        return Question(*self.names_on(bench), None if self.prior is None else bench.range_set(self.prior))
+
+
+@dataclass(frozen=True)
+class EstimateOptions(QuestionOptions):
+    """Options of an estimate."""
+
+    method: str | None = option(None, "see above (default: oem; windows for a recording)", choices=tuple(METHODS))
+    model: str | None = option(
+        None,
+        "plant of the bench to estimate with, or 'all': each is fitted, and the best is used (default: the one that "
+        "was simulated; exact where a log does not say)",
+        "MODEL",
+    )
+    systematic: str = option(
+        "bench",
+        "'bench' also estimates sensor offsets, gain and delay, with priors from [systematic] of the bench file; "
+        "'none' assumes ideal sensors (default: bench)",
+        choices=("bench", "none"),
+    )
+    known: Names | None = option(
+        None,
+        "parameters that were measured otherwise, such as k_m=0.0217±0.1%; J is then estimated (default: none, or k_m "
+        "where [systematic] of the bench file says how well it is known)",
+        "NAME=VALUE±HALF",
+    )
+    window: float = option(
+        0.0, "length of the windows [s], with method windows (default: what the map says, or 0.5)", "X", kind=float
+    )
+    starts: int = option(STARTS, "local searches (default: 8)", "N", kind=int, least=1)
+    seed: int = option(0, "seed of the starts of these searches (default: 0)", "N", kind=int, least=0)
+    profile: bool = option(False, "likelihood profiles of all parameters (default: of those that are identified badly)")
+    last: str | Path | None = option(
+        None, "JSON of an earlier estimate or report, to say what has changed since", "FILE", kind=Path
+    )
+
+    def __post_init__(self) -> None:
+        """Check all that needs no bench."""
+        super().__post_init__()
+        if not (self.window == 0.0 or 1e-3 <= self.window <= 3600.0):
+            raise UsageError(f"--window: expected a time from 0.001 to 3600 s, got {self.window:g}")
+        known_values(self.known)
+        EstimationProblem(*self.names_on(None))
+
+    def method_on(self, bench: Bench) -> str:
+        """The method: the one that is given, or the usual one of the bench's machine."""
+        method = self.method or ("oem" if bench.machine is None else "windows")
+        if self.window and method != "windows":
+            raise UsageError(f"--window: the method {method} has no windows; leave it out, or add --method windows")
+        return method
+
+    def problem(self, bench: Bench, plant: Plant) -> EstimationProblem:
+        """The unknowns of a plant, with the systematic errors that it can have where they are estimated too."""
+        question, known = self.question(bench), known_values(self.known)
+        asked = EstimationProblem(**vars(question), known=known, window=self.window)
+        if unasked := [name for name in known if name not in asked.names]:
+            raise UsageError(f"--known {', '.join(unasked)}: expected one of {', '.join(asked.names)}")
+        asked = freed(asked, bench)
+        return with_systematic(asked, bench, plant) if self.systematic == "bench" else asked
+
+
+@dataclass(frozen=True)
+class ReportOptions(EstimateOptions):
+    """Options of a report; likelihood profiles are of all parameters."""
+
+    profile: bool = True
+    acceptance: str | Path | None = option(
+        None,
+        "TOML file with an [acceptance] table: tolerances, drift, budgets; each is passed, failed, or not decided",
+        "FILE",
+        kind=Path,
+    )
+    junit: str | Path | None = option(
+        None, "XML file to write with the results of the acceptance criteria as test cases", "FILE", kind=Path
+    )
+
+
+def names_of(names: Names) -> tuple[str, ...]:
+    """Names, or a text with commas between them."""
+    listed = names.split(",") if isinstance(names, str) else names
+    return tuple(name for entry in listed if (name := entry.strip()))
+
+
+def known_values(given: Names | None) -> dict[str, tuple[float, float]]:
+    """Value and standard deviation of each known parameter, SI units, as ``--known`` has them."""
+    found = {}
+    for text in () if given is None else names_of(given):
+        parts = re.fullmatch(rf"(\w+)=({NUMBER})(?:±|\+-)({NUMBER})(%?)", text)
+        value, half = (float(parts[2]), float(parts[3])) if parts else (0.0, 0.0)
+        if parts is None or not (0.0 < value < math.inf and 0.0 < half < math.inf):
+            raise UsageError(
+                f"--known: expected a parameter with half of its 95 % interval, as k_m=0.0217±0.1%, got '{text}'"
+            )
+        found[parts[1]] = value, half * (0.01 * value if parts[4] else 1.0) / NORMAL_95
+    return found

@@ -1,0 +1,52 @@
+"""Options of a command as a record, which API and command line take: each with its default and a line of help."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import Field, dataclass, field, fields
+from typing import Any, NamedTuple, TypeVar
+
+from emb_runtime.errors import UsageError
+
+T = TypeVar("T")
+TOLD = "told"
+
+
+class Told(NamedTuple):
+    """Help and type of an option on a command line."""
+
+    text: str  # Line of help; of one that is on by itself, help of its ``--no-NAME``
+    metavar: str = ""
+    kind: Callable[[str], Any] = str
+    choices: Sequence[str] = ()
+    least: int | None = None
+
+
+def option(default: T, text: str, metavar: str = "", **more: Any) -> T:
+    """An option of a record; ``more`` are further fields of :class:`Told`."""
+    return field(default=default, metadata={TOLD: Told(text, metavar, **more)})
+
+
+def told(one: Field[Any]) -> Told | None:
+    """Help and type of a field of a record; None if no command line has it."""
+    return one.metadata.get(TOLD)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a command."""
+
+    def __post_init__(self) -> None:
+        """Check numbers and words that are one of several.
+
+        Raises:
+            UsageError: a number is too small, or a word is none of them.
+        """
+        for one in fields(self):
+            value, row = getattr(self, one.name), told(one)
+            if row is None or value is None:
+                continue
+            if row.least is not None and value < row.least:
+                raise UsageError(f"--{one.name}: expected a number from {row.least}, got {value}")
+            if row.choices and value not in row.choices:
+                raise UsageError(f"--{one.name}: expected one of {', '.join(row.choices)}, got {value!r:.40}")
