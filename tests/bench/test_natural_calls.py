@@ -198,6 +198,13 @@ WORKING: dict[str, Case] = {
         lambda s: api.estimate(str(s.path), params="f_v", starts=1),
         lambda study: len(study) == 1,
     ),
+    "estimate(run, options)": (
+        lambda s: (
+            api.estimate(s.run, api.EstimateOptions("f_v", starts=1)),
+            api.estimate(s.run, params="f_v", starts=1),
+        ),
+        lambda both: both[0].to_dict() == both[1].to_dict(),
+    ),
     "estimate([run])": (lambda s: api.estimate([s.run], params=["f_v"], starts=1), lambda study: "f_v" in study),
     "study['f_v'].value": (lambda s: s.study["f_v"].value, lambda value: math.isclose(value, 3e-5, rel_tol=0.03)),
     "study['f_v'].interval": (lambda s: s.study["f_v"].interval, lambda ends: ends[0] < 3e-5 < ends[1]),
@@ -303,6 +310,31 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], type[Exception], str]] = {
         lambda s: api.fisher_information(s.run, thta="nominal"),
         UsageError,
         "did you mean theta?",
+    ),
+    "estimate(run, options, starts=)": (
+        lambda s: api.estimate(s.run, api.EstimateOptions("f_v"), starts=1),
+        UsageError,
+        "expected a record of options or keywords, got both",
+    ),
+    "estimate(run, systematic='off')": (
+        lambda s: api.estimate(s.run, systematic="off"),
+        UsageError,
+        "--systematic: expected one of bench, none, got 'off'",
+    ),
+    "report(run, 'page.html', method='ols')": (
+        lambda s: api.report(s.run, s.folder / "page.html", method="ols"),
+        UsageError,
+        "--method: expected one of oem, pem, rls, windows, got 'ols'",
+    ),
+    "campaign(path, 'rows.csv', jobs=0)": (
+        lambda s: api.campaign(s.path, s.folder / "rows.csv", jobs=0),
+        UsageError,
+        "--jobs: expected a number from 1, got 0",
+    ),
+    "simulate(seed=1.5)": (
+        lambda s: api.simulate(seed=1.5),  # type: ignore[arg-type]
+        UsageError,
+        "seed: expected a whole number from 0 of up to 18 digits, got '1.5'",
     ),
     "simulate(u)": (lambda s: api.simulate(CURRENTS), UsageError, "simulate(currents=...)"),  # type: ignore[arg-type]
     "timing(DataFrame)": (lambda s: api.timing(s.frame), UsageError, "map='map.toml'"),

@@ -27,10 +27,12 @@ class QuestionOptions(Options):
     """Model, unknowns and prior; wrong names are refused before a log is read."""
 
     params: Names | None = option(
-        None, "parameters of interest (default: the four of the brake; what the map of a recording guesses)", "NAMES"
+        None,
+        "parameters of interest (default: the four of the brake; of a recording those that its map guesses)",
+        "NAMES",
     )
     nuisance: Names | None = option(
-        None, "further unknowns (default: none, or what the map of a recording says)", "NAMES"
+        None, "further unknowns (default: none; of a recording those that its map names)", "NAMES"
     )
     model: str | None = option(
         None, "plant of the bench (default: the one that was simulated; exact where a log does not say)", "MODEL"

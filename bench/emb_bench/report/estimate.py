@@ -202,9 +202,12 @@ def document(study: Study) -> dict[str, Any]:
     found |= {
         "stopped": [run.stop for run in study.used if run.stop],
         "model_fits": study.model_fits,
+        "predicts": checks.predicts,
         "identified": not study.unidentified,
+        "drifts": checks.drifts,
+        "left_out": checks.held_out,
+        "apart": checks.apart,
     }
-    found |= {"left_out": checks.held_out, **_fields(checks, "predicts", "drifts", "apart")}
     document: dict[str, Any] = to_json(found | _fields(e, "process_noise", "load_noise", "theta"))
     return document
 
