@@ -32,7 +32,7 @@ def told(one: Field[Any]) -> Told | None:
     return one.metadata.get(TOLD)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Options:
     """Options of a command."""
 

@@ -10,8 +10,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from mcap.writer import MCAP0_MAGIC
-
 from emb_bench.compiled import on_compiling
 from emb_runtime.errors import UsageError
 from emb_runtime.system.input_file import open_regular
@@ -79,6 +77,8 @@ def text_cells(column: Any) -> Any:
 
 
 def _is_log(path: Path) -> bool:
+    from mcap.writer import MCAP0_MAGIC
+
     with open_regular(path) as file:
         return file.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
 

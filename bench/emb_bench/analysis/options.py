@@ -22,7 +22,7 @@ Names = str | Sequence[str]
 NUMBER = r"(?:[0-9]+[.]?[0-9]*|[.][0-9]+)(?:[eE][-+]?[0-9]+)?"  # Without a sign
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class QuestionOptions(Options):
     """Model, unknowns and prior; wrong names are refused before a log is read."""
 
@@ -66,7 +66,7 @@ class QuestionOptions(Options):
         return Question(*self.names_on(bench), None if self.prior is None else bench.range_set(self.prior))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EstimateOptions(QuestionOptions):
     """Options of an estimate."""
 
@@ -124,7 +124,7 @@ class EstimateOptions(QuestionOptions):
         return with_systematic(asked, bench, plant) if self.systematic == "bench" else asked
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReportOptions(EstimateOptions):
     """Options of a report; likelihood profiles are of all parameters."""
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from emb_bench.information.fisher import Kind
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DesignOptions(Options):
     """Options of a design."""
 

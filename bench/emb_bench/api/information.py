@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from emb_bench.information.evaluation import Information
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FimOptions(QuestionOptions):
     """Options of a Fisher information."""
 

@@ -143,7 +143,7 @@ def draw(run: Source, axes: Sequence[Axes]) -> None:
     draw_on(opened(run), axes)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ExportOptions(Options):
     """Options of an export."""
 

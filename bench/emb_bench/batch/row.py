@@ -32,7 +32,7 @@ class Source:
     trouble: str = ""  # Reason why it cannot be read, if that is known before it is opened; else empty
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CampaignOptions(QuestionOptions):
     """Options of a campaign, equal for all logs."""
 

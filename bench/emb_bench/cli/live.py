@@ -16,7 +16,7 @@ from emb_runtime.errors import LogError, UsageError
 from emb_runtime.system.terminal import mention
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LiveOptions(Options):
     """Options of the server."""
 

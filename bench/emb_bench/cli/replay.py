@@ -15,7 +15,6 @@ from emb_bench.cli.live import LiveOptions, live
 from emb_bench.cli.options import add, add_output_options, answer, description, given, summary
 from emb_bench.options import Options
 from emb_bench.output import reported_if_interrupted
-from emb_bench.report import fim, runs
 from emb_bench.report.text import show
 from emb_runtime.errors import (
     EXIT_CANNOT_TELL,
@@ -50,6 +49,8 @@ UNKNOWNS = METHODS + "\nThe names of unknowns are in the help of emb-replay esti
 
 
 def _fim(args: argparse.Namespace) -> int:
+    from emb_bench.report import fim
+
     found = cast("Evaluation", api.fisher_information(args.run, given(args, api.FimOptions)))  # of one log
     answer(args, lambda: fim.document(found), lambda verbose: fim.text(found, verbose=verbose))
     return EXIT_DONE
@@ -110,18 +111,24 @@ def _campaign(args: argparse.Namespace) -> int:
 
 
 def _rerun(args: argparse.Namespace) -> int:
+    from emb_bench.report import runs
+
     again = api.rerun(args.run)
     answer(args, lambda: runs.rerun_document(again), lambda verbose: runs.rerun_text(again, verbose=verbose))
     return EXIT_DONE if again.reproduced else EXIT_CHECK_FAILED
 
 
 def _info(args: argparse.Namespace) -> int:
+    from emb_bench.report import runs
+
     document = api.info(args.run)
     answer(args, lambda: document, lambda verbose: runs.info(document, verbose=verbose))
     return EXIT_DONE
 
 
 def _timing(args: argparse.Namespace) -> int:
+    from emb_bench.report import runs
+
     found = api.timing(args.runs)
     answer(
         args,
