@@ -326,6 +326,11 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], type[Exception], str]] = {
         UsageError,
         "--method: expected one of oem, pem, rls, windows, got 'ols'",
     ),
+    "campaign(path, 'rows.csv', map=)": (
+        lambda s: api.campaign(s.path, s.folder / "rows.csv", map=s.map),
+        UsageError,
+        "campaign has no option 'map'",
+    ),
     "campaign(path, 'rows.csv', jobs=0)": (
         lambda s: api.campaign(s.path, s.folder / "rows.csv", jobs=0),
         UsageError,

@@ -19,6 +19,7 @@ from emb_runtime.estimator.estimate import NORMAL_95
 
 Names = str | Sequence[str]
 """Names, or one text with commas between them."""
+MAP = "map file of a recording of others: which column of it is what, and what is known of the machine"
 NUMBER = r"(?:[0-9]+[.]?[0-9]*|[.][0-9]+)(?:[eE][-+]?[0-9]+)?"  # Without a sign
 
 
@@ -41,12 +42,6 @@ class QuestionOptions(Options):
         None, "name of ranges in the bench file in which the parameters are known to lie (default: none)", "PRIOR"
     )
     bench: str | Path | None = option(None, "bench file (default: the one in the log)", "FILE", kind=Path)
-    map: str | Path | None = option(
-        None,
-        "map file of a recording of others: which column of it is what, and what is known of the machine",
-        "FILE",
-        kind=Path,
-    )
 
     def __post_init__(self) -> None:
         """Check all that needs no bench."""
@@ -98,6 +93,7 @@ class EstimateOptions(QuestionOptions):
     last: str | Path | None = option(
         None, "JSON of an earlier estimate or report, to say what has changed since", "FILE", kind=Path
     )
+    map: str | Path | None = option(None, MAP, "FILE", kind=Path)
 
     def __post_init__(self) -> None:
         """Check all that needs no bench."""

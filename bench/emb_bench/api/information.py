@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emb_bench.analysis.options import Names, QuestionOptions
+from emb_bench.analysis.options import MAP, Names, QuestionOptions
 from emb_bench.api.arguments import Source, driven, is_row, listed, options_of
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
@@ -31,6 +31,7 @@ class FimOptions(QuestionOptions):
         "'name=value,...', or the JSON of an estimate or report (default: log, and nominal where it has no estimate)",
         "THETA",
     )
+    map: str | Path | None = option(None, MAP, "FILE", kind=Path)
     plant: str | None = None  # The model, by the name that ``simulate`` has for it
     parameters: Mapping[str, float] | None = None  # The parameters, as ``simulate`` has them, in place of ``theta``
 

@@ -48,7 +48,6 @@ class CampaignOptions(QuestionOptions):
         "address of a Ray cluster, or 'local' for a Ray of this machine (default: processes of this machine)",
         "ADDRESS",
     )
-    map: None = None  # A campaign has no recordings of others
     bench_text: str | None = None  # Text of the bench file, which other machines do not have; None of each log's own
 
     def __post_init__(self) -> None:
