@@ -18,7 +18,8 @@ from emb_bench.options import Options
 from emb_runtime.errors import UsageError, near, needs
 from emb_runtime.system.terminal import mention
 
-Source = RunLog | str | Path | Mapping[str, Any]
+AnyRun = RunLog | str | Path | Mapping[str, Any]
+"""A run: opened, its path, or with a map a table in memory."""
 MEANT: Mapping[str, str] = {"plant": "model", "parameters": "params"}
 """Options of one function by the names that others have for them."""
 Record = TypeVar("Record", bound=Options)
@@ -91,7 +92,7 @@ def _recorded(table: Any, map_path: str | Path | None) -> RunLog:
     return recording
 
 
-def driven(run: Source, map_path: str | Path | None) -> RunLog:
+def driven(run: AnyRun, map_path: str | Path | None) -> RunLog:
     """As :func:`opened`, of a run in which something was driven."""
     log = opened(run, map_path)
     require_driven(log)

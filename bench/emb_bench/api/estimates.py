@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emb_bench.analysis.options import EstimateOptions, ReportOptions
-from emb_bench.api.arguments import Source, driven, is_table, listed, opened, options_of, say
+from emb_bench.api.arguments import AnyRun, driven, is_table, listed, opened, options_of, say
 from emb_bench.config.bench import load_bench
 from emb_bench.logs.log import RunLog
 from emb_bench.output import replacing, require_place, say_if_compiling
@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # scipy, numba and matplotlib come with the extra [bench]
 PAGES = (".html", ".htm")  # Endings of a report's page
 
 
-def estimate(runs: Source | Sequence[Source] = (), options: EstimateOptions | None = None, **more: Any) -> Study:
+def estimate(runs: AnyRun | Sequence[AnyRun] = (), options: EstimateOptions | None = None, **more: Any) -> Study:
     """Parameters of a brake from its runs, with total and repeatability, and whether the model explains them.
 
     The verdict on the model comes first, then each parameter, the largest part of its uncertainty, and the next step.
@@ -57,7 +57,7 @@ def estimate(runs: Source | Sequence[Source] = (), options: EstimateOptions | No
 
 
 def report(
-    runs: Source | Sequence[Source], output: str | Path, options: ReportOptions | None = None, **more: Any
+    runs: AnyRun | Sequence[AnyRun], output: str | Path, options: ReportOptions | None = None, **more: Any
 ) -> Report:
     """One page about runs of one brake, to hand over, and a JSON file beside it.
 
@@ -136,7 +136,7 @@ def _earlier(options: EstimateOptions) -> Earlier | None:
     return read_last(Path(options.last))
 
 
-def _usable(runs: Sequence[Source], options: ReportOptions) -> tuple[list[RunLog], list[tuple[Path, str]]]:
+def _usable(runs: Sequence[AnyRun], options: ReportOptions) -> tuple[list[RunLog], list[tuple[Path, str]]]:
     """The logs that can be read, and why the others cannot.
 
     Raises:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emb_bench.analysis.options import MAP, Names, QuestionOptions
-from emb_bench.api.arguments import Source, driven, is_row, listed, options_of
+from emb_bench.api.arguments import AnyRun, driven, is_row, listed, options_of
 from emb_bench.config.bench import load_bench
 from emb_bench.config.plants import DEFAULT_PLANT
 from emb_bench.experiment.experiment import planned
@@ -44,7 +44,7 @@ class FimOptions(QuestionOptions):
 
 
 def fisher_information(
-    run: Source | Sequence[Source] | Sequence[float] | Any = (), options: FimOptions | None = None, **more: Any
+    run: AnyRun | Sequence[AnyRun] | Sequence[float] | Any = (), options: FimOptions | None = None, **more: Any
 ) -> Information:
     """Fisher information of a run: how precisely its parameters can be known at best.
 

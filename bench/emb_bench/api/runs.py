@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary, finalize
 
 from numpy.typing import NDArray
 
-from emb_bench.api.arguments import Source, listed, opened, options_of
+from emb_bench.api.arguments import AnyRun, listed, opened, options_of
 from emb_bench.figures import for_notebook
 from emb_bench.logs.log import RunLog, read_log
 from emb_bench.options import Options, option
@@ -99,12 +99,12 @@ def open_run(log: str | Path) -> Run:
     return Run(**{field.name: getattr(opened, field.name) for field in fields(RunLog)})
 
 
-def topics(run: Source) -> dict[str, int]:
+def topics(run: AnyRun) -> dict[str, int]:
     """Names of the topics of a run, each with its number of messages."""
     return opened(run).counts
 
 
-def topic(run: Source, name: str) -> Table:
+def topic(run: AnyRun, name: str) -> Table:
     """One topic of a run as an Arrow table; enumerated values are names, a value that does not exist is null.
 
     ``.to_pandas()`` makes a pandas frame of it, ``polars.from_arrow(...)`` one of polars, ``.column(name).to_numpy()``
@@ -127,7 +127,7 @@ def topic(run: Source, name: str) -> Table:
     return cast("Table", pa.concat_tables(parts) if parts else schema.empty_table())
 
 
-def draw(run: Source, axes: Sequence[Axes]) -> None:
+def draw(run: AnyRun, axes: Sequence[Axes]) -> None:
     """Draw a run on five axes of matplotlib: angle, velocity, currents, why currents were changed, states.
 
     Args:
@@ -153,7 +153,7 @@ class ExportOptions(Options):
     )
 
 
-def export(run: Source, output: str | Path, options: ExportOptions | None = None, **more: Any) -> str:
+def export(run: AnyRun, output: str | Path, options: ExportOptions | None = None, **more: Any) -> str:
     """A part of a run for another tool: a picture, one topic as a table with units, or the brake as a MuJoCo model.
 
     The frames on the bus go to BLF, ASC and others by can_logconvert RUN FILE.
@@ -177,7 +177,7 @@ def export(run: Source, output: str | Path, options: ExportOptions | None = None
     return write(opened(run), Path(output), asked.topic, asked.theta)
 
 
-def rerun(run: Source) -> Rerun:
+def rerun(run: AnyRun) -> Rerun:
     """Run the loop again from the log of a run, and compare what it decides.
 
     The core of the control loop runs again with the policy, bench file and DBC of the log. What went into it goes in
@@ -202,7 +202,7 @@ def rerun(run: Source) -> Rerun:
     return rerun_as_recorded(opened(run))
 
 
-def info(run: Source) -> dict[str, Any]:
+def info(run: AnyRun) -> dict[str, Any]:
     """Summary of a run: end, counts, largest values, completeness.
 
     Args:
@@ -217,7 +217,7 @@ def info(run: Source) -> dict[str, Any]:
     return info_document(opened(run))
 
 
-def timing(runs: Source | Sequence[Source]) -> list[RunTiming]:
+def timing(runs: AnyRun | Sequence[AnyRun]) -> list[RunTiming]:
     """Timing of runs, judged by the budgets of their bench.
 
     How long each part of a control cycle took, by the time stamps in the log: sample to sample, sample to loop,

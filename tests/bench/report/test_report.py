@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from emb_bench.analysis import study as analysis_study
 from emb_bench.analysis.options import EstimateOptions
 from emb_bench.analysis.study import make_study
 from emb_bench.batch.evaluate import evaluate_one
@@ -26,9 +27,10 @@ from emb_bench.cli.replay import main
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.records import Unknown
+from emb_bench.experiment.experiment import Experiment
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.figures import COLOURS
-from emb_bench.logs.log import read_log
+from emb_bench.logs.log import RunLog, read_log
 from emb_bench.report import figures
 from emb_bench.report.figures import applied_as_sent
 from emb_bench.report.motion import Motion
@@ -283,6 +285,21 @@ def gathered(bench: Bench, *paths: Path) -> Made:
     """What a report would say, without the figures."""
     options = EstimateOptions(starts=1)
     return Made(make_study(bench, [read_log(path) for path in paths], options, for_report=True), bench, [], "x")
+
+
+def test_a_report_reads_each_experiment_once(
+    folder: Path, bench: Bench, good: Path, joint: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[str] = []
+
+    def counted(log: RunLog, *more: Any) -> Experiment:
+        seen.append(log.path.name)
+        return read_experiment(log, *more)
+
+    monkeypatch.setattr(analysis_study, "read_experiment", counted)
+    made = gathered(bench, good, folder / "other.mcap")
+    assert [run.alone is not None for run in made.study.runs] == [True, True]
+    assert seen == [good.name, "other.mcap"]
 
 
 def test_a_further_run_is_named_where_a_parameter_is_not_identified_and_none_was_stopped(
