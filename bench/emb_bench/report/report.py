@@ -209,7 +209,7 @@ def _model(study: Study, found: Verdict) -> Iterator[Block]:
         size = f": chi2/n is {plain(m.ratio)}, {plain(m.expected[0])} to {plain(m.expected[1])} expected."
         yield Text([Cell("fits", "good"), size], paragraph=False)
     else:
-        yield Text([Cell(found.standing, "bad")], paragraph=False)
+        yield Text([Cell(found.standing, "bad")], paragraph=not tested)
         if tested:
             yield Items(say.alarms(e), "alarms")
         yield Items([f"{h.name}: {say.held_out(h)}" for h in study.checks.held_out if not h.fits], "alarms")
