@@ -65,9 +65,9 @@ class CampaignOptions(QuestionOptions):
     @property
     def origin(self) -> dict[str, Any]:
         """Options that the rows depend on, for the file that has them."""
-        names = ("method", "model", "prior", "bench_text", "starts", "seed")
         params, nuisances = self.names_on(None)
-        return {"params": params, "nuisances": nuisances, **{name: getattr(self, name) for name in names}}
+        kept = {name: getattr(self, name) for name in ("model", "prior", "bench_text", "starts", "seed")}
+        return {"method": self.method, "params": params, "nuisances": nuisances, **kept}
 
 
 class Column(NamedTuple):

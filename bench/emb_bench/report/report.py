@@ -136,7 +136,7 @@ def page_of(report: Report) -> Page:
         "motion": (_measured(motions[0]), [_motion(motions[0], drawn[0])]) if one and drawn[0] else None,
         "tested": ("What was tested", [facts, table, None if shown else SIGNATURE]),
     }
-    parts = [Section(name, *one) for name, one in sections.items() if one is not None]
+    parts = [Section(name, *part) for name, part in sections.items() if part is not None]
     return Page(
         mark="SIMULATED: " if report.simulated else "",
         number=report.number,
