@@ -9,10 +9,10 @@ from typing import Any, NamedTuple, TypeVar
 from emb_runtime.errors import UsageError
 
 T = TypeVar("T")
-TOLD = "told"
+HELP = "help"  # Key of a field's metadata
 
 
-class Told(NamedTuple):
+class Help(NamedTuple):
     """Help and type of an option on a command line."""
 
     text: str  # Line of help; of one that is on by itself, help of its ``--no-NAME``
@@ -23,13 +23,13 @@ class Told(NamedTuple):
 
 
 def option(default: T, text: str, metavar: str = "", **more: Any) -> T:
-    """An option of a record; ``more`` are further fields of :class:`Told`."""
-    return field(default=default, metadata={TOLD: Told(text, metavar, **more)})
+    """An option of a record; ``more`` are further fields of :class:`Help`."""
+    return field(default=default, metadata={HELP: Help(text, metavar, **more)})
 
 
-def told(one: Field[Any]) -> Told | None:
+def help_of(one: Field[Any]) -> Help | None:
     """Help and type of a field of a record; None if no command line has it."""
-    return one.metadata.get(TOLD)
+    return one.metadata.get(HELP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Options:
             UsageError: a number is too small, or a word is none of them.
         """
         for one in fields(self):
-            value, row = getattr(self, one.name), told(one)
+            value, row = getattr(self, one.name), help_of(one)
             if row is None or value is None:
                 continue
             if row.least is not None and value < row.least:

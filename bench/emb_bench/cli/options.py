@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import fields
 from typing import Any, TypeVar
 
-from emb_bench.options import Options, told
+from emb_bench.options import Options, help_of
 from emb_bench.report.text import show
 from emb_runtime.system.terminal import as_json
 
@@ -26,14 +26,14 @@ def summary(text: str | None) -> str:
 
 def description(text: str | None) -> str:
     """A docstring before its arguments, as paragraphs of ``--help``."""
-    told = textwrap.dedent(f"    {text or ''}".partition("Args:\n")[0])
-    return "\n".join(textwrap.fill(part, HELP_WIDTH) for part in told.strip().split("\n\n")) + "\n"
+    before = textwrap.dedent(f"    {text or ''}".partition("Args:\n")[0])
+    return "\n".join(textwrap.fill(part, HELP_WIDTH) for part in before.strip().split("\n\n")) + "\n"
 
 
 def add(p: argparse.ArgumentParser, record: type[Options]) -> None:
     """Add the options of a record to a command line."""
     for one in fields(record):
-        if (row := told(one)) is None:
+        if (row := help_of(one)) is None:
             continue
         form: dict[str, Any] = {"dest": one.name, "default": argparse.SUPPRESS, "help": row.text.replace("%", "%%")}
         if isinstance(one.default, bool):

@@ -159,7 +159,7 @@ class Command(NamedTuple):
     codes: Collection[int]
     example: str  # Arguments to begin with
     argument: str = "run"
-    told: str = "MCAP file of emb-run"  # Help of the argument
+    argument_help: str = "MCAP file of emb-run"
     options: type[Options] = Options
     output: str = ""  # Help of ``--output``, if the command has it
     more: str = ""  # Help below what the docstring says
@@ -214,7 +214,7 @@ COMMANDS: Mapping[str, Command] = {
         _fim,
         OF_A_LOG,
         "run.mcap --theta nominal --params k_m,f_v",
-        told="MCAP file of emb-run; with a map, a recording of others",
+        argument_help="MCAP file of emb-run; with a map, a recording of others",
         options=api.FimOptions,
     ),
     "timing": Command(
@@ -285,7 +285,7 @@ def parser(only: str | None = None) -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         metavar, nargs = ARGUMENTS[one.argument]
-        form: dict[str, Any] = {"metavar": metavar, "nargs": nargs, "help": one.told}
+        form: dict[str, Any] = {"metavar": metavar, "nargs": nargs, "help": one.argument_help}
         command.add_argument(one.argument, type=Path, default=argparse.SUPPRESS, **form)
         if one.output:
             command.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=one.output)
