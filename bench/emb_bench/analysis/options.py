@@ -10,7 +10,7 @@ from pathlib import Path
 
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import Plant
-from emb_bench.estimate.records import METHODS, STARTS, EstimationProblem, freed, with_systematic
+from emb_bench.estimate.records import METHODS, STARTS, EstimationProblem, freed
 from emb_bench.information.evaluation import Question
 from emb_bench.options import Options, option
 from emb_runtime.config.bench import PARAMETER_NAMES
@@ -112,6 +112,8 @@ class EstimateOptions(QuestionOptions):
 
     def problem(self, bench: Bench, plant: Plant) -> EstimationProblem:
         """The unknowns of a plant, with the systematic errors that it can have where they are estimated too."""
+        from emb_bench.estimate.records import with_systematic
+
         question, known = self.question(bench), known_values(self.known)
         asked = EstimationProblem(**vars(question), known=known, window=self.window)
         if unasked := [name for name in known if name not in asked.names]:
