@@ -68,12 +68,6 @@ class Conclusion:
         """Returns True if it is identified."""
         return self.finding.identified
 
-    @property
-    def notable(self) -> bool:
-        """Returns True if there is more to say than the value, its interval, and that it is identified."""
-        drifted = self.drift is not None and self.drift.drifted
-        return bool(self.finding.doubts or self.finding.traded_with) or drifted
-
 
 def conclude(
     e: Estimate,

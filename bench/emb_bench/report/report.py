@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from emb_bench.analysis.conclusion import Conclusion
 from emb_bench.analysis.study import Code, Run, Study, Verdict, verdict
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import QUANTILES, Bench
@@ -261,13 +262,19 @@ def _parameters(study: Study) -> list[Block | None]:
     return [
         tables.parameters(study),
         Text(note, "note"),
-        Items([[Cell(c.label, "name"), f": {say.conclusion(c)}"] for c in study.conclusions if c.notable]),
+        Items([[Cell(c.label, "name"), f": {say.conclusion(c)}"] for c in study.conclusions if _notable(c)]),
         _care(say.changed_model(study)),
         None if found.holds else Text(f"The intervals do not include {bias}.", "bad"),
         tables.budget(study) if found.holds else None,
         tables.ratios(e) if found.holds else None,
         SIGNATURE,
     ]
+
+
+def _notable(c: Conclusion) -> bool:
+    """Returns True if there is more to say than the value, its interval, and that it is identified."""
+    drifted = c.drift is not None and c.drift.drifted
+    return bool(c.finding.doubts or c.finding.traded_with) or drifted
 
 
 def _next(study: Study, found: Verdict, to_do: Sequence[str]) -> list[Block | None]:
