@@ -181,7 +181,7 @@ def make_setup(bench: Bench, plant: Plant, parameters: Sequence[str], conditions
         conditions.gain,
     )
     safety = law, unproven_law(bench, law), response_model(bench, law), sensor_thresholds(bench, law)
-    model = make_model(bench, bench.range_set(bench.prior), sticks=True)
+    model = make_model(bench, bench.range_set(bench.prior))
     return Setup(*safety, rules, plant.mechanics, plant.instruments, no_sensitivity(parameters)[0], model)
 
 

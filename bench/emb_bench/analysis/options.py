@@ -112,7 +112,7 @@ class EstimateOptions(QuestionOptions):
 
     def problem(self, bench: Bench, plant: Plant) -> EstimationProblem:
         """The unknowns of a plant, with the systematic errors that it can have where they are estimated too."""
-        from emb_bench.estimate.records import with_systematic
+        from emb_bench.estimate.effects import with_systematic
 
         question, known = self.question(bench), known_values(self.known)
         asked = EstimationProblem(**vars(question), known=known, window=self.window)
