@@ -114,10 +114,6 @@ class ShieldLaw(NamedTuple):
     home: WayHome
 
 
-Condition = tuple[float, Callable[[float, float], bool], float, str]
-"""Step of the argument: a value, its relation to a limit, the limit; what is wrong otherwise, with what to change."""
-
-
 def stoppable(room: float, v: float, braking: float, ts: float) -> float:
     """Greatest next velocity from which ``room`` suffices, −1 if there is none.
 
@@ -320,8 +316,11 @@ def unmet_condition(law: ShieldLaw, bench: Bench) -> str:
     return next((refusal for value, holds, limit, refusal in conditions if not holds(value, limit)), "")
 
 
-def _conditions(law: ShieldLaw, bench: Bench) -> Iterator[Condition]:
-    """The steps of the argument, in an order in which each has a value where those before it hold."""
+def _conditions(law: ShieldLaw, bench: Bench) -> Iterator[tuple[float, Callable[[float, float], bool], float, str]]:
+    """The steps of the argument: a value, its relation to a limit, the limit; what is wrong otherwise, and its remedy.
+
+    In an order in which each has a value where those before it hold.
+    """
     ts, box, home, (lag, _, observer) = law.sample_time, law.box, law.home, law.delay
     speed, farthest = bench.limits.velocity, home.apex if law.coasting else bench.limits.angle[1]
     yield (lag > 0.0) + law.coasting + (law.age_high > 0), le, 1, (
