@@ -149,9 +149,10 @@ def begin(model: ResponseModel, angle: float, velocity: float) -> State:
     """State at the first measurement of a run [rad, rad/s]."""
     (b, c, d, e), (sb, sc, sd, se), sa, sf = model.prior, model.deviations, model.deviation, model.widest
     return State(
-        angle, velocity, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
-        (velocity, b, c, d, e, 0.0),
-        (
+        angle=angle, velocity=velocity, commands=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        flowing=0.0, largest=0.0, lagging=0.0, doubts=0.0, slides=0.0, innovations=0.0, misfit=0.0, likelihood=0.0,
+        mean=(velocity, b, c, d, e, 0.0),
+        covariance=(
             sa * sa, 0.0, 0.0, 0.0, 0.0, 0.0,
             sb * sb, 0.0, 0.0, 0.0, 0.0,
             sc * sc, 0.0, 0.0, 0.0,
@@ -359,7 +360,7 @@ class Response:
         self._full = law
         self._slow = self.law = unproven_law(bench, law)
         self.model = response_model(bench, law)
-        self._state, self._verdict = begin(self.model, 0.0, 0.0), OPEN
+        self._verdict = OPEN
         self._rows: deque[Row] = deque(maxlen=KEPT)
         self.stop: list[Row] = []
 
