@@ -203,7 +203,8 @@ def unseen_speed(law: ShieldLaw, limits: SensorThresholds, state: State) -> floa
 
     Causes are frames that act late, a current that lags, and a velocity that an observer derives from the angle.
     """
-    motor, speed, acted = law.box.motor_high, 0.0, 0.0
+    motor = law.box.motor_high
+    speed = acted = 0.0
     for i in range(law.age_high):
         speed += motor * max(-state.lows[i], state.highs[i]) * law.sample_time
     for i in range(law.age_high, _oldest(law) + 1):
