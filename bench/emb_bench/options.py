@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import Field, dataclass, field, fields
+from numbers import Integral, Real
 from typing import Any, NamedTuple, TypeVar
 
 from emb_runtime.errors import UsageError
@@ -44,9 +45,12 @@ class Options:
         """
         for one in fields(self):
             value, row = getattr(self, one.name), help_of(one)
-            if row is None or value is None:
+            if row is None or value is one.default:
                 continue
-            if row.least is not None and value < row.least:
-                raise UsageError(f"--{one.name}: expected a number from {row.least}, got {value}")
+            name = f"--{one.name.replace('_', '-')}"
+            if row.least is not None and not (isinstance(value, Integral) and int(value) >= row.least):
+                raise UsageError(f"{name}: expected a number from {row.least}, got {value!r:.40}")
+            if row.kind is float and not isinstance(value, Real):
+                raise UsageError(f"{name}: expected a number, got {value!r:.40}")
             if row.choices and value not in row.choices:
-                raise UsageError(f"--{one.name}: expected one of {', '.join(row.choices)}, got {value!r:.40}")
+                raise UsageError(f"{name}: expected one of {', '.join(row.choices)}, got {value!r:.40}")

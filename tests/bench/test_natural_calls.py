@@ -316,6 +316,36 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], type[Exception], str]] = {
         UsageError,
         "expected a record of options or keywords, got both",
     ),
+    "estimate(run, run)": (
+        lambda s: api.estimate(s.run, s.second),
+        UsageError,
+        "estimate: expected EstimateOptions, or its fields as keywords",
+    ),
+    "report(run, 'page.html', estimate's options)": (
+        lambda s: api.report(s.run, s.folder / "page.html", api.EstimateOptions()),
+        UsageError,
+        "report: expected ReportOptions",
+    ),
+    "export(run, 'x.csv', '/cycle')": (
+        lambda s: api.export(s.run, s.folder / "x.csv", "/cycle"),
+        UsageError,
+        "export: expected ExportOptions",
+    ),
+    "estimate(run, systematic=None)": (
+        lambda s: api.estimate(s.run, systematic=None),
+        UsageError,
+        "--systematic: expected one of bench, none, got None",
+    ),
+    "estimate(run, starts='3')": (
+        lambda s: api.estimate(s.run, starts="3"),
+        UsageError,
+        "--starts: expected a number from 1, got '3'",
+    ),
+    "campaign(path, 'rows.csv', time_limit=None)": (
+        lambda s: api.campaign(s.path, s.folder / "rows.csv", time_limit=None),
+        UsageError,
+        "--time-limit: expected a number, got None",
+    ),
     "estimate(run, systematic='off')": (
         lambda s: api.estimate(s.run, systematic="off"),
         UsageError,

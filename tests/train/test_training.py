@@ -287,6 +287,10 @@ def test_a_damaged_folder_is_refused(finished: Path, tmp_path: Path, capsys: pyt
         (5, lambda d: (d / ONNX).write_bytes(data[:1000])),
         (5, lambda d: (d / ONNX).write_bytes(b"junk" * 100)),
         (5, lambda d: (d / BENCH).write_text((d / BENCH).read_text().replace("time = 1.0e-3", "time = 2.0e-3"))),
+        (
+            2,
+            lambda d: (d / BENCH).write_text((d / BENCH).read_text().replace("angle    = 1.0e-3", "angle    = 1.1e-3")),
+        ),
     ]
     for i, (code, damage) in enumerate(damages):
         folder = shutil.copytree(finished, tmp_path / str(i))

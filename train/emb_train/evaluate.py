@@ -83,14 +83,18 @@ def open_subject(given: str, bench_file: Path | None) -> Subject:
         raise UsageError(f"{given}: expected '{ACTOR}', an .onnx file, the folder of a training or its {PLAN}{hint}")
     if not own.exists() or not (path / ONNX).exists():
         raise UsageError(f"{given}: expected the folder of emb-train ppo, with {ONNX} and {BENCH}")
-    return _file(given, path / ONNX, load_bench(own))
+    return _file(given, path / ONNX, load_bench(own), trained_on=own)
 
 
-def _file(name: str, path: Path, bench: Bench) -> Subject:
+def _file(name: str, path: Path, bench: Bench, trained_on: Path | None = None) -> Subject:
     try:
         policy = load_policy(path, bench) if path == shipped_actor_path() else admit_policy(path, bench)
     except PolicyRefusedError as err:
         raise PolicyRefusedError(f"{path}: {err}") from err
+    if trained_on is not None and policy.contract.provenance.get("bench") != bench.identity_hash:
+        raise UsageError(
+            f"{trained_on}: not the bench that {path} was trained on; --bench with the file alone takes any"
+        )
     made_for = {str(name): pair for name, pair in policy.contract.ranges.items()}
     sets = [ranges.name for ranges in bench.ranges.values() if made_for == bounds(ranges)]
     return Subject(name, bench, Estimating(policy, bench), sets[0] if sets else "")

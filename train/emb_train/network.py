@@ -43,6 +43,7 @@ def network_file(trained: Trained, training: Training, bench: Bench) -> tuple[by
         **{name: text_of(value) for name, value in parts.items() if value is not None},
         "steps": trained.iteration * training.ppo.batch,
         "score": trained.score,
+        "bench": bench.identity_hash,
         **versions("torch", "onnxscript"),
     }
     ranges = bench.range_set(training.ranges)

@@ -41,7 +41,9 @@ class QuestionOptions(Options):
     prior: str | None = option(
         None, "name of ranges in the bench file in which the parameters are known to lie (default: none)", "PRIOR"
     )
-    bench: str | Path | None = option(None, "bench file (default: the one in the log)", "FILE", kind=Path)
+    bench: str | Path | None = option(
+        None, "bench file (default: the one in the log; of several logs in one estimate the first)", "FILE", kind=Path
+    )
 
     def __post_init__(self) -> None:
         """Check all that needs no bench."""

@@ -32,9 +32,13 @@ def options_of(function: str, record: type[Record], options: Record | None, more
         UsageError: a keyword is no field of the record, or there are both.
     """
     require_options(function, more, [one.name for one in fields(record)])
-    if options is not None and more:
+    if options is None:
+        return record(**more)
+    if more:
         raise UsageError(f"{function}: expected a record of options or keywords, got both")
-    return record(**more) if options is None else options
+    if isinstance(options, record):
+        return options
+    raise UsageError(f"{function}: expected {record.__name__}, or its fields as keywords, got {options!r:.60}")
 
 
 def require_options(function: str, options: Mapping[str, Any], known: Sequence[str]) -> None:

@@ -25,6 +25,12 @@ if TYPE_CHECKING:
 class FimOptions(QuestionOptions):
     """Options of a Fisher information."""
 
+    params: Names | None = option(
+        None,
+        "parameters of interest; all others are taken as known (default: the four of the brake; of a recording those "
+        "that its map guesses)",
+        "NAMES",
+    )
     theta: str | Path | Mapping[str, float] | None = option(
         None,
         "where to evaluate: 'log' for the running estimate in the log, 'nominal', 'true' of a simulated brake, "

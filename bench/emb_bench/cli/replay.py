@@ -190,7 +190,7 @@ COMMANDS: Mapping[str, Command] = {
         (*CHECKED, EXIT_OUTSIDE),
         "run.mcap --json > estimate.json",
         "runs",
-        f"{RUNS}; they are taken together",
+        "MCAP files of emb-run, of one brake, which are taken together; with a map, recordings of others",
         api.EstimateOptions,
         more=f"{METHODS}\nunknowns for --nuisance, besides the parameters:\n"
         + "".join(f"  {name:17} {row.about}\n" for name, row in PARAMETERS.items() if row.about),
