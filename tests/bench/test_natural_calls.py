@@ -322,12 +322,12 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], type[Exception], str]] = {
         "estimate: expected EstimateOptions, or its fields as keywords",
     ),
     "report(run, 'page.html', estimate's options)": (
-        lambda s: api.report(s.run, s.folder / "page.html", api.EstimateOptions()),
+        lambda s: api.report(s.run, s.folder / "page.html", api.EstimateOptions()),  # type: ignore[arg-type]
         UsageError,
         "report: expected ReportOptions",
     ),
     "export(run, 'x.csv', '/cycle')": (
-        lambda s: api.export(s.run, s.folder / "x.csv", "/cycle"),
+        lambda s: api.export(s.run, s.folder / "x.csv", "/cycle"),  # type: ignore[arg-type]
         UsageError,
         "export: expected ExportOptions",
     ),

@@ -35,7 +35,12 @@ _BOUNDARY: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Gt: ast.GtE,
     ast.GtE: ast.Gt,
 }
-_RELATION = {"lt": "gt", "gt": "lt", "le": "ge", "ge": "le"}  # Functions of the module ``operator``
+_RELATION = {
+    "lt": ("gt", "le"),
+    "gt": ("lt", "ge"),
+    "le": ("ge", "lt"),
+    "ge": ("le", "gt"),
+}  # Functions of the module ``operator``
 _OTHER_FUNCTION = {"min": "max", "max": "min", "ceil": "floor", "floor": "ceil", "round": "int"}
 _ONE_OF_ITS_ARGUMENTS = {"min", "max", "abs"}
 _DELETED = (ast.Expr, ast.Assign, ast.AugAssign, ast.AnnAssign, ast.Raise, ast.Assert, ast.Delete)
@@ -184,7 +189,7 @@ def _of_expression(node: ast.expr, parent: ast.AST) -> Iterator[tuple[str, ast.e
     elif isinstance(node, ast.UnaryOp) and not isinstance(node.op, ast.Not):
         yield "sign", node.operand
     elif isinstance(node, ast.Name) and node.id in _RELATION:
-        yield "boundary", _with(node, id=_RELATION[node.id])
+        yield from (("relation", _with(node, id=other)) for other in _RELATION[node.id])
     elif isinstance(node, ast.Call):
         yield from _other_calls(node)
     elif isinstance(node, ast.Dict):
