@@ -129,8 +129,8 @@ def digest(module: str) -> str:
     That is mutation itself, the list, the tests, the judged modules, and the bench and drives that their tests load.
     """
     files = [*Path(__file__).parent.glob("*.py"), EQUIVALENT, *(ROOT / name for name in tests_of(module))]
-    files += [*(path_of(name) for name in TESTS), ROOT / "tests/conftest.py", ROOT / "tests/independent.py"]
-    files += [ROOT / RUNTIME / "conftest.py", ROOT / "tests/drives.py"]
+    files += [*(path_of(name) for name in TESTS), ROOT / RUNTIME / "conftest.py"]
+    files += [ROOT / f"tests/{name}.py" for name in ("benches", "conftest", "drives", "independent", "laws")]
     files += [path for path in (ROOT / "examples/drives").iterdir() if path.is_file()]
     files += [path_of("config.bench"), path_of("config.bench").with_suffix(".toml")]
     return hashlib.sha256("".join(map(_without_words, sorted(files))).encode()).hexdigest()
