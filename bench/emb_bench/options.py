@@ -41,7 +41,7 @@ class Options:
         """Check numbers and words that are one of several.
 
         Raises:
-            UsageError: a number is too small, or a word is none of them.
+            UsageError: a number is none or too small, or a word is none of them.
         """
         for one in fields(self):
             value, row = getattr(self, one.name), help_of(one)

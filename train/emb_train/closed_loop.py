@@ -279,9 +279,11 @@ def response_of(row: Any) -> ResponseState:
 
 def store_response(state: ResponseState, verdict: int, row: Any) -> None:
     """Store the verdict on the response and the state of its proof, shape [RESPONSE]."""
-    _, _, commands, flowing, largest, lagging, doubts, slides, number, misfit, likelihood, mean, covariance = state
-    sums = (flowing, largest, lagging, doubts, slides, number, misfit, likelihood)
-    row[:] = (float(verdict), state.angle, state.velocity, *commands, *sums, *mean, *covariance)
+    sums = (
+        state.flowing, state.largest, state.lagging, state.doubts, state.slides, state.innovations, state.misfit,
+        state.likelihood,
+    )  # fmt: skip
+    row[:] = (float(verdict), state.angle, state.velocity, *state.commands, *sums, *state.mean, *state.covariance)
 
 
 def monitor_of(row: Any) -> MonitorState:

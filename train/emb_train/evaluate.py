@@ -93,7 +93,8 @@ def _file(name: str, path: Path, bench: Bench, trained_on: Path | None = None) -
         raise PolicyRefusedError(f"{path}: {err}") from err
     if trained_on is not None and policy.contract.provenance.get("bench") != bench.identity_hash:
         raise UsageError(
-            f"{trained_on}: not the bench that {path} was trained on; --bench with the file alone takes any"
+            f"{trained_on}: not the bench that {path} was trained on; to evaluate it on this one, give "
+            f"{path} --bench {trained_on}"
         )
     made_for = {str(name): pair for name, pair in policy.contract.ranges.items()}
     sets = [ranges.name for ranges in bench.ranges.values() if made_for == bounds(ranges)]

@@ -29,7 +29,7 @@ def options_of(function: str, record: type[Record], options: Record | None, more
     """Options of a call: a record of them, or its fields as keywords.
 
     Raises:
-        UsageError: a keyword is no field of the record, or there are both.
+        UsageError: a keyword is no field of the record, there are both, or the record is another function's.
     """
     require_options(function, more, [one.name for one in fields(record)])
     if options is None:
