@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from msgspec.structs import replace
 
 from emb_bench.estimate.expected import IntervalCriterion
 from emb_bench.information.symmetric import Floats
@@ -47,18 +48,12 @@ def test_a_plan_stays_within_the_limit_and_goes_as_far_as_its_levels_do(numbers:
 
 
 class Landscape(Compared):
-    """Plans that are worth what a function says, with what was asked; one brake says nearly the same."""
+    """Plans that are worth what a function says, with what was asked."""
 
     def __init__(self, worth: Callable[[Floats], Floats]) -> None:
-        self.plans, self.screened, self.asked, self._worth = 16, list[Floats](), list[Floats](), worth
-
-    def screening(self) -> Compared:
-        one = Landscape(self._worth)
-        one.plans, one.asked = 40, self.screened
-        return one
+        self.most, self.asked, self._worth = 64, list[Floats](), worth
 
     def returns(self, plans: Floats) -> Floats:
-        assert len(plans) == self.plans
         self.asked.append(plans.copy())
         return self._worth(plans)
 
@@ -69,30 +64,36 @@ def distance(plans: Floats) -> Floats:
     return worth
 
 
-def test_a_search_begins_with_the_best_plans_at_random_and_returns_the_best_of_all() -> None:
+FOUR = PlanSearch(drawn=90, starts=4, steps=30, population=16, levels=LEVELS, spread=SPREAD)
+
+
+def test_searches_begin_at_the_best_plans_drawn_and_the_better_half_goes_on_with_twice_the_brakes() -> None:
     landscape, shown = Landscape(distance), list[Found]()
-    asked = PlanSearch(drawn=90, starts=2, steps=30, levels=LEVELS, spread=SPREAD)
-    found = search(landscape, asked, np.random.default_rng(3), shown.append)
-    assert [one.plans for one in shown] == [40, 80, 120, *(120 + 16 * (i + 1) for i in range(1 + 3 * 30))]
-    assert (np.diff([one.best for one in shown[3:]]) >= 0.0).all()
-    drawn = np.concatenate(landscape.screened)
-    assert (np.abs(drawn) <= 1.0).all()
-    best = drawn[np.argsort(-distance(drawn))[:16]]
-    assert sorted(landscape.asked[0].tolist()) == sorted(best.tolist())
-    first_steps = landscape.asked[1::30]
-    for begin, first in zip(best, first_steps[:2], strict=False):
-        assert np.abs(first.mean(axis=0) - begin).max() < 5.0 * SPREAD / np.sqrt(16)
-    last = [landscape.asked[30], landscape.asked[60]]
-    better = max(last, key=lambda plans: float(distance(plans).max()))
-    assert np.abs(first_steps[2] - better.mean(axis=0)).max() < 5.0 * np.std(better)  # where it ended, it goes on
-    everything = np.concatenate(landscape.asked)
-    assert found.tolist() == np.clip(everything[np.argmax(distance(everything))], -1.0, 1.0).tolist()
+    found = search(landscape, FOUR, np.random.default_rng(3), shown.append)
+    assert [len(plans) for plans in landscape.asked] == [64, 64, *[64] * 30, *[32] * 30, *[16] * 30]
+    assert len(landscape.asked) == replace(FOUR, brakes=4).rounds
+    assert [one.plans for one in shown] == np.cumsum([len(plans) for plans in landscape.asked]).tolist()
+    drawn = np.concatenate(landscape.asked[:2])
+    levels = np.abs(drawn[:, :LEVELS])
+    assert ((levels == 1.0) | (levels <= 0.5)).all()  # full strokes and creeps
+    assert 0.4 < (levels == 1.0).mean() < 0.6
+    best = drawn[np.argsort(-distance(drawn))[:4]]
+    middles = landscape.asked[2].reshape(4, 16, -1).mean(axis=1)
+    assert np.abs(middles - best).max() < 5.0 * SPREAD / np.sqrt(16)
+    for before, after, left in ((31, 32, 2), (61, 62, 1)):
+        ended = landscape.asked[before].reshape(-1, 16, 2 * LEVELS)
+        order = np.argsort([-distance(plans).max() for plans in ended])[:left]
+        begun = landscape.asked[after].reshape(-1, 16, 2 * LEVELS)
+        for k, own in zip(order, begun, strict=True):
+            assert np.abs(own.mean(axis=0) - ended[k].mean(axis=0)).max() < 5.0 * ended[k].std()  # where it ended
+    last = np.concatenate(landscape.asked[62:])
+    assert found.tolist() == np.clip(last[np.argmax(distance(last))], -1.0, 1.0).tolist()
     assert distance(found[None])[0] > 0.2 * distance(drawn).max()
-    again = search(Landscape(distance), asked, np.random.default_rng(3))
+    again = search(Landscape(distance), FOUR, np.random.default_rng(3))
     assert again.tolist() == found.tolist()
 
 
-def test_a_plan_that_no_step_improves_is_kept() -> None:
+def test_the_best_plan_is_one_of_the_last_search_whatever_fewer_brakes_said() -> None:
     calls = 0
 
     def falling(plans: Floats) -> Floats:
@@ -102,9 +103,8 @@ def test_a_plan_that_no_step_improves_is_kept() -> None:
         return returns
 
     landscape = Landscape(falling)
-    found = search(landscape, PlanSearch(drawn=32, starts=1, steps=5, levels=4), np.random.default_rng(3))
-    assert len(found) == 2 * 4
-    assert found.tolist() == landscape.asked[0][-1].tolist()
+    found = search(landscape, replace(FOUR, starts=2, steps=5), np.random.default_rng(3))
+    assert found.tolist() == np.clip(landscape.asked[-5][-1], -1.0, 1.0).tolist()
 
 
 def environments(count: int) -> list[EmbExcitationVectorEnv]:
@@ -117,20 +117,19 @@ def test_plans_are_compared_on_the_same_brakes_of_each_plant_and_worth_the_mean(
     rng = np.random.default_rng(1)
     plans = rng.uniform(-1.0, 1.0, (3, 2 * LEVELS))
     plans[2] = plans[0]
-    both = environments(6)
-    found = Compared(both, 3, 60, 5).returns(plans)
+    both = environments(7)
+    found = Compared(both, 60, 5).returns(plans)
     assert found[0] == found[2] != found[1]
     for env in both:
-        brakes = env.batch.experiments.brakes.reshape(3, 2, -1)
+        brakes = env.batch.experiments.brakes[:6].reshape(3, 2, -1)
         assert (brakes[0] == brakes[1]).all()
         assert (brakes[0, 0] != brakes[0, 1]).any()
-    assert (both[0].batch.experiments.brakes != both[1].batch.experiments.brakes).any()
-    screening = Compared(environments(6), 3, 60, 5).screening()
-    many = screening.returns(np.repeat(plans[:1], screening.plans, axis=0))
-    assert (screening.plans, len({*many.tolist()})) == (6, 1)
-    apart = [Compared([env], 3, 60, 5).returns(plans) for env in environments(6)[:1]]
-    assert found[0] != apart[0][0]
-    assert Compared(environments(6), 3, 60, 6).returns(plans)[0] != found[0]
+    assert (both[0].batch.experiments.brakes[:6] != both[1].batch.experiments.brakes[:6]).any()
+    many = Compared(environments(7), 60, 5)
+    assert len({*many.returns(np.repeat(plans[:1], many.most, axis=0)).tolist()}) == 1
+    apart = Compared(environments(7)[:1], 60, 5).returns(plans)
+    assert found[0] != apart[0]
+    assert Compared(environments(7), 60, 6).returns(plans)[0] != found[0]
 
 
 def test_an_experiment_counts_until_it_is_over() -> None:

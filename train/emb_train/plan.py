@@ -3,15 +3,15 @@
 A plan holds n levels of speed, for a time each, and then the shield brings the brake home; it depends on no
 measurement. Its 2 n numbers lie within ±1: the signed root of each level, so that a creep of some rad/s is as wide as
 a full stroke, and the logarithm of each time, so that the levels keep their order. The landscape has many tops, and
-most plans say nothing at all: the best of some hundred at random begins, and CMA-ES (Hansen and Ostermeier, Completely
-derandomized self-adaptation in evolution strategies, Evolutionary Computation 9, 2001) improves it with the same brakes
-in each step, one set for each environment.
+most plans say nothing at all: plans of full strokes and creeps are drawn, and CMA-ES (Hansen and Ostermeier, Completely
+derandomized self-adaptation in evolution strategies, Evolutionary Computation 9, 2001) improves the best of them with
+the same brakes in each step, one set for each environment. Again and again the worse half of the searches ends, and the
+others go on with twice the brakes (Jamieson and Talwalkar, Non-stochastic best arm identification and hyperparameter
+optimization, AISTATS 2016): what is best on few brakes is not best on others.
 """
 
 from __future__ import annotations
 
-import copy
-import operator
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, NamedTuple
 
@@ -25,7 +25,7 @@ from emb_train.env import EmbExcitationVectorEnv
 from emb_train.ppo import at_once
 
 BOUND = 1.05  # Beyond the ends of the numbers, so that full speed is inside
-NEAR = 0.3  # Half the levels drawn are this much smaller, for a creep
+CREEP = 0.5  # Greatest root of a level that is drawn and is no full stroke
 WIDTHS = 3.0  # Logarithm of the longest time over the mean
 STREAM = 0x706C616E  # Spawn key of the brakes on which plans are compared
 
@@ -33,25 +33,25 @@ STREAM = 0x706C616E  # Spawn key of the brakes on which plans are compared
 class PlanSearch(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The search for the plan that an actor begins with."""
 
-    drawn: Count = 1600  # Plans at random, rounded up
-    starts: Count = 2  # Of these, from which CMA-ES begins
-    steps: Count = 60  # Of CMA-ES from each, and from the best of them on
+    drawn: Count = 800  # Plans at random, each on one brake of each plant; rounded up
+    starts: Count = 8  # Searches by CMA-ES that begin at the best of them
+    steps: Count = 12  # Of each search, before the worse half of them ends; the last has as many
     population: Annotated[int, msgspec.Meta(ge=4, le=1000)] = 16  # Plans of a step
-    brakes: Count = 3  # Of each plant, on which they are compared
+    brakes: Count = 16  # Of each plant, on which the plans of the last search are compared
     levels: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 9  # Of a plan; seven nearly suffice
     spread: Positive = 0.15  # First standard deviation of its numbers, -1 to 1, in CMA-ES
 
     @property
     def rounds(self) -> int:
         """Times that plans are compared."""
-        return -(-self.drawn // (self.population * self.brakes)) + 1 + (self.starts + 1) * self.steps
+        return -(-self.drawn // (self.population * self.brakes)) + len(halvings(self.starts)) * self.steps
 
 
 class Found(NamedTuple):
     """State of a search."""
 
     plans: int  # Played so far
-    best: float  # Greatest mean return of a plan
+    best: float  # Greatest mean return of a plan on the brakes of this round
     numbers: Floats  # Of that plan, shape [2 n]
 
 
@@ -71,31 +71,24 @@ def speeds_of(numbers: Floats, horizon: int) -> Floats:
 
 
 class Compared:
-    """Brakes of several environments on which plans are compared, some plans at a time."""
+    """Brakes of several environments on which plans are compared: the fewer plans at a time, the more brakes."""
 
-    def __init__(self, environments: Sequence[EmbExcitationVectorEnv], plans: int, steps: int, seed: int) -> None:
-        """Draw the brakes: as many in each environment as leave room for ``plans`` of these steps at a time."""
-        self._environments, self.plans, self._steps = environments, plans, steps
+    def __init__(self, environments: Sequence[EmbExcitationVectorEnv], steps: int, seed: int) -> None:
+        """Draw the brakes of each environment for experiments of these steps."""
+        self._environments, self._steps = environments, steps
         streams = np.random.SeedSequence(seed, spawn_key=(STREAM,)).spawn(len(environments))
-        self._seeds = [
-            stream.generate_state(env.num_envs // plans, np.uint64).tolist()
-            for stream, env in zip(streams, environments, strict=True)
-        ]
-
-    def screening(self) -> Compared:
-        """Gives the same with the first brake of each environment alone, for as many more plans at a time."""
-        screening = copy.copy(self)
-        screening.plans = self._environments[0].num_envs
-        screening._seeds = [seeds[:1] for seeds in self._seeds]
-        return screening
+        self.most = environments[0].num_envs  # Plans at a time
+        self._seeds = [stream.generate_state(self.most, np.uint64).tolist() for stream in streams]
 
     def returns(self, plans: Floats) -> Floats:
-        """Mean return of each plan, shape [plans, 2 n] to [plans]."""
-        speeds = speeds_of(plans, self._steps)
+        """Mean return of each plan on the first brakes for which there is room, shape [plans, 2 n] to [plans]."""
+        speeds, brakes = speeds_of(plans, self._steps), self.most // len(plans)
 
         def of_env(env: EmbExcitationVectorEnv, seeds: list[int]) -> Floats:
-            returns = play(env, seeds * len(plans), np.repeat(speeds, len(seeds), axis=0))
-            of_plans: Floats = returns.reshape(len(plans), -1).mean(axis=1)
+            played = speeds.repeat(brakes, axis=0)
+            spare = self.most - len(played)  # the environment has that many more; they play the first plan again
+            returns = play(env, seeds[:brakes] * len(plans) + seeds[:spare], np.concatenate([played, played[:spare]]))
+            of_plans: Floats = returns[: len(played)].reshape(len(plans), brakes).mean(axis=1)
             return of_plans
 
         means: Floats = np.mean(at_once(of_env, self._environments, self._seeds), axis=0)
@@ -123,54 +116,47 @@ def search(
     """Finds a plan.
 
     Args:
-        compared: brakes, as many plans at a time as a step of CMA-ES has.
-        asked: how far to look; the best of the plans at random are compared on all brakes.
+        compared: brakes.
+        asked: how far to look.
         rng: of the plans.
         show: called after each comparison.
 
     Returns:
-        The best of all plans on these brakes; shape [2 n].
+        The best plan of the last search on its brakes; shape [2 n].
     """
     found, levels = Found(0, -np.inf, np.zeros(2 * asked.levels)), asked.levels
 
-    def note(plans: Floats, by: Compared, counts: bool = True) -> Floats:
+    def returns_of(plans: Floats) -> Floats:
         nonlocal found
-        returns = by.returns(plans)
+        returns = compared.returns(plans)
         at = int(np.argmax(returns))
-        better = counts and returns[at] > found.best
-        best = (float(returns[at]), plans[at].copy()) if better else (found.best, found.numbers)
+        best = (float(returns[at]), plans[at].copy()) if returns[at] > found.best else (found.best, found.numbers)
         found = Found(found.plans + len(plans), *best)
         show(found)
         return returns
 
-    def improve(strategy: Any) -> float:
-        """A step of CMA-ES after the other; gives the best return of the last."""
-        last = -np.inf
+    plans = rng.uniform(-1.0, 1.0, (-(-asked.drawn // compared.most), compared.most, 2 * levels))
+    of_levels = plans[..., :levels]
+    plans[..., :levels] = np.where(rng.random(of_levels.shape) < 0.5, np.sign(of_levels), CREEP * of_levels)
+    returns = np.concatenate([returns_of(some) for some in plans])
+    options: dict[str, Any] = {
+        "popsize": asked.population, "bounds": [-BOUND, BOUND], "verbose": -9, "seed": np.nan,
+        "randn": lambda *shape: rng.standard_normal(shape),
+    }  # fmt: skip
+    best = plans.reshape(-1, 2 * levels)[np.argsort(-returns)[: asked.starts]]
+    searches: list[Any] = [cma.CMAEvolutionStrategy(begin, asked.spread, options) for begin in best]
+    for left in halvings(asked.starts):
+        found = found._replace(best=-np.inf)  # there are more brakes now
         for _ in range(asked.steps):
-            plans = np.array(strategy.ask())
-            returns = note(plans, compared)
-            strategy.tell(list(plans), (-returns).tolist())
-            last = float(returns.max())
-        return last
-
-    screening, plans, returns = compared.screening(), [], []
-    for _ in range(-(-asked.drawn // screening.plans)):
-        some = rng.uniform(-1.0, 1.0, (screening.plans, 2 * levels))
-        some[:, :levels] *= np.where(rng.random((len(some), levels)) < 0.5, NEAR, 1.0)
-        plans.append(some)
-        returns.append(note(some, screening, counts=False))
-    best, searches = _best(np.concatenate(plans), np.concatenate(returns), compared.plans), []
-    for begin in _best(best, note(best, compared), asked.starts):
-        options: dict[str, Any] = {
-            "popsize": compared.plans, "bounds": [-BOUND, BOUND], "verbose": -9, "seed": np.nan,
-            "randn": lambda *shape: rng.standard_normal(shape),
-        }  # fmt: skip
-        strategy = cma.CMAEvolutionStrategy(begin, asked.spread, options)
-        searches.append((improve(strategy), strategy))
-    improve(max(searches, key=operator.itemgetter(0))[1])
+            asks = np.array([strategy.ask() for strategy in searches])
+            returns = returns_of(asks.reshape(-1, 2 * levels)).reshape(len(searches), asked.population)
+            for strategy, own, of_own in zip(searches, asks, returns, strict=True):
+                strategy.tell(list(own), (-of_own).tolist())
+        best_first = np.argsort(-returns.max(axis=1), kind="stable")
+        searches = [searches[k] for k in best_first[: -(-left // 2)]]
     return np.clip(found.numbers, -1.0, 1.0)
 
 
-def _best(plans: Floats, returns: Floats, count: int) -> Floats:
-    chosen: Floats = plans[np.argsort(-returns)[:count]]
-    return chosen
+def halvings(starts: int) -> list[int]:
+    """Searches that are left in each round: all, half of them, ..., one."""
+    return [starts, *halvings(-(-starts // 2))] if starts > 1 else [1]

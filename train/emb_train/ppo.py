@@ -153,7 +153,7 @@ class Actor(nn.Module):
             speed: the action is a target speed, of time and estimate.
         """
         super().__init__()
-        self._speed = speed
+        self.speed = speed
         features = TimeAndEstimate(bench) if speed else Scaled(bench, inputs)
         self.features: TimeAndEstimate | Scaled = features
         self.log_deviation = nn.Parameter(torch.full((1,), math.log(ppo.initial_deviation)))
@@ -171,7 +171,7 @@ class Actor(nn.Module):
 
         Near zero a speed is exponentially finer, so that noise lets neither a creep nor a standstill stick.
         """
-        return torch.sinh(FINENESS * action.clamp(-1.0, 1.0)) / math.sinh(FINENESS) if self._speed else action
+        return torch.sinh(FINENESS * action.clamp(-1.0, 1.0)) / math.sinh(FINENESS) if self.speed else action
 
     def action(self, part: Tensor) -> Tensor:
         """The action whose :meth:`part` this is, of a speed."""
@@ -214,12 +214,19 @@ class DeployedActor(nn.Module):
         self.actor, self.limit = copy.deepcopy(actor), limit
         if sample_time != 1.0:
             self.actor.features.in_seconds(sample_time)
-        alike = [nn.Tanh() if isinstance(layer, Tanh) else layer for layer in self.actor.layers]  # one operator
+        # As few operators as there can be, for each costs the same in a cycle
+        *_, last = alike = [nn.Tanh() if isinstance(layer, Tanh) else layer for layer in self.actor.layers]
         self.actor.layers = nn.Sequential(*alike)
+        self._speed, self.scale = actor.speed, limit
+        if actor.speed:
+            self.scale /= math.sinh(FINENESS)
+            for values in last.parameters():
+                values.data *= FINENESS
 
     def forward(self, observation: Tensor) -> Tensor:
         """Currents [A] or speeds [rad/s] within ±limit, shape [N, 1], for raw observations, shape [N, I]."""
-        return torch.clamp(self.limit * self.actor.part(self.actor(observation)), -self.limit, self.limit)
+        action = self.actor(observation)
+        return torch.clamp(self.scale * (torch.sinh(action) if self._speed else action), -self.limit, self.limit)
 
 
 def clone(actor: Actor, speeds: Sequence[float], bench: Bench, ppo: Ppo, generator: torch.Generator) -> None:

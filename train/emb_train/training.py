@@ -144,8 +144,8 @@ def training_from(record: object, source: str) -> Training:
         raise UsageError(f"{source}: plan: expected none, for the actor's action is no speed")
     if training.ppo.noise_hold > training.ppo.rollout:
         raise UsageError(f"{source}: noise_hold: expected at most the rollout of {training.ppo.rollout} steps")
-    if training.plan is not None and training.plan.starts > training.plan.population:
-        raise UsageError(f"{source}: plan.starts: expected at most the plan.population of {training.plan.population}")
+    if training.plan is not None and training.plan.starts > training.plan.brakes:
+        raise UsageError(f"{source}: plan.starts: expected at most the plan.brakes of {training.plan.brakes}")
     if training.ppo.envs % training.share:
         raise UsageError(
             f"{source}: envs: expected a multiple of {training.share}, for as many of each plant, got "
@@ -276,7 +276,7 @@ def follow_plan(
         clone(actor, plan, bench, training.ppo, torch.Generator().manual_seed(training.seed))
 
     environments = training.environments(bench, asked.population * asked.brakes, pool)
-    compared = Compared(environments, asked.population, training.ppo.rollout, training.seed)
+    compared = Compared(environments, training.ppo.rollout, training.seed)
     rng = np.random.default_rng(np.random.SeedSequence(training.seed, spawn_key=(PLAN_STREAM,)))
     try:
         search(compared, asked, rng, show=searched)
