@@ -185,7 +185,7 @@ def test_a_file_that_computes_something_else_is_not_written(
     def wrong(actor: Any, width: int) -> Any:
         actor = copy.deepcopy(actor)
         with torch.no_grad():
-            actor.actor.layers[-1].bias.add_(0.1)
+            actor.layers[-1].bias.add_(0.1)
         return torch_graph(actor, width)
 
     monkeypatch.setattr("emb_train.network.torch_graph", wrong)

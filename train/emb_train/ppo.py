@@ -30,6 +30,7 @@ from emb_train.env import EmbExcitationVectorEnv
 Result = TypeVar("Result")
 
 STEPS = 128  # Soft steps in time that a network of time and estimate has
+SEEN = slice(len(SAMPLE) - 1, len(SAMPLE) + len(PARAMETER_NAMES))  # Time and estimates in an observation
 SLOPE = 2.0  # Of the soft step in an estimate, at the nominal value and relative to it
 FARTHEST = 1.0  # Most that a reward may be from its pair's mean
 FINENESS = 9.0  # A speed is sinh(9 a)/sinh 9 of the limit for the action a
@@ -97,14 +98,13 @@ class Scaled(nn.Module):
         self.register_buffer("centre", centre)
         self.register_buffer("span", span)
 
-    def in_seconds(self, sample_time: float) -> None:
-        """Take the time in seconds in place of the step."""
-        self.centre[len(SAMPLE) - 1] *= sample_time
-        self.span[len(SAMPLE) - 1] *= sample_time
-
     def forward(self, observation: Tensor) -> Tensor:
         """Shape [N, size] to the same."""
         return (observation - self.centre) / self.span
+
+    def layers(self, inputs: int, sample_time: float) -> list[nn.Module]:
+        """Layers with the same outputs, for observations with the time [s] in place of the step."""
+        return [linear(torch.diag(1.0 / self.span), -self.centre / self.span, sample_time)]
 
 
 class TimeAndEstimate(nn.Module):
@@ -126,14 +126,26 @@ class TimeAndEstimate(nn.Module):
         self.register_buffer("scale", scale)
         self.register_buffer("shift", shift)
 
-    def in_seconds(self, sample_time: float) -> None:
-        """Take the time in seconds in place of the step."""
-        self.scale[:, 0] /= sample_time
-
     def forward(self, observation: Tensor) -> Tensor:
         """Shape [N, 11] to [N, features]."""
-        time_and_estimate = observation[:, len(SAMPLE) - 1 : len(SAMPLE) + len(PARAMETER_NAMES)]
-        return torch.tanh(nn.functional.linear(time_and_estimate, self.scale, self.shift))
+        return torch.tanh(nn.functional.linear(observation[:, SEEN], self.scale, self.shift))
+
+    def layers(self, inputs: int, sample_time: float) -> list[nn.Module]:
+        """Layers with the same outputs, for whole observations with the time [s] in place of the step."""
+        weight = torch.zeros(len(self.shift), inputs)
+        weight[:, SEEN] = self.scale
+        return [linear(weight, self.shift, sample_time), nn.Tanh()]
+
+
+def linear(weight: Tensor, bias: Tensor, sample_time: float) -> nn.Linear:
+    """A layer with these weights of (angle, velocity, step, ...), for (angle, velocity, time [s], ...)."""
+    initial: Any = nn.utils.skip_init  # without types; drawn weights would change what is drawn next
+    layer: nn.Linear = initial(nn.Linear, *reversed(weight.shape))
+    with torch.no_grad():
+        layer.weight.copy_(weight)
+        layer.weight[:, len(SAMPLE) - 1] /= sample_time
+        layer.bias.copy_(bias)
+    return layer
 
 
 class Actor(nn.Module):
@@ -153,7 +165,7 @@ class Actor(nn.Module):
             speed: the action is a target speed, of time and estimate.
         """
         super().__init__()
-        self.speed = speed
+        self.inputs, self.speed = inputs, speed
         features = TimeAndEstimate(bench) if speed else Scaled(bench, inputs)
         self.features: TimeAndEstimate | Scaled = features
         self.log_deviation = nn.Parameter(torch.full((1,), math.log(ppo.initial_deviation)))
@@ -206,27 +218,32 @@ class Critic(nn.Module):
 
 
 class DeployedActor(nn.Module):
-    """The network that is exported: raw observation in, current [A] or speed [rad/s] out; scaling and clip inside."""
+    """The network that is exported: raw observation in, current [A] or speed [rad/s] out; scaling and clip inside.
+
+    It has as few operators as there can be, for each takes its time in a cycle, however small it is.
+    """
 
     def __init__(self, actor: Actor, limit: float, sample_time: float = 1.0) -> None:
-        """Wrap a trained actor for a bench with this limit, [A] or [rad/s]; with a sample time [s] it gets the time."""
+        """Take the layers of a trained actor.
+
+        Args:
+            actor: of this bench.
+            limit: of the bench, [A] or [rad/s].
+            sample_time: of a bench whose policies get the time [s] in place of the step.
+        """
         super().__init__()
-        self.actor, self.limit = copy.deepcopy(actor), limit
-        if sample_time != 1.0:
-            self.actor.features.in_seconds(sample_time)
-        # As few operators as there can be, for each costs the same in a cycle
-        *_, last = alike = [nn.Tanh() if isinstance(layer, Tanh) else layer for layer in self.actor.layers]
-        self.actor.layers = nn.Sequential(*alike)
-        self._speed, self.scale = actor.speed, limit
+        self.limit, self.speed = limit, actor.speed
+        alike = [nn.Tanh() if isinstance(layer, Tanh) else copy.deepcopy(layer) for layer in actor.layers]
+        self.layers = nn.Sequential(*actor.features.layers(actor.inputs, sample_time), *alike)
         if actor.speed:
-            self.scale /= math.sinh(FINENESS)
-            for values in last.parameters():
+            for values in alike[-1].parameters():
                 values.data *= FINENESS
 
     def forward(self, observation: Tensor) -> Tensor:
         """Currents [A] or speeds [rad/s] within ±limit, shape [N, 1], for raw observations, shape [N, I]."""
-        action = self.actor(observation)
-        return torch.clamp(self.scale * (torch.sinh(action) if self._speed else action), -self.limit, self.limit)
+        action = self.layers(observation)
+        wanted = self.limit / math.sinh(FINENESS) * torch.sinh(action) if self.speed else self.limit * action
+        return torch.clamp(wanted, -self.limit, self.limit)
 
 
 def clone(actor: Actor, speeds: Sequence[float], bench: Bench, ppo: Ppo, generator: torch.Generator) -> None:
