@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from msgspec.structs import replace
@@ -38,10 +38,11 @@ def test_a_plan_has_its_levels_in_their_order_each_for_its_time(numbers: Floats)
 
 
 @given(NUMBERS, st.integers(1, 300))
+@example(np.concatenate([np.ones(LEVELS), np.linspace(-0.7, 0.9, LEVELS)]), 300)
 def test_a_plan_stays_within_the_limit_and_goes_as_far_as_its_levels_do(numbers: Floats, horizon: int) -> None:
     speeds = speeds_of(np.stack([numbers, -numbers]), horizon)
     assert speeds.shape == (2, horizon)
-    assert (np.abs(speeds) <= 1.0 + 1e-12).all()
+    assert (np.abs(speeds) <= 1.0).all()  # else evaluate refuses the plan.json of a full stroke
     levels, times = np.split(np.clip(numbers, -1.0, 1.0), 2)
     weights = np.exp(3.0 * times)
     assert speeds[0].mean() == pytest.approx(np.sign(levels) * levels**2 @ weights / weights.sum(), abs=1e-9)

@@ -6,7 +6,6 @@ What needs torch is imported inside functions, so that ``--help`` is quick and a
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -191,7 +190,7 @@ def ppo(arguments: argparse.Namespace) -> int:
             if m is None:
                 advance("the actor learns the best plan")
             elif isinstance(m, Found):
-                advance(f"plan {m.plans}" + (f", best {m.best:.3f}" if math.isfinite(m.best) else " at random"))
+                advance(f"plan {m.plans}, best {m.best:.3f}")
             else:
                 advance(f"return {m.mean_return:.3f}, left {m.violations}, home {m.home} of {m.ended}")
 

@@ -66,8 +66,8 @@ def speeds_of(numbers: Floats, horizon: int) -> Floats:
     passed = np.clip(np.arange(horizon + 1.0) - horizon * ends[..., None], 0.0, None)
     shares = np.diff(passed, axis=-1)
     within = shares[..., :-1, :] - shares[..., 1:, :]  # of each period in each level
-    speeds: Floats = np.einsum("...i,...ik->...k", np.sign(of_levels) * of_levels**2, within)
-    return speeds
+    speeds = np.einsum("...i,...ik->...k", np.sign(of_levels) * of_levels**2, within)
+    return np.clip(speeds, -1.0, 1.0)  # sums of shares are 1 but for rounding
 
 
 class Compared:

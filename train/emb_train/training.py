@@ -282,7 +282,7 @@ def follow_plan(
         search(compared, asked, rng, show=searched)
         follow()
     except KeyboardInterrupt:
-        if not found or not math.isfinite(found[0].best):
+        if not found:
             raise
         follow()
         return True
