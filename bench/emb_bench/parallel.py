@@ -1,7 +1,7 @@
 """Work shared out to processes of this machine or to Ray.
 
-A process that dies, out of memory or in a fault of compiled code, costs its own piece of work and no other:
-``concurrent.futures`` calls all pieces in flight broken then, pebble does not.
+A process that dies, out of memory or in a fault of compiled code, costs its own piece of work and no other: each has a
+pipe of its own and one piece at a time, so that it is known which one that was, whenever the process died.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import chdir, contextmanager, suppress
-from multiprocessing import resource_tracker
+from itertools import islice
+from multiprocessing import connection, resource_tracker
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -28,8 +29,10 @@ from emb_runtime.errors import UsageError, needs
 LOCAL = "local"  # Address that stands for a Ray started here, on this machine
 
 _SPAWN = multiprocessing.get_context("spawn")  # Compiled code is not safe after a fork, and some of it has threads
-_PATIENCE = 5.0  # Time for a cluster to answer [s]
+_PATIENCE = 5.0  # Time for a cluster to answer, and for a process whose pipe has ended to end [s]
 _RETRIES = 1  # Of a Ray task: a machine of a cluster may be lost; a piece that ends its process may do so twice
+
+_NONE = object()  # No answer yet
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -49,21 +52,87 @@ def shared_out(
     The work raises nothing; it is a function that another process can import, or a ``functools.partial`` of one. A
     process that takes longer than the limit [s] is ended. Closed or interrupted, all are ended at once.
     """
-    from pebble import ProcessPool
-
-    limit = None if math.isinf(time_limit) else time_limit
-    numbers: dict[Future[Any], int] = {}
-    pool: Any = ProcessPool(min(jobs, len(pieces)) or 1, context=_SPAWN)  # its types do not say all
+    waiting = enumerate(pieces)
+    most = min(jobs, 60) if os.name == "nt" else jobs  # Windows waits for 63 pipes at most
+    busy: list[_Worker] = []
     try:
-        with _environment():
-            with _deaf():
-                for number, piece in enumerate(pieces):
-                    numbers[pool.schedule(work, args=[piece], timeout=limit)] = number
-            for future in as_completed(numbers):
-                yield numbers[future], _result(future, time_limit)
+        for number, piece in islice(waiting, most):
+            busy.append(_Worker(work, time_limit))
+            busy[-1].begin(number, piece)
+        while busy:
+            left = min(worker.end for worker in busy) - time.monotonic()
+            connection.wait([worker.pipe for worker in busy], None if math.isinf(left) else max(0.0, left))
+            for worker in list(busy):
+                if (found := worker.answer()) is _NONE:
+                    continue
+                number, job = worker.number, next(waiting, None)
+                if job is None:
+                    worker.close()
+                    busy.remove(worker)
+                else:
+                    worker.begin(*job)
+                yield number, found
     finally:
-        pool.stop()
-        pool.join()
+        for worker in busy:
+            worker.close()
+
+
+class _Worker:
+    """A process that does one piece of work after another; in place of one that has ended, a new one."""
+
+    def __init__(self, work: Callable[[Any], object], time_limit: float) -> None:
+        self._work, self._time_limit = work, time_limit
+        self._process: Any = None
+
+    def begin(self, number: int, piece: object) -> None:
+        """Hand a piece over; its time begins when the process has it."""
+        if self._process is None:
+            self.pipe, other = _SPAWN.Pipe()
+            self._process = _SPAWN.Process(target=_serve, args=(self._work, other), daemon=True)
+            with _environment(), _deaf():
+                self._process.start()
+            other.close()  # so that the end of the process is the end of the pipe
+        self.number, self.end, self._begun = number, math.inf, False
+        with suppress(OSError):  # of a process that has died: the pipe ends
+            self.pipe.send(piece)
+
+    def answer(self) -> Any:
+        """The result of the piece, or why there will be none; ``_NONE`` while neither is there."""
+        if not self.pipe.poll():
+            if time.monotonic() < self.end:
+                return _NONE
+            self.close()
+            return Lost(f"not evaluated within {self._time_limit:g} s")
+        try:
+            sent = self.pipe.recv()
+        except (EOFError, OSError):
+            self._process.join(_PATIENCE)
+            code = self.close()
+            how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+            return Lost(f"the process that evaluated it {how}")
+        if self._begun:
+            return sent
+        self._begun, self.end = True, time.monotonic() + self._time_limit
+        return _NONE
+
+    def close(self) -> int:
+        """End the process at once; its exit code."""
+        process, self._process = self._process, None
+        if process is None:
+            return 0
+        process.kill()
+        process.join()
+        self.pipe.close()
+        return int(process.exitcode)
+
+
+def _serve(work: Callable[[Any], object], pipe: Any) -> None:
+    """Do what comes through a pipe, until nothing more does."""
+    with suppress(EOFError):
+        while True:
+            piece = pipe.recv()
+            pipe.send(None)
+            pipe.send(work(piece))
 
 
 def processors() -> int:
@@ -84,19 +153,6 @@ def processes() -> Iterator[Executor]:
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _result(future: Future[Any], time_limit: float) -> Any:
-    from pebble import ProcessExpired
-
-    try:
-        return future.result()
-    except TimeoutError:
-        return Lost(f"not evaluated within {time_limit:g} s")
-    except ProcessExpired as err:
-        code = err.exitcode or 0
-        how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        return Lost(f"the process that evaluated it {how}")
 
 
 @contextmanager

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 PLANTED = (
     *("json", "struct", "socket", "pickle", "selectors", "signal", "runpy", "random", "csv", "logging", "platform"),
     *("multiprocessing", "sitecustomize", "usercustomize", "numpy", "scipy", "numba", "mcap", "msgspec", "cantools"),
-    *("onnxruntime", "pebble", "pyarrow", "ray", "emb_runtime", "emb_bench", "emb_export", "emb_train"),
+    *("onnxruntime", "pyarrow", "ray", "emb_runtime", "emb_bench", "emb_export", "emb_train"),
 )
 STARTING = {
     "emb-run --iface sim --log run.mcap --policy actor.onnx --report run.html": 0,

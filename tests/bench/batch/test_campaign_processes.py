@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
 import subprocess
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -63,6 +65,34 @@ def test_the_environment_is_as_it_was_and_no_process_stays() -> None:
 def squared(number: int) -> int:
     """A piece of work."""
     return number**2
+
+
+class Fatal:
+    """Ends the process that receives it with this exit code, before any work can begin."""
+
+    def __init__(self, code: int) -> None:
+        self.code = code
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return os._exit, (self.code,)
+
+    def __call__(self, _: object) -> None:
+        """Work."""
+
+
+def ended_with(code: int) -> Lost:
+    return Lost(f"the process that evaluated it ended with exit code {code}")
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_process_that_dies_before_its_work_begins_costs_no_other_piece(jobs: int) -> None:
+    pieces: list[Any] = [-1, Fatal(3), -2, Fatal(4), Fatal(5), -3]
+    found = dict(shared_out(abs, pieces, jobs, math.inf))
+    assert found == {0: 1, 1: ended_with(3), 2: 2, 3: ended_with(4), 4: ended_with(5), 5: 3}
+
+
+def test_work_that_no_process_can_receive_ends_with_every_piece_lost() -> None:
+    assert dict(shared_out(Fatal(3), "abc", jobs=2, time_limit=math.inf)) == dict.fromkeys(range(3), ended_with(3))
 
 
 def test_elsewhere_than_in_the_main_thread_work_is_shared_out_too() -> None:
