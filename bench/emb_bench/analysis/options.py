@@ -13,6 +13,7 @@ from emb_bench.config.plants import Plant
 from emb_bench.estimate.records import METHODS, STARTS, EstimationProblem, freed
 from emb_bench.information.evaluation import Question
 from emb_bench.options import Options, option
+from emb_bench.sim.open_loop import check_unknowns
 from emb_runtime.config.bench import PARAMETER_NAMES
 from emb_runtime.errors import UsageError
 from emb_runtime.estimator.estimate import NORMAL_95
@@ -48,7 +49,11 @@ class QuestionOptions(Options):
     def __post_init__(self) -> None:
         """Check all that needs no bench."""
         super().__post_init__()
-        Question(*self.names_on(None))
+        nuisances = () if self.nuisance is None else names_of(self.nuisance)
+        if self.params is None:
+            check_unknowns(nuisances)  # parameters that are not named depend on the machine
+        else:
+            Question(names_of(self.params), nuisances)
 
     def names_on(self, bench: Bench | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Parameters and nuisances; those that are not given are the machine's of the bench, if it has one."""
@@ -64,7 +69,15 @@ class QuestionOptions(Options):
 
 
 @dataclass(frozen=True, eq=False)
-class EstimateOptions(QuestionOptions):
+class SearchOptions(QuestionOptions):
+    """A question, and the searches for its answer."""
+
+    starts: int = option(STARTS, "local searches (default: 8)", "N", kind=int, least=1)
+    seed: int = option(0, "seed of the starts of these searches (default: 0)", "N", kind=int, least=0)
+
+
+@dataclass(frozen=True, eq=False)
+class EstimateOptions(SearchOptions):
     """Options of an estimate."""
 
     method: str | None = option(None, "see above (default: oem; windows for a recording)", choices=tuple(METHODS))
@@ -89,8 +102,6 @@ class EstimateOptions(QuestionOptions):
     window: float = option(
         0.0, "length of the windows [s], with method windows (default: what the map says, or 0.5)", "X", kind=float
     )
-    starts: int = option(STARTS, "local searches (default: 8)", "N", kind=int, least=1)
-    seed: int = option(0, "seed of the starts of these searches (default: 0)", "N", kind=int, least=0)
     profile: bool = option(False, "likelihood profiles of all parameters (default: of those that are identified badly)")
     last: str | Path | None = option(
         None, "JSON of an earlier estimate or report, to say what has changed since", "FILE", kind=Path
@@ -103,7 +114,6 @@ class EstimateOptions(QuestionOptions):
         if not (self.window == 0.0 or 1e-3 <= self.window <= 3600.0):
             raise UsageError(f"--window: expected a time from 0.001 to 3600 s, got {self.window:g}")
         known_values(self.known)
-        EstimationProblem(*self.names_on(None))
 
     def method_on(self, bench: Bench) -> str:
         """The method: the one that is given, or the usual one of the bench's machine."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from emb_bench.batch.row import NONE, CampaignOptions, Row, Source, failed
 from emb_bench.brake.parameters import PARAMETERS
-from emb_bench.config.bench import Bench, parse_bench
+from emb_bench.config.bench import Bench
 from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.expected import of_information
@@ -54,7 +54,7 @@ def _steps(source: Source, options: CampaignOptions) -> Iterator[Row]:
     log = read_log(source.path)
     yield _of_the_run(log)
     require_driven(log)
-    bench = log.bench if options.bench_text is None else parse_bench(options.bench_text, "--bench", analysis=True)
+    bench = options.bench_of_all or log.bench
     check_sample_time(log, bench)
     plant = bench.model(options.model or default_model(log)[0])
     question = options.question(bench)

@@ -9,9 +9,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from emb_bench.analysis.options import QuestionOptions
+from emb_bench.analysis.options import SearchOptions
 from emb_bench.brake.parameters import SI, UNITS
-from emb_bench.estimate.records import METHODS, STARTS
+from emb_bench.config.bench import Bench, parse_bench
+from emb_bench.estimate.records import METHODS
 from emb_bench.options import option
 from emb_bench.output import text_cells
 from emb_runtime.errors import UsageError
@@ -33,12 +34,10 @@ class Source:
 
 
 @dataclass(frozen=True, eq=False)
-class CampaignOptions(QuestionOptions):
+class CampaignOptions(SearchOptions):
     """Options of a campaign, equal for all logs."""
 
     method: str = option("oem", "see above, or 'none' for information alone (default: oem)", choices=(NONE, *METHODS))
-    starts: int = option(STARTS, "local searches (default: 8)", "N", kind=int, least=1)
-    seed: int = option(0, "seed of the starts of these searches (default: 0)", "N", kind=int, least=0)
     jobs: int | None = option(None, "logs at a time (default: one for each processor)", "N", kind=int, least=1)
     time_limit: float = option(
         600.0, "longest time for one log [s]; one that takes longer has failed (default: 600)", "X", kind=float
@@ -57,15 +56,20 @@ class CampaignOptions(QuestionOptions):
             raise UsageError(f"--time-limit: expected 0.001 to 1e6 s, got {self.time_limit:g}")
 
     @property
+    def bench_of_all(self) -> Bench | None:
+        """The bench that all logs are evaluated with; None if each has its own."""
+        return None if self.bench_text is None else parse_bench(self.bench_text, "--bench", analysis=True)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """All unknowns, nuisances last."""
-        params, nuisances = self.names_on(None)
+        params, nuisances = self.names_on(self.bench_of_all)
         return (*params, *nuisances)
 
     @property
     def origin(self) -> dict[str, Any]:
         """Options that the rows depend on, for the file that has them."""
-        params, nuisances = self.names_on(None)
+        params, nuisances = self.names_on(self.bench_of_all)
         kept = {name: getattr(self, name) for name in ("model", "prior", "bench_text", "starts", "seed")}
         return {"method": self.method, "params": params, "nuisances": nuisances, **kept}
 

@@ -15,12 +15,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomlkit
 from mcap.reader import make_reader
 from pyarrow import parquet
 
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import CampaignOptions, Source
 from emb_bench.cli.replay import main
+from emb_bench.config.bench import DRIVEN
 from emb_bench.experiment.from_log import read_experiment
 from emb_bench.logs.log import read_log
 from emb_runtime.config.bench import PARAMETER_NAMES, Bench
@@ -252,6 +254,27 @@ def test_a_log_of_another_sample_time_than_the_bench_fails_with_what_is_known_of
     assert row["error"] == f"{path}: expected a sample time of 0.002 s, as in the bench file, got 0.001 s"
     assert row["exit_reason"] == "DONE"
     assert "log_det" not in row
+
+
+def test_the_unknowns_of_a_machine_s_bench_are_those_of_rows_summary_and_file(
+    folder: Path, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = tomlkit.parse(bench.text)
+    for driven in (*DRIVEN, "estimator"):
+        text.pop(driven, None)
+    text["machine"] = {"unknown": ["T_c", "J"]}
+    machine = tmp_path / "machine.toml"
+    machine.write_text(tomlkit.dumps(text))
+    asked = ("--bench", str(machine), "--nuisance", "k_m", "--method", "none", "--jobs", "1")
+    found = campaign(monkeypatch, folder / "tuesday", tmp_path / "r.parquet", *asked)
+    assert found.code == 0
+    assert [*found.document["parameters"]] == ["T_c", "J", "k_m"]
+    assert {name.removesuffix("_cramer_rao") for name in found.rows["c.mcap"] if name.endswith("_cramer_rao")} == {
+        *found.document["parameters"]
+    }
+    assert all(p["identified"] is not None for p in found.document["parameters"].values())
+    options = json.loads(parquet.read_schema(found.path).metadata[b"options"])
+    assert (options["params"], options["nuisances"]) == (["T_c", "J"], ["k_m"])
 
 
 def test_samples_beyond_a_limit_are_counted(folder: Path, bench: Bench) -> None:
