@@ -43,7 +43,7 @@ class Read:
     @property
     def said(self) -> bool:
         """Whether it was said that something is missing."""
-        return bool(not self.log.complete or self.log.missing or self.experiment.lacks)
+        return bool(not self.log.complete or self.log.missing or self.experiment.quality.lacks)
 
     @property
     def numbers(self) -> list[Any]:

@@ -17,7 +17,7 @@ from enum import StrEnum
 import numpy as np
 
 from emb_bench.analysis.drift import Drift
-from emb_bench.analysis.profile import Profile
+from emb_bench.analysis.records import Profile
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import least
 from emb_bench.estimate.estimate import Estimate
@@ -60,7 +60,7 @@ class Conclusion:
 
     @property
     def label(self) -> str:
-        """Name of the parameter; of one of several records its number, too."""
+        """Name of the parameter; of one of several experiments its number, too."""
         return self.finding.name
 
     @property
@@ -97,7 +97,7 @@ def conclude(
         interval = bounded(interval, value, least(unknown.name))
         gross = GROSS.get(unknown.name, 1.0)
         finding = findings.get(label)
-        if finding is None:  # of a single record
+        if finding is None:  # of a single experiment
             doubts = (Doubt.TOO_WIDE,) if deviation >= gross else ()
             finding = Finding(label, deviation, doubts, unit="" if unknown.relative else shown.unit)
         finding = replace(

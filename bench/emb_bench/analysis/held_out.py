@@ -1,23 +1,26 @@
-"""Prediction of a record that the estimate has not seen.
+"""Prediction of an experiment that the estimate has not seen, and parameters in which experiments differ.
 
 Residuals of what was estimated from are smaller than the noise, and a flexible model bends to them. The error of a
 prediction is noise plus the error of the parameters: with the estimate's covariance C and the sensitivities J,
 e^T (I + J C J^T)⁻¹ e is χ² with as many degrees of freedom as there are samples. It is the least of |e|² + δ^T C⁻¹ δ
 over the parameters' errors δ, and that is how it is computed here, by simulation instead of J: the curvature of
-the model counts. Each combination that is not identified, and each unknown of the new record alone, costs a degree of
-freedom.
+the model counts. Each combination that is not identified, and each unknown of the new experiment alone, costs a degree
+of freedom.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import special
 
+from emb_bench.analysis.records import Differing, HeldOut
+from emb_bench.analysis.several_runs import apart_by, constancy
 from emb_bench.brake.motion import Floats
+from emb_bench.brake.parameters import quantity
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.innovations import Filter
 from emb_bench.estimate.methods import method_of
@@ -29,36 +32,20 @@ from emb_bench.estimate.windows import predict_windows
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.errors import UsageError
 
+APART = 0.001  # Chance that a parameter of one and the same brake is said to differ, for all parameters together
 LEVEL = 0.01  # Chance of a false alarm with the right model, for all predictions together
 
-GROUPS = 4  # Most estimates that leave records out: the time grows with the number of records, not with its square
+GROUPS = 4  # Most estimates that leave experiments out: the time grows with their number, not with its square
 _DETERMINED = 1e-7  # share of the largest singular value, columns of unit length, from which a direction is determined
 
 
-@dataclass(frozen=True)
-class HeldOut:
-    """Prediction of a record that the estimate has not seen."""
-
-    name: str
-    chi2: float  # Weighted square of the prediction's errors, the uncertainty of the estimate taken into account
-    freedom: int
-    p_value: float  # Chance of a larger one if the model is right
-    fits: bool
-    error: float = math.nan  # Root mean square of the angle's error over windows [rad]; NaN for other methods
-
-    @property
-    def ratio(self) -> float:
-        """χ²/n."""
-        return self.chi2 / max(self.freedom, 1)
-
-
-def held_out(e: Estimate, record: Experiment, *, among: int = 1) -> HeldOut:
-    """Predict a record of the same brake from an estimate of others; ``among`` predictions share the false alarms."""
+def held_out(e: Estimate, experiment: Experiment, *, among: int = 1) -> HeldOut:
+    """Predict an experiment of the same brake from an estimate of others; ``among`` predictions share false alarms."""
     level = LEVEL / among
     if e.method == "windows":
-        return _windows_predicted(e, record, level)
-    problem = replace(e.problem, asked=replace(e.asked, prior=None), records=(record,))
-    index = [i for i, unknown in enumerate(problem.unknowns) if unknown.record is None]
+        return _windows_predicted(e, experiment, level)
+    problem = replace(e.problem, asked=replace(e.asked, prior=None), experiments=(experiment,))
+    index = [i for i, unknown in enumerate(problem.unknowns) if unknown.experiment is None]
     start = problem.nominal()
     start[index] = e.z[e.shared()]
     start = np.clip(start, *problem.bounds)
@@ -66,7 +53,7 @@ def held_out(e: Estimate, record: Experiment, *, among: int = 1) -> HeldOut:
     known = np.zeros((len(index), len(start)))
     known[:, index] = _root(e.shared_information())
     weights = problem.weights(start)
-    if record.gap_unknowns and e.method != "pem":
+    if experiment.gap_unknowns and e.method != "pem":
         problem = searched(problem, [start]).problem
     parts = _errors(e, problem, start, weights)
 
@@ -81,45 +68,46 @@ def held_out(e: Estimate, record: Experiment, *, among: int = 1) -> HeldOut:
     measured = sum(root.size for root in weights)
     starts = len(rows) - len(known) - measured
     if e.method != "pem":
-        starts -= record.gap_unknowns
+        starts -= experiment.gap_unknowns
         fitted += taken(problem.gap_basis(end.z, weights), measured)
     freedom = max(samples + starts - fitted, 1)
     p_value = float(special.chdtrc(freedom, end.cost))
-    return HeldOut(record.name, end.cost, freedom, p_value, p_value >= level)
+    return HeldOut(experiment.name, end.cost, freedom, p_value, p_value >= level)
 
 
 def refit(e: Estimate, chosen: Sequence[int]) -> Estimate:
-    """Estimates again from some of the records, any of them as often as it is to count, by the same method.
+    """Estimates again from some of the experiments, any of them as often as it is to count, by the same method.
 
     Output error begins where the estimate is. The model validation is not repeated: it is that of the first estimate.
     """
     problem, own = e.problem.part(chosen)
     if e.method != "oem":
-        return method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit(problem.records)
+        return method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit(problem.experiments)
     return searched(problem, [np.clip(e.z[own], *problem.bounds)]).finished(e.validation)
 
 
 def leave_one_out(e: Estimate) -> tuple[HeldOut, ...]:
-    """Predict each record from an estimate of others, made by the same method.
+    """Predict each experiment from an estimate of others, made by the same method.
 
-    Of up to ``GROUPS`` records these are all others; of more, those that are not in its group, of ``GROUPS`` in turns.
+    Of up to ``GROUPS`` experiments these are all others; of more, those that are not in its group, of ``GROUPS`` in
+    turns.
     """
-    count = len(e.records)
+    count = len(e.experiments)
     if count < 2:
         raise UsageError(f"to predict each record from the others takes at least 2, got {count}")
     groups = min(count, GROUPS)
     others = [refit(e, [k for k in range(count) if k % groups != group]) for group in range(groups)]
-    return tuple(held_out(others[i % groups], record, among=count) for i, record in enumerate(e.records))
+    return tuple(held_out(others[i % groups], experiment, among=count) for i, experiment in enumerate(e.experiments))
 
 
-def _windows_predicted(e: Estimate, record: Experiment, level: float) -> HeldOut:
-    """Prediction of the windows of a record, each from the start that fits it best.
+def _windows_predicted(e: Estimate, experiment: Experiment, level: float) -> HeldOut:
+    """Prediction of the windows of an experiment, each from the start that fits it best.
 
     What a window was disturbed by is not in the parameters, so that their uncertainty is not released.
     """
-    error, chi2, freedom = predict_windows(replace(e.problem, records=(record,)), e.values)
+    error, chi2, freedom = predict_windows(replace(e.problem, experiments=(experiment,)), e.values)
     p_value = float(special.chdtrc(freedom, chi2))
-    return HeldOut(record.name, chi2, freedom, p_value, p_value >= level, error)
+    return HeldOut(experiment.name, chi2, freedom, p_value, p_value >= level, error)
 
 
 def _errors(
@@ -145,3 +133,34 @@ def _root(information: Floats) -> Floats:
 def _rank(rows: Floats) -> int:
     lengths = np.linalg.norm(rows, axis=0)
     return int(np.linalg.matrix_rank(rows / np.where(lengths > 0.0, lengths, 1.0), tol=_DETERMINED * len(lengths)))
+
+
+def apart(e: Estimate) -> tuple[Differing, ...]:
+    """Parameters in which the experiments of an estimate differ that each fit alone; the most different first.
+
+    Empty if they fit together, if no more than half of them fit alone, or if no parameter differs. An experiment that
+    does not fit alone is not compared: of many right ones, one raises a false alarm.
+    """
+    if len(e.experiments) < 2 or e.validation.fits:
+        return ()
+    every = [method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit([experiment]) for experiment in e.experiments]
+    alone = [one for one in every if one.validation.fits]
+    if 2 * len(alone) <= max(len(every), 2):
+        return ()
+    found = []
+    for name in e.asked.params:
+        at = [next(i for i, u in enumerate(one.unknowns) if u.name == name) for one in alone]
+        values = np.array([one.values[i] for one, i in zip(alone, at, strict=True)])
+        effects = [one.effects(i) for one, i in zip(alone, at, strict=True)]
+        mean = {effect: tuple(np.mean([one[effect] for one in effects], axis=0).tolist()) for effect in effects[0]}
+        between = [float(one.between_runs()[i]) for one, i in zip(alone, at, strict=True)]
+        if not np.isfinite(between).all():
+            continue
+        deviations = [apart_by(d, own, mean) for d, own in zip(between, effects, strict=True)]
+        scale = float(np.mean([one.scale[i] for one, i in zip(alone, at, strict=True)]))
+        p_value = constancy(values.tolist(), [scale * d for d in deviations]).p_value
+        if p_value < APART / len(e.asked.params):
+            in_order = iter(values.tolist())
+            by_experiment = tuple(next(in_order) if one.validation.fits else math.nan for one in every)
+            found.append(Differing(quantity(e.bench.machine, name).name, by_experiment, p_value))
+    return tuple(sorted(found, key=lambda one: one.p_value))

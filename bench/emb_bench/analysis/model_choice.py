@@ -1,35 +1,35 @@
-"""Choice of a model: plants fitted to the records and ranked, and the interval that covers those left over.
+"""Choice of a model: plants fitted to the experiments and ranked, and the interval that covers those left over.
 
 Every plant is fitted by output error with the same unknowns, and with the systematic errors that it can have. The fit
 of the simplest plant is a start for all others, and the fit without systematic errors one for that with them; whichever
-does not explain the records from there is started anew from the best of the others.
+does not explain the experiments from there is started anew from the best of the others.
 
 *Likelihood.* −2 log L = Σ e²/σ² + Σ log σ² over all samples. The variance counts, because it is part of the model: a
 jittering clock makes samples of a fast brake uncertain. A model in which the velocity is an observer's has no noise of
 its own in it: given the angles its velocity follows, to the last digits that are sent. So its likelihood is that of
 the angles, and that of the difference between the velocity sent and the one that the observer's recursion gives from
-three samples in a row, whose variance is taken from the record.
+three samples in a row, whose variance is taken from the experiment.
 
 *Criteria* (Burnham and Anderson, Model Selection and Multimodel Inference, 2nd ed., 2002, chapter 6): BIC adds log n
 for each unknown, but none for the systematic errors that are estimated too, which have priors. The *held-out score*
-needs no count of unknowns: the logarithm of the density that a model fitted to a part of the records gives to the rest
-(Laplace's approximation, an uncertainty of 100 % before the records). The part is all but one of several records, each
-in its turn, or the first half of a single one.
+needs no count of unknowns: the logarithm of the density that a model fitted to a part of the experiments gives to the
+rest (Laplace's approximation, an uncertainty of 100 % before the experiments). The part is all but one of several
+experiments, each in its turn, or the first half of a single one.
 
-*Weights.* A model's weight is exp(−BIC/2) over the sum of all; where the records tell models apart, one has all of it.
-The interval of a parameter is that of the mixture of the models' Gaussians with these weights, so that it covers both
-where two explain the records. Models that do not fit beside one that does have no weight.
+*Weights.* A model's weight is exp(−BIC/2) over the sum of all; where the experiments tell models apart, one has all of
+it. The interval of a parameter is that of the mixture of the models' Gaussians with these weights, so that it covers
+both where two explain the experiments. Models that do not fit beside one that does have no weight.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy import optimize, special
 
+from emb_bench.analysis.records import Candidate, ModelChoice
 from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DEFAULT_PLANT, Instruments, Mechanics, Plant
@@ -38,118 +38,34 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.output_error import Fit, reweighted, search, with_gaps
 from emb_bench.estimate.prediction import Problem, make_problem
-from emb_bench.estimate.records import NORMAL_95, EstimationProblem, Unknown, has_time_for_a_delay
+from emb_bench.estimate.records import EstimationProblem, has_time_for_a_delay
 from emb_bench.estimate.search import released
 from emb_bench.experiment.experiment import Experiment
 from emb_runtime.estimator.observer import observer_gains
 
-NEGLIGIBLE = 0.01  # Weight below which a model adds nothing to an interval
-WRONG = 25  # Simulations after which the search of a model that does not explain the records ends
-RecordsOf = Callable[[Plant], Sequence[Experiment]]
-"""The records as a model takes them: its encoder's offset says whether one starts at the origin."""
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A fitted model."""
-
-    name: str  # Of the plant, or what was added to it
-    estimate: Estimate = field(repr=False)
-    deviance: float  # −2 log L, but for a constant that all models share
-    bic: float
-    held_out: float  # Logarithm of the density of what was held out, but for a constant that all models share
-    weight: float = 0.0  # Share of it in the answer
-
-    @property
-    def fits(self) -> bool:
-        """Returns True if the tests on the residuals do not reject it."""
-        return self.estimate.validation.fits
-
-
-@dataclass(frozen=True)
-class Change:
-    """Difference that another model makes to a parameter."""
-
-    name: str
-    percent: float  # Of the value by the first model
-    deviations: float  # In the standard deviations that the first model states
-
-
-@dataclass(frozen=True, eq=False)
-class ModelChoice:
-    """Models that were fitted to the same records, the best one first."""
-
-    candidates: tuple[Candidate, ...]
-    same: tuple[str, ...] = ()
-    """Plants that are left out: one that fits better is the same but for an offset that is estimated too."""
-
-    @property
-    def best(self) -> Candidate:
-        """The model with the least BIC among those that fit, or among all if none does."""
-        return self.candidates[0]
-
-    @property
-    def left_over(self) -> tuple[Candidate, ...]:
-        """Models that the records do not tell from the best one."""
-        return tuple(c for c in self.candidates if c.weight >= NEGLIGIBLE)
-
-    def changes(self, other: Candidate) -> tuple[Change, ...]:
-        """Changes of the parameters of interest if ``other`` were right instead of the best model."""
-        e, found = self.best.estimate, []
-        theirs = dict(zip(other.estimate.unknowns, other.estimate.values.tolist(), strict=True))
-        columns = (e.unknowns, e.values.tolist(), e.between_runs().tolist(), e.scale.tolist())
-        for unknown, value, deviation, size in zip(*columns, strict=True):
-            if unknown.name in e.asked.params and unknown in theirs:
-                change = (theirs[unknown] - value) / size if size > 0.0 else math.nan
-                sigmas = change / deviation if deviation > 0.0 else math.nan
-                found.append(Change(unknown.name, 100.0 * change, sigmas))
-        return tuple(found)
-
-    def interval(self, unknown: Unknown, level: float = 0.95) -> tuple[float, float]:
-        """Interval of the mixture of the models that are left over, SI units."""
-        parts = [(c.weight, *own) for c in self.left_over if (own := _normal(c.estimate, unknown)) is not None]
-        return mixture_interval(parts, level)
-
-
-def mixture_interval(parts: Sequence[tuple[float, float, float]], level: float) -> tuple[float, float]:
-    """Central interval of a mixture of Gaussians, each with a weight, a mean and a standard deviation."""
-    if not parts or not all(math.isfinite(deviation) for _, _, deviation in parts):
-        return -math.inf, math.inf
-    weights, means, deviations = (np.array(column) for column in zip(*parts, strict=True))
-    weights = weights / weights.sum()
-    low, high = float(np.min(means - 9.0 * deviations)), float(np.max(means + 9.0 * deviations))
-    if low == high:
-        return low, high
-
-    def below(x: float, share: float) -> float:
-        return float(weights @ special.ndtr((x - means) / deviations)) - share
-
-    tails = 0.5 * (1.0 - level), 0.5 * (1.0 + level)
-    first, last = (optimize.brentq(below, low, high, args=(tail,), xtol=1e-9 * (high - low)) for tail in tails)
-    return float(first), float(last)
-
-
-def _normal(e: Estimate, unknown: Unknown) -> tuple[float, float] | None:
-    """Value and standard deviation of an unknown in SI units; None if the model does not have it."""
-    if unknown not in e.unknowns:
-        return None
-    i = e.unknowns.index(unknown)
-    low, high = e.intervals()[i].tolist()
-    return float(e.values[i]), 0.5 * (high - low) / NORMAL_95
+WRONG = 25  # Simulations after which the search of a model that does not explain the experiments ends
+ExperimentsOf = Callable[[Plant], Sequence[Experiment]]
+"""The experiments as a model takes them: its encoder's offset says whether one starts at the origin."""
 
 
 def choose_model(
-    bench: Bench, plants: Sequence[Plant], records_of: RecordsOf, asked: EstimationProblem, *, starts: int, seed: int
+    bench: Bench,
+    plants: Sequence[Plant],
+    experiments_of: ExperimentsOf,
+    asked: EstimationProblem,
+    *,
+    starts: int,
+    seed: int,
 ) -> ModelChoice:
     """Fits every plant and ranks them."""
     ordered = sorted(plants, key=lambda plant: (plant.name != DEFAULT_PLANT, plant.mechanics, plant.instruments))
 
     def problems(asked: EstimationProblem) -> list[Problem]:
-        return [make_problem(bench, plant, records_of(plant), _asked_of(bench, plant, asked)) for plant in ordered]
+        return [make_problem(bench, plant, experiments_of(plant), _asked_of(bench, plant, asked)) for plant in ordered]
 
     trusting = problems(replace(asked, systematic={}))
     simplest = trusting[0]
-    first = method_of("oem")(bench, ordered[0], simplest.asked, starts=starts, seed=seed).fit(simplest.records)
+    first = method_of("oem")(bench, ordered[0], simplest.asked, starts=starts, seed=seed).fit(simplest.experiments)
     fits = _from_the_best([fit_from(problem, first) for problem in trusting])
     if asked.systematic:
         fits = _from_the_best([fit_from(own, fit) for own, fit in zip(problems(asked), fits, strict=True)])
@@ -163,7 +79,7 @@ def choose_model(
 
 
 def _from_the_best(fits: Sequence[Fit]) -> list[Fit]:
-    """Fits what does not explain the records once more, from the best of the others."""
+    """Fits what does not explain the experiments once more, from the best of the others."""
     near = min(fits, key=lambda fit: fit.ratio)
     again = []
     for fit in fits:
@@ -203,7 +119,7 @@ def fit_from(problem: Problem, near: Estimate | Fit, *, follow: bool = False) ->
 
 def candidate(name: str, e: Estimate) -> Candidate:
     """A fitted model with its criteria."""
-    samples = sum(int(record.measured.sum()) for record in e.records) * 2
+    samples = sum(int(experiment.measured.sum()) for experiment in e.experiments) * 2
     deviance, count = _deviance(e.problem, e.fit), len(e.wanted())
     return Candidate(name, e, deviance, deviance + count * math.log(samples), held_out_score(e, deviance))
 
@@ -224,17 +140,18 @@ def _deviance(problem: Problem, z: Floats) -> float:
     weights = problem.weights(z)
     errors, _ = problem.jacobian(z, weights)
     total = float(errors @ errors)
-    for record, root in zip(problem.records, weights, strict=True):
+    for experiment, root in zip(problem.experiments, weights, strict=True):
         total -= 2.0 * float(np.sum(np.log(root[root > 0.0])))
         if problem.plant.instruments.observer_bandwidth > 0.0:
-            total += _observed(record, problem.plant.instruments.observer_bandwidth, problem.bench.timing.sample_time)
+            bandwidth = problem.plant.instruments.observer_bandwidth
+            total += _observed(experiment, bandwidth, problem.bench.timing.sample_time)
     return total
 
 
-def _observed(record: Experiment, bandwidth: float, t_s: float) -> float:
+def _observed(experiment: Experiment, bandwidth: float, t_s: float) -> float:
     """−2 log L of a velocity that an observer derives from the angles."""
     alpha, beta = observer_gains(bandwidth, t_s)
-    angle, velocity = record.samples.T
+    angle, velocity = experiment.samples.T
     surprise = np.diff(velocity)[:-1] * t_s / beta  # of the middle one of three samples
     ahead = angle[1:-1] - (1.0 - alpha) * surprise + t_s * velocity[1:-1]
     errors = velocity[2:] - velocity[1:-1] - beta / t_s * (angle[2:] - ahead)
@@ -242,18 +159,18 @@ def _observed(record: Experiment, bandwidth: float, t_s: float) -> float:
     if not len(errors):
         return 0.0
     variance = max(float(np.mean(errors**2)), 1e-300)
-    return int(record.measured.sum()) * (math.log(variance) + 1.0)
+    return int(experiment.measured.sum()) * (math.log(variance) + 1.0)
 
 
 def held_out_score(e: Estimate, deviance: float) -> float:
     """Logarithm of the density that the model gives to what was held out when it was fitted to the rest."""
-    volume, score, count = _volume(e.problem, e.z), 0.0, len(e.records)
+    volume, score, count = _volume(e.problem, e.z), 0.0, len(e.experiments)
     for out in range(count):
         if count > 1:
             problem, own = e.problem.part([i for i in range(count) if i != out])
         else:
-            half = e.records[0].until(max(len(e.records[0].currents) // 2, 1))
-            problem, own = replace(e.problem, records=(half,)), list(range(len(e.z)))
+            half = e.experiments[0].until(max(len(e.experiments[0].currents) // 2, 1))
+            problem, own = replace(e.problem, experiments=(half,)), list(range(len(e.z)))
         start = e.z[own]
         there = search(problem, start, problem.weights(start), WRONG).z
         score -= 0.5 * (deviance - _deviance(problem, there) + volume - _volume(problem, there))

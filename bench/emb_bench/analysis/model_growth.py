@@ -1,4 +1,4 @@
-"""Growth of a model: features that the records ask for, added one by one to a simple plant.
+"""Growth of a model: features that the experiments ask for, added one by one to a simple plant.
 
 In each round Rao's score test asks of every feature that the model lacks how much of it the residuals want. Those that
 they want are fitted. The one with the least BIC is added if that is less than before and what was held out is predicted
@@ -19,7 +19,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from emb_bench.analysis.model_choice import Candidate, candidate, fit_from, ranked
+from emb_bench.analysis.model_choice import candidate, fit_from, ranked
+from emb_bench.analysis.records import Candidate
 from emb_bench.brake.parameters import PARAMETERS
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EXACT, Plant
@@ -44,12 +45,12 @@ AROUND = 0.03  # from values that differ by this share
 
 
 def grow_model(
-    bench: Bench, plant: Plant, records: Sequence[Experiment], asked: EstimationProblem, *, starts: int, seed: int
+    bench: Bench, plant: Plant, experiments: Sequence[Experiment], asked: EstimationProblem, *, starts: int, seed: int
 ) -> Estimate:
-    """Adds features to a plant until the records ask for nothing more; the estimate's plant is named after them."""
+    """Adds features to a plant until the experiments ask for nothing more; the estimate's plant is named after them."""
     if plant.mechanics.solver != EXACT:
         raise UsageError(f"plant '{plant.name}': expected one that is solved exactly: others have no features to add")
-    first = method_of("oem")(bench, plant, asked, starts=starts, seed=seed).fit(records)
+    first = method_of("oem")(bench, plant, asked, starts=starts, seed=seed).fit(experiments)
     now = _judged(plant, first, ())
     added: tuple[str, ...] = ()
     seen: dict[tuple[str, ...], Candidate] = {(): now}
@@ -109,7 +110,7 @@ def _problem(plant: Plant, asked: EstimationProblem, near: Estimate, names: Sequ
     found = _with(asked, names)
     if found.systematic:
         found = with_systematic(found, near.bench, plant)
-    return Problem(near.bench, plant, found, near.records)
+    return Problem(near.bench, plant, found, near.experiments)
 
 
 def _judged(plant: Plant, e: Estimate, added: Sequence[str]) -> Candidate:

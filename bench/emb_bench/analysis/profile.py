@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emb_bench.analysis.records import LEVEL, Profile
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import least
 from emb_bench.estimate.estimate import Estimate
@@ -29,8 +29,6 @@ from emb_bench.estimate.search import minimise
 from emb_bench.information.identifiability import GROSS, Doubt
 from emb_runtime.errors import UsageError
 
-LEVEL = NORMAL_95**2
-"""Rise of χ² that one parameter stays below in 95 % of experiments: a quantile of χ² with one degree of freedom."""
 STEP = 0.4  # First distance from the minimum [standard deviations]
 SHARE = 0.05  # Largest first distance from the minimum, as a share of the way to the border
 SMALL, LARGE = 0.1, 2.5
@@ -39,33 +37,8 @@ SEARCHES = 60  # Most searches on one side
 BETTER = 0.01  # Fall of χ² below its minimum that is more than the search's own error
 MINIMA = 3  # Most minima that a profile moves on to
 CLIFF = 1e-9  # Share of the way to the border that the grid is not narrowed below: the rise jumps there
-AGREES = 0.1  # Largest relative difference of two half-widths that count as equal
 DOUBTFUL = 0.05
 """Deviation, as a share of the value or of a gross error, above which a parabola is not trusted without a profile."""
-
-
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """Likelihood profile of one unknown: rise of χ² when it is held and the others are refitted."""
-
-    label: str
-    values: Floats  # Values of the held unknown, ascending, SI units, shape (n,)
-    rise: Floats  # χ² above its minimum, prior included, shape (n,)
-    interval: tuple[float, float]
-    """95 % by the likelihood ratio; infinite on a side where the rise does not reach ``LEVEL``."""
-    doubt: Doubt | None
-    """None if it is closed, else ``FLAT`` (open on both sides), ``OPEN_BELOW``, ``OPEN_ABOVE`` or ``CUT``."""
-    fisher: tuple[float, float]
-    """95 % by the Fisher information, around the profile's minimum; infinite where it identifies nothing."""
-    minimum: float  # Value with the least χ², SI units
-    fell: float  # Fall of χ² below that of the estimate, which is then a local minimum only; 0 if none
-
-    @property
-    def agrees(self) -> bool:
-        """Returns True if the Fisher information gives the same interval."""
-        half = self.fisher[1] - self.minimum
-        sides = (self.interval[1] - self.minimum, self.minimum - self.interval[0])
-        return max(abs(side / half - 1.0) for side in sides) <= AGREES
 
 
 class _Point(NamedTuple):
@@ -83,7 +56,7 @@ class _Side(NamedTuple):
 
 
 def profiles(e: Estimate, *, of_all: bool) -> tuple[Profile, ...]:
-    """Profiles of the unknowns that all records share; unless ``of_all``, of those whose verdict may depend on one.
+    """Profiles of the unknowns that all experiments share; unless ``of_all``, of those whose verdict may depend on one.
 
     No verdict does if the parabola of the Fisher information holds for all of them inside the search range. Otherwise
     the curvature may affect each; an unknown that the information does not identify is not identified either way.

@@ -8,12 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emb_bench.brake.parameters import quantity
 from emb_bench.estimate.effects import DRIFTS
-from emb_bench.estimate.estimate import Estimate
 
 DIFFERENT = 0.01  # Significance level of the test: with a smaller p-value, the number is not the same in all runs
-APART = 0.001  # Chance that a parameter of one and the same brake is said to differ, for all parameters together
 
 
 @dataclass(frozen=True)
@@ -61,46 +58,3 @@ def apart_by(deviation: float, effects: Effects, other: Effects) -> float:
         shared = name not in DRIFTS and name in other and other[name][1] > 0.0
         square += (bias - (size / other[name][1] * other[name][0] if shared else 0.0)) ** 2
     return math.sqrt(square)
-
-
-@dataclass(frozen=True)
-class Differing:
-    """A parameter that differs between records."""
-
-    name: str
-    values: tuple[float, ...]
-    """By each record alone, in their order, in the unit that they are shown in; NaN by one that does not fit."""
-    p_value: float  # Chance of such differences if it is the same (χ² of the values around their weighted mean)
-
-
-def apart(e: Estimate) -> tuple[Differing, ...]:
-    """Parameters in which the records of an estimate differ that each fit alone; the most different first.
-
-    Empty if they fit together, if no more than half of them fit alone, or if no parameter differs. A record that does
-    not fit alone is not compared: of many right ones, one raises a false alarm.
-    """
-    if len(e.records) < 2 or e.validation.fits:
-        return ()
-    from emb_bench.estimate.methods import method_of
-
-    every = [method_of(e.method)(e.bench, e.plant, e.asked, starts=1).fit([record]) for record in e.records]
-    alone = [one for one in every if one.validation.fits]
-    if 2 * len(alone) <= max(len(every), 2):
-        return ()
-    found = []
-    for name in e.asked.params:
-        at = [next(i for i, u in enumerate(one.unknowns) if u.name == name) for one in alone]
-        values = np.array([one.values[i] for one, i in zip(alone, at, strict=True)])
-        effects = [one.effects(i) for one, i in zip(alone, at, strict=True)]
-        mean = {effect: tuple(np.mean([one[effect] for one in effects], axis=0).tolist()) for effect in effects[0]}
-        between = [float(one.between_runs()[i]) for one, i in zip(alone, at, strict=True)]
-        if not np.isfinite(between).all():
-            continue
-        deviations = [apart_by(d, own, mean) for d, own in zip(between, effects, strict=True)]
-        scale = float(np.mean([one.scale[i] for one, i in zip(alone, at, strict=True)]))
-        p_value = constancy(values.tolist(), [scale * d for d in deviations]).p_value
-        if p_value < APART / len(e.asked.params):
-            in_order = iter(values.tolist())
-            by_record = tuple(next(in_order) if one.validation.fits else math.nan for one in every)
-            found.append(Differing(quantity(e.bench.machine, name).name, by_record, p_value))
-    return tuple(sorted(found, key=lambda one: one.p_value))

@@ -45,7 +45,7 @@ def estimate(runs: AnyRun | Sequence[AnyRun] = (), options: EstimateOptions | No
     asked = options_of("estimate", EstimateOptions, options, more)
     _require_estimates()
     before = _earlier(asked)
-    from emb_bench.analysis.study import make_study
+    from emb_bench.analysis.stages import make_study
 
     logs = [driven(run, asked.map) for run in listed(runs)]
     if not logs:
@@ -93,7 +93,7 @@ def report(
     _require_estimates()
     with needs("a report", "bench"):
         import matplotlib  # noqa: F401
-    from emb_bench.analysis.study import make_study
+    from emb_bench.analysis.stages import make_study
     from emb_bench.report import acceptance as test
     from emb_bench.report.page import html
     from emb_bench.report.report import Report, document, page_of
@@ -124,7 +124,7 @@ def _require_estimates() -> None:
     with needs("an estimate", "bench"):
         import numba  # noqa: F401
 
-        import emb_bench.analysis.study  # noqa: F401
+        import emb_bench.analysis.stages  # noqa: F401
 
 
 def _earlier(options: EstimateOptions) -> Earlier | None:

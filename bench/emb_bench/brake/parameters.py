@@ -25,7 +25,7 @@ class Parameter(NamedTuple):
     low: float = 0.0  # Lowest value that is searched; where low = high, limits of the bench
     high: float = 0.0  # Highest value that is searched
     start: float = 0.0  # Value of a feature to begin with where the plant has none; 0 for what is no feature
-    of_a_record: bool = False  # Each record has one of its own
+    of_an_experiment: bool = False  # Each experiment has one of its own
     gross: float = 1.0  # Deviation from which on an estimate is of no use: relative, or in its unit
     effect: str = ""  # Noun phrase for a score test; empty where there is none
     remedy: str = ""  # What to do if the score test finds it
@@ -51,7 +51,7 @@ PARAMETERS: Mapping[str, Parameter] = {
         "rad",
         False,
         "what the encoder shows at the origin [rad], of each log",
-        of_a_record=True,
+        of_an_experiment=True,
         effect="an encoder offset",
         remedy="home the encoder, or --nuisance offset,x1_0",
         addition="encoder offset",
@@ -68,7 +68,7 @@ PARAMETERS: Mapping[str, Parameter] = {
         "rad",
         False,
         "angle at the start [rad], of each log",
-        of_a_record=True,
+        of_an_experiment=True,
         effect="another angle at the start",
         remedy="let the brake rest before the run, or --nuisance x1_0",
     ),
@@ -76,7 +76,7 @@ PARAMETERS: Mapping[str, Parameter] = {
         "rad/s",
         False,
         "velocity at the start [rad/s], of each log",
-        of_a_record=True,
+        of_an_experiment=True,
         gross=10.0,
         effect="a motion at the start",
         remedy="let the brake rest before the run, or --nuisance x2_0",
@@ -254,7 +254,7 @@ UNITS = {name: row.unit for name, row in PARAMETERS.items() if not row.relative}
 """Units of the unknowns whose sensitivity is absolute; the others are relative to their value."""
 FEATURES = tuple(name for name, row in PARAMETERS.items() if row.start)
 """Features of a brake beyond the thesis's equations."""
-OF_A_RECORD = tuple(name for name, row in PARAMETERS.items() if row.of_a_record)
+OF_AN_EXPERIMENT = tuple(name for name, row in PARAMETERS.items() if row.of_an_experiment)
 """Unknowns that each record has for itself: its start, and the homing of its encoder."""
 
 

@@ -77,7 +77,7 @@ def _steps(drive: DriveMapping | None) -> tuple[float, float]:
 def current(log: RunLog) -> CurrentCheck:
     """Scale and latency of the current, and how far the brake moved."""
     experiment = read_experiment(log)
-    late = experiment.command_delay
+    late = experiment.quality.command_delay
     commands, reports = np.asarray(log.cycles["sent_current"]), np.asarray(log.cycles["applied_current"])
     sent, applied = commands[: len(commands) - 1 - late], reports[1 + late :]
     both = np.isfinite(sent) & np.isfinite(applied)
@@ -130,7 +130,7 @@ def identify(logs: Sequence[RunLog], sheet: Bench, noise: Noise, before: Identif
     bench = replace(sheet, noise=noise_in_motion(noise, logs[0].drive), sensors=velocity.sensors)
     best = _best(bench, experiments, before, velocity.bandwidth)
     asked = with_systematic(best.asked, bench, best.plant)
-    e = fit_from(Problem(bench, best.plant, asked, best.records), best).finished() if asked.systematic else best
+    e = fit_from(Problem(bench, best.plant, asked, best.experiments), best).finished() if asked.systematic else best
     names = [unknown.name for unknown in e.unknowns]
     half = NORMAL_95 * e.between_runs() * e.scale
     values = dict(zip(names, e.values.tolist(), strict=True))
@@ -146,7 +146,7 @@ def identify(logs: Sequence[RunLog], sheet: Bench, noise: Noise, before: Identif
         model=best.plant.name,
         fits=best.validation.fits and e.validation.fits,  # an offset explains a wrong model of a small motion
         ratio=e.validation.ratio,
-        command_delay=max(own.command_delay for own in experiments),
+        command_delay=max(own.quality.command_delay for own in experiments),
         measurement_delay=e.plant.instruments.measurement_delay,
         current_lag=(max(0.0, lag[0]), max(0.0, lag[1])),
         features={name: value for name, value in values.items() if name in FEATURES and name != "current_lag"},
@@ -175,15 +175,14 @@ def _best(
     """
     lags = ("current_lag",) if bench.shield.current_lag > 0.0 else ()
     starts = ("x1_0",) if any(own.x0() != (0.0, 0.0) for own in experiments) else ()  # of a few samples at rest
-    most = bench.shield.frame_age[1] - max(own.command_delay for own in experiments)
+    most = bench.shield.frame_age[1] - max(own.quality.command_delay for own in experiments)
 
     def fit(late: int, features: Mapping[str, float], name: str) -> Estimate:
         mechanics = Mechanics(**cast(dict[str, Any], features))
         plant = Plant(name, mechanics, Instruments(measurement_delay=late, observer_bandwidth=observer_bandwidth))
-        records = [own.seen_by(plant) for own in experiments]
         prior = bench.range_set(bench.shield.ranges)
         asked = EstimationProblem(PARAMETER_NAMES, (*features, *lags, *starts), prior)
-        return method_of("oem")(bench, plant, asked, starts=STARTS).fit(records)
+        return method_of("oem")(bench, plant, asked, starts=STARTS).fit([own.seen_by(plant) for own in experiments])
 
     def misfit(e: Estimate) -> tuple[bool, bool, float]:
         is_excluded = e.plant.instruments.measurement_delay > max(most, 0)
@@ -198,13 +197,13 @@ def _best(
     best = min(found, key=misfit)
     if best.validation.fits or len(experiments) == 1:  # a single one does not tell features apart
         return best
-    return grow_model(bench, best.plant, best.records, best.asked, starts=1, seed=0)
+    return grow_model(bench, best.plant, best.experiments, best.asked, starts=1, seed=0)
 
 
 def _residuals(e: Estimate, noise: Noise) -> Noise:
     """Standard deviations of the residuals, of the samples in the slower half of the motion."""
     both = np.concatenate(e.residuals)
-    speed = np.abs(np.concatenate([record.samples[:, 1] for record in e.records]))
+    speed = np.abs(np.concatenate([experiment.samples[:, 1] for experiment in e.experiments]))
     slow = both[speed <= np.nanmedian(speed)]
     count = np.maximum(np.isfinite(slow).sum(axis=0), 1)  # none of a velocity that an observer derives
     angle, velocity = np.sqrt(np.nansum(slow**2, axis=0) / count).tolist()

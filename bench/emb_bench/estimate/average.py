@@ -3,8 +3,8 @@
 A bench has no certain error with the probability ``ABSENT``; else the error is Gaussian, of a deviation that is one of
 ``SHARES`` of its prior's: a spike and a slab (Mitchell and Beauchamp, Journal of the American Statistical Association
 83, 1988). For given deviations the estimate is Gaussian in the linearised problem, and all of them count with their
-probabilities given the record (Bayesian model averaging: Hoeting, Madigan, Raftery and Volinsky, Statistical Science
-14, 1999).
+probabilities given the experiment (Bayesian model averaging: Hoeting, Madigan, Raftery and Volinsky, Statistical
+Science 14, 1999).
 
 Let M be the information with all priors in full, C its inverse, and S the prior deviations of the errors η. The samples
 have the information A = C_ηη⁻¹ − S⁻² on η, and the score b = C_ηη⁻¹ η̂. With the deviations D, the errors have the
@@ -24,7 +24,7 @@ from emb_bench.brake.motion import Floats
 from emb_bench.estimate.prediction import Problem
 from emb_bench.information.identifiability import Spectrum, schur_complement
 
-ABSENT = 5.0 / 6.0  # Probability, before any record, that a bench does not have a certain systematic error
+ABSENT = 5.0 / 6.0  # Probability, before any experiment, that a bench does not have a certain systematic error
 SHARES = (1e-3, 1e-2, 0.1, 1.0)  # Deviations of an error that is there, over that of its prior
 
 
@@ -36,7 +36,7 @@ class Average(NamedTuple):
     gain: Floats  # Change of all unknowns with the errors, shape (p, errors)
     full: Floats  # Information on the errors with all priors in full
     covariance: Floats  # Of the errors, over all combinations
-    chances: Floats  # Logarithms of the probabilities of the combinations given the record, shape (c,)
+    chances: Floats  # Logarithms of the probabilities of the combinations given the experiment, shape (c,)
     shifts: Floats  # Means of the errors from the fit with all priors in full, by combination
     covariances: Floats  # Of the errors, by combination
 
@@ -79,7 +79,7 @@ class Influence(NamedTuple):
     information: float  # On its size
     score: float  # Of the residuals
     deviations: Floats  # Those that its prior may have, as many as of any other effect
-    present: float  # Probability before the record that it is there
+    present: float  # Probability before the experiment that it is there
     besides: Floats  # Further bias of each unknown, which adds to its size
 
 

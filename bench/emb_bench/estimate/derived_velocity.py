@@ -29,14 +29,14 @@ STARTS = 3  # Of the nearest, from which a nearer one is searched
 ALIKE = 1.25  # Ratio of mean squares of two observers that are not told apart
 TOLD = 1.3  # Ratio of the ends of a bandwidth that is known
 SETTLED = 20  # Samples after the begin or a gap, during which an observer forgets what is not known
-FEWEST = 10  # Periods of a record that tell a lag
-LONGEST = 20_000  # Samples of a record that are looked at
+FEWEST = 10  # Periods of an experiment that tell a lag
+LONGEST = 20_000  # Samples of an experiment that are looked at
 
 
-def derived(records: Sequence[Experiment], t_s: float) -> Derived | None:
-    """The observer in the first record that shows one; None if none does."""
-    for record in records:
-        angle, velocity = record.all_samples[:LONGEST].T
+def derived(experiments: Sequence[Experiment], t_s: float) -> Derived | None:
+    """The observer in the first experiment that shows one; None if none does."""
+    for experiment in experiments:
+        angle, velocity = experiment.all_samples[:LONGEST].T
         lag, deviation = _lag(angle, velocity, t_s)
         if lag > max(SURE * deviation, LEAST * t_s):
             return Derived(*_bandwidth(angle, velocity, t_s), float(special.ndtr(-lag / max(deviation, 1e-300))))

@@ -55,21 +55,21 @@ LAGGING = "velocity_lag"  # Explains a misfit if the velocity itself shows an ob
 
 
 class Shown(Protocol):
-    """Samples of each record as a model expects them at an estimate, in the standard deviations of its residuals."""
+    """Samples of each experiment as a model expects them at an estimate, in standard deviations of its residuals."""
 
-    def columns(self, record: int, names: tuple[str, ...]) -> Floats:
+    def columns(self, experiment: int, names: tuple[str, ...]) -> Floats:
         """Derivatives of what is shown to other unknowns, shape (n, names, 2)."""
 
-    def parts(self, record: int, unknowns: Integers, shares: Floats) -> Floats:
+    def parts(self, experiment: int, unknowns: Integers, shares: Floats) -> Floats:
         """Derivatives to unknowns that count in each period by shares of the shape (n, m), shape (n, m, 2)."""
 
-    def shown(self, record: int, mechanics: Mechanics) -> Floats:
+    def shown(self, experiment: int, mechanics: Mechanics) -> Floats:
         """Samples of another brake under the same currents, shape (n, 2)."""
 
-    def whitened(self, record: int, shift: Floats) -> Floats:
+    def whitened(self, experiment: int, shift: Floats) -> Floats:
         """A small change of what is shown [rad, rad/s], in the unit of the residuals, shape (n, 2)."""
 
-    def motion(self, record: int) -> Floats:
+    def motion(self, experiment: int) -> Floats:
         """Angle [rad] and velocity [rad/s] that are shown, shape (n, 2)."""
 
 
@@ -80,7 +80,7 @@ class Simulated:
     problem: Problem
     z: Floats
     weights: Sequence[Floats]
-    said: Sequence[Trajectory] | None = None  # Prediction of each record, where there is one,
+    said: Sequence[Trajectory] | None = None  # Prediction of each experiment, where there is one,
     besides: tuple[str, ...] = ()  # and the unknowns whose sensitivities are in it besides those of the problem
 
     @cached_property
@@ -89,41 +89,41 @@ class Simulated:
 
     @cached_property
     def _motion(self) -> list[Floats]:
-        said = self.said or [self.problem.motion(self.z, i) for i in range(len(self.problem.records))]
+        said = self.said or [self.problem.motion(self.z, i) for i in range(len(self.problem.experiments))]
         return [one.samples for one in said]
 
-    def columns(self, record: int, names: tuple[str, ...]) -> Floats:
+    def columns(self, experiment: int, names: tuple[str, ...]) -> Floats:
         """As :class:`Shown`."""
-        own = len(self.problem.columns(record))
+        own = len(self.problem.columns(experiment))
         is_said = self.said is not None and names == self.besides
-        at = self.said[record] if self.said and is_said else self.problem.predict(self.z, record, names)
-        return at.sensitivities[:, own : own + len(names)] * self.weights[record][:, None]
+        at = self.said[experiment] if self.said and is_said else self.problem.predict(self.z, experiment, names)
+        return at.sensitivities[:, own : own + len(names)] * self.weights[experiment][:, None]
 
-    def parts(self, record: int, unknowns: Integers, shares: Floats) -> Floats:
+    def parts(self, experiment: int, unknowns: Integers, shares: Floats) -> Floats:
         """As :class:`Shown`."""
-        return self.problem.parts(self.z, record, unknowns, shares) * self.weights[record][:, None]
+        return self.problem.parts(self.z, experiment, unknowns, shares) * self.weights[experiment][:, None]
 
-    def shown(self, record: int, mechanics: Mechanics) -> Floats:
+    def shown(self, experiment: int, mechanics: Mechanics) -> Floats:
         """As :class:`Shown`."""
         nominal = mechanics == self._mechanics
-        samples = self._motion[record] if nominal else self.problem.motion(self.z, record, mechanics).samples
-        return samples * self.weights[record]
+        samples = self._motion[experiment] if nominal else self.problem.motion(self.z, experiment, mechanics).samples
+        return samples * self.weights[experiment]
 
-    def whitened(self, record: int, shift: Floats) -> Floats:
+    def whitened(self, experiment: int, shift: Floats) -> Floats:
         """As :class:`Shown`."""
-        return shift * self.weights[record]
+        return shift * self.weights[experiment]
 
-    def motion(self, record: int) -> Floats:
+    def motion(self, experiment: int) -> Floats:
         """As :class:`Shown`."""
-        return self._motion[record]
+        return self._motion[experiment]
 
 
 class Path(NamedTuple):
-    """A record as the model moves."""
+    """An experiment as the model moves."""
 
     brake: BrakeParameters
     limits: Limits
-    passed: Floats  # Share of the record that has passed, -½ to ½, shape (n,)
+    passed: Floats  # Share of the experiment that has passed, -½ to ½, shape (n,)
     current: Floats  # Shape (n,) [A]
     angles: Floats  # From contact, at the ends of the periods, shape (n + 1,) [rad]
     velocities: Floats  # At the same, shape (n + 1,) [rad/s]
@@ -134,7 +134,7 @@ def columns(problem: Problem, z: Floats, shown: Shown, jacobian: Floats, names: 
 
     As long as all residuals, whose derivatives to z are the ``jacobian``.
     """
-    ends = np.cumsum([0, *(record.samples.size for record in problem.records)]).tolist()
+    ends = np.cumsum([0, *(experiment.samples.size for experiment in problem.experiments)]).tolist()
     at = [Linearised(problem, z, shown, i, jacobian[begin:end], names) for i, (begin, end) in enumerate(pairwise(ends))]
     found = dict[str, Floats]()
     for name in names:
@@ -145,15 +145,17 @@ def columns(problem: Problem, z: Floats, shown: Shown, jacobian: Floats, names: 
         if parts:
             found[name] = np.zeros(len(jacobian))
             found[name][: ends[-1]] = np.concatenate(parts)
-        if name == ANGLE_SCALE:  # the angles at rest before the records follow the samples among the residuals
-            rests = [(problem.records[i].angle - at[i].offset) / problem.records[i].slack for i in problem.rests()]
+        if name == ANGLE_SCALE:  # the angles at rest before the experiments follow the samples among the residuals
+            rests = [
+                (problem.experiments[i].angle - at[i].offset) / problem.experiments[i].slack for i in problem.rests()
+            ]
             found[name][ends[-1] : ends[-1] + len(rests)] = rests
     return found
 
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """A model at an estimate along a record; its regressors are of samples, shape (n, 2), in standard deviations.
+    """A model at an estimate along an experiment; its regressors are of samples, shape (n, 2), in standard deviations.
 
     None of an effect that the model has, or that its brake cannot have.
     """
@@ -161,7 +163,7 @@ class Linearised:
     problem: Problem
     z: Floats
     shown: Shown
-    record: int
+    experiment: int
     jacobian: Floats  # Derivatives of the residuals of its samples to z, shape (2 n, p)
     names: tuple[str, ...]  # Effects that are asked for
 
@@ -177,8 +179,8 @@ class Linearised:
             return self._turned.get(name)
         slow = after.stribeck_velocity
         if slow not in self._slowed:
-            self._slowed[slow] = self.shown.shown(self.record, before._replace(stribeck_velocity=slow))
-        return (self.shown.shown(self.record, after) - self._slowed[slow]) / step
+            self._slowed[slow] = self.shown.shown(self.experiment, before._replace(stribeck_velocity=slow))
+        return (self.shown.shown(self.experiment, after) - self._slowed[slow]) / step
 
     def turned(self, name: str) -> Floats | None:
         """The sensitivity to a torque that counts in each period by a share."""
@@ -188,13 +190,13 @@ class Linearised:
         """A lag of the velocity, where it is no observer's anyway."""
         if self._is_observed:
             return None
-        before, velocity = self.problem.records[self.record].velocity, self.shown.motion(self.record)[:, 1]
+        before, velocity = self.problem.experiments[self.experiment].velocity, self.shown.motion(self.experiment)[:, 1]
         slope = np.diff(velocity, prepend=before) / self.problem.bench.timing.sample_time
         return self._small(np.stack([np.zeros_like(slope), -slope], axis=1))
 
     def angle_scale(self, _: str) -> Floats:
         """A larger angle; a velocity by an observer follows it."""
-        return self._small((self.shown.motion(self.record) - [self.offset, 0.0]) * [1.0, self._is_observed])
+        return self._small((self.shown.motion(self.experiment) - [self.offset, 0.0]) * [1.0, self._is_observed])
 
     def current_scale(self, _: str) -> Floats:
         """A larger current, which acts as a larger k_m does."""
@@ -206,7 +208,7 @@ class Linearised:
 
     def _small(self, shift: Floats) -> Floats:
         """A change of what is shown [rad, rad/s], to first order."""
-        return self.shown.whitened(self.record, SMALL * shift) / SMALL
+        return self.shown.whitened(self.experiment, SMALL * shift) / SMALL
 
     @property
     def _is_observed(self) -> bool:
@@ -220,12 +222,12 @@ class Linearised:
     @cached_property
     def offset(self) -> float:
         """Reading of the encoder at the origin [rad]."""
-        return self.problem.at(self.z, self.record).offset(self.problem.plant)
+        return self.problem.at(self.z, self.experiment).offset(self.problem.plant)
 
     @cached_property
     def _slowed(self) -> dict[float, Floats]:
         """Samples that are shown with a Stribeck velocity and no more static friction, by that velocity."""
-        return {self.mechanics.stribeck_velocity: self.shown.shown(self.record, self.mechanics)}
+        return {self.mechanics.stribeck_velocity: self.shown.shown(self.experiment, self.mechanics)}
 
     @cached_property
     def _sensitivities(self) -> dict[str, Floats]:
@@ -235,7 +237,7 @@ class Linearised:
             n: -self.jacobian[:, own.index(n)].reshape(-1, 2) for n in ("k_m", "f_v", "J") if n in own
         }
         if names:
-            found |= zip(names, self.shown.columns(self.record, names).transpose(1, 0, 2), strict=True)
+            found |= zip(names, self.shown.columns(self.experiment, names).transpose(1, 0, 2), strict=True)
         return found
 
     @cached_property
@@ -244,7 +246,7 @@ class Linearised:
         if not shares:
             return {}
         unknowns, counted = zip(*shares.values(), strict=True)
-        moved = self.shown.parts(self.record, np.array(unknowns), np.stack(counted, axis=1))
+        moved = self.shown.parts(self.experiment, np.array(unknowns), np.stack(counted, axis=1))
         return dict(zip(shares, moved.transpose(1, 0, 2), strict=True))
 
     def shares(self) -> dict[str, tuple[int, Floats]]:
@@ -259,14 +261,14 @@ class Linearised:
 
     def _path(self) -> Path:
         """The motion that is shown."""
-        at, shown = self.problem.at(self.z, self.record), self.shown.motion(self.record)
+        at, shown = self.problem.at(self.z, self.experiment), self.shown.motion(self.experiment)
         n, delay = len(shown), self.problem.plant.instruments.measurement_delay
         ends = np.concatenate([shown[delay:], np.repeat(shown[-1:], min(delay, n), axis=0)])[:n]
         return Path(
             at.brake,
             self.problem.bench.limits,
             (np.arange(n) + 0.5) / n - 0.5,
-            self.problem.records[self.record].currents + at.errors.current_offset,
+            self.problem.experiments[self.experiment].currents + at.errors.current_offset,
             np.append(at.start[0], ends[:, 0] - self.offset) - at.contact,
             np.append(at.start[1], ends[:, 1]),
         )
@@ -308,7 +310,7 @@ class Effect(NamedTuple):
     remedy: str
     regressor: Callable[[Linearised, str], Floats | None]  # Of one unit
     unit: str = ""
-    prior: str = ""  # Key of ``[systematic]``: standard deviation before any record; empty where the total allows none
+    prior: str = ""  # Key of ``[systematic]``: standard deviation without any experiment; empty where none is allowed
     positive: bool = False  # It is suspected on one side only
     torque: tuple[int, Callable[[Path], Floats]] | None = None
     """Unknown, and its share in each period per unit of the effect."""

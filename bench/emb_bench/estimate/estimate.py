@@ -34,7 +34,7 @@ class Ratio(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Parameters from records."""
+    """Parameters from experiments."""
 
     problem: Problem  # Its plant has the features that were estimated
     z: Floats  # The unknowns, in the coordinates of ``problem``
@@ -48,7 +48,7 @@ class Estimate:
     validation: ModelValidation
     ends: tuple[End, ...]  # Of all local searches, best first
     residuals: tuple[Floats, ...] = field(repr=False)
-    """Of each record in standard deviations, NaN where lost, shape (n, 2); innovations where the method has them."""
+    """Of each experiment in standard deviations, NaN where lost, shape (n, 2); of a filter the innovations."""
     method: str = "oem"  # Key of ``METHODS``
     process_noise: float = 0.0
     """Standard deviation of the velocity's random walk, as the prediction error method estimates it [rad/s per √s]."""
@@ -68,9 +68,9 @@ class Estimate:
         return self.problem.plant
 
     @property
-    def records(self) -> tuple[Experiment, ...]:
+    def experiments(self) -> tuple[Experiment, ...]:
         """The experiments, without outliers."""
-        return self.problem.records
+        return self.problem.experiments
 
     @property
     def asked(self) -> EstimationProblem:
@@ -192,20 +192,20 @@ class Estimate:
         return Spectrum(self.information).correlation()
 
     def shared(self) -> list[int]:
-        """Indices of the unknowns that all records share."""
-        return [i for i, unknown in enumerate(self.unknowns) if unknown.record is None]
+        """Indices of the unknowns that all experiments share."""
+        return [i for i, unknown in enumerate(self.unknowns) if unknown.experiment is None]
 
     def wanted(self) -> list[int]:
         """Indices of the unknowns that were asked for: all but the systematic errors that are estimated too."""
         return [i for i, unknown in enumerate(self.unknowns) if unknown.name not in self.asked.along]
 
     def shared_information(self) -> Floats:
-        """FIM of the shared unknowns when those of single records are unknown too; relative, prior included."""
+        """FIM of the shared unknowns when those of single experiments are unknown too; relative, prior included."""
         return schur_complement(self.information, self.shared())
 
     def verdict(self) -> Identifiability:
-        """Identifiability of each unknown that was asked for; of several records, of those that they share."""
-        shared = [i for i, u in enumerate(self.unknowns) if u.record is None or len(self.records) == 1]
+        """Identifiability of each unknown that was asked for; of several experiments, of those that they share."""
+        shared = [i for i, u in enumerate(self.unknowns) if u.experiment is None or len(self.experiments) == 1]
         if not shared:
             return Identifiability((), (), ())
         matrix = schur_complement(self.information, shared)
@@ -222,4 +222,4 @@ class Estimate:
     def label(self, unknown: Unknown) -> str:
         """Label of an unknown."""
         name = quantity(self.bench.machine, unknown.name).name
-        return name if unknown.record is None or len(self.records) == 1 else f"{name}[{unknown.record}]"
+        return name if unknown.experiment is None or len(self.experiments) == 1 else f"{name}[{unknown.experiment}]"

@@ -155,12 +155,12 @@ def of_problem(problem: Problem, z: Floats) -> Interval:
     """The interval of a problem of one record, without noise, that is explained by ``z``."""
     allowed = tuple(problem.asked.allowed)
     held = lacked_sensitivities(problem, allowed)
-    said = [problem.predict(z, i, held) for i in range(len(problem.records))]
+    said = [problem.predict(z, i, held) for i in range(len(problem.experiments))]
     weights = problem.weights(z, said)
     jacobian = problem.jacobian(z, weights, said)[1]
     averaged = average(problem, z, (np.zeros(len(jacobian)), jacobian))  # of records without noise
     basis, inverse = basis_and_inverse(jacobian)
-    if any(record.gap_unknowns for record in problem.records):
+    if any(experiment.gap_unknowns for experiment in problem.experiments):
         basis = np.concatenate([basis, problem.gap_basis(z, weights)], axis=1)
     shown = Simulated(problem, z, weights, said, held)
     found = lacking(columns(problem, z, shown, jacobian, allowed), basis, inverse)

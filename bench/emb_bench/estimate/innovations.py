@@ -43,14 +43,14 @@ GAIN = 4
 
 @dataclass(frozen=True, eq=False)
 class Filter:
-    """Innovations of the records of a problem under a disturbance."""
+    """Innovations of the experiments of a problem under a disturbance."""
 
     problem: Problem
     walk: float  # q, standard deviation of the velocity's random walk [rad/s per √s]
     load: float = 0.0  # r, standard deviation of the load's random walk, as a current [A per √s]
 
     def gains(self, z: Floats, weights: Sequence[Floats]) -> list[Floats]:
-        """Gains of each record along the motion for ``z``, shape (n, 2, 4), in the order of ``GAIN``."""
+        """Gains of each experiment along the motion for ``z``, shape (n, 2, 4), in the order of ``GAIN``."""
         gains = [np.zeros((*root.shape, GAIN)) for root in weights]
         self._parts(z, weights, gains, False, ())
         return gains
@@ -90,11 +90,11 @@ class Filter:
         parts: tuple[Integers, Floats] | None = None,
         shifted: Floats | float = 0.0,
     ) -> tuple[Floats, Floats]:
-        """Innovations of record ``i`` over their standard deviations, and what unknowns add to what is shown.
+        """Innovations of experiment ``i`` over their standard deviations, and what unknowns add to what is shown.
 
         Args:
             z: the unknowns.
-            i: number of the record.
+            i: number of the experiment.
             root: inverse standard deviations of its samples, shape (n, 2).
             gain: its gains, shape (n, 2, 4); become those if they are not held.
             held: True if the gains are given.
@@ -106,20 +106,20 @@ class Filter:
         Returns:
             Shapes (n, 2) and (n, unknowns, 2).
         """
-        problem, record = self.problem, self.problem.records[i]
-        n, names = len(record.currents), (*problem.names(i), *besides)
+        problem, experiment = self.problem, self.problem.experiments[i]
+        n, names = len(experiment.currents), (*problem.names(i), *besides)
         at = problem.at(z, i)
-        x, chosen, s = at.begin(record.before, (*START, *names))
+        x, chosen, s = at.begin(experiment.before, (*START, *names))
         in_part, counted = (np.zeros(0, np.int64), np.zeros((n, 0))) if parts is None else parts
         chosen, s = np.append(chosen, in_part), np.pad(s, ((0, len(in_part)), (0, 0)))
         innovations, shares = np.zeros((n, 2)), np.zeros((n, len(names) + len(in_part), 2))
         given = FilterInput(
-            record.currents + at.errors.current_offset,
+            experiment.currents + at.errors.current_offset,
             problem.bench.timing.sample_time,
             max(at.errors.delay, 0.0),
             problem.plant.instruments.measurement_delay,
-            np.nan_to_num(record.samples) + shifted,
-            np.zeros(n) if record.late is None else record.late,
+            np.nan_to_num(experiment.samples) + shifted,
+            np.zeros(n) if experiment.late is None else experiment.late,
             self._unreported(i),
             root,
             at.contact + at.offset(problem.plant),
@@ -136,15 +136,15 @@ class Filter:
             innovations -= at.errors.delay * shares[:, names.index("delay")]
         return innovations, shares
 
-    def _unreported(self, record: int) -> Floats:
-        """Variances of the currents of a record, zero where a report says what acted [A²], shape (n,)."""
-        data = self.problem.records[record]
+    def _unreported(self, experiment: int) -> Floats:
+        """Variances of the currents of an experiment, zero where a report says what acted [A²], shape (n,)."""
+        data = self.problem.experiments[experiment]
         lost = np.zeros(len(data.currents)) if data.assumed is None else np.isfinite(data.assumed)
         return self.problem.bench.limits.current**2 * lost
 
-    def _uncertainty(self, record: int) -> Floats:
+    def _uncertainty(self, experiment: int) -> Floats:
         """Covariance of angle, velocity and load at the start: of what was measured and is not estimated."""
-        data, asked = self.problem.records[record], self.problem.names(record)
+        data, asked = self.problem.experiments[experiment], self.problem.names(experiment)
         covariance = np.zeros((3, 3))
         if not data.from_origin and "x1_0" not in asked and "offset" not in asked:
             covariance[0, 0] = data.slack**2
@@ -162,45 +162,47 @@ class Followed:
     weights: Sequence[Floats]
     gains: Sequence[Floats]
 
-    def columns(self, record: int, names: tuple[str, ...]) -> Floats:
+    def columns(self, experiment: int, names: tuple[str, ...]) -> Floats:
         """Derivatives of what is shown to other unknowns, in standard deviations, shape (n, names, 2)."""
-        _, shares = self.filter.followed(self.z, record, self.weights[record], self.gains[record], besides=names)
+        _, shares = self.filter.followed(
+            self.z, experiment, self.weights[experiment], self.gains[experiment], besides=names
+        )
         return shares[:, -len(names) :]
 
-    def parts(self, record: int, unknowns: Integers, shares: Floats) -> Floats:
+    def parts(self, experiment: int, unknowns: Integers, shares: Floats) -> Floats:
         """Derivatives to unknowns that count by shares, in standard deviations, shape (n, m, 2)."""
-        weights, gains = self.weights[record], self.gains[record]
-        _, found = self.filter.followed(self.z, record, weights, gains, parts=(unknowns, shares))
+        weights, gains = self.weights[experiment], self.gains[experiment]
+        _, found = self.filter.followed(self.z, experiment, weights, gains, parts=(unknowns, shares))
         return found[:, -len(unknowns) :]
 
-    def shown(self, record: int, mechanics: Mechanics) -> Floats:
+    def shown(self, experiment: int, mechanics: Mechanics) -> Floats:
         """Expected less measured samples of another brake under the same currents, whitened."""
-        weights, gains = self.weights[record], self.gains[record]
-        return -self.filter.followed(self.z, record, weights, gains, mechanics=mechanics)[0]
+        weights, gains = self.weights[experiment], self.gains[experiment]
+        return -self.filter.followed(self.z, experiment, weights, gains, mechanics=mechanics)[0]
 
-    def whitened(self, record: int, shift: Floats) -> Floats:
+    def whitened(self, experiment: int, shift: Floats) -> Floats:
         """A small change of what is shown, shape (n, 2), as the innovations have it."""
-        weights, gains = self.weights[record], self.gains[record]
-        whole, _ = self.filter.followed(self.z, record, weights, gains, shifted=shift)
-        without, _ = self.filter.followed(self.z, record, weights, gains)
+        weights, gains = self.weights[experiment], self.gains[experiment]
+        whole, _ = self.filter.followed(self.z, experiment, weights, gains, shifted=shift)
+        without, _ = self.filter.followed(self.z, experiment, weights, gains)
         return whole - without
 
-    def motion(self, record: int) -> Floats:
+    def motion(self, experiment: int) -> Floats:
         """Angle and velocity that are expected of each sample from those before, shape (n, 2)."""
-        root, scale = self.weights[record], self.gains[record][:, :, 2]
-        innovations, _ = self.filter.followed(self.z, record, root, self.gains[record])
+        root, scale = self.weights[experiment], self.gains[experiment][:, :, 2]
+        innovations, _ = self.filter.followed(self.z, experiment, root, self.gains[experiment])
         expected, instants = np.zeros_like(root), np.arange(len(root))
         for output in range(2):
             counts = root[:, output] > 0.0
             if counts.any():
-                seen = self.filter.problem.records[record].samples[counts, output]
+                seen = self.filter.problem.experiments[experiment].samples[counts, output]
                 at = seen - innovations[counts, output] / scale[counts, output]
                 expected[:, output] = np.interp(instants, instants[counts], at)
         return expected
 
 
 class FilterInput(NamedTuple):
-    """Record of n samples and instruments, as a filter takes them."""
+    """Experiment of n samples and instruments, as a filter takes them."""
 
     currents: Floats  # [A], shape (n,)
     t_s: float  # Period [s]
@@ -236,7 +238,7 @@ def march_filtered(
     gains: Floats,
     results: Innovations,
 ) -> None:
-    """One record through the filter, which corrects the state between two periods; runs as it is or compiled.
+    """One experiment through the filter, which corrects the state between two periods; runs as it is or compiled.
 
     The unknowns ``chosen`` begin with ``START``. State ``x``, its sensitivities ``s``, the ``covariance`` of angle,
     velocity and load, shape (3, 3), and ``results`` change in place; so do the ``gains``, unless they are ``held``.

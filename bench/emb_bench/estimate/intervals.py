@@ -5,7 +5,7 @@
 3. *A model that does not fit*: the deviation is at least that of the sandwich, which the residuals give.
 4. *The likelihood profile*, where one was made, takes the interval's place if it is not closed, or if its assumptions
    hold: the model fits, and the method is output error. Beside a bias by rule 2 the union of both counts.
-5. *Several models* that the records do not tell apart: the union with the interval of their mixture.
+5. *Several models* that the experiments do not tell apart: the union with the interval of their mixture.
 6. *What a brake can have*: an interval ends at the least value that is possible.
 """
 

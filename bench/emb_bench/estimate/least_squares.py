@@ -50,7 +50,7 @@ class RecursiveLeastSquares(Method):
                 f"plant '{plant.name}': recursive least squares has the thesis's torques only, which are linear in "
                 "the parameters; another method takes this model"
             )
-        parts = [regression(problem, record) for record in problem.records]
+        parts = [regression(problem, experiment) for experiment in problem.experiments]
         rows, errors = (np.concatenate(part) for part in zip(*parts, strict=True))
         counts = np.any(rows != 0.0, axis=1)
         used = int(counts.sum())
@@ -92,8 +92,8 @@ class RecursiveLeastSquares(Method):
         )
 
 
-def regression(problem: Problem, record: Experiment) -> tuple[Floats, Floats]:
-    """A record's equations of motion, each over the deviation that the noise of the velocities gives it.
+def regression(problem: Problem, experiment: Experiment) -> tuple[Floats, Floats]:
+    """An experiment's equations of motion, each over the deviation that the noise of the velocities gives it.
 
     Returns:
         Regressors, shape (periods, unknowns), of the parameters, and what they make up, shape (periods,). Zero for a
@@ -101,13 +101,13 @@ def regression(problem: Problem, record: Experiment) -> tuple[Floats, Floats]:
     """
     p, t_s = problem.bench.brake, problem.bench.timing.sample_time
     delay, offset = problem.plant.instruments.measurement_delay, problem.plant.instruments.encoder_offset
-    seen = record.samples[delay:]
+    seen = experiment.samples[delay:]
     begun, ended = seen[:-1], seen[1:]
     mean = 0.5 * (begun + ended)
     noise = problem.bench.noise.velocity
     sign = np.sign(mean[:, 1])
     impulses = {
-        "k_m": record.currents[1 : len(seen)] * t_s,
+        "k_m": experiment.currents[1 : len(seen)] * t_s,
         "k_1": -p.gamma * np.maximum(mean[:, 0] - offset, 0.0) * t_s,
         "T_c": -sign * t_s,
         "f_v": -mean[:, 1] * t_s,
@@ -115,7 +115,7 @@ def regression(problem: Problem, record: Experiment) -> tuple[Floats, Floats]:
     known = sum(getattr(p, n) * v for n, v in impulses.items() if n not in problem.asked.names)
     whole = p.J * (ended[:, 1] - begun[:, 1]) - known
     rows = np.stack([impulses[name] for name in problem.asked.names], axis=1)
-    reported = True if record.assumed is None else np.isnan(record.assumed[1 : len(seen)])
+    reported = True if experiment.assumed is None else np.isnan(experiment.assumed[1 : len(seen)])
     with np.errstate(invalid="ignore"):  # a lost sample compares as not sure
         moves = np.minimum(begun[:, 1] * sign, ended[:, 1] * sign) > SURE * noise
     counts = moves & np.isfinite(mean[:, 0]) & reported

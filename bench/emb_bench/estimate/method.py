@@ -26,7 +26,6 @@ class Method(ABC):
     starts: int = STARTS  # Local searches; recursive least squares needs none
     seed: int = 0  # Of the random numbers
     systematic: ClassVar[bool] = False  # Systematic errors are among its unknowns
-    gaps: ClassVar[bool] = True  # Currents of periods without a report are unknown to it, or left out
 
     def fit(self, experiments: Sequence[Experiment]) -> Estimate:
         """Estimate from one experiment, or from several of the same brake."""

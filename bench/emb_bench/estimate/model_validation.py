@@ -1,4 +1,4 @@
-"""Model validation: tests of whether the model explains the record, before any number is used.
+"""Model validation: tests of whether the model explains the experiment, before any number is used.
 
 With the bench's noise known, three questions have a distribution under the right model:
 
@@ -29,13 +29,13 @@ from scipy import special
 
 from emb_bench.brake.motion import Floats
 from emb_bench.estimate.effects import LAGGING, Shown, Simulated
-from emb_bench.estimate.prediction import Problem, by_record
-from emb_bench.estimate.records import Disturbance, Independence, ModelValidation, Whiteness
+from emb_bench.estimate.prediction import Problem, by_experiment
+from emb_bench.estimate.records import OUTPUTS, Disturbance, Independence, ModelValidation, Whiteness
 from emb_bench.estimate.suspects import DEPENDENT, score
 
 Bools = NDArray[np.bool_]
 
-OUTPUTS = ("angle", "velocity")
+
 LEVEL = 0.01  # Chance of a false alarm of all tests together
 LAGS = 10  # Periods back in which a current may still show in a residual
 NEIGHBOURS = 20  # Lags at which residuals are compared with each other
@@ -56,11 +56,11 @@ def examine(
     """
     counts = np.concatenate([root.ravel() for root in weights]) > 0.0
     every, jacobian = found
-    residuals = by_record(every, weights)
+    residuals = by_experiment(every, weights)
     e = every[: len(counts)]
     model, whole = _basis(jacobian), float(every @ every)
     freedom = int(counts.sum()) - model.shape[1]
-    count = sum(record.gap_unknowns for record in problem.records)
+    count = sum(experiment.gap_unknowns for experiment in problem.experiments)
     if count and shown is None:  # a filter has no unknowns in gaps
         gaps = problem.gap_basis(z, weights)
         freedom -= taken(gaps, len(e))
@@ -157,7 +157,7 @@ def _basis(columns: Floats) -> Floats:
 
 
 def _whiteness(series: Sequence[Floats], counts: Sequence[Bools]) -> Whiteness:
-    """Ljung-Box of several records; a pair of which one sample was lost does not count."""
+    """Ljung-Box of several experiments; a pair of which one sample was lost does not count."""
     lags = min(NEIGHBOURS, max(1, min(len(s) for s in series) // 5))
     total = float(sum(np.sum(s**2) for s in series))
     n = int(sum(np.sum(c) for c in counts))
@@ -182,7 +182,7 @@ def _independence(
     problem: Problem, output: int, e: Floats, squares: float, counts: Bools, model: Floats, freedom: int
 ) -> Independence:
     """F test of an output; ``squares`` is the sum of squares of the residuals but for those of unknown currents."""
-    past = np.concatenate([lagged(record.currents, LAGS) for record in problem.records])
+    past = np.concatenate([lagged(experiment.currents, LAGS) for experiment in problem.experiments])
     own = np.zeros((len(past), 2, LAGS))
     own[:, output] = past
     regressors = np.zeros((len(e), LAGS))

@@ -7,14 +7,14 @@ before them is unknown (:meth:`emb_bench.estimate.prediction.Problem.jacobian`).
 starting points, because there are local ones; and if none of them leads to a model that fits, from where a filter leads
 that follows the measured brake (:mod:`emb_bench.estimate.search`).
 
-**The start.** A record whose start cannot be distinguished from rest at the origin starts there; any other starts where
-it was measured. If ``x1_0`` or ``offset`` is unknown, the mean of the samples at rest before the experiment is one
-more measurement, of x1_0 + offset. With ``offset`` alone the brake is taken to have rested at the true origin.
+**The start.** An experiment whose start cannot be distinguished from rest at the origin starts there; any other starts
+where it was measured. If ``x1_0`` or ``offset`` is unknown, the mean of the samples at rest before the experiment is
+one more measurement, of x1_0 + offset. With ``offset`` alone the brake is taken to have rested at the true origin.
 
 **Outliers.** The error of a sample is compared with the median of those around it. What a model lacks bends the errors
 of many samples alike and shows in the median as well; a single wrong sample does not. One that is further off than
-``APART`` is left out, angle and velocity together: a loss that is quadratic up to there and constant beyond. Where more
-samples are than ``MOST`` of all, none is left out: then the noise or the model is not as the bench file says.
+``OUTLIER`` is left out, angle and velocity together: a loss that is quadratic up to there and constant beyond. Where
+more samples are than ``MOST`` of all, none is left out: then the noise or the model is not as the bench file says.
 """
 
 from __future__ import annotations
@@ -34,16 +34,14 @@ from emb_bench.estimate.average import average
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import LEVEL, examine
-from emb_bench.estimate.prediction import Problem, by_record
-from emb_bench.estimate.records import End, ModelValidation
+from emb_bench.estimate.prediction import Problem, by_experiment
+from emb_bench.estimate.records import OUTLIER, SAME, End, ModelValidation
 from emb_bench.estimate.search import EVALUATIONS, minimise, released
 from emb_bench.information.identifiability import Spectrum
 from emb_runtime.errors import UsageError
 
-APART = 8.0  # Distance from the neighbours from which on a sample is an outlier, in standard deviations
 AROUND = 5  # Neighbours on each side
 MOST = 0.01  # Largest share of the samples that is left out
-SAME = 1.0  # Searches whose weighted sums of squares differ by less ended in the same minimum: a shift of one sigma
 REWEIGHTED = 3  # Rounds in which the weights follow the motion, where the clock jitters
 LEFT_OUT = 3  # Most times that outliers are looked for
 
@@ -52,7 +50,7 @@ LEFT_OUT = 3  # Most times that outliers are looked for
 class Fit:
     """State of output error: the problem, the weights of its samples, and the ends of local searches, best first."""
 
-    problem: Problem  # Its records lack outliers, and have in their gaps what was found there
+    problem: Problem  # Its experiments lack outliers, and have in their gaps what was found there
     weights: list[Floats]
     ends: tuple[End, ...]
 
@@ -146,17 +144,19 @@ def searched(problem: Problem, points: Sequence[Floats]) -> Fit:
 def without_outliers(fit: Fit, points: Sequence[Floats]) -> Fit:
     """The searches again without the samples that lie apart from their neighbours, as long as there are a few."""
     for _ in range(LEFT_OUT):
-        residuals = by_record(fit.problem.jacobian(fit.best.z, fit.weights)[0], fit.weights)
+        residuals = by_experiment(fit.problem.jacobian(fit.best.z, fit.weights)[0], fit.weights)
         found = [outliers(r, root > 0.0) for r, root in zip(residuals, fit.weights, strict=True)]
         if not few(found):
             break
-        records = tuple(record.lose(mask) for record, mask in zip(fit.problem.records, found, strict=True))
-        fit = searched(replace(fit.problem, records=records), points)
+        experiments = tuple(
+            experiment.lose(mask) for experiment, mask in zip(fit.problem.experiments, found, strict=True)
+        )
+        fit = searched(replace(fit.problem, experiments=experiments), points)
     return fit
 
 
 def outliers(residuals: Floats, counts: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask of the samples of a record that lie apart from their neighbours, shape (n,).
+    """Mask of the samples of an experiment that lie apart from their neighbours, shape (n,).
 
     From residuals in standard deviations, and a mask of the outputs that count, shape (n, 2).
     """
@@ -169,7 +169,7 @@ def outliers(residuals: Floats, counts: NDArray[np.bool_]) -> NDArray[np.bool_]:
         windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * AROUND + 1)
         apart = np.abs(errors[at] - np.median(windows, axis=1))
         usual = 1.4826 * float(np.median(apart))  # of Gaussian noise, its standard deviation
-        found[at[apart > APART * max(usual, 1.0)]] = True
+        found[at[apart > OUTLIER * max(usual, 1.0)]] = True
     return found
 
 
@@ -181,7 +181,7 @@ def few(found: Sequence[NDArray[np.bool_]]) -> bool:
 
 def with_systematic_errors(fit: Fit, problem: Problem) -> Fit:
     """The best minimum once more with the systematic errors of the ``problem``, which those of ``fit`` lack."""
-    problem = replace(problem, records=fit.problem.records)
+    problem = replace(problem, experiments=fit.problem.experiments)
     if not problem.asked.along:
         return Fit(problem, fit.weights, fit.ends)
     index = [problem.unknowns.index(unknown) for unknown in fit.problem.unknowns]
@@ -203,13 +203,14 @@ def along_filter(fit: Fit, point: Floats) -> Fit:
 
 
 def with_gaps(fit: Fit) -> Fit:
-    """The ends best first, the best one searched on along what happened in the gaps of the records.
+    """The ends best first, the best one searched on along what happened in the gaps of the experiments.
 
-    A search sees the gaps linearly around what the records hold of them. Here the simulation follows each step in both,
-    and none is taken that does not lower the sum of squares. The records hold then what was found in their gaps.
+    A search sees the gaps linearly around what the experiments hold of them. Here the simulation follows each step in
+    both, and none is taken that does not lower the sum of squares. The experiments hold then what was found in their
+    gaps.
     """
     problem, fit = fit.problem, replace(fit, ends=tuple(sorted(fit.ends, key=lambda end: end.cost)))
-    if not any(record.gap_unknowns for record in problem.records):
+    if not any(experiment.gap_unknowns for experiment in problem.experiments):
         return fit.moved(fit.best)
     count = len(fit.best.z)
     after = minimise(
@@ -248,7 +249,7 @@ def finished(
     linearised = linearised or partial(problem.jacobian, weights=weights)
     found = linearised(z)
     every, jacobian = found
-    residuals, information = by_record(every, weights), jacobian.T @ jacobian
+    residuals, information = by_experiment(every, weights), jacobian.T @ jacobian
     prior = np.diag((problem.prior[1] * problem.scale(z)) ** 2)
     averaged, near = average(problem, z, found), z
     if averaged.errors:
@@ -275,8 +276,8 @@ def sandwich(
 
     Scores of neighbouring samples count together (Newey and West 1987, Bartlett weights up to 4 (n/100)^(2/9) lags), so
     that residuals that follow from each other widen it. What is no sample, a start or a prior, has its own information,
-    as has what is ``added`` to that of the jacobian. The residuals, shape (m,), are two for each sample of records of
-    these lengths, then those of what is no sample. The diagonal is inf for unknowns that the data do not identify.
+    as has what is ``added`` to that of the jacobian. The residuals, shape (m,), are two for each sample of experiments
+    of these lengths, then those of what is no sample. The diagonal is inf for unknowns that the data do not identify.
     """
     scores, meat, used = jacobian * errors[:, None], np.zeros_like(information), 0
     for n in lengths:

@@ -1,4 +1,4 @@
-"""Predictions of the records: residuals in standard deviations, and their exact derivatives to the unknowns."""
+"""Predictions of the experiments: residuals in standard deviations, and their exact derivatives to the unknowns."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from emb_bench.brake.motion import Floats, Integers
 from emb_bench.brake.parameters import FEATURES, PARAMETERS
 from emb_bench.compiled import compiled
 from emb_bench.config.bench import Bench
+from emb_bench.config.machine import WINDOW
 from emb_bench.config.plants import Mechanics, Plant
 from emb_bench.estimate.records import EstimationProblem, Unknown, check_model, searched
 from emb_bench.experiment.experiment import Booleans, Experiment
@@ -37,7 +38,7 @@ NEAR_BOUND = 1e-6  # Share of what is searched within which an unknown is at its
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Records, a model and what is unknown.
+    """Experiments, a model and what is unknown.
 
     A search moves a vector z: the logarithm of each relative unknown, the others in their units. Derivatives to z are
     then the sensitivities themselves, θ ∂y/∂θ = ∂y/∂ln θ, and what is positive stays so.
@@ -46,12 +47,18 @@ class Problem:
     bench: Bench
     plant: Plant
     asked: EstimationProblem
-    records: tuple[Experiment, ...]
+    experiments: tuple[Experiment, ...]
+
+    @property
+    def window(self) -> float:
+        """Length of the windows [s], of the method ``windows``."""
+        machine = self.bench.machine
+        return self.asked.window or (WINDOW if machine is None else machine.window)
 
     @cached_property
     def unknowns(self) -> tuple[Unknown, ...]:
         """The elements of z."""
-        return self.asked.unknowns(len(self.records))
+        return self.asked.unknowns(len(self.experiments))
 
     @cached_property
     def _logarithmic(self) -> Booleans:
@@ -82,7 +89,7 @@ class Problem:
 
     @cached_property
     def prior(self) -> tuple[Floats, Floats]:
-        """Means of the unknowns before the records, and inverse deviations: zero for what nothing was known of."""
+        """Means of the unknowns before the experiments, and inverse deviations: zero for what nothing was known of."""
         prior = self.asked.prior
         mean, inverse = np.zeros(len(self.unknowns)), np.zeros(len(self.unknowns))
         if prior is not None:
@@ -106,13 +113,13 @@ class Problem:
         of_all = self.plant.mechanics._asdict() | self.bench.brake._asdict()
         values = np.zeros(len(self.unknowns))
         for i, unknown in enumerate(self.unknowns):
-            if unknown.record is None:
+            if unknown.experiment is None:
                 own, row = of_all.get(unknown.name, 0.0), PARAMETERS[unknown.name]
                 values[i] = row.start if unknown.name in FEATURES and own in (0.0, row.low) else own
                 continue
-            record = self.records[unknown.record]
-            x1, x2 = record.start(record.angle if free else offset)
-            known = {"x1_0": 0.0 if free else x1, "x2_0": x2, "offset": offset if along else record.angle}
+            experiment = self.experiments[unknown.experiment]
+            x1, x2 = experiment.start(experiment.angle if free else offset)
+            known = {"x1_0": 0.0 if free else x1, "x2_0": x2, "offset": offset if along else experiment.angle}
             values[i] = known[unknown.name]
         return np.clip(self.coordinates(values), *self.bounds)
 
@@ -145,20 +152,20 @@ class Problem:
         return replace(self, plant=replace(self.plant, mechanics=self.mechanics(z)))
 
     def part(self, kept: Sequence[int]) -> tuple[Problem, list[int]]:
-        """The problem of some of the records, any of them as often as it is to count, and the elements of z it has."""
-        problem = replace(self, records=tuple(self.records[i] for i in kept))
-        own = [Unknown(u.name, None if u.record is None else kept[u.record]) for u in problem.unknowns]
+        """The problem of some of the experiments, each as often as it is to count, and the elements of z it has."""
+        problem = replace(self, experiments=tuple(self.experiments[i] for i in kept))
+        own = [Unknown(u.name, None if u.experiment is None else kept[u.experiment]) for u in problem.unknowns]
         return problem, [self.unknowns.index(unknown) for unknown in own]
 
-    def columns(self, record: int) -> list[int]:
-        """Indices of the elements of z that a record depends on."""
-        return [i for i, u in enumerate(self.unknowns) if u.record in (None, record)]
+    def columns(self, experiment: int) -> list[int]:
+        """Indices of the elements of z that an experiment depends on."""
+        return [i for i, u in enumerate(self.unknowns) if u.experiment in (None, experiment)]
 
-    def at(self, z: Floats, record: int) -> Theta:
-        """Values at ``z`` of all that a record depends on."""
-        own = {self.unknowns[i].name: float(z[i]) for i in self.columns(record)}
+    def at(self, z: Floats, experiment: int) -> Theta:
+        """Values at ``z`` of all that an experiment depends on."""
+        own = {self.unknowns[i].name: float(z[i]) for i in self.columns(experiment)}
         offset = own.get("offset", self.plant.instruments.encoder_offset)
-        x1, x2 = self.records[record].start(offset)
+        x1, x2 = self.experiments[experiment].start(offset)
         if "offset" in own:
             x1 = 0.0  # with an unknown encoder offset the brake rests at the origin, unless its start is estimated too
         errors = SystematicErrors(
@@ -166,42 +173,42 @@ class Problem:
         )
         return Theta(self.theta(z), (own.get("x1_0", x1), own.get("x2_0", x2)), errors, own.get("contact", 0.0))
 
-    def names(self, record: int) -> tuple[str, ...]:
-        """The unknowns that a record depends on, in the order of ``columns``."""
-        return tuple(self.unknowns[i].name for i in self.columns(record))
+    def names(self, experiment: int) -> tuple[str, ...]:
+        """The unknowns that an experiment depends on, in the order of ``columns``."""
+        return tuple(self.unknowns[i].name for i in self.columns(experiment))
 
-    def predict(self, z: Floats, record: int, besides: tuple[str, ...] = ()) -> Trajectory:
-        """Predicts a record, with sensitivities to its unknowns, to those ``besides``, and to those of its gaps."""
-        return self._simulated(z, record, self.mechanics(z), (*self.names(record), *besides))
+    def predict(self, z: Floats, experiment: int, besides: tuple[str, ...] = ()) -> Trajectory:
+        """Predicts an experiment, with sensitivities to its unknowns, those ``besides``, and those of its gaps."""
+        return self._simulated(z, experiment, self.mechanics(z), (*self.names(experiment), *besides))
 
-    def motion(self, z: Floats, record: int, mechanics: Mechanics | None = None) -> Trajectory:
-        """Predicts a record without sensitivities to unknowns that are not its gaps'.
+    def motion(self, z: Floats, experiment: int, mechanics: Mechanics | None = None) -> Trajectory:
+        """Predicts an experiment without sensitivities to unknowns that are not its gaps'.
 
         Another brake moves by ``mechanics``.
         """
-        return self._simulated(z, record, self.mechanics(z) if mechanics is None else mechanics, ())
+        return self._simulated(z, experiment, self.mechanics(z) if mechanics is None else mechanics, ())
 
-    def parts(self, z: Floats, record: int, unknowns: Integers, shares: Floats) -> Floats:
-        """Sensitivities of a record to unknowns that count in each period by a share, as :func:`simulate_shares`."""
-        plant, data, t_s = self.solved(z).plant, self.records[record], self.bench.timing.sample_time
-        return simulate_shares(plant, self.at(z, record), data, t_s, unknowns, shares, compiled(march_shares))
+    def parts(self, z: Floats, experiment: int, unknowns: Integers, shares: Floats) -> Floats:
+        """Sensitivities of an experiment to unknowns that count in each period by a share: :func:`simulate_shares`."""
+        plant, data, t_s = self.solved(z).plant, self.experiments[experiment], self.bench.timing.sample_time
+        return simulate_shares(plant, self.at(z, experiment), data, t_s, unknowns, shares, compiled(march_shares))
 
-    def _simulated(self, z: Floats, record: int, mechanics: Mechanics, names: tuple[str, ...]) -> Trajectory:
+    def _simulated(self, z: Floats, experiment: int, mechanics: Mechanics, names: tuple[str, ...]) -> Trajectory:
         plant, t_s = replace(self.plant, mechanics=mechanics), self.bench.timing.sample_time
-        return simulate(plant, self.at(z, record), self.records[record], t_s, names, compiled(march))
+        return simulate(plant, self.at(z, experiment), self.experiments[experiment], t_s, names, compiled(march))
 
     def weights(self, z: Floats, said: Sequence[Trajectory] | None = None) -> list[Floats]:
-        """Inverse standard deviations of each record's samples at ``z``, zero where they do not count, shape (n, 2).
+        """Inverse standard deviations of each experiment's samples at ``z``, 0 where they do not count, shape (n, 2).
 
         What is predicted there may have been ``said`` before.
         """
         result = []
-        for i, record in enumerate(self.records):
+        for i, experiment in enumerate(self.experiments):
             instruments = self.plant.instruments
             states = (self.motion(z, i) if said is None else said[i]).states
             along = weights_along(self.bench, "physical", instruments, states)
-            root = np.sqrt(along) * record.measured[:, None]
-            root[later(record.inside.astype(np.float64), instruments.measurement_delay) > 0.0] = 0.0
+            root = np.sqrt(along) * experiment.measured[:, None]
+            root[later(experiment.inside.astype(np.float64), instruments.measurement_delay) > 0.0] = 0.0
             result.append(root)
         return result
 
@@ -212,12 +219,12 @@ class Problem:
 
         Of a single period without report the current is unknown, Gaussian around the one that is assumed and as wide as
         the bench's limit; of several in a row, angle and velocity after them, next to free. Both enter the residuals
-        linearly around what the records hold. What is left beside them has J^T J as the information on z with them
+        linearly around what the experiments hold. What is left beside them has J^T J as the information on z with them
         unknown, and |r|² as the least sum of squares over them.
 
         Returns:
-            Shapes (m,) and (m, len(z)): all samples of all records, angle and velocity in turn, then each record's
-            start if that is unknown, then the prior, then the unknowns of the gaps.
+            Shapes (m,) and (m, len(z)): all samples of all experiments, angle and velocity in turn, then each
+            experiment's start if that is unknown, then the prior, then the unknowns of the gaps.
         """
         residuals, rows = self.joint(z, weights, said)
         own, basis = rows[:, : len(z)], _orthonormal(rows[:, len(z) :])
@@ -230,20 +237,21 @@ class Problem:
     def joint(
         self, z: Floats, weights: Sequence[Floats], said: Sequence[Trajectory] | None = None
     ) -> tuple[Floats, Floats]:
-        """Residuals as in :meth:`jacobian`, with the unknowns of the gaps where the records hold them.
+        """Residuals as in :meth:`jacobian`, with the unknowns of the gaps where the experiments hold them.
 
         Returns:
-            Shapes (m,) and (m, len(z) + gaps): derivatives to z, and to the unknowns of the gaps, record by record.
+            Shapes (m,) and (m, len(z) + gaps): derivatives to z, and to the unknowns of the gaps, experiment by
+            experiment.
         """
         parts, columns = [], []
-        for i, (record, root) in enumerate(zip(self.records, weights, strict=True)):
+        for i, (experiment, root) in enumerate(zip(self.experiments, weights, strict=True)):
             at = self.predict(z, i) if said is None else said[i]
             rows = at.sensitivities * root[:, None]
-            parts.append((np.nan_to_num(record.samples - at.samples) * root, rows[:, : len(self.columns(i))]))
-            in_gaps = rows[:, rows.shape[1] - record.gap_unknowns :]
+            parts.append((np.nan_to_num(experiment.samples - at.samples) * root, rows[:, : len(self.columns(i))]))
+            in_gaps = rows[:, rows.shape[1] - experiment.gap_unknowns :]
             columns.append(in_gaps.transpose(0, 2, 1).reshape(root.size, -1))
         residuals, rows = self.stacked(z, parts)
-        count = sum(record.gap_unknowns for record in self.records)
+        count = sum(experiment.gap_unknowns for experiment in self.experiments)
         if not count:
             return residuals, rows
         held, assumed, inverse = (
@@ -255,12 +263,12 @@ class Problem:
         return np.concatenate([residuals, (assumed - held) * inverse]), np.concatenate([rows, own], axis=1)
 
     def in_gaps(self) -> Floats:
-        """Values held in the gaps of the records: currents [A], then angles [rad] and velocities [rad/s] in turn."""
-        return np.concatenate([self._gaps(i)[0] for i in range(len(self.records))])
+        """Values in the gaps of the experiments: currents [A], then angles [rad] and velocities [rad/s] in turn."""
+        return np.concatenate([self._gaps(i)[0] for i in range(len(self.experiments))])
 
-    def _gaps(self, record: int) -> tuple[Floats, Floats, Floats]:
-        """Values that a record holds in its gaps, means before the samples, and inverse deviations."""
-        data = self.records[record]
+    def _gaps(self, experiment: int) -> tuple[Floats, Floats, Floats]:
+        """Values that an experiment holds in its gaps, means before the samples, and inverse deviations."""
+        data = self.experiments[experiment]
         pulses, breaks = data.gaps
         places = gap_ends(data, self.plant.instruments)[1].ravel()
         assumed = data.currents if data.assumed is None else data.assumed
@@ -274,21 +282,23 @@ class Problem:
         )
 
     def filled(self, gaps: Floats) -> Problem:
-        """The problem whose records hold these unknowns in their gaps, in the order of :meth:`in_gaps`."""
-        left, records = gaps, []
-        for record in self.records:
-            own, left = left[: record.gap_unknowns], left[record.gap_unknowns :]
-            pulses, currents = record.gaps[0], record.currents.copy()
+        """The problem whose experiments hold these unknowns in their gaps, in the order of :meth:`in_gaps`."""
+        left, experiments = gaps, []
+        for experiment in self.experiments:
+            own, left = left[: experiment.gap_unknowns], left[experiment.gap_unknowns :]
+            pulses, currents = experiment.gaps[0], experiment.currents.copy()
             currents[pulses] = own[: len(pulses)]
             places = own[len(pulses) :].reshape(-1, 2)
-            records.append(replace(record, currents=currents, places=places) if record.gap_unknowns else record)
-        return replace(self, records=tuple(records))
+            experiments.append(
+                replace(experiment, currents=currents, places=places) if experiment.gap_unknowns else experiment
+            )
+        return replace(self, experiments=tuple(experiments))
 
     def stacked(self, z: Floats, parts: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
         """All residuals in one row, and their derivatives to z, as :meth:`jacobian`.
 
-        The ``parts`` are of each record the errors of its samples in standard deviations, shape (n, 2), and what each
-        of its unknowns adds to what is shown, in the same unit, shape (n, own, 2).
+        The ``parts`` are of each experiment the errors of its samples in standard deviations, shape (n, 2), and what
+        each of its unknowns adds to what is shown, in the same unit, shape (n, own, 2).
         """
         residuals, rows = [], []
         for i, (errors, shares) in enumerate(parts):
@@ -301,24 +311,24 @@ class Problem:
         return np.concatenate([*residuals, known]), np.concatenate([*rows, their_rows])
 
     def rests(self) -> dict[int, list[int]]:
-        """Numbers of the records whose angle at rest is a measurement, with the elements of z that it depends on."""
+        """Numbers of the experiments whose angle at rest is a measurement, and the elements of z that it depends on."""
         found = {}
-        for i, record in enumerate(self.records):
+        for i, experiment in enumerate(self.experiments):
             touched = [c for c in self.columns(i) if self.unknowns[c].name in ("x1_0", "offset")]
-            if touched and record.slack > 0.0:
+            if touched and experiment.slack > 0.0:
                 found[i] = touched
         return found
 
     def prior_residuals(self, z: Floats) -> tuple[Floats, Floats]:
-        """Residuals of what is no sample, and their derivatives: each record's start if it is unknown, the prior."""
+        """Residuals of what is no sample, and their derivatives: an experiment's start if it is unknown, the prior."""
         residuals, rows = [], []
         for i, touched in self.rests().items():
-            record, row = self.records[i], np.zeros((1, len(z)))
-            row[0, touched] = -1.0 / record.slack
+            experiment, row = self.experiments[i], np.zeros((1, len(z)))
+            row[0, touched] = -1.0 / experiment.slack
             free = any(self.unknowns[c].name == "offset" for c in touched)
             unseen = 0.0 if free else self.plant.instruments.encoder_offset
             shown = sum(float(z[c]) for c in touched) + unseen
-            residuals.append(np.array([(record.angle - shown) / record.slack]))
+            residuals.append(np.array([(experiment.angle - shown) / experiment.slack]))
             rows.append(row)
         mean, inverse = self.prior
         known = np.flatnonzero(inverse)
@@ -332,27 +342,27 @@ def _orthonormal(columns: Floats) -> Floats:
     return basis
 
 
-def by_record(errors: Floats, weights: Sequence[Floats]) -> list[Floats]:
-    """The residuals of each record's samples, shape (n, 2), from all of them in one row."""
+def by_experiment(errors: Floats, weights: Sequence[Floats]) -> list[Floats]:
+    """The residuals of each experiment's samples, shape (n, 2), from all of them in one row."""
     ends = np.cumsum([root.size for root in weights])
     return [part.reshape(root.shape) for part, root in zip(np.split(errors, ends), weights, strict=False)]
 
 
-def make_problem(bench: Bench, plant: Plant, records: Sequence[Experiment], asked: EstimationProblem) -> Problem:
+def make_problem(bench: Bench, plant: Plant, experiments: Sequence[Experiment], asked: EstimationProblem) -> Problem:
     """Makes the problem to be solved, and checks that it can be."""
     check_model(plant, asked.names)
-    if not records:
+    if not experiments:
         raise UsageError("expected at least one record")
-    if why_not := too_few(plant, asked, sum(int(r.measured.sum()) for r in records), len(records)):
-        raise LogError(f"{', '.join(record.name for record in records)}: {why_not}")
-    return Problem(bench, plant, asked, tuple(records))
+    if why_not := too_few(plant, asked, sum(int(r.measured.sum()) for r in experiments), len(experiments)):
+        raise LogError(f"{', '.join(experiment.name for experiment in experiments)}: {why_not}")
+    return Problem(bench, plant, asked, tuple(experiments))
 
 
-def too_few(plant: Plant, asked: EstimationProblem, samples: int, records: int) -> str:
-    """The reason that so many samples cannot tell the unknowns, of all records together; empty if they can."""
-    unknowns, outputs = len(asked.unknowns(records)), 1 if plant.instruments.observer_bandwidth > 0.0 else 2
+def too_few(plant: Plant, asked: EstimationProblem, samples: int, experiments: int) -> str:
+    """The reason that so many samples cannot tell the unknowns, of all experiments together; empty if they can."""
+    unknowns, outputs = len(asked.unknowns(experiments)), 1 if plant.instruments.observer_bandwidth > 0.0 else 2
     if samples * outputs >= unknowns:
         return ""
-    asked_for = len(replace(asked, systematic={}).unknowns(records))
+    asked_for = len(replace(asked, systematic={}).unknowns(experiments))
     also = f" and {unknowns - asked_for} systematic errors" if unknowns > asked_for else ""
     return f"{'1 sample is' if samples == 1 else f'{samples} samples are'} too few for {asked_for} unknowns{also}"

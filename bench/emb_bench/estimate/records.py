@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from emb_bench.brake.motion import Floats, is_plain
-from emb_bench.brake.parameters import CURVED, FEATURES, OF_A_RECORD, PARAMETERS
+from emb_bench.brake.parameters import CURVED, FEATURES, OF_AN_EXPERIMENT, PARAMETERS
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import DIRECTED, EXACT, Plant
 from emb_bench.experiment.simulate import SystematicErrors
@@ -26,6 +26,11 @@ METHODS: Mapping[str, str] = {
     "windows": "output error over windows",
 }
 """Estimation methods by their names."""
+WITHOUT_GAPS = ("windows",)  # Methods that assume the currents of periods without a report
+OUTPUTS = ("angle", "velocity")
+FEWEST_WINDOWS = 3  # For each unknown that they share: with fewer their scatter says little
+SAME = 1.0  # Searches whose weighted sums of squares differ by less ended in the same minimum: a shift of one sigma
+OUTLIER = 8.0  # Distance from the neighbours from which on a sample is an outlier, in standard deviations
 STARTS = 8  # Default number of local searches
 DONE = "DONE"  # Exit reason of a run that came to its planned end
 NORMAL_95 = estimate.NORMAL_95  # Standard deviations that 95 % of a Gaussian lie within
@@ -35,7 +40,7 @@ class Unknown(NamedTuple):
     """One number to be estimated."""
 
     name: str  # Key of ``PARAMETERS``
-    record: int | None = None  # Number of the record that it belongs to; None if all share it
+    experiment: int | None = None  # Number of the experiment that it belongs to; None if all share it
 
     @property
     def relative(self) -> bool:
@@ -63,10 +68,10 @@ class EstimationProblem(Question):
         return tuple(name for name in named if name not in self.names)
 
     def unknowns(self, count: int) -> tuple[Unknown, ...]:
-        """The numbers to be estimated from ``count`` records: ``names`` in their order, then what is ``along``."""
+        """The numbers to be estimated from ``count`` experiments: ``names`` in their order, then what is ``along``."""
         found: list[Unknown] = []
         for name in (*self.names, *self.along):
-            found += [Unknown(name, i) for i in range(count)] if name in OF_A_RECORD else [Unknown(name)]
+            found += [Unknown(name, i) for i in range(count)] if name in OF_AN_EXPERIMENT else [Unknown(name)]
         return tuple(found)
 
 
@@ -192,7 +197,7 @@ class Suspect:
     sigmas: float
     p_value: float = 1.0  # Chance of as much of it if the model is right
     possible: bool = True  # A brake can have this amount
-    observer: Derived | None = None  # What the velocity's lag comes from, if the record shows it
+    observer: Derived | None = None  # What the velocity's lag comes from, if the experiment shows it
 
 
 @dataclass(frozen=True)
@@ -232,7 +237,7 @@ class Disturbance(NamedTuple):
 
 @dataclass(frozen=True)
 class ModelValidation:
-    """Model validation: tests on the residuals of whether the model explains the records."""
+    """Model validation: tests on the residuals of whether the model explains the experiments."""
 
     chi2: float
     freedom: int  # Samples of both outputs less unknowns

@@ -27,11 +27,11 @@ from emb_bench.estimate.prediction import Problem
 from emb_bench.estimate.records import Contribution, JointScore, Suspect
 from emb_runtime.config.bench import PARAMETER_NAMES
 
-PRESENT = 0.5  # Probability, before any record, that a brake has a certain one of the effects that are not certain
+PRESENT = 0.5  # Probability, before any experiment, that a brake has a certain one of the effects that are not certain
 
 DISTURBED = 10.0
-"""Factor of what is known of drifts before a record in which something disturbs the brake: it may be a drift, which the
-random walk of a filter follows without an alarm."""
+"""Factor of what is known of drifts before an experiment in which something disturbs the brake: it may be a drift,
+which the random walk of a filter follows without an alarm."""
 
 ALIKE = 2.0  # Difference of two suspects' squared scores below which they are hardly distinguished
 
@@ -159,9 +159,9 @@ def _ranked(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
 
 
 def _with_observer(found: tuple[Suspect, ...], problem: Problem) -> tuple[Suspect, ...]:
-    """Suspects with the observer that derives the velocity, if a record shows one: the lag of it comes first."""
+    """Suspects with the observer that derives the velocity, if an experiment shows one: the lag of it comes first."""
     observed = problem.plant.instruments.observer_bandwidth > 0.0
-    if observed or (observer := derived(problem.records, problem.bench.timing.sample_time)) is None:
+    if observed or (observer := derived(problem.experiments, problem.bench.timing.sample_time)) is None:
         return found
     ordered = sorted(found, key=lambda s: s.name != LAGGING)
     return tuple(

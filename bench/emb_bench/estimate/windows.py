@@ -27,15 +27,14 @@ from typing import NamedTuple
 import numpy as np
 
 from emb_bench.brake.motion import Floats
-from emb_bench.brake.parameters import OF_A_RECORD
+from emb_bench.brake.parameters import OF_AN_EXPERIMENT
 from emb_bench.compiled import compiled
-from emb_bench.config.machine import WINDOW
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.method import Method
 from emb_bench.estimate.model_validation import examine
 from emb_bench.estimate.output_error import start_points
 from emb_bench.estimate.prediction import Problem
-from emb_bench.estimate.records import End, ModelValidation
+from emb_bench.estimate.records import FEWEST_WINDOWS, End, ModelValidation
 from emb_bench.estimate.search import EVALUATIONS, minimise
 from emb_bench.experiment.experiment import Booleans, Experiment, Integers
 from emb_bench.experiment.simulate import Trajectory, simulate_apart
@@ -53,7 +52,7 @@ SETTLED = 4  # Steps in which the starts of windows settle for given parameters
 FOLLOWS = 0.97  # Largest correlation of neighbouring windows' scores that is reckoned with
 START = ("x1_0", "x2_0")
 _LOST = 1e-9  # share of a start's largest singular value below which the samples do not tell it
-FEWEST = 3  # Fewest windows for each unknown that they share: with fewer their scatter says little
+
 JUDGED = 5000  # Samples, in whole windows, that the model is validated on: an hour has millions, and these see as much
 OTHER = 4.0  # Ratio of the lengths of the windows in two estimates whose difference is counted
 REFINED = 2  # Searches that are carried to their ends: those whose first steps led lowest
@@ -64,12 +63,11 @@ SHORT = 6  # Simulations of a search that is only begun
 class Windows(Method):
     """Output error of all windows: the parameters that they share."""
 
-    gaps = False
-
     def solve(self, problem: Problem) -> Estimate:
         """As :class:`Method`."""
-        if any(unknown.record is not None for unknown in problem.unknowns):
-            raise UsageError(f"method windows: each window has a start of its own: leave out {', '.join(OF_A_RECORD)}")
+        if any(unknown.experiment is not None for unknown in problem.unknowns):
+            names = ", ".join(OF_AN_EXPERIMENT)
+            raise UsageError(f"method windows: each window has a start of its own: leave out {names}")
         points = start_points(problem, self.starts, self.seed)
         cut = Cut(problem, points[0])
         searches = cut.searches(points)
@@ -127,16 +125,16 @@ def _times(matrices: Floats, vectors: Floats) -> Floats:
 
 
 class Cut:
-    """The records of a problem in windows, weighted at shared unknowns and at the starts where they were seen."""
+    """The experiments of a problem in windows, weighted at shared unknowns and at the starts where they were seen."""
 
     def __init__(self, problem: Problem, shared: Floats) -> None:
-        length = max(round(window_of(problem) / problem.bench.timing.sample_time), SHORTEST)
+        length = max(round(problem.window / problem.bench.timing.sample_time), SHORTEST)
         asked = replace(problem.asked, nuisances=(*problem.asked.nuisances, *START))
         self.problem = problem
-        self.spans = [span for i in range(len(problem.records)) for span in _spans(problem, i, length)]
+        self.spans = [span for i in range(len(problem.experiments)) for span in _spans(problem, i, length)]
         if not self.spans:
             raise UsageError(f"method windows: no window of {length} periods has {SHORTEST} samples: expected longer")
-        self.windows = [replace(problem, asked=asked, records=(_window(problem, span),)) for span in self.spans]
+        self.windows = [replace(problem, asked=asked, experiments=(_window(problem, span),)) for span in self.spans]
         self.begun = Point(shared, np.array([window.nominal()[-len(START) :] for window in self.windows]))
         self.weights = [
             window.weights(np.append(shared, start))[0]
@@ -147,15 +145,15 @@ class Cut:
         self.inside = np.arange(length) < np.array([[end - begin] for _, begin, end in self.spans])
         self.outputs = [n for n in range(2) if any(root[:, n].any() for root in self.weights)]
         self.roots = self._below(self.inside, np.concatenate(self.weights))
-        self.samples = self._below(self.inside, np.concatenate([w.records[0].samples for w in self.windows]))
+        self.samples = self._below(self.inside, np.concatenate([w.experiments[0].samples for w in self.windows]))
 
     def searches(self, values: Sequence[Floats]) -> list[tuple[Point, End]]:
         """Searches from shared unknowns, best first; of several most are only begun."""
         p = len(self.problem.unknowns)
-        if len(self.windows) < FEWEST * p:
+        if len(self.windows) < FEWEST_WINDOWS * p:
             raise UsageError(
-                f"method windows: {len(self.windows)} windows of {window_of(self.problem):g} s are too few for {p} "
-                f"unknowns, expected at least {FEWEST * p}: shorter windows (--window) or a longer recording"
+                f"method windows: {len(self.windows)} windows of {self.problem.window:g} s are too few for {p} "
+                f"unknowns, expected at least {FEWEST_WINDOWS * p}: shorter windows (--window) or a longer recording"
             )
         if len(values) > REFINED:
             costs = [self.search(z, SHORT)[1].cost for z in values]
@@ -225,7 +223,7 @@ class Cut:
         """Predicts windows from their starts, the samples of one below those of the other."""
         one, z = self.windows[0], np.append(shared, starts[0])
         plant = replace(one.plant, mechanics=one.mechanics(z))
-        parts = [self.windows[i].records[0] for i in chosen]
+        parts = [self.windows[i].experiments[0] for i in chosen]
         t_s = one.bench.timing.sample_time
         return simulate_apart(plant, one.at(z, 0), parts, starts, t_s, one.names(0), compiled(march))
 
@@ -269,7 +267,7 @@ class Cut:
         ends = np.cumsum([end - begin for _, begin, end in self.spans])
         apart = np.split(np.concatenate(shown), ends[:-1])
         for window, said, span, root in zip(self.windows, apart, self.spans, self.weights, strict=True):
-            yield span, window.records[0].samples - said, root
+            yield span, window.experiments[0].samples - said, root
 
     @property
     def follows(self) -> list[bool]:
@@ -279,15 +277,15 @@ class Cut:
 
 def _other(problem: Problem, shared: Floats) -> Floats:
     """The shared unknowns from windows of another length: longer ones, or shorter where those would be too few."""
-    seconds = sum(record.periods for record in problem.records) * problem.bench.timing.sample_time
-    length = window_of(problem) * OTHER
-    if FEWEST * len(shared) * length > seconds:
-        length = window_of(problem) / OTHER
+    seconds = sum(experiment.periods for experiment in problem.experiments) * problem.bench.timing.sample_time
+    length = problem.window * OTHER
+    if FEWEST_WINDOWS * len(shared) * length > seconds:
+        length = problem.window / OTHER
     return Cut(replace(problem, asked=replace(problem.asked, window=length)), shared).search(shared)[0].shared
 
 
 def predict_windows(problem: Problem, values: Floats) -> tuple[float, float, int]:
-    """Prediction of the windows of records with parameters in SI units, each from the start that fits it best.
+    """Prediction of the windows of experiments with parameters in SI units, each from the start that fits it best.
 
     Returns:
         Root mean square of the angle's error [rad], χ² of the samples, and its degrees of freedom.
@@ -317,7 +315,7 @@ def _finished(cut: Cut, at: Point, ends: tuple[End, ...], moved: Floats) -> Esti
     problem = cut.problem
     information, scores = _sums(cut.linearised(at))
     covariance = by_windows(information, scores, cut.follows)
-    residuals = tuple(np.full(record.samples.shape, np.nan) for record in problem.records)
+    residuals = tuple(np.full(experiment.samples.shape, np.nan) for experiment in problem.experiments)
     for (number, begin, end), errors, root in cut.residuals(at):
         residuals[number][begin:end] = np.where(root > 0.0, errors * root, np.nan)
     return Estimate(
@@ -336,31 +334,25 @@ def _finished(cut: Cut, at: Point, ends: tuple[End, ...], moved: Floats) -> Esti
 
 
 def _validated(cut: Cut, at: Point) -> ModelValidation:
-    """Tests of the model on windows spread over the records."""
+    """Tests of the model on windows spread over the experiments."""
     count = len(cut.windows)
-    few_enough = max(JUDGED // len(cut.windows[0].records[0].currents), 2)
+    few_enough = max(JUDGED // len(cut.windows[0].experiments[0].currents), 2)
     chosen = sorted({round(k) for k in np.linspace(0, count - 1, min(count, few_enough)).tolist()})
-    few = replace(cut.windows[0], records=tuple(cut.windows[i].records[0] for i in chosen))
+    few = replace(cut.windows[0], experiments=tuple(cut.windows[i].experiments[0] for i in chosen))
     z, roots = np.concatenate([at.shared, at.starts[chosen].T.ravel()]), [cut.weights[i] for i in chosen]
     return examine(few, z, roots, few.jacobian(z, roots))
 
 
-def window_of(problem: Problem) -> float:
-    """Length of the windows [s]."""
-    machine = problem.bench.machine
-    return problem.asked.window or (WINDOW if machine is None else machine.window)
-
-
 Span = tuple[int, int, int]
-"""Number of a record, first period of a window in it, and the one after its last."""
+"""Number of an experiment, first period of a window in it, and the one after its last."""
 
 
 def _spans(problem: Problem, number: int, length: int) -> Iterator[Span]:
-    """The windows of a record that have enough samples."""
-    record = problem.records[number]
-    for begin in range(0, record.periods, length):
-        end = min(begin + length, record.periods)
-        enough = record.measured[begin:end].sum() >= min(SHORTEST, length)
+    """The windows of an experiment that have enough samples."""
+    experiment = problem.experiments[number]
+    for begin in range(0, experiment.periods, length):
+        end = min(begin + length, experiment.periods)
+        enough = experiment.measured[begin:end].sum() >= min(SHORTEST, length)
         if enough and (end - begin) * 2 >= length:
             yield number, begin, end
 
@@ -372,14 +364,22 @@ def _window(problem: Problem, span: Span) -> Experiment:
     its start. One that starts too slow may stick where the machine did not, and then nothing says which way to go.
     """
     number, begin, end = span
-    record = problem.records[number]
-    received = np.flatnonzero(record.measured[:begin])
-    angle, velocity = record.samples[received[-1]].tolist() if len(received) else (record.angle, record.velocity)
+    experiment = problem.experiments[number]
+    received = np.flatnonzero(experiment.measured[:begin])
+    angle, velocity = (
+        experiment.samples[received[-1]].tolist() if len(received) else (experiment.angle, experiment.velocity)
+    )
     if problem.plant.instruments.observer_bandwidth > 0.0:
-        angles = np.concatenate([[record.angle], record.samples[:, 0]])
+        angles = np.concatenate([[experiment.angle], experiment.samples[:, 0]])
         velocity = _slope(angles, begin, problem.bench.timing.sample_time)
     return replace(
-        record.part(begin, end), angle=angle, velocity=velocity, slack=0.0, from_origin=False, assumed=None, places=None
+        experiment.part(begin, end),
+        angle=angle,
+        velocity=velocity,
+        slack=0.0,
+        from_origin=False,
+        assumed=None,
+        places=None,
     )
 
 

@@ -39,6 +39,20 @@ class Lack(Enum):
     BAD_FRAMES = auto()  # CAN frames that do not fit the DBC
 
 
+@dataclass(frozen=True)
+class Quality:
+    """What a log says about an experiment besides its samples."""
+
+    planned: int = 0  # Periods that the run was to have
+    braked: int = 0  # Periods that the node braked by itself because no command came in time
+    command_delay: int = 0  # Samples by which commands acted late, by the node's reports
+    lacks: Mapping[Lack, tuple[float, ...]] = field(default_factory=dict)  # With the numbers that belong to each
+    faults: tuple[str, ...] = ()  # What of its map a recording of others contradicts, in words
+    within: float | None = None
+    """Of a mapped drive: difference between command and report up to which the command acted [A], NaN if its mapping is
+    not readable, so that reports alone count; None of other nodes."""
+
+
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """An experiment of n sampling periods; period k lies between the samples k and k + 1, k = 0, ..., n - 1."""
@@ -61,14 +75,7 @@ class Experiment:
     before: float = 0.0  # Current that acted before the first period [A]
     outliers: int = 0  # Samples that were left out because they lie apart from their neighbours
     first: tuple[float, float] = (np.nan, np.nan)  # Sample 0: angle [rad], velocity [rad/s]; NaN where it was lost
-    planned: int = 0  # Periods that the run was to have
-    braked: int = 0  # Periods that the node braked by itself because no command came in time
-    command_delay: int = 0  # Samples by which commands acted late, by the node's reports
-    lacks: Mapping[Lack, tuple[float, ...]] = field(default_factory=dict)  # With the numbers that belong to each
-    faults: tuple[str, ...] = ()  # What of its map a recording of others contradicts, in words
-    within: float | None = None
-    """Of a mapped drive: difference between command and report up to which the command acted [A], NaN if its mapping is
-    not readable, so that reports alone count; None of other nodes."""
+    quality: Quality = Quality()
 
     @property
     def periods(self) -> int:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import LONGEST_DELAY
-from emb_bench.experiment.experiment import REST_SIGMAS, Booleans, Experiment, Floats, Integers, Lack
+from emb_bench.experiment.experiment import REST_SIGMAS, Booleans, Experiment, Floats, Integers, Lack, Quality
 from emb_bench.logs.log import RunLog, Table, once
 from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER
 from emb_runtime.can.messages import CHARGE, Layout
@@ -98,11 +98,13 @@ def _read(log: RunLog, bench: Bench) -> Experiment:
         late=samples.late[1:].copy(),  # a view would keep all columns
         assumed=None if reported.all() else np.where(reported, np.nan, currents),
         first=(float(samples.angle[0]), float(samples.velocity[0])),
-        planned=planned,
-        braked=int((counted & (samples.obeyed[1:] == NO_COUNTER)).sum()),
-        command_delay=delay,
-        lacks=_lacks(periods, _due(log, periods, planned), lost, told, wrong[delay]),
-        within=None if log.drive_files is None else math.nan if log.drive is None else within,
+        quality=Quality(
+            planned=planned,
+            braked=int((counted & (samples.obeyed[1:] == NO_COUNTER)).sum()),
+            command_delay=delay,
+            lacks=_lacks(periods, _due(log, periods, planned), lost, told, wrong[delay]),
+            within=None if log.drive_files is None else math.nan if log.drive is None else within,
+        ),
     )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.brake.parameters import OF_A_RECORD, PARAMETERS
+from emb_bench.brake.parameters import OF_AN_EXPERIMENT, PARAMETERS
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.config.plants import DEFAULT_PLANT, RECORDED_PLANT, THESIS_PLANT, Plant
 from emb_bench.documents import ByName
@@ -279,7 +279,7 @@ def together(parts: Sequence[Information]) -> Information:
         UsageError: they are of other parameters, models or unknowns, or about what each record has of its own.
     """
     first, names = parts[0], parts[0].params
-    if own := [name for name in first.question.params if name in OF_A_RECORD]:
+    if own := [name for name in first.question.params if name in OF_AN_EXPERIMENT]:
         raise UsageError(f"each run has its own {own[0]}: expected it as a nuisance of several runs")
     parts = [
         evaluate(p.log, p.experiment, p.bench, [p.plant], p.question, LOG, first.theta, p.errors)[0]
@@ -292,7 +292,7 @@ def together(parts: Sequence[Information]) -> Information:
             if getattr(part, what) != getattr(first, what):
                 option = {"plant": "model", "question": "params, nuisance and prior"}.get(what, what)
                 raise UsageError(f"informations add if they are about one brake: expected the same {option} of all")
-    shared = [i for i, name in enumerate(names) if name not in OF_A_RECORD]
+    shared = [i for i, name in enumerate(names) if name not in OF_AN_EXPERIMENT]
     question = replace(first.question, nuisances=tuple(names[i] for i in shared[len(first.question.params) :]))
     start, found = question.start(first.theta), {}
     for kind in KINDS:

@@ -13,7 +13,8 @@ from emb_bench.experiment.experiment import Lack
 from emb_bench.experiment.from_log import Recording
 from emb_bench.logs.log import Chunks
 from emb_bench.recordings.map_file import RecordingMap, read_map
-from emb_bench.recordings.readers import Found, experiment_of, read_columns
+from emb_bench.recordings.readers import read_columns
+from emb_bench.recordings.signals import Found, experiment_of
 from emb_runtime.config.bench import Systematic
 from emb_runtime.errors import UsageError
 
@@ -35,8 +36,8 @@ def open_recording(path: Path, map_path: Path) -> Recording:
     try:
         parse_bench(text, f"{map_path}: the bench file made of it", analysis=True)
     except UsageError:
-        if found.experiment.faults:  # the cause of a guess that no bench file takes
-            raise UsageError(f"{map_path}: {found.experiment.faults[0]}") from None
+        if faults := found.experiment.quality.faults:  # the cause of a guess that no bench file takes
+            raise UsageError(f"{map_path}: {faults[0]}") from None
         raise
     return Recording(
         path=path,

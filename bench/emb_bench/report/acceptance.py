@@ -20,7 +20,7 @@ import msgspec
 
 from emb_bench.analysis.drift import Drift
 from emb_bench.analysis.study import Code, Result, Run, Study, verdict
-from emb_bench.brake.parameters import OF_A_RECORD, PARAMETERS, SI, UNITS
+from emb_bench.brake.parameters import OF_AN_EXPERIMENT, PARAMETERS, SI, UNITS
 from emb_bench.estimate.records import DONE, NORMAL_95
 from emb_bench.logs.timing import timing
 from emb_bench.numbers import amount, share, share_between
@@ -32,7 +32,7 @@ from emb_runtime.system.input_file import read_text
 
 LONGEST = 2**20  # Size limit of the file [bytes]
 NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")  # Characters that XML cannot have
-SHARED = tuple(name for name in PARAMETERS if name not in OF_A_RECORD)  # Unknowns that a tolerance can be stated for
+SHARED = tuple(name for name in PARAMETERS if name not in OF_AN_EXPERIMENT)  # A tolerance can be stated for these
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
@@ -184,7 +184,7 @@ def _missed(run: Run) -> float | None:
 def _lost(run: Run) -> float | None:
     """Share of the samples that are not in the log; None without an experiment."""
     x = run.experiment
-    return None if x is None or x.planned == 0 else 1.0 - int(x.measured.sum()) / max(len(x.measured), 1)
+    return None if x is None or x.quality.planned == 0 else 1.0 - int(x.measured.sum()) / max(len(x.measured), 1)
 
 
 def _doubt(study: Study) -> str:

@@ -1,4 +1,4 @@
-"""Limits of an estimate: sentences from its method, its records and its bench."""
+"""Limits of an estimate: sentences from its method, its experiments and its bench."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ ON_THE_GRID = 0.01  # Share of a period by which samples may be off the grid wit
 
 
 def caveats(e: Estimate) -> list[str]:
-    """Limitations of an estimate's method on its records."""
+    """Limitations of an estimate's method on its experiments."""
     of_method = {"oem": _of_losses, "pem": _of_innovations, "rls": _of_least_squares, "windows": _of_windows}[e.method]
     return [*of_method(e), *_of_scale(e), *_of_ideal_sensors(e)]
 
 
 def _of_losses(e: Estimate) -> Iterator[str]:
     """Outliers, and unknowns that lost reports bring."""
-    from emb_bench.estimate.output_error import APART
+    from emb_bench.estimate.records import OUTLIER
 
-    if apart := sum(record.outliers for record in e.records):
+    if apart := sum(experiment.outliers for experiment in e.experiments):
         yield (
-            f"{apart} samples lie apart from their neighbours by more than {APART:g} standard deviations: they are "
+            f"{apart} samples lie apart from their neighbours by more than {OUTLIER:g} standard deviations: they are "
             "left out as outliers"
         )
-    pulses, breaks = (sum(len(record.gaps[kind]) for record in e.records) for kind in (0, 1))
+    pulses, breaks = (sum(len(experiment.gaps[kind]) for experiment in e.experiments) for kind in (0, 1))
     if pulses:
         yield (
             f"what acted in {pulses} single periods was not reported: each of these currents is unknown, around the "
@@ -52,22 +52,20 @@ def _of_innovations(e: Estimate) -> Iterator[str]:
 
 def _of_least_squares(e: Estimate) -> Iterator[str]:
     instruments, t_s = e.plant.instruments, e.bench.timing.sample_time
-    periods = sum(record.periods - instruments.measurement_delay - 1 for record in e.records)
+    periods = sum(experiment.periods - instruments.measurement_delay - 1 for experiment in e.experiments)
     yield "the regressors are measured with noise: the values are biased, and no deviation says by how much"
     yield (
         f"{e.ends[0].evaluations} of {periods} periods count: in the others the direction of motion is not sure, or a "
         "sample was lost"
     )
-    if any(r.late is not None and bool(np.any(np.abs(r.late) > ON_THE_GRID * t_s)) for r in e.records):
+    if any(r.late is not None and bool(np.any(np.abs(r.late) > ON_THE_GRID * t_s)) for r in e.experiments):
         yield "samples are taken as on the grid, and some are not by their stamps"
     if instruments.observer_bandwidth > 0.0:
         yield "the velocity is an observer's: it lags, and its errors follow from each other"
 
 
 def _of_windows(e: Estimate) -> Iterator[str]:
-    from emb_bench.estimate.windows import window_of
-
-    yield f"each of the {e.windows} windows of {window_of(e.problem):g} s has a start of its own"
+    yield f"each of the {e.windows} windows of {e.problem.window:g} s has a start of its own"
 
 
 def _of_ideal_sensors(e: Estimate) -> Iterator[str]:

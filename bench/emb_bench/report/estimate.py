@@ -115,8 +115,8 @@ def _evidence(study: Study) -> Iterator[str]:
     """Tests and tables behind the answer."""
     e, m = study.estimate, study.estimate.validation
     measured = (
-        f"{name}: {record.measured.sum()} of {len(record.currents)} samples"
-        for name, record in zip(study.names, e.records, strict=True)
+        f"{name}: {experiment.measured.sum()} of {experiment.periods} samples"
+        for name, experiment in zip(study.names, e.experiments, strict=True)
     )
     expected = f"{plain(m.ratio, 4)} of {m.freedom}, {m.expected[0]:.3f} to {m.expected[1]:.3f} expected"
     yield ""
@@ -153,7 +153,7 @@ def document(study: Study) -> dict[str, Any]:
         "model": e.plant.name,
         "records": [
             {"name": log.path, "periods": len(r.currents), "measured": r.measured.sum()}
-            for log, r in zip(study.logs, e.records, strict=True)
+            for log, r in zip(study.logs, e.experiments, strict=True)
         ],
         "params": e.asked.params,
         "nuisances": e.asked.nuisances,

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from emb_bench.analysis.profile import LEVEL, Profile
+from emb_bench.analysis.records import LEVEL, Profile
 from emb_bench.brake.motion import Floats
 from emb_bench.brake.parameters import quantity
 from emb_bench.estimate.estimate import Estimate
-from emb_bench.estimate.model_validation import OUTPUTS
+from emb_bench.estimate.records import OUTPUTS
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.figures import COLOURS, DASHED, GREY, svg
 from emb_bench.report.motion import ActiveCycles, Motion, StopSamples

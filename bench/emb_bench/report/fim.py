@@ -41,16 +41,16 @@ def document(e: Evaluation) -> dict[str, Any]:
     numbers = ("log_det", "lambda_min", "trace_inverse", "condition", "singular")
     found: dict[str, Any] = {
         "log": e.log.path,
-        "complete": e.log.complete and not x.lacks,
+        "complete": e.log.complete and not x.quality.lacks,
         "warnings": say.warnings(e),
         "notes": say.notes(e),
         "exit_reason": e.log.exit_reason,
         "samples": {
-            "planned": x.planned,
+            "planned": x.quality.planned,
             "periods": x.periods,
             "measured": x.measured.sum(),
-            "braked_periods": x.braked,
-            "command_delay": x.command_delay,
+            "braked_periods": x.quality.braked,
+            "command_delay": x.quality.command_delay,
         },
         "model": e.plant.name,
         "theta": {"name": e.theta_name, **e.theta._asdict()},
@@ -179,10 +179,10 @@ def _over_time(e: Evaluation) -> Table:
 
 
 def _heading(e: Evaluation) -> list[str]:
-    x, late, machine = e.experiment, e.experiment.command_delay, e.bench.machine
+    x, late, machine = e.experiment, e.experiment.quality.command_delay, e.bench.machine
     run = "recording" if e.log.is_recording else e.log.exit_reason
-    run += f", {x.periods} of {x.planned} periods, {x.measured.sum()} samples"
-    run += f", {x.braked} braked by the node" if x.braked else ""
+    run += f", {x.periods} of {x.quality.planned} periods, {x.measured.sum()} samples"
+    run += f", {x.quality.braked} braked by the node" if x.quality.braked else ""
     run += f"; commands acted {in_samples(late)} late" if late else ""
     if machine is None:
         theta = ", ".join(f"{name} {plain(getattr(e.theta, name), 4)}" for name in PARAMETER_NAMES) + " (SI)"

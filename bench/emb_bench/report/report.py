@@ -225,7 +225,8 @@ def _end(run: Run) -> Words:
     """End of a run, its samples, and whether its log is whole."""
     log, x = run.log, run.experiment
     detail, samples = log.end.get("detail"), 0 if x is None else x.measured.sum()
-    said = "" if x is None else f"{len(x.currents)} of {x.planned} periods, {samples} {_plural('sample', samples)}; "
+    periods = "" if x is None else f"{x.periods} of {x.quality.planned} periods, "
+    said = f"{periods}{samples} {_plural('sample', samples)}; " if periods else ""
     whole = Cell("the log is complete", "good") if log.complete else Cell("the log is NOT complete", "bad")
     end = Cell(log.exit_reason, "good" if log.exit_reason == DONE else "bad")
     return [end, f" ({detail})" if detail else "", f"; {said}", whole]
@@ -362,10 +363,10 @@ def _excitation(motion: Motion) -> list[Block | None]:
     said = "The node applied the sent current in every period."
     if not figures.applied_as_sent(motion):
         said = "In some periods the node did not apply the sent current, or its report was lost."
-    if x is not None and x.braked:
-        said += f" {x.braked} periods were braked by the node itself, because no command came in time."
-    if x is not None and x.command_delay:
-        said += f" Commands acted {x.command_delay} samples late by the node's reports."
+    if x is not None and x.quality.braked:
+        said += f" {x.quality.braked} periods were braked by the node itself, because no command came in time."
+    if x is not None and x.quality.command_delay:
+        said += f" Commands acted {x.quality.command_delay} samples late by the node's reports."
     marks = "The bars below the current mark periods in which the sent current differs from the requested one:"
     reasons = [f"{str(reason.name).lower()}: {words}" for reason, words in REASONS.items()]
     return [Text(said), Text(marks), Items(reasons)]
@@ -476,7 +477,7 @@ def _log(run: Run) -> Iterator[Block]:
     if detail := log.end.get("detail"):
         rows.append(("detail", detail[:LONGEST]))
     if x is not None:
-        counts = f"{len(x.currents)} of {x.planned} periods, {x.measured.sum()} samples received"
+        counts = f"{len(x.currents)} of {x.quality.planned} periods, {x.measured.sum()} samples received"
         rows.append(("experiment", counts))
     yield Facts(rows)
     for title, entries in log.metadata.items():
@@ -601,13 +602,13 @@ def _run_document(run: Run, study: Study) -> dict[str, Any]:
     x, alone = run.experiment, run.alone
     if x is not None:
         found["experiment"] = {
-            "planned": x.planned,
-            "command_delay": x.command_delay,
+            "planned": x.quality.planned,
+            "command_delay": x.quality.command_delay,
             "missing": say.lacks(x),
             "notes": say.taken_for_acted(x),
             "periods": len(x.currents),
             "measured": x.measured.sum(),
-            "braked_periods": x.braked,
+            "braked_periods": x.quality.braked,
             "applied_current": x.currents,
             "angle": x.all_samples[:, 0],
             "velocity": x.all_samples[:, 1],

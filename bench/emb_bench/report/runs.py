@@ -25,21 +25,23 @@ SHOWN_DIFFERENCES = 10  # Unless all are asked for
 def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
     """A :func:`emb_bench.logs.info.info_document` for a person; with ``verbose`` all metadata and events."""
     d = _lines(d)
+    c, end = d["cycles"], d["metadata"].get("emb.end", {})
     lines = listed("WARNING: ", [d["missing"]])
     lines += ["SIMULATED: no real machine was driven"] if d["simulated"] else []
-    lines += wrapped(
-        f"{d['log']}: {d['exit_reason']}{_why(d['metadata'].get('emb.end', {}))}, {d['duration']:.3f} s, log "
-        f"{'complete' if d['complete'] else 'NOT complete'}"
-    )
+    why = f" ({detail})" if (detail := end_detail(end)) else ""
+    complete = "complete" if d["complete"] else "NOT complete"
+    lines += wrapped(f"{d['log']}: {d['exit_reason']}{why}, {d['duration']:.3f} s, log {complete}")
+    cycles = f"{c['active']} active, {c['answered']} answered, {c['unanswered']} unanswered"
+    commands = f"{c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home"
     lines += facts(
-        *_loop(d["cycles"]),
+        ("cycles", f"{cycles}, {c['missed_periods']} periods missed"),
+        ("commands", f"{commands}, {c['left']} braked by the node"),
         ("extremes", _largest(d.get("largest"))),
         *(("drive lacks", f"{name}: {lost}") for name, lost in d.get("drive_lacks", {}).items()),
         ("response", _delays(d)),
     )
     if estimate := d.get("estimate"):
-        fits = d["metadata"].get("emb.end", {}).get("model_fits") != "False"
-        lines += ["", *words(estimate, d.get("total", ""), fits=fits)]
+        lines += ["", *words(estimate, d.get("total", ""), fits=end.get("model_fits") != "False")]
     if not verbose:
         return "\n".join(lines)
     lines += _listed("messages", {topic: f"{count:9}" for topic, count in d["messages"].items()})
@@ -51,27 +53,9 @@ def info(d: Mapping[str, Any], *, verbose: bool = False) -> str:
 
 def _delays(d: Mapping[str, Any]) -> str:
     """Time from a sample to the command that answers it."""
-    delays = d.get("sensor_to_command", {})
+    delays = ", ".join(f"{name} {1e6 * value:.0f}" for name, value in d.get("sensor_to_command", {}).items())
     simulated = " (simulated time)" if "emb.truth" in d["metadata"] else ""
-    return (
-        ", ".join(f"{name} {1e6 * value:.0f}" for name, value in delays.items()) + f" µs{simulated}" if delays else ""
-    )
-
-
-def _loop(c: Mapping[str, int]) -> tuple[tuple[str, str], ...]:
-    """Counts of the control loop's cycles."""
-    return (
-        (
-            "cycles",
-            f"{c['active']} active, {c['answered']} answered, {c['unanswered']} unanswered, "
-            f"{c['missed_periods']} periods missed",
-        ),
-        (
-            "commands",
-            f"{c['clipped']} clipped, {c['limited']} limited, {c['returning']} returning home, "
-            f"{c['left']} braked by the node",
-        ),
-    )
+    return f"{delays} µs{simulated}" if delays else ""
 
 
 def _lines(value: Any) -> Any:
@@ -94,11 +78,6 @@ def _largest(largest: Mapping[str, float] | None) -> str:
 
 def _listed(title: str, entries: Mapping[str, str]) -> list[str]:
     return ["", title, *(f"  {name:24} {said}" for name, said in entries.items())]
-
-
-def _why(end: Mapping[str, str]) -> str:
-    said = end_detail(end)
-    return f" ({said})" if said else ""
 
 
 class RunTiming(NamedTuple):
@@ -161,14 +140,12 @@ def timing_text(entry: RunTiming, *, verbose: bool = False) -> str:
     rows = [_row(said, list(quantiles(t.interval(name)).values())) for name, said in INTERVALS.items()]
     lines += ["", *Table("", ("", *QUANTILE_NAMES, "unit"), rows, words=(0, len(QUANTILE_NAMES) + 1)).lines()]
     shown = entry.checks if verbose else missed
-    rows = [[check.name, _check(check, check.budget), _check(check, check.measured), _met(check)] for check in shown]
+    rows = [
+        [one.name, _check(one, one.budget), _check(one, one.measured), "met" if one.met else "NOT MET"] for one in shown
+    ]
     if rows:
         lines += ["", *Table("", ("budget", "at most", "measured", ""), rows, words=(0, 3)).lines()]
     return "\n".join(lines)
-
-
-def _met(check: BudgetCheck) -> str:
-    return "met" if check.met else "NOT MET"
 
 
 def _check(check: BudgetCheck, value: float | None) -> str:

@@ -19,9 +19,7 @@ from emb_runtime.system.terminal import one_line
 if TYPE_CHECKING:  # scipy comes with the extra [bench]
     from emb_bench.analysis.conclusion import Conclusion
     from emb_bench.analysis.drift import Drift, Earlier
-    from emb_bench.analysis.held_out import HeldOut
-    from emb_bench.analysis.model_choice import Candidate
-    from emb_bench.analysis.profile import Profile
+    from emb_bench.analysis.records import Candidate, HeldOut, Profile
     from emb_bench.analysis.study import Stop, Study
     from emb_bench.config.bench import Bench
     from emb_bench.config.machine import Machine
@@ -111,18 +109,19 @@ def without(study: Study) -> str:
 
 def lacks(x: Experiment, but: Collection[Lack] = ()) -> list[str]:
     """Parts of an experiment that are missing, or not to be trusted."""
-    return [LACKS[lack].format(*numbers) for lack, numbers in x.lacks.items() if lack not in but]
+    return [LACKS[lack].format(*numbers) for lack, numbers in x.quality.lacks.items() if lack not in but]
 
 
 def taken_for_acted(x: Experiment) -> list[str]:
     """The currents that were taken for those that acted, where these are not the reported ones."""
-    if x.within is None:
+    q = x.quality
+    if q.within is None:
         return []
-    if math.isnan(x.within):
+    if math.isnan(q.within):
         return ["the drive's mapping is not readable: what acted is taken to be what the drive reported"]
     return [
-        f"what acted is taken to be the command as its bus carried it, {in_samples(x.command_delay)} late, where what "
-        f"the drive reported lies within {x.within:.3g} A of it, and elsewhere what the drive reported"
+        f"what acted is taken to be the command as its bus carried it, {in_samples(q.command_delay)} late, where what "
+        f"the drive reported lies within {q.within:.3g} A of it, and elsewhere what the drive reported"
     ]
 
 
@@ -238,17 +237,15 @@ def other_model(now: Estimate, last: Earlier | None) -> str:
 
 def missing(study: Study) -> list[str]:
     """Defects of the logs; that a stopped run ended early is not repeated."""
-    from emb_bench.estimate.methods import method_of
-    from emb_bench.estimate.records import DONE
+    from emb_bench.estimate.records import DONE, WITHOUT_GAPS
 
     found = []
-    gaps = method_of(study.estimate.method).gaps
-    for log, record in zip(study.logs, study.estimate.records, strict=True):
+    for log, experiment in zip(study.logs, study.estimate.experiments, strict=True):
         said = [log.missing] if log.missing else []
         stopped = log.end.get("exit_reason", DONE) != DONE
-        said += lacks(record, but=(Lack.ENDS_EARLY,) if stopped else ())
-        lost = int((~record.measured).sum()) - record.outliers
-        if lost and not gaps:
+        said += lacks(experiment, but=(Lack.ENDS_EARLY,) if stopped else ())
+        lost = int((~experiment.measured).sum()) - experiment.outliers
+        if lost and study.estimate.method in WITHOUT_GAPS:
             said.append(
                 f"what acted in {lost} periods is assumed, for this method does not estimate it: the command, or the "
                 "node's braking where there was none; the right model may not fit"
@@ -259,7 +256,7 @@ def missing(study: Study) -> list[str]:
 
 def assumptions(study: Study) -> list[str]:
     """Assumptions about the currents that acted, where they are not those that were reported."""
-    return _of_which(study, [taken_for_acted(record) for record in study.estimate.records])
+    return _of_which(study, [taken_for_acted(experiment) for experiment in study.estimate.experiments])
 
 
 def _of_which(study: Study, found: Sequence[Sequence[str]]) -> list[str]:
@@ -282,7 +279,7 @@ def model_reason(study: Study) -> str:
 
 
 def models(study: Study) -> str:
-    """Models that the records do not tell apart; empty if one is left."""
+    """Models that the experiments do not tell apart; empty if one is left."""
     choice = study.checks.choice
     found: Sequence[Candidate] = choice.left_over if choice is not None else ()
     if choice is None or len(found) < 2:
@@ -349,9 +346,9 @@ def alarms(e: Estimate) -> list[str]:
 
 def _window(e: Estimate) -> str:
     """Option with which a recording has windows enough for two unknowns more; empty where it has, or has none."""
-    from emb_bench.estimate.windows import FEWEST
+    from emb_bench.estimate.records import FEWEST_WINDOWS
 
-    machine, needed = e.bench.machine, FEWEST * (len(e.unknowns) + 2)
+    machine, needed = e.bench.machine, FEWEST_WINDOWS * (len(e.unknowns) + 2)
     if machine is None or not 0 < e.windows < needed:
         return ""
     longest = (e.asked.window or machine.window) * e.windows / (needed + 1)
@@ -366,7 +363,7 @@ def _first(suspected: Sequence[Suspect], machine: Machine | None) -> Suspect:
 
 def faults(e: Estimate) -> list[str]:
     """Faults of recordings of others and their maps."""
-    return [fault for record in e.records for fault in record.faults]
+    return [fault for experiment in e.experiments for fault in experiment.quality.faults]
 
 
 def left_fixed(e: Estimate) -> list[str]:
@@ -491,7 +488,7 @@ def drift(d: Drift) -> str:
 
 
 def held_out(h: HeldOut) -> str:
-    """Prediction of one record."""
+    """Prediction of one experiment."""
     return (
         f"{'predicted' if h.fits else 'NOT predicted'}, chi2/n {plain(h.ratio, 4)} of {h.freedom}, {p_value(h.p_value)}"
     )
@@ -625,7 +622,7 @@ def impact(bench: Bench, speed: float | None, why_not: str) -> str:
 def warnings(e: Evaluation) -> list[str]:
     """Reasons to doubt an information."""
     found = [text for text in (e.log.missing, *lacks(e.experiment)) if text]
-    late, expected = e.experiment.command_delay, e.plant.instruments.command_delay
+    late, expected = e.experiment.quality.command_delay, e.plant.instruments.command_delay
     if late != expected:
         found.append(
             f"commands acted {in_samples(late)} late, in the model '{e.plant.name}' {in_samples(expected)}: the "
@@ -644,7 +641,7 @@ def warnings(e: Evaluation) -> list[str]:
             if e.theta_name == "nominal"
             else "the model does not include what disturbed the machine"
         )
-    elif e.log.missing or e.experiment.lacks:
+    elif e.log.missing or e.experiment.quality.lacks:
         why = "what is missing hides whether theta is right"
     else:
         why = "pass --theta or --model"

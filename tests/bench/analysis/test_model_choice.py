@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from emb_bench.analysis.model_choice import ModelChoice, choose_model, mixture_interval
+from emb_bench.analysis.model_choice import choose_model
 from emb_bench.analysis.options import EstimateOptions
-from emb_bench.analysis.study import make_study
+from emb_bench.analysis.records import ModelChoice, mixture_interval
+from emb_bench.analysis.stages import make_study
 from emb_bench.brake.motion import Floats
 from emb_bench.config.bench import Bench
 from emb_bench.config.plants import EVERY, Plant

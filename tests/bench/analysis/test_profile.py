@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from emb_bench.analysis.profile import LEVEL, profile
+from emb_bench.analysis.profile import profile
+from emb_bench.analysis.records import LEVEL
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.prediction import Problem
@@ -51,7 +52,7 @@ def test_the_rise_is_that_of_a_search_over_the_other_parameter(bench: Bench) -> 
     data = record(bench, bench.plant("exact"), currents_of(bench, "square:amplitude=3,period=0.05"))
     e = estimated(bench, [data], "T_c", "f_v")
     found = profile(e, "T_c")
-    problem = Problem(e.bench, e.plant, e.asked, e.records)
+    problem = Problem(e.bench, e.plant, e.asked, e.experiments)
     z = e.z
     weights = problem.weights(z)
 

@@ -11,8 +11,8 @@ import pytest
 
 from emb_bench.analysis import held_out
 from emb_bench.analysis.drift import Earlier, Entry, drifts
-from emb_bench.analysis.held_out import GROUPS, leave_one_out
-from emb_bench.analysis.several_runs import apart, apart_by
+from emb_bench.analysis.held_out import GROUPS, apart, leave_one_out
+from emb_bench.analysis.several_runs import apart_by
 from emb_bench.config.bench import Bench
 from emb_bench.estimate.effects import with_systematic
 from emb_bench.estimate.estimate import Estimate

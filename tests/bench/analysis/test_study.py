@@ -14,7 +14,8 @@ import pytest
 from emb_bench.analysis.conclusion import Standing, conclude
 from emb_bench.analysis.options import EstimateOptions
 from emb_bench.analysis.profile import profile
-from emb_bench.analysis.study import Code, make_study, verdict
+from emb_bench.analysis.stages import make_study
+from emb_bench.analysis.study import Code, verdict
 from emb_bench.api import simulate as simulate_run
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import CampaignOptions, Source

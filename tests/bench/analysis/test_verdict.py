@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from emb_bench.analysis.held_out import HeldOut
 from emb_bench.analysis.options import EstimateOptions
-from emb_bench.analysis.several_runs import Differing
-from emb_bench.analysis.study import Code, Result, Study, Tone, make_study, verdict
+from emb_bench.analysis.records import Differing, HeldOut
+from emb_bench.analysis.stages import make_study
+from emb_bench.analysis.study import Code, Result, Study, Tone, verdict
 from emb_bench.information.identifiability import Doubt
 from emb_bench.logs.log import read_log
 
@@ -54,7 +54,7 @@ def of_method(study: Study, name: str) -> Study:
 def cut_short(study: Study) -> Study:
     x = study.runs[0].experiment
     assert x is not None
-    return with_run(study, experiment=replace(x, planned=x.periods + 1))
+    return with_run(study, experiment=replace(x, quality=replace(x.quality, planned=x.periods + 1)))
 
 
 def misfit(study: Study) -> Study:

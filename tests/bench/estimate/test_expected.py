@@ -71,7 +71,9 @@ def test_an_effect_that_acts_as_a_current_sums_the_derivatives_to_single_current
     wanted = np.zeros_like(found)
     for odd in range(2):
         lost = np.arange(len(CURRENTS)) % 2 == odd
-        gaps = replace(problem, records=(replace(problem.records[0], assumed=np.where(lost, CURRENTS, np.nan)),))
+        gaps = replace(
+            problem, experiments=(replace(problem.experiments[0], assumed=np.where(lost, CURRENTS, np.nan)),)
+        )
         single = gaps.predict(z, 0).sensitivities[:, len(z) :]
         wanted += np.einsum("kgo,gj->kjo", single, rows[lost])
     assert (np.abs(found - wanted).max(axis=0) <= 1e-8 * np.abs(wanted).max(axis=0)).all()

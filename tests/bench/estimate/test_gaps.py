@@ -102,7 +102,7 @@ def test_what_is_fitted_again_or_by_another_model_settles_its_own_gaps(bench: Be
     e = fit(bench, plant, [raw])
     others = (
         fit_from(Problem(bench, plant, EstimationProblem(), (raw,)), e),
-        refit(replace(e, problem=replace(e.problem, records=(raw,))), [0]),
+        refit(replace(e, problem=replace(e.problem, experiments=(raw,))), [0]),
     )
     assert [e.ends[0].cost] * 2 == pytest.approx([others[0].best.cost, others[1].ends[0].cost], abs=1e-2)
     choice = choose_model(

@@ -10,8 +10,8 @@ from scipy import stats
 from emb_bench.config.bench import Bench, load_bench
 from emb_bench.estimate.effects import DRIFTS, with_systematic
 from emb_bench.estimate.estimate import OF_THE_BENCH, Estimate
-from emb_bench.estimate.model_validation import LAGS, OUTPUTS, lagged
-from emb_bench.estimate.records import NORMAL_95, EstimationProblem
+from emb_bench.estimate.model_validation import LAGS, lagged
+from emb_bench.estimate.records import NORMAL_95, OUTPUTS, EstimationProblem
 from emb_bench.experiment.experiment import planned
 from emb_bench.experiment.simulate import Theta, simulate
 from emb_bench.report.sentences import alarms, residual_notes
@@ -123,8 +123,8 @@ def test_the_whiteness_is_that_of_ljung_and_box(bench: Bench) -> None:
 def test_the_dependence_on_the_current_is_an_f_test_of_two_regressions(bench: Bench) -> None:
     """The residuals regressed on the model's sensitivities, without and with the currents."""
     found = fitted(bench, "stribeck", text="constant-speed:turn=0.15")
-    e, past = found.residuals[0], lagged(found.records[0].currents, LAGS)
-    currents = planned(found.records[0].currents)
+    e, past = found.residuals[0], lagged(found.experiments[0].currents, LAGS)
+    currents = planned(found.experiments[0].currents)
     s = simulate(found.plant, Theta(found.theta), currents, 0.001, ("k_m", "k_1", "T_c", "f_v"))
     model = (s.sensitivities / [bench.noise.angle, bench.noise.velocity]).transpose(0, 2, 1).reshape(-1, 4)
     model /= np.linalg.norm(model, axis=0)

@@ -31,7 +31,7 @@ def test_a_jump_of_one_sample_moves_no_parameter_by_more_than_its_interval(
     data = record(bench, plant, currents_of(bench, "chirp"), seed=2)
     clean, found = fit(bench, plant, [data]), fit(bench, plant, [with_jumps(data, jump)])
     assert found.validation.fits
-    assert found.records[0].outliers == 1
+    assert found.experiments[0].outliers == 1
     assert len(caveats(found)) == 1
     low, high = clean.intervals().T
     assert ((low < found.values) & (found.values < high)).all()
@@ -42,7 +42,7 @@ def test_many_samples_apart_are_no_outliers_but_a_record_that_does_not_fit(bench
     plant = bench.plant("exact")
     data = record(bench, plant, currents_of(bench, "chirp"), seed=2)
     found = fit(bench, plant, [with_jumps(data, *((k, 0, 0.1) for k in range(50, 450, 40)))])
-    assert found.records[0].outliers == 0
+    assert found.experiments[0].outliers == 0
     assert not found.validation.fits
 
 

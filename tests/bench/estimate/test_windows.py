@@ -10,11 +10,12 @@ from emb_bench.estimate.estimate import Estimate
 from emb_bench.estimate.methods import method_of
 from emb_bench.estimate.prediction import make_problem
 from emb_bench.estimate.records import EstimationProblem
-from emb_bench.estimate.windows import Cut, by_windows, predict_windows, window_of
+from emb_bench.estimate.windows import Cut, by_windows, predict_windows
 from emb_bench.experiment.experiment import Experiment
 from emb_bench.recordings.map_file import Place, parse_map
-from emb_bench.recordings.readers import Column, experiment_of
+from emb_bench.recordings.readers import Column
 from emb_bench.recordings.recording import bench_of
+from emb_bench.recordings.signals import experiment_of
 from emb_runtime.errors import UsageError
 from tests.bench.linear_machine import MAP, Machine, Recording, record
 
@@ -107,9 +108,9 @@ def test_a_window_that_begins_at_rest_is_predicted_from_a_start_that_does_not_di
 
 def test_eliminating_the_starts_gives_the_information_of_all_unknowns_together() -> None:
     e = fitted(record(Machine(), 6.0))
-    problem = make_problem(e.bench, e.plant, e.records, ASKED)
+    problem = make_problem(e.bench, e.plant, e.experiments, ASKED)
     cut = Cut(problem, e.z).windows
-    whole = make_problem(e.bench, e.plant, [w.records[0] for w in cut], cut[0].asked)
+    whole = make_problem(e.bench, e.plant, [w.experiments[0] for w in cut], cut[0].asked)
     z = whole.nominal()
     z[:4] = e.z
     for i, window in enumerate(cut):  # where the estimate has its windows matters little to their derivatives
@@ -135,7 +136,7 @@ def test_windows_that_disagree_widen_the_covariance_and_neighbours_count_togethe
 def test_a_length_that_is_asked_for_goes_before_the_map_s() -> None:
     data = record(Machine(), 2.0)
     for e in (fitted(data, replace(ASKED, window=0.15)), fitted(data, text=MAP.replace("= 0.5", "= 0.15"))):
-        assert (e.windows, window_of(e.problem)) == (13, 0.15)
+        assert (e.windows, e.problem.window) == (13, 0.15)
 
 
 @pytest.mark.parametrize("straight", [False, True])

@@ -88,7 +88,7 @@ def test_what_acted_is_exactly_what_the_node_was_told(
     log, experiment = recorded(tmp_path, run)
     assert experiment.currents.tolist() == commanded(run, layout)
     assert experiment.measured.all()
-    assert (experiment.planned, experiment.braked, experiment.lacks) == (500, 0, {})
+    assert (experiment.quality.planned, experiment.quality.braked, experiment.quality.lacks) == (500, 0, {})
     assert experiment.x0() == (0.0, 0.0)
     assert experiment.all_samples[:-1, 0].tolist() == [c.angle for c in run.journal.cycles[:-1]]
     assert experiment.all_samples[:, 1].tolist() == [c.velocity for c in run.journal.cycles]
@@ -105,9 +105,9 @@ def test_a_lost_sample_is_a_gap_whose_currents_are_assumed_and_said_to_be(
     lost = np.flatnonzero(~experiment.measured)
     assert len(lost) == 3
     assert np.isnan(experiment.samples[lost, 0]).all()
-    assert experiment.lacks == {Lack.LOST: (3,)}
+    assert experiment.quality.lacks == {Lack.LOST: (3,)}
     # A period that begins at a lost sample has no command: the node braked, and of two in a row one is not reported.
-    assert experiment.braked == 2
+    assert experiment.quality.braked == 2
     sent = {c.step: c.sent_current for c in run.journal.cycles if c.command_counter != 15}
     first, second, third = lost.tolist()
     assert (experiment.currents[first], experiment.currents[second]) == (sent[first], sent[second])
@@ -121,7 +121,7 @@ def test_an_experiment_whose_last_sample_was_lost_ends_where_it_was_due(tmp_path
     run = simulate(square, options="f_v=4e-5", on_receive=Lose(512))
     assert run.journal.cycles[-1].step == 501
     log, experiment = recorded(tmp_path, run)
-    assert (len(experiment.currents), experiment.planned) == (500, 500)
+    assert (len(experiment.currents), experiment.quality.planned) == (500, 500)
     assert np.flatnonzero(~experiment.measured).tolist() == [499]
     assert log.truth is not None
     assert fit(experiment, log.bench, log.truth, log.bench.plant("exact")).fits
@@ -131,7 +131,7 @@ def test_without_gaps_in_the_reports_braked_periods_are_known_exactly(
     tmp_path: Path, simulate: Simulate, bench: Bench
 ) -> None:
     log, experiment = recorded(tmp_path, simulate(square, options="f_v=4e-5", on_receive=Lose(150, 260, 370)))
-    assert experiment.braked == 3
+    assert experiment.quality.braked == 3
     assert log.truth is not None
     assert fit(experiment, bench, log.truth, bench.plant("exact")).fits
 
@@ -154,9 +154,9 @@ def test_the_charge_tells_what_acted_before_a_single_lost_sample_and_nothing_els
     acted = dict(zip(lost.tolist(), lose.applied[-len(lost) :], strict=True))
     assert len(told) == 3
     assert experiment.currents[told] == pytest.approx([acted[k] for k in told.tolist()], abs=1e-7)
-    assert experiment.lacks[Lack.LOST_WITH_CHARGE][1] == 3
+    assert experiment.quality.lacks[Lack.LOST_WITH_CHARGE][1] == 3
     assert assumed.reported.tolist() == assumed.measured.tolist() == experiment.measured.tolist()
-    assert Lack.LOST_WITH_CHARGE not in assumed.lacks
+    assert Lack.LOST_WITH_CHARGE not in assumed.quality.lacks
     assert "/emb/EMB_Charge" in topics
     assert "/emb/EMB_Charge" not in older.topics
     assert len(charges) > 500
@@ -208,9 +208,9 @@ def test_of_a_late_plant_what_acted_is_known_exactly_and_how_late_is_found(
     run = simulate(square, options="plant=late", on_bench=knowing_how_late(bench))
     log, experiment = recorded(tmp_path, run)
     sent = commanded(run, layout)
-    assert experiment.command_delay == 1
+    assert experiment.quality.command_delay == 1
     assert experiment.currents.tolist() == [0.0, *sent[:-1]]
-    assert experiment.lacks == {}
+    assert experiment.quality.lacks == {}
     assert log.truth is not None
     assert fit(experiment, bench, log.truth, bench.plant("late")).fits
     assert not fit(experiment, bench, log.truth, bench.plant("exact")).fits
@@ -223,9 +223,9 @@ def test_a_lost_report_of_a_late_plant_is_taken_from_the_command_that_was_to_act
     _, experiment = recorded(tmp_path, run)
     (lost,) = np.flatnonzero(~experiment.measured).tolist()
     sent = {c.step: c.sent_current for c in run.journal.cycles if c.command_counter != 15}
-    assert (experiment.command_delay, experiment.currents[lost]) == (1, sent[lost - 1])
+    assert (experiment.quality.command_delay, experiment.currents[lost]) == (1, sent[lost - 1])
     # That the node braked a period later, for want of that command, contradicts nothing.
-    assert experiment.lacks == {Lack.LOST: (1,)}
+    assert experiment.quality.lacks == {Lack.LOST: (1,)}
 
 
 def test_what_cannot_be_compared_does_not_fit() -> None:
@@ -247,7 +247,7 @@ def test_a_report_that_contradicts_the_command_is_counted(tmp_path: Path, simula
         at = next(n for n, r in enumerate(records) if isinstance(r, CycleRecord) and r.step == changed.step)
         records[at] = changed
     _, experiment = recorded(tmp_path, run)
-    assert experiment.lacks == {Lack.CONTRADICTED: (2,)}
+    assert experiment.quality.lacks == {Lack.CONTRADICTED: (2,)}
 
 
 def test_a_log_without_an_experiment_its_frames_or_a_whole_period_is_refused(

@@ -61,8 +61,8 @@ def test_parameters_are_known_from_a_log_of_a_drive_that_tells_its_current_coars
 ) -> None:
     log, truly = run(name, tmp_path, monkeypatch)
     experiment = read_experiment(log)
-    assert experiment.command_delay == late
-    assert experiment.lacks == {}
+    assert experiment.quality.command_delay == late
+    assert experiment.quality.lacks == {}
     assert error(np.asarray(log.cycles["applied_current"])[1 : experiment.periods + 1], truly) > 0.04  # as it was told
     assert error(experiment.currents, truly) < 1e-3
 
@@ -87,5 +87,5 @@ def test_of_a_mapping_that_is_not_readable_what_was_told_acted(tmp_path: Path, m
     damaged = replace(log, attachments={**log.attachments, "drive.toml": b"schema = "})
     experiment = read_experiment(damaged)
     assert experiment.currents.tolist() == log.cycles["applied_current"][1 : experiment.periods + 1].tolist()
-    assert experiment.within is not None
-    assert np.isnan(experiment.within)
+    assert experiment.quality.within is not None
+    assert np.isnan(experiment.quality.within)

@@ -185,7 +185,7 @@ def test_messages_of_equal_log_time_may_come_in_any_order(path: Path, seed: int)
     found = read_experiment(read_log(path))
     np.testing.assert_array_equal(found.currents, own.currents)
     np.testing.assert_array_equal(found.samples, own.samples)
-    assert (found.angle, found.slack, found.lacks) == (own.angle, own.slack, own.lacks)
+    assert (found.angle, found.slack, found.quality.lacks) == (own.angle, own.slack, own.quality.lacks)
 
 
 @pytest.mark.parametrize(

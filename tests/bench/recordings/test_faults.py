@@ -184,7 +184,7 @@ NAMED = {
 
 
 def opened_faults(folder: Path, fault: Fault, text: Mapping[str, str]) -> tuple[str, ...]:
-    return open_recording(*put(folder, csv_text(RIGHT | dict(fault.changed)), text)).experiment.faults
+    return open_recording(*put(folder, csv_text(RIGHT | dict(fault.changed)), text)).experiment.quality.faults
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -254,4 +254,4 @@ def test_what_is_no_fault_is_not_called_one(name: str, velocity: bool, tmp_path:
         text = map_path.read_text()
         begin, end = text.index("[signals.velocity]"), text.index("[signals.command]")
         map_path.write_text(text[:begin] + text[end:])
-    assert open_recording(source, map_path).experiment.faults == ()
+    assert open_recording(source, map_path).experiment.quality.faults == ()

@@ -192,11 +192,11 @@ def test_a_map_of_frames_that_does_not_fit_says_what_there_is(written: dict[str,
 def test_skipped_and_unreadable_frames_are_counted(written: dict[str, bytes], tmp_path: Path) -> None:
     source, map_path = put(tmp_path, "r.log", written["r.log"])
     count = len(RECORDING.time)
-    assert open_recording(source, map_path).experiment.lacks[Lack.OTHER_FRAMES] == (count, 1)
+    assert open_recording(source, map_path).experiment.quality.lacks[Lack.OTHER_FRAMES] == (count, 1)
     lines = written["r.log"].decode().splitlines()
     lines[300] = lines[300].replace(lines[300].split("#")[1], "00")
     source.write_text("\n".join(lines))
-    assert open_recording(source, map_path).experiment.lacks[Lack.BAD_FRAMES] == (1,)
+    assert open_recording(source, map_path).experiment.quality.lacks[Lack.BAD_FRAMES] == (1,)
     source.write_text("\n".join([*lines, lines[0].replace(" can0 ", " can1 ").replace(lines[0].split()[1], "can1")]))
     with pytest.raises(UsageError, match="comes on channels"):
         open_recording(source, map_path)

@@ -66,7 +66,7 @@ def test_a_machine_that_stands_still_is_read_as_any_other(tmp_path: Path) -> Non
 
 def test_what_a_recording_lacks_is_said_of_its_experiment(tmp_path: Path) -> None:
     experiment = opened(tmp_path, csv(tmp_path / "r.csv", RECORDING)).experiment
-    assert {Lack.NO_COUNTERS, Lack.NO_VELOCITY, Lack.NO_CURRENT} <= experiment.lacks.keys()
+    assert {Lack.NO_COUNTERS, Lack.NO_VELOCITY, Lack.NO_CURRENT} <= experiment.quality.lacks.keys()
 
 
 def test_a_column_that_an_observer_derives_is_told_and_without_it_the_machine_is_the_same(
@@ -156,7 +156,7 @@ def test_lost_and_shifted_samples_stay_where_their_times_are(tmp_path: Path) -> 
     lost = np.flatnonzero(~experiment.measured) + 1
     assert lost.tolist() == [50, 51, 90]
     np.testing.assert_allclose(experiment.all_samples[kept, 0], found.position)
-    assert experiment.lacks[Lack.LOST_OF_RECORDING] == (3,)
+    assert experiment.quality.lacks[Lack.LOST_OF_RECORDING] == (3,)
 
 
 MAPS_REFUSED = (

@@ -154,8 +154,8 @@ def test_columns_without_a_head_have_numbers(tmp_path: Path) -> None:
 
 
 def test_the_line_of_a_head_that_was_found_is_said(tmp_path: Path) -> None:
-    assert open_recording(*written(tmp_path, READ["a preamble"])).experiment.lacks[Lack.HEAD] == (4,)
-    assert Lack.HEAD not in open_recording(*written(tmp_path, READ["as it is"])).experiment.lacks
+    assert open_recording(*written(tmp_path, READ["a preamble"])).experiment.quality.lacks[Lack.HEAD] == (4,)
+    assert Lack.HEAD not in open_recording(*written(tmp_path, READ["as it is"])).experiment.quality.lacks
     changed = written(tmp_path, Form("x\n" + csv_text(RIGHT | {"t": 0.0 * RIGHT["t"]})))
     with pytest.raises(UsageError, match=r"\(head in line 2\): 99 of 100 rows"):
         open_recording(*changed)

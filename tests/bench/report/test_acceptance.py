@@ -14,7 +14,8 @@ import pytest
 
 from emb_bench.analysis.drift import Earlier
 from emb_bench.analysis.options import EstimateOptions
-from emb_bench.analysis.study import Result, Study, make_study
+from emb_bench.analysis.stages import make_study
+from emb_bench.analysis.study import Result, Study
 from emb_bench.cli.replay import main
 from emb_bench.config.bench import load_bench
 from emb_bench.experiment.experiment import Experiment

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from emb_bench.analysis import study as analysis_study
+from emb_bench.analysis import stages
 from emb_bench.analysis.options import EstimateOptions
-from emb_bench.analysis.study import make_study
+from emb_bench.analysis.stages import make_study
 from emb_bench.batch.evaluate import evaluate_one
 from emb_bench.batch.row import CampaignOptions, Source
 from emb_bench.batch.summary import summarise
@@ -296,7 +296,7 @@ def test_a_report_reads_each_experiment_once(
         seen.append(log.path.name)
         return read_experiment(log, *more)
 
-    monkeypatch.setattr(analysis_study, "read_experiment", counted)
+    monkeypatch.setattr(stages, "read_experiment", counted)
     made = gathered(bench, good, folder / "other.mcap")
     assert [run.alone is not None for run in made.study.runs] == [True, True]
     assert seen == [good.name, "other.mcap"]
