@@ -41,7 +41,7 @@ class Lack(Enum):
 
 @dataclass(frozen=True)
 class Quality:
-    """What a log says about an experiment besides its samples."""
+    """Facts about an experiment besides its samples, by its log."""
 
     planned: int = 0  # Periods that the run was to have
     braked: int = 0  # Periods that the node braked by itself because no command came in time
