@@ -22,7 +22,6 @@ FEWEST = 20  # Fewest samples of a recording
 LONGEST = 1_000_000  # Most periods of a recording
 
 Integers = NDArray[np.int64]
-Lacks = Mapping[Lack, tuple[float, ...]]
 
 
 class Found(NamedTuple):
@@ -35,7 +34,11 @@ class Found(NamedTuple):
 
 
 def experiment_of(
-    columns: Mapping[Place, Column], wanted: RecordingMap, kind: str, source: str, lacks: Lacks = MappingProxyType({})
+    columns: Mapping[Place, Column],
+    wanted: RecordingMap,
+    kind: str,
+    source: str,
+    lacks: Mapping[Lack, tuple[float, ...]] = MappingProxyType({}),
 ) -> Found:
     """Columns, by their places, as an experiment that ``lacks`` this already; messages call the file ``source``.
 
@@ -262,7 +265,7 @@ def _derived(step: Integers, angle: Floats, t_s: float, bandwidth: float) -> Flo
     return np.array(found)
 
 
-def _lacks(wanted: RecordingMap, kind: str, bandwidth: float, lost: int) -> Lacks:
+def _lacks(wanted: RecordingMap, kind: str, bandwidth: float, lost: int) -> dict[Lack, tuple[float, ...]]:
     found: dict[Lack, tuple[float, ...]] = {Lack.NO_COUNTERS: ()}
     if bandwidth:
         found[Lack.NO_VELOCITY] = (bandwidth,)
