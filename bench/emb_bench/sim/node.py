@@ -19,7 +19,7 @@ import math
 from emb_bench.config.plants import BUILT_IN, DEFAULT_PLANT, Plant
 from emb_bench.sim.simulated_brake import Noise, SimulatedBrake
 from emb_runtime.can.codec import Signal
-from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck
+from emb_runtime.can.e2e import COUNTER_MODULUS, NO_COUNTER, CounterCheck, next_counter
 from emb_runtime.can.messages import Layout, StopReason, bench_identity
 from emb_runtime.config.bench import Bench, BrakeParameters
 from emb_runtime.errors import FrameError
@@ -34,6 +34,22 @@ REST_TIME = 0.05  # s
 it chatter by ± T_c t_s / J = 2.2 rad/s where the brake stands still."""
 
 NOTHING_ASKED = math.nan  # On its way to the motor where no command is
+
+
+class Rest:
+    """Watch over a brake that stops, from a first angle on [rad]."""
+
+    def __init__(self, angle: float) -> None:
+        self._angle = angle
+        self._periods = 0  # within REST_TRAVEL of that angle
+
+    def reached(self, angle: float, t_s: float) -> bool:
+        """Returns True if the brake rests; the angle after each period [rad]."""
+        if abs(angle - self._angle) > REST_TRAVEL:
+            self._angle, self._periods = angle, 0
+            return False
+        self._periods += 1
+        return self._periods * t_s >= REST_TIME
 
 
 class BrakeNode(SimulatedBrake):
@@ -53,23 +69,24 @@ class BrakeNode(SimulatedBrake):
         self._bench = bench
         self._layout = layout
         self._watchdog_periods = math.ceil(bench.node.watchdog / self._t_s - 1e-9)
-        self._current_step = layout.command.signal("Current").factor
         self._identity = bench_identity(bench.identity_hash)
         self._check = CounterCheck(COUNTER_MODULUS)
-        self._counter = NO_COUNTER - 1  # the first sample has counter 0
-        self._status_counter = 0
-        self._status_due = 1
-        self._sends_charge, self._charge = charge, 0.0
+        self._status = 0, 1  # counter of the next status, and the period from which on it is due
+        self._charge = 0.0 if charge else None
         self._command: CurrentCommand | None = None
         self._idle_periods = 0
-        self._rest_angle = 0.0
-        self._rest_periods = 0
+        self._rest = Rest(0.0)
         self.samples = 0  # Samples sent so far
         self.state = NodeState.IDLE
         self.stop_reason = StopReason.NEVER_COMMANDED
         self.obeyed = 0  # Commands obeyed
         self.braked = 0  # Periods without an obeyed command while active
         self.rejected = 0  # Command frames not obeyed
+
+    @property
+    def _counter(self) -> int:
+        """Counter of the newest sample: the first one has 0."""
+        return (self.samples - 1) % COUNTER_MODULUS
 
     def receive(self, frame: Frame) -> None:
         """Take one frame from the bus; only a valid, fresh command for this sample is kept."""
@@ -101,8 +118,8 @@ class BrakeNode(SimulatedBrake):
             obeys = self.state is NodeState.ACTIVE and not math.isnan(asked)
             applied = asked if obeys else self._own_current()
             angle, velocity = self._advance(applied)
-            self._charge += applied * self._t_s
-        self._counter = (self._counter + 1) % COUNTER_MODULUS
+            if self._charge is not None:
+                self._charge += applied * self._t_s
         self.samples += 1
         return self._frames(angle, velocity, applied, answered_by)
 
@@ -131,7 +148,7 @@ class BrakeNode(SimulatedBrake):
 
     def _latch(self, reason: StopReason) -> None:
         self.state, self.stop_reason = NodeState.STOPPING, reason
-        self._rest_angle, self._rest_periods = self.angle, 0
+        self._rest = Rest(self.angle)
 
     def _own_current(self) -> float:
         """Current of a drive without commands: the damped stop, or none [A]."""
@@ -139,7 +156,8 @@ class BrakeNode(SimulatedBrake):
             return 0.0
         limit = self._bench.limits.current
         damping = damped_current(self.velocity, limit, self._bench.node.damping_velocity)
-        return round(damping / self._current_step) * self._current_step
+        step = self._layout.command.signal("Current").factor
+        return round(damping / step) * step
 
     def _advance(self, current: float) -> tuple[float, float]:
         measured = super()._advance(current)
@@ -147,17 +165,9 @@ class BrakeNode(SimulatedBrake):
         outside = not low <= self.angle <= high or abs(self.velocity) > self._bench.limits.velocity
         if outside and self.state is NodeState.ACTIVE:
             self._latch(StopReason.LIMIT)
-        if self.state is NodeState.STOPPING:
-            self._watch_rest()
-        return measured
-
-    def _watch_rest(self) -> None:
-        if abs(self.angle - self._rest_angle) > REST_TRAVEL:
-            self._rest_angle, self._rest_periods = self.angle, 0
-            return
-        self._rest_periods += 1
-        if self._rest_periods * self._t_s >= REST_TIME:
+        if self.state is NodeState.STOPPING and self._rest.reached(self.angle, self._t_s):
             self.state = NodeState.IDLE
+        return measured
 
     def _frames(self, angle: float, velocity: float, applied: float, answered_by: int) -> list[Frame]:
         layout, counter = self._layout, self._counter
@@ -172,20 +182,12 @@ class BrakeNode(SimulatedBrake):
                 answered_by,
             ),
         ]
-        if self._sends_charge:
+        if self._charge is not None:
             frames.insert(0, layout.encode_charge(counter, self._charge))
-        if self.periods >= self._status_due:
-            self._status_due = self.periods + STATUS_PERIODS
-            frames.append(
-                layout.encode_status(
-                    self._status_counter,
-                    self.state,
-                    self.stop_reason,
-                    self.rejected,
-                    self._identity,
-                )
-            )
-            self._status_counter = (self._status_counter + 1) % COUNTER_MODULUS
+        number, due = self._status
+        if self.periods >= due:
+            self._status = next_counter(number), self.periods + STATUS_PERIODS
+            frames.append(layout.encode_status(number, self.state, self.stop_reason, self.rejected, self._identity))
         return frames
 
 
