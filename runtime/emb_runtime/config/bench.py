@@ -211,24 +211,35 @@ class Can:
 
 
 @dataclass(frozen=True)
-class Systematic:
-    """Systematic errors that a bench cannot exclude by itself: ``[systematic]``.
-
-    Standard deviations of Gaussian priors with mean zero, or with what the plant itself says. Most
-    records determine an error better than its prior. 0 excludes an error.
-    """
+class SensorErrors:
+    """Errors of sensors and time grid. Most records determine them better than their priors: they are estimated too."""
 
     offset: NotNegative = 0.05  # Reading of the encoder at the true origin [rad]
     current_offset: NotNegative = 0.05
     """Current that acts beyond what the node reports; a friction that depends on the direction looks the same [A]."""
     delay: NotNegative = 0.3  # By which commands act late, or samples early [samples]
     velocity_gain: NotNegative = 0.02  # Relative error of the velocity's scale
+
+
+@dataclass(frozen=True)
+class SharedErrors(SensorErrors):
+    """And errors of what is known beforehand, which no record determines: each adds to the totals with its prior."""
+
     k_m: Positive | None = None  # Relative error of k_m in [brake], where it was measured; J is then estimated
     inertia: NotNegative = 0.01  # Relative error of J, which all four parameters share
     angle_scale: NotNegative = 0.003  # Relative error of the angle's scale, which k_m and T_c share
     current_scale: NotNegative = 0.0  # Relative error of the current's scale, where k_m is meant per true ampere
     time_scale: NotNegative = 1e-5  # Relative error of the node's clock, which all four parameters share
     held: NotNegative = 0.02  # Relative error of each parameter that is held at its nominal value
+
+
+@dataclass(frozen=True)
+class Systematic(SharedErrors):
+    """Systematic errors that a bench cannot exclude by itself: ``[systematic]``; last, effects that the plant lacks.
+
+    Standard deviations of Gaussian priors with mean zero, or with what the plant itself says. 0 excludes an error.
+    """
+
     quadratic: NotNegative = 1e-4  # Quadratic share of the stiffness that the plant lacks [1/rad]
     cubic: NotNegative = 1e-6  # Cubic share of the stiffness that the plant lacks [1/rad²]
     hysteresis: NotNegative = 1e-2  # Hysteresis of the clamping force that the plant lacks
